@@ -1,0 +1,38 @@
+"""Diffusion bridges by coupling, in JAX."""
+
+from .bridges import Bridges as Bridges, sample_bridges as sample_bridges
+from .coupling import (
+    AbstractCoupling as AbstractCoupling,
+    Coupling as Coupling,
+    no_rotation as no_rotation,
+    polar_rotation as polar_rotation,
+    published_rotation as published_rotation,
+)
+from .diffusion import Diffusion as Diffusion
+from .meeting import (
+    AbstractMeeting as AbstractMeeting,
+    BrownianCrossing as BrownianCrossing,
+    ReflectionPlane as ReflectionPlane,
+    SignTest as SignTest,
+)
+from .schemes import (
+    AbstractScheme as AbstractScheme,
+    Euler as Euler,
+    Heun as Heun,
+    Milstein as Milstein,
+)
+from .gaussian import (
+    GaussianBridge as GaussianBridge,
+    GaussianLaw as GaussianLaw,
+    OrnsteinUhlenbeckParams as OrnsteinUhlenbeckParams,
+    gaussian_bridge as gaussian_bridge,
+    ornstein_uhlenbeck as ornstein_uhlenbeck,
+    ou_stationary as ou_stationary,
+    ou_transition as ou_transition,
+)
+from .models import (
+    hyperbolic as hyperbolic,
+    langevin as langevin,
+    stationary_diffusion as stationary_diffusion,
+)
+from .simulate import simulate as simulate

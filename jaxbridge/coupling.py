@@ -1,0 +1,218 @@
+"""Couplings: how the noise of one copy of the diffusion is made from that of the other.
+
+The paper's γ-coupling (section 2.1) drives X' by
+
+    dW' = {I - (1-γ)Π} O dW + √(1-γ²) u dU,    Π = uuᵀ,  u ∝ σ(x')⁻¹(x - x'),
+
+and read in the other direction, for the associated diffusion, equation (stjerne-dif),
+
+    dW = Oᵀ [{I - (1-γ)Π} dW' + √(1-γ²) u dU'].
+
+u is built with σ(x') in both directions, x' being the state of X'. The rotation O(x, x')
+belongs to the pair, not to the coupling's geometry: a coupling sees the noise of X after O
+has turned it, so one O serves both directions.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Key
+
+from .linalg import dot, matmul, matvec, polar_factor
+from .meeting import (
+    AbstractMeeting,
+    BrownianCrossing,
+    Frame,
+    ReflectionPlane,
+    SignTest,
+)
+from .schemes import AbstractScheme, Euler, Heun
+from .sigma import AbstractSigma, Full
+
+Rotation = Callable[[Float[Array, "d d"], Float[Array, "d d"]], Float[Array, "d d"] | None]
+
+
+def polar_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
+    """O(x, x'), the orthogonal matrix closest to σ(x')ᵀσ(x), so that σ(x')O ≈ σ(x)."""
+    return polar_factor(matmul(driven_sigma.T, sigma))
+
+
+def no_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
+    """O = I: as exact as any other rotation, but σ(x) and σ(x') may point elsewhere."""
+    return None
+
+
+def published_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
+    """The orthogonal factor of σ(x)ᵀσ(x') as printed in the paper: the transpose of the
+    rotation that aligns the two, so it turns the wrong way. For comparisons."""
+    return polar_factor(matmul(sigma.T, driven_sigma))
+
+
+class AbstractCoupling(eqx.Module):
+    """A coupling is two maps of noise increments, and how the pair is stepped and joined.
+
+    Both maps act on one point: `dw`, shape (d,), is the noise of X, already turned by O;
+    `driven_dw` that of X'; `du` an independent N(0, δ) increment, or `None` where
+    `independent_noise` is false, in which case none is drawn. Each map must turn N(0, δ I)
+    noise into N(0, δ I) noise, and the two must be the two conditional laws of one joint law.
+
+    Write another coupling by subclassing. Synchronous up to a distance, then reflection:
+
+    ```python
+    class SynchronousThenReflection(jb.AbstractCoupling):
+        distance: float = 1.0
+        meeting: jb.AbstractMeeting = jb.BrownianCrossing()
+        scheme: jb.AbstractScheme = jb.Heun()
+        rotation: Callable | None = eqx.field(default=None, static=True)
+        independent_noise = False
+
+        def driven_noise(self, frame, dw, du):
+            mirrored = dw - 2 * frame.u * dot(frame.u, dw)
+            return jnp.where(frame.gap > self.distance, dw, mirrored)
+
+        def driving_noise(self, frame, driven_dw, du):
+            return self.driven_noise(frame, driven_dw, du)  # its own inverse
+
+        def gap_variance(self, frame):
+            return jnp.where(frame.gap > self.distance, 0.0, 4.0)
+
+        def realise(self, keys):
+            return self
+    ```
+    """
+
+    meeting: eqx.AbstractVar[AbstractMeeting]
+    scheme: eqx.AbstractVar[AbstractScheme]
+    rotation: eqx.AbstractVar[Rotation | None]
+    independent_noise: eqx.AbstractVar[bool]
+
+    @abstractmethod
+    def driven_noise(
+        self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None
+    ) -> Float[Array, " d"]:
+        """ΔW' of the driven X', from ΔW."""
+
+    @abstractmethod
+    def driving_noise(
+        self, frame: Frame, driven_dw: Float[Array, " d"], du: Float[Array, ""] | None
+    ) -> Float[Array, " d"]:
+        """ΔW of X, from ΔW': the same joint law read in the other direction."""
+
+    @abstractmethod
+    def gap_variance(self, frame: Frame) -> Float[Array, ""]:
+        """The variance per unit of time of `uᵀ(dW - dW')`."""
+
+    @abstractmethod
+    def realise(self, keys: Key[Array, " lanes"]) -> "AbstractCoupling":
+        """The coupling of each of many proposals: arrays drawn at random get a trailing axis
+        of lanes. A coupling without randomness of its own returns itself."""
+
+
+class Coupling(AbstractCoupling):
+    """The γ-coupling of section 2.1 of the paper.
+
+    γ = -1 is reflection (Lindvall & Rogers 1986), γ = 0 projection (Chen & Li 1989), which in
+    one dimension makes X' independent of X: the method of Bladt & Sørensen (2014). As γ → 1
+    the two share more of their noise and meet more rarely, but a joined path is closer to a
+    bridge.
+
+    **Arguments:**
+
+    - `gamma`: γ in [-1, 1); or a law, a function `key -> γ`, from which each proposal draws
+        its own.
+    - `meeting`: `BrownianCrossing()`, `SignTest(radius)` or, for γ = -1, `ReflectionPlane()`.
+    - `scheme`: `Heun()`, `Euler()` or `Milstein()`.
+    - `rotation`: O(x, x') from the matrices σ(x), σ(x'); `None` is `polar_rotation` where σ is
+        a full matrix that depends on the state, and nothing elsewhere.
+
+    **Raises:** `ValueError` for γ outside [-1, 1) or `ReflectionPlane` with γ ≠ -1.
+
+    !!! example
+
+        ```python
+        coupling = jb.Coupling(0.5)
+        bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000, num_steps=50, coupling=coupling)
+        ```
+    """
+
+    gamma: Float[Array, "..."]
+    meeting: AbstractMeeting
+    scheme: AbstractScheme
+    rotation: Rotation | None = eqx.field(static=True)
+    independent_noise: bool = eqx.field(static=True)
+    _gamma_law: Callable | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        gamma: ArrayLike | Callable = 0.0,
+        meeting: AbstractMeeting | None = None,
+        scheme: AbstractScheme | None = None,
+        rotation: Rotation | None = None,
+    ):
+        law, gamma = (gamma, jnp.nan) if callable(gamma) else (None, gamma)
+        self.gamma = jnp.asarray(gamma)
+        self.meeting = BrownianCrossing() if meeting is None else meeting
+        self.scheme = Heun() if scheme is None else scheme
+        self.rotation = rotation
+        self._gamma_law = law
+        reflection = False
+        if law is None and not isinstance(self.gamma, jax.core.Tracer):
+            if self.gamma.ndim != 0:
+                raise ValueError(
+                    f"`gamma` must be a scalar, got shape {self.gamma.shape}; use `jax.vmap` "
+                    "for several values, or pass a function `key -> gamma`."
+                )
+            if not -1 <= self.gamma < 1:
+                raise ValueError(f"`gamma` must be in [-1, 1), got {gamma}.")
+            reflection = bool(self.gamma == -1)
+        self.independent_noise = not reflection
+        if isinstance(self.meeting, ReflectionPlane) and not reflection:
+            raise ValueError(
+                "`ReflectionPlane` decides meetings of the reflection coupling only: use "
+                f"`gamma=-1.0` (got {gamma}) or another meeting rule."
+            )
+
+    @staticmethod
+    def as_published(gamma: ArrayLike) -> "Coupling":
+        """The paper's own settings: Euler, the sign test with radius 0.05, the printed O."""
+        return Coupling(gamma, SignTest(0.05), Euler(), published_rotation)
+
+    def driven_noise(self, frame, dw, du):
+        return self._turn(frame, dw, du)
+
+    def driving_noise(self, frame, driven_dw, du):
+        return self._turn(frame, driven_dw, du)
+
+    def gap_variance(self, frame):
+        return 2 * (1 - self.gamma)
+
+    def realise(self, keys):
+        if self._gamma_law is None:
+            return self
+        gamma = jax.vmap(self._gamma_law)(keys)
+        return eqx.tree_at(lambda c: c.gamma, self, gamma.astype(self.gamma.dtype))
+
+    def _turn(self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None):
+        """{I - (1-γ)Π} w + √(1-γ²) u ΔU: symmetric, so it serves both directions."""
+        along = -(1 - self.gamma) * dot(frame.u, dw)
+        if du is not None:
+            along += jnp.sqrt((1 - self.gamma) * (1 + self.gamma)) * du
+        return dw + frame.u * along
+
+
+def rotation_between(
+    coupling: AbstractCoupling, sigma: AbstractSigma, driven_sigma: AbstractSigma
+) -> Float[Array, "d d"] | None:
+    """O(x, x'), or `None` where σ calls for no rotation."""
+    if not (isinstance(sigma, Full) and isinstance(driven_sigma, Full)):
+        return None
+    rotation = polar_rotation if coupling.rotation is None else coupling.rotation
+    return rotation(sigma.matrix, driven_sigma.matrix)
+
+
+def rotate(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Float[Array, " d"]:
+    """O w."""
+    return dw if rotation is None else matvec(rotation, dw)

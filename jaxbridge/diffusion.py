@@ -1,0 +1,340 @@
+"""A diffusion and its time reversal (sections 2 and 2.1 of the paper).
+
+The diffusion solves `dX = α(X) dt + σ(X) dW` in R^d and is ergodic with stationary density ν.
+Run backwards in time, the stationary process is a diffusion with the same σ and the drift of
+equation (reversedrift),
+
+    α*(x) = -α(x) + ν(x)⁻¹ Σ_j ∂_j(ν V_ij)(x) = -α + V ∇log ν + div V,    V = σσᵀ,
+
+in which the normaliser of ν cancels. It is reversible if and only if α* = α, equation
+(timereversible).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.extend
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Inexact, Key, PyTree
+
+from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
+
+
+class Dynamics(NamedTuple):
+    """The coefficients of one stochastic differential equation, ready for a compiled loop.
+
+    `drift` maps a point, shape (d,), to a vector (d,); `sigma` maps it to σ(x);
+    `sigma_varies` tells whether σ depends on the point at all.
+    """
+
+    drift: Callable[[Array], Array]
+    sigma: Callable[[Array], AbstractSigma]
+    sigma_varies: bool
+
+
+class Diffusion(eqx.Module):
+    """The diffusion `dX = α(X) dt + σ(X) dW`, from pure functions of one point.
+
+    A pytree: its leaves are the arrays of `params` (and a constant σ), so it passes through
+    `jit`, `vmap` and `grad`; its functions are static and compared by identity, so define
+    them once to compile once. Differentiate and batch with respect to `params`, not with
+    respect to values that the functions close over.
+
+    **Arguments:**
+
+    - `drift`: α, a function `(x, params) -> (d,)` of a point `x` of shape (d,), in space per
+        unit of time.
+    - `diffusion`: σ. `None` is the identity; an array of shape (d, d), or (d,) for a
+        diagonal, is constant; a function `(x, params)` returns one of these shapes. Whether it
+        uses `x` is seen when it is traced: one that does not is constant as well. In space per
+        square root of a unit of time. Must be invertible.
+    - `log_stationary`: log ν up to a constant, `(x, params) -> ()`.
+    - `params`: any pytree; Python and NumPy numbers in it become JAX arrays.
+    - `reverse_drift`: α*, `(x, params) -> (d,)`, where it is known in closed form. Otherwise
+        it comes from `log_stationary` by automatic differentiation.
+    - `sample_stationary`: an exact sampler of ν, `(key, params) -> (d,)`.
+    - `reversible`: declare α* = α; then no reverse drift is computed. See
+        `reversibility_residual` for a check.
+    - `prepare`: maps `params` to what the functions above receive in their place, for
+        quantities that depend on the parameters but not on the point. It runs once per call,
+        outside every loop.
+
+    **Raises:** `TypeError` where a function is not callable; `ValueError` for a constant σ of
+    a wrong shape, or singular.
+
+    !!! example
+
+        ```python
+        model = jb.Diffusion(lambda x, p: -p * x, log_stationary=lambda x, p: -p * x @ x, params=1.0)
+        model.reverse_drift(jnp.ones(2))  # Array([-1., -1.], dtype=float32)
+        ```
+    """
+
+    _drift: Callable = eqx.field(static=True)
+    _diffusion: Callable | None = eqx.field(static=True)
+    _log_stationary: Callable | None = eqx.field(static=True)
+    _reverse_drift: Callable | None = eqx.field(static=True)
+    _sample_stationary: Callable | None = eqx.field(static=True)
+    _prepare: Callable | None = eqx.field(static=True)
+    _constant_sigma: Inexact[Array, "..."] | None
+    params: PyTree
+    reversible: bool = eqx.field(static=True)
+
+    def __init__(
+        self,
+        drift: Callable,
+        diffusion: Callable | ArrayLike | None = None,
+        log_stationary: Callable | None = None,
+        params: PyTree = None,
+        *,
+        reverse_drift: Callable | None = None,
+        sample_stationary: Callable | None = None,
+        reversible: bool = False,
+        prepare: Callable | None = None,
+    ):
+        for name, function in [
+            ("drift", drift),
+            ("log_stationary", log_stationary),
+            ("reverse_drift", reverse_drift),
+            ("sample_stationary", sample_stationary),
+            ("prepare", prepare),
+        ]:
+            if not (callable(function) or (function is None and name != "drift")):
+                raise TypeError(f"`{name}` must be a function, got {function!r}.")
+        self._drift = drift
+        self._log_stationary = log_stationary
+        self._reverse_drift = reverse_drift
+        self._sample_stationary = sample_stationary
+        self._prepare = prepare
+        if diffusion is None or callable(diffusion):
+            self._diffusion, self._constant_sigma = diffusion, None
+        else:
+            self._diffusion, self._constant_sigma = None, _check_constant_sigma(diffusion)
+        self.params = jax.tree.map(_as_leaf, params)
+        self.reversible = reversible
+
+    def drift(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
+        """α(x), shape (d,)."""
+        x = jnp.asarray(x)
+        return self.forward(x).drift(x)
+
+    def diffusion(self, x: Float[Array, " d"]) -> Float[Array, "d d"]:
+        """σ(x) as a dense matrix, shape (d, d)."""
+        x = jnp.asarray(x)
+        return self.forward(x).sigma(x).as_matrix(x.shape[0], x.dtype)
+
+    def reverse_drift(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
+        """α*(x), shape (d,): equation (reversedrift) of the paper.
+
+        **Raises:** `ValueError` for a model without `log_stationary` or `reverse_drift` that
+        is not declared reversible.
+        """
+        x = jnp.asarray(x)
+        return self.backward(x).drift(x)
+
+    def log_stationary(self, x: Float[Array, " d"]) -> Float[Array, ""]:
+        """log ν(x) up to a constant."""
+        return self._log_stationary_function()(jnp.asarray(x))
+
+    def sample_stationary(self, key: Key[Array, ""]) -> Float[Array, " d"]:
+        """One draw from ν, shape (d,), by the model's own sampler."""
+        if self._sample_stationary is None:
+            raise ValueError(
+                "this model has no sampler of its stationary law: pass `sample_stationary=`, "
+                "a function `(key, params) -> x`, to `Diffusion`."
+            )
+        return self._sample_stationary(key, self._prepared_params())
+
+    def reversibility_residual(self, points: Float[Array, "n d"]) -> Float[Array, "n d"]:
+        """α - ½ (V ∇log ν + div V) at each of the points, shape (n, d).
+
+        Zero everywhere if and only if the diffusion is time-reversible: equation
+        (timereversible) of the paper, divided by ν.
+        """
+        points = jnp.asarray(points)
+        forward, log_nu = self.forward(points[0]), self._log_stationary_function()
+        return jax.vmap(lambda x: forward.drift(x) - _stationary_flux(forward, log_nu, x) / 2)(
+            points
+        )
+
+    def with_params(self, params: PyTree) -> "Diffusion":
+        """The same functions with other parameters."""
+        params = jax.tree.map(_as_leaf, params)
+        return eqx.tree_at(lambda m: m.params, self, params, is_leaf=lambda leaf: leaf is None)
+
+    @property
+    def has_reverse_drift(self) -> bool:
+        """Whether the time reversal of this model is known."""
+        return (
+            self.reversible or self._reverse_drift is not None or self._log_stationary is not None
+        )
+
+    def forward(self, like: Float[Array, " d"]) -> Dynamics:
+        """The coefficients α and σ at points like this one (only its shape and dtype count),
+        with everything done that does not depend on the point."""
+        params = self._prepared_params()
+
+        def drift(x):
+            return _check_value("drift", self._drift(x, params), x.shape, x)
+
+        if self._diffusion is not None:
+            diffusion = self._diffusion
+
+            def sigma(x):
+                return _as_sigma(diffusion(x, params), x, constant=False)
+
+            if _uses_argument(lambda x: diffusion(x, params), like):
+                return Dynamics(drift, sigma, sigma_varies=True)
+            constant_sigma = _as_sigma(diffusion(jnp.zeros_like(like), params), like)
+        elif self._constant_sigma is not None:
+            constant_sigma = _as_sigma(self._constant_sigma, like)
+        else:
+            constant_sigma = Identity()
+        return Dynamics(drift, lambda x: constant_sigma, sigma_varies=False)
+
+    def backward(self, like: Float[Array, " d"]) -> Dynamics:
+        """The coefficients α* and σ of the time-reversed diffusion, as for `forward`."""
+        forward = self.forward(like)
+        if self.reversible:
+            return forward
+        if self._reverse_drift is not None:
+            params, reverse_drift = self._prepared_params(), self._reverse_drift
+
+            def drift(x):
+                return _check_value("reverse_drift", reverse_drift(x, params), x.shape, x)
+
+        elif self._log_stationary is not None:
+            log_nu = self._log_stationary_function()
+
+            def drift(x):
+                return -forward.drift(x) + _stationary_flux(forward, log_nu, x)
+
+        else:
+            raise ValueError(
+                "the time reversal of this model is unknown, and couplings need it: give "
+                "`Diffusion` a `log_stationary` (up to a constant), a `reverse_drift`, or "
+                "`reversible=True`."
+            )
+        return forward._replace(drift=drift)
+
+    def _prepared_params(self) -> PyTree:
+        return self.params if self._prepare is None else self._prepare(self.params)
+
+    def _log_stationary_function(self) -> Callable[[Array], Array]:
+        if self._log_stationary is None:
+            raise ValueError(
+                "this model has no stationary density: pass `log_stationary=` to `Diffusion`."
+            )
+        params, log_stationary = self._prepared_params(), self._log_stationary
+        return lambda x: _check_value("log_stationary", log_stationary(x, params), (), x)
+
+
+def ito_correction(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
+    """½ Σ_jk ∂_k σ_ij σ_kj, by which Itô's drift exceeds Stratonovich's."""
+
+    def column(y, j):
+        return dynamics.sigma(y).as_matrix(y.shape[0], y.dtype)[:, j]
+
+    correction = jnp.zeros_like(x)
+    for j in range(x.shape[0]):
+        correction += jax.jvp(lambda y: column(y, j), (x,), (column(x, j),))[1]
+    return correction / 2
+
+
+def weighted_divergence(
+    product: Callable[[Array, Array], Array],
+    log_nu: Callable[[Array], Array],
+    x: Float[Array, " d"],
+    varies: bool = True,
+) -> Float[Array, " d"]:
+    """ν⁻¹ Σ_j ∂_j(ν M_ij) = M ∇log ν + div M, for a matrix field given by `product(x, v)` =
+    M(x) v; div M is left out where M does not vary."""
+    flux = product(x, jax.grad(log_nu)(x))
+    if varies:
+        for direction in np.eye(x.shape[0], dtype=x.dtype):
+            direction = jnp.asarray(direction)
+            flux += jax.jvp(lambda y: product(y, direction), (x,), (direction,))[1]
+    return flux
+
+
+def _stationary_flux(
+    dynamics: Dynamics, log_nu: Callable, x: Float[Array, " d"]
+) -> Float[Array, " d"]:
+    """V ∇log ν + div V = α + α*."""
+
+    def product(y, v):
+        sigma = dynamics.sigma(y)
+        return sigma.mv(sigma.mv_transpose(v))
+
+    return weighted_divergence(product, log_nu, x, dynamics.sigma_varies)
+
+
+def _as_sigma(values: Array, x: Float[Array, " d"], constant: bool = True) -> AbstractSigma:
+    d = x.shape[0]
+    values = jnp.asarray(values)
+    if values.shape not in ((d,), (d, d)):
+        raise ValueError(
+            f"`diffusion` must have shape ({d}, {d}), or ({d},) for a diagonal, at a point of "
+            f"shape ({d},); it has {values.shape}."
+        )
+    values = values.astype(x.dtype)
+    if values.ndim == 1:
+        return Diagonal(values)
+    return Constant(values) if constant else Full(values)
+
+
+def _uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:
+    """Whether the values of `function` depend on its argument, by following its jaxpr."""
+    jaxpr = jax.make_jaxpr(function)(like).jaxpr
+    reached = set(jaxpr.invars)
+
+    def any_reached(atoms) -> bool:
+        return any(a in reached for a in atoms if not isinstance(a, jax.extend.core.Literal))
+
+    for equation in jaxpr.eqns:
+        if any_reached(equation.invars):
+            reached.update(equation.outvars)
+    return any_reached(jaxpr.outvars)
+
+
+def _check_value(name: str, value: Array, shape: tuple, x: Float[Array, " d"]) -> Array:
+    value = jnp.asarray(value)
+    if value.shape != shape:
+        raise ValueError(
+            f"`{name}` must return shape {shape} at a point of shape {x.shape}; "
+            f"it returned {value.shape}."
+        )
+    return value.astype(x.dtype)
+
+
+def _check_constant_sigma(sigma: ArrayLike) -> Array:
+    sigma = jnp.asarray(sigma)
+    if not jnp.issubdtype(sigma.dtype, jnp.inexact):
+        sigma = sigma.astype(float)
+    square = sigma.ndim == 2 and sigma.shape[0] == sigma.shape[1]
+    if not (square or sigma.ndim == 1):
+        raise ValueError(
+            "a constant `diffusion` must have shape (d, d), or (d,) for a diagonal; "
+            f"got {sigma.shape}."
+        )
+    check_invertible("diffusion", sigma)
+    return sigma
+
+
+def check_invertible(name: str, sigma: Array) -> None:
+    """Raise `ValueError` for a visibly singular or non-finite σ; silent while tracing."""
+    if isinstance(sigma, jax.core.Tracer):
+        return
+    matrix = np.diag(sigma) if sigma.ndim == 1 else np.asarray(sigma)
+    if not np.all(np.isfinite(matrix)):
+        raise ValueError(f"`{name}` must be finite; got {matrix}.")
+    if np.linalg.cond(matrix) > 1 / np.finfo(matrix.dtype).eps:
+        raise ValueError(f"`{name}` must be invertible; got the singular matrix {matrix}.")
+
+
+def _as_leaf(leaf):
+    # `asarray` keeps Python numbers weakly typed, so they follow the precision of the points.
+    return jnp.asarray(leaf) if isinstance(leaf, int | float | np.ndarray | np.generic) else leaf

@@ -1,0 +1,308 @@
+"""The Ornstein–Uhlenbeck process and its bridges in closed form (section 3.1 of the paper).
+
+For `dX = -B (X - m) dt + σ dW`, V = σσᵀ and B with eigenvalues in the right half plane,
+
+    Γ solves B Γ + Γ Bᵀ = V,   Γ_t = ∫_0^t e^{-sB} V e^{-sBᵀ} ds = Γ - e^{-tB} Γ e^{-tBᵀ},
+
+the stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x - m), Γ_t). The bridge
+from a to b in T is Gaussian. With the gain `K_t = Γ_t e^{-Bᵀ(T-t)} Γ_T⁻¹` its moments are
+
+    E Z_t = m + e^{-tB}(a - m) + K_t (b - m - e^{-TB}(a - m)),
+    Var Z_t = Γ_t - K_t e^{-B(T-t)} Γ_t.
+
+(The paper prints the gain without these transposes; that is right for reversible processes.)
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Key
+
+from .diffusion import Diffusion, check_invertible
+from .intervals import as_intervals, is_traced
+from .linalg import dot, matvec
+
+
+class GaussianLaw(NamedTuple):
+    """The normal distribution N(mean, covariance), with shapes (d,) and (d, d)."""
+
+    mean: Float[Array, " d"]
+    covariance: Float[Array, "d d"]
+
+    def sample(self, key: Key[Array, ""]) -> Float[Array, " d"]:
+        """One draw, shape (d,)."""
+        noise = jax.random.normal(key, self.mean.shape, self.mean.dtype)
+        return self.mean + matvec(jnp.linalg.cholesky(self.covariance), noise)
+
+    def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
+        """The normalised log density at a point."""
+        return jax.scipy.stats.multivariate_normal.logpdf(x, self.mean, self.covariance)
+
+
+class OrnsteinUhlenbeckParams(NamedTuple):
+    """B, shape (d, d); the mean, (d,); σ, (d, d), (d,) for a diagonal, or `None` for I."""
+
+    B: Float[Array, "d d"]
+    mean: Float[Array, " d"]
+    sigma: Float[Array, "..."] | None
+
+
+class _Prepared(NamedTuple):
+    """What depends on the parameters alone."""
+
+    B: Float[Array, "d d"]
+    mean: Float[Array, " d"]
+    sigma: Float[Array, "..."] | None
+    covariance: Float[Array, "d d"]
+    precision: Float[Array, "d d"]
+    log_normaliser: Float[Array, ""]
+    reverse_B: Float[Array, "d d"]
+
+
+def ornstein_uhlenbeck(
+    B: ArrayLike, mean: ArrayLike | None = None, sigma: ArrayLike | None = None
+) -> Diffusion:
+    """The Ornstein–Uhlenbeck process `dX = -B (X - mean) dt + σ dW`: equation (OU).
+
+    The log stationary density is normalised. The time reversal is the Ornstein–Uhlenbeck process with matrix Γ Bᵀ Γ⁻¹; it is reversible
+    if and only if BΓ is symmetric, which is not asked for. `params` is an
+    `OrnsteinUhlenbeckParams`, and Γ follows it.
+
+    **Arguments:** `B`, shape (d, d), per unit of time; `mean`, shape (d,), by default zero;
+    `sigma`, shape (d, d) or (d,), by default the identity.
+
+    **Raises:** `ValueError` where B has an eigenvalue whose real part is not positive, so
+    that the process is not ergodic; for a singular σ; for shapes that do not fit.
+
+    !!! example
+
+        ```python
+        model = jb.ornstein_uhlenbeck(jnp.array([[1.5, 1.0], [1.0, 1.5]]))
+        model.reverse_drift(jnp.array([1.0, 0.0]))  # Array([-1.5, -1. ], dtype=float32)
+        ```
+    """
+    B = _floating(B)
+    if B.ndim != 2 or B.shape[0] != B.shape[1]:
+        raise ValueError(f"`B` must be a square matrix, shape (d, d); got {B.shape}.")
+    d = B.shape[0]
+    mean = jnp.zeros(d, B.dtype) if mean is None else _floating(mean)
+    if mean.shape != (d,):
+        raise ValueError(f"`mean` must have shape ({d},) to fit `B`; got {mean.shape}.")
+    if sigma is not None:
+        sigma = _floating(sigma)
+        if sigma.shape not in ((d,), (d, d)):
+            raise ValueError(f"`sigma` must have shape ({d}, {d}) or ({d},); got {sigma.shape}.")
+        check_invertible("sigma", sigma)
+    if not is_traced(B):
+        if not np.all(np.isfinite(B)):
+            raise ValueError(f"`B` must be finite; got {B}.")
+        eigenvalues = np.linalg.eigvals(B)
+        if not np.all(eigenvalues.real > 0):
+            raise ValueError(
+                "the Ornstein–Uhlenbeck process is ergodic only if all eigenvalues of `B` have "
+                f"positive real parts; got {eigenvalues}."
+            )
+    return Diffusion(
+        drift=_drift,
+        diffusion=None if sigma is None else _sigma,
+        log_stationary=_log_stationary,
+        params=OrnsteinUhlenbeckParams(B, mean, sigma),
+        reverse_drift=_reverse_drift,
+        sample_stationary=_sample_stationary,
+        prepare=_prepare,
+    )
+
+
+def ou_stationary(model: Diffusion) -> GaussianLaw:
+    """The stationary law N(m, Γ) of an Ornstein–Uhlenbeck model."""
+    prepared = _prepare(_ou_params(model))
+    return GaussianLaw(prepared.mean, prepared.covariance)
+
+
+def ou_transition(model: Diffusion, start: Float[Array, " d"], duration: ArrayLike) -> GaussianLaw:
+    """The law of X_t given X_0 = `start`, for t = `duration`, of an Ornstein–Uhlenbeck model.
+
+    **Raises:** `TypeError` for any other model.
+
+    !!! example
+
+        ```python
+        law = jb.ou_transition(model, jnp.zeros(2), 1.0)
+        law.log_density(jnp.ones(2))
+        ```
+    """
+    params = _ou_params(model)
+    start = jnp.asarray(start, params.B.dtype)
+    decay, covariance = _decay_and_covariance(params, jnp.asarray(duration, params.B.dtype))
+    return GaussianLaw(params.mean + decay @ (start - params.mean), covariance)
+
+
+class GaussianBridge(eqx.Module):
+    """The exact law of an Ornstein–Uhlenbeck bridge at K times.
+
+    `times` (K,), `mean` (K, d) and `covariance` (K, d, d), the covariance at each time;
+    `sample` draws whole paths.
+    """
+
+    times: Float[Array, " K"]
+    mean: Float[Array, "K d"]
+    covariance: Float[Array, "K d d"]
+    _model: Diffusion
+    _start: Float[Array, " d"]
+    _end: Float[Array, " d"]
+    _duration: Float[Array, ""]
+    _gain: Float[Array, "K d d"]
+
+    def sample(self, key: Key[Array, ""], num_paths: int) -> Float[Array, "n K d"]:
+        """Independent paths at `times`, exact in law: an unconditional path X, corrected by
+        `Z_t = X_t + K_t (b - X_T)`, as in the paper's lemma on the bridge."""
+        params = _ou_params(self._model)
+        grid = jnp.concatenate([self.times, self._duration[None]])
+        steps = jnp.diff(grid, prepend=jnp.zeros((), grid.dtype))
+        decay, covariance = jax.vmap(lambda t: _decay_and_covariance(params, t))(steps)
+        still = (steps <= 0)[:, None, None]  # two equal times: no noise between them
+        identity = jnp.eye(len(self._start), dtype=grid.dtype)
+        root = jnp.linalg.cholesky(jnp.where(still, identity, covariance))
+        root = jnp.where(still, 0, root)
+        noise = jax.random.normal(key, (len(steps), num_paths, len(self._start)), grid.dtype)
+
+        def step(x, inputs):  # x: deviations from the mean, (num_paths, d)
+            decay, root, noise = inputs
+            x = x @ decay.T + noise @ root.T
+            return x, x
+
+        start = jnp.broadcast_to(self._start - params.mean, (num_paths, len(self._start)))
+        _, path = jax.lax.scan(step, start, (decay, root, noise))
+        miss = self._end - params.mean - path[-1]
+        correction = jnp.einsum("kij,nj->nki", self._gain, miss)
+        return params.mean + jnp.moveaxis(path[:-1], 0, 1) + correction
+
+
+def gaussian_bridge(
+    model: Diffusion,
+    start: ArrayLike,
+    end: ArrayLike,
+    duration: ArrayLike,
+    times: ArrayLike,
+) -> GaussianBridge:
+    """The exact law of the (start, end, duration)-bridge of an Ornstein–Uhlenbeck model at
+    `times`, increasing, shape (K,), in [0, duration]; B need not be reversible.
+
+    **Raises:** `TypeError` for any other model, `ValueError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        exact = jb.gaussian_bridge(model, [0.0, 0.0], [1.0, 0.0], 1.0, times=[0.25, 0.5])
+        exact.mean[1], exact.covariance[1], exact.sample(jax.random.key(0), 1000)
+        ```
+    """
+    params = _ou_params(model)
+    intervals, batched, several = as_intervals(start, end, duration)
+    if batched or several:
+        raise ValueError("`gaussian_bridge` is for one interval; use `jax.vmap` for several.")
+    a, b, total = (leaf[0].astype(params.B.dtype) for leaf in intervals)
+    times = jnp.asarray(times, params.B.dtype)
+    if times.ndim != 1:
+        raise ValueError(f"`times` must have shape (K,); got {times.shape}.")
+    if not is_traced(times, total) and not (
+        np.all(np.diff(times, prepend=0, append=total) >= 0) and times.size
+    ):
+        raise ValueError(f"`times` must increase within [0, {total}]; got {times}.")
+    decay_T, covariance_T = _decay_and_covariance(params, total)
+    miss = b - params.mean - decay_T @ (a - params.mean)
+
+    def moments(t):
+        decay, covariance = _decay_and_covariance(params, t)
+        remaining, _ = _decay_and_covariance(params, total - t)
+        gain = jnp.linalg.solve(covariance_T, remaining @ covariance).T
+        mean = params.mean + decay @ (a - params.mean) + gain @ miss
+        return mean, covariance - gain @ remaining @ covariance, gain
+
+    mean, covariance, gain = jax.vmap(moments)(times)
+    return GaussianBridge(times, mean, covariance, model, a, b, total, gain)
+
+
+def _drift(x, p: _Prepared):
+    return -matvec(p.B, x - p.mean)
+
+
+def _reverse_drift(x, p: _Prepared):
+    return -matvec(p.reverse_B, x - p.mean)
+
+
+def _sigma(x, p: _Prepared):
+    return p.sigma
+
+
+def _log_stationary(x, p: _Prepared):
+    deviation = x - p.mean
+    return -dot(deviation, matvec(p.precision, deviation)) / 2 - p.log_normaliser
+
+
+def _sample_stationary(key, p: _Prepared):
+    return GaussianLaw(p.mean, p.covariance).sample(key)
+
+
+def _prepare(params: OrnsteinUhlenbeckParams) -> _Prepared:
+    B, mean, sigma = params
+    covariance = _lyapunov(B, _noise_covariance(params))
+    precision = jnp.linalg.inv(covariance)
+    precision = (precision + precision.T) / 2
+    log_normaliser = jnp.linalg.slogdet(2 * jnp.pi * covariance)[1] / 2
+    reverse_B = covariance @ B.T @ precision
+    return _Prepared(B, mean, sigma, covariance, precision, log_normaliser, reverse_B)
+
+
+def _noise_covariance(params: OrnsteinUhlenbeckParams) -> Float[Array, "d d"]:
+    """V = σσᵀ."""
+    if params.sigma is None:
+        return jnp.eye(params.B.shape[0], dtype=params.B.dtype)
+    matrix = jnp.diag(params.sigma) if params.sigma.ndim == 1 else params.sigma
+    return matrix @ matrix.T
+
+
+def _lyapunov(B: Float[Array, "d d"], V: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """Γ with BΓ + ΓBᵀ = V, equation (Gamma), as one linear system of size d²."""
+    identity = jnp.eye(B.shape[0], dtype=B.dtype)
+    operator = jnp.kron(B, identity) + jnp.kron(identity, B)
+    solution = jnp.linalg.solve(operator, V.reshape(-1)).reshape(V.shape)
+    return (solution + solution.T) / 2
+
+
+def _decay_and_covariance(
+    params: OrnsteinUhlenbeckParams, t: Float[Array, ""]
+) -> tuple[Float[Array, "d d"], Float[Array, "d d"]]:
+    """e^{-tB} and Γ_t."""
+    B, V = params.B, _noise_covariance(params)
+    decay = jax.scipy.linalg.expm(-t * B)
+    stationary = _lyapunov(B, V)
+    # For small t the difference Γ - e^{-tB} Γ e^{-tBᵀ} loses its digits, for large t Van
+    # Loan's block exponential (1978) overflows: each is used where it is accurate.
+    rate = jnp.max(jnp.sum(jnp.abs(B), axis=1))
+    brief = t * rate < 1
+    s = jnp.where(brief, t, 0)
+    block = jax.scipy.linalg.expm(jnp.block([[-B, V], [jnp.zeros_like(B), B.T]]) * s)
+    d = B.shape[0]
+    van_loan = block[:d, d:] @ decay.T
+    covariance = jnp.where(brief, van_loan, stationary - decay @ stationary @ decay.T)
+    return decay, (covariance + covariance.T) / 2
+
+
+def _ou_params(model: Diffusion) -> OrnsteinUhlenbeckParams:
+    params = getattr(model, "params", None)
+    if not isinstance(params, OrnsteinUhlenbeckParams):
+        raise TypeError(
+            "the closed form is for models made by `ornstein_uhlenbeck`; got a model with "
+            f"params {params!r}."
+        )
+    return params
+
+
+def _floating(value: ArrayLike) -> Array:
+    value = jnp.asarray(value)
+    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)

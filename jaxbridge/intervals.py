@@ -1,0 +1,128 @@
+"""The bridges asked for: end points and durations, checked and brought to one shape.
+
+What is wrong and visible before tracing is refused here, with a sentence that says what to
+change. Values that are being traced cannot be looked at and pass.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from .diffusion import Diffusion, check_invertible
+from .schemes import AbstractScheme, Milstein
+
+
+class Intervals(NamedTuple):
+    """I bridges of one model: from `start` to `end`, both (I, d), in `duration`, (I,)."""
+
+    start: Float[Array, "I d"]
+    end: Float[Array, "I d"]
+    duration: Float[Array, " I"]
+
+
+def is_traced(*trees) -> bool:
+    """Whether any value in the trees is abstract, so that it cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def as_intervals(
+    start: ArrayLike, end: ArrayLike, duration: ArrayLike
+) -> tuple[Intervals, bool, bool]:
+    """The intervals, and whether the end points and the duration came with an axis I."""
+    points = {"start": jnp.asarray(start), "end": jnp.asarray(end)}
+    duration = jnp.asarray(duration)
+    for name, value in {**points, "duration": duration}.items():
+        if not (
+            jnp.issubdtype(value.dtype, jnp.floating) or jnp.issubdtype(value.dtype, jnp.integer)
+        ):
+            raise TypeError(f"`{name}` must be real numbers; got dtype {value.dtype}.")
+    for name, point in points.items():
+        if point.ndim not in (1, 2) or point.shape[-1] == 0:
+            raise ValueError(
+                f"`{name}` must be one point, shape (d,), or one for each interval, shape "
+                f"(I, d); got {point.shape}."
+            )
+    if duration.ndim > 1:
+        raise ValueError(f"`duration` must have shape () or (I,); got {duration.shape}.")
+    if points["start"].shape[-1] != points["end"].shape[-1]:
+        raise ValueError(
+            "`start` and `end` must be points of one dimension; got shapes "
+            f"{points['start'].shape} and {points['end'].shape}."
+        )
+    dtype = _working_dtype(*points.values(), duration)
+    lengths = {point.shape[0] for point in points.values() if point.ndim == 2}
+    lengths |= {duration.shape[0]} if duration.ndim == 1 else set()
+    if len(lengths - {1}) > 1:
+        raise ValueError(
+            "`start`, `end` and `duration` must agree in the number of intervals; got shapes "
+            f"{points['start'].shape}, {points['end'].shape} and {duration.shape}."
+        )
+    for name, value in {**points, "duration": duration}.items():
+        if not is_traced(value) and not np.all(np.isfinite(value)):
+            raise ValueError(f"`{name}` must be finite; got {value}.")
+    if not is_traced(duration) and not np.all(np.asarray(duration) > 0):
+        raise ValueError(f"`duration` must be positive; got {duration}.")
+    num_intervals = max(lengths, default=1)
+    d = points["start"].shape[-1]
+    intervals = Intervals(
+        *(jnp.broadcast_to(p, (num_intervals, d)).astype(dtype) for p in points.values()),
+        jnp.broadcast_to(duration, (num_intervals,)).astype(dtype),
+    )
+    return intervals, bool(lengths), duration.ndim == 1
+
+
+def check_count(name: str, value, minimum: int = 1) -> int:
+    """A static whole number of at least `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"`{name}` must be a Python integer, known when compiling; got {value!r}.")
+    if value < minimum:
+        raise ValueError(f"`{name}` must be at least {minimum}; got {value}.")
+    return int(value)
+
+
+def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) -> None:
+    """Raise `ValueError` where the model does not fit the end points, or the scheme the model."""
+    if not isinstance(model, Diffusion):
+        raise TypeError(f"`model` must be a `jaxbridge.Diffusion`; got {type(model).__name__}.")
+    point = jax.ShapeDtypeStruct(intervals.start.shape[1:], intervals.start.dtype)
+    jax.eval_shape(model.drift, point)
+    jax.eval_shape(model.diffusion, point)
+    if is_traced(model, intervals.start, intervals.end):
+        return
+    for name, points in [("start", intervals.start), ("end", intervals.end)]:
+        drift, sigma, slopes = _coefficients(model, points)
+        for value in (drift, sigma):
+            bad = ~np.all(np.isfinite(np.asarray(value)).reshape(len(points), -1), axis=1)
+            if bad.any():
+                raise ValueError(
+                    f"the coefficients of the model are not finite at `{name}` = "
+                    f"{points[bad.argmax()]}: is that point inside the state space?"
+                )
+        if slopes is not None:
+            for matrix in np.asarray(sigma)[np.linalg.cond(sigma).argmax(keepdims=True)]:
+                check_invertible(f"diffusion(x) at `{name}`", matrix)
+            off_diagonal = slopes * (1 - np.eye(points.shape[1])[:, None, :])
+            if isinstance(scheme, Milstein) and np.any(off_diagonal != 0):
+                raise ValueError(
+                    "`Milstein` needs diagonal noise in which σ_i depends on x_i alone; here it "
+                    "depends on other coordinates too. Choose `Heun` or `Euler`."
+                )
+
+
+@eqx.filter_jit
+def _coefficients(model: Diffusion, points: Float[Array, "n d"]):
+    varies = model.forward(points[0]).sigma_varies
+    slopes = jax.vmap(jax.jacfwd(model.diffusion))(points) if varies else None
+    return jax.vmap(model.drift)(points), jax.vmap(model.diffusion)(points), slopes
+
+
+def _working_dtype(*arrays: Array) -> jnp.dtype:
+    """The widest floating point type that was given; JAX's default if none was."""
+    floating = [
+        a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating) and not a.weak_type
+    ]
+    return max(floating, key=lambda dtype: dtype.itemsize, default=jnp.asarray(0.0).dtype)

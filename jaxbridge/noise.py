@@ -1,0 +1,86 @@
+"""Scans over time that draw their noise as they go, a stretch of steps at once.
+
+Every lane (one simulated path) has its own key, and its numbers depend on that key and the
+step only. So a result does not depend on how lanes are gathered into batches, and an accepted
+path can be replayed from its key alone.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Int, Key, PyTree, Shaped
+
+# Drawing for many steps at once spreads the cost of deriving keys; drawing for all of them
+# would double the memory of a long path.
+_LONGEST_STRETCH = 64
+
+
+class Store(NamedTuple):
+    """Where the output of each step goes: row `slots[i]` of `rows`, whose last is for waste."""
+
+    slots: Int[Array, " N"]
+    rows: Shaped[Array, "rows ..."]
+
+
+def noisy_scan(
+    step: Callable[[Any, tuple[Any, Any]], tuple[Any, Any]],
+    init: PyTree,
+    keys: Key[Array, " lanes"],
+    draw: Callable[[Key[Array, ""], int], PyTree],
+    xs: PyTree,
+    num_steps: int,
+    *,
+    reverse: bool = False,
+    store: Store | None = None,
+) -> tuple[PyTree, PyTree]:
+    """`lax.scan` of `step(carry, (noise, x)) -> (carry, y)` over `num_steps` steps.
+
+    `draw(key, k)` gives one lane's noise for k steps, with leading axis k; `step` sees one
+    step of it, lanes in the last axis. `xs` has leading axis `num_steps`; with `reverse` it is
+    read, and the `y` written, from the last to the first. With a `store` only the rows it asks
+    for are kept, and returned in place of all `y`.
+    """
+    num_stretches = -(-num_steps // _LONGEST_STRETCH)
+    length = -(-num_steps // num_stretches)
+    num_idle = num_stretches * length - num_steps  # steps that fill up the last stretch
+    slots, rows = (None, None) if store is None else store
+
+    def one_step(carry, inputs):
+        carry, rows = carry
+        noise, active, slot, x = inputs
+        stepped, y = step(carry, (noise, x))
+        if active is not None:
+            stepped = jax.tree.map(lambda new, old: jnp.where(active, new, old), stepped, carry)
+        if rows is None:
+            return (stepped, None), y
+        return (stepped, lax.dynamic_update_index_in_dim(rows, y, slot, 0)), None
+
+    def one_stretch(carry, inputs):
+        index, *inputs = inputs
+        stretch_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, index)
+        noise = jax.vmap(lambda key: draw(key, length), out_axes=-1)(stretch_keys)
+        return lax.scan(one_step, carry, (noise, *inputs), reverse=reverse)
+
+    if num_stretches == 1:
+        (carry, rows), ys = one_stretch((init, rows), (0, None, slots, xs))
+        return carry, ys if store is None else rows
+
+    def split(leaf, fill=0):
+        idle = (num_idle, 0) if reverse else (0, num_idle)
+        widths = [idle] + [(0, 0)] * (leaf.ndim - 1)
+        padded = jnp.pad(leaf, widths, constant_values=fill)
+        return padded.reshape(num_stretches, length, *leaf.shape[1:])
+
+    def join(leaf):
+        leaf = leaf.reshape(num_stretches * length, *leaf.shape[2:])
+        return leaf[num_idle:] if reverse else leaf[:num_steps]
+
+    if slots is not None:
+        slots = split(slots, fill=rows.shape[0] - 1)
+    active = split(jnp.ones(num_steps, dtype=bool)) if num_idle else None
+    inputs = (jnp.arange(num_stretches), active, slots, jax.tree.map(split, xs))
+    (carry, rows), ys = lax.scan(one_stretch, (init, rows), inputs, reverse=reverse)
+    return carry, jax.tree.map(join, ys) if store is None else rows

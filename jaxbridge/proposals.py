@@ -1,0 +1,153 @@
+"""Proposed bridges: a pair of coupled paths, joined where they meet (section 2.2).
+
+For each lane: simulate the time-reversed diffusion from the end point, which read forwards is
+X with X_T = b; recover the noise that drives it forwards, equation (Wrev); drive X' from the
+start point with the coupled noise, equations (simY') and (simW'); and join,
+
+    Z_i = X'_i for i < ρ,   Z_i = X_i for i ≥ ρ,
+
+equation (bridgesim), where ρ - 1 is the first step in which the two meet.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from .coupling import AbstractCoupling, rotate, rotation_between
+from .diffusion import Diffusion
+from .linalg import all_finite
+from .meeting import PairStep, frame
+from .noise import Store, noisy_scan
+
+
+class Proposals(NamedTuple):
+    """Joined paths, lanes in the last axis.
+
+    `paths` are kept at the K stored steps. `meeting_step` is ρ, between 1 and N, or N + 1
+    where the pair did not meet; `finite` is false where one of the two paths left the finite
+    numbers before the pair met.
+    """
+
+    paths: Float[Array, "K d lanes"]
+    meeting_step: Int[Array, " lanes"]
+    finite: Bool[Array, " lanes"]
+
+
+def propose(
+    model: Diffusion,
+    coupling: AbstractCoupling,
+    keys: Key[Array, " lanes"],
+    start: Float[Array, "d lanes"],
+    end: Float[Array, "d lanes"],
+    dt: Float[Array, " lanes"],
+    num_steps: int,
+    stored: Int[Array, " K"] | None = None,
+    meeting_step: Int[Array, " lanes"] | None = None,
+) -> Proposals:
+    """One proposal in each lane, whose random numbers depend on the lane's key alone.
+
+    `stored` are the steps among 0, ..., N at which the joined path is kept, by default all.
+    With `meeting_step` the pair is joined there, not where the coupling's rule says: a replay.
+    """
+    forward, backward = model.forward(start[:, 0]), model.backward(start[:, 0])
+    scheme, rule = coupling.scheme, coupling.meeting
+    (d, _), dtype = start.shape, start.dtype
+    draws_uniform = rule.draws_uniform and meeting_step is None
+    split_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
+    reverse_keys, driven_keys, coupling_keys = split_keys
+    coupling, coupling_axes = _realise(coupling, coupling_keys, dtype)
+    root_dt = jnp.sqrt(dt)
+
+    # The reversed path: X_N = b, ..., X_0, kept in forward order as X_1, ..., X_N.
+    @_over_lanes(-1, -1, -1, -1)
+    def step_back(x, dw, dt, root_dt):
+        return scheme.step(backward, x, dt, root_dt * dw)
+
+    x_start, x_path = noisy_scan(
+        lambda x, inputs: (step_back(x, inputs[0], dt, root_dt), x),
+        end,
+        reverse_keys,
+        lambda key, k: jax.random.normal(key, (k, d), dtype),
+        None,
+        num_steps,
+        reverse=True,
+    )
+
+    # The joined path Z: X' until the pair meets, X from then on.
+    @_over_lanes(-1, -1, -1, -1, -1, -1, None, coupling_axes)
+    def step_joined(x, z, rho, x_next, noise, lane, i, coupling):
+        dt, root_dt, fixed_rho = lane
+        normal, uniform = noise
+        sigma, driven_sigma = forward.sigma(x), forward.sigma(z)
+        seen = frame(driven_sigma, x, z)
+        du = None if normal is None else root_dt * normal
+        dw = scheme.noise(forward, x, x_next, dt)
+        dw = rotate(rotation_between(coupling, sigma, driven_sigma), dw)
+        driven_next = scheme.step(forward, z, dt, coupling.driven_noise(seen, dw, du))
+        if fixed_rho is None:
+            variance = coupling.gap_variance(seen)
+            pair = PairStep(seen, x, x_next, z, driven_next, dt, variance)
+            met = rule.met(pair, forward, uniform) & all_finite(driven_next)
+            # The first meeting: a minimum over the steps, masked by whether they saw one.
+            rho = jnp.where(met, jnp.minimum(rho, i + 1), rho)
+        return jnp.where(i + 1 >= rho, x_next, driven_next), rho
+
+    def step(carry, inputs):
+        x, z, rho = carry
+        noise, (i, x_next) = inputs
+        lane = (dt, root_dt, meeting_step)
+        z, rho = step_joined(x, z, rho, x_next, noise, lane, i, coupling)
+        return (x_next, z, rho), z
+
+    def draw(key, k):
+        normal_key, uniform_key = jax.random.split(key)
+        normal = uniform = None
+        if coupling.independent_noise:
+            normal = jax.random.normal(normal_key, (k,), dtype)
+        if draws_uniform:
+            uniform = jax.random.uniform(uniform_key, (k,), dtype)
+        return normal, uniform
+
+    never = jnp.full(dt.shape, num_steps + 1, jnp.int32)
+    rho = never if meeting_step is None else meeting_step
+    (_, z_end, rho), z_path = noisy_scan(
+        step,
+        (x_start, start, rho),
+        driven_keys,
+        draw,
+        (jnp.arange(num_steps, dtype=jnp.int32), x_path),
+        num_steps,
+        store=None if stored is None else _store(stored, start, num_steps),
+    )
+    if stored is None:
+        z_path = jnp.concatenate([start[None], z_path])
+    else:
+        z_path = z_path[:-1]
+    # Non-finite numbers stay non-finite from step to step, so the last states tell.
+    finite = jnp.all(jnp.isfinite(x_start) & jnp.isfinite(z_end), axis=0) | (rho <= num_steps)
+    return Proposals(z_path, rho, finite)
+
+
+def _realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
+    """Each lane's coupling, and the axes of lanes in its leaves."""
+    coupling = jax.tree.map(
+        lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, coupling
+    )
+    realised = coupling.realise(keys)
+    axes = jax.tree.map(lambda old, new: None if old is new else -1, coupling, realised)
+    return realised, axes
+
+
+def _over_lanes(*in_axes) -> Callable[[Callable], Callable[..., Any]]:
+    return lambda function: jax.vmap(function, in_axes=in_axes, out_axes=-1)
+
+
+def _store(stored: Int[Array, " K"], start: Float[Array, "d lanes"], num_steps: int) -> Store:
+    """Rows for the stored steps; all begin as the start, which is what step 0 keeps."""
+    rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *start.shape))
+    slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(stored.shape[0]))
+    return Store(slots[1:], rows)

@@ -1,0 +1,132 @@
+"""Discretisation schemes, each with its step and its inverse.
+
+A bridge is built from a path that was simulated backwards, so each scheme must also answer:
+which noise drives the forward equation along a given path? (equation (Wrev) of the paper for
+Euler). Steps have length δ, in units of time; noise increments are N(0, δ I).
+
+The inverse must use the forward drift. To take the negative of the noise that generated the
+reversed path would be wrong by O(δ) per step, which adds up to the drift itself.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .diffusion import Dynamics, ito_correction
+from .sigma import Diagonal
+
+
+class AbstractScheme(eqx.Module):
+    """A one-step scheme. All methods act on one point of shape (d,); `dt` is a scalar."""
+
+    @abstractmethod
+    def step(
+        self,
+        dynamics: Dynamics,
+        x: Float[Array, " d"],
+        dt: Float[Array, ""],
+        dw: Float[Array, " d"],
+    ) -> Float[Array, " d"]:
+        """The point reached from `x` after `dt` with noise increment `dw`."""
+
+    @abstractmethod
+    def noise(
+        self,
+        dynamics: Dynamics,
+        x: Float[Array, " d"],
+        x_next: Float[Array, " d"],
+        dt: Float[Array, ""],
+    ) -> Float[Array, " d"]:
+        """The noise increment that takes `x` to `x_next` in `dt`: the inverse of `step`."""
+
+
+class Euler(AbstractScheme):
+    """Euler–Maruyama, `x + α(x)δ + σ(x)ΔW`, as in the paper. Its inverse is exact.
+
+    Strong order ½ (1 for constant σ), weak order 1.
+    """
+
+    def step(self, dynamics, x, dt, dw):
+        return x + dynamics.drift(x) * dt + dynamics.sigma(x).mv(dw)
+
+    def noise(self, dynamics, x, x_next, dt):
+        return dynamics.sigma(x).solve(x_next - x - dynamics.drift(x) * dt)
+
+
+class Milstein(AbstractScheme):
+    """Milstein's scheme for diagonal noise, where σ_i depends on x_i alone (which covers d = 1):
+
+        x_i + α_i δ + σ_i ΔW_i + ½ σ_i ∂_iσ_i (ΔW_i² - δ).
+
+    Strong order 1. The inverse solves the quadratic for the root that tends to the Euler
+    noise as ∂σ → 0; it is exact as long as `1 + ∂_iσ_i ΔW_i > 0`, which fails with a
+    probability that vanishes faster than any power of δ. For constant σ this is Euler.
+
+    **Raises:** `ValueError` for a σ that is a full, state-dependent matrix.
+    """
+
+    def step(self, dynamics, x, dt, dw):
+        sigma = dynamics.sigma(x)
+        step = x + dynamics.drift(x) * dt + sigma.mv(dw)
+        if not dynamics.sigma_varies:
+            return step
+        return step + sigma.mv(self._slope(dynamics, x)) * (dw**2 - dt) / 2
+
+    def noise(self, dynamics, x, x_next, dt):
+        euler = dynamics.sigma(x).solve(x_next - x - dynamics.drift(x) * dt)
+        if not dynamics.sigma_varies:
+            return euler
+        slope = self._slope(dynamics, x)
+        increment = euler + slope * dt / 2  # = ΔW + ½ ∂σ ΔW²
+        # Past the fold, where no increment explains the step, take the fold itself.
+        discriminant = jnp.maximum(1 + 2 * slope * increment, jnp.finfo(x.dtype).eps)
+        return 2 * increment / (1 + jnp.sqrt(discriminant))
+
+    @staticmethod
+    def _slope(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
+        """∂_iσ_i(x)."""
+
+        def diagonal(y):
+            sigma = dynamics.sigma(y)
+            if isinstance(sigma, Diagonal):
+                return sigma.diagonal
+            if y.shape[0] == 1:
+                return sigma.as_matrix(1, y.dtype)[0]
+            raise ValueError(
+                "`Milstein` is for scalar or diagonal noise: let `diffusion` return the "
+                "diagonal of σ, shape (d,), or choose `Heun` or `Euler`."
+            )
+
+        return jax.jvp(diagonal, (x,), (jnp.ones_like(x),))[1]
+
+
+class Heun(AbstractScheme):
+    """Heun's predictor–corrector for the Stratonovich form of the equation,
+
+        x + ½ [α_S(x) + α_S(x̃)] δ + ½ [σ(x) + σ(x̃)] ΔW,    α_S = α - ½ Σ_jk ∂_kσ_·j σ_kj,
+
+    with x̃ the Euler point of the same form. Weak order 2 for constant σ, 1 otherwise.
+
+    The inverse is that of the trapezoid rule along the path,
+    `½ [σ(x) + σ(x⁺)] ξ = x⁺ - x - ½ [α_S(x) + α_S(x⁺)] δ`; after a predictor–corrector step it
+    returns the noise up to O(δ^{3/2}), for constant σ up to O(δ^{5/2}).
+    """
+
+    def step(self, dynamics, x, dt, dw):
+        drift, sigma = self._stratonovich_drift(dynamics, x), dynamics.sigma(x)
+        predicted = x + drift * dt + sigma.mv(dw)
+        drift = (drift + self._stratonovich_drift(dynamics, predicted)) / 2
+        return x + drift * dt + sigma.average(dynamics.sigma(predicted)).mv(dw)
+
+    def noise(self, dynamics, x, x_next, dt):
+        drift = self._stratonovich_drift(dynamics, x) + self._stratonovich_drift(dynamics, x_next)
+        sigma = dynamics.sigma(x).average(dynamics.sigma(x_next))
+        return sigma.solve(x_next - x - drift * dt / 2)
+
+    @staticmethod
+    def _stratonovich_drift(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
+        drift = dynamics.drift(x)
+        return drift - ito_correction(dynamics, x) if dynamics.sigma_varies else drift

@@ -1,0 +1,126 @@
+"""The diffusion coefficient σ(x) at one point, as the operator its form calls for.
+
+Four forms: the identity, a constant matrix (inverted once per call, not once per step), a
+diagonal and a full matrix. Whoever holds a `Sigma` multiplies and solves without knowing
+which; what a form does not need is never computed.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .linalg import inverse, matvec, solve
+
+
+class AbstractSigma(eqx.Module):
+    """σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,)."""
+
+    @abstractmethod
+    def mv(self, noise: Float[Array, " d"]) -> Float[Array, " d"]:
+        """`σ w`."""
+
+    @abstractmethod
+    def mv_transpose(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
+        """`σᵀ v`."""
+
+    @abstractmethod
+    def solve(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
+        """`σ⁻¹ v`."""
+
+    @abstractmethod
+    def average(self, other: "AbstractSigma") -> "AbstractSigma":
+        """`½ (σ + other)`, for two coefficients of one model."""
+
+    @abstractmethod
+    def as_matrix(self, dim: int, dtype) -> Float[Array, "d d"]:
+        """`σ` as a dense matrix."""
+
+
+class Identity(AbstractSigma):
+    """σ = I."""
+
+    def mv(self, noise):
+        return noise
+
+    def mv_transpose(self, vector):
+        return vector
+
+    def solve(self, vector):
+        return vector
+
+    def average(self, other):
+        return self
+
+    def as_matrix(self, dim, dtype):
+        return jnp.eye(dim, dtype=dtype)
+
+
+class Constant(AbstractSigma):
+    """The same matrix everywhere, kept with its inverse."""
+
+    matrix: Float[Array, "d d"]
+    inverse: Float[Array, "d d"]
+
+    def __init__(self, matrix: Float[Array, "d d"]):
+        self.matrix = matrix
+        # Outside every loop, so LAPACK may serve where unrolling would only cost compile time.
+        self.inverse = inverse(matrix) if matrix.shape[0] <= 16 else jnp.linalg.inv(matrix)
+
+    def mv(self, noise):
+        return matvec(self.matrix, noise)
+
+    def mv_transpose(self, vector):
+        return matvec(self.matrix.T, vector)
+
+    def solve(self, vector):
+        return matvec(self.inverse, vector)
+
+    def average(self, other):
+        return self
+
+    def as_matrix(self, dim, dtype):
+        return self.matrix
+
+
+class Diagonal(AbstractSigma):
+    """A diagonal matrix, given by its diagonal."""
+
+    diagonal: Float[Array, " d"]
+
+    def mv(self, noise):
+        return self.diagonal * noise
+
+    def mv_transpose(self, vector):
+        return self.diagonal * vector
+
+    def solve(self, vector):
+        return vector / self.diagonal
+
+    def average(self, other):
+        return Diagonal((self.diagonal + other.diagonal) / 2)
+
+    def as_matrix(self, dim, dtype):
+        return jnp.diag(self.diagonal)
+
+
+class Full(AbstractSigma):
+    """A full matrix that changes with the state."""
+
+    matrix: Float[Array, "d d"]
+
+    def mv(self, noise):
+        return matvec(self.matrix, noise)
+
+    def mv_transpose(self, vector):
+        return matvec(self.matrix.T, vector)
+
+    def solve(self, vector):
+        return solve(self.matrix, vector)
+
+    def average(self, other):
+        return Full((self.matrix + other.matrix) / 2)
+
+    def as_matrix(self, dim, dtype):
+        return self.matrix
