@@ -9,18 +9,6 @@ from .coupling import (
     published_rotation as published_rotation,
 )
 from .diffusion import Diffusion as Diffusion
-from .meeting import (
-    AbstractMeeting as AbstractMeeting,
-    BrownianCrossing as BrownianCrossing,
-    ReflectionPlane as ReflectionPlane,
-    SignTest as SignTest,
-)
-from .schemes import (
-    AbstractScheme as AbstractScheme,
-    Euler as Euler,
-    Heun as Heun,
-    Milstein as Milstein,
-)
 from .gaussian import (
     GaussianBridge as GaussianBridge,
     GaussianLaw as GaussianLaw,
@@ -30,9 +18,21 @@ from .gaussian import (
     ou_stationary as ou_stationary,
     ou_transition as ou_transition,
 )
+from .meeting import (
+    AbstractMeeting as AbstractMeeting,
+    BrownianCrossing as BrownianCrossing,
+    ReflectionPlane as ReflectionPlane,
+    SignTest as SignTest,
+)
 from .models import (
     hyperbolic as hyperbolic,
     langevin as langevin,
     stationary_diffusion as stationary_diffusion,
+)
+from .schemes import (
+    AbstractScheme as AbstractScheme,
+    Euler as Euler,
+    Heun as Heun,
+    Milstein as Milstein,
 )
 from .simulate import simulate as simulate

@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
+from .annotations import Numbers
 from .coupling import AbstractCoupling, Coupling
 from .diffusion import Diffusion
 from .intervals import Intervals, as_intervals, check_count, check_model, is_traced
@@ -47,17 +48,17 @@ class Bridges(NamedTuple):
 def sample_bridges(
     key: Key[Array, ""],
     model: Diffusion,
-    start: ArrayLike,
-    end: ArrayLike,
-    duration: ArrayLike,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
     *,
     num_bridges: int = 1,
     num_steps: int = 50,
     coupling: AbstractCoupling | None = None,
-    max_proposals: ArrayLike | None = None,
-    save_at: ArrayLike | None = None,
+    max_proposals: Numbers | None = None,
+    save_at: Numbers | None = None,
     batch_size: int | None = None,
-    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter(),
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
 ) -> Bridges:
     """Independent approximate (start, end, duration)-bridges: section 2.2 of the paper.
@@ -100,7 +101,9 @@ def sample_bridges(
 
         ```python
         model = jb.ornstein_uhlenbeck(jnp.array([[1.5, 1.0], [1.0, 1.5]]))
-        bridges = jb.sample_bridges(jax.random.key(0), model, [0., 0.], [1., 0.], 1.0, num_bridges=1000)
+        bridges = jb.sample_bridges(
+            jax.random.key(0), model, [0.0, 0.0], [1.0, 0.0], 1.0, num_bridges=1000
+        )
         ```
     """
     coupling = Coupling() if coupling is None else coupling
@@ -120,6 +123,7 @@ def sample_bridges(
     if batch_size is None:
         batch_size = _default_batch_size(intervals, num_bridges, num_steps)
     batch_size = check_count("batch_size", batch_size)
+    progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     bridges = _sample_bridges(
         key,
         model,
@@ -236,7 +240,8 @@ def _search(
         tried = number < max_proposals
         success = tried & (made.meeting_step <= num_steps)
         # The lanes of one interval lie side by side, in the order of their numbers.
-        successes_before = jnp.cumsum(success) - success
+        successes = jnp.cumsum(success, dtype=jnp.int32)
+        successes_before = successes - success.astype(jnp.int32)
         rank = search.found[interval] + successes_before - successes_before[first[interval]]
         needed = tried & (rank < num_bridges)
         row = jnp.where(success & needed, interval * num_bridges + rank, num_rows)
@@ -250,7 +255,7 @@ def _search(
             )
 
         found = search.found + count(success & needed)
-        progress = jnp.sum(found) / num_rows
+        progress = jnp.sum(found).astype(jnp.float32) / num_rows
         return _Search(
             keep(search.paths, jnp.moveaxis(made.paths, -1, 0)),
             keep(search.rho, made.meeting_step),
@@ -280,8 +285,9 @@ def _assign_lanes(
 ) -> tuple[Int[Array, " I"], Int[Array, " lanes"], Int[Array, " lanes"]]:
     """The first lane of each interval; each lane's interval, and its place among that
     interval's lanes. Lanes go in proportion to the proposals still expected to be needed."""
-    rate = (search.found + 1) / (search.tried + 2)
-    need = jnp.where(pending, (num_bridges - search.found) / rate, 0)
+    found, tried = search.found.astype(jnp.float32), search.tried.astype(jnp.float32)
+    rate = (found + 1) / (tried + 2)
+    need = jnp.where(pending, (num_bridges - found) / rate, 0)
     share = jnp.cumsum(need) / jnp.sum(need)
     last = jnp.round(share * num_lanes).astype(jnp.int32)
     first = jnp.concatenate([jnp.zeros(1, jnp.int32), last[:-1]])
@@ -344,7 +350,7 @@ def check_key(key) -> None:
 
 
 def _stored_steps(
-    save_at: ArrayLike | None, duration: ArrayLike, num_steps: int
+    save_at: Numbers | None, duration: Numbers, num_steps: int
 ) -> Int[Array, " K"] | None:
     if save_at is None:
         return None

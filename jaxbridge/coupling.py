@@ -134,7 +134,7 @@ class Coupling(AbstractCoupling):
 
         ```python
         coupling = jb.Coupling(0.5)
-        bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000, num_steps=50, coupling=coupling)
+        bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000, coupling=coupling)
         ```
     """
 

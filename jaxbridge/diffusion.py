@@ -10,6 +10,7 @@ in which the normaliser of ν cancels. It is reversible if and only if α* = α,
 (timereversible).
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -18,8 +19,9 @@ import jax
 import jax.extend
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Inexact, Key, PyTree
+from jaxtyping import Array, Float, Inexact, Key, PyTree
 
+from .annotations import Numbers
 from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
 
 
@@ -68,7 +70,7 @@ class Diffusion(eqx.Module):
     !!! example
 
         ```python
-        model = jb.Diffusion(lambda x, p: -p * x, log_stationary=lambda x, p: -p * x @ x, params=1.0)
+        model = jb.Diffusion(lambda x, p: -p * x, None, lambda x, p: -p * x @ x, params=1.0)
         model.reverse_drift(jnp.ones(2))  # Array([-1., -1.], dtype=float32)
         ```
     """
@@ -86,7 +88,7 @@ class Diffusion(eqx.Module):
     def __init__(
         self,
         drift: Callable,
-        diffusion: Callable | ArrayLike | None = None,
+        diffusion: Callable | Numbers | None = None,
         log_stationary: Callable | None = None,
         params: PyTree = None,
         *,
@@ -240,7 +242,7 @@ def ito_correction(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " 
 
     correction = jnp.zeros_like(x)
     for j in range(x.shape[0]):
-        correction += jax.jvp(lambda y: column(y, j), (x,), (column(x, j),))[1]
+        correction += jax.jvp(functools.partial(column, j=j), (x,), (column(x, j),))[1]
     return correction / 2
 
 
@@ -254,9 +256,9 @@ def weighted_divergence(
     M(x) v; div M is left out where M does not vary."""
     flux = product(x, jax.grad(log_nu)(x))
     if varies:
-        for direction in np.eye(x.shape[0], dtype=x.dtype):
-            direction = jnp.asarray(direction)
-            flux += jax.jvp(lambda y: product(y, direction), (x,), (direction,))[1]
+        for direction in jnp.eye(x.shape[0], dtype=x.dtype):
+            _, tangent = jax.jvp(product, (x, direction), (direction, jnp.zeros_like(x)))
+            flux += tangent
     return flux
 
 
@@ -310,7 +312,7 @@ def _check_value(name: str, value: Array, shape: tuple, x: Float[Array, " d"]) -
     return value.astype(x.dtype)
 
 
-def _check_constant_sigma(sigma: ArrayLike) -> Array:
+def _check_constant_sigma(sigma: Numbers) -> Array:
     sigma = jnp.asarray(sigma)
     if not jnp.issubdtype(sigma.dtype, jnp.inexact):
         sigma = sigma.astype(float)
@@ -324,7 +326,7 @@ def _check_constant_sigma(sigma: ArrayLike) -> Array:
     return sigma
 
 
-def check_invertible(name: str, sigma: Array) -> None:
+def check_invertible(name: str, sigma: Array | np.ndarray) -> None:
     """Raise `ValueError` for a visibly singular or non-finite σ; silent while tracing."""
     if isinstance(sigma, jax.core.Tracer):
         return

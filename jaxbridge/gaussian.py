@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Key
+from jaxtyping import Array, Float, Key
 
+from .annotations import Numbers
 from .diffusion import Diffusion, check_invertible
 from .intervals import as_intervals, is_traced
 from .linalg import dot, matvec
@@ -64,13 +65,13 @@ class _Prepared(NamedTuple):
 
 
 def ornstein_uhlenbeck(
-    B: ArrayLike, mean: ArrayLike | None = None, sigma: ArrayLike | None = None
+    B: Numbers, mean: Numbers | None = None, sigma: Numbers | None = None
 ) -> Diffusion:
     """The Ornstein–Uhlenbeck process `dX = -B (X - mean) dt + σ dW`: equation (OU).
 
-    The log stationary density is normalised. The time reversal is the Ornstein–Uhlenbeck process with matrix Γ Bᵀ Γ⁻¹; it is reversible
-    if and only if BΓ is symmetric, which is not asked for. `params` is an
-    `OrnsteinUhlenbeckParams`, and Γ follows it.
+    Its time reversal is the Ornstein–Uhlenbeck process with matrix Γ Bᵀ Γ⁻¹; it is reversible
+    if and only if BΓ is symmetric, which is not asked for. The log stationary density is
+    normalised. `params` is an `OrnsteinUhlenbeckParams`, and Γ follows it.
 
     **Arguments:** `B`, shape (d, d), per unit of time; `mean`, shape (d,), by default zero;
     `sigma`, shape (d, d) or (d,), by default the identity.
@@ -123,7 +124,7 @@ def ou_stationary(model: Diffusion) -> GaussianLaw:
     return GaussianLaw(prepared.mean, prepared.covariance)
 
 
-def ou_transition(model: Diffusion, start: Float[Array, " d"], duration: ArrayLike) -> GaussianLaw:
+def ou_transition(model: Diffusion, start: Float[Array, " d"], duration: Numbers) -> GaussianLaw:
     """The law of X_t given X_0 = `start`, for t = `duration`, of an Ornstein–Uhlenbeck model.
 
     **Raises:** `TypeError` for any other model.
@@ -184,10 +185,10 @@ class GaussianBridge(eqx.Module):
 
 def gaussian_bridge(
     model: Diffusion,
-    start: ArrayLike,
-    end: ArrayLike,
-    duration: ArrayLike,
-    times: ArrayLike,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    times: Numbers,
 ) -> GaussianBridge:
     """The exact law of the (start, end, duration)-bridge of an Ornstein–Uhlenbeck model at
     `times`, increasing, shape (K,), in [0, duration]; B need not be reversible.
@@ -303,6 +304,6 @@ def _ou_params(model: Diffusion) -> OrnsteinUhlenbeckParams:
     return params
 
 
-def _floating(value: ArrayLike) -> Array:
+def _floating(value: Numbers) -> Array:
     value = jnp.asarray(value)
     return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)

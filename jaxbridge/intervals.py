@@ -10,8 +10,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from .annotations import Numbers
 from .diffusion import Diffusion, check_invertible
 from .schemes import AbstractScheme, Milstein
 
@@ -29,9 +30,7 @@ def is_traced(*trees) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def as_intervals(
-    start: ArrayLike, end: ArrayLike, duration: ArrayLike
-) -> tuple[Intervals, bool, bool]:
+def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Intervals, bool, bool]:
     """The intervals, and whether the end points and the duration came with an axis I."""
     points = {"start": jnp.asarray(start), "end": jnp.asarray(end)}
     duration = jnp.asarray(duration)
@@ -94,23 +93,24 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
     if is_traced(model, intervals.start, intervals.end):
         return
     for name, points in [("start", intervals.start), ("end", intervals.end)]:
-        drift, sigma, slopes = _coefficients(model, points)
+        drift, sigma, slopes = jax.device_get(_coefficients(model, points))
         for value in (drift, sigma):
-            bad = ~np.all(np.isfinite(np.asarray(value)).reshape(len(points), -1), axis=1)
+            bad = ~np.all(np.isfinite(value).reshape(len(points), -1), axis=1)
             if bad.any():
                 raise ValueError(
                     f"the coefficients of the model are not finite at `{name}` = "
                     f"{points[bad.argmax()]}: is that point inside the state space?"
                 )
-        if slopes is not None:
-            for matrix in np.asarray(sigma)[np.linalg.cond(sigma).argmax(keepdims=True)]:
-                check_invertible(f"diffusion(x) at `{name}`", matrix)
-            off_diagonal = slopes * (1 - np.eye(points.shape[1])[:, None, :])
-            if isinstance(scheme, Milstein) and np.any(off_diagonal != 0):
-                raise ValueError(
-                    "`Milstein` needs diagonal noise in which σ_i depends on x_i alone; here it "
-                    "depends on other coordinates too. Choose `Heun` or `Euler`."
-                )
+        if slopes is None:
+            continue
+        worst = np.linalg.cond(sigma).argmax()
+        check_invertible(f"diffusion(x) at `{name}`", sigma[worst])
+        other_coordinates = 1 - np.eye(points.shape[1])[:, None, :]
+        if isinstance(scheme, Milstein) and np.any(slopes * other_coordinates != 0):
+            raise ValueError(
+                "`Milstein` needs diagonal noise in which σ_i depends on x_i alone; here it "
+                "depends on other coordinates too. Choose `Heun` or `Euler`."
+            )
 
 
 @eqx.filter_jit

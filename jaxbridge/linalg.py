@@ -10,11 +10,12 @@ import functools
 import operator
 
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
-
 # Sums are written out up to this dimension: a reduction would be a kernel of its own.
-_WRITTEN_OUT = 16
+_WRITTEN_OUT = 4
 
 
 def dot(left: Float[Array, " d"], right: Float[Array, " d"]) -> Float[Array, ""]:
@@ -32,12 +33,14 @@ def all_finite(vector: Float[Array, " d"]) -> Bool[Array, ""]:
 def matvec(matrix: Float[Array, "n m"], vector: Float[Array, " m"]) -> Float[Array, " n"]:
     """`matrix @ vector`, written out."""
     if matrix.shape[0] > _WRITTEN_OUT:
-        return jnp.matmul(matrix, vector, precision="highest")
+        return jnp.sum(matrix * vector, axis=1)
     return jnp.stack([dot(matrix[i], vector) for i in range(matrix.shape[0])])
 
 
 def matmul(left: Float[Array, "n k"], right: Float[Array, "k m"]) -> Float[Array, "n m"]:
     """`left @ right`, written out."""
+    if left.shape[1] > _WRITTEN_OUT:
+        return jnp.sum(left[:, :, None] * right, axis=1)
     return jnp.stack([matvec(right.T, left[i]) for i in range(left.shape[0])])
 
 
@@ -49,27 +52,28 @@ def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
 
 
 def solve(matrix: Float[Array, "d d"], right: Float[Array, "d *m"]) -> Float[Array, "d *m"]:
-    """`matrix⁻¹ right` by Gaussian elimination with partial pivoting, unrolled.
+    """`matrix⁻¹ right`, by Cramer's rule for d ≤ 2, otherwise by Gauss–Jordan elimination with
+    partial pivoting.
 
     A singular matrix gives non-finite numbers, as a division by zero does.
     """
     d = matrix.shape[0]
-    columns = right.reshape(d, -1)
-    rows = [jnp.concatenate([matrix[i], columns[i]]) for i in range(d)]
+    if d == 1:
+        return right / matrix[0, 0]
+    if d == 2:
+        (a, b), (c, e) = matrix
+        first, second = e * right[0] - b * right[1], a * right[1] - c * right[0]
+        return jnp.stack([first, second]) / (a * e - b * c)
+    rows = jnp.concatenate([matrix, right.reshape(d, -1)], axis=1)
     for k in range(d):
-        for i in range(k + 1, d):  # one bubble pass brings the largest pivot to row k
-            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
-            rows[k], rows[i] = (
-                jnp.where(swap, rows[i], rows[k]),
-                jnp.where(swap, rows[k], rows[i]),
-            )
-        for i in range(k + 1, d):
-            rows[i] = rows[i] - rows[i][k] / rows[k][k] * rows[k]
-    solution: list = [None] * d
-    for k in reversed(range(d)):
-        known = sum((rows[k][j] * solution[j] for j in range(k + 1, d)), start=jnp.zeros(()))
-        solution[k] = (rows[k][d:] - known) / rows[k][k]
-    return jnp.stack(solution).reshape(right.shape)
+        below = jnp.where(np.arange(d) < k, -1, jnp.abs(rows[:, k]))
+        chosen = jnp.arange(d) == jnp.argmax(below)
+        pivot_row = jnp.sum(jnp.where(chosen[:, None], rows, 0), axis=0)
+        rows = jnp.where(chosen[:, None], rows[k], rows)  # the other half of the swap
+        pivot_row = pivot_row / pivot_row[k]
+        reduced = rows - rows[:, k : k + 1] * pivot_row
+        rows = jnp.where((np.arange(d) == k)[:, None], pivot_row, reduced)
+    return rows[:, d:].reshape(right.shape)
 
 
 def inverse(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
@@ -108,12 +112,13 @@ def polar_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
         length = safe_norm(jnp.stack([p, q]))
         p, q = p / length, q / length
         return jnp.stack([jnp.stack([p, -sign * q]), jnp.stack([q, sign * p])])
-    factor = matrix
-    for _ in range(_NEWTON_STEPS):
+
+    def newton(_, factor):
         inverse_transpose = inverse(factor).T
-        scale = jnp.sqrt(jnp.sqrt(jnp.sum(inverse_transpose**2)) / jnp.sqrt(jnp.sum(factor**2)))
-        factor = (scale * factor + inverse_transpose / scale) / 2
-    return factor
+        scale = jnp.sqrt(safe_norm(inverse_transpose.ravel()) / safe_norm(factor.ravel()))
+        return (scale * factor + inverse_transpose / scale) / 2
+
+    return lax.fori_loop(0, _NEWTON_STEPS, newton, matrix)
 
 
 # With this scaling a condition number of 1e8 is orthogonal to 1e-15 after nine steps.

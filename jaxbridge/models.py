@@ -13,8 +13,9 @@ import jax.numpy as jnp
 import jax.scipy.special as special
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float, Key, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
+from .annotations import Numbers
 from .diffusion import Diffusion, weighted_divergence
 from .intervals import check_count, is_traced
 from .linalg import cholesky, dot, matvec
@@ -73,7 +74,7 @@ def langevin(log_density: Callable, params: PyTree = None) -> Diffusion:
     return stationary_diffusion(log_density, params=params)
 
 
-def hyperbolic(alpha: ArrayLike, dim: int) -> Diffusion:
+def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     """The hyperbolic diffusion `dX = -α X / √(1+|X|²) dt + dW` in R^dim: equation
     (hyperbolicsde). Reversible; its log stationary density is the normalised one of equation
     (hypdensity), and its stationary sampler is exact. `params` is α, per unit of time.

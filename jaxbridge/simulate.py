@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Key
+from jaxtyping import Array, Float, Key
 
+from .annotations import Numbers
 from .bridges import check_key
 from .diffusion import Diffusion, Dynamics, ito_correction
 from .intervals import check_count, is_traced
@@ -17,8 +18,8 @@ from .sigma import AbstractSigma, Diagonal
 def simulate(
     key: Key[Array, ""],
     model: Diffusion,
-    x0: ArrayLike | None,
-    times: ArrayLike,
+    x0: Numbers | None,
+    times: Numbers,
     *,
     num_paths: int = 1,
     num_steps: int = 50,
@@ -44,7 +45,8 @@ def simulate(
     !!! example
 
         ```python
-        paths = jb.simulate(jax.random.key(0), model, [0.0, 0.0], jnp.linspace(0, 10, 101), num_paths=8)
+        times = jnp.linspace(0, 10, 101)
+        paths = jb.simulate(jax.random.key(0), model, [0.0, 0.0], times, num_paths=8)
         ```
     """
     check_key(key)

@@ -1,0 +1,24 @@
+"""Every test runs with the package's annotations checked at run time, strict promotion of
+dtypes and warnings as errors."""
+
+from jaxtyping import install_import_hook
+
+install_import_hook("jaxbridge", "beartype.beartype")
+
+import jax  # noqa: E402
+import pytest  # noqa: E402
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(params=["float32", "float64"])
+def precision(request):
+    """Run a test in both precisions."""
+    with jax.enable_x64(request.param == "float64"):
+        yield request.param
+
+
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
