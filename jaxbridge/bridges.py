@@ -7,6 +7,7 @@ and number only, and its j-th success is the interval's j-th bridge. So the resu
 depend on the number of lanes.
 """
 
+import functools
 from typing import Any, NamedTuple
 
 import diffrax
@@ -17,10 +18,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from .annotations import Numbers
+from .arrays import Numbers, as_real, is_traced
 from .coupling import AbstractCoupling, Coupling
 from .diffusion import Diffusion
-from .intervals import Intervals, as_intervals, check_count, check_model, is_traced
+from .intervals import Intervals, as_intervals, check_count, check_model
 from .proposals import Proposals, propose
 
 
@@ -114,7 +115,7 @@ def sample_bridges(
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, several_durations = as_intervals(start, end, duration)
     check_model(model, intervals, coupling.scheme)
-    model.backward(intervals.start[0])  # raises where the time reversal is unknown
+    model.check_reversal()
     stored = _stored_steps(save_at, 1.0 if several_durations else duration, num_steps)
     if max_proposals is None:
         max_proposals = max(1_000 * num_bridges, 100_000)
@@ -198,9 +199,8 @@ def _sample_bridges(
     num_intervals, d = intervals.start.shape
     met = search.rho <= num_steps
     interval = jnp.repeat(jnp.arange(num_intervals), num_bridges)
-    paths = _differentiable(
-        inputs, search.paths, key, interval, search.number, search.rho, stored, num_steps
-    )
+    accepted = (key, interval, search.number, stored, search.rho)
+    paths = _with_replayed_tangents(inputs, accepted, search.paths, num_steps)
     paths = jnp.where(met[:, None, None], paths, jnp.nan)
     steps = jnp.arange(num_steps + 1) if stored is None else stored
     times = steps.astype(paths.dtype) / num_steps * intervals.duration[:, None]
@@ -322,23 +322,24 @@ def _propose_numbered(
     )
 
 
-def _differentiable(inputs, paths, key, interval, number, rho, stored, num_steps):
-    """`paths`, with the tangents that a replay of the accepted proposals gives them."""
+@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+def _with_replayed_tangents(inputs, accepted, paths, num_steps):
+    """`paths`, whose tangents come from a replay of the accepted proposals.
 
-    @jax.custom_jvp
-    def attach(inputs, paths):
-        return paths
+    The search is a `while_loop`, which has no reverse mode, and most of its work was rejected.
+    """
+    return paths
 
-    @attach.defjvp
-    def attach_jvp(primals, tangents):
-        def replay(inputs):
-            made = _propose_numbered(inputs, key, interval, number, num_steps, stored, rho)
-            return jnp.moveaxis(made.paths, -1, 0)
 
-        inputs, paths = primals
-        return paths, jax.jvp(replay, (inputs,), (tangents[0],))[1]
+@_with_replayed_tangents.defjvp
+def _replay_tangents(num_steps, primals, tangents):
+    inputs, (key, interval, number, stored, rho), paths = primals
 
-    return attach(inputs, paths)
+    def replay(inputs):
+        made = _propose_numbered(inputs, key, interval, number, num_steps, stored, rho)
+        return jnp.moveaxis(made.paths, -1, 0)
+
+    return paths, jax.jvp(replay, (inputs,), (tangents[0],))[1]
 
 
 def check_key(key) -> None:
@@ -354,7 +355,7 @@ def _stored_steps(
 ) -> Int[Array, " K"] | None:
     if save_at is None:
         return None
-    save_at = jnp.asarray(save_at)
+    save_at = as_real("save_at", save_at)
     if save_at.ndim != 1 or save_at.shape[0] == 0:
         raise ValueError(f"`save_at` must be times in an array of shape (K,); got {save_at.shape}.")
     steps = save_at / jnp.asarray(duration) * num_steps

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from .arrays import as_real, is_traced
 from .linalg import dot, matmul, matvec, polar_factor
 from .meeting import (
     AbstractMeeting,
@@ -153,13 +154,13 @@ class Coupling(AbstractCoupling):
         rotation: Rotation | None = None,
     ):
         law, gamma = (gamma, jnp.nan) if callable(gamma) else (None, gamma)
-        self.gamma = jnp.asarray(gamma)
+        self.gamma = as_real("gamma", gamma)
         self.meeting = BrownianCrossing() if meeting is None else meeting
         self.scheme = Heun() if scheme is None else scheme
         self.rotation = rotation
         self._gamma_law = law
         reflection = False
-        if law is None and not isinstance(self.gamma, jax.core.Tracer):
+        if law is None and not is_traced(self.gamma):
             if self.gamma.ndim != 0:
                 raise ValueError(
                     f"`gamma` must be a scalar, got shape {self.gamma.shape}; use `jax.vmap` "

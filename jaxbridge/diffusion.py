@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Key, PyTree
 
-from .annotations import Numbers
+from .arrays import Numbers, as_real, is_traced
 from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
 
 
@@ -167,12 +167,14 @@ class Diffusion(eqx.Module):
         params = jax.tree.map(_as_leaf, params)
         return eqx.tree_at(lambda m: m.params, self, params, is_leaf=lambda leaf: leaf is None)
 
-    @property
-    def has_reverse_drift(self) -> bool:
-        """Whether the time reversal of this model is known."""
-        return (
-            self.reversible or self._reverse_drift is not None or self._log_stationary is not None
-        )
+    def check_reversal(self) -> None:
+        """Raise `ValueError` where the time reversal of this model is unknown."""
+        if not self.reversible and self._reverse_drift is None and self._log_stationary is None:
+            raise ValueError(
+                "the time reversal of this model is unknown, and couplings need it: give "
+                "`Diffusion` a `log_stationary` (up to a constant), a `reverse_drift`, or "
+                "`reversible=True`."
+            )
 
     def forward(self, like: Float[Array, " d"]) -> Dynamics:
         """The coefficients α and σ at points like this one (only its shape and dtype count),
@@ -199,6 +201,7 @@ class Diffusion(eqx.Module):
 
     def backward(self, like: Float[Array, " d"]) -> Dynamics:
         """The coefficients α* and σ of the time-reversed diffusion, as for `forward`."""
+        self.check_reversal()
         forward = self.forward(like)
         if self.reversible:
             return forward
@@ -208,18 +211,12 @@ class Diffusion(eqx.Module):
             def drift(x):
                 return _check_value("reverse_drift", reverse_drift(x, params), x.shape, x)
 
-        elif self._log_stationary is not None:
+        else:
             log_nu = self._log_stationary_function()
 
             def drift(x):
                 return -forward.drift(x) + _stationary_flux(forward, log_nu, x)
 
-        else:
-            raise ValueError(
-                "the time reversal of this model is unknown, and couplings need it: give "
-                "`Diffusion` a `log_stationary` (up to a constant), a `reverse_drift`, or "
-                "`reversible=True`."
-            )
         return forward._replace(drift=drift)
 
     def _prepared_params(self) -> PyTree:
@@ -313,9 +310,7 @@ def _check_value(name: str, value: Array, shape: tuple, x: Float[Array, " d"]) -
 
 
 def _check_constant_sigma(sigma: Numbers) -> Array:
-    sigma = jnp.asarray(sigma)
-    if not jnp.issubdtype(sigma.dtype, jnp.inexact):
-        sigma = sigma.astype(float)
+    sigma = as_real("diffusion", sigma)
     square = sigma.ndim == 2 and sigma.shape[0] == sigma.shape[1]
     if not (square or sigma.ndim == 1):
         raise ValueError(
@@ -328,7 +323,7 @@ def _check_constant_sigma(sigma: Numbers) -> Array:
 
 def check_invertible(name: str, sigma: Array | np.ndarray) -> None:
     """Raise `ValueError` for a visibly singular or non-finite σ; silent while tracing."""
-    if isinstance(sigma, jax.core.Tracer):
+    if is_traced(sigma):
         return
     matrix = np.diag(sigma) if sigma.ndim == 1 else np.asarray(sigma)
     if not np.all(np.isfinite(matrix)):

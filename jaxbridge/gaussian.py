@@ -22,9 +22,9 @@ import jax.scipy.linalg
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .annotations import Numbers
+from .arrays import Numbers, as_real, is_traced
 from .diffusion import Diffusion, check_invertible
-from .intervals import as_intervals, is_traced
+from .intervals import as_intervals
 from .linalg import dot, matvec
 
 
@@ -86,15 +86,15 @@ def ornstein_uhlenbeck(
         model.reverse_drift(jnp.array([1.0, 0.0]))  # Array([-1.5, -1. ], dtype=float32)
         ```
     """
-    B = _floating(B)
+    B = as_real("B", B)
     if B.ndim != 2 or B.shape[0] != B.shape[1]:
         raise ValueError(f"`B` must be a square matrix, shape (d, d); got {B.shape}.")
     d = B.shape[0]
-    mean = jnp.zeros(d, B.dtype) if mean is None else _floating(mean)
+    mean = jnp.zeros(d, B.dtype) if mean is None else as_real("mean", mean)
     if mean.shape != (d,):
         raise ValueError(f"`mean` must have shape ({d},) to fit `B`; got {mean.shape}.")
     if sigma is not None:
-        sigma = _floating(sigma)
+        sigma = as_real("sigma", sigma)
         if sigma.shape not in ((d,), (d, d)):
             raise ValueError(f"`sigma` must have shape ({d}, {d}) or ({d},); got {sigma.shape}.")
         check_invertible("sigma", sigma)
@@ -207,7 +207,7 @@ def gaussian_bridge(
     if batched or several:
         raise ValueError("`gaussian_bridge` is for one interval; use `jax.vmap` for several.")
     a, b, total = (leaf[0].astype(params.B.dtype) for leaf in intervals)
-    times = jnp.asarray(times, params.B.dtype)
+    times = as_real("times", times).astype(params.B.dtype)
     if times.ndim != 1:
         raise ValueError(f"`times` must have shape (K,); got {times.shape}.")
     if not is_traced(times, total) and not (
@@ -302,8 +302,3 @@ def _ou_params(model: Diffusion) -> OrnsteinUhlenbeckParams:
             f"params {params!r}."
         )
     return params
-
-
-def _floating(value: Numbers) -> Array:
-    value = jnp.asarray(value)
-    return value if jnp.issubdtype(value.dtype, jnp.floating) else value.astype(float)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .annotations import Numbers
+from .arrays import Numbers, as_real, is_traced
 from .diffusion import Diffusion, check_invertible
 from .schemes import AbstractScheme, Milstein
 
@@ -25,20 +25,10 @@ class Intervals(NamedTuple):
     duration: Float[Array, " I"]
 
 
-def is_traced(*trees) -> bool:
-    """Whether any value in the trees is abstract, so that it cannot be looked at."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
-
-
 def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Intervals, bool, bool]:
     """The intervals, and whether the end points and the duration came with an axis I."""
-    points = {"start": jnp.asarray(start), "end": jnp.asarray(end)}
-    duration = jnp.asarray(duration)
-    for name, value in {**points, "duration": duration}.items():
-        if not (
-            jnp.issubdtype(value.dtype, jnp.floating) or jnp.issubdtype(value.dtype, jnp.integer)
-        ):
-            raise TypeError(f"`{name}` must be real numbers; got dtype {value.dtype}.")
+    points = {"start": as_real("start", start), "end": as_real("end", end)}
+    duration = as_real("duration", duration)
     for name, point in points.items():
         if point.ndim not in (1, 2) or point.shape[-1] == 0:
             raise ValueError(
@@ -84,12 +74,12 @@ def check_count(name: str, value, minimum: int = 1) -> int:
 
 
 def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) -> None:
-    """Raise `ValueError` where the model does not fit the end points, or the scheme the model."""
+    """Raise `ValueError` where the model does not fit the end points, or the scheme the model.
+
+    Shapes are checked wherever the model's functions are traced, so here only values are.
+    """
     if not isinstance(model, Diffusion):
         raise TypeError(f"`model` must be a `jaxbridge.Diffusion`; got {type(model).__name__}.")
-    point = jax.ShapeDtypeStruct(intervals.start.shape[1:], intervals.start.dtype)
-    jax.eval_shape(model.drift, point)
-    jax.eval_shape(model.diffusion, point)
     if is_traced(model, intervals.start, intervals.end):
         return
     for name, points in [("start", intervals.start), ("end", intervals.end)]:
@@ -122,7 +112,5 @@ def _coefficients(model: Diffusion, points: Float[Array, "n d"]):
 
 def _working_dtype(*arrays: Array) -> jnp.dtype:
     """The widest floating point type that was given; JAX's default if none was."""
-    floating = [
-        a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating) and not a.weak_type
-    ]
-    return max(floating, key=lambda dtype: dtype.itemsize, default=jnp.asarray(0.0).dtype)
+    given = [array.dtype for array in arrays if not array.weak_type]
+    return max(given, key=lambda dtype: dtype.itemsize, default=jnp.asarray(0.0).dtype)

@@ -15,9 +15,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key, PyTree
 
-from .annotations import Numbers
+from .arrays import Numbers, is_traced
 from .diffusion import Diffusion, weighted_divergence
-from .intervals import check_count, is_traced
+from .intervals import check_count
 from .linalg import cholesky, dot, matvec
 
 

@@ -1,7 +1,7 @@
 """Every test runs with the package's annotations checked at run time, strict promotion of
 dtypes and warnings as errors."""
 
-from jaxtyping import install_import_hook
+from jaxtyping import config as jaxtyping_config, install_import_hook
 
 install_import_hook("jaxbridge", "beartype.beartype")
 
@@ -22,3 +22,11 @@ def precision(request):
 def x64():
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture
+def unchecked():
+    """Without the check of annotations, as users run the package."""
+    jaxtyping_config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping_config.update("jaxtyping_disable", False)

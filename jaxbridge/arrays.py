@@ -1,0 +1,33 @@
+"""What counts as numbers, and how they become arrays."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, ArrayLike
+
+# Anything `jnp.asarray` takes: an array, a number, a (nested) list of numbers.
+Numbers = ArrayLike | Sequence[Any]
+
+
+def as_real(name: str, value: Numbers) -> Array:
+    """`value` as an array of real numbers; integers become weakly typed floats.
+
+    Raises `TypeError`, naming the argument, for anything else.
+    """
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`{name}` must be real numbers in an array; got {value!r}.") from error
+    if jnp.issubdtype(array.dtype, jnp.integer):
+        return lax.convert_element_type(array, float)
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        raise TypeError(f"`{name}` must be real numbers; got dtype {array.dtype}.")
+    return array
+
+
+def is_traced(*trees) -> bool:
+    """Whether any value in the trees is abstract, so that it cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))

@@ -1,0 +1,177 @@
+"""Pictures of bridges, and of their law beside an exact one. Needs the extra `plot`."""
+
+from collections.abc import Mapping, Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr, ndtri
+from jaxtyping import Array, Float
+
+from .gaussian import GaussianLaw
+
+try:
+    import matplotlib.pyplot as plt
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+except ImportError as error:
+    raise ImportError(
+        'pictures are drawn by matplotlib; install it with `pip install "jaxbridge[plot]"`.'
+    ) from error
+
+_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9")  # Okabe & Ito
+_EXACT = "0.15"
+_DASHES = (0, (4, 2))
+
+# Margins and samples come as arrays of either kind.
+Reals = Array | np.ndarray
+
+
+def qq(
+    samples: Mapping[str, Float[Reals, " n"]],
+    mean: float,
+    sd: float,
+    ax: Axes | None = None,
+) -> Axes:
+    """Q-Q plot of one margin against N(mean, sd²), each method in its own colour.
+
+    `samples` are the draws of each method by its name. Quantiles are shown at levels that are
+    evenly spaced on the normal scale, out to the most extreme draws; on the diagonal the two
+    laws agree.
+    """
+    ax = _axes(ax)
+    largest = max(np.size(values) for values in samples.values())
+    reach = mean + sd * np.array([-1, 1]) * _scores(largest)[-1]
+    ax.plot(reach, reach, color=_EXACT, linewidth=0.8, label="exact")
+    for colour, (name, values) in zip(_colours(samples), samples.items(), strict=True):
+        scores = _scores(np.size(values))
+        levels = np.asarray(ndtr(scores), float)
+        quantiles = np.quantile(np.asarray(values, float), levels, method="hazen")
+        style = {"marker": "o", "markersize": 3.5, "markeredgewidth": 0.8, "linestyle": "none"}
+        ax.plot(mean + sd * scores, quantiles, color=colour, fillstyle="none", label=name, **style)
+    ax.set(xlabel="exact quantile", ylabel="quantile of the bridges")
+    return _finish(ax)
+
+
+def copula_levels(
+    samples: Mapping[str, Float[Reals, "n 2"]],
+    covariance: Float[Reals, "2 2"],
+    levels: Sequence[float] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9),
+    ax: Axes | None = None,
+) -> Axes:
+    """Level curves of the copula: exact (full drawn) and of each method's draws (dashed).
+
+    `samples` are the draws of each method by its name; `covariance` is that of the exact,
+    Gaussian law.
+    """
+    ax = _axes(ax)
+    variance = np.diag(covariance)
+    correlation = float(covariance[0, 1] / np.sqrt(variance[0] * variance[1]))
+    resolution = 100
+    grid = np.linspace(0, 1, resolution + 1)
+
+    def draw(copula, **style):
+        return ax.contour(grid, grid, copula.T, levels=list(levels), **style)
+
+    u, v = np.meshgrid(grid, grid, indexing="ij")
+    exact = draw(gaussian_copula(u, v, correlation), colors=_EXACT, linewidths=0.8)
+    ax.clabel(exact, fontsize=7, fmt="%g")
+    handles = [Line2D([], [], color=_EXACT, linewidth=0.8, label="exact")]
+    for colour, (name, values) in zip(_colours(samples), samples.items(), strict=True):
+        style = {"linewidths": 1.3, "linestyles": [_DASHES]}
+        draw(empirical_copula(values, resolution), colors=colour, **style)
+        handles.append(Line2D([], [], color=colour, linestyle=_DASHES, label=name))
+    ax.set(xlabel="$u$", ylabel="$v$", aspect="equal")
+    return _finish(ax, handles=handles, loc="lower left")
+
+
+def bridge_fan(
+    times: Float[Reals, " K"],
+    paths: Float[Reals, "n K d"],
+    ax: Axes | None = None,
+    coordinate: int = 0,
+    num_paths: int = 5,
+) -> Axes:
+    """One coordinate of many bridges: median, 50 % and 90 % bands, and the first few paths.
+
+    `times` and `paths` as `sample_bridges` returns them; bridges not found are left out.
+    """
+    ax = _axes(ax)
+    values = np.asarray(paths, float)[..., coordinate]
+    values = values[np.all(np.isfinite(values), axis=1)]
+    times = np.asarray(times, float)
+    low, lower, median, upper, high = np.quantile(values, [0.05, 0.25, 0.5, 0.75, 0.95], axis=0)
+    colour = _COLOURS[0]
+    band = {"color": colour, "linewidth": 0}
+    ax.fill_between(times, low, high, alpha=0.15, label="90 %", **band)
+    ax.fill_between(times, lower, upper, alpha=0.3, label="50 %", **band)
+    ax.plot(times, values[:num_paths].T, color=_EXACT, linewidth=0.6, alpha=0.7)
+    ax.plot(times, median, color=colour, linewidth=1.6, label="median")
+    ax.set(xlabel="time", ylabel=f"$Z^{{({coordinate + 1})}}_t$", xlim=(times[0], times[-1]))
+    return _finish(ax)
+
+
+def margins_and_copula(
+    samples: Mapping[str, Float[Reals, "n 2"]], law: GaussianLaw, title: str
+) -> Figure:
+    """The figures of section 3: Q-Q plots of both margins and the copula, in one row."""
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    *margins, dependence = figure.subplots(1, 3)
+    for i, ax in enumerate(margins):
+        margin = {name: values[:, i] for name, values in samples.items()}
+        qq(margin, float(law.mean[i]), float(jnp.sqrt(law.covariance[i, i])), ax)
+        ax.set_title(f"coordinate {i + 1}", fontsize="medium")
+    copula_levels(samples, law.covariance, ax=dependence)
+    dependence.set_title("copula", fontsize="medium")
+    figure.suptitle(title)
+    return figure
+
+
+def gaussian_copula(
+    u: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."], correlation: float
+) -> Float[np.ndarray, "..."]:
+    """The Gaussian copula C(u, v), for u, v in [0, 1] and -1 < correlation < 1.
+
+    By Plackett's identity ∂C/∂r = φ₂(x, y; r), integrated from independence with r = sin θ.
+    """
+    # Away from the edges, where the scores are infinite, by less than a picture can show.
+    x, y = (np.asarray(ndtri(np.clip(p, 1e-6, 1 - 1e-6)), float)[..., None] for p in (u, v))
+    nodes, weights = np.polynomial.legendre.leggauss(48)
+    half = np.arcsin(correlation) / 2
+    angle = half * (1 + nodes)
+    exponent = (x**2 + y**2 - 2 * x * y * np.sin(angle)) / (2 * np.cos(angle) ** 2)
+    return u * v + half * np.exp(-exponent) @ weights / (2 * np.pi)
+
+
+def empirical_copula(
+    samples: Float[Reals, "n 2"], resolution: int
+) -> Float[np.ndarray, "{resolution}+1 {resolution}+1"]:
+    """C_n(u, v), the share of draws with ranks at most nu and nv, at u, v = 0, 1/m, ..., 1,
+    m being the `resolution`."""
+    n = len(samples)
+    ranks = np.argsort(np.argsort(np.asarray(samples), axis=0), axis=0) + 1
+    cell = (ranks * resolution - 1) // n  # rank/n lies in (cell/m, (cell + 1)/m]
+    counts = np.zeros((resolution + 1, resolution + 1))
+    np.add.at(counts, tuple(cell.T + 1), 1)
+    return counts.cumsum(0).cumsum(1) / n
+
+
+def _scores(n: int, num_points: int = 61) -> Float[np.ndarray, " num_points"]:
+    """Evenly spaced normal scores, out to those of the extremes of n draws."""
+    extreme = min(n, 10**6)
+    last = float(ndtri(1 - 0.5 / extreme))
+    return np.linspace(-last, last, num_points)
+
+
+def _axes(ax: Axes | None) -> Axes:
+    return plt.subplots(layout="constrained")[1] if ax is None else ax
+
+
+def _colours(samples: Mapping) -> list[str]:
+    return [_COLOURS[i % len(_COLOURS)] for i in range(len(samples))]
+
+
+def _finish(ax: Axes, **legend) -> Axes:
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.legend(frameon=False, fontsize="small", **legend)
+    return ax

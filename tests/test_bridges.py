@@ -1,0 +1,506 @@
+"""Approximate bridges: their law, the search for them, gradients, compilation and errors."""
+
+import os
+import subprocess
+import sys
+import textwrap
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import (
+    PAPER_B,
+    PAPER_CASES,
+    assert_moments,
+    count_compilations,
+    paper_model,
+    swirl,
+    unswirl,
+    warped_model,
+)
+from reference import approximate_bridges
+
+import jaxbridge as jb
+import jaxbridge.bridges
+from jaxbridge.proposals import propose
+
+NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
+
+
+def mid_points(case, gamma, coupling=None, num_bridges=50_000, seed=0):
+    """Deviations of approximate bridges at T/2 from the exact mean, in exact sds."""
+    start, end = PAPER_CASES[case]
+    model = paper_model()
+    bridges = jb.sample_bridges(
+        jax.random.key(seed),
+        model,
+        start,
+        end,
+        1.0,
+        num_bridges=num_bridges,
+        num_steps=50,
+        coupling=jb.Coupling(gamma) if coupling is None else coupling,
+        save_at=[0.5],
+    )
+    exact = jb.gaussian_bridge(model, start, end, 1.0, [0.5])
+    assert bridges.met.all()
+    scale = np.sqrt(np.diag(exact.covariance[0]))
+    return (np.asarray(bridges.paths[:, 0]) - np.asarray(exact.mean[0])) / scale
+
+
+def run_program(program, deadline=240):
+    """Run it in a process of its own, on CPU, within a deadline in seconds."""
+    command = [sys.executable, "-c", textwrap.dedent(program)]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    subprocess.run(command, check=True, timeout=deadline, env=environment)
+
+
+# The law
+
+
+def test_likely_bridges_by_reflection_have_the_exact_law():
+    start, end = PAPER_CASES["likely"]
+    exact = jb.gaussian_bridge(paper_model(), start, end, 1.0, [0.5]).covariance[0]
+    scale = np.sqrt(np.diag(exact))
+    z = mid_points("likely", -1.0)
+    assert_moments(z, np.zeros(2), exact / np.outer(scale, scale))
+
+
+def test_unlikely_bridges_show_the_error_of_the_method():
+    """Conditioning on being hit pulls the bridge towards the stationary law. The error is the
+    same in both coordinates up to sign, by symmetry, and shrinks as γ → 1, as the paper saw."""
+    error = 5 / np.sqrt(50_000)
+    half, close = (mid_points("unlikely", gamma).mean(0) for gamma in (0.5, 0.95))
+    assert (half < -0.1).all() and abs(half[0] - half[1]) < 2 * error
+    assert (np.abs(close) < np.abs(half) - error).all() and (np.abs(close) < 0.06).all()
+    extreme = mid_points("very unlikely", 0.5).mean(0)
+    assert extreme[0] < -0.15 and abs(extreme[0] + extreme[1]) < 2 * error
+
+
+@pytest.mark.parametrize(
+    ("gamma", "meeting", "crossing"),
+    [(-1.0, jb.SignTest(), False), (0.5, jb.BrownianCrossing(), True)],
+)
+def test_same_law_as_an_independent_implementation(gamma, meeting, crossing):
+    """Mid-points, meeting and acceptance against NumPy, same scheme and same step."""
+    start, end = PAPER_CASES["unlikely"]
+    num_proposals, num_steps = 40_000, 20
+    other = approximate_bridges(
+        np.random.default_rng(0),
+        PAPER_B,
+        start,
+        end,
+        1.0,
+        num_steps,
+        num_proposals,
+        gamma,
+        crossing,
+    )
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        paper_model(),
+        start,
+        end,
+        1.0,
+        num_bridges=20_000,
+        num_steps=num_steps,
+        coupling=jb.Coupling(gamma, meeting, jb.Euler()),
+    )
+    share, other_share = 20_000 / float(bridges.num_proposals), len(other) / num_proposals
+    assert abs(share - other_share) < 5 * np.sqrt(share * (1 - share) * 2 / 20_000)
+    for step in (5, 10, 15):
+        ours, theirs = np.asarray(bridges.paths[:, step]), other[:, step]
+        for statistic in (lambda z: z, lambda z: z**2, lambda z: z[:, :1] * z[:, 1:]):
+            a, b = statistic(ours), statistic(theirs)
+            error = np.sqrt(a.var(0) / len(a) + b.var(0) / len(b))
+            assert (np.abs(a.mean(0) - b.mean(0)) < 5 * error).all()
+
+
+def test_non_reversible_process_on_a_long_interval():
+    """Nearly every pair meets, so the approximate bridge is exact up to Monte Carlo error."""
+    model = jb.ornstein_uhlenbeck(NON_REVERSIBLE, mean=[0.2, -0.1], sigma=[[1.0, 0.3], [0.0, 0.8]])
+    arguments = ([0.5, 0.5], [-0.5, 0.3], 10.0)
+    bridges = jb.sample_bridges(
+        jax.random.key(1),
+        model,
+        *arguments,
+        num_bridges=20_000,
+        num_steps=250,
+        coupling=jb.Coupling(-1.0),
+        save_at=[1.0, 5.0, 9.0],
+    )
+    exact = jb.gaussian_bridge(model, *arguments, [1.0, 5.0, 9.0])
+    for k in range(3):
+        assert_moments(
+            bridges.paths[:, k], exact.mean[k], exact.covariance[k], mean_allowance=0.002
+        )
+
+
+def test_state_dependent_full_sigma_on_a_long_interval():
+    """Bridges of the swirled process, unswirled. The allowance is for its first-order step."""
+    inner = jb.ornstein_uhlenbeck(NON_REVERSIBLE)
+    start, end = jnp.array([0.5, 0.5]), jnp.array([-0.5, 0.3])
+    bridges = jb.sample_bridges(
+        jax.random.key(1),
+        warped_model(inner, swirl, unswirl),
+        swirl(start),
+        swirl(end),
+        8.0,
+        num_bridges=8_000,
+        num_steps=400,
+        coupling=jb.Coupling(-1.0),
+        save_at=[1.0, 4.0, 7.0],
+    )
+    exact = jb.gaussian_bridge(inner, start, end, 8.0, [1.0, 4.0, 7.0])
+    for k in range(3):
+        y = jax.vmap(unswirl)(bridges.paths[:, k])
+        assert_moments(y, exact.mean[k], exact.covariance[k], mean_allowance=0.02)
+
+
+def test_one_dimension_and_independent_copies():
+    """d = 1 and γ = 0: the method of Bladt & Sørensen (2014)."""
+    model = jb.ornstein_uhlenbeck([[1.0]])
+    bridges = jb.sample_bridges(
+        jax.random.key(1),
+        model,
+        [0.3],
+        [-0.2],
+        10.0,
+        num_bridges=20_000,
+        num_steps=200,
+        save_at=[1.0, 5.0],
+    )
+    exact = jb.gaussian_bridge(model, [0.3], [-0.2], 10.0, [1.0, 5.0])
+    for k in range(2):
+        assert_moments(bridges.paths[:, k], exact.mean[k], exact.covariance[k])
+
+
+def test_precisions_agree_in_law(precision):
+    bridges = jb.sample_bridges(
+        jax.random.key(1),
+        paper_model(),
+        [0.5, 0.0],
+        [0.0, 0.5],
+        6.0,
+        num_bridges=10_000,
+        num_steps=120,
+        save_at=[3.0],
+    )
+    assert bridges.paths.dtype == precision and bridges.times.dtype == precision
+    exact = jb.gaussian_bridge(paper_model(), [0.5, 0.0], [0.0, 0.5], 6.0, [3.0])
+    assert_moments(bridges.paths[:, 0], exact.mean[0], exact.covariance[0])
+
+
+# The search
+
+
+def test_result_does_not_depend_on_the_batch_size():
+    sample = lambda **settings: jb.sample_bridges(
+        jax.random.key(0),
+        paper_model(),
+        [[0.5, 0.5], [0.0, 0.0], [1.0, -1.0]],
+        [[1.0, 1.0], [0.0, 0.0], [1.0, -0.5]],
+        jnp.array([1.0, 0.5, 2.0]),
+        num_bridges=40,
+        num_steps=20,
+        **settings,
+    )
+    first = sample()
+    for batch_size in (7, 64, 1000):
+        other = sample(batch_size=batch_size)
+        np.testing.assert_allclose(other.paths, first.paths, atol=1e-5)
+        for field in ("met", "meeting_step", "num_proposals", "num_nonfinite"):
+            np.testing.assert_array_equal(getattr(other, field), getattr(first, field))
+
+
+def test_many_intervals_share_one_search():
+    num_intervals, n, num_steps = 200, 3, 20
+    keys = jax.random.split(jax.random.key(4), 2 * num_intervals)
+    points = jax.vmap(paper_model().sample_stationary)(keys)
+    start, end = points[:num_intervals], points[num_intervals:]
+    duration = jnp.linspace(0.5, 3, num_intervals)
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        paper_model(),
+        start,
+        end,
+        duration,
+        num_bridges=n,
+        num_steps=num_steps,
+        save_at=[0.0, 0.5, 1.0],
+    )
+    assert bridges.met.all() and bridges.paths.shape == (num_intervals, n, 3, 2)
+    assert (bridges.num_proposals >= n).all()
+    np.testing.assert_array_equal(
+        bridges.paths[:, :, 0], jnp.broadcast_to(start[:, None], (200, 3, 2))
+    )
+    np.testing.assert_array_equal(
+        bridges.paths[:, :, -1], jnp.broadcast_to(end[:, None], (200, 3, 2))
+    )
+    np.testing.assert_allclose(bridges.times, duration[:, None] * np.array([0, 0.5, 1]), rtol=1e-6)
+    alone = jb.sample_bridges(
+        jax.random.key(0),
+        paper_model(),
+        start[0],
+        end[0],
+        duration[0],
+        num_bridges=n,
+        num_steps=num_steps,
+        save_at=[0.0, 0.25, 0.5],
+    )
+    np.testing.assert_allclose(alone.paths, bridges.paths[0], atol=1e-5)
+
+
+def test_saved_times_are_a_subset_of_the_path():
+    sample = lambda **settings: jb.sample_bridges(
+        jax.random.key(0), paper_model(), [0.5, 0.5], [1.0, 1.0], 2.0, num_bridges=20, **settings
+    )
+    whole, some = sample(), sample(save_at=[0.0, 0.4, 2.0])
+    np.testing.assert_allclose(whole.times, np.linspace(0, 2, 51), rtol=1e-6)
+    np.testing.assert_allclose(some.times, [0.0, 0.4, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(some.paths, whole.paths[:, [0, 10, 50]], atol=1e-6)
+
+
+def test_unreachable_end_stops_at_the_bound():
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        paper_model(),
+        [[40.0, 40.0], [0.0, 0.0]],
+        [[-40.0, -40.0], [0.0, 0.0]],
+        [0.01, 1.0],
+        num_bridges=3,
+        num_steps=10,
+        max_proposals=500,
+    )
+    np.testing.assert_array_equal(bridges.met, [[False] * 3, [True] * 3])
+    np.testing.assert_array_equal(bridges.meeting_step[0], [-1] * 3)
+    assert bridges.num_proposals[0] == 500 and bridges.num_proposals[1] < 500
+    assert jnp.isnan(bridges.paths[0]).all() and jnp.isfinite(bridges.paths[1]).all()
+
+
+def test_exploding_proposals_are_rejected_and_counted():
+    """Explicit steps of a quartic potential overflow from some starts, not from all."""
+    model = jb.langevin(lambda x, p: -((x @ x) ** 2))
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        model,
+        [0.0, 0.0],
+        [1.3, 0.0],
+        10.0,
+        num_bridges=200,
+        num_steps=40,
+        coupling=jb.Coupling(0.0, scheme=jb.Euler()),
+        max_proposals=20_000,
+    )
+    assert 0 < bridges.num_nonfinite <= bridges.num_proposals
+    assert jnp.isfinite(bridges.paths[bridges.met]).all()
+
+
+def test_throw():
+    arguments = (jax.random.key(0), paper_model(), [9.0, 9.0], [-9.0, -9.0], 0.01)
+    settings = dict(num_steps=5, max_proposals=10, throw=True)
+    with pytest.raises(RuntimeError, match="were not found within `max_proposals`"):
+        jax.block_until_ready(jb.sample_bridges(*arguments, **settings))
+
+
+def test_progress_is_shown_on_request(capfd):
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        paper_model(),
+        [0.0, 0.0],
+        [0.5, 0.5],
+        1.0,
+        num_bridges=500,
+        batch_size=100,
+        progress_meter=diffrax.TextProgressMeter(),
+    )
+    jax.block_until_ready(bridges)
+    jax.effects_barrier()
+    printed = capfd.readouterr().out
+    assert "0.00%" in printed and "100.00%" in printed
+
+
+# Gradients
+
+
+def quantity(params, start, end, duration, coupling=None):
+    model = jb.ornstein_uhlenbeck(np.eye(2)).with_params(params)
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        model,
+        start,
+        end,
+        duration,
+        num_bridges=8,
+        num_steps=20,
+        coupling=jb.Coupling(0.5) if coupling is None else coupling,
+    )
+    return jnp.sum(bridges.paths[:, 10] ** 2)
+
+
+def test_gradients_are_those_at_fixed_noise_and_meeting_step(x64):
+    """Forward and reverse mode against central differences, too small to move a meeting."""
+    params = jb.OrnsteinUhlenbeckParams(jnp.asarray(NON_REVERSIBLE), jnp.zeros(2), jnp.eye(2))
+    arguments = (params, jnp.array([0.5, 0.2]), jnp.array([0.3, -0.2]), jnp.asarray(1.0))
+    direction = jax.tree.map(
+        lambda leaf: jnp.cos(jnp.arange(1.0, leaf.size + 1)).reshape(leaf.shape), arguments
+    )
+    shifted = lambda e: jax.tree.map(lambda leaf, d: leaf + e * d, arguments, direction)
+    numeric = (quantity(*shifted(1e-6)) - quantity(*shifted(-1e-6))) / 2e-6
+    _, forward = jax.jvp(quantity, arguments, direction)
+    gradient = jax.jit(jax.grad(quantity, argnums=(0, 1, 2, 3)))(*arguments)
+    reverse = sum(
+        jnp.vdot(g, d) for g, d in zip(*map(jax.tree.leaves, (gradient, direction)), strict=True)
+    )
+    assert abs(forward) > 1e-2
+    np.testing.assert_allclose([forward, reverse], numeric, rtol=1e-6)
+
+
+def test_a_caller_who_asks_for_no_gradient_pays_for_none(monkeypatch):
+    """The replay of proposals is traced only when a derivative is asked for."""
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return propose(*arguments)
+
+    monkeypatch.setattr(jaxbridge.bridges, "propose", counted)
+
+    def plain(start):
+        params = jb.OrnsteinUhlenbeckParams(jnp.eye(2), jnp.zeros(2), None)
+        return quantity(params, start, jnp.ones(2), 1.0)
+
+    jax.make_jaxpr(plain)(jnp.zeros(2))
+    assert all(len(arguments) == 8 or arguments[8] is None for arguments in calls)
+    jax.make_jaxpr(jax.grad(plain))(jnp.zeros(2))
+    assert calls[-1][8] is not None  # the fixed meeting step of a replay
+
+
+# Compilation
+
+
+def test_changed_numbers_do_not_recompile():
+    def sample(rate, gamma, start, duration, seed):
+        model = jb.hyperbolic(rate, 2)  # made anew each time
+        return jb.sample_bridges(
+            jax.random.key(seed), model, start, [0.1, 0.0], duration, coupling=jb.Coupling(gamma)
+        )
+
+    sample(1.0, 0.0, [0.0, 0.0], 1.0, 0)
+    with count_compilations() as compiled:
+        sample(2.5, 0.7, [0.3, -0.2], 2.0, 2)
+    assert not compiled
+    with count_compilations() as compiled:
+        sample(2.5, -1.0, [0.3, -0.2], 2.0, 2)  # no independent noise: another program
+    assert compiled
+    cached = jax.jit(sample)
+    cached(1.0, 0.5, jnp.zeros(2), 1.0, 0)
+    cached(3.0, -0.5, jnp.ones(2), 2.0, 1)
+    assert cached._cache_size() == 1
+
+
+def test_under_jit_and_inside_vmap_over_parameters():
+    def mean(rate):
+        model = jb.hyperbolic(1.0, 2).with_params(rate)
+        bridges = jb.sample_bridges(
+            jax.random.key(0), model, [0.5, 0.0], [0.0, 0.5], 2.0, num_bridges=10, num_steps=20
+        )
+        return bridges.paths
+
+    rates = jnp.array([0.7, 1.4])
+    together = jax.jit(jax.vmap(mean))(rates)
+    apart = jnp.stack([mean(rate) for rate in rates])
+    np.testing.assert_allclose(together, apart, atol=1e-5)
+
+
+@pytest.mark.parametrize("scheme", ["Heun", "Euler"])
+def test_sixty_thousand_lanes_with_full_sigma_finish(scheme):
+    """Batched LAPACK calls in such a scan can hang XLA's thread pool on CPU for ever."""
+    program = f"""
+        import jax, jax.numpy as jnp, jaxbridge as jb
+        mix = lambda x: jnp.array([[1.0, jnp.sin(x[0])], [jnp.cos(x[1]) / 2, 2.0]])
+        model = jb.stationary_diffusion(lambda x, p: -x @ x / 2, V=lambda x, p: mix(x) @ mix(x).T)
+        bridges = jb.sample_bridges(
+            jax.random.key(0), model, [0.5, 0.0], [0.0, 0.5], 1.0, num_bridges=60_000,
+            num_steps=10, batch_size=60_000, coupling=jb.Coupling(0.5, scheme=jb.{scheme}()),
+        )
+        assert bridges.met.all()
+    """
+    run_program(program)
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (dict(start=[[[0.0, 0.0]]]), "`start` must be one point"),
+        (dict(start=[0.0]), "points of one dimension"),
+        (dict(start=[[0.0, 0.0]] * 3, end=[[0.0, 0.0]] * 2), "number of intervals"),
+        (dict(start=[float("nan"), 0.0]), "`start` must be finite"),
+        (dict(end=[float("inf"), 0.0]), "`end` must be finite"),
+        (dict(duration=0.0), "`duration` must be positive"),
+        (dict(duration=-1.0), "`duration` must be positive"),
+        (dict(duration=[[1.0]]), "`duration` must have shape"),
+        (dict(num_steps=0), "`num_steps` must be at least 1"),
+        (dict(num_bridges=0), "`num_bridges` must be at least 1"),
+        (dict(batch_size=0), "`batch_size` must be at least 1"),
+        (dict(max_proposals=0), "`max_proposals` must be in"),
+        (dict(save_at=[0.0, 0.013]), "`save_at` must lie on the grid"),
+        (dict(save_at=[0.0, 1.2]), "`save_at` must lie in"),
+        (dict(save_at=[0.5, 0.2]), "`save_at` must increase"),
+        (dict(save_at=0.5), "`save_at` must be times"),
+        (dict(model=jb.Diffusion(lambda x, p: -x)), "time reversal of this model is unknown"),
+        (
+            dict(model=jb.Diffusion(lambda x, p: -x, lambda x, p: jnp.diag(x), reversible=True)),
+            "must be invertible",
+        ),
+        (
+            dict(model=jb.Diffusion(lambda x, p: -1 / x, reversible=True)),
+            "not finite at `start`",
+        ),
+        (
+            dict(model=jb.Diffusion(lambda x, p: -x, np.eye(3), reversible=True)),
+            r"shape \(2, 2\)",
+        ),
+        (
+            dict(
+                model=jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + x[::-1] ** 2, reversible=True),
+                coupling=jb.Coupling(scheme=jb.Milstein()),
+            ),
+            "needs diagonal noise",
+        ),
+    ],
+)
+def test_bad_values(changes, message):
+    settings = dict(model=paper_model(), start=[0.0, 0.0], end=[1.0, 1.0], duration=1.0)
+    settings |= changes
+    with pytest.raises(ValueError, match=message):
+        jb.sample_bridges(jax.random.key(0), **settings)
+
+
+def test_bad_types():
+    """In a process of its own, where annotations are not checked at run time."""
+    program = """
+        import jax, jaxbridge as jb
+        good = dict(key=jax.random.key(0), model=jb.hyperbolic(0.8, 2), start=[0.0, 0.0],
+                    end=[1.0, 1.0], duration=1.0)
+        for changes, message in [
+            (dict(key=jax.random.PRNGKey(0)), "`key` must be a typed key"),
+            (dict(num_steps=10.0), "`num_steps` must be a Python integer"),
+            (dict(coupling=0.5), "`coupling` must be"),
+            (dict(model=lambda x: x), "`model` must be"),
+            (dict(start=[True, False]), "`start` must be real numbers"),
+            (dict(end="b"), "`end` must be real numbers"),
+        ]:
+            try:
+                jb.sample_bridges(**(good | changes))
+            except TypeError as error:
+                assert message in str(error), (message, str(error))
+            else:
+                raise AssertionError(f"nothing was raised for {changes}")
+    """
+    run_program(program)

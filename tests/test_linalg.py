@@ -1,0 +1,210 @@
+"""Written-out linear algebra against NumPy's LAPACK."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbridge.linalg import (
+    all_finite,
+    cholesky,
+    dot,
+    inverse,
+    matmul,
+    matvec,
+    polar_factor,
+    safe_norm,
+    solve,
+)
+
+DIMENSIONS = [1, 2, 3, 5]
+COUNT = 24  # matrices in every batch, so that each function compiles once for each dimension
+TOLERANCE = {"float32": 2e-4, "float64": 1e-11}
+
+many_solve = jax.jit(jax.vmap(solve))
+many_inverse = jax.jit(jax.vmap(inverse))
+many_cholesky = jax.jit(jax.vmap(cholesky))
+many_polar_factor = jax.jit(jax.vmap(polar_factor))
+
+
+def random_orthogonal(rng, d):
+    """Orthogonal matrices of both signs of the determinant."""
+    orthogonal = np.linalg.qr(rng.standard_normal((COUNT, d, d)))[0]
+    orthogonal[:, 0] *= rng.choice([-1, 1], (COUNT, 1))
+    return orthogonal
+
+
+def with_singular_values(rng, singular_values):
+    """Matrices with these singular values, of both signs of the determinant."""
+    d = len(singular_values)
+    return random_orthogonal(rng, d) * singular_values @ random_orthogonal(rng, d)
+
+
+def polar_factor_by_svd(matrices):
+    u, _, vh = np.linalg.svd(matrices)
+    return u @ vh
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 5, 10])
+def test_products_equal_numpys(d, precision):
+    rng = np.random.default_rng(d)
+    a, b = rng.standard_normal((2, d, d)).astype(precision)
+    v, w = rng.standard_normal((2, d)).astype(precision)
+    close = lambda ours, exact: np.testing.assert_allclose(ours, exact, rtol=1e-5, atol=1e-5)
+    close(dot(jnp.asarray(v), jnp.asarray(w)), v @ w)
+    close(matvec(jnp.asarray(a), jnp.asarray(v)), a @ v)
+    close(matmul(jnp.asarray(a), jnp.asarray(b)), a @ b)
+
+
+@pytest.mark.parametrize("d", DIMENSIONS)
+def test_solve_and_inverse_equal_numpys(d, precision):
+    rng = np.random.default_rng(d)
+    matrices = with_singular_values(rng, np.linspace(1, 3, d)).astype(precision)
+    vectors = rng.standard_normal((COUNT, d)).astype(precision)
+    tolerance = TOLERANCE[precision]
+    solved = many_solve(matrices, vectors)
+    exact = np.linalg.solve(matrices, vectors[:, :, None])[:, :, 0]
+    assert solved.dtype == precision
+    np.testing.assert_allclose(solved, exact, atol=tolerance)
+    np.testing.assert_allclose(many_inverse(matrices), np.linalg.inv(matrices), atol=tolerance)
+
+
+@pytest.mark.parametrize("d", [3, 5])
+def test_solve_takes_several_right_hand_sides(d, x64):
+    rng = np.random.default_rng(d)
+    matrices, right = rng.standard_normal((COUNT, d, d)), rng.standard_normal((COUNT, d, 2))
+    np.testing.assert_allclose(
+        many_solve(matrices, right), np.linalg.solve(matrices, right), rtol=1e-8
+    )
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_solve_exchanges_rows_where_the_leading_entries_vanish(d, precision):
+    # Without pivoting each of these divides by zero, or by nearly zero.
+    cyclic = np.roll(np.eye(d), 1, axis=0)
+    reversal = np.eye(d)[::-1]
+    hollow = np.ones((d, d)) - np.eye(d)
+    tiny_pivot = hollow + 1e-9 * np.eye(d)
+    matrices = np.stack([cyclic, reversal, hollow, tiny_pivot]).astype(precision)
+    matrices = np.resize(matrices, (COUNT, d, d))
+    vectors = np.resize(np.arange(1, d + 1), (COUNT, d)).astype(precision)
+    exact = np.linalg.solve(matrices, vectors[:, :, None])[:, :, 0]
+    tolerance = TOLERANCE[precision]
+    np.testing.assert_allclose(many_solve(matrices, vectors), exact, rtol=tolerance, atol=tolerance)
+
+
+@pytest.mark.parametrize("d", DIMENSIONS)
+def test_a_singular_matrix_gives_nonfinite_numbers(d):
+    matrices = np.zeros((COUNT, d, d), np.float32)
+    matrices[:, : d - 1, : d - 1] = np.eye(d - 1)  # the last row and column vanish
+    vectors = np.ones((COUNT, d), np.float32)
+    assert not np.isfinite(many_solve(matrices, vectors)).all(1).any()
+
+
+def test_ten_dimensions(x64):
+    rng = np.random.default_rng(10)
+    matrices = with_singular_values(rng, np.geomspace(1e-6, 1, 10))
+    vectors = rng.standard_normal((COUNT, 10))
+    solved = np.asarray(many_solve(matrices, vectors))
+    residual = np.einsum("nij,nj->ni", matrices, solved) - vectors
+    np.testing.assert_allclose(residual, 0, atol=1e-8)
+    np.testing.assert_allclose(
+        many_polar_factor(matrices), polar_factor_by_svd(matrices), atol=1e-8
+    )
+
+
+@pytest.mark.parametrize("d", DIMENSIONS)
+def test_cholesky_equals_numpys(d, precision):
+    rng = np.random.default_rng(d)
+    roots = with_singular_values(rng, np.linspace(1, 3, d))
+    matrices = (roots @ roots.swapaxes(1, 2)).astype(precision)
+    np.testing.assert_allclose(
+        many_cholesky(matrices), np.linalg.cholesky(matrices), atol=TOLERANCE[precision]
+    )
+
+
+def test_cholesky_of_an_indefinite_matrix_is_nan():
+    indefinite = np.resize([[1.0, 2.0], [2.0, 1.0]], (COUNT, 2, 2)).astype(np.float32)
+    assert np.isnan(many_cholesky(indefinite)).any((1, 2)).all()
+
+
+@pytest.mark.parametrize("d", DIMENSIONS)
+def test_polar_factor_equals_that_of_the_svd(d, precision):
+    rng = np.random.default_rng(d)
+    matrices = with_singular_values(rng, np.linspace(1, 3, d))
+    assert {-1, 1} == set(np.sign(np.linalg.det(matrices)))
+    factors = many_polar_factor(matrices.astype(precision))
+    assert factors.dtype == precision
+    np.testing.assert_allclose(factors, polar_factor_by_svd(matrices), atol=TOLERANCE[precision])
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_polar_factor_of_a_scaled_orthogonal_matrix_is_that_matrix(d, precision):
+    # All singular values agree, where the derivative of an SVD does not exist.
+    orthogonal = random_orthogonal(np.random.default_rng(d), d)
+    scaled = np.resize([1e-3, 1, 1e3], (COUNT, 1, 1)) * orthogonal
+    factors = many_polar_factor(scaled.astype(precision))
+    np.testing.assert_allclose(factors, orthogonal, atol=1e-6)
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_polar_factor_of_an_ill_conditioned_matrix(d, x64):
+    rng = np.random.default_rng(d)
+    matrices = with_singular_values(rng, np.geomspace(1e-6, 1, d))
+    factors = np.asarray(many_polar_factor(matrices))
+    gram = factors @ factors.swapaxes(1, 2)
+    np.testing.assert_allclose(gram, np.broadcast_to(np.eye(d), gram.shape), atol=1e-13)
+    np.testing.assert_allclose(factors, polar_factor_by_svd(matrices), atol=1e-8)
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_the_derivative_of_polar_factor_is_the_limit_of_differences(d, x64):
+    rng, step = np.random.default_rng(d), 1e-5
+    matrices = with_singular_values(rng, np.linspace(1, 3, d))
+    matrices[:4] = 2 * random_orthogonal(rng, d)[:4]  # repeated singular values
+    directions = rng.standard_normal(matrices.shape)
+    slope = lambda m, v: jnp.tensordot(jax.jacfwd(polar_factor)(m), v)
+    differences = many_polar_factor(matrices + step * directions)
+    differences -= many_polar_factor(matrices - step * directions)
+    np.testing.assert_allclose(
+        jax.jit(jax.vmap(slope))(matrices, directions), differences / (2 * step), atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("function", [inverse, polar_factor])
+def test_reverse_mode_agrees_with_forward_mode(d, function, x64):
+    rng = np.random.default_rng(d)
+    matrix, weights = with_singular_values(rng, np.linspace(1, 3, d))[0], rng.random((d, d))
+    direction = rng.standard_normal((d, d))
+    value = lambda m: jnp.sum(weights * function(m))
+    gradient = jax.jit(jax.grad(value))(matrix)
+    _, slope = jax.jit(lambda m, v: jax.jvp(value, (m,), (v,)))(matrix, direction)
+    assert np.all(np.isfinite(gradient))
+    np.testing.assert_allclose(np.sum(gradient * direction), slope, atol=1e-10)
+
+
+def test_safe_norm_is_the_norm_with_derivative_zero_at_zero():
+    vectors = jnp.array([[3.0, 4.0], [0.0, 0.0]])
+    norms, gradients = jax.vmap(jax.value_and_grad(safe_norm))(vectors)
+    np.testing.assert_allclose(norms, [5, 0])
+    np.testing.assert_allclose(gradients, [[0.6, 0.8], [0, 0]])
+
+
+@pytest.mark.parametrize("d", [2, 6])
+def test_all_finite_sees_every_coordinate(d):
+    assert all_finite(jnp.ones(d))
+    for value in [np.nan, np.inf, -np.inf]:
+        for i in range(d):
+            assert not all_finite(jnp.ones(d).at[i].set(value))
+    assert not all_finite(jnp.ones(d).at[0].set(np.inf).at[1].set(-np.inf))
+
+
+@pytest.mark.parametrize("d", [3, 5])
+def test_no_lapack_call_is_compiled(d):
+    matrices = jnp.broadcast_to(jnp.eye(d), (4, d, d))
+    text = lambda function: jax.jit(jax.vmap(function)).lower(matrices).as_text().lower()
+    assert "custom_call" in text(jnp.linalg.inv)  # so the search would find one
+    for function in [inverse, cholesky, polar_factor, jax.jacfwd(polar_factor)]:
+        assert "custom_call" not in text(function)
+        assert "lapack" not in text(function)
