@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, ArrayLike
 
 # Anything `jnp.asarray` takes: an array, a number, a (nested) list of numbers.
@@ -13,7 +13,7 @@ Numbers = ArrayLike | Sequence[Any]
 
 
 def as_real(name: str, value: Numbers) -> Array:
-    """`value` as an array of real numbers; integers become weakly typed floats.
+    """`value` as an array, which must be of floating point or whole numbers.
 
     Raises `TypeError`, naming the argument, for anything else.
     """
@@ -21,11 +21,15 @@ def as_real(name: str, value: Numbers) -> Array:
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise TypeError(f"`{name}` must be real numbers in an array; got {value!r}.") from error
-    if jnp.issubdtype(array.dtype, jnp.integer):
-        return lax.convert_element_type(array, float)
-    if not jnp.issubdtype(array.dtype, jnp.floating):
+    if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer)):
         raise TypeError(f"`{name}` must be real numbers; got dtype {array.dtype}.")
     return array
+
+
+def as_floating(name: str, value: Numbers) -> Array:
+    """`value` as an array of floating point numbers, whole numbers in JAX's default type."""
+    array = as_real(name, value)
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
 
 
 def is_traced(*trees) -> bool:

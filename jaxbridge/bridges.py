@@ -18,7 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from .arrays import Numbers, as_real, is_traced
+from .arrays import Numbers, as_floating, is_traced
 from .coupling import AbstractCoupling, Coupling
 from .diffusion import Diffusion
 from .intervals import Intervals, as_intervals, check_count, check_model
@@ -272,7 +272,10 @@ def _search(
         jnp.zeros((num_rows, num_stored, d), inputs.intervals.start.dtype),
         jnp.full(num_rows, num_steps + 1, jnp.int32),
         jnp.zeros(num_rows, jnp.int32),
-        *(nothing,) * 4,
+        nothing,
+        nothing,
+        nothing,
+        nothing,
         progress_meter.init(),
     )
     search = lax.while_loop(lambda search: jnp.any(pending(search)), one_round, search)
@@ -355,7 +358,7 @@ def _stored_steps(
 ) -> Int[Array, " K"] | None:
     if save_at is None:
         return None
-    save_at = as_real("save_at", save_at)
+    save_at = as_floating("save_at", save_at)
     if save_at.ndim != 1 or save_at.shape[0] == 0:
         raise ValueError(f"`save_at` must be times in an array of shape (K,); got {save_at.shape}.")
     steps = save_at / jnp.asarray(duration) * num_steps

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Key
 
-from .arrays import as_real, is_traced
+from .arrays import as_floating, is_traced
 from .linalg import dot, matmul, matvec, polar_factor
 from .meeting import (
     AbstractMeeting,
@@ -154,7 +154,7 @@ class Coupling(AbstractCoupling):
         rotation: Rotation | None = None,
     ):
         law, gamma = (gamma, jnp.nan) if callable(gamma) else (None, gamma)
-        self.gamma = as_real("gamma", gamma)
+        self.gamma = as_floating("gamma", gamma)
         self.meeting = BrownianCrossing() if meeting is None else meeting
         self.scheme = Heun() if scheme is None else scheme
         self.rotation = rotation

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Key, PyTree
 
-from .arrays import Numbers, as_real, is_traced
+from .arrays import Numbers, as_floating, is_traced
 from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
 
 
@@ -310,7 +310,7 @@ def _check_value(name: str, value: Array, shape: tuple, x: Float[Array, " d"]) -
 
 
 def _check_constant_sigma(sigma: Numbers) -> Array:
-    sigma = as_real("diffusion", sigma)
+    sigma = as_floating("diffusion", sigma)
     square = sigma.ndim == 2 and sigma.shape[0] == sigma.shape[1]
     if not (square or sigma.ndim == 1):
         raise ValueError(

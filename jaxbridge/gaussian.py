@@ -22,7 +22,7 @@ import jax.scipy.linalg
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .arrays import Numbers, as_real, is_traced
+from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Diffusion, check_invertible
 from .intervals import as_intervals
 from .linalg import dot, matvec
@@ -41,7 +41,8 @@ class GaussianLaw(NamedTuple):
 
     def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
         """The normalised log density at a point."""
-        return jax.scipy.stats.multivariate_normal.logpdf(x, self.mean, self.covariance)
+        value = jax.scipy.stats.multivariate_normal.logpdf(x, self.mean, self.covariance)
+        return jnp.asarray(value)
 
 
 class OrnsteinUhlenbeckParams(NamedTuple):
@@ -86,15 +87,15 @@ def ornstein_uhlenbeck(
         model.reverse_drift(jnp.array([1.0, 0.0]))  # Array([-1.5, -1. ], dtype=float32)
         ```
     """
-    B = as_real("B", B)
+    B = as_floating("B", B)
     if B.ndim != 2 or B.shape[0] != B.shape[1]:
         raise ValueError(f"`B` must be a square matrix, shape (d, d); got {B.shape}.")
     d = B.shape[0]
-    mean = jnp.zeros(d, B.dtype) if mean is None else as_real("mean", mean)
+    mean = jnp.zeros(d, B.dtype) if mean is None else as_floating("mean", mean)
     if mean.shape != (d,):
         raise ValueError(f"`mean` must have shape ({d},) to fit `B`; got {mean.shape}.")
     if sigma is not None:
-        sigma = as_real("sigma", sigma)
+        sigma = as_floating("sigma", sigma)
         if sigma.shape not in ((d,), (d, d)):
             raise ValueError(f"`sigma` must have shape ({d}, {d}) or ({d},); got {sigma.shape}.")
         check_invertible("sigma", sigma)
@@ -207,7 +208,7 @@ def gaussian_bridge(
     if batched or several:
         raise ValueError("`gaussian_bridge` is for one interval; use `jax.vmap` for several.")
     a, b, total = (leaf[0].astype(params.B.dtype) for leaf in intervals)
-    times = as_real("times", times).astype(params.B.dtype)
+    times = as_floating("times", times).astype(params.B.dtype)
     if times.ndim != 1:
         raise ValueError(f"`times` must have shape (K,); got {times.shape}.")
     if not is_traced(times, total) and not (

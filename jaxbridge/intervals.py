@@ -58,7 +58,8 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
     num_intervals = max(lengths, default=1)
     d = points["start"].shape[-1]
     intervals = Intervals(
-        *(jnp.broadcast_to(p, (num_intervals, d)).astype(dtype) for p in points.values()),
+        jnp.broadcast_to(points["start"], (num_intervals, d)).astype(dtype),
+        jnp.broadcast_to(points["end"], (num_intervals, d)).astype(dtype),
         jnp.broadcast_to(duration, (num_intervals,)).astype(dtype),
     )
     return intervals, bool(lengths), duration.ndim == 1
@@ -112,5 +113,7 @@ def _coefficients(model: Diffusion, points: Float[Array, "n d"]):
 
 def _working_dtype(*arrays: Array) -> jnp.dtype:
     """The widest floating point type that was given; JAX's default if none was."""
-    given = [array.dtype for array in arrays if not array.weak_type]
-    return max(given, key=lambda dtype: dtype.itemsize, default=jnp.asarray(0.0).dtype)
+    floating = [
+        a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating) and not a.weak_type
+    ]
+    return max(floating, key=lambda dtype: dtype.itemsize, default=jnp.asarray(0.0).dtype)

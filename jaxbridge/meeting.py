@@ -10,7 +10,7 @@ a meeting is a visit of that Brownian motion, from D_i to D_{i+1}, to zero.
 """
 
 from abc import abstractmethod
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -72,7 +72,7 @@ class AbstractMeeting(eqx.Module):
     drawn and `uniform` is `None`.
     """
 
-    draws_uniform: eqx.AbstractClassVar[bool]
+    draws_uniform: ClassVar[bool]
 
     @abstractmethod
     def met(
@@ -89,7 +89,7 @@ class SignTest(AbstractMeeting):
     """
 
     radius: Float[Array, ""] | None = None
-    draws_uniform = False
+    draws_uniform: ClassVar[bool] = False
 
     def __init__(self, radius: float | Float[Array, ""] | None = None):
         self.radius = None if radius is None else jnp.asarray(radius)
@@ -110,7 +110,7 @@ class ReflectionPlane(AbstractMeeting):
     The same test as `SignTest()` where the two share their drift, and off by O(√δ) as well.
     """
 
-    draws_uniform = False
+    draws_uniform: ClassVar[bool] = False
 
     def met(self, step, forward, uniform):
         noise = step.along_u(step.x_next - step.x - forward.drift(step.x) * step.dt)
@@ -125,9 +125,10 @@ class BrownianCrossing(AbstractMeeting):
     with s the variance of the gap per unit of time, 2(1-γ) for the γ-coupling. Off by O(δ).
     """
 
-    draws_uniform = True
+    draws_uniform: ClassVar[bool] = True
 
     def met(self, step, forward, uniform):
+        assert uniform is not None
         gap_next = step.gap_next()
         moving = step.gap_variance > 0  # a gap that does not move is crossed only if closed
         scale = jnp.where(moving, step.gap_variance * step.dt, 1)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key, PyTree
 
-from .arrays import Numbers, is_traced
+from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Diffusion, weighted_divergence
 from .intervals import check_count
 from .linalg import cholesky, dot, matvec
@@ -89,7 +89,8 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
         ```
     """
     dim = check_count("dim", dim)
-    if not is_traced(alpha) and not (np.shape(alpha) == () and 0 < alpha < np.inf):
+    alpha = as_floating("alpha", alpha)
+    if alpha.shape != () or not (is_traced(alpha) or 0 < alpha < np.inf):
         raise ValueError(f"`alpha` must be one positive number; got {alpha}.")
     return Diffusion(
         drift=_hyperbolic_drift,

@@ -78,8 +78,8 @@ def noisy_scan(
         leaf = leaf.reshape(num_stretches * length, *leaf.shape[2:])
         return leaf[num_idle:] if reverse else leaf[:num_steps]
 
-    if slots is not None:
-        slots = split(slots, fill=rows.shape[0] - 1)
+    if store is not None:
+        slots = split(slots, fill=store.rows.shape[0] - 1)
     active = split(jnp.ones(num_steps, dtype=bool)) if num_idle else None
     inputs = (jnp.arange(num_stretches), active, slots, jax.tree.map(split, xs))
     (carry, rows), ys = lax.scan(one_stretch, (init, rows), inputs, reverse=reverse)

@@ -7,6 +7,8 @@ which; what a form does not need is never computed.
 
 from abc import abstractmethod
 
+from typing import Self
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -30,7 +32,7 @@ class AbstractSigma(eqx.Module):
         """`σ⁻¹ v`."""
 
     @abstractmethod
-    def average(self, other: "AbstractSigma") -> "AbstractSigma":
+    def average(self, other: Self) -> Self:
         """`½ (σ + other)`, for two coefficients of one model."""
 
     @abstractmethod

@@ -8,7 +8,7 @@ import lineax as lx
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from .arrays import Numbers, as_real, is_traced
+from .arrays import Numbers, as_floating, is_traced
 from .bridges import check_key
 from .diffusion import Diffusion, Dynamics, ito_correction
 from .intervals import check_count
@@ -52,7 +52,7 @@ def simulate(
     check_key(key)
     num_paths = check_count("num_paths", num_paths)
     num_steps = check_count("num_steps", num_steps)
-    times = as_real("times", times)
+    times = as_floating("times", times)
     if times.ndim != 1 or times.shape[0] < 2:
         raise ValueError(f"`times` must have shape (K,) with K ≥ 2; got {times.shape}.")
     if not is_traced(times) and not np.all(np.diff(times) > 0):
@@ -60,7 +60,7 @@ def simulate(
     start_key, path_key = jax.random.split(key)
     if x0 is None:
         x0 = jax.vmap(model.sample_stationary)(jax.random.split(start_key, num_paths))
-    x0 = as_real("x0", x0)
+    x0 = as_floating("x0", x0)
     if x0.shape[:-1] not in ((), (num_paths,)) or x0.ndim == 0:
         raise ValueError(
             f"`x0` must have shape (d,) or ({num_paths}, d), one for each path; got {x0.shape}."
@@ -106,7 +106,7 @@ def _simulate(key, model, x0, times, num_steps, solver):
             max_steps=num_intervals * num_steps,
             throw=False,
         )
-        return solution.ys
+        return jnp.asarray(solution.ys)
 
     return jax.vmap(one_path)(jax.random.split(key, num_paths), x0)
 
