@@ -7,8 +7,6 @@ which; what a form does not need is never computed.
 
 from abc import abstractmethod
 
-from typing import Self
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -32,7 +30,7 @@ class AbstractSigma(eqx.Module):
         """`σ⁻¹ v`."""
 
     @abstractmethod
-    def average(self, other: Self) -> Self:
+    def average(self, other: "AbstractSigma") -> "AbstractSigma":
         """`½ (σ + other)`, for two coefficients of one model."""
 
     @abstractmethod
@@ -101,6 +99,7 @@ class Diagonal(AbstractSigma):
         return vector / self.diagonal
 
     def average(self, other):
+        assert isinstance(other, Diagonal)
         return Diagonal((self.diagonal + other.diagonal) / 2)
 
     def as_matrix(self, dim, dtype):
@@ -122,6 +121,7 @@ class Full(AbstractSigma):
         return solve(self.matrix, vector)
 
     def average(self, other):
+        assert isinstance(other, Full)
         return Full((self.matrix + other.matrix) / 2)
 
     def as_matrix(self, dim, dtype):
