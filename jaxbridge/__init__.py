@@ -1,4 +1,11 @@
-"""Diffusion bridges by coupling, in JAX."""
+"""Diffusion bridges by coupling, in JAX.
+
+Data flows one way: a model (`diffusion`, `models`, `gaussian`) and a scheme (`schemes`) make
+steps; a coupling (`coupling`) with a meeting rule (`meeting`) makes pairs of paths and joins
+them (`proposals`); a search keeps the pairs that met (`bridges`). Exact laws stand beside
+(`gaussian`), the study of the paper on top (`study`, `plot`). References to equations and
+sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*.
+"""
 
 from .bridges import Bridges as Bridges, sample_bridges as sample_bridges
 from .coupling import (
@@ -21,6 +28,8 @@ from .gaussian import (
 from .meeting import (
     AbstractMeeting as AbstractMeeting,
     BrownianCrossing as BrownianCrossing,
+    Frame as Frame,
+    PairStep as PairStep,
     ReflectionPlane as ReflectionPlane,
     SignTest as SignTest,
 )

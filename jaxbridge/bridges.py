@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from .arrays import Numbers, as_floating, is_traced
 from .coupling import AbstractCoupling, Coupling
-from .diffusion import Diffusion
+from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count, check_model
 from .proposals import Proposals, propose
 
@@ -66,8 +66,7 @@ def sample_bridges(
 
     Their law is that of the diffusion bridge conditioned on being hit by its associated
     diffusion (Theorem 1), close to the bridge's own law for end points that are likely, and
-    closer the longer the duration. The step size adds its own error, O(δ²) with the default
-    scheme and meeting rule where σ is constant.
+    closer the longer the duration. The step size adds its own error.
 
     **Arguments:**
 
@@ -111,6 +110,7 @@ def sample_bridges(
     if not isinstance(coupling, AbstractCoupling):
         raise TypeError(f"`coupling` must be a `Coupling`; got {coupling!r}.")
     check_key(key)
+    check_diffusion(model)
     num_bridges = check_count("num_bridges", num_bridges)
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, several_durations = as_intervals(start, end, duration)
@@ -119,8 +119,8 @@ def sample_bridges(
     stored = _stored_steps(save_at, 1.0 if several_durations else duration, num_steps)
     if max_proposals is None:
         max_proposals = max(1_000 * num_bridges, 100_000)
-    elif not is_traced(max_proposals) and not 1 <= np.asarray(max_proposals) < 2**31:
-        raise ValueError(f"`max_proposals` must be in [1, 2³¹); got {max_proposals}.")
+    elif not is_traced(max_proposals) and not 1 <= np.asarray(max_proposals) <= 2**30:
+        raise ValueError(f"`max_proposals` must be in [1, 2³⁰]; got {max_proposals}.")
     if batch_size is None:
         batch_size = _default_batch_size(intervals, num_bridges, num_steps)
     batch_size = check_count("batch_size", batch_size)
@@ -291,7 +291,7 @@ def _assign_lanes(
     found, tried = search.found.astype(jnp.float32), search.tried.astype(jnp.float32)
     rate = (found + 1) / (tried + 2)
     need = jnp.where(pending, (num_bridges - found) / rate, 0)
-    share = jnp.cumsum(need) / jnp.sum(need)
+    share = jnp.cumsum(need) / jnp.maximum(jnp.sum(need), 1)
     last = jnp.round(share * num_lanes).astype(jnp.int32)
     first = jnp.concatenate([jnp.zeros(1, jnp.int32), last[:-1]])
     lanes = jnp.arange(num_lanes, dtype=jnp.int32)

@@ -50,7 +50,7 @@ class Diffusion(eqx.Module):
     - `drift`: α, a function `(x, params) -> (d,)` of a point `x` of shape (d,), in space per
         unit of time.
     - `diffusion`: σ. `None` is the identity; an array of shape (d, d), or (d,) for a
-        diagonal, is constant; a function `(x, params)` returns one of these shapes. Whether it
+        diagonal, is constant; a function `(x, params)` returns one of these. Whether it
         uses `x` is seen when it is traced: one that does not is constant as well. In space per
         square root of a unit of time. Must be invertible.
     - `log_stationary`: log ν up to a constant, `(x, params) -> ()`.
@@ -118,28 +118,28 @@ class Diffusion(eqx.Module):
         self.params = jax.tree.map(_as_leaf, params)
         self.reversible = reversible
 
-    def drift(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
+    def drift(self, x: Numbers) -> Float[Array, " d"]:
         """α(x), shape (d,)."""
-        x = jnp.asarray(x)
+        x = as_floating("x", x)
         return self.forward(x).drift(x)
 
-    def diffusion(self, x: Float[Array, " d"]) -> Float[Array, "d d"]:
+    def diffusion(self, x: Numbers) -> Float[Array, "d d"]:
         """σ(x) as a dense matrix, shape (d, d)."""
-        x = jnp.asarray(x)
+        x = as_floating("x", x)
         return self.forward(x).sigma(x).as_matrix(x.shape[0], x.dtype)
 
-    def reverse_drift(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
+    def reverse_drift(self, x: Numbers) -> Float[Array, " d"]:
         """α*(x), shape (d,): equation (reversedrift) of the paper.
 
         **Raises:** `ValueError` for a model without `log_stationary` or `reverse_drift` that
         is not declared reversible.
         """
-        x = jnp.asarray(x)
+        x = as_floating("x", x)
         return self.backward(x).drift(x)
 
-    def log_stationary(self, x: Float[Array, " d"]) -> Float[Array, ""]:
+    def log_stationary(self, x: Numbers) -> Float[Array, ""]:
         """log ν(x) up to a constant."""
-        return self._log_stationary_function()(jnp.asarray(x))
+        return self._log_stationary_function()(as_floating("x", x))
 
     def sample_stationary(self, key: Key[Array, ""]) -> Float[Array, " d"]:
         """One draw from ν, shape (d,), by the model's own sampler."""
@@ -150,13 +150,13 @@ class Diffusion(eqx.Module):
             )
         return self._sample_stationary(key, self._prepared_params())
 
-    def reversibility_residual(self, points: Float[Array, "n d"]) -> Float[Array, "n d"]:
+    def reversibility_residual(self, points: Numbers) -> Float[Array, "n d"]:
         """α - ½ (V ∇log ν + div V) at each of the points, shape (n, d).
 
         Zero everywhere if and only if the diffusion is time-reversible: equation
         (timereversible) of the paper, divided by ν.
         """
-        points = jnp.asarray(points)
+        points = as_floating("points", points)
         forward, log_nu = self.forward(points[0]), self._log_stationary_function()
         return jax.vmap(lambda x: forward.drift(x) - _stationary_flux(forward, log_nu, x) / 2)(
             points
@@ -193,10 +193,8 @@ class Diffusion(eqx.Module):
             if _uses_argument(lambda x: diffusion(x, params), like):
                 return Dynamics(drift, sigma, sigma_varies=True)
             constant_sigma = _as_sigma(diffusion(jnp.zeros_like(like), params), like)
-        elif self._constant_sigma is not None:
-            constant_sigma = _as_sigma(self._constant_sigma, like)
         else:
-            constant_sigma = Identity()
+            constant_sigma = _as_sigma(self._constant_sigma, like)
         return Dynamics(drift, lambda x: constant_sigma, sigma_varies=False)
 
     def backward(self, like: Float[Array, " d"]) -> Dynamics:
@@ -271,7 +269,11 @@ def _stationary_flux(
     return weighted_divergence(product, log_nu, x, dynamics.sigma_varies)
 
 
-def _as_sigma(values: Array, x: Float[Array, " d"], constant: bool = True) -> AbstractSigma:
+def _as_sigma(
+    values: Numbers | None, x: Float[Array, " d"], constant: bool = True
+) -> AbstractSigma:
+    if values is None:
+        return Identity()
     d = x.shape[0]
     values = jnp.asarray(values)
     if values.shape not in ((d,), (d, d)):
@@ -299,7 +301,7 @@ def _uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:
     return any_reached(jaxpr.outvars)
 
 
-def _check_value(name: str, value: Array, shape: tuple, x: Float[Array, " d"]) -> Array:
+def _check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) -> Array:
     value = jnp.asarray(value)
     if value.shape != shape:
         raise ValueError(
@@ -319,6 +321,12 @@ def _check_constant_sigma(sigma: Numbers) -> Array:
         )
     check_invertible("diffusion", sigma)
     return sigma
+
+
+def check_diffusion(model) -> None:
+    """Raise `TypeError` for anything but a model."""
+    if not isinstance(model, Diffusion):
+        raise TypeError(f"`model` must be a `jaxbridge.Diffusion`; got {type(model).__name__}.")
 
 
 def check_invertible(name: str, sigma: Array | np.ndarray) -> None:

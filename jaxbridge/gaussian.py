@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import jax.scipy.linalg
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Key
 
 from .arrays import Numbers, as_floating, is_traced
@@ -94,6 +95,8 @@ def ornstein_uhlenbeck(
     mean = jnp.zeros(d, B.dtype) if mean is None else as_floating("mean", mean)
     if mean.shape != (d,):
         raise ValueError(f"`mean` must have shape ({d},) to fit `B`; got {mean.shape}.")
+    if not is_traced(mean) and not np.all(np.isfinite(mean)):
+        raise ValueError(f"`mean` must be finite; got {mean}.")
     if sigma is not None:
         sigma = as_floating("sigma", sigma)
         if sigma.shape not in ((d,), (d, d)):
@@ -110,7 +113,7 @@ def ornstein_uhlenbeck(
             )
     return Diffusion(
         drift=_drift,
-        diffusion=None if sigma is None else _sigma,
+        diffusion=_sigma,
         log_stationary=_log_stationary,
         params=OrnsteinUhlenbeckParams(B, mean, sigma),
         reverse_drift=_reverse_drift,
@@ -138,8 +141,8 @@ def ou_transition(model: Diffusion, start: Float[Array, " d"], duration: Numbers
         ```
     """
     params = _ou_params(model)
-    start = jnp.asarray(start, params.B.dtype)
-    decay, covariance = _decay_and_covariance(params, jnp.asarray(duration, params.B.dtype))
+    start, _, duration = _one_interval(params, start, start, duration)
+    decay, covariance = _decay_and_covariance(params, duration)
     return GaussianLaw(params.mean + decay @ (start - params.mean), covariance)
 
 
@@ -178,7 +181,7 @@ class GaussianBridge(eqx.Module):
             return x, x
 
         start = jnp.broadcast_to(self._start - params.mean, (num_paths, len(self._start)))
-        _, path = jax.lax.scan(step, start, (decay, root, noise))
+        _, path = lax.scan(step, start, (decay, root, noise))
         miss = self._end - params.mean - path[-1]
         correction = jnp.einsum("kij,nj->nki", self._gain, miss)
         return params.mean + jnp.moveaxis(path[:-1], 0, 1) + correction
@@ -204,10 +207,7 @@ def gaussian_bridge(
         ```
     """
     params = _ou_params(model)
-    intervals, batched, several = as_intervals(start, end, duration)
-    if batched or several:
-        raise ValueError("`gaussian_bridge` is for one interval; use `jax.vmap` for several.")
-    a, b, total = (leaf[0].astype(params.B.dtype) for leaf in intervals)
+    a, b, total = _one_interval(params, start, end, duration)
     times = as_floating("times", times).astype(params.B.dtype)
     if times.ndim != 1:
         raise ValueError(f"`times` must have shape (K,); got {times.shape}.")
@@ -281,18 +281,51 @@ def _decay_and_covariance(
 ) -> tuple[Float[Array, "d d"], Float[Array, "d d"]]:
     """e^{-tB} and Γ_t."""
     B, V = params.B, _noise_covariance(params)
-    decay = jax.scipy.linalg.expm(-t * B)
-    stationary = _lyapunov(B, V)
-    # For small t the difference Γ - e^{-tB} Γ e^{-tBᵀ} loses its digits, for large t Van
-    # Loan's block exponential (1978) overflows: each is used where it is accurate.
-    rate = jnp.max(jnp.sum(jnp.abs(B), axis=1))
-    brief = t * rate < 1
-    s = jnp.where(brief, t, 0)
-    block = jax.scipy.linalg.expm(jnp.block([[-B, V], [jnp.zeros_like(B), B.T]]) * s)
     d = B.shape[0]
-    van_loan = block[:d, d:] @ decay.T
-    covariance = jnp.where(brief, van_loan, stationary - decay @ stationary @ decay.T)
+    # By Van Loan's block exponential (1978) over a time s = t / 2^k short enough for it, and
+    # then k times e^{-2sB} = (e^{-sB})², Γ_2s = Γ_s + e^{-sB} Γ_s e^{-sBᵀ}: sums of positive
+    # terms, so no digits are lost for short times and nothing overflows for long ones.
+    rate = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(B), axis=1)))
+    doublings = jnp.ceil(jnp.log2(jnp.maximum(lax.stop_gradient(t) * rate, 1)))
+    s = t / 2**doublings
+    block = jax.scipy.linalg.expm(jnp.block([[-B, V], [jnp.zeros_like(B), B.T]]) * s)
+    decay = block[:d, :d]
+    covariance = block[:d, d:] @ decay.T
+
+    def double(i, moments):
+        decay, covariance = moments
+        doubled = decay @ decay, covariance + decay @ covariance @ decay.T
+        return jax.tree.map(lambda new, old: jnp.where(i < doublings, new, old), doubled, moments)
+
+    decay, covariance = lax.fori_loop(0, _MAX_DOUBLINGS, double, (decay, covariance))
     return decay, (covariance + covariance.T) / 2
+
+
+# Enough for durations of 2^64 times the shortest relaxation time.
+_MAX_DOUBLINGS = 64
+
+
+def _one_interval(
+    params: OrnsteinUhlenbeckParams, start: Numbers, end: Numbers, duration: Numbers
+) -> tuple[Float[Array, " d"], Float[Array, " d"], Float[Array, ""]]:
+    """The end points and the duration, checked and in the precision of the parameters."""
+    intervals, batched, several_durations = as_intervals(start, end, duration)
+    if batched or several_durations:
+        raise ValueError(
+            "`start`, `end` and `duration` must be those of one interval, shapes (d,), (d,) and "
+            "(); use `jax.vmap` for several."
+        )
+    d, dtype = params.B.shape[0], params.B.dtype
+    if intervals.start.shape[1] != d:
+        raise ValueError(
+            f"`start` and `end` must have shape ({d},) to fit the model; "
+            f"got ({intervals.start.shape[1]},)."
+        )
+    return (
+        intervals.start[0].astype(dtype),
+        intervals.end[0].astype(dtype),
+        intervals.duration[0].astype(dtype),
+    )
 
 
 def _ou_params(model: Diffusion) -> OrnsteinUhlenbeckParams:

@@ -79,8 +79,6 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
 
     Shapes are checked wherever the model's functions are traced, so here only values are.
     """
-    if not isinstance(model, Diffusion):
-        raise TypeError(f"`model` must be a `jaxbridge.Diffusion`; got {type(model).__name__}.")
     if is_traced(model, intervals.start, intervals.end):
         return
     for name, points in [("start", intervals.start), ("end", intervals.end)]:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Key
 
 from .arrays import Numbers, as_floating, is_traced
 from .bridges import check_key
-from .diffusion import Diffusion, Dynamics, ito_correction
+from .diffusion import Diffusion, Dynamics, check_diffusion, ito_correction
 from .intervals import check_count
 from .sigma import AbstractSigma, Diagonal
 
@@ -50,6 +50,7 @@ def simulate(
         ```
     """
     check_key(key)
+    check_diffusion(model)
     num_paths = check_count("num_paths", num_paths)
     num_steps = check_count("num_steps", num_steps)
     times = as_floating("times", times)

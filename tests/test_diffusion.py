@@ -407,7 +407,6 @@ def test_a_function_that_returns_a_wrong_shape_is_named(name, method, wrong):
 
 def test_a_model_without_stationary_law_says_what_to_give():
     model = jb.Diffusion(lambda x, p: -x)
-    assert not model.has_reverse_drift
     x = jnp.ones(2)
     for missing, call in [
         ("log_stationary.*reverse_drift.*reversible=True", lambda: model.reverse_drift(x)),

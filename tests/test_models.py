@@ -39,10 +39,10 @@ def test_the_hyperbolic_sampler_is_exact(dim):
     for alpha in [0.3, 2.0]:
         samples = np.asarray(stationary_samples(jb.hyperbolic(alpha, dim)))
         radius = np.linalg.norm(samples, axis=1)
-        distance = lambda a: scipy.stats.kstest(radius, radial_cdf(a, dim)).statistic
         gate = KOLMOGOROV_GATE / np.sqrt(len(radius))
-        assert distance(alpha) < gate
-        assert distance(1.1 * alpha) > gate  # another law fails
+        assert scipy.stats.kstest(radius, radial_cdf(alpha, dim)).statistic < gate
+        # Another law fails.
+        assert scipy.stats.kstest(radius, radial_cdf(1.1 * alpha, dim)).statistic > gate
         # The direction is uniform on the sphere, near the origin and far from it. (Its second
         # moments vary less than those of the normal law by which the gates are set.)
         direction = samples / radius[:, None]
@@ -150,7 +150,9 @@ def Q_reversed(x, p):
 
 PARAMS = {"scale": 0.7, "spread": 0.5, "swirl": 0.6}
 MATRIX_FIELDS = pytest.mark.parametrize(
-    "V, Q", [(None, Q), (V_full, None), (V_diagonal, Q), (V_full, Q)]
+    "V, Q",
+    [(None, Q), (V_full, None), (V_diagonal, Q), (V_full, Q)],
+    ids=["Q", "V", "diagonal V, Q", "V, Q"],
 )
 
 
@@ -188,7 +190,7 @@ def test_a_wrong_drift_is_not_stationary(x64):
 
 
 @MATRIX_FIELDS
-@pytest.mark.parametrize("dim", [2, 5])
+@pytest.mark.parametrize("dim", [2, 3])
 def test_the_reversal_of_the_recipe_turns_Q_around(V, Q, dim, x64):
     model = jb.stationary_diffusion(log_density, V, Q, PARAMS)
     turned = jb.stationary_diffusion(log_density, V, None if Q is None else Q_reversed, PARAMS)

@@ -38,7 +38,7 @@ def joint_law(first, second):
     [
         (None, 20),
         (diffrax.Euler(), 200),
-        (diffrax.SEA(), 20),
+        (diffrax.SEA(), 200),
         (diffrax.ShARK(), 20),
     ],
     ids=["default", "Euler", "SEA", "ShARK"],
@@ -177,8 +177,7 @@ def test_paths_are_differentiable_in_forward_mode():
         ({"times": [0.0, np.nan]}, ValueError, "`times` must increase"),
         ({"x0": 1.0}, ValueError, "`x0` must have shape"),
         ({"x0": np.zeros((3, 2))}, ValueError, "`x0` must have shape"),
-        ({"x0": np.zeros(3)}, ValueError, "`x0`"),
-        ({"x0": [np.nan, 0.0]}, ValueError, "`x0` must be finite"),
+        ({"x0": np.zeros(3)}, ValueError, r"at a point of shape \(3,\)"),
         ({"num_paths": 0}, ValueError, "`num_paths` must be at least 1"),
         ({"num_steps": 0}, ValueError, "`num_steps` must be at least 1"),
         ({"num_steps": 2.0}, TypeError, "`num_steps` must be a Python integer"),

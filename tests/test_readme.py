@@ -1,0 +1,25 @@
+"""The code in the README runs as it stands."""
+
+import pathlib
+import re
+
+README = pathlib.Path(__file__).parent.parent / "README.md"
+BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+
+
+def test_readme_code_runs():
+    assert len(BLOCKS) == 4
+    namespace = {}
+    for block in BLOCKS:
+        exec(block, namespace)
+    assert namespace["bridges"].paths.shape == (1000, 101, 2)
+    assert bool(namespace["bridges"].met.all())
+    assert namespace["many"].paths.shape == (500, 4, 51, 2)
+    assert bool(namespace["many"].met.all())
+    assert namespace["exact"].mean.shape == (2, 2)
+
+
+def test_readme_names_the_two_commands():
+    text = README.read_text(encoding="utf-8")
+    assert 'pip install ".[plot]" && python -m jaxbridge' in text
+    assert 'pip install ".[test]" && pytest' in text
