@@ -7,7 +7,8 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Array, Float
 
-from .gaussian import GaussianLaw
+from .bridges import Bridges
+from .gaussian import GaussianBridge, GaussianLaw
 
 try:
     import matplotlib.pyplot as plt
@@ -124,6 +125,35 @@ def margins_and_copula(
     copula_levels(samples, law.covariance, ax=dependence)
     dependence.set_title("copula", fontsize="medium")
     figure.suptitle(title)
+    return figure
+
+
+def bridges_overview(bridges: Bridges, exact: GaussianBridge) -> Figure:
+    """Two-dimensional bridges: paths with time upwards, and each coordinate's bands with those
+    of the exact law dashed over them."""
+    figure = Figure(figsize=(11, 3.8), layout="constrained")
+    space = figure.add_subplot(1, 3, 1, projection="3d")
+    times, paths = np.asarray(bridges.times, float), np.asarray(bridges.paths, float)
+    for colour, path in zip(_COLOURS[:3], paths, strict=False):
+        space.plot(*path.T, times, color=colour, linewidth=0.9)
+    for end, time in ((paths[0, 0], times[0]), (paths[0, -1], times[-1])):
+        space.scatter(*end, time, color=_EXACT, s=18, depthshade=False)
+    space.set(xlabel="$Z^{(1)}$", ylabel="$Z^{(2)}$", zlabel="time")
+    space.tick_params(labelsize="x-small", pad=0)
+    space.locator_params(nbins=4)
+    space.set_box_aspect((1, 1, 1.6), zoom=0.95)
+    space.view_init(elev=15, azim=-55)
+    for coordinate in range(2):
+        ax = bridge_fan(times, paths, figure.add_subplot(1, 3, coordinate + 2), coordinate)
+        mean = np.asarray(exact.mean, float)[:, coordinate]
+        sd = np.sqrt(np.maximum(np.asarray(exact.covariance, float)[:, coordinate, coordinate], 0))
+        for score in ndtri(np.array([0.05, 0.25, 0.5, 0.75, 0.95])):
+            label = "exact" if score == 0 else None
+            curve = mean + float(score) * sd
+            ax.plot(times, curve, color=_EXACT, linewidth=0.9, linestyle=_DASHES, label=label)
+        bottom, top = ax.get_ylim()
+        ax.set_ylim(bottom - 0.2 * (top - bottom), top)  # room for the legend
+        ax.legend(frameon=False, fontsize="x-small", ncols=2, loc="lower center")
     return figure
 
 

@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Key
 from .bridges import Bridges, sample_bridges
 from .coupling import Coupling
 from .diffusion import Diffusion
-from .gaussian import GaussianLaw, gaussian_bridge, ornstein_uhlenbeck
+from .gaussian import GaussianBridge, GaussianLaw, gaussian_bridge, ornstein_uhlenbeck
 
 Point = tuple[float, float]
 
@@ -178,15 +178,14 @@ def chance(num_bridges: int) -> Chance:
 
 
 def format_table(results: Sequence[Result]) -> str:
-    """The results as a table of 109 columns, in plain characters."""
-    rule = "-" * 109
-    row = "{:<32}  {:>5}  {:<12}  {:>8}  {:>7}  {:>7} {:>7}  {:>7} {:>7}  {:>6} {:>6}"
-    wide = "{:<32}  {:>5}  {:<12}  {:>8}  {:>7}  {:^15}  {:^15}  {:^13}"
+    """The results as a table of 119 columns, in plain characters."""
+    rule = "-" * 119
+    row = "{:<32}  {:>5}  {:<12}  {:>6}  {:>7}  {:>7} {:>7}  {:>7} {:>7}  {:>6} {:>6}"
+    wide = "{:<32}  {:>5}  {:<12}  {:>6}  {:>7}  {:^15}  {:^15}  {:^13}"
+    titles = ("bridge", "gamma", "method", "met", "seconds", "(exact sd)", "(exact sd)", "(KS)")
     lines = [
         wide.format("", "", "", "share", "", "bias of mean", "bias of sd", "distance"),
-        wide.format(
-            "bridge", "gamma", "method", "accepted", "seconds", "(exact sd)", "(exact sd)", "(KS)"
-        ),
+        wide.format(*titles),
     ]
     for bridge, rows in itertools.groupby(results, key=lambda result: result.case.bridge):
         lines.append(rule)
@@ -207,15 +206,16 @@ def format_table(results: Sequence[Result]) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def write_figures(results: Sequence[Result], directory: Path) -> list[Path]:
-    """Per case one PNG, with Q-Q plots of both margins and the copula; all methods together.
+def write_figures(key: Key[Array, ""], results: Sequence[Result], directory: Path) -> list[Path]:
+    """Per case one PNG, with Q-Q plots of both margins and the copula, all methods together;
+    and `bridges.png`, whole paths of the unlikely bridge.
 
     **Raises:** `ImportError` without matplotlib.
     """
     from . import plot
 
-    directory.mkdir(parents=True, exist_ok=True)
-    paths = []
+    paths = [directory / "bridges.png"]
+    plot.bridges_overview(*_whole_bridges(key)).savefig(paths[0], dpi=110)
     for case, by_method in itertools.groupby(results, key=lambda result: result.case):
         group = list(by_method)
         samples = {result.method: result.samples for result in group}
@@ -224,6 +224,16 @@ def write_figures(results: Sequence[Result], directory: Path) -> list[Path]:
         paths.append(directory / f"{case.name.replace(' ', '-')}_gamma_{case.gamma:g}.png")
         figure.savefig(paths[-1], dpi=150)
     return paths
+
+
+def _whole_bridges(key: Key[Array, ""]) -> tuple[Bridges, GaussianBridge]:
+    """Bridges between unlikely points, over a time long enough to see them relax, and their
+    exact law."""
+    model, ends, duration = study_model(), ([0.785, 0.785], [1.091, 1.091]), 3.0
+    bridges = sample_bridges(
+        key, model, *ends, duration, num_bridges=5_000, num_steps=150, coupling=Coupling(0.9)
+    )
+    return bridges, gaussian_bridge(model, *ends, duration, bridges.times)
 
 
 def _timed(function: Callable[[], Bridges]) -> tuple[Bridges, float]:

@@ -1,0 +1,37 @@
+"""The command line."""
+
+import subprocess
+import sys
+
+import pytest
+
+
+def run(*arguments, cwd):
+    command = [sys.executable, "-m", "jaxbridge", *arguments]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+
+
+def test_quick_run_prints_a_table_and_writes_pictures(tmp_path):
+    done = run("--quick", "--out", "pictures", "--seed", "3", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "2,000 bridges a case (--quick" in done.stdout
+    assert done.stdout.count("as published") >= 8
+    assert "[16/16]" in done.stderr
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 9
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--sed", "1"], ["--seed", "-1"], ["--seed", "x"], ["--out", "a-file"]]
+)
+def test_bad_arguments_end_with_one_line(arguments, tmp_path):
+    (tmp_path / "a-file").touch()
+    done = run(*arguments, cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert done.stderr.startswith("python -m jaxbridge: ")
+
+
+def test_help(tmp_path):
+    done = run("--help", cwd=tmp_path)
+    assert done.returncode == 0
+    assert all(option in done.stdout for option in ("--quick", "--seed", "--out"))

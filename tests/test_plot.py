@@ -1,0 +1,59 @@
+"""Pictures show what they say."""
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import jax
+import numpy as np
+import pytest
+import scipy.stats
+from helpers import paper_model
+
+import jaxbridge as jb
+from jaxbridge import plot
+
+
+@pytest.mark.parametrize("correlation", [-0.8, 0.0, 0.6])
+def test_gaussian_copula(correlation):
+    u, v = np.meshgrid([0.1, 0.5, 0.9], [0.2, 0.5, 0.7])
+    law = scipy.stats.multivariate_normal(cov=[[1, correlation], [correlation, 1]])
+    expected = law.cdf(np.stack([scipy.stats.norm.ppf(u), scipy.stats.norm.ppf(v)], -1))
+    np.testing.assert_allclose(plot.gaussian_copula(u, v, correlation), expected, atol=1e-5)
+
+
+def test_empirical_copula_counts_ranks():
+    samples = np.random.default_rng(0).normal(size=(97, 2))
+    grid = np.linspace(0, 1, 11)
+    ranks = scipy.stats.rankdata(samples, axis=0)
+    expected = [
+        [np.mean((ranks[:, 0] <= 97 * u + 1e-9) & (ranks[:, 1] <= 97 * v + 1e-9)) for v in grid]
+        for u in grid
+    ]
+    np.testing.assert_allclose(plot.empirical_copula(samples, 10), expected)
+
+
+def test_qq_of_the_exact_law_lies_on_the_diagonal():
+    quantiles = 2 + 3 * scipy.stats.norm.ppf((np.arange(20_000) + 0.5) / 20_000)
+    ax = plot.qq({"exact draws": quantiles}, 2.0, 3.0)
+    x, y = (values[2:-2] for values in ax.lines[1].get_data())  # tails are interpolated
+    np.testing.assert_allclose(x, y, atol=0.02)
+    _, shifted = plot.qq({"shifted": quantiles + 1}, 2.0, 3.0).lines[1].get_data()
+    np.testing.assert_allclose(shifted[2:-2] - x, 1, atol=0.02)
+
+
+def test_figures_render(tmp_path):
+    model, ends = paper_model(), ([0.0, 0.0], [1.0, 1.0])
+    bridges = jb.sample_bridges(jax.random.key(0), model, *ends, 2.0, num_bridges=200)
+    exact = jb.gaussian_bridge(model, *ends, 2.0, bridges.times)
+    overview = plot.bridges_overview(bridges, exact)
+    # In both coordinates the dashed exact median starts and ends where the bridges do.
+    for coordinate, ax in enumerate(overview.axes[1:]):
+        median = next(line for line in ax.lines if line.get_label() == "exact").get_ydata()
+        np.testing.assert_allclose(median[[0, -1]], [0.0, 1.0], atol=1e-5)
+        assert ax.get_ylabel() == f"$Z^{{({coordinate + 1})}}_t$"
+    law = jb.GaussianLaw(exact.mean[25], exact.covariance[25])
+    panels = plot.margins_and_copula({"bridges": np.asarray(bridges.paths[:, 25])}, law, "title")
+    for name, figure in [("overview", overview), ("panels", panels)]:
+        figure.savefig(tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").stat().st_size > 10_000
