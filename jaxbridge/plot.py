@@ -137,11 +137,11 @@ def bridges_overview(bridges: Bridges, exact: GaussianBridge) -> Figure:
     for colour, path in zip(_COLOURS[:3], paths, strict=False):
         space.plot(*path.T, times, color=colour, linewidth=0.9)
     for end, time in ((paths[0, 0], times[0]), (paths[0, -1], times[-1])):
-        space.scatter(*end, time, color=_EXACT, s=18, depthshade=False)
+        space.plot([end[0]], [end[1]], [time], "o", color=_EXACT, markersize=4)
     space.set(xlabel="$Z^{(1)}$", ylabel="$Z^{(2)}$", zlabel="time")
     space.tick_params(labelsize="x-small", pad=0)
     space.locator_params(nbins=4)
-    space.set_box_aspect((1, 1, 1.6), zoom=0.95)
+    space.set_box_aspect((1, 1, 1.6))
     space.view_init(elev=15, azim=-55)
     for coordinate in range(2):
         ax = bridge_fan(times, paths, figure.add_subplot(1, 3, coordinate + 2), coordinate)
