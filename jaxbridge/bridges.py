@@ -185,7 +185,7 @@ def _sample_bridges(
     num_lanes: int,
     progress_meter: diffrax.AbstractProgressMeter,
 ) -> Bridges:
-    inputs = _Inputs(model, coupling, intervals)
+    inputs = _Inputs(model.prepared(), coupling, intervals)
     search = _search(
         key,
         jax.tree.map(lax.stop_gradient, inputs),

@@ -148,7 +148,7 @@ class Diffusion(eqx.Module):
                 "this model has no sampler of its stationary law: pass `sample_stationary=`, "
                 "a function `(key, params) -> x`, to `Diffusion`."
             )
-        return self._sample_stationary(key, self._prepared_params())
+        return self._sample_stationary(key, self.prepared().params)
 
     def reversibility_residual(self, points: Numbers) -> Float[Array, "n d"]:
         """α - ½ (V ∇log ν + div V) at each of the points, shape (n, d).
@@ -167,6 +167,20 @@ class Diffusion(eqx.Module):
         params = jax.tree.map(_as_leaf, params)
         return eqx.tree_at(lambda m: m.params, self, params, is_leaf=lambda leaf: leaf is None)
 
+    def prepared(self) -> "Diffusion":
+        """The same model with `prepare` done, so that no loop repeats it."""
+        if self._prepare is None:
+            return self
+        return Diffusion(
+            self._drift,
+            self._constant_sigma if self._diffusion is None else self._diffusion,
+            self._log_stationary,
+            self._prepare(self.params),
+            reverse_drift=self._reverse_drift,
+            sample_stationary=self._sample_stationary,
+            reversible=self.reversible,
+        )
+
     def check_reversal(self) -> None:
         """Raise `ValueError` where the time reversal of this model is unknown."""
         if not self.reversible and self._reverse_drift is None and self._log_stationary is None:
@@ -179,7 +193,7 @@ class Diffusion(eqx.Module):
     def forward(self, like: Float[Array, " d"]) -> Dynamics:
         """The coefficients α and σ at points like this one (only its shape and dtype count),
         with everything done that does not depend on the point."""
-        params = self._prepared_params()
+        params = self.prepared().params
 
         def drift(x):
             return _check_value("drift", self._drift(x, params), x.shape, x)
@@ -204,7 +218,7 @@ class Diffusion(eqx.Module):
         if self.reversible:
             return forward
         if self._reverse_drift is not None:
-            params, reverse_drift = self._prepared_params(), self._reverse_drift
+            params, reverse_drift = self.prepared().params, self._reverse_drift
 
             def drift(x):
                 return _check_value("reverse_drift", reverse_drift(x, params), x.shape, x)
@@ -217,15 +231,12 @@ class Diffusion(eqx.Module):
 
         return forward._replace(drift=drift)
 
-    def _prepared_params(self) -> PyTree:
-        return self.params if self._prepare is None else self._prepare(self.params)
-
     def _log_stationary_function(self) -> Callable[[Array], Array]:
         if self._log_stationary is None:
             raise ValueError(
                 "this model has no stationary density: pass `log_stationary=` to `Diffusion`."
             )
-        params, log_stationary = self._prepared_params(), self._log_stationary
+        params, log_stationary = self.prepared().params, self._log_stationary
         return lambda x: _check_value("log_stationary", log_stationary(x, params), (), x)
 
 

@@ -22,7 +22,8 @@ except ImportError as error:
 
 _COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9")  # Okabe & Ito
 _EXACT = "0.15"
-_DASHES = (0, (4, 2))
+_MARKERS = ("o", "^", "s", "D")
+_DASHES = ((0, (6, 3)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
 # Margins and samples come as arrays of either kind.
 Reals = Array | np.ndarray
@@ -44,12 +45,13 @@ def qq(
     largest = max(np.size(values) for values in samples.values())
     reach = mean + sd * np.array([-1, 1]) * _scores(largest)[-1]
     ax.plot(reach, reach, color=_EXACT, linewidth=0.8, label="exact")
-    for colour, (name, values) in zip(_colours(samples), samples.items(), strict=True):
+    for i, (name, values) in enumerate(samples.items()):
         scores = _scores(np.size(values))
         levels = np.asarray(ndtr(scores), float)
         quantiles = np.quantile(np.asarray(values, float), levels, method="hazen")
-        style = {"marker": "o", "markersize": 3.5, "markeredgewidth": 0.8, "linestyle": "none"}
-        ax.plot(mean + sd * scores, quantiles, color=colour, fillstyle="none", label=name, **style)
+        colour, marker = _COLOURS[i % len(_COLOURS)], _MARKERS[i % len(_MARKERS)]
+        style = {"color": colour, "markersize": 3.5, "markeredgewidth": 0.8, "fillstyle": "none"}
+        ax.plot(mean + sd * scores, quantiles, marker, label=name, **style)
     ax.set(xlabel="exact quantile", ylabel="quantile of the bridges")
     return _finish(ax)
 
@@ -75,14 +77,15 @@ def copula_levels(
         return ax.contour(grid, grid, copula.T, levels=list(levels), **style)
 
     u, v = np.meshgrid(grid, grid, indexing="ij")
-    exact = draw(gaussian_copula(u, v, correlation), colors=_EXACT, linewidths=0.8)
-    ax.clabel(exact, fontsize=7, fmt="%g")
+    draw(gaussian_copula(u, v, correlation), colors=_EXACT, linewidths=0.8)
     handles = [Line2D([], [], color=_EXACT, linewidth=0.8, label="exact")]
-    for colour, (name, values) in zip(_colours(samples), samples.items(), strict=True):
-        style = {"linewidths": 1.3, "linestyles": [_DASHES]}
-        draw(empirical_copula(values, resolution), colors=colour, **style)
-        handles.append(Line2D([], [], color=colour, linestyle=_DASHES, label=name))
-    ax.set(xlabel="$u$", ylabel="$v$", aspect="equal")
+    for i, (name, values) in enumerate(samples.items()):
+        colour, dashes = _COLOURS[i % len(_COLOURS)], _DASHES[i % len(_DASHES)]
+        copula = empirical_copula(values, resolution)
+        draw(copula, colors=colour, linewidths=1.4, linestyles=[dashes])
+        handles.append(Line2D([], [], color=colour, linewidth=1.4, linestyle=dashes, label=name))
+    # No labels on the curves: C(1, v) = v, so each ends on the right at its own level.
+    ax.set(xlabel="$u$", ylabel="$v$", xticks=levels, yticks=levels)
     return _finish(ax, handles=handles, loc="lower left")
 
 
@@ -116,14 +119,16 @@ def margins_and_copula(
     samples: Mapping[str, Float[Reals, "n 2"]], law: GaussianLaw, title: str
 ) -> Figure:
     """The figures of section 3: Q-Q plots of both margins and the copula, in one row."""
-    figure = Figure(figsize=(11, 4), layout="constrained")
+    figure = Figure(figsize=(11, 4.1), layout="constrained")
     *margins, dependence = figure.subplots(1, 3)
     for i, ax in enumerate(margins):
         margin = {name: values[:, i] for name, values in samples.items()}
         qq(margin, float(law.mean[i]), float(jnp.sqrt(law.covariance[i, i])), ax)
         ax.set_title(f"coordinate {i + 1}", fontsize="medium")
+        ax.set_box_aspect(1)
     copula_levels(samples, law.covariance, ax=dependence)
-    dependence.set_title("copula", fontsize="medium")
+    dependence.set_title("copula, level curves", fontsize="medium")
+    dependence.set_box_aspect(1)
     figure.suptitle(title)
     return figure
 
@@ -138,7 +143,8 @@ def bridges_overview(bridges: Bridges, exact: GaussianBridge) -> Figure:
         space.plot(*path.T, times, color=colour, linewidth=0.9)
     for end, time in ((paths[0, 0], times[0]), (paths[0, -1], times[-1])):
         space.plot([end[0]], [end[1]], [time], "o", color=_EXACT, markersize=4)
-    space.set(xlabel="$Z^{(1)}$", ylabel="$Z^{(2)}$", zlabel="time")
+    space.set(xlabel="$Z^{(1)}$", ylabel="$Z^{(2)}$")
+    space.set_title("time upwards", fontsize="small")
     space.tick_params(labelsize="x-small", pad=0)
     space.locator_params(nbins=4)
     space.set_box_aspect((1, 1, 1.6))
@@ -150,7 +156,7 @@ def bridges_overview(bridges: Bridges, exact: GaussianBridge) -> Figure:
         for score in ndtri(np.array([0.05, 0.25, 0.5, 0.75, 0.95])):
             label = "exact" if score == 0 else None
             curve = mean + float(score) * sd
-            ax.plot(times, curve, color=_EXACT, linewidth=0.9, linestyle=_DASHES, label=label)
+            ax.plot(times, curve, color=_EXACT, linewidth=0.9, linestyle=_DASHES[0], label=label)
         bottom, top = ax.get_ylim()
         ax.set_ylim(bottom - 0.2 * (top - bottom), top)  # room for the legend
         ax.legend(frameon=False, fontsize="x-small", ncols=2, loc="lower center")
@@ -188,17 +194,12 @@ def empirical_copula(
 
 def _scores(n: int, num_points: int = 61) -> Float[np.ndarray, " num_points"]:
     """Evenly spaced normal scores, out to those of the extremes of n draws."""
-    extreme = min(n, 10**6)
-    last = float(ndtri(1 - 0.5 / extreme))
+    last = -float(ndtri(0.5 / n))
     return np.linspace(-last, last, num_points)
 
 
 def _axes(ax: Axes | None) -> Axes:
     return plt.subplots(layout="constrained")[1] if ax is None else ax
-
-
-def _colours(samples: Mapping) -> list[str]:
-    return [_COLOURS[i % len(_COLOURS)] for i in range(len(samples))]
 
 
 def _finish(ax: Axes, **legend) -> Axes:

@@ -60,7 +60,7 @@ def simulate(
         raise ValueError(f"`times` must increase; got {times}.")
     start_key, path_key = jax.random.split(key)
     if x0 is None:
-        x0 = jax.vmap(model.sample_stationary)(jax.random.split(start_key, num_paths))
+        x0 = jax.vmap(model.prepared().sample_stationary)(jax.random.split(start_key, num_paths))
     x0 = as_floating("x0", x0)
     if x0.shape[:-1] not in ((), (num_paths,)) or x0.ndim == 0:
         raise ValueError(

@@ -77,7 +77,7 @@ class Result(NamedTuple):
 
     `samples`, shape (n, 2), are the bridges at time 1/2 and `law` the exact law there.
     `acceptance` is the share of proposals that met. `seconds` is the time of the run once
-    compiled; `compile_seconds` that of compiling, almost zero where the program was at hand.
+    compiled; `compile_seconds` that of a first call that compiles it, if it was not at hand.
     """
 
     case: Case
@@ -134,8 +134,8 @@ def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> 
             save_at=[0.0, 0.5, 1.0],
         )
 
-    # The bound is traced, so a single proposal compiles the program of the whole run.
-    _, first_seconds = _timed(lambda: bridges(1))
+    # The bound is traced: with one proposal the very program of the run is compiled, hardly run.
+    _, compile_seconds = _timed(lambda: bridges(1))
     result, seconds = _timed(lambda: bridges(None))
     first, middle, last = np.moveaxis(np.asarray(result.paths), 1, 0)
     ends = np.array([case.start, case.end], first.dtype)
@@ -151,7 +151,7 @@ def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> 
         compare(middle, law),
         num_bridges / int(result.num_proposals),
         seconds,
-        first_seconds,
+        compile_seconds,
     )
 
 
@@ -220,6 +220,7 @@ def write_figures(key: Key[Array, ""], results: Sequence[Result], directory: Pat
         group = list(by_method)
         samples = {result.method: result.samples for result in group}
         title = f"{case.bridge.replace('->', '→')} in time 1, at time ½,  γ = {case.gamma:g}"
+        title = title.replace("-", "−")
         figure = plot.margins_and_copula(samples, group[0].law, title)
         paths.append(directory / f"{case.name.replace(' ', '-')}_gamma_{case.gamma:g}.png")
         figure.savefig(paths[-1], dpi=150)

@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax
+import jax.extend
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -416,3 +417,30 @@ def test_a_model_without_stationary_law_says_what_to_give():
     ]:
         with pytest.raises(ValueError, match=missing):
             call()
+
+
+def primitives(jaxpr, inside=None, found=False):
+    """The names of all primitives, or of those inside the loops named `inside`."""
+    names = set()
+    for equation in jaxpr.eqns:
+        if inside is None or found:
+            names.add(equation.primitive.name)
+        for inner in jax.extend.core.jaxprs_in_params(equation.params):
+            here = found or equation.primitive.name == inside
+            names |= primitives(inner, inside, here)
+    return names
+
+
+def test_prepare_runs_outside_every_loop():
+    def prepare(rate):
+        return jnp.linalg.inv(rate * jnp.eye(2))  # by LAPACK, which must not be in a loop
+
+    model = jb.Diffusion(
+        lambda x, p: -p @ x, None, lambda x, p: -x @ p @ x, 1.0, reversible=True, prepare=prepare
+    )
+    jaxpr = jax.make_jaxpr(
+        lambda key: jb.sample_bridges(key, model, [0.0, 0.0], [0.1, 0.0], 1.0).paths
+    )(jax.random.key(0))
+    assert "lu" in primitives(jaxpr.jaxpr)
+    assert "scan" in primitives(jaxpr.jaxpr, inside="while")
+    assert "lu" not in primitives(jaxpr.jaxpr, inside="while")
