@@ -15,10 +15,15 @@ Numbers = ArrayLike | Sequence[Any]
 def as_real(name: str, value: Numbers) -> Array:
     """`value` as an array, which must be of floating point or whole numbers.
 
+    A value that is known stays known while a program around it is traced, so it can be checked.
     Raises `TypeError`, naming the argument, for anything else.
     """
     try:
-        array = jnp.asarray(value)
+        if is_traced(value):
+            array = jnp.asarray(value)
+        else:
+            with jax.ensure_compile_time_eval():
+                array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise TypeError(f"`{name}` must be real numbers in an array; got {value!r}.") from error
     if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer)):
@@ -29,7 +34,10 @@ def as_real(name: str, value: Numbers) -> Array:
 def as_floating(name: str, value: Numbers) -> Array:
     """`value` as an array of floating point numbers, whole numbers in JAX's default type."""
     array = as_real(name, value)
-    return array if jnp.issubdtype(array.dtype, jnp.floating) else array.astype(float)
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    with jax.ensure_compile_time_eval():
+        return array.astype(float)
 
 
 def is_traced(*trees) -> bool:

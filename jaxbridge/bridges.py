@@ -7,7 +7,6 @@ and number only, and its j-th success is the interval's j-th bridge. So the resu
 depend on the number of lanes.
 """
 
-import functools
 from typing import Any, NamedTuple
 
 import diffrax
@@ -72,8 +71,8 @@ def sample_bridges(
 
     - `key`: a typed key, `jax.random.key(...)`.
     - `model`: the diffusion; its time reversal must be known.
-    - `start`, `end`: points, shape (d,), or (I, d) for I intervals at once. Their floating
-        point type is that of the paths.
+    - `start`, `end`: points, shape (d,), or (I, d) for I intervals at once. The widest
+        floating point type of these and the duration is that of the paths.
     - `duration`: the length of the interval, in units of time, shape () or (I,).
     - `num_bridges`: n, how many bridges of each interval.
     - `num_steps`: N, so δ = duration / N. Compile time does not grow with it.
@@ -82,8 +81,8 @@ def sample_bridges(
         and at least 100,000.
     - `save_at`: times in [0, duration] on the grid, increasing, shape (K,), at which paths are
         kept; with several durations, fractions of them. By default the whole grid.
-    - `batch_size`: proposals simulated side by side; bounds memory, does not change results.
-        By default as many as fit in 64 MiB, and no more than are useful.
+    - `batch_size`: proposals simulated side by side; bounds memory, and changes results by
+        rounding only. By default as many as fit in 64 MiB, and no more than are useful.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time where a bridge was not found.
 
@@ -91,8 +90,9 @@ def sample_bridges(
 
     **Gradients** of the paths with respect to `params`, `start`, `end` and `duration`, forward
     and reverse, are those at fixed noise and fixed meeting step: accepted paths are replayed
-    from their keys, only when a derivative is asked for. They are *not* derivatives of
-    expectations over bridges, for whether a pair meets depends on the parameters too.
+    from their keys, all side by side, only when a derivative is asked for. They are *not*
+    derivatives of expectations over bridges, for whether a pair meets depends on the parameters
+    too.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit, as far as their
     values are visible before tracing.
@@ -118,9 +118,11 @@ def sample_bridges(
     model.check_reversal()
     stored = _stored_steps(save_at, 1.0 if several_durations else duration, num_steps)
     if max_proposals is None:
-        max_proposals = max(1_000 * num_bridges, 100_000)
-    elif not is_traced(max_proposals) and not 1 <= np.asarray(max_proposals) <= 2**30:
-        raise ValueError(f"`max_proposals` must be in [1, 2³⁰]; got {max_proposals}.")
+        max_proposals = min(max(1_000 * num_bridges, 100_000), _MOST_PROPOSALS)
+    elif not is_traced(max_proposals):
+        max_proposals = check_count("max_proposals", max_proposals)
+        if max_proposals > _MOST_PROPOSALS:
+            raise ValueError(f"`max_proposals` must be at most 2³⁰; got {max_proposals}.")
     if batch_size is None:
         batch_size = _default_batch_size(intervals, num_bridges, num_steps)
     batch_size = check_count("batch_size", batch_size)
@@ -149,6 +151,10 @@ def sample_bridges(
     if batched:
         return bridges
     return Bridges(bridges.times, *(leaf[0] for leaf in bridges[1:]))
+
+
+# Proposals are numbered in 32 bits.
+_MOST_PROPOSALS = 2**30
 
 
 class _Search(NamedTuple):
@@ -188,7 +194,7 @@ def _sample_bridges(
     inputs = _Inputs(model.prepared(), coupling, intervals)
     search = _search(
         key,
-        jax.tree.map(lax.stop_gradient, inputs),
+        jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs),
         max_proposals,
         stored,
         num_bridges,
@@ -247,7 +253,7 @@ def _search(
         row = jnp.where(success & needed, interval * num_bridges + rank, num_rows)
 
         def keep(rows, values):
-            return rows.at[row].set(values, mode="drop", unique_indices=False)
+            return rows.at[row].set(values, mode="drop")
 
         def count(lanes):
             return jax.ops.segment_sum(
@@ -292,7 +298,8 @@ def _assign_lanes(
     rate = (found + 1) / (tried + 2)
     need = jnp.where(pending, (num_bridges - found) / rate, 0)
     share = jnp.cumsum(need) / jnp.maximum(jnp.sum(need), 1)
-    last = jnp.round(share * num_lanes).astype(jnp.int32)
+    # Rounded sums of floats need not increase, and an interval's lanes must not overlap the next's.
+    last = lax.cummax(jnp.round(share * num_lanes).astype(jnp.int32)).at[-1].set(num_lanes)
     first = jnp.concatenate([jnp.zeros(1, jnp.int32), last[:-1]])
     lanes = jnp.arange(num_lanes, dtype=jnp.int32)
     interval = jnp.searchsorted(last, lanes, side="right").astype(jnp.int32)
@@ -307,6 +314,7 @@ def _propose_numbered(
     num_steps: int,
     stored: Int[Array, " K"] | None,
     meeting_step: Int[Array, " lanes"] | None = None,
+    time_scale: Float[Array, " lanes"] | float = 1.0,
 ) -> Proposals:
     """The proposals with these numbers, of these intervals: a function of nothing else."""
     fold_in = jax.vmap(jax.random.fold_in)
@@ -318,14 +326,14 @@ def _propose_numbered(
         keys,
         start[interval].T,
         end[interval].T,
-        duration[interval] / num_steps,
+        duration[interval] * time_scale / num_steps,
         num_steps,
         stored,
         meeting_step,
     )
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(3,))
+@eqx.filter_custom_jvp
 def _with_replayed_tangents(inputs, accepted, paths, num_steps):
     """`paths`, whose tangents come from a replay of the accepted proposals.
 
@@ -334,15 +342,18 @@ def _with_replayed_tangents(inputs, accepted, paths, num_steps):
     return paths
 
 
-@_with_replayed_tangents.defjvp
-def _replay_tangents(num_steps, primals, tangents):
-    inputs, (key, interval, number, stored, rho), paths = primals
+@_with_replayed_tangents.def_jvp
+def _replay_tangents(primals, tangents):
+    inputs, (key, interval, number, stored, rho), paths, num_steps = primals
 
     def replay(inputs):
-        made = _propose_numbered(inputs, key, interval, number, num_steps, stored, rho)
+        # A row without a bridge replays a proposal of no duration, which cannot overflow: its
+        # tangent is masked by the caller, and in reverse mode 0 · ∞ would be NaN.
+        brief = jnp.where(rho <= num_steps, 1, 1e-12).astype(paths.dtype)
+        made = _propose_numbered(inputs, key, interval, number, num_steps, stored, rho, brief)
         return jnp.moveaxis(made.paths, -1, 0)
 
-    return paths, jax.jvp(replay, (inputs,), (tangents[0],))[1]
+    return paths, eqx.filter_jvp(replay, (inputs,), (tangents[0],))[1]
 
 
 def check_key(key) -> None:
@@ -361,23 +372,29 @@ def _stored_steps(
     save_at = as_floating("save_at", save_at)
     if save_at.ndim != 1 or save_at.shape[0] == 0:
         raise ValueError(f"`save_at` must be times in an array of shape (K,); got {save_at.shape}.")
-    steps = save_at / jnp.asarray(duration) * num_steps
-    nearest = jnp.round(steps)
-    if not is_traced(steps):
-        if np.any(steps < -1e-3) or np.any(steps > num_steps + 1e-3):
-            raise ValueError(f"`save_at` must lie in [0, {duration}]; got {save_at}.")
-        if np.any(np.abs(steps - nearest) > 1e-3):
-            raise ValueError(
-                "`save_at` must lie on the grid of `num_steps` steps: the times nearest to "
-                f"those given are {nearest / num_steps * jnp.asarray(duration)}."
-            )
-        if np.any(np.diff(nearest) <= 0):
-            raise ValueError(f"`save_at` must increase from one grid point on; got {save_at}.")
-    return nearest.astype(jnp.int32)
+    if is_traced(save_at, duration):
+        steps = jnp.round(save_at / jnp.asarray(duration) * num_steps)
+        return jnp.clip(steps, 0, num_steps).astype(jnp.int32)
+    steps = np.asarray(save_at, float) / np.asarray(duration, float) * num_steps
+    nearest = np.round(steps)
+    tolerance = 1e-3 + num_steps * float(jnp.finfo(save_at.dtype).eps)
+    if np.any(steps < -tolerance) or np.any(steps > num_steps + tolerance):
+        raise ValueError(f"`save_at` must lie in [0, {duration}]; got {save_at}.")
+    if np.any(np.abs(steps - nearest) > tolerance):
+        raise ValueError(
+            "`save_at` must lie on the grid of `num_steps` steps: the times nearest to "
+            f"those given are {nearest / num_steps * np.asarray(duration)}."
+        )
+    if np.any(np.diff(nearest) <= 0):
+        raise ValueError(f"`save_at` must increase from one grid point on; got {save_at}.")
+    return jnp.asarray(nearest, jnp.int32)
 
 
 def _default_batch_size(intervals: Intervals, num_bridges: int, num_steps: int) -> int:
-    """Lanes: as many as bridges are asked for, within a bound on the memory of their paths."""
+    """Lanes: as many as bridges are asked for, within a bound on the memory of their paths.
+
+    A lane holds the reversed path, the joined one and their noise.
+    """
     num_intervals, d = intervals.start.shape
     bytes_per_lane = 3 * d * (num_steps + 1) * intervals.start.dtype.itemsize
     fitting = 2**26 // bytes_per_lane

@@ -19,6 +19,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from .arrays import as_floating, is_traced
@@ -63,15 +64,19 @@ class AbstractCoupling(eqx.Module):
     Write another coupling by subclassing. Synchronous up to a distance, then reflection:
 
     ```python
+    import equinox as eqx
+    import jax.numpy as jnp
+    import jaxbridge as jb
+
     class SynchronousThenReflection(jb.AbstractCoupling):
         distance: float = 1.0
         meeting: jb.AbstractMeeting = jb.BrownianCrossing()
         scheme: jb.AbstractScheme = jb.Heun()
-        rotation: Callable | None = eqx.field(default=None, static=True)
+        rotation: object = eqx.field(default=None, static=True)
         independent_noise = False
 
         def driven_noise(self, frame, dw, du):
-            mirrored = dw - 2 * frame.u * dot(frame.u, dw)
+            mirrored = dw - 2 * frame.u * (frame.u @ dw)
             return jnp.where(frame.gap > self.distance, dw, mirrored)
 
         def driving_noise(self, frame, driven_dw, du):
@@ -166,9 +171,9 @@ class Coupling(AbstractCoupling):
                     f"`gamma` must be a scalar, got shape {self.gamma.shape}; use `jax.vmap` "
                     "for several values, or pass a function `key -> gamma`."
                 )
-            if not -1 <= self.gamma < 1:
+            if not -1 <= np.asarray(self.gamma) < 1:
                 raise ValueError(f"`gamma` must be in [-1, 1), got {gamma}.")
-            reflection = bool(self.gamma == -1)
+            reflection = bool(np.asarray(self.gamma) == -1)
         self.independent_noise = not reflection
         if isinstance(self.meeting, ReflectionPlane) and not reflection:
             raise ValueError(
@@ -200,7 +205,9 @@ class Coupling(AbstractCoupling):
         """{I - (1-γ)Π} w + √(1-γ²) u ΔU: symmetric, so it serves both directions."""
         along = -(1 - self.gamma) * dot(frame.u, dw)
         if du is not None:
-            along += jnp.sqrt((1 - self.gamma) * (1 + self.gamma)) * du
+            own = (1 - self.gamma) * (1 + self.gamma)
+            positive = own > 0  # at a traced γ = -1 the root has no derivative
+            along += jnp.where(positive, jnp.sqrt(jnp.where(positive, own, 1)), 0) * du
         return dw + frame.u * along
 
 

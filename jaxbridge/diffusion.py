@@ -148,7 +148,7 @@ class Diffusion(eqx.Module):
                 "this model has no sampler of its stationary law: pass `sample_stationary=`, "
                 "a function `(key, params) -> x`, to `Diffusion`."
             )
-        return self._sample_stationary(key, self.prepared().params)
+        return self._sample_stationary(key, self._prepared_params())
 
     def reversibility_residual(self, points: Numbers) -> Float[Array, "n d"]:
         """α - ½ (V ∇log ν + div V) at each of the points, shape (n, d).
@@ -175,7 +175,7 @@ class Diffusion(eqx.Module):
             self._drift,
             self._constant_sigma if self._diffusion is None else self._diffusion,
             self._log_stationary,
-            self._prepare(self.params),
+            self._prepared_params(),
             reverse_drift=self._reverse_drift,
             sample_stationary=self._sample_stationary,
             reversible=self.reversible,
@@ -193,7 +193,7 @@ class Diffusion(eqx.Module):
     def forward(self, like: Float[Array, " d"]) -> Dynamics:
         """The coefficients α and σ at points like this one (only its shape and dtype count),
         with everything done that does not depend on the point."""
-        params = self.prepared().params
+        params = self._prepared_params()
 
         def drift(x):
             return _check_value("drift", self._drift(x, params), x.shape, x)
@@ -218,7 +218,7 @@ class Diffusion(eqx.Module):
         if self.reversible:
             return forward
         if self._reverse_drift is not None:
-            params, reverse_drift = self.prepared().params, self._reverse_drift
+            params, reverse_drift = self._prepared_params(), self._reverse_drift
 
             def drift(x):
                 return _check_value("reverse_drift", reverse_drift(x, params), x.shape, x)
@@ -231,12 +231,15 @@ class Diffusion(eqx.Module):
 
         return forward._replace(drift=drift)
 
+    def _prepared_params(self) -> PyTree:
+        return self.params if self._prepare is None else self._prepare(self.params)
+
     def _log_stationary_function(self) -> Callable[[Array], Array]:
         if self._log_stationary is None:
             raise ValueError(
                 "this model has no stationary density: pass `log_stationary=` to `Diffusion`."
             )
-        params, log_stationary = self.prepared().params, self._log_stationary
+        params, log_stationary = self._prepared_params(), self._log_stationary
         return lambda x: _check_value("log_stationary", log_stationary(x, params), (), x)
 
 
@@ -353,4 +356,6 @@ def check_invertible(name: str, sigma: Array | np.ndarray) -> None:
 
 def _as_leaf(leaf):
     # `asarray` keeps Python numbers weakly typed, so they follow the precision of the points.
-    return jnp.asarray(leaf) if isinstance(leaf, int | float | np.ndarray | np.generic) else leaf
+    if isinstance(leaf, int | float) and not isinstance(leaf, bool):
+        return jnp.asarray(float(leaf))
+    return jnp.asarray(leaf) if isinstance(leaf, bool | np.ndarray | np.generic) else leaf

@@ -82,7 +82,10 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
     if is_traced(model, intervals.start, intervals.end):
         return
     for name, points in [("start", intervals.start), ("end", intervals.end)]:
-        drift, sigma, slopes = jax.device_get(_coefficients(model, points))
+        coefficients = _coefficients(model, points)
+        if is_traced(coefficients):  # the model's functions close over traced values
+            return
+        drift, sigma, slopes = jax.device_get(coefficients)
         for value in (drift, sigma):
             bad = ~np.all(np.isfinite(value).reshape(len(points), -1), axis=1)
             if bad.any():

@@ -90,7 +90,7 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     """
     dim = check_count("dim", dim)
     alpha = as_floating("alpha", alpha)
-    if alpha.shape != () or not (is_traced(alpha) or 0 < alpha < np.inf):
+    if alpha.shape != () or not (is_traced(alpha) or 0 < np.asarray(alpha) < np.inf):
         raise ValueError(f"`alpha` must be one positive number; got {alpha}.")
     return Diffusion(
         drift=_hyperbolic_drift,
@@ -177,7 +177,7 @@ class _HyperbolicSampler:
 
     and the direction is uniform. For even dim this is a mixture of gamma laws. For odd dim,
     (t+2)^{a+½} times `√t + √2 ≥ √(t+2) ≥ (1+t)/√(t+2)` gives such a mixture, from which a draw
-    is accepted with probability `(1+t) / (√(t+2) (√t+√2))`, never less than 0.44.
+    is accepted with probability `(1+t) / (√(t+2) (√t+√2))`, never less than 0.43.
     """
 
     dim: int
@@ -202,7 +202,7 @@ class _HyperbolicSampler:
         if self.dim % 2 == 0:
             t, _ = propose(key)
         else:
-            # After 100 refusals, of probability 0.56^100, the next proposal is taken as it is.
+            # After 100 refusals, of probability below 0.57^100, the next is taken as it is.
             def again(state):
                 attempt, (_, accepted) = state
                 return ~accepted & (attempt < 100)

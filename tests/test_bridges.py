@@ -6,6 +6,7 @@ import sys
 import textwrap
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,6 +25,7 @@ from reference import approximate_bridges
 
 import jaxbridge as jb
 import jaxbridge.bridges
+from jaxbridge.bridges import _assign_lanes, _Search
 from jaxbridge.proposals import propose
 
 NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
@@ -322,6 +324,33 @@ def test_progress_is_shown_on_request(capfd):
     assert "0.00%" in printed and "100.00%" in printed
 
 
+def test_lanes_of_each_interval_carry_consecutive_numbers():
+    """Whatever the rounding: places 0, 1, ... without gaps, and no lane for those done."""
+    num_intervals, num_lanes = 5_000, 8_192
+    assign = jax.jit(_assign_lanes, static_argnums=(2, 3))
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        tried = rng.integers(0, 60, num_intervals)
+        found = (rng.uniform(size=num_intervals) < 0.5) & (tried > 0)
+        nothing = jnp.zeros(num_intervals, jnp.int32)
+        search = _Search(
+            jnp.zeros((num_intervals, 1, 1)),
+            nothing,
+            nothing,
+            jnp.asarray(found, jnp.int32),
+            jnp.asarray(tried, jnp.int32),
+            nothing,
+            nothing,
+            None,
+        )
+        first, interval, place = map(np.asarray, assign(search, jnp.asarray(~found), 1, num_lanes))
+        assert not found[interval].any()
+        assert (np.diff(interval) >= 0).all() and len(interval) == num_lanes
+        expected = np.arange(num_lanes) - np.searchsorted(interval, interval)
+        np.testing.assert_array_equal(place, expected)
+        np.testing.assert_array_equal(first[interval], np.arange(num_lanes) - expected)
+
+
 # Gradients
 
 
@@ -378,6 +407,50 @@ def test_a_caller_who_asks_for_no_gradient_pays_for_none(monkeypatch):
     assert calls[-1][8] is not None  # the fixed meeting step of a replay
 
 
+def test_gradients_stay_finite_where_no_bridge_was_found():
+    """Some rows have no bridge because every proposal overflowed; masked, they count nothing,
+    in reverse mode too."""
+
+    def masked_sum(rate):
+        model = jb.Diffusion(
+            lambda x, p: -p * x**3, None, lambda x, p: -p * jnp.sum(x**4) / 2, rate
+        )
+        bridges = jb.sample_bridges(
+            jax.random.key(0),
+            model,
+            [[3.0], [0.0]],
+            [[3.2], [0.0]],
+            4.0,
+            num_bridges=2,
+            num_steps=12,
+            coupling=jb.Coupling(0.0, scheme=jb.Euler()),
+            max_proposals=8,
+        )
+        found = bridges.met[..., None, None]
+        return jnp.where(found, bridges.paths, 0).sum(), bridges
+
+    derivative, bridges = jax.grad(masked_sum, has_aux=True)(1.0)
+    assert not bridges.met[0].any() and bridges.met[1].all() and bridges.num_nonfinite[0] == 8
+    assert jnp.isfinite(derivative)
+
+
+def test_derivatives_at_a_traced_reflection_are_finite():
+    def path(start, gamma):
+        bridges = jb.sample_bridges(
+            jax.random.key(0),
+            paper_model(),
+            start,
+            [0.0, 0.5],
+            1.0,
+            num_steps=10,
+            coupling=jb.Coupling(gamma),
+        )
+        return bridges.paths.sum()
+
+    gradients = jax.vmap(jax.grad(path), in_axes=(None, 0))(jnp.zeros(2), jnp.array([-1.0, 0.5]))
+    assert jnp.isfinite(gradients).all()
+
+
 # Compilation
 
 
@@ -415,6 +488,51 @@ def test_under_jit_and_inside_vmap_over_parameters():
     np.testing.assert_allclose(together, apart, atol=1e-5)
 
 
+def test_arguments_are_checked_inside_jit_too():
+    """Numbers written in a traced function are known, and decide what is compiled."""
+    arguments = (jax.random.key(0), paper_model(), [0.0, 0.0], [0.1, 0.0])
+    sample = lambda duration, **settings: jax.jit(
+        lambda: jb.sample_bridges(*arguments, duration, num_steps=10, **settings)
+    )()
+    with pytest.raises(ValueError, match="`duration` must be positive"):
+        sample(-1.0)
+    with pytest.raises(ValueError, match="`save_at` must lie in"):
+        sample(1.0, save_at=[0.5, 7.0])
+    with pytest.raises(ValueError, match="`gamma` must be in"):
+        jax.jit(lambda: jb.Coupling(1.5).gamma)()
+    couplings = []
+    jax.jit(lambda: couplings.append(jb.Coupling(-1.0, jb.ReflectionPlane())))()
+    assert not couplings[0].independent_noise
+
+
+def test_models_that_close_over_traced_values_can_be_batched():
+    def paths(rate):
+        model = jb.Diffusion(lambda x, p: -rate * x, reversible=True)
+        return jb.sample_bridges(
+            jax.random.key(0), model, [0.0, 0.0], [0.1, 0.0], 1.0, num_steps=10
+        ).paths
+
+    rates = jnp.array([0.5, 1.0])
+    np.testing.assert_allclose(jax.vmap(paths)(rates)[1], paths(1.0), atol=1e-5)
+
+
+def test_params_may_hold_a_neural_network():
+    network = eqx.nn.MLP(2, 2, 8, 1, key=jax.random.key(0))
+    model = jb.Diffusion(
+        lambda x, p: -x + p(x), reverse_drift=lambda x, p: -x - p(x), params=network
+    )
+
+    def loss(model):
+        return jb.sample_bridges(
+            jax.random.key(0), model, [0.0, 0.0], [0.1, 0.0], 2.0, num_steps=10
+        ).paths.sum()
+
+    gradient = eqx.filter_grad(loss)(model)
+    leaves = jax.tree.leaves(eqx.filter(gradient.params, eqx.is_array))
+    assert any((leaf != 0).any() for leaf in leaves)
+    assert all(jnp.isfinite(leaf).all() for leaf in leaves)
+
+
 @pytest.mark.parametrize("scheme", ["Heun", "Euler"])
 def test_sixty_thousand_lanes_with_full_sigma_finish(scheme):
     """Batched LAPACK calls in such a scan can hang XLA's thread pool on CPU for ever."""
@@ -448,7 +566,8 @@ def test_sixty_thousand_lanes_with_full_sigma_finish(scheme):
         (dict(num_steps=0), "`num_steps` must be at least 1"),
         (dict(num_bridges=0), "`num_bridges` must be at least 1"),
         (dict(batch_size=0), "`batch_size` must be at least 1"),
-        (dict(max_proposals=0), "`max_proposals` must be in"),
+        (dict(max_proposals=0), "`max_proposals` must be at least 1"),
+        (dict(max_proposals=2**31), "`max_proposals` must be at most"),
         (dict(save_at=[0.0, 0.013]), "`save_at` must lie on the grid"),
         (dict(save_at=[0.0, 1.2]), "`save_at` must lie in"),
         (dict(save_at=[0.5, 0.2]), "`save_at` must increase"),

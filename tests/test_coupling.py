@@ -1,6 +1,8 @@
 """Couplings: marginal and joint laws of the two noises, rotation, user-written couplings."""
 
-import equinox as eqx
+import inspect
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,28 +14,11 @@ from jaxbridge.coupling import AbstractCoupling, polar_rotation, published_rotat
 from jaxbridge.meeting import frame
 from jaxbridge.sigma import Full
 
-
-class SynchronousThenReflection(AbstractCoupling):
-    """The example of the documentation."""
-
-    distance: float = 1.0
-    meeting: jb.AbstractMeeting = jb.BrownianCrossing()
-    scheme: jb.AbstractScheme = jb.Heun()
-    rotation: object = eqx.field(default=None, static=True)
-    independent_noise = False
-
-    def driven_noise(self, frame, dw, du):
-        mirrored = dw - 2 * frame.u * jnp.sum(frame.u * dw)
-        return jnp.where(frame.gap > self.distance, dw, mirrored)
-
-    def driving_noise(self, frame, driven_dw, du):
-        return self.driven_noise(frame, driven_dw, du)
-
-    def gap_variance(self, frame):
-        return jnp.where(frame.gap > self.distance, 0.0, 4.0)
-
-    def realise(self, keys):
-        return self
+# The example of the documentation, as it is printed there.
+_EXAMPLE = re.search(r"```python\n(.*?)```", inspect.cleandoc(AbstractCoupling.__doc__), re.DOTALL)
+_NAMES: dict = {}
+exec(_EXAMPLE[1], _NAMES)
+SynchronousThenReflection = _NAMES["SynchronousThenReflection"]
 
 
 COUPLINGS = [jb.Coupling(g) for g in (-1.0, -0.5, 0.0, 0.5, 0.99)]
