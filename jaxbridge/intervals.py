@@ -82,23 +82,23 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
     if is_traced(model, intervals.start, intervals.end):
         return
     for name, points in [("start", intervals.start), ("end", intervals.end)]:
-        coefficients = _coefficients(model, points)
+        coefficients = _coefficients(model, points, isinstance(scheme, Milstein))
         if is_traced(coefficients):  # the model's functions close over traced values
             return
         drift, sigma, slopes = jax.device_get(coefficients)
         for value in (drift, sigma):
-            bad = ~np.all(np.isfinite(value).reshape(len(points), -1), axis=1)
+            bad = ~np.all(np.isfinite(value).reshape(len(value), -1), axis=1)
             if bad.any():
                 raise ValueError(
                     f"the coefficients of the model are not finite at `{name}` = "
                     f"{points[bad.argmax()]}: is that point inside the state space?"
                 )
+        worst = np.linalg.cond(sigma).argmax()
+        check_invertible(f"diffusion` at `{name}", sigma[worst])
         if slopes is None:
             continue
-        worst = np.linalg.cond(sigma).argmax()
-        check_invertible(f"diffusion(x) at `{name}`", sigma[worst])
         other_coordinates = 1 - np.eye(points.shape[1])[:, None, :]
-        if isinstance(scheme, Milstein) and np.any(slopes * other_coordinates != 0):
+        if np.any(slopes * other_coordinates != 0):
             raise ValueError(
                 "`Milstein` needs diagonal noise in which σ_i depends on x_i alone; here it "
                 "depends on other coordinates too. Choose `Heun` or `Euler`."
@@ -106,10 +106,12 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
 
 
 @eqx.filter_jit
-def _coefficients(model: Diffusion, points: Float[Array, "n d"]):
+def _coefficients(model: Diffusion, points: Float[Array, "n d"], with_slopes: bool):
+    """α and σ at the points, a constant σ only once; ∂σ where it is asked for and varies."""
     varies = model.forward(points[0]).sigma_varies
-    slopes = jax.vmap(jax.jacfwd(model.diffusion))(points) if varies else None
-    return jax.vmap(model.drift)(points), jax.vmap(model.diffusion)(points), slopes
+    sigma = jax.vmap(model.diffusion)(points if varies else points[:1])
+    slopes = jax.vmap(jax.jacfwd(model.diffusion))(points) if varies and with_slopes else None
+    return jax.vmap(model.drift)(points), sigma, slopes
 
 
 def _working_dtype(*arrays: Array) -> jnp.dtype:

@@ -578,6 +578,12 @@ def test_sixty_thousand_lanes_with_full_sigma_finish(scheme):
             "must be invertible",
         ),
         (
+            dict(
+                model=jb.Diffusion(lambda x, p: -x, lambda x, p: np.zeros((2, 2)), reversible=True)
+            ),
+            "must be invertible",
+        ),
+        (
             dict(model=jb.Diffusion(lambda x, p: -1 / x, reversible=True)),
             "not finite at `start`",
         ),
