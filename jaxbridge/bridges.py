@@ -1,13 +1,10 @@
 """Approximate bridges by rejection (section 2.2): propose until the pair meets.
 
-Thousands of proposals run side by side, in lanes. Each round gives every lane to an interval
-that still lacks bridges, more lanes to those that lack more or succeed less often. The
-proposals of an interval are numbered, the random numbers of a proposal depend on its interval
-and number only, and its j-th success is the interval's j-th bridge. So the result does not
-depend on the number of lanes.
+The proposals of an interval are numbered trials (`search`), and its j-th success is the
+interval's j-th bridge.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -15,34 +12,41 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from .arrays import Numbers, as_floating, is_traced
 from .coupling import AbstractCoupling, Coupling
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count, check_model
 from .proposals import Proposals, propose
+from .search import MOST_TRIALS, Trials, default_num_lanes, numbered_keys, search
 
 
-class Bridges(NamedTuple):
-    """What `sample_bridges` returns. With I intervals all but `times` have a leading axis I.
+class Bridges(eqx.Module):
+    """What `sample_bridges` returns. With I intervals arrays have a leading axis I; `times` has
+    it only where there are I durations.
 
-    - `times`: the K stored times, shape (K,), from 0 to the duration; (I, K) for I durations.
+    - `times`: the K stored times, shape (K,), from 0 to the duration.
     - `paths`: the bridges, shape (n, K, d). A bridge that was not found is NaN throughout.
     - `met`: whether the bridge was found, shape (n,).
     - `meeting_step`: ρ, the first step at which the path follows the reversed path, between 1
         and N; -1 where no bridge was found. Shape (n,).
+    - `reverse_start`: the reversed path at time 0, shape (n, d); NaN where no bridge was found.
     - `num_proposals`: proposals made until the last bridge was found, or until the bound.
         `n / num_proposals` estimates the acceptance probability.
     - `num_nonfinite`: how many of them left the finite numbers and were rejected for it.
+    - `coupling`, `num_steps`: those they were made with.
     """
 
-    times: Float[Array, "*I K"]
+    times: Float[Array, "*durations K"]
     paths: Float[Array, "*I n K d"]
     met: Bool[Array, "*I n"]
     meeting_step: Int[Array, "*I n"]
+    reverse_start: Float[Array, "*I n d"]
     num_proposals: Int[Array, "*I"]
     num_nonfinite: Int[Array, "*I"]
+    coupling: AbstractCoupling
+    num_steps: int = eqx.field(static=True)
 
 
 def sample_bridges(
@@ -118,13 +122,14 @@ def sample_bridges(
     model.check_reversal()
     stored = _stored_steps(save_at, 1.0 if several_durations else duration, num_steps)
     if max_proposals is None:
-        max_proposals = min(max(1_000 * num_bridges, 100_000), _MOST_PROPOSALS)
+        max_proposals = min(max(1_000 * num_bridges, 100_000), MOST_TRIALS)
     elif not is_traced(max_proposals):
         max_proposals = check_count("max_proposals", max_proposals)
-        if max_proposals > _MOST_PROPOSALS:
+        if max_proposals > MOST_TRIALS:
             raise ValueError(f"`max_proposals` must be at most 2³⁰; got {max_proposals}.")
     if batch_size is None:
-        batch_size = _default_batch_size(intervals, num_bridges, num_steps)
+        num_wanted = num_bridges * intervals.start.shape[0]
+        batch_size = default_num_lanes(num_wanted, num_steps, intervals.start)
     batch_size = check_count("batch_size", batch_size)
     progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     bridges = _sample_bridges(
@@ -138,6 +143,8 @@ def sample_bridges(
         num_steps,
         batch_size,
         progress_meter,
+        batched,
+        several_durations,
     )
     if throw:
         message = (
@@ -145,29 +152,8 @@ def sample_bridges(
             "the duration or choose a smaller `gamma`."
         )
         paths = eqx.error_if(bridges.paths, ~bridges.met, message)
-        bridges = bridges._replace(paths=paths)
-    if not several_durations:
-        bridges = bridges._replace(times=bridges.times[0])
-    if batched:
-        return bridges
-    return Bridges(bridges.times, *(leaf[0] for leaf in bridges[1:]))
-
-
-# Proposals are numbered in 32 bits.
-_MOST_PROPOSALS = 2**30
-
-
-class _Search(NamedTuple):
-    """The state of the rejection loop; an interval's bridges fill its n rows in order."""
-
-    paths: Float[Array, "rows K d"]
-    rho: Int[Array, " rows"]
-    number: Int[Array, " rows"]  # of the proposal that became this bridge
-    found: Int[Array, " I"]
-    tried: Int[Array, " I"]
-    num_proposals: Int[Array, " I"]
-    num_nonfinite: Int[Array, " I"]
-    meter: Any
+        bridges = eqx.tree_at(lambda b: b.paths, bridges, paths)
+    return bridges
 
 
 class _Inputs(NamedTuple):
@@ -190,125 +176,67 @@ def _sample_bridges(
     num_steps: int,
     num_lanes: int,
     progress_meter: diffrax.AbstractProgressMeter,
+    batched: bool,
+    several_durations: bool,
 ) -> Bridges:
+    (num_intervals, d), dtype = intervals.start.shape, intervals.start.dtype
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_intervals))
     inputs = _Inputs(model.prepared(), coupling, intervals)
-    search = _search(
-        key,
-        jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs),
-        max_proposals,
-        stored,
-        num_bridges,
-        num_steps,
-        num_lanes,
-        progress_meter,
-    )
-    num_intervals, d = intervals.start.shape
-    met = search.rho <= num_steps
-    interval = jnp.repeat(jnp.arange(num_intervals), num_bridges)
-    accepted = (key, interval, search.number, stored, search.rho)
-    paths = _with_replayed_tangents(inputs, accepted, search.paths, num_steps)
-    paths = jnp.where(met[:, None, None], paths, jnp.nan)
-    steps = jnp.arange(num_steps + 1) if stored is None else stored
-    times = steps.astype(paths.dtype) / num_steps * intervals.duration[:, None]
-    shape = (num_intervals, num_bridges)
-    return Bridges(
-        times,
-        paths.reshape(*shape, -1, d),
-        met.reshape(shape),
-        jnp.where(met, search.rho, -1).reshape(shape),
-        search.num_proposals,
-        search.num_nonfinite,
+    fixed = jax.tree.map(
+        lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs
     )
 
+    def trial(interval, number):
+        made = _propose_numbered(fixed, keys, interval, number, num_steps, stored)
+        outputs = (jnp.moveaxis(made.paths, -1, 0), made.reverse_start.T, made.meeting_step)
+        return Trials(made.meeting_step <= num_steps, made.finite, outputs)
 
-def _search(
-    key: Key[Array, ""],
-    inputs: _Inputs,
-    max_proposals: Int[Array, ""],
-    stored: Int[Array, " K"] | None,
-    num_bridges: int,
-    num_steps: int,
-    num_lanes: int,
-    progress_meter: diffrax.AbstractProgressMeter,
-) -> _Search:
-    """Propose, round by round, until every interval has its bridges or has run out of tries."""
-    num_intervals, d = inputs.intervals.start.shape
     num_rows = num_intervals * num_bridges
     num_stored = num_steps + 1 if stored is None else stored.shape[0]
-
-    def pending(search: _Search):
-        return (search.found < num_bridges) & (search.tried < max_proposals)
-
-    def one_round(search: _Search) -> _Search:
-        first, interval, place = _assign_lanes(search, pending(search), num_bridges, num_lanes)
-        number = search.tried[interval] + place
-        made = _propose_numbered(inputs, key, interval, number, num_steps, stored)
-        tried = number < max_proposals
-        success = tried & (made.meeting_step <= num_steps)
-        # The lanes of one interval lie side by side, in the order of their numbers.
-        successes = jnp.cumsum(success, dtype=jnp.int32)
-        successes_before = successes - success.astype(jnp.int32)
-        rank = search.found[interval] + successes_before - successes_before[first[interval]]
-        needed = tried & (rank < num_bridges)
-        row = jnp.where(success & needed, interval * num_bridges + rank, num_rows)
-
-        def keep(rows, values):
-            return rows.at[row].set(values, mode="drop")
-
-        def count(lanes):
-            return jax.ops.segment_sum(
-                lanes.astype(jnp.int32), interval, num_intervals, indices_are_sorted=True
-            )
-
-        found = search.found + count(success & needed)
-        progress = jnp.sum(found).astype(jnp.float32) / num_rows
-        return _Search(
-            keep(search.paths, jnp.moveaxis(made.paths, -1, 0)),
-            keep(search.rho, made.meeting_step),
-            keep(search.number, number),
-            found,
-            search.tried + count(jnp.ones_like(tried)),
-            search.num_proposals + count(needed),
-            search.num_nonfinite + count(needed & ~made.finite),
-            progress_meter.step(search.meter, progress),
-        )
-
-    nothing = jnp.zeros(num_intervals, jnp.int32)
-    search = _Search(
-        jnp.zeros((num_rows, num_stored, d), inputs.intervals.start.dtype),
+    rows = (
+        jnp.zeros((num_rows, num_stored, d), dtype),
+        jnp.full((num_rows, d), jnp.nan, dtype),
         jnp.full(num_rows, num_steps + 1, jnp.int32),
-        jnp.zeros(num_rows, jnp.int32),
-        nothing,
-        nothing,
-        nothing,
-        nothing,
-        progress_meter.init(),
     )
-    search = lax.while_loop(lambda search: jnp.any(pending(search)), one_round, search)
-    progress_meter.close(search.meter)
-    return search
+    everything = jnp.ones(num_intervals, bool)
+    found = search(trial, rows, everything, num_bridges, max_proposals, num_lanes, progress_meter)
+    paths, reverse_start, rho = found.outputs
+    met = rho <= num_steps
+    interval = jnp.repeat(jnp.arange(num_intervals), num_bridges)
+    accepted = (keys, interval, jnp.maximum(found.number, 0), stored, rho)
+    paths = _with_replayed_tangents(inputs, accepted, paths, num_steps)
+    paths = jnp.where(met[:, None, None], paths, jnp.nan)
+
+    return Bridges(
+        stored_times(intervals, stored, num_steps, several_durations),
+        unflatten_rows(paths, num_intervals, batched),
+        unflatten_rows(met, num_intervals, batched),
+        unflatten_rows(jnp.where(met, rho, -1), num_intervals, batched),
+        unflatten_rows(reverse_start, num_intervals, batched),
+        found.num_trials if batched else found.num_trials[0],
+        found.num_nonfinite if batched else found.num_nonfinite[0],
+        coupling,
+        num_steps,
+    )
 
 
-def _assign_lanes(
-    search: _Search, pending: Bool[Array, " I"], num_bridges: int, num_lanes: int
-) -> tuple[Int[Array, " I"], Int[Array, " lanes"], Int[Array, " lanes"]]:
-    """The first lane of each interval; each lane's interval, and its place among that
-    interval's lanes. Lanes go in proportion to the proposals still expected to be needed."""
-    found, tried = search.found.astype(jnp.float32), search.tried.astype(jnp.float32)
-    rate = (found + 1) / (tried + 2)
-    need = jnp.where(pending, (num_bridges - found) / rate, 0)
-    share = jnp.cumsum(need) / jnp.maximum(jnp.sum(need), 1)
-    # Rounded sums of floats need not increase, and an interval's lanes must not overlap the next's.
-    last = lax.cummax(jnp.round(share * num_lanes).astype(jnp.int32)).at[-1].set(num_lanes)
-    first = jnp.concatenate([jnp.zeros(1, jnp.int32), last[:-1]])
-    lanes = jnp.arange(num_lanes, dtype=jnp.int32)
-    interval = jnp.searchsorted(last, lanes, side="right").astype(jnp.int32)
-    return first, interval, lanes - first[interval]
+def unflatten_rows(rows: Shaped[Array, "rows ..."], num_intervals: int, batched: bool) -> Array:
+    """Rows (I × n, ...) as (I, n, ...), or as (n, ...) for the only interval."""
+    return rows.reshape(num_intervals, -1, *rows.shape[1:]) if batched else rows
+
+
+def stored_times(
+    intervals: Intervals, stored: Int[Array, " K"] | None, num_steps: int, several_durations: bool
+) -> Float[Array, "*durations K"]:
+    """The times of the stored steps, for each interval where durations differ."""
+    duration = intervals.duration[:, None] if several_durations else intervals.duration[0]
+    steps = jnp.arange(num_steps + 1) if stored is None else stored
+    return steps.astype(duration.dtype) / num_steps * duration
 
 
 def _propose_numbered(
     inputs: _Inputs,
-    key: Key[Array, ""],
+    keys: Key[Array, " I"],
     interval: Int[Array, " lanes"],
     number: Int[Array, " lanes"],
     num_steps: int,
@@ -317,13 +245,11 @@ def _propose_numbered(
     time_scale: Float[Array, " lanes"] | float = 1.0,
 ) -> Proposals:
     """The proposals with these numbers, of these intervals: a function of nothing else."""
-    fold_in = jax.vmap(jax.random.fold_in)
-    keys = fold_in(jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, interval), number)
     start, end, duration = inputs.intervals
     return propose(
         inputs.model,
         inputs.coupling,
-        keys,
+        numbered_keys(keys, interval, number),
         start[interval].T,
         end[interval].T,
         duration[interval] * time_scale / num_steps,
@@ -344,13 +270,13 @@ def _with_replayed_tangents(inputs, accepted, paths, num_steps):
 
 @_with_replayed_tangents.def_jvp
 def _replay_tangents(primals, tangents):
-    inputs, (key, interval, number, stored, rho), paths, num_steps = primals
+    inputs, (keys, interval, number, stored, rho), paths, num_steps = primals
 
     def replay(inputs):
         # A row without a bridge replays a proposal of no duration, which cannot overflow: its
         # tangent is masked by the caller, and in reverse mode 0 · ∞ would be NaN.
         brief = jnp.where(rho <= num_steps, 1, 1e-12).astype(paths.dtype)
-        made = _propose_numbered(inputs, key, interval, number, num_steps, stored, rho, brief)
+        made = _propose_numbered(inputs, keys, interval, number, num_steps, stored, rho, brief)
         return jnp.moveaxis(made.paths, -1, 0)
 
     return paths, eqx.filter_jvp(replay, (inputs,), (tangents[0],))[1]
@@ -388,14 +314,3 @@ def _stored_steps(
     if np.any(np.diff(nearest) <= 0):
         raise ValueError(f"`save_at` must increase from one grid point on; got {save_at}.")
     return jnp.asarray(nearest, jnp.int32)
-
-
-def _default_batch_size(intervals: Intervals, num_bridges: int, num_steps: int) -> int:
-    """Lanes: as many as bridges are asked for, within a bound on the memory of their paths.
-
-    A lane holds the reversed path, the joined one and their noise.
-    """
-    num_intervals, d = intervals.start.shape
-    bytes_per_lane = 3 * d * (num_steps + 1) * intervals.start.dtype.itemsize
-    fitting = 2**26 // bytes_per_lane
-    return max(1, min(fitting, 8_192, max(num_intervals * num_bridges, 64)))

@@ -27,12 +27,13 @@ from .noise import Store, noisy_scan
 class Proposals(NamedTuple):
     """Joined paths, lanes in the last axis.
 
-    `paths` are kept at the K stored steps. `meeting_step` is ρ, between 1 and N, or N + 1
-    where the pair did not meet; `finite` is false where one of the two paths left the finite
-    numbers before the pair met.
+    `paths` are kept at the K stored steps. `reverse_start` is X_0, the value of the reversed
+    path at time 0. `meeting_step` is ρ, between 1 and N, or N + 1 where the pair did not meet;
+    `finite` is false where one of the two paths left the finite numbers before the pair met.
     """
 
     paths: Float[Array, "K d lanes"]
+    reverse_start: Float[Array, "d lanes"]
     meeting_step: Int[Array, " lanes"]
     finite: Bool[Array, " lanes"]
 
@@ -59,11 +60,11 @@ def propose(
     draws_uniform = rule.draws_uniform and meeting_step is None
     split_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
     reverse_keys, driven_keys, coupling_keys = split_keys
-    coupling, coupling_axes = _realise(coupling, coupling_keys, dtype)
+    coupling, coupling_axes = realise(coupling, coupling_keys, dtype)
     root_dt = jnp.sqrt(dt)
 
     # The reversed path: X_N = b, ..., X_0, kept in forward order as X_1, ..., X_N.
-    @_over_lanes(-1, -1, -1, -1)
+    @over_lanes(-1, -1, -1, -1)
     def step_back(x, dw, dt, root_dt):
         return scheme.step(backward, x, dt, root_dt * dw)
 
@@ -78,7 +79,7 @@ def propose(
     )
 
     # The joined path Z: X' until the pair meets, X from then on.
-    @_over_lanes(-1, -1, -1, -1, -1, -1, None, coupling_axes)
+    @over_lanes(-1, -1, -1, -1, -1, -1, None, coupling_axes)
     def step_joined(x, z, rho, x_next, noise, lane, i, coupling):
         dt, root_dt, fixed_rho = lane
         normal, uniform = noise
@@ -129,10 +130,10 @@ def propose(
         z_path = z_path[:-1]
     # Non-finite numbers stay non-finite from step to step, so the last states tell.
     finite = jnp.all(jnp.isfinite(x_start) & jnp.isfinite(z_end), axis=0) | (rho <= num_steps)
-    return Proposals(z_path, rho, finite)
+    return Proposals(z_path, x_start, rho, finite)
 
 
-def _realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
+def realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
     """Each lane's coupling, and the axes of lanes in its leaves."""
     coupling = jax.tree.map(
         lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, coupling
@@ -142,7 +143,7 @@ def _realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
     return realised, axes
 
 
-def _over_lanes(*in_axes) -> Callable[[Callable], Callable[..., Any]]:
+def over_lanes(*in_axes) -> Callable[[Callable], Callable[..., Any]]:
     return lambda function: jax.vmap(function, in_axes=in_axes, out_axes=-1)
 
 

@@ -25,7 +25,6 @@ from reference import approximate_bridges
 
 import jaxbridge as jb
 import jaxbridge.bridges
-from jaxbridge.bridges import _assign_lanes, _Search
 from jaxbridge.proposals import propose
 
 NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
@@ -322,33 +321,6 @@ def test_progress_is_shown_on_request(capfd):
     jax.effects_barrier()
     printed = capfd.readouterr().out
     assert "0.00%" in printed and "100.00%" in printed
-
-
-def test_lanes_of_each_interval_carry_consecutive_numbers():
-    """Whatever the rounding: places 0, 1, ... without gaps, and no lane for those done."""
-    num_intervals, num_lanes = 5_000, 8_192
-    assign = jax.jit(_assign_lanes, static_argnums=(2, 3))
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        tried = rng.integers(0, 60, num_intervals)
-        found = (rng.uniform(size=num_intervals) < 0.5) & (tried > 0)
-        nothing = jnp.zeros(num_intervals, jnp.int32)
-        search = _Search(
-            jnp.zeros((num_intervals, 1, 1)),
-            nothing,
-            nothing,
-            jnp.asarray(found, jnp.int32),
-            jnp.asarray(tried, jnp.int32),
-            nothing,
-            nothing,
-            None,
-        )
-        first, interval, place = map(np.asarray, assign(search, jnp.asarray(~found), 1, num_lanes))
-        assert not found[interval].any()
-        assert (np.diff(interval) >= 0).all() and len(interval) == num_lanes
-        expected = np.arange(num_lanes) - np.searchsorted(interval, interval)
-        np.testing.assert_array_equal(place, expected)
-        np.testing.assert_array_equal(first[interval], np.arange(num_lanes) - expected)
 
 
 # Gradients

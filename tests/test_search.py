@@ -1,0 +1,68 @@
+"""The search: lanes, numbers and bounds, on trials whose outcomes are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbridge.search import Trials, _assign_lanes, search
+
+
+def test_lanes_of_each_problem_carry_consecutive_numbers():
+    """Whatever the rounding: places 0, 1, ... without gaps, and no lane for those done."""
+    num_problems, num_lanes = 5_000, 8_192
+    assign = jax.jit(_assign_lanes, static_argnums=(3, 4))
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        tried = rng.integers(0, 60, num_problems)
+        found = (rng.uniform(size=num_problems) < 0.5) & (tried > 0)
+        first, problem, place = map(
+            np.asarray,
+            assign(
+                jnp.asarray(found, jnp.int32),
+                jnp.asarray(tried, jnp.int32),
+                jnp.asarray(~found),
+                1,
+                num_lanes,
+            ),
+        )
+        assert not found[problem].any()
+        assert (np.diff(problem) >= 0).all() and len(problem) == num_lanes
+        expected = np.arange(num_lanes) - np.searchsorted(problem, problem)
+        np.testing.assert_array_equal(place, expected)
+        np.testing.assert_array_equal(first[problem], np.arange(num_lanes) - expected)
+
+
+def table_search(table, active, wanted, max_trials, num_lanes):
+    """Trials whose successes are read off a table (problem, number)."""
+    table = jnp.asarray(table)
+
+    def trial(problem, number):
+        inside = number < table.shape[1]
+        success = table[problem, jnp.minimum(number, table.shape[1] - 1)] & inside
+        return Trials(success, ~(number % 7 == 3), {"square": number**2})
+
+    rows = {"square": jnp.full(len(table) * wanted, -5, jnp.int32)}
+    run = jax.jit(lambda: search(trial, rows, active, wanted, jnp.int32(max_trials), num_lanes))
+    return run()
+
+
+@pytest.mark.parametrize("num_lanes", [1, 7, 64])
+def test_search_finds_the_first_successes(num_lanes):
+    """Recomputed one trial at a time."""
+    rng = np.random.default_rng(0)
+    wanted, max_trials = 3, 40
+    table = rng.uniform(size=(9, 60)) < rng.uniform(0, 0.5, size=(9, 1))
+    active = np.arange(9) != 8
+    found = table_search(table, jnp.asarray(active), wanted, max_trials, num_lanes)
+    number = np.asarray(found.number).reshape(9, wanted)
+    assert (np.asarray(found.num_found) < wanted).any()
+    for p in range(9):
+        successes = np.flatnonzero(table[p, :max_trials])[:wanted] if active[p] else []
+        spent = successes[-1] + 1 if len(successes) == wanted else max_trials * active[p]
+        assert list(number[p]) == [*successes, *[-1] * (wanted - len(successes))]
+        assert found.num_found[p] == len(successes) and found.num_trials[p] == spent
+        assert found.num_nonfinite[p] == (np.arange(spent) % 7 == 3).sum()
+        squares = np.asarray(found.outputs["square"]).reshape(9, wanted)[p]
+        assert list(squares[: len(successes)]) == [s**2 for s in successes]
+        assert (squares[len(successes) :] == -5).all()
