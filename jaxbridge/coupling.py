@@ -15,6 +15,7 @@ has turned it, so one O serves both directions.
 
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -33,6 +34,7 @@ from .meeting import (
 )
 from .schemes import AbstractScheme, Euler, Heun
 from .sigma import AbstractSigma, Full
+from .start_laws import AnyStartLaw, Reversed, Stationary, as_start_law
 
 Rotation = Callable[[Float[Array, "d d"], Float[Array, "d d"]], Float[Array, "d d"] | None]
 
@@ -72,6 +74,7 @@ class AbstractCoupling(eqx.Module):
         distance: float = 1.0
         meeting: jb.AbstractMeeting = jb.BrownianCrossing()
         scheme: jb.AbstractScheme = jb.Heun()
+        start_law: jb.Stationary = jb.Stationary()
         rotation: object = eqx.field(default=None, static=True)
         independent_noise = False
 
@@ -92,6 +95,7 @@ class AbstractCoupling(eqx.Module):
 
     meeting: eqx.AbstractVar[AbstractMeeting]
     scheme: eqx.AbstractVar[AbstractScheme]
+    start_law: eqx.AbstractVar[AnyStartLaw]
     rotation: eqx.AbstractVar[Rotation | None]
     independent_noise: eqx.AbstractVar[bool]
 
@@ -133,8 +137,12 @@ class Coupling(AbstractCoupling):
     - `scheme`: `Heun()`, `Euler()` or `Milstein()`.
     - `rotation`: O(x, x') from the matrices σ(x), σ(x'); `None` is `polar_rotation` where σ is
         a full matrix that depends on the state, and nothing elsewhere.
+    - `start_law`: μ, where the associated diffusion starts, which only what corrects bridges to
+        their exact law makes use of: `Stationary()`, `GaussianLaw(mean, covariance)`, or any
+        object with `sample(key, model)` and a normalised `log_density(x)`; see `fit_start_law`.
 
-    **Raises:** `ValueError` for γ outside [-1, 1) or `ReflectionPlane` with γ ≠ -1.
+    **Raises:** `ValueError` for γ outside [-1, 1) or `ReflectionPlane` with γ ≠ -1; `TypeError`
+    for a start law that is none.
 
     !!! example
 
@@ -147,6 +155,7 @@ class Coupling(AbstractCoupling):
     gamma: Float[Array, "..."]
     meeting: AbstractMeeting
     scheme: AbstractScheme
+    start_law: AnyStartLaw
     rotation: Rotation | None = eqx.field(static=True)
     independent_noise: bool = eqx.field(static=True)
     _gamma_law: Callable | None = eqx.field(static=True)
@@ -157,11 +166,13 @@ class Coupling(AbstractCoupling):
         meeting: AbstractMeeting | None = None,
         scheme: AbstractScheme | None = None,
         rotation: Rotation | None = None,
+        start_law: Any = None,
     ):
         law, gamma = (gamma, jnp.nan) if callable(gamma) else (None, gamma)
         self.gamma = as_floating("gamma", gamma)
         self.meeting = BrownianCrossing() if meeting is None else meeting
         self.scheme = Heun() if scheme is None else scheme
+        self.start_law = as_start_law(Stationary() if start_law is None else start_law)
         self.rotation = rotation
         self._gamma_law = law
         reflection = False
@@ -183,8 +194,9 @@ class Coupling(AbstractCoupling):
 
     @staticmethod
     def as_published(gamma: ArrayLike) -> "Coupling":
-        """The paper's own settings: Euler, the sign test with radius 0.05, the printed O."""
-        return Coupling(gamma, SignTest(0.05), Euler(), published_rotation)
+        """The paper's own settings: Euler, the sign test with radius 0.05, the printed O and the
+        printed start law, with which bridges are **not** corrected to their exact law."""
+        return Coupling(gamma, SignTest(0.05), Euler(), published_rotation, Reversed())
 
     def driven_noise(self, frame, dw, du):
         return self._turn(frame, dw, du)
@@ -224,3 +236,10 @@ def rotation_between(
 def rotate(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Float[Array, " d"]:
     """O w."""
     return dw if rotation is None else matvec(rotation, dw)
+
+
+def rotate_back(
+    rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]
+) -> Float[Array, " d"]:
+    """Oᵀ w."""
+    return dw if rotation is None else matvec(rotation.T, dw)

@@ -150,6 +150,11 @@ class Diffusion(eqx.Module):
             )
         return self._sample_stationary(key, self._prepared_params())
 
+    @property
+    def has_sampler(self) -> bool:
+        """Whether the model comes with a sampler of its stationary law."""
+        return self._sample_stationary is not None
+
     def reversibility_residual(self, points: Numbers) -> Float[Array, "n d"]:
         """α - ½ (V ∇log ν + div V) at each of the points, shape (n, d).
 

@@ -26,24 +26,58 @@ from jaxtyping import Array, Float, Key
 from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Diffusion, check_invertible
 from .intervals import as_intervals
-from .linalg import dot, matvec
+from .linalg import cholesky, dot, inverse, matvec
 
 
-class GaussianLaw(NamedTuple):
-    """The normal distribution N(mean, covariance), with shapes (d,) and (d, d)."""
+class GaussianLaw(eqx.Module):
+    """The normal distribution N(mean, covariance), with shapes (d,) and (d, d).
+
+    **Raises:** `ValueError` for shapes that do not fit, or a covariance that is visibly not
+    symmetric and positive definite.
+    """
 
     mean: Float[Array, " d"]
     covariance: Float[Array, "d d"]
 
-    def sample(self, key: Key[Array, ""]) -> Float[Array, " d"]:
-        """One draw, shape (d,)."""
+    def __init__(self, mean: Numbers, covariance: Numbers):
+        mean, covariance = as_floating("mean", mean), as_floating("covariance", covariance)
+        dtype = jnp.promote_types(mean.dtype, covariance.dtype)
+        self.mean, self.covariance = mean.astype(dtype), covariance.astype(dtype)
+        if mean.ndim != 1 or covariance.shape != 2 * mean.shape:
+            raise ValueError(
+                "`mean` must have shape (d,) and `covariance` (d, d); got "
+                f"{mean.shape} and {covariance.shape}."
+            )
+        if is_traced(covariance):
+            return
+        matrix = np.asarray(covariance, float)
+        tolerance = 100 * np.finfo(dtype).eps * np.abs(matrix).max()
+        symmetric = np.abs(matrix - matrix.T).max() <= tolerance  # false for NaN
+        if not (symmetric and np.linalg.eigvalsh(matrix).min() >= -tolerance):
+            raise ValueError(
+                f"`covariance` must be symmetric and positive definite; got {covariance}."
+            )
+
+    def sample(self, key: Key[Array, ""], model: Diffusion | None = None) -> Float[Array, " d"]:
+        """One draw, shape (d,). The model is not looked at: start laws are called with one."""
         noise = jax.random.normal(key, self.mean.shape, self.mean.dtype)
-        return self.mean + matvec(jnp.linalg.cholesky(self.covariance), noise)
+        return self.mean + matvec(_cholesky(self.covariance), noise)
 
     def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
         """The normalised log density at a point."""
-        value = jax.scipy.stats.multivariate_normal.logpdf(x, self.mean, self.covariance)
-        return jnp.asarray(value)
+        root = _cholesky(self.covariance)
+        white = matvec(_inverse(root), (x - self.mean).astype(root.dtype))
+        return -dot(white, white) / 2 - jnp.sum(jnp.log(jnp.sqrt(2 * np.pi) * jnp.diag(root)))
+
+
+# Laws are sampled inside compiled loops, where LAPACK is a hazard; from some size on writing
+# the elimination out costs too much compilation.
+def _cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    return cholesky(matrix) if matrix.shape[0] <= 16 else jnp.linalg.cholesky(matrix)
+
+
+def _inverse(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    return inverse(matrix) if matrix.shape[0] <= 16 else jnp.linalg.inv(matrix)
 
 
 class OrnsteinUhlenbeckParams(NamedTuple):

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Int, Key, PyTree, Shaped
 
 # Drawing for many steps at once spreads the cost of deriving keys; drawing for all of them
 # would double the memory of a long path.
@@ -35,13 +35,15 @@ def noisy_scan(
     *,
     reverse: bool = False,
     store: Store | None = None,
+    over: Callable[[Any], Bool[Array, " lanes"]] | None = None,
 ) -> tuple[PyTree, PyTree]:
     """`lax.scan` of `step(carry, (noise, x)) -> (carry, y)` over `num_steps` steps.
 
     `draw(key, k)` gives one lane's noise for k steps, with leading axis k; `step` sees one
     step of it, lanes in the last axis. `xs` has leading axis `num_steps`; with `reverse` it is
     read, and the `y` written, from the last to the first. With a `store` only the rows it asks
-    for are kept, and returned in place of all `y`.
+    for are kept, and returned in place of all `y`. With `over`, nothing but the carry is
+    returned, and it is final once every lane is over: no further stretch is simulated.
     """
     num_stretches = -(-num_steps // _LONGEST_STRETCH)
     length = -(-num_steps // num_stretches)
@@ -82,5 +84,18 @@ def noisy_scan(
         slots = split(slots, fill=store.rows.shape[0] - 1)
     active = split(jnp.ones(num_steps, dtype=bool)) if num_idle else None
     inputs = (jnp.arange(num_stretches), active, slots, jax.tree.map(split, xs))
+    if over is not None:
+
+        def next_stretch(state):
+            index, carry = state
+            stretch = jax.tree.map(lambda leaf: leaf[index], inputs)
+            (carry, _), _ = one_stretch((carry, None), stretch)
+            return index + 1, carry
+
+        def going_on(state):
+            index, carry = state
+            return (index < num_stretches) & ~jnp.all(over(carry))
+
+        return lax.while_loop(going_on, next_stretch, (0, init))[1], None
     (carry, rows), ys = lax.scan(one_stretch, (init, rows), inputs, reverse=reverse)
     return carry, jax.tree.map(join, ys) if store is None else rows

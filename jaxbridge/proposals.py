@@ -104,22 +104,13 @@ def propose(
         z, rho = step_joined(x, z, rho, x_next, noise, lane, i, coupling)
         return (x_next, z, rho), z
 
-    def draw(key, k):
-        normal_key, uniform_key = jax.random.split(key)
-        normal = uniform = None
-        if coupling.independent_noise:
-            normal = jax.random.normal(normal_key, (k,), dtype)
-        if draws_uniform:
-            uniform = jax.random.uniform(uniform_key, (k,), dtype)
-        return normal, uniform
-
     never = jnp.full(dt.shape, num_steps + 1, jnp.int32)
     rho = never if meeting_step is None else meeting_step
     (_, z_end, rho), z_path = noisy_scan(
         step,
         (x_start, start, rho),
         driven_keys,
-        draw,
+        pair_noise(coupling, draws_uniform, dtype),
         (jnp.arange(num_steps, dtype=jnp.int32), x_path),
         num_steps,
         store=None if stored is None else _store(stored, start, num_steps),
@@ -131,6 +122,22 @@ def propose(
     # Non-finite numbers stay non-finite from step to step, so the last states tell.
     finite = jnp.all(jnp.isfinite(x_start) & jnp.isfinite(z_end), axis=0) | (rho <= num_steps)
     return Proposals(z_path, x_start, rho, finite)
+
+
+def pair_noise(coupling: AbstractCoupling, draws_uniform: bool, dtype) -> Callable:
+    """A lane's random numbers of k steps beyond the noise of the path that drives: N(0, 1)
+    for dU and U(0, 1) for the meeting rule, each only where it is called for."""
+
+    def draw(key, k):
+        normal_key, uniform_key = jax.random.split(key)
+        normal = uniform = None
+        if coupling.independent_noise:
+            normal = jax.random.normal(normal_key, (k,), dtype)
+        if draws_uniform:
+            uniform = jax.random.uniform(uniform_key, (k,), dtype)
+        return normal, uniform
+
+    return draw
 
 
 def realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):

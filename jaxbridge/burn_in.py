@@ -1,0 +1,115 @@
+"""How long until the reversed diffusion has forgotten where it started?
+
+For models without a sampler of their stationary law. Two copies of the reversed diffusion,
+coupled by reflection, start from b and from where another run from b has come in a time s. By
+the coupling inequality the total variation distance between their laws after t is at most
+P(τ > t), τ the time when they meet. s is doubled until all of 512 pairs meet within s, that
+is, until what s can spread s can join again; pairs at distance √s do not all meet within s
+before that, however small s is. Twice that s is the burn-in: meeting times have exponential
+tails, so the distance left is of the order of 512⁻².
+
+A diffusion with wells that it leaves only after very many relaxation times can deceive this, as
+any look at a finite run: give `Stationary(burn_in=...)`, or a start law with a density.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Key
+
+from .coupling import AbstractCoupling, Coupling, rotate, rotation_between
+from .diffusion import Diffusion
+from .meeting import PairStep, frame
+from .noise import noisy_scan
+from .start_laws import Stationary, needs_burn_in, run_for
+
+_NUM_PAIRS = 512
+# s is doubled at most until it takes this many steps: some seconds of work.
+_MOST_STEPS = 2**17
+
+
+def with_burn_in(
+    key: Key[Array, ""],
+    model: Diffusion,
+    coupling: AbstractCoupling,
+    end: Float[Array, "P d"],
+    duration: Float[Array, " P"],
+    num_steps: int,
+) -> AbstractCoupling:
+    """The coupling, whose start law knows its burn-in where it needs one."""
+    if not needs_burn_in(coupling.start_law, model):
+        return coupling
+    pairs = jnp.arange(_NUM_PAIRS) % end.shape[0]
+    usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
+    end = jnp.where(usable, end, end[jnp.argmax(usable)])  # bridges that were not found are NaN
+    time = measure_burn_in(
+        key, model, coupling, end[pairs].T, duration[pairs] / num_steps, num_steps
+    )
+    return eqx.tree_at(lambda c: c.start_law, coupling, Stationary(time))
+
+
+def measure_burn_in(
+    key: Key[Array, ""],
+    model: Diffusion,
+    coupling: AbstractCoupling,
+    end: Float[Array, "d pairs"],
+    dt: Float[Array, " pairs"],
+    num_steps: int,
+) -> Float[Array, ""]:
+    """2s for the first s = 1, 2, 4, ... times `num_steps` steps within which all pairs meet."""
+    dynamics, scheme = model.backward(end[:, 0]), coupling.scheme
+    reflection = Coupling(-1.0, scheme=scheme, rotation=coupling.rotation)
+    rule, root_dt = reflection.meeting, jnp.sqrt(dt)
+
+    def step_pair(x, driven, met, dw, uniform, dt, root_dt):
+        sigma, driven_sigma = dynamics.sigma(x), dynamics.sigma(driven)
+        seen = frame(driven_sigma, x, driven)
+        dw = root_dt * dw
+        turned = rotate(rotation_between(reflection, sigma, driven_sigma), dw)
+        x_next = scheme.step(dynamics, x, dt, dw)
+        driven_next = scheme.step(dynamics, driven, dt, reflection.driven_noise(seen, turned, None))
+        variance = reflection.gap_variance(seen).astype(x.dtype)
+        pair = PairStep(seen, x, x_next, driven, driven_next, dt, variance)
+        met |= rule.met(pair, dynamics, uniform)
+        return x_next, jnp.where(met, x_next, driven_next), met
+
+    step_pairs = jax.vmap(step_pair, in_axes=-1, out_axes=-1)
+
+    def draw(key, k):
+        normal_key, uniform_key = jax.random.split(key)
+        normal = jax.random.normal(normal_key, (k, end.shape[0]), end.dtype)
+        return normal, jax.random.uniform(uniform_key, (k,), end.dtype)
+
+    def attempt(doublings):
+        repeats = 2**doublings
+        ahead_key, pair_key = jax.random.split(jax.random.fold_in(key, doublings))
+        ahead_keys = jax.random.split(ahead_key, _NUM_PAIRS)
+        driven = run_for(dynamics, scheme, ahead_keys, end, dt, num_steps, repeats)
+        keys = jax.random.split(pair_key, _NUM_PAIRS)
+
+        def once(repeat, pairs):
+            return noisy_scan(
+                lambda pairs, inputs: (step_pairs(*pairs, *inputs[0], dt, root_dt), None),
+                pairs,
+                jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, repeat),
+                draw,
+                None,
+                num_steps,
+            )[0]
+
+        pairs = (end, driven, jnp.zeros(_NUM_PAIRS, bool))
+        return jnp.all(lax.fori_loop(0, repeats, once, pairs)[2])
+
+    most = max(0, (_MOST_STEPS // num_steps).bit_length() - 1)
+
+    def going_on(state):
+        doublings, all_met = state
+        return ~all_met & (doublings < most)
+
+    def double(state):
+        doublings, _ = state
+        return doublings + 1, attempt(doublings + 1)
+
+    doublings, _ = lax.while_loop(going_on, double, (jnp.int32(0), attempt(jnp.int32(0))))
+    return 2 * num_steps * jnp.max(dt) * (2**doublings).astype(dt.dtype)

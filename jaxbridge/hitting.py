@@ -1,0 +1,228 @@
+"""Hitting counts: how many associated diffusions does it take to hit a bridge? (section 2.3)
+
+    T(x) = min {i : the i-th associated diffusion hits x}
+
+is geometric with mean 1/π(x), so the mean of N counts is an unbiased estimate of 1/π(x). The
+counts of one bridge are the gaps between the hits in one sequence of independent trials: the
+mean of N counts is the number of trials up to the N-th hit, divided by N.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from .arrays import is_traced
+from .associated import run_associated
+from .bridges import Bridges, check_key
+from .burn_in import with_burn_in
+from .coupling import AbstractCoupling
+from .diffusion import Diffusion, check_diffusion
+from .intervals import check_count
+from .search import MOST_TRIALS, Trials, default_num_lanes, numbered_keys, search
+from .start_laws import AnyStartLaw, as_start_law
+
+# A count that takes longer than this is cut off, unless the user says otherwise.
+DEFAULT_MAX_TRIALS = 10_000
+
+
+class HittingCounts(eqx.Module):
+    """Counts of n bridges, or of I × n with a leading axis I.
+
+    - `counts`: N independent counts for each bridge, shape (n, N); -1 where the trials ran out
+        before the count was complete, and for a bridge that is missing.
+    - `truncated`: whether the trials ran out, shape (n,).
+    - `num_trials`: how many there were in all, shape (n,).
+    - `num_nonfinite`: how many of them left the finite numbers, which is no hit.
+    - `start`: where the last trial that hit had started, shape (n, d).
+    """
+
+    counts: Int[Array, "*I n N"]
+    truncated: Bool[Array, "*I n"]
+    num_trials: Int[Array, "*I n"]
+    num_nonfinite: Int[Array, "*I n"]
+    start: Float[Array, "*I n d"]
+
+    @property
+    def mean(self) -> Float[Array, "*I n"]:
+        """ρ̂, the mean of the counts: an unbiased estimate of 1/π(x).
+
+        Where the trials ran out, all of them divided by the hits, or their number if nothing
+        hit: finite, and too small on average.
+        """
+        hits = jnp.maximum(self._num_hits, 1).astype(self.start.dtype)
+        return self.num_trials.astype(self.start.dtype) / hits
+
+    @property
+    def probability(self) -> Float[Array, "*I n"]:
+        """An unbiased estimate of the hitting probability π(x), (N - 1)/(Σ_j T_j - 1) for N
+        counts (Haldane 1945); with N = 1, whether the first trial hit."""
+        hits, trials = self._num_hits, self.num_trials
+        # Trials that ran out are a binomial sample, estimated by hits / trials.
+        less = jnp.where(self.truncated, 0, 1)
+        numerator, denominator = hits - less, trials - less
+        certain = denominator <= 0  # one trial, one hit
+        ratio = numerator / jnp.where(certain, 1, denominator)
+        return jnp.where(certain & (hits > 0), 1, ratio).astype(self.start.dtype)
+
+    @property
+    def standard_error(self) -> Float[Array, "*I n"]:
+        """That of `probability`, about π √((1-π)/N); infinite for fewer than three counts, of
+        which nothing is known."""
+        variance = self.probability**2 * (1 - self.probability)
+        hits = self._num_hits
+        error = jnp.sqrt(variance / jnp.maximum(hits - 2, 1).astype(variance.dtype))
+        return jnp.where(hits > 2, error, jnp.inf)
+
+    @property
+    def _num_hits(self) -> Int[Array, "*I n"]:
+        return jnp.sum(self.counts > 0, axis=-1)
+
+
+def hitting_counts(
+    key: Key[Array, ""],
+    model: Diffusion,
+    bridges: Bridges,
+    num_counts: int = 1,
+    *,
+    start_law: AnyStartLaw | None = None,
+    max_trials: int | None = None,
+    batch_size: int | None = None,
+) -> HittingCounts:
+    """Independent counts T(x) for each of the bridges, and so their hitting probabilities.
+
+    **Arguments:**
+
+    - `key`: a typed key, not the one the bridges were made with.
+    - `model`: the model the bridges were made with.
+    - `bridges`: from `sample_bridges`, with their whole paths (no `save_at`).
+    - `num_counts`: N, for each bridge.
+    - `start_law`: μ, by default that of the bridges' coupling.
+    - `max_trials`: bounds the trials of each bridge; by default 10,000 for each count.
+    - `batch_size`: trials simulated side by side; changes results by rounding only.
+
+    **Returns:** `HittingCounts`.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        counts = jb.hitting_counts(key, model, bridges, num_counts=100)
+        counts.probability, counts.standard_error
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    check_whole(bridges)
+    num_counts = check_count("num_counts", num_counts)
+    max_trials = check_max_trials(max_trials, num_counts)
+    coupling = bridges.coupling
+    if start_law is not None:
+        coupling = with_start_law(coupling, start_law)
+    return _hitting_counts(key, model, coupling, bridges, num_counts, max_trials, batch_size)
+
+
+@eqx.filter_jit
+def _hitting_counts(key, model, coupling, bridges, num_counts, max_trials, batch_size):
+    burn_in_key, count_key = jax.random.split(key)
+    model = model.prepared()
+    shape = bridges.met.shape
+    paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
+    duration = durations_of(bridges)
+    coupling = with_burn_in(burn_in_key, model, coupling, paths[:, -1], duration, bridges.num_steps)
+    keys = jax.random.split(count_key, paths.shape[0])
+    counts = count_hits(
+        keys,
+        model,
+        coupling,
+        paths,
+        duration,
+        bridges.met.reshape(-1),
+        num_counts,
+        max_trials,
+        batch_size,
+    )
+    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), counts)
+
+
+def count_hits(
+    keys: Key[Array, " P"],
+    model: Diffusion,
+    coupling: AbstractCoupling,
+    paths: Float[Array, "P N+1 d"],
+    duration: Float[Array, " P"],
+    active: Bool[Array, " P"],
+    num_counts: int,
+    max_trials: Int[Array, ""],
+    num_lanes: int | None = None,
+) -> HittingCounts:
+    """Counts for each of P bridges that is active, from trials that share the lanes."""
+    num_steps = paths.shape[1] - 1
+    if num_lanes is None:
+        num_lanes = default_num_lanes(paths.shape[0] * num_counts, num_steps, paths[:, 0])
+
+    def trial(problem, number):
+        made = run_associated(
+            model,
+            coupling,
+            numbered_keys(keys, problem, number),
+            jnp.moveaxis(paths[problem], 0, -1),
+            duration[problem] / num_steps,
+        )
+        return Trials(made.hit, made.finite, made.start.T)
+
+    num_rows = paths.shape[0] * num_counts
+    rows = jnp.full((num_rows, paths.shape[2]), jnp.nan, paths.dtype)
+    found = search(trial, rows, active, num_counts, max_trials, num_lanes)
+    number = found.number.reshape(-1, num_counts)
+    before = jnp.concatenate([jnp.full_like(number[:, :1], -1), number[:, :-1]], axis=1)
+    last = jnp.maximum(found.num_found - 1, 0)
+    starts = found.outputs.reshape(*number.shape, -1)
+    return HittingCounts(
+        jnp.where(number >= 0, number - before, -1),
+        active & (found.num_found < num_counts),
+        found.num_trials,
+        found.num_nonfinite,
+        starts[jnp.arange(len(number)), last],
+    )
+
+
+def durations_of(bridges: Bridges) -> Float[Array, " P"]:
+    """The duration of each of the I × n bridges."""
+    duration = bridges.times[..., -1]
+    if bridges.times.ndim == 2:
+        duration = duration[:, None]
+    return jnp.broadcast_to(duration, bridges.met.shape).reshape(-1)
+
+
+def with_start_law(coupling: AbstractCoupling, start_law: AnyStartLaw) -> AbstractCoupling:
+    """The coupling with another start law."""
+    law = as_start_law(start_law)
+    return eqx.tree_at(lambda c: c.start_law, coupling, law)
+
+
+def check_whole(bridges: Bridges) -> None:
+    """Raise `TypeError` or `ValueError` for anything but bridges at all steps of their grid."""
+    if not isinstance(bridges, Bridges):
+        raise TypeError(f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}.")
+    if bridges.paths.ndim not in (3, 4):
+        raise ValueError(f"`bridges.paths` must be (n, N+1, d) or (I, n, N+1, d); "
+                         f"got {bridges.paths.shape}.")
+    if bridges.paths.shape[-2] != bridges.num_steps + 1:
+        raise ValueError(
+            "whether a bridge is hit depends on its whole path, but these bridges were kept at "
+            f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points: sample them "
+            "without `save_at`, or use `sample_exact_bridges`, which takes it."
+        )
+
+
+def check_max_trials(max_trials: int | None, num_counts: int) -> Int[Array, ""]:
+    """The bound on the trials of a bridge."""
+    if max_trials is None:
+        max_trials = min(DEFAULT_MAX_TRIALS * num_counts, MOST_TRIALS)
+    elif not is_traced(max_trials):
+        max_trials = check_count("max_trials", max_trials)
+        if max_trials > MOST_TRIALS:
+            raise ValueError(f"`max_trials` must be at most 2³⁰; got {max_trials}.")
+    return jnp.asarray(max_trials, jnp.int32)
