@@ -8,6 +8,13 @@ sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion 
 """
 
 from .bridges import Bridges as Bridges, sample_bridges as sample_bridges
+from .chains import (
+    Chain as Chain,
+    Kernel as Kernel,
+    pseudo_marginal as pseudo_marginal,
+    renewal as renewal,
+    sample_exact_bridges as sample_exact_bridges,
+)
 from .coupling import (
     AbstractCoupling as AbstractCoupling,
     Coupling as Coupling,
@@ -25,6 +32,7 @@ from .gaussian import (
     ou_stationary as ou_stationary,
     ou_transition as ou_transition,
 )
+from .hitting import HittingCounts as HittingCounts, hitting_counts as hitting_counts
 from .meeting import (
     AbstractMeeting as AbstractMeeting,
     BrownianCrossing as BrownianCrossing,
@@ -45,3 +53,17 @@ from .schemes import (
     Milstein as Milstein,
 )
 from .simulate import simulate as simulate
+from .start_laws import (
+    Reversed as Reversed,
+    StartLaw as StartLaw,
+    Stationary as Stationary,
+)
+from .transition import (
+    TransitionLogDensity as TransitionLogDensity,
+    transition_log_density as transition_log_density,
+)
+from .weighted import (
+    AbstractWeightedProposal as AbstractWeightedProposal,
+    WeightedBridges as WeightedBridges,
+    weigh_bridges as weigh_bridges,
+)

@@ -45,7 +45,7 @@ def run_associated(
 ) -> Associated:
     """One path associated with the bridge in each lane, whose random numbers depend on the
     lane's key alone. Simulation ends when all lanes have hit."""
-    num_steps, (_, d, _), dtype = path.shape[0] - 1, path.shape, path.dtype
+    num_steps, dtype = path.shape[0] - 1, path.dtype
     forward = model.forward(path[0, :, 0])
     scheme, rule = coupling.scheme, coupling.meeting
     split_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)

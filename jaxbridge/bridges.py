@@ -19,7 +19,14 @@ from .coupling import AbstractCoupling, Coupling
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count, check_model
 from .proposals import Proposals, propose
-from .search import MOST_TRIALS, Trials, default_num_lanes, numbered_keys, search
+from .search import (
+    Found,
+    Trials,
+    check_bound,
+    default_num_lanes,
+    numbered_keys,
+    search,
+)
 
 
 class Bridges(eqx.Module):
@@ -120,13 +127,8 @@ def sample_bridges(
     intervals, batched, several_durations = as_intervals(start, end, duration)
     check_model(model, intervals, coupling.scheme)
     model.check_reversal()
-    stored = _stored_steps(save_at, 1.0 if several_durations else duration, num_steps)
-    if max_proposals is None:
-        max_proposals = min(max(1_000 * num_bridges, 100_000), MOST_TRIALS)
-    elif not is_traced(max_proposals):
-        max_proposals = check_count("max_proposals", max_proposals)
-        if max_proposals > MOST_TRIALS:
-            raise ValueError(f"`max_proposals` must be at most 2³⁰; got {max_proposals}.")
+    stored = stored_steps(save_at, 1.0 if several_durations else duration, num_steps)
+    max_proposals = check_bound("max_proposals", max_proposals, max(1_000 * num_bridges, 100_000))
     if batch_size is None:
         num_wanted = num_bridges * intervals.start.shape[0]
         batch_size = default_num_lanes(num_wanted, num_steps, intervals.start)
@@ -137,7 +139,7 @@ def sample_bridges(
         model,
         coupling,
         intervals,
-        jnp.asarray(max_proposals, jnp.int32),
+        max_proposals,
         stored,
         num_bridges,
         num_steps,
@@ -156,7 +158,7 @@ def sample_bridges(
     return bridges
 
 
-class _Inputs(NamedTuple):
+class Inputs(NamedTuple):
     """Everything a path may be differentiated with respect to."""
 
     model: Diffusion
@@ -179,34 +181,30 @@ def _sample_bridges(
     batched: bool,
     several_durations: bool,
 ) -> Bridges:
-    (num_intervals, d), dtype = intervals.start.shape, intervals.start.dtype
+    num_intervals = intervals.start.shape[0]
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_intervals))
-    inputs = _Inputs(model.prepared(), coupling, intervals)
+    inputs = Inputs(model.prepared(), coupling, intervals)
     fixed = jax.tree.map(
         lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs
     )
-
-    def trial(interval, number):
-        made = _propose_numbered(fixed, keys, interval, number, num_steps, stored)
-        outputs = (jnp.moveaxis(made.paths, -1, 0), made.reverse_start.T, made.meeting_step)
-        return Trials(made.meeting_step <= num_steps, made.finite, outputs)
-
-    num_rows = num_intervals * num_bridges
-    num_stored = num_steps + 1 if stored is None else stored.shape[0]
-    rows = (
-        jnp.zeros((num_rows, num_stored, d), dtype),
-        jnp.full((num_rows, d), jnp.nan, dtype),
-        jnp.full(num_rows, num_steps + 1, jnp.int32),
-    )
     everything = jnp.ones(num_intervals, bool)
-    found = search(trial, rows, everything, num_bridges, max_proposals, num_lanes, progress_meter)
+    found = find_bridges(
+        keys,
+        fixed,
+        everything,
+        num_bridges,
+        max_proposals,
+        num_steps,
+        stored,
+        num_lanes,
+        progress_meter,
+    )
     paths, reverse_start, rho = found.outputs
     met = rho <= num_steps
     interval = jnp.repeat(jnp.arange(num_intervals), num_bridges)
     accepted = (keys, interval, jnp.maximum(found.number, 0), stored, rho)
     paths = _with_replayed_tangents(inputs, accepted, paths, num_steps)
     paths = jnp.where(met[:, None, None], paths, jnp.nan)
-
     return Bridges(
         stored_times(intervals, stored, num_steps, several_durations),
         unflatten_rows(paths, num_intervals, batched),
@@ -218,6 +216,44 @@ def _sample_bridges(
         coupling,
         num_steps,
     )
+
+
+class Joined(NamedTuple):
+    """Accepted proposals: the path, X_0 and ρ of each row, N + 1 for a row not filled."""
+
+    paths: Float[Array, "rows K d"]
+    reverse_start: Float[Array, "rows d"]
+    meeting_step: Int[Array, " rows"]
+
+
+def find_bridges(
+    keys: Key[Array, " P"],
+    inputs: Inputs,
+    active: Bool[Array, " P"],
+    num_bridges: int,
+    max_proposals: Int[Array, ""],
+    num_steps: int,
+    stored: Int[Array, " K"] | None,
+    num_lanes: int,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> Found:
+    """Propose for each of P active problems, one interval and one key each, until it has its
+    bridges. The outputs are `Joined`."""
+
+    def trial(problem, number):
+        made = _propose_numbered(inputs, keys, problem, number, num_steps, stored)
+        joined = Joined(jnp.moveaxis(made.paths, -1, 0), made.reverse_start.T, made.meeting_step)
+        return Trials(made.meeting_step <= num_steps, made.finite, joined)
+
+    (num_problems, d), dtype = inputs.intervals.start.shape, inputs.intervals.start.dtype
+    num_rows = num_problems * num_bridges
+    num_stored = num_steps + 1 if stored is None else stored.shape[0]
+    rows = Joined(
+        jnp.zeros((num_rows, num_stored, d), dtype),
+        jnp.full((num_rows, d), jnp.nan, dtype),
+        jnp.full(num_rows, num_steps + 1, jnp.int32),
+    )
+    return search(trial, rows, active, num_bridges, max_proposals, num_lanes, progress_meter)
 
 
 def unflatten_rows(rows: Shaped[Array, "rows ..."], num_intervals: int, batched: bool) -> Array:
@@ -235,7 +271,7 @@ def stored_times(
 
 
 def _propose_numbered(
-    inputs: _Inputs,
+    inputs: Inputs,
     keys: Key[Array, " I"],
     interval: Int[Array, " lanes"],
     number: Int[Array, " lanes"],
@@ -290,7 +326,7 @@ def check_key(key) -> None:
         raise ValueError(f"`key` must be a single key; got an array of keys, {key.shape}.")
 
 
-def _stored_steps(
+def stored_steps(
     save_at: Numbers | None, duration: Numbers, num_steps: int
 ) -> Int[Array, " K"] | None:
     if save_at is None:

@@ -22,6 +22,7 @@ from .coupling import AbstractCoupling, Coupling, rotate, rotation_between
 from .diffusion import Diffusion
 from .meeting import PairStep, frame
 from .noise import noisy_scan
+from .search import key_for
 from .start_laws import Stationary, needs_burn_in, run_for
 
 _NUM_PAIRS = 512
@@ -40,6 +41,7 @@ def with_burn_in(
     """The coupling, whose start law knows its burn-in where it needs one."""
     if not needs_burn_in(coupling.start_law, model):
         return coupling
+    key = key_for("burn-in", key)
     pairs = jnp.arange(_NUM_PAIRS) % end.shape[0]
     usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
     end = jnp.where(usable, end, end[jnp.argmax(usable)])  # bridges that were not found are NaN
@@ -74,7 +76,12 @@ def measure_burn_in(
         met |= rule.met(pair, dynamics, uniform)
         return x_next, jnp.where(met, x_next, driven_next), met
 
-    step_pairs = jax.vmap(step_pair, in_axes=-1, out_axes=-1)
+    def step_pairs(pairs, inputs):
+        x, driven, met = pairs
+        (dw, uniform), _ = inputs
+        return jax.vmap(step_pair, in_axes=-1, out_axes=-1)(
+            x, driven, met, dw, uniform, dt, root_dt
+        ), None
 
     def draw(key, k):
         normal_key, uniform_key = jax.random.split(key)
@@ -90,7 +97,7 @@ def measure_burn_in(
 
         def once(repeat, pairs):
             return noisy_scan(
-                lambda pairs, inputs: (step_pairs(*pairs, *inputs[0], dt, root_dt), None),
+                step_pairs,
                 pairs,
                 jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, repeat),
                 draw,

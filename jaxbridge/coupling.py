@@ -238,8 +238,6 @@ def rotate(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Floa
     return dw if rotation is None else matvec(rotation, dw)
 
 
-def rotate_back(
-    rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]
-) -> Float[Array, " d"]:
+def rotate_back(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Float[Array, " d"]:
     """Oᵀ w."""
     return dw if rotation is None else matvec(rotation.T, dw)

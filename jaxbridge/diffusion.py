@@ -155,6 +155,11 @@ class Diffusion(eqx.Module):
         """Whether the model comes with a sampler of its stationary law."""
         return self._sample_stationary is not None
 
+    @property
+    def has_density(self) -> bool:
+        """Whether the model knows its stationary density."""
+        return self._log_stationary is not None
+
     def reversibility_residual(self, points: Numbers) -> Float[Array, "n d"]:
         """α - ½ (V ∇log ν + div V) at each of the points, shape (n, d).
 

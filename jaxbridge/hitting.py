@@ -12,18 +12,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from .arrays import is_traced
 from .associated import run_associated
 from .bridges import Bridges, check_key
 from .burn_in import with_burn_in
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
 from .intervals import check_count
-from .search import MOST_TRIALS, Trials, default_num_lanes, numbered_keys, search
+from .search import Trials, check_bound, default_num_lanes, key_for, numbered_keys, search
 from .start_laws import AnyStartLaw, as_start_law
 
 # A count that takes longer than this is cut off, unless the user says otherwise.
-DEFAULT_MAX_TRIALS = 10_000
+_MAX_TRIALS_PER_COUNT = 10_000
 
 
 class HittingCounts(eqx.Module):
@@ -93,7 +92,7 @@ def hitting_counts(
 
     **Arguments:**
 
-    - `key`: a typed key, not the one the bridges were made with.
+    - `key`: a typed key.
     - `model`: the model the bridges were made with.
     - `bridges`: from `sample_bridges`, with their whole paths (no `save_at`).
     - `num_counts`: N, for each bridge.
@@ -116,22 +115,21 @@ def hitting_counts(
     check_diffusion(model)
     check_whole(bridges)
     num_counts = check_count("num_counts", num_counts)
-    max_trials = check_max_trials(max_trials, num_counts)
+    bound = check_max_trials(max_trials, num_counts)
     coupling = bridges.coupling
     if start_law is not None:
         coupling = with_start_law(coupling, start_law)
-    return _hitting_counts(key, model, coupling, bridges, num_counts, max_trials, batch_size)
+    return _hitting_counts(key, model, coupling, bridges, num_counts, bound, batch_size)
 
 
 @eqx.filter_jit
 def _hitting_counts(key, model, coupling, bridges, num_counts, max_trials, batch_size):
-    burn_in_key, count_key = jax.random.split(key)
     model = model.prepared()
     shape = bridges.met.shape
     paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
     duration = durations_of(bridges)
-    coupling = with_burn_in(burn_in_key, model, coupling, paths[:, -1], duration, bridges.num_steps)
-    keys = jax.random.split(count_key, paths.shape[0])
+    coupling = with_burn_in(key, model, coupling, paths[:, -1], duration, bridges.num_steps)
+    keys = jax.random.split(key_for("hitting counts", key), paths.shape[0])
     counts = count_hits(
         keys,
         model,
@@ -207,8 +205,9 @@ def check_whole(bridges: Bridges) -> None:
     if not isinstance(bridges, Bridges):
         raise TypeError(f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}.")
     if bridges.paths.ndim not in (3, 4):
-        raise ValueError(f"`bridges.paths` must be (n, N+1, d) or (I, n, N+1, d); "
-                         f"got {bridges.paths.shape}.")
+        raise ValueError(
+            f"`bridges.paths` must be (n, N+1, d) or (I, n, N+1, d); got {bridges.paths.shape}."
+        )
     if bridges.paths.shape[-2] != bridges.num_steps + 1:
         raise ValueError(
             "whether a bridge is hit depends on its whole path, but these bridges were kept at "
@@ -219,10 +218,4 @@ def check_whole(bridges: Bridges) -> None:
 
 def check_max_trials(max_trials: int | None, num_counts: int) -> Int[Array, ""]:
     """The bound on the trials of a bridge."""
-    if max_trials is None:
-        max_trials = min(DEFAULT_MAX_TRIALS * num_counts, MOST_TRIALS)
-    elif not is_traced(max_trials):
-        max_trials = check_count("max_trials", max_trials)
-        if max_trials > MOST_TRIALS:
-            raise ValueError(f"`max_trials` must be at most 2³⁰; got {max_trials}.")
-    return jnp.asarray(max_trials, jnp.int32)
+    return check_bound("max_trials", max_trials, _MAX_TRIALS_PER_COUNT * num_counts)

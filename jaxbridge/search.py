@@ -8,6 +8,7 @@ or succeed less often. So results do not depend on the number of lanes, and no l
 the slowest problem.
 """
 
+import zlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,8 +18,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from .arrays import Numbers, is_traced
+from .intervals import check_count
+
 # Trials are numbered in 32 bits.
-MOST_TRIALS = 2**30
+_MOST_TRIALS = 2**30
 
 
 class Trials(NamedTuple):
@@ -136,11 +140,29 @@ def _assign_lanes(
     return first, problem, lanes - first[problem]
 
 
+def check_bound(name: str, value: Numbers | None, default: int) -> Int[Array, ""]:
+    """A bound on numbered trials, by default `default`; traced, so that it can change without
+    compiling again."""
+    if value is None:
+        value = min(default, _MOST_TRIALS)
+    elif not is_traced(value):
+        value = check_count(name, value)
+        if value > _MOST_TRIALS:
+            raise ValueError(f"`{name}` must be at most 2³⁰; got {value}.")
+    return jnp.asarray(value, jnp.int32)
+
+
 def numbered_keys(
     keys: Key[Array, " P"], problem: Int[Array, " lanes"], number: Int[Array, " lanes"]
 ) -> Key[Array, " lanes"]:
     """The key of each trial, from that of its problem."""
     return jax.vmap(jax.random.fold_in)(keys[problem], number)
+
+
+def key_for(purpose: str, key: Key[Array, ""]) -> Key[Array, ""]:
+    """A key that no numbering of problems or trials leads to, so that a caller may use one key
+    for several calls on the same bridges."""
+    return jax.random.fold_in(key, zlib.crc32(purpose.encode()))
 
 
 def default_num_lanes(num_wanted: int, num_steps: int, point: Float[Array, "P d"]) -> int:

@@ -96,9 +96,7 @@ def as_start_law(law: Any) -> AnyStartLaw:
     return Opaque(law) if opaque else law
 
 
-def log_ratio(
-    law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]
-) -> Float[Array, ""]:
+def log_ratio(law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]) -> Float[Array, ""]:
     """log (μ/ν)(x), up to the constant of ν; zero for `Stationary`, and taken to be zero for
     `Reversed`, as printed."""
     if isinstance(law, Stationary | Reversed):

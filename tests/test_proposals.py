@@ -83,7 +83,7 @@ def test_meeting_step_is_the_first_sign_change():
     np.testing.assert_array_equal(found[later], expected[later])
 
 
-def test_stored_steps_are_those_of_the_whole_path():
+def teststored_steps_are_those_of_the_whole_path():
     model = paper_model()
     keys = jax.random.split(jax.random.key(0), 50)
     lanes = lambda value: jnp.full((2, 50), value)

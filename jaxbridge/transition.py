@@ -1,0 +1,140 @@
+"""Transition densities by Monte Carlo: p_T(a, b) = E[w] over weighted proposals.
+
+Unbiased on the natural scale, up to the step error, and so fit for pseudo-marginal
+Metropolis–Hastings over the parameters of a model.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Float, Int, Key
+
+from .arrays import Numbers
+from .bridges import check_key
+from .chains import check_proposal
+from .diffusion import Diffusion, check_diffusion
+from .intervals import Intervals, as_intervals, check_count
+from .weighted import AbstractWeightedProposal, as_proposal
+
+
+class TransitionLogDensity(eqx.Module):
+    """Estimates for one pair of points, shape (), or for I of them.
+
+    - `value`: log p̂_T(a, b); `exp(value)` is unbiased. -inf where no proposal became a bridge.
+    - `standard_error`: that of `value`, by the delta method; infinite where nothing is known.
+        Only to be trusted where `effective_sample_size` is large.
+    - `effective_sample_size`: (Σw)²/Σw² over the proposals.
+    - `num_met`: how many proposals became bridges.
+    - `num_truncated`: how many of their weights were cut off by `max_trials`. Each makes the
+        estimate too small on average.
+    - `num_simulated`: paths simulated in all.
+    - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
+    """
+
+    value: Float[Array, "*I"]
+    standard_error: Float[Array, "*I"]
+    effective_sample_size: Float[Array, "*I"]
+    num_met: Int[Array, "*I"]
+    num_truncated: Int[Array, "*I"]
+    num_simulated: Int[Array, "*I"]
+    proposal: AbstractWeightedProposal
+
+
+def transition_log_density(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_proposals: int = 1000,
+    num_steps: int = 50,
+    proposal: Any = None,
+    num_counts: int = 1,
+    max_trials: int | None = None,
+) -> TransitionLogDensity:
+    """An estimate of log p_T(a, b) with its standard error, for one pair or thousands.
+
+    **Arguments:**
+
+    - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`. The
+        density is with respect to `end`, in units of space to the power -d.
+    - `num_proposals`: for each interval. One that does not meet counts as zero.
+    - `proposal`: a `Coupling`, with its start law; by default `Coupling(gamma=0.0)`. With
+        `Stationary()` the model's `log_stationary` must be normalised (those of
+        `ornstein_uhlenbeck` and `hyperbolic` are); with a start law that has a density it
+        need not be, for its constant cancels.
+    - `num_counts`: N hitting counts for each proposal.
+    - `max_trials`: bounds the trials of each proposal; by default 10,000 for each count.
+
+    **Returns:** `TransitionLogDensity`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
+        estimate = jb.transition_log_density(
+            jax.random.key(0), model, a, b, 1.0, proposal=jb.Coupling(0.5, start_law=law)
+        )
+        estimate.value, estimate.standard_error
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_proposals = check_count("num_proposals", num_proposals)
+    num_steps = check_count("num_steps", num_steps)
+    intervals, batched, _ = as_intervals(start, end, duration)
+    proposal = as_proposal(proposal, num_counts, None, max_trials)
+    check_proposal(proposal, model, intervals)
+    return _estimate(key, model, proposal, intervals, num_proposals, num_steps, batched)
+
+
+@eqx.filter_jit
+def _estimate(
+    key: Key[Array, ""],
+    model: Diffusion,
+    proposal: AbstractWeightedProposal,
+    intervals: Intervals,
+    num_proposals: int,
+    num_steps: int,
+    batched: bool,
+) -> TransitionLogDensity:
+    model, num_intervals = model.prepared(), intervals.start.shape[0]
+    proposal = proposal.prepared(key, model, intervals, num_steps)
+    fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
+    keys = fold_in(key, jnp.arange(num_intervals * num_proposals))
+    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_proposals, axis=0), intervals)
+    nothing = jnp.zeros(0, jnp.int32)  # no path is kept
+    drawn = proposal.draw(keys, model, each, num_steps, nothing, True)
+
+    def by_interval(leaf):
+        return leaf.reshape(num_intervals, num_proposals)
+
+    log_weights = by_interval(drawn.log_weights)
+    log_sum = logsumexp(log_weights, axis=1)
+    log_squares = logsumexp(2 * log_weights, axis=1)
+    some = log_sum > -jnp.inf
+    inverse_size = jnp.where(some, jnp.exp(log_squares - 2 * log_sum), jnp.inf)
+    # The variance of the mean, in squares of the mean: (Σw²/(Σw)² - 1/n) n/(n-1).
+    variance = jnp.maximum(inverse_size - 1 / num_proposals, 0)
+    variance *= num_proposals / max(num_proposals - 1, 1)
+    error = jnp.sqrt(variance) if num_proposals > 1 else jnp.full_like(variance, jnp.inf)
+
+    def of_interval(leaf):
+        return leaf if batched else leaf[0]
+
+    return TransitionLogDensity(
+        of_interval(log_sum - np.log(num_proposals)),
+        of_interval(jnp.where(some, error, jnp.inf)),
+        of_interval(jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0)),
+        of_interval(jnp.sum(by_interval(drawn.found), axis=1)),
+        of_interval(jnp.sum(by_interval(drawn.truncated), axis=1)),
+        of_interval(jnp.sum(by_interval(drawn.num_simulated), axis=1)),
+        proposal,
+    )

@@ -1,0 +1,417 @@
+"""Weighted proposals: a bridge proposal is a path with an unbiased weight,
+
+    E[w h(path)] = p_T(a, b) E_bridge[h].
+
+Chains, importance means and transition densities are written on this alone. For a coupling
+(`start_laws` has the derivation)
+
+    w = 1{met} · ν(b)/ν(x_0) · μ(x_0) · (mean of N hitting counts).
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from .bridges import Bridges, Inputs, check_key, find_bridges
+from .burn_in import with_burn_in
+from .coupling import AbstractCoupling, Coupling
+from .diffusion import Diffusion, check_diffusion
+from .hitting import (
+    HittingCounts,
+    check_max_trials,
+    check_whole,
+    count_hits,
+    durations_of,
+    with_start_law,
+)
+from .intervals import Intervals, check_count
+from .search import check_bound, default_num_lanes, key_for
+from .start_laws import AnyStartLaw, Reversed, Stationary, log_ratio, needs_burn_in
+
+
+class WeightedPaths(NamedTuple):
+    """One weighted path for each of P keys.
+
+    `log_weights` are -inf and `paths` NaN where none was `found`; `truncated` says where a
+    weight is not exact because a bound on the work was reached; `num_simulated` counts the
+    simulated paths.
+    """
+
+    paths: Float[Array, "P K d"]
+    log_weights: Float[Array, " P"]
+    found: Bool[Array, " P"]
+    truncated: Bool[Array, " P"]
+    num_simulated: Int[Array, " P"]
+
+
+class AbstractWeightedProposal(eqx.Module):
+    """A way to propose bridges, each with an unbiased weight."""
+
+    @abstractmethod
+    def prepared(
+        self, key: Key[Array, ""], model: Diffusion, intervals: Intervals, num_steps: int
+    ) -> "AbstractWeightedProposal":
+        """The proposal with everything measured that it must know of these intervals."""
+
+    @abstractmethod
+    def draw(
+        self,
+        keys: Key[Array, " P"],
+        model: Diffusion,
+        intervals: Intervals,
+        num_steps: int,
+        stored: Int[Array, " K"] | None,
+        misses_count: bool,
+    ) -> WeightedPaths:
+        """One weighted path for each key and each of P `intervals`, a function of its key.
+
+        With `misses_count` a proposal that does not become a bridge has weight zero, so that
+        `E[w] = p_T(a, b)`; otherwise it is tried again, and weights are in proportion only.
+        """
+
+    @abstractmethod
+    def reweigh(
+        self,
+        keys: Key[Array, " P"],
+        model: Diffusion,
+        intervals: Intervals,
+        paths: Float[Array, "P N+1 d"],
+    ) -> WeightedPaths:
+        """Given paths with weights from their conditional law under the target of a chain."""
+
+
+class CoupledPairs(AbstractWeightedProposal):
+    """The proposals of a coupling, weighted by `num_counts` hitting counts each."""
+
+    coupling: AbstractCoupling
+    max_proposals: Int[Array, ""]
+    max_trials: Int[Array, ""]
+    num_counts: int = eqx.field(static=True)
+
+    def prepared(self, key, model, intervals, num_steps):
+        _, end, duration = intervals
+        coupling = with_burn_in(key, model, self.coupling, end, duration, num_steps)
+        return eqx.tree_at(lambda p: p.coupling, self, coupling)
+
+    def draw(self, keys, model, intervals, num_steps, stored, misses_count):
+        if misses_count and not model.has_density:
+            raise ValueError(
+                "the transition density needs the stationary one: give `Diffusion` a "
+                "`log_stationary`, normalised if the start law is `Stationary()`."
+            )
+        max_proposals = jnp.int32(1) if misses_count else self.max_proposals
+
+        def block(keys, intervals):
+            num_lanes = default_num_lanes(len(keys), num_steps, intervals.start)
+            propose_keys, count_keys = _split(keys)
+            inputs = Inputs(model, self.coupling, intervals)
+            everything = jnp.ones(len(keys), bool)
+            proposed = find_bridges(
+                propose_keys, inputs, everything, 1, max_proposals, num_steps, None, num_lanes
+            )
+            paths, reverse_start, _ = proposed.outputs
+            found = proposed.num_found > 0
+            counts = self._counts(count_keys, model, intervals, paths, found, self.num_counts)
+            log_weights = _log_weights(
+                self.coupling.start_law, model, intervals.end, reverse_start, counts.mean
+            )
+            return WeightedPaths(
+                jnp.where(
+                    found[:, None, None], paths if stored is None else paths[:, stored], jnp.nan
+                ),
+                jnp.where(found, log_weights, -jnp.inf),
+                found,
+                counts.truncated,
+                proposed.num_trials + counts.num_trials,
+            )
+
+        return _in_blocks(block, (keys, intervals), num_steps)
+
+    def reweigh(self, keys, model, intervals, paths):
+        # Under the target the counts of a path are size-biased, and x_0 is where a trial that
+        # hit had started: N + 1 counts, less one trial.
+        found = jnp.all(jnp.isfinite(paths), axis=(1, 2))
+        counts = self._counts(keys, model, intervals, paths, found, self.num_counts + 1)
+        num_hits = jnp.maximum(jnp.sum(counts.counts > 0, axis=1) - 1, 1)
+        mean = jnp.maximum(counts.num_trials - 1, 1) / num_hits
+        log_weights = _log_weights(
+            self.coupling.start_law, model, intervals.end, counts.start, mean.astype(paths.dtype)
+        )
+        # Where nothing hit, x_0 is unknown and the ratio of the densities there is left out.
+        fallback = jnp.log(mean).astype(paths.dtype)
+        log_weights = jnp.where(jnp.isfinite(log_weights), log_weights, fallback)
+        return WeightedPaths(
+            paths,
+            jnp.where(found, log_weights, -jnp.inf),
+            found,
+            counts.truncated,
+            counts.num_trials,
+        )
+
+    def _counts(self, keys, model, intervals, paths, found, num_counts) -> HittingCounts:
+        return count_hits(
+            keys,
+            model,
+            self.coupling,
+            paths,
+            intervals.duration,
+            found,
+            num_counts,
+            self.max_trials,
+        )
+
+
+def _log_weights(
+    law: AnyStartLaw,
+    model: Diffusion,
+    end: Float[Array, "P d"],
+    reverse_start: Float[Array, "P d"],
+    mean_count: Float[Array, " P"],
+) -> Float[Array, " P"]:
+    """log [ν(b)/ν(x_0) · μ(x_0) · ρ̂]; without ν(b), a constant, where the model has no ν."""
+    log_weights = jax.vmap(lambda x: log_ratio(law, model, x))(reverse_start)
+    log_weights += jnp.log(mean_count)
+    if model.has_density:
+        log_weights += jax.vmap(model.log_stationary)(end)
+    return log_weights
+
+
+def as_proposal(
+    proposal: Any,
+    num_counts: int = 1,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+) -> AbstractWeightedProposal:
+    """What the user gave as `proposal`, as a weighted proposal."""
+    proposal = Coupling() if proposal is None else proposal
+    if isinstance(proposal, AbstractWeightedProposal):
+        return proposal
+    if not isinstance(proposal, AbstractCoupling):
+        raise TypeError(f"`proposal` must be a `Coupling`; got {proposal!r}.")
+    num_counts = check_count("num_counts", num_counts)
+    return CoupledPairs(
+        proposal,
+        check_bound("max_proposals", max_proposals, 100_000),
+        check_max_trials(max_trials, num_counts),
+        num_counts,
+    )
+
+
+def check_density(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
+    """Raise `ValueError` where a start law has a density but the model's ν is not known."""
+    if not isinstance(proposal, CoupledPairs):
+        return
+    law = proposal.coupling.start_law
+    if not isinstance(law, Stationary | Reversed) and not model.has_density:
+        raise ValueError(
+            "a start law other than `Stationary()` is paid for with ν(x): give `Diffusion` a "
+            "`log_stationary` (up to a constant)."
+        )
+
+
+def check_burn_in(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
+    """Raise `ValueError` where a burn-in would have to be measured, but there is no place."""
+    if isinstance(proposal, CoupledPairs) and needs_burn_in(proposal.coupling.start_law, model):
+        raise ValueError(
+            "this model has no sampler of its stationary law, so the length of the run that "
+            "replaces it must be known: use `Stationary(burn_in=...)`, in units of time, for "
+            "instance from `burn_in`, pass `sample_stationary=` to `Diffusion`, or choose a start "
+            "law with a density (`fit_start_law`)."
+        )
+
+
+class WeightedBridges(eqx.Module):
+    """Bridges whose weights make them exact; with I intervals arrays have a leading axis I.
+
+    - `times`, `paths`: as in `Bridges`, shapes (K,) and (n, K, d).
+    - `log_weights`: shape (n,), up to a common constant; -inf for a bridge that is missing.
+    - `met`: whether the bridge was found, shape (n,).
+    - `truncated`: whether its counts were cut off by `max_trials`, shape (n,). Such a weight is
+        finite and too small on average, so that paths that are hard to hit weigh too little.
+    - `num_simulated`: paths simulated in all, proposals and trials.
+    - `start_law`: μ; a `Stationary` that had to be run has its `burn_in` in it.
+    """
+
+    times: Float[Array, "*durations K"]
+    paths: Float[Array, "*I n K d"]
+    log_weights: Float[Array, "*I n"]
+    met: Bool[Array, "*I n"]
+    truncated: Bool[Array, "*I n"]
+    num_simulated: Int[Array, "*I"]
+    start_law: AnyStartLaw
+
+    @property
+    def weights(self) -> Float[Array, "*I n"]:
+        """The weights, normalised to sum to one; all zero where no bridge was found."""
+        largest = jnp.max(self.log_weights, axis=-1, keepdims=True)
+        weights = jnp.exp(self.log_weights - jnp.where(jnp.isfinite(largest), largest, 0))
+        total = jnp.sum(weights, axis=-1, keepdims=True)
+        return weights / jnp.where(total > 0, total, 1)
+
+    @property
+    def effective_sample_size(self) -> Float[Array, "*I"]:
+        """(Σw)²/Σw²: how many exact bridges these are worth, between 0 and n."""
+        squares = jnp.sum(self.weights**2, axis=-1)
+        positive = squares > 0
+        return jnp.where(positive, 1 / jnp.where(positive, squares, 1), 0)
+
+    @property
+    def efficiency(self) -> Float[Array, "*I"]:
+        """Effective sample size per simulated path."""
+        return self.effective_sample_size / jnp.maximum(self.num_simulated, 1)
+
+    def mean(self, fn: Callable[[Array], PyTree] = lambda path: path) -> PyTree:
+        """The weighted mean of `fn(path)`, a function of one path of shape (K, d), by default
+        the path itself: an estimate of its expectation over exact bridges."""
+        values, weights = self._values(fn), self.weights
+        return jax.tree.map(lambda value: _weighted_sum(weights, value), values)
+
+    def standard_error(self, fn: Callable[[Array], PyTree] = lambda path: path) -> PyTree:
+        """That of `mean(fn)`, by the delta method, entry by entry."""
+        values, weights = self._values(fn), self.weights
+
+        def error(value):
+            mean = _weighted_sum(weights, value)
+            deviation = value - jnp.expand_dims(mean, weights.ndim - 1)
+            return jnp.sqrt(_weighted_sum(weights**2, deviation**2))
+
+        return jax.tree.map(error, values)
+
+    def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:
+        """Equally weighted paths by systematic resampling, shape (m, K, d): many effective ones
+        are needed for few repetitions. NaN where no bridge was found."""
+        num_bridges = check_count("num_bridges", num_bridges)
+
+        def one_interval(key, weights, paths):
+            shift = jax.random.uniform(key, dtype=weights.dtype)
+            points = (jnp.arange(num_bridges, dtype=weights.dtype) + shift) / num_bridges
+            cumulated = jnp.cumsum(weights)
+            chosen = jnp.searchsorted(cumulated, points * cumulated[-1], side="right")
+            # Rounding may lead past the last positive weight.
+            last = jnp.max(jnp.where(weights > 0, jnp.arange(len(weights)), 0))
+            return paths[jnp.minimum(chosen, last)]
+
+        if self.log_weights.ndim == 1:
+            return one_interval(key, self.weights, self.paths)
+        keys = jax.random.split(key, len(self.log_weights))
+        return jax.vmap(one_interval)(keys, self.weights, self.paths)
+
+    def _values(self, fn: Callable[[Array], PyTree]) -> PyTree:
+        each = jax.vmap(fn) if self.log_weights.ndim == 1 else jax.vmap(jax.vmap(fn))
+        # Missing bridges are NaN and weigh nothing.
+        paths = jnp.where(self.met[..., None, None], self.paths, 0)
+        return each(paths)
+
+
+def _weighted_sum(weights: Float[Array, "*I n"], values: Array) -> Array:
+    axis = weights.ndim - 1
+    weights = weights.reshape(*weights.shape, *[1] * (values.ndim - weights.ndim))
+    return jnp.sum(jnp.where(weights > 0, weights * values, 0), axis=axis)
+
+
+def weigh_bridges(
+    key: Key[Array, ""],
+    model: Diffusion,
+    bridges: Bridges,
+    num_counts: int = 1,
+    *,
+    start_law: AnyStartLaw | None = None,
+    max_trials: int | None = None,
+    batch_size: int | None = None,
+) -> WeightedBridges:
+    """Weights that correct approximate bridges to the exact law: importance sampling.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: the model the bridges were made with.
+    - `bridges`: from `sample_bridges`, with their whole paths (no `save_at`).
+    - `num_counts`: N hitting counts for each bridge. More make a weight less noisy; one is often
+        the best use of time.
+    - `start_law`: μ, by default that of the bridges' coupling.
+    - `max_trials`: bounds the trials of each bridge; by default 10,000 for each count. See
+        `WeightedBridges.truncated`.
+    - `batch_size`: trials simulated side by side; changes results by rounding only.
+
+    **Returns:** `WeightedBridges`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000)
+        weighted = jb.weigh_bridges(jax.random.key(1), model, bridges)
+        weighted.mean(lambda path: path[25]), weighted.effective_sample_size
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    check_whole(bridges)
+    num_counts = check_count("num_counts", num_counts)
+    bound = check_max_trials(max_trials, num_counts)
+    coupling = bridges.coupling
+    if start_law is not None:
+        coupling = with_start_law(coupling, start_law)
+    check_density(as_proposal(coupling), model)
+    return _weigh_bridges(key, model, coupling, bridges, num_counts, bound, batch_size)
+
+
+@eqx.filter_jit
+def _weigh_bridges(key, model, coupling, bridges, num_counts, max_trials, num_lanes):
+    model = model.prepared()
+    d = bridges.paths.shape[-1]
+    paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
+    reverse_start, end = bridges.reverse_start.reshape(-1, d), paths[:, -1]
+    duration, met = durations_of(bridges), bridges.met
+    coupling = with_burn_in(key, model, coupling, end, duration, bridges.num_steps)
+    keys = jax.random.split(key_for("hitting counts", key), len(paths))
+    active = met.reshape(-1)
+    counts = count_hits(
+        keys, model, coupling, paths, duration, active, num_counts, max_trials, num_lanes
+    )
+    log_weights = _log_weights(coupling.start_law, model, end, reverse_start, counts.mean)
+    num_trials = jnp.sum(counts.num_trials.reshape(met.shape), axis=-1)
+    return WeightedBridges(
+        bridges.times,
+        bridges.paths,
+        jnp.where(met, log_weights.reshape(met.shape), -jnp.inf),
+        met,
+        counts.truncated.reshape(met.shape),
+        bridges.num_proposals + num_trials,
+        coupling.start_law,
+    )
+
+
+def _split(keys: Key[Array, " P"]) -> tuple[Key[Array, " P"], Key[Array, " P"]]:
+    first, second = jax.vmap(jax.random.split, out_axes=1)(keys)
+    return first, second
+
+
+# Whole paths are kept only until they are weighed: at most this many bytes of them at a time.
+_BLOCK_BYTES = 2**28
+
+
+def _in_blocks(
+    function: Callable[[Key[Array, " block"], Intervals], WeightedPaths],
+    arguments: tuple[Key[Array, " P"], Intervals],
+    num_steps: int,
+) -> WeightedPaths:
+    """`function`, row by row of its arguments, on blocks of rows."""
+    keys, intervals = arguments
+    num, d = intervals.start.shape
+    bytes_per_path = (num_steps + 1) * d * intervals.start.dtype.itemsize
+    num_blocks = -(-num * bytes_per_path // _BLOCK_BYTES)
+    if num_blocks == 1:
+        return function(keys, intervals)
+    size = -(-num // num_blocks)
+    rows = jnp.minimum(jnp.arange(num_blocks * size), num - 1).reshape(num_blocks, size)
+    keys, intervals = keys[rows], jax.tree.map(lambda leaf: leaf[rows], intervals)
+    blocks = lax.map(lambda block: function(*block), (keys, intervals))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:num], blocks)
