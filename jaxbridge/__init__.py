@@ -8,6 +8,7 @@ sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion 
 """
 
 from .bridges import Bridges as Bridges, sample_bridges as sample_bridges
+from .burn_in import measure_burn_in as measure_burn_in
 from .chains import (
     Chain as Chain,
     Kernel as Kernel,
@@ -21,6 +22,11 @@ from .coupling import (
     no_rotation as no_rotation,
     polar_rotation as polar_rotation,
     published_rotation as published_rotation,
+)
+from .diagnostics import (
+    HittingVariation as HittingVariation,
+    effective_sample_size as effective_sample_size,
+    hitting_variation as hitting_variation,
 )
 from .diffusion import Diffusion as Diffusion
 from .gaussian import (
@@ -61,6 +67,12 @@ from .start_laws import (
 from .transition import (
     TransitionLogDensity as TransitionLogDensity,
     transition_log_density as transition_log_density,
+)
+from .tuning import (
+    Pilot as Pilot,
+    Tuning as Tuning,
+    fit_start_law as fit_start_law,
+    tune_coupling as tune_coupling,
 )
 from .weighted import (
     AbstractWeightedProposal as AbstractWeightedProposal,

@@ -18,8 +18,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Key
 
+from .arrays import Numbers
+from .bridges import check_key
 from .coupling import AbstractCoupling, Coupling, rotate, rotation_between
-from .diffusion import Diffusion
+from .diffusion import Diffusion, check_diffusion
+from .intervals import as_intervals, check_count, check_model
 from .meeting import PairStep, frame
 from .noise import noisy_scan
 from .search import key_for
@@ -45,13 +48,50 @@ def with_burn_in(
     pairs = jnp.arange(_NUM_PAIRS) % end.shape[0]
     usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
     end = jnp.where(usable, end, end[jnp.argmax(usable)])  # bridges that were not found are NaN
-    time = measure_burn_in(
-        key, model, coupling, end[pairs].T, duration[pairs] / num_steps, num_steps
-    )
+    dt = duration[pairs] / num_steps
+    time = _measure(key, model, coupling, end[pairs].T, dt, num_steps)
     return eqx.tree_at(lambda c: c.start_law, coupling, Stationary(time))
 
 
 def measure_burn_in(
+    key: Key[Array, ""],
+    model: Diffusion,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_steps: int = 50,
+    coupling: AbstractCoupling | None = None,
+) -> Float[Array, ""]:
+    """A time after which the reversed diffusion from `end` is stationary to about 1e-5 in total
+    variation, for `Stationary(burn_in=...)`: a multiple of `duration`, found by coupling.
+
+    **Arguments:** as in `sample_bridges`; only the scheme and the step matter.
+
+    !!! example
+
+        ```python
+        burn_in = jb.measure_burn_in(jax.random.key(0), model, b, 1.0)
+        coupling = jb.Coupling(0.5, start_law=jb.Stationary(burn_in))
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_steps = check_count("num_steps", num_steps)
+    intervals, _, _ = as_intervals(end, end, duration)
+    coupling = Coupling() if coupling is None else coupling
+    check_model(model, intervals, coupling.scheme)
+    model.check_reversal()
+    return _measure_compiled(key_for("burn-in", key), model, coupling, intervals, num_steps)
+
+
+@eqx.filter_jit
+def _measure_compiled(key, model, coupling, intervals, num_steps):
+    pairs = jnp.arange(_NUM_PAIRS) % len(intervals.end)
+    end, dt = intervals.end[pairs].T, intervals.duration[pairs] / num_steps
+    return _measure(key, model.prepared(), coupling, end, dt, num_steps)
+
+
+def _measure(
     key: Key[Array, ""],
     model: Diffusion,
     coupling: AbstractCoupling,

@@ -235,6 +235,7 @@ class Chain(eqx.Module):
         little weight, and the chain's law is not exact. Shape (n,), or `None` as `log_weights`.
     - `num_simulated`: paths simulated in all, shape ().
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
+    - `num_steps`: N.
     """
 
     times: Float[Array, "*durations K"]
@@ -245,6 +246,12 @@ class Chain(eqx.Module):
     truncated: Bool[Array, "*I n"] | None
     num_simulated: Int[Array, "*I"]
     proposal: AbstractWeightedProposal
+    num_steps: int = eqx.field(static=True)
+
+    @property
+    def coupling(self) -> AbstractCoupling | None:
+        """That of the proposal, if it has one."""
+        return self.proposal.coupling if isinstance(self.proposal, CoupledPairs) else None
 
     @property
     def acceptance_rate(self) -> Float[Array, "*I"]:
@@ -369,6 +376,7 @@ def _run_pseudo_marginal(
         of_states(drawn.truncated),
         num_simulated if batched else num_simulated[0],
         proposal,
+        num_steps,
     )
 
 
@@ -497,6 +505,7 @@ def _run_renewal(
         None,
         num_simulated if batched else num_simulated[0],
         pairs,
+        num_steps,
     )
 
 

@@ -7,13 +7,15 @@ counts of one bridge are the gaps between the hits in one sequence of independen
 mean of N counts is the number of trials up to the N-th hit, divided by N.
 """
 
+from typing import Protocol, runtime_checkable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from .associated import run_associated
-from .bridges import Bridges, check_key
+from .bridges import check_key
 from .burn_in import with_burn_in
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
@@ -23,6 +25,21 @@ from .start_laws import AnyStartLaw, as_start_law
 
 # A count that takes longer than this is cut off, unless the user says otherwise.
 _MAX_TRIALS_PER_COUNT = 10_000
+
+
+@runtime_checkable
+class BridgePaths(Protocol):
+    """What has bridges in it: `Bridges`, `WeightedBridges` and `Chain`."""
+
+    times: Array
+    paths: Array
+    met: Array
+    num_steps: int
+
+    @property
+    def coupling(self) -> AbstractCoupling | None:
+        """That which proposed them, if one did."""
+        ...
 
 
 class HittingCounts(eqx.Module):
@@ -81,7 +98,7 @@ class HittingCounts(eqx.Module):
 def hitting_counts(
     key: Key[Array, ""],
     model: Diffusion,
-    bridges: Bridges,
+    bridges: BridgePaths,
     num_counts: int = 1,
     *,
     start_law: AnyStartLaw | None = None,
@@ -94,7 +111,8 @@ def hitting_counts(
 
     - `key`: a typed key.
     - `model`: the model the bridges were made with.
-    - `bridges`: from `sample_bridges`, with their whole paths (no `save_at`).
+    - `bridges`: from `sample_bridges`, `weigh_bridges` or `sample_exact_bridges`, with their
+        whole paths (no `save_at`).
     - `num_counts`: N, for each bridge.
     - `start_law`: μ, by default that of the bridges' coupling.
     - `max_trials`: bounds the trials of each bridge; by default 10,000 for each count.
@@ -113,12 +131,9 @@ def hitting_counts(
     """
     check_key(key)
     check_diffusion(model)
-    check_whole(bridges)
+    coupling = coupling_of(bridges, start_law)
     num_counts = check_count("num_counts", num_counts)
     bound = check_max_trials(max_trials, num_counts)
-    coupling = bridges.coupling
-    if start_law is not None:
-        coupling = with_start_law(coupling, start_law)
     return _hitting_counts(key, model, coupling, bridges, num_counts, bound, batch_size)
 
 
@@ -186,7 +201,7 @@ def count_hits(
     )
 
 
-def durations_of(bridges: Bridges) -> Float[Array, " P"]:
+def durations_of(bridges: BridgePaths) -> Float[Array, " P"]:
     """The duration of each of the I × n bridges."""
     duration = bridges.times[..., -1]
     if bridges.times.ndim == 2:
@@ -194,26 +209,25 @@ def durations_of(bridges: Bridges) -> Float[Array, " P"]:
     return jnp.broadcast_to(duration, bridges.met.shape).reshape(-1)
 
 
-def with_start_law(coupling: AbstractCoupling, start_law: AnyStartLaw) -> AbstractCoupling:
-    """The coupling with another start law."""
-    law = as_start_law(start_law)
-    return eqx.tree_at(lambda c: c.start_law, coupling, law)
+def coupling_of(bridges: BridgePaths, start_law: AnyStartLaw | None) -> AbstractCoupling:
+    """The coupling that proposed the bridges, with this start law if there is one.
 
-
-def check_whole(bridges: Bridges) -> None:
-    """Raise `TypeError` or `ValueError` for anything but bridges at all steps of their grid."""
-    if not isinstance(bridges, Bridges):
+    **Raises:** `TypeError` or `ValueError` for anything but bridges by a coupling at all steps of
+    their grid.
+    """
+    if not isinstance(bridges, BridgePaths):
         raise TypeError(f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}.")
-    if bridges.paths.ndim not in (3, 4):
-        raise ValueError(
-            f"`bridges.paths` must be (n, N+1, d) or (I, n, N+1, d); got {bridges.paths.shape}."
-        )
+    if bridges.coupling is None:
+        raise ValueError("`bridges` must have been proposed by a `Coupling`.")
     if bridges.paths.shape[-2] != bridges.num_steps + 1:
         raise ValueError(
             "whether a bridge is hit depends on its whole path, but these bridges were kept at "
             f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points: sample them "
             "without `save_at`, or use `sample_exact_bridges`, which takes it."
         )
+    if start_law is None:
+        return bridges.coupling
+    return eqx.tree_at(lambda c: c.start_law, bridges.coupling, as_start_law(start_law))
 
 
 def check_max_trials(max_trials: int | None, num_counts: int) -> Int[Array, ""]:

@@ -25,10 +25,9 @@ from .diffusion import Diffusion, check_diffusion
 from .hitting import (
     HittingCounts,
     check_max_trials,
-    check_whole,
     count_hits,
+    coupling_of,
     durations_of,
-    with_start_law,
 )
 from .intervals import Intervals, check_count
 from .search import check_bound, default_num_lanes, key_for
@@ -221,8 +220,8 @@ def check_burn_in(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
         raise ValueError(
             "this model has no sampler of its stationary law, so the length of the run that "
             "replaces it must be known: use `Stationary(burn_in=...)`, in units of time, for "
-            "instance from `burn_in`, pass `sample_stationary=` to `Diffusion`, or choose a start "
-            "law with a density (`fit_start_law`)."
+            "instance from `measure_burn_in`; or pass `sample_stationary=` to `Diffusion`, or "
+            "choose a start law with a density (`fit_start_law`)."
         )
 
 
@@ -235,7 +234,8 @@ class WeightedBridges(eqx.Module):
     - `truncated`: whether its counts were cut off by `max_trials`, shape (n,). Such a weight is
         finite and too small on average, so that paths that are hard to hit weigh too little.
     - `num_simulated`: paths simulated in all, proposals and trials.
-    - `start_law`: μ; a `Stationary` that had to be run has its `burn_in` in it.
+    - `coupling`, `num_steps`: those they were made with. The coupling has the start law of the
+        weights; a `Stationary` that had to be run has its `burn_in` in it.
     """
 
     times: Float[Array, "*durations K"]
@@ -244,7 +244,8 @@ class WeightedBridges(eqx.Module):
     met: Bool[Array, "*I n"]
     truncated: Bool[Array, "*I n"]
     num_simulated: Int[Array, "*I"]
-    start_law: AnyStartLaw
+    coupling: AbstractCoupling
+    num_steps: int = eqx.field(static=True)
 
     @property
     def weights(self) -> Float[Array, "*I n"]:
@@ -353,12 +354,9 @@ def weigh_bridges(
     """
     check_key(key)
     check_diffusion(model)
-    check_whole(bridges)
+    coupling = coupling_of(bridges, start_law)
     num_counts = check_count("num_counts", num_counts)
     bound = check_max_trials(max_trials, num_counts)
-    coupling = bridges.coupling
-    if start_law is not None:
-        coupling = with_start_law(coupling, start_law)
     check_density(as_proposal(coupling), model)
     return _weigh_bridges(key, model, coupling, bridges, num_counts, bound, batch_size)
 
@@ -385,7 +383,8 @@ def _weigh_bridges(key, model, coupling, bridges, num_counts, max_trials, num_la
         met,
         counts.truncated.reshape(met.shape),
         bridges.num_proposals + num_trials,
-        coupling.start_law,
+        coupling,
+        bridges.num_steps,
     )
 
 

@@ -1,0 +1,157 @@
+"""How much do hitting probabilities vary, and how good is a chain?
+
+The approximate bridge has the density `f_bridge(z) π_T(z) / π_T`, equation (z-density): it is
+exact if π_T(z) is constant. With ρ̂_N the mean of N counts and B an exact bridge,
+
+    V(ρ̂_N) = V(1/π_T(B)) + E[(1 - π_T(B)) / π_T(B)²] / N,
+
+equation (regression), so a regression of the variance of ρ̂_N on 1/N has V(1/π_T(B)) as its
+intercept. It holds for **fresh** counts drawn for each exact bridge; the counts that a chain
+itself has kept are size-biased.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, Key
+
+from .bridges import check_key
+from .hitting import BridgePaths, hitting_counts
+from .intervals import check_count
+from .start_laws import AnyStartLaw
+from .weighted import WeightedBridges
+
+
+class HittingVariation(NamedTuple):
+    """The regression of V(ρ̂_N) on 1/N; standard errors by bootstrap over the bridges.
+
+    - `num_counts`, `variances`: N and V(ρ̂_N), shape (K,).
+    - `intercept`: an estimate of V(1/π_T(B)), which chance can make negative, and its error.
+    - `slope`: an estimate of E[(1-π)/π²].
+    - `mean`: of ρ̂, an estimate of E[1/π_T(B)].
+    - `ratio`: √intercept / mean, zero for a negative intercept: the variation of 1/π_T(B), and
+        its error. Zero for a proposal that is exact as it is.
+    - `num_truncated`: bridges left out because their counts were cut off by `max_trials`.
+    """
+
+    num_counts: Int[Array, " K"]
+    variances: Float[Array, " K"]
+    intercept: Float[Array, ""]
+    intercept_error: Float[Array, ""]
+    slope: Float[Array, ""]
+    mean: Float[Array, ""]
+    ratio: Float[Array, ""]
+    ratio_error: Float[Array, ""]
+    num_truncated: Int[Array, ""]
+
+
+def hitting_variation(
+    key: Key[Array, ""],
+    model,
+    bridges: BridgePaths,
+    num_counts: Sequence[int] = (50, 100, 150, 200, 300),
+    *,
+    start_law: AnyStartLaw | None = None,
+    max_trials: int | None = None,
+) -> HittingVariation:
+    """How much 1/π_T varies over exact bridges: section 3.2 of the paper.
+
+    **Arguments:**
+
+    - `bridges`: exact ones, of one interval, with whole paths: from `sample_exact_bridges`
+        (thin the chain: states that repeat cost counts but say little) or `weigh_bridges`,
+        whose weights are taken into account.
+    - `num_counts`: increasing, at least two. The largest is what is simulated for each bridge.
+    - `start_law`: where the associated diffusion starts, by default as the bridges' coupling has
+        it.
+    - `key`, `model`, `max_trials`: as in `hitting_counts`.
+
+    **Returns:** `HittingVariation`.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        weighted = jb.weigh_bridges(key, model, bridges)
+        jb.hitting_variation(key, model, weighted, num_counts=(10, 20, 40)).ratio
+        ```
+    """
+    check_key(key)
+    sizes = [check_count("num_counts", n) for n in num_counts]
+    if len(sizes) < 2 or sorted(set(sizes)) != sizes:
+        raise ValueError(f"`num_counts` must be two or more increasing numbers; got {num_counts}.")
+    if bridges.paths.ndim != 3:
+        raise ValueError("`bridges` must be those of one interval, paths of shape (n, N+1, d).")
+    counted = hitting_counts(
+        key, model, bridges, sizes[-1], start_law=start_law, max_trials=max_trials
+    )
+    usable = bridges.met & ~counted.truncated
+    weights = bridges.weights if isinstance(bridges, WeightedBridges) else usable * 1.0
+    weights = jnp.where(usable, weights, 0)
+    sums = jnp.cumsum(jnp.where(usable[:, None], counted.counts, 1), axis=1)
+    ends = np.asarray(sizes)
+    rho = sums[:, ends - 1] / ends.astype(weights.dtype)  # ρ̂_N of each bridge, (n, K)
+    drawn = jax.random.randint(jax.random.fold_in(key, 0), (200, len(rho)), 0, len(rho))
+    estimates = _regress(rho, weights, ends)
+    replicates = jax.vmap(lambda i: _regress(rho[i], weights[i], ends))(drawn)
+    variances, intercept, slope, mean, ratio = estimates
+    return HittingVariation(
+        jnp.asarray(ends),
+        variances,
+        intercept,
+        jnp.nanstd(replicates[1]),
+        slope,
+        mean,
+        ratio,
+        jnp.nanstd(replicates[4]),
+        jnp.sum(counted.truncated),
+    )
+
+
+def _regress(rho: Float[Array, "n K"], weights: Float[Array, " n"], sizes: Int[np.ndarray, " K"]):
+    """V(ρ̂_N), then intercept and slope of its regression on 1/N, the mean and the ratio."""
+    weights = weights / jnp.sum(weights)
+    mean = weights @ rho
+    # With equal weights this is the variance with n - 1 in the denominator.
+    variances = weights @ (rho - mean) ** 2 / (1 - jnp.sum(weights**2))
+    x = (1 / sizes).astype(variances.dtype)
+    slope = jnp.sum((x - x.mean()) * variances) / jnp.sum((x - x.mean()) ** 2)
+    intercept = variances.mean() - slope * x.mean()
+    ratio = jnp.sqrt(jnp.maximum(intercept, 0)) / mean[-1]
+    return variances, intercept, slope, mean[-1], ratio
+
+
+def effective_sample_size(draws: ArrayLike) -> Float[Array, "..."]:
+    """How many independent draws a chain is worth: n / (1 + 2 Σ_t ρ_t), with autocorrelations
+    summed as far as sums of adjacent pairs are positive, and made to decrease (Geyer 1992).
+
+    `draws`: one chain, shape (n, ...), for instance `chain.paths[:, 25]`.
+
+    !!! example
+
+        ```python
+        jb.effective_sample_size(chain.paths[:, 25])  # shape (d,)
+        ```
+    """
+    draws = jnp.asarray(draws)
+    if draws.ndim == 0 or draws.shape[0] < 4:
+        raise ValueError(
+            f"`draws` must be a chain of at least 4, shape (n, ...); got {draws.shape}."
+        )
+    n = draws.shape[0]
+    centred = draws - jnp.mean(draws, axis=0)
+    spectrum = jnp.fft.rfft(centred, 2 * n, axis=0)
+    covariance = jnp.fft.irfft(jnp.abs(spectrum) ** 2, 2 * n, axis=0)[:n]
+    moving = covariance[0] > 0
+    correlation = covariance / jnp.where(moving, covariance[0], 1)
+    pairs = correlation[: n // 2 * 2].reshape(n // 2, 2, *draws.shape[1:]).sum(1)
+    positive = jnp.cumprod(pairs > 0, axis=0)
+    pairs = jax.lax.cummin(jnp.where(positive, pairs, 0), axis=0)
+    time = 2 * jnp.sum(pairs, axis=0) - 1
+    # A chain that alternates can be worth more than n, but how much is not well determined.
+    size = jnp.minimum(n / jnp.maximum(time, 1 / n), n * np.log10(n))
+    return jnp.where(moving, size, 1)
