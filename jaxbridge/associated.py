@@ -40,7 +40,7 @@ def run_associated(
     model: Diffusion,
     coupling: AbstractCoupling,
     keys: Key[Array, " lanes"],
-    path: Float[Array, "N+1 d lanes"],
+    path: Float[Array, "points d lanes"],
     dt: Float[Array, " lanes"],
 ) -> Associated:
     """One path associated with the bridge in each lane, whose random numbers depend on the

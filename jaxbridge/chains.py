@@ -64,7 +64,7 @@ class PseudoMarginalState(NamedTuple):
     A state without a path, where none was found, has weight -inf.
     """
 
-    position: Float[Array, "N+1 d"]
+    position: Float[Array, "points d"]
     log_weight: Float[Array, ""]
     truncated: Bool[Array, ""]
 
@@ -82,7 +82,7 @@ class PseudoMarginalInfo(NamedTuple):
 class RenewalState(NamedTuple):
     """`position`, the path, shape (N+1, d); NaN where none was found."""
 
-    position: Float[Array, "N+1 d"]
+    position: Float[Array, "points d"]
 
 
 class RenewalInfo(NamedTuple):
@@ -404,7 +404,7 @@ class _Segments(NamedTuple):
 
     paths: Float[Array, "L S K d"]
     moved: Bool[Array, "L S"]
-    ends: Float[Array, "S N+1 d"]
+    ends: Float[Array, "S points d"]
     stale: Bool[Array, " S"]
     num_simulated: Int[Array, " S"]
 
@@ -514,9 +514,9 @@ def _renew(
     model: Diffusion,
     pairs: CoupledPairs,
     intervals: Intervals,
-    paths: Float[Array, "S N+1 d"],
+    paths: Float[Array, "S points d"],
     active: Bool[Array, " S"],
-) -> tuple[Float[Array, "S N+1 d"], RenewalInfo]:
+) -> tuple[Float[Array, "S points d"], RenewalInfo]:
     """One renewal step of each of S chains that is active: hit first, propose only then."""
     num_steps = paths.shape[1] - 1
     trial_keys, propose_keys, accept_keys = jax.vmap(
@@ -551,7 +551,7 @@ def _propose(keys, model, pairs, intervals, active, num_steps):
 
 
 @eqx.filter_jit
-def _first_paths(keys, model, pairs, intervals, num_steps) -> Float[Array, "I N+1 d"]:
+def _first_paths(keys, model, pairs, intervals, num_steps) -> Float[Array, "I points d"]:
     """A bridge by proposal for each interval, NaN where none was found."""
     everything = jnp.ones(len(keys), bool)
     proposed = _propose(keys, model.prepared(), pairs, intervals, everything, num_steps)

@@ -163,7 +163,7 @@ def count_hits(
     keys: Key[Array, " P"],
     model: Diffusion,
     coupling: AbstractCoupling,
-    paths: Float[Array, "P N+1 d"],
+    paths: Float[Array, "P points d"],
     duration: Float[Array, " P"],
     active: Bool[Array, " P"],
     num_counts: int,

@@ -80,7 +80,7 @@ class AbstractWeightedProposal(eqx.Module):
         keys: Key[Array, " P"],
         model: Diffusion,
         intervals: Intervals,
-        paths: Float[Array, "P N+1 d"],
+        paths: Float[Array, "P points d"],
     ) -> WeightedPaths:
         """Given paths with weights from their conditional law under the target of a chain."""
 

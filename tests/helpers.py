@@ -1,10 +1,13 @@
 """Oracles and gates shared by the tests."""
 
 import contextlib
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxbridge as jb
 
@@ -62,6 +65,7 @@ def warped_model(model, forward, backward):
         lambda x, p: coefficients(x, p)[1],
         log_stationary,
         model.params,
+        sample_stationary=lambda key, p: forward(model.with_params(p).sample_stationary(key)),
     )
 
 
@@ -100,3 +104,127 @@ def count_compilations():
         yield compiled
     finally:
         jax.monitoring.clear_event_listeners()
+
+
+class ExactCase(NamedTuple):
+    """A bridge whose law is known: that of `to_gaussian` of its mid-point, and its density."""
+
+    model: jb.Diffusion
+    start: list
+    end: list
+    duration: float
+    num_steps: int
+    gamma: float
+    start_law: object
+    allowance: float  # for the step error, of log p and in standard deviations
+    to_gaussian: Callable
+    mean: np.ndarray
+    covariance: np.ndarray
+    log_density: float
+
+    @property
+    def coupling(self):
+        return jb.Coupling(self.gamma, start_law=self.start_law)
+
+    def middle(self, paths):
+        """The mid-points of paths (n, N+1, d), in the coordinates where they are Gaussian."""
+        return np.asarray(jax.vmap(self.to_gaussian)(paths[:, self.num_steps // 2]))
+
+
+def exact_case(
+    model, start, end, duration, gamma, start_law=None, num_steps=40, allowance=0.015, warp=None
+):
+    """A bridge of an Ornstein–Uhlenbeck process, or of `warp` = (forward, backward) of one."""
+    start, end = jnp.asarray(start, jnp.float32), jnp.asarray(end, jnp.float32)
+    law = jb.gaussian_bridge(model, start, end, duration, [duration / 2])
+    log_density = float(jb.ou_transition(model, start, duration).log_density(end))
+    to_gaussian = lambda x: x
+    if warp is not None:
+        forward, to_gaussian = warp
+        model, start, end = warped_model(model, *warp), forward(start), forward(end)
+        log_density += float(log_abs_det_2x2(jax.jacfwd(to_gaussian)(end))[1])
+    return ExactCase(
+        model,
+        start,
+        end,
+        duration,
+        num_steps,
+        gamma,
+        start_law,
+        allowance,
+        to_gaussian,
+        np.asarray(law.mean[0]),
+        np.asarray(law.covariance[0]),
+        log_density,
+    )
+
+
+NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
+FIVE_DIMENSIONAL = np.eye(5) + 0.4 * (np.eye(5, k=1) - np.eye(5, k=-1)) + 0.2
+FULL_SIGMA = np.array([[1.0, 0.3], [-0.2, 0.7]])
+
+
+def exact_cases():
+    """The bridges on which everything exact is tested."""
+    unlikely, very_unlikely = PAPER_CASES["unlikely"], PAPER_CASES["very unlikely"]
+    fitted = jb.GaussianLaw([1.5, -1.5], [[0.3, -0.12], [-0.12, 0.3]])
+    off_centre = jb.GaussianLaw([0.3, -1.2], [[0.5, -0.2], [-0.2, 0.6]])
+    one = jb.ornstein_uhlenbeck([[0.8]], [0.5], [[1.2]])
+    two = jb.ornstein_uhlenbeck(NON_REVERSIBLE, [0.2, -0.1], FULL_SIGMA)
+    five = jb.ornstein_uhlenbeck(FIVE_DIMENSIONAL)
+    swirled = jb.ornstein_uhlenbeck(NON_REVERSIBLE)
+    paper = paper_model()
+    return {
+        **{
+            f"unlikely, gamma {gamma:g}": lambda gamma=gamma: exact_case(
+                paper, *unlikely, 1.0, gamma
+            )
+            for gamma in (-1.0, 0.0, 0.5, 0.9)
+        },
+        "very unlikely": lambda: exact_case(paper, *very_unlikely, 1.0, 0.5, allowance=0.03),
+        "very unlikely, fitted law": lambda: exact_case(
+            paper, *very_unlikely, 1.0, 0.5, fitted, allowance=0.03
+        ),
+        "very unlikely, law off centre": lambda: exact_case(
+            paper, *very_unlikely, 1.0, 0.5, off_centre, allowance=0.03
+        ),
+        "not reversible": lambda: exact_case(two, [0.8, -0.3], [-0.5, 0.4], 1.5, 0.3),
+        "five dimensions": lambda: exact_case(five, 5 * [0.3], [-0.4, 0, 0, 0, 0.4], 2.0, 0.0),
+        "one dimension": lambda: exact_case(one, [-0.5], [1.5], 1.0, 0.0),
+        "swirled": lambda: exact_case(
+            swirled,
+            [0.8, -0.3],
+            [-0.5, 0.4],
+            1.5,
+            0.3,
+            num_steps=80,
+            warp=(swirl, unswirl),
+        ),
+    }
+
+
+def assert_weighted_moments(values, weights, mean, covariance, num_sigma=5.0, allowance=0.0):
+    """Weighted means and covariances within `num_sigma` standard errors of the exact ones, for
+    the effective sample size of the weights; `allowance` in exact standard deviations."""
+    values, weights = np.asarray(values, float), np.asarray(weights, float)
+    weights = weights / weights.sum()
+    size = 1 / (weights**2).sum()
+    sd = np.sqrt(np.diag(covariance))
+    deviations = (values - mean) / sd
+    correlation = covariance / np.outer(sd, sd)
+    bias = weights @ deviations
+    error = np.sqrt(weights**2 @ deviations**2)
+    np.testing.assert_array_less(np.abs(bias), num_sigma * error + allowance)
+    products = deviations[:, :, None] * deviations[:, None]
+    difference = np.tensordot(weights, products, 1) - correlation
+    error = np.sqrt(np.tensordot(weights**2, (products - correlation) ** 2, 1))
+    np.testing.assert_array_less(np.abs(difference), num_sigma * error + allowance)
+    return size
+
+
+def slow_cases(cases, everywhere):
+    """Names of cases, of which those not in `everywhere` are marked as slow."""
+    return [
+        name if name in everywhere else pytest.param(name, marks=pytest.mark.slow)
+        for name in cases
+    ]
