@@ -225,6 +225,5 @@ def assert_weighted_moments(values, weights, mean, covariance, num_sigma=5.0, al
 def slow_cases(cases, everywhere):
     """Names of cases, of which those not in `everywhere` are marked as slow."""
     return [
-        name if name in everywhere else pytest.param(name, marks=pytest.mark.slow)
-        for name in cases
+        name if name in everywhere else pytest.param(name, marks=pytest.mark.slow) for name in cases
     ]

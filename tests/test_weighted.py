@@ -50,9 +50,7 @@ def test_unweighted_and_published_midpoints_fail_the_same_test():
     case = exact_case(paper_model(), *PAPER_CASES["very unlikely"], 1.0, 0.5)
     raw = weighted_bridges(case, 10_000)
     with pytest.raises(AssertionError):
-        assert_weighted_moments(
-            case.middle(raw.paths), np.ones(10_000), case.mean, case.covariance
-        )
+        assert_weighted_moments(case.middle(raw.paths), np.ones(10_000), case.mean, case.covariance)
     published = weighted_bridges(case._replace(start_law=jb.Reversed()), 10_000)
     with pytest.raises(AssertionError):
         assert_weighted_moments(

@@ -1,0 +1,289 @@
+"""Chains have the exact law, batched or step by step, and run in BlackJAX."""
+
+import functools
+
+import blackjax.util
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import (
+    PAPER_CASES,
+    count_compilations,
+    exact_case,
+    exact_cases,
+    paper_model,
+    slow_cases,
+)
+
+import jaxbridge as jb
+from jaxbridge.intervals import Intervals
+from jaxbridge.weighted import as_proposal
+
+CASES = exact_cases()
+EVERYWHERE = {"unlikely, gamma 0.5", "very unlikely, fitted law"}
+FITTED = jb.GaussianLaw([0.4, 0.3], [[0.5, -0.3], [-0.3, 0.5]])
+
+
+def assert_chain_moments(values, mean, covariance):
+    """5 standard errors of batch means; batches are many times longer than the chain's memory."""
+    values = np.asarray(values, float)
+    sd = np.sqrt(np.diag(covariance))
+    deviations = (values - mean) / sd
+    products = deviations[:, :, None] * deviations[:, None]
+    correlation = covariance / np.outer(sd, sd)
+    for samples, exact in [(deviations, np.zeros(len(sd))), (products, correlation)]:
+        batches = samples[: len(samples) // 50 * 50].reshape(50, -1, *samples.shape[1:]).mean(1)
+        error = batches.std(0, ddof=1) / np.sqrt(50)
+        np.testing.assert_array_less(np.abs(batches.mean(0) - exact), 5 * error)
+        assert error.max() < 0.1
+
+
+@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
+@pytest.mark.parametrize("name", slow_cases(CASES, EVERYWHERE))
+def test_chain_midpoints_have_the_exact_law(name, method):
+    case = CASES[name]()
+    stationary = case.start_law is None
+    if method == "renewal" and name in ("very unlikely", "very unlikely, law off centre"):
+        pytest.skip("renewals are too rare for a test of the law")
+    chain = jb.sample_exact_bridges(
+        jax.random.key(3),
+        case.model,
+        case.start,
+        case.end,
+        case.duration,
+        num_bridges=20_000 if name in ("very unlikely", "swirled") else 50_000,
+        num_steps=case.num_steps,
+        proposal=case.coupling,
+        method=method,
+    )
+    assert chain.met.all() and (chain.truncated is None or not chain.truncated.any())
+    assert 0.02 < chain.acceptance_rate < 0.95
+    assert_chain_moments(case.middle(chain.paths), case.mean, case.covariance)
+    moved = np.any(np.diff(np.asarray(chain.paths[:, case.num_steps // 2]), axis=0) != 0, axis=1)
+    np.testing.assert_array_equal(moved, chain.accepted[1:])
+    assert stationary or method == "renewal" or np.ptp(chain.log_weights) > 0
+
+
+def test_published_chain_fails_the_same_test():
+    """The paper's exact algorithm with the printed start law is 0.18 standard deviations off."""
+    case = exact_case(paper_model(), *PAPER_CASES["very unlikely"], 1.0, 0.5)
+    chain = jb.sample_exact_bridges(
+        jax.random.key(0),
+        case.model,
+        case.start,
+        case.end,
+        1.0,
+        num_bridges=50_000,
+        num_steps=40,
+        proposal=jb.Coupling(0.5, start_law=jb.Reversed()),
+    )
+    with pytest.raises(AssertionError):
+        assert_chain_moments(case.middle(chain.paths), case.mean, case.covariance)
+
+
+def run_kernel(kernel, key, num_bridges):
+    run_key, init_key = jax.random.split(key)
+    state = kernel.init(None, init_key)
+    step = lambda state, key: (lambda new: (new[0], new))(kernel.step(key, state))
+    return jax.lax.scan(step, state, jax.random.split(run_key, num_bridges))[1]
+
+
+ARGUMENTS = (paper_model(), [0.785, 0.785], [1.091, 1.091], 1.0)
+
+
+@pytest.mark.parametrize("law", [None, FITTED], ids=["nu", "mu"])
+@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
+def test_batched_chain_is_the_kernel_stepped(method, law):
+    """Also where the renewal chain runs in several segments."""
+    key, num_bridges = jax.random.key(5), 300
+    options = dict(num_steps=20, proposal=jb.Coupling(0.5, start_law=law))
+    if method == "pseudo_marginal":
+        options |= {"num_counts": 2}
+    kernel = getattr(jb, method)(*ARGUMENTS, **options)
+    states, infos = jax.jit(functools.partial(run_kernel, kernel), static_argnums=1)(
+        key, num_bridges
+    )
+    chain = jb.sample_exact_bridges(
+        key, *ARGUMENTS, num_bridges=num_bridges, method=method, **options
+    )
+    np.testing.assert_array_equal(chain.accepted, infos.is_accepted)
+    np.testing.assert_allclose(chain.paths, states.position, atol=1e-5)
+    if method == "pseudo_marginal":
+        np.testing.assert_allclose(chain.log_weights, states.log_weight, atol=1e-4)
+        assert 0.3 < chain.acceptance_rate < 0.95
+    else:
+        assert chain.log_weights is None
+        assert (infos.is_accepted <= infos.is_hit).all() and infos.is_accepted.any()
+
+
+def test_segments_of_hard_bridges_are_mended_to_one_chain():
+    """Few renewals: trajectories seldom rejoin within their segment."""
+    arguments = (paper_model(), *PAPER_CASES["very unlikely"], 1.0)
+    options = dict(num_steps=10, proposal=jb.Coupling(0.5))
+    kernel = jb.renewal(*arguments, **options)
+    key, num_bridges = jax.random.key(2), 1500
+    states, infos = jax.jit(functools.partial(run_kernel, kernel), static_argnums=1)(
+        key, num_bridges
+    )
+    chain = jb.sample_exact_bridges(
+        key, *arguments, num_bridges=num_bridges, method="renewal", save_at=[0.5, 1.0], **options
+    )
+    assert 0 < infos.is_accepted.mean() < 0.1
+    np.testing.assert_array_equal(chain.accepted, infos.is_accepted)
+    np.testing.assert_allclose(chain.paths, states.position[:, [5, 10]], atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
+def test_several_intervals_are_several_chains(method):
+    model = paper_model()
+    starts, ends = jnp.array([[0.3, 0.1], [0.785, 0.785]]), jnp.array([[0.0, 0.5], [1.0, 1.0]])
+    durations = jnp.array([1.0, 1.5])
+    options = dict(num_bridges=150, num_steps=20, proposal=jb.Coupling(0.5), method=method)
+    key = jax.random.key(0)
+    both = jb.sample_exact_bridges(key, model, starts, ends, durations, **options)
+    assert both.paths.shape == (2, 150, 21, 2) and both.times.shape == (2, 21)
+    assert both.acceptance_rate.shape == (2,)
+    kernel = getattr(jb, method)(
+        model, starts[1], ends[1], durations[1], num_steps=20, proposal=jb.Coupling(0.5)
+    )
+    run = jax.jit(functools.partial(run_kernel, kernel), static_argnums=1)
+    states, _ = run(jax.random.fold_in(key, 1), 150)
+    np.testing.assert_allclose(both.paths[1], states.position, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
+def test_blackjax_runs_the_kernels(method):
+    """The runner touches `init(position, key)` and `step(key, state)` only."""
+    kernel = getattr(jb, method)(*ARGUMENTS, num_steps=20, proposal=jb.Coupling(0.5))
+    bridge = jb.sample_bridges(jax.random.key(0), *ARGUMENTS, num_steps=20).paths[0]
+    key = jax.random.key(1)
+    final, (states, infos) = blackjax.util.run_inference_algorithm(
+        key, kernel, num_steps=40, initial_position=bridge
+    )
+    assert states.position.shape == (40, 21, 2) and infos.is_accepted.any()
+    run_key, init_key = jax.random.split(key)
+    state = kernel.init(bridge, init_key)
+    for step_key in jax.random.split(run_key, 40):
+        state, _ = kernel.step(step_key, state)
+    np.testing.assert_allclose(final.position, state.position, atol=1e-5)
+
+
+@pytest.mark.parametrize("law", [None, FITTED], ids=["nu", "mu"])
+@pytest.mark.parametrize("num_counts", [1, 3])
+def test_weights_of_given_bridges_have_their_law_in_the_chain(law, num_counts):
+    """Over exact bridges with weights from their law in the chain, E[1/w] = P(met)/p: one over
+    the mean weight of proposals. Plain counts are size-unbiased and fail."""
+    model, start, end, duration = ARGUMENTS
+    n, num_steps = 20_000, 30
+    exact = jb.gaussian_bridge(model, start, end, duration, jnp.linspace(0, 1, num_steps + 1))
+    paths = exact.sample(jax.random.key(0), n)
+    paths = paths.at[:, 0].set(jnp.asarray(start)).at[:, -1].set(jnp.asarray(end))
+    coupling = jb.Coupling(0.5, start_law=law)
+    bridges = jb.sample_bridges(
+        jax.random.key(1),
+        *ARGUMENTS,
+        num_bridges=n,
+        num_steps=num_steps,
+        coupling=coupling,
+    )
+    met = n / float(bridges.num_proposals)
+    density = jb.ou_transition(model, jnp.asarray(start), 1.0).log_density(jnp.asarray(end))
+    expected = met / float(jnp.exp(density))
+
+    def inverse_weights(num_counts):
+        proposal = as_proposal(coupling, num_counts)
+        intervals = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, jnp.float32), (n, *jnp.shape(leaf))),
+            Intervals(jnp.asarray(start), jnp.asarray(end), jnp.asarray(duration)),
+        )
+        keys = jax.random.split(jax.random.key(2), n)
+        drawn = jax.jit(lambda keys: proposal.reweigh(keys, model.prepared(), intervals, paths))(
+            keys
+        )
+        assert drawn.found.all()
+        return np.exp(-np.asarray(drawn.log_weights, float))
+
+    inverse = inverse_weights(num_counts)
+    error = inverse.std() / np.sqrt(n) + expected * np.sqrt((1 - met) / n)
+    assert abs(inverse.mean() - expected) < 5 * error + 0.02 * expected
+    if num_counts == 1 and law is None:
+        fresh = jb.hitting_counts(jax.random.key(3), model, bridges).mean
+        weights = np.asarray(fresh) * float(jnp.exp(model.log_stationary(jnp.asarray(end))))
+        assert abs((1 / weights).mean() - expected) > 20 * error
+
+
+def test_chain_without_a_bridge_is_nan_and_said():
+    arguments = (paper_model(), [0.0, 0.0], [9.0, 0.0], 0.01)
+    for method in ("pseudo_marginal", "renewal"):
+        chain = jb.sample_exact_bridges(
+            jax.random.key(0), *arguments, num_bridges=20, method=method, max_proposals=9
+        )
+        assert not chain.met.any() and not chain.accepted.any()
+        assert np.isnan(chain.paths).all()
+        kernel = getattr(jb, method)(*arguments, max_proposals=9)
+        state = kernel.init(None, jax.random.key(0))
+        state, info = kernel.step(jax.random.key(1), state)
+        assert np.isnan(state.position).all() and not info.is_accepted
+
+
+def test_chain_that_finds_its_first_bridge_late_goes_on():
+    arguments = (paper_model(), [0.0, 0.0], [2.0, -2.0], 1.0)  # 7 % of the pairs meet
+    for method in ("pseudo_marginal", "renewal"):
+        chain = jb.sample_exact_bridges(
+            jax.random.key(2), *arguments, num_bridges=400, method=method, max_proposals=1
+        )
+        met = np.asarray(chain.met)
+        first = met.argmax()
+        assert 0 < first < 200 and met[first:].all() and chain.accepted[first]
+        assert np.isnan(chain.paths[:first]).all() and np.isfinite(chain.paths[first:]).all()
+
+
+def test_cut_off_counts_are_flagged():
+    chain = jb.sample_exact_bridges(
+        jax.random.key(0),
+        paper_model(),
+        *PAPER_CASES["very unlikely"],
+        1.0,
+        num_bridges=200,
+        max_trials=20,
+    )
+    assert chain.truncated.any() and chain.met.all()
+    assert np.isfinite(chain.log_weights).all() and np.isfinite(chain.paths).all()
+
+
+def test_numbers_change_without_compiling_again():
+    model = paper_model()
+
+    def run(seed, value):
+        return jb.sample_exact_bridges(
+            jax.random.key(seed),
+            model,
+            jnp.array([value, 0.0]),
+            jnp.array([0.0, value]),
+            1.0 + value,
+            num_bridges=50,
+            proposal=jb.Coupling(value),
+            max_trials=500 + seed,
+            max_proposals=1000 + seed,
+        )
+
+    run(0, 0.1)
+    with count_compilations() as compiled:
+        jax.block_until_ready(run(1, 0.2).paths)
+    assert len(compiled) == 0
+
+
+def test_errors_say_what_to_change(unchecked):
+    model, key, interval = ARGUMENTS[0], jax.random.key(0), ARGUMENTS[1:]
+    with pytest.raises(ValueError, match='"pseudo_marginal" or "renewal"'):
+        jb.sample_exact_bridges(key, model, *interval, method="gibbs")
+    with pytest.raises(ValueError, match="for one interval"):
+        jb.pseudo_marginal(model, jnp.zeros((3, 2)), jnp.zeros((3, 2)), 1.0)
+    with pytest.raises(ValueError, match=r"shape \(21, 2\), or `None`"):
+        jb.renewal(model, *interval, num_steps=20).init(jnp.zeros((5, 2)), key)
+    blind = jb.Diffusion(lambda x, p: -x, None, lambda x, p: -x @ x)
+    with pytest.raises(ValueError, match="Stationary\\(burn_in"):
+        jb.pseudo_marginal(blind, *interval)
+    with pytest.raises(TypeError, match="`proposal` must be"):
+        jb.sample_exact_bridges(key, model, *interval, proposal=0.5)
