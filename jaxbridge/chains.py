@@ -38,7 +38,7 @@ from .bridges import (
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count, check_model
-from .search import default_num_lanes
+from .search import default_num_lanes, most_lanes
 from .start_laws import log_ratio
 from .weighted import (
     AbstractWeightedProposal,
@@ -391,7 +391,6 @@ def _acceptance_rate(
 # Segments of the renewal chain run side by side: as many as keep each this long, and no more
 # than fill the lanes. Those that must be run again are few, and run this many at a time.
 _SHORTEST_SEGMENT = 64
-_MOST_SEGMENTS = 4_096
 _REPAIR_WIDTH = 128
 
 
@@ -430,7 +429,8 @@ def _run_renewal(
     pairs = pairs.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = _chain_keys(key, num_intervals, num_bridges, batched)
     first = _first_paths(init_keys, model, pairs, intervals, num_steps)
-    num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, _MOST_SEGMENTS // num_intervals))
+    most_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
+    num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, most_segments))
     length = -(-num_bridges // num_segments)
     # The last steps of the last segment may be too many: they repeat a key, and are dropped.
     steps = jnp.minimum(jnp.arange(num_segments * length), num_bridges - 1)

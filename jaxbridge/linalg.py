@@ -14,34 +14,32 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-# Sums are written out up to this dimension: a reduction would be a kernel of its own.
-_WRITTEN_OUT = 4
-
 
 def dot(left: Float[Array, " d"], right: Float[Array, " d"]) -> Float[Array, ""]:
-    """`left @ right`, written out so that it fuses with its neighbours under `vmap`."""
-    if left.shape[0] > _WRITTEN_OUT:
-        return jnp.sum(left * right)
-    return functools.reduce(operator.add, [left[i] * right[i] for i in range(left.shape[0])])
+    """`left @ right`."""
+    return _sum([left[i] * right[i] for i in range(left.shape[0])])
 
 
 def all_finite(vector: Float[Array, " d"]) -> Bool[Array, ""]:
     """Whether every coordinate is finite (up to overflow of their sum)."""
-    return jnp.isfinite(dot(vector, jnp.ones_like(vector)))
+    return jnp.isfinite(_sum(list(vector)))
 
 
 def matvec(matrix: Float[Array, "n m"], vector: Float[Array, " m"]) -> Float[Array, " n"]:
-    """`matrix @ vector`, written out."""
-    if matrix.shape[0] > _WRITTEN_OUT:
-        return jnp.sum(matrix * vector, axis=1)
-    return jnp.stack([dot(matrix[i], vector) for i in range(matrix.shape[0])])
+    """`matrix @ vector`, column by column."""
+    return _sum([matrix[:, j] * vector[j] for j in range(matrix.shape[1])])
 
 
 def matmul(left: Float[Array, "n k"], right: Float[Array, "k m"]) -> Float[Array, "n m"]:
-    """`left @ right`, written out."""
-    if left.shape[1] > _WRITTEN_OUT:
-        return jnp.sum(left[:, :, None] * right, axis=1)
-    return jnp.stack([matvec(right.T, left[i]) for i in range(left.shape[0])])
+    """`left @ right`, as a sum of outer products."""
+    return _sum([left[:, j : j + 1] * right[j] for j in range(left.shape[1])])
+
+
+def _sum(terms: list[Array]) -> Array:
+    """Σ terms, written out. A reduction would be a kernel of its own, which does not fuse with
+    its neighbours under `vmap`; and XLA's CPU compiler (JAX 0.10.2) leaves all but the first
+    32,768 numbers of some reductions inside loops uncomputed."""
+    return functools.reduce(operator.add, terms)
 
 
 def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
@@ -68,7 +66,7 @@ def solve(matrix: Float[Array, "d d"], right: Float[Array, "d *m"]) -> Float[Arr
     for k in range(d):
         below = jnp.where(np.arange(d) < k, -1, jnp.abs(rows[:, k]))
         chosen = jnp.arange(d) == jnp.argmax(below)
-        pivot_row = jnp.sum(jnp.where(chosen[:, None], rows, 0), axis=0)
+        pivot_row = _sum([jnp.where(chosen[i], rows[i], 0) for i in range(d)])
         rows = jnp.where(chosen[:, None], rows[k], rows)  # the other half of the swap
         pivot_row = pivot_row / pivot_row[k]
         reduced = rows - rows[:, k : k + 1] * pivot_row

@@ -165,10 +165,22 @@ def key_for(purpose: str, key: Key[Array, ""]) -> Key[Array, ""]:
     return jax.random.fold_in(key, zlib.crc32(purpose.encode()))
 
 
+# See `linalg`: beyond this many numbers per array, reductions that a user's model may contain
+# are not safe in XLA's loops on CPU.
+_MOST_NUMBERS = 2**15
+
+
 def default_num_lanes(num_wanted: int, num_steps: int, point: Float[Array, "P d"]) -> int:
     """As many lanes as successes are wanted, within a bound on the memory of their paths.
 
     A lane holds two paths and their noise.
     """
-    bytes_per_lane = 3 * point.shape[1] * (num_steps + 1) * point.dtype.itemsize
-    return max(1, min(2**26 // bytes_per_lane, 8_192, max(num_wanted, 64)))
+    d = point.shape[1]
+    bytes_per_lane = 3 * d * (num_steps + 1) * point.dtype.itemsize
+    bounds = (2**26 // bytes_per_lane, most_lanes(d), max(num_wanted, 64))
+    return max(1, min(bounds))
+
+
+def most_lanes(d: int) -> int:
+    """How many lanes may run side by side, for points in R^d."""
+    return max(1, min(8_192, _MOST_NUMBERS // d))

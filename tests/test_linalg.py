@@ -208,3 +208,31 @@ def test_no_lapack_call_is_compiled(d):
     for function in [inverse, cholesky, polar_factor, jax.jacfwd(polar_factor)]:
         assert "custom_call" not in text(function)
         assert "lapack" not in text(function)
+
+
+@pytest.mark.parametrize("d", [3, 5, 7])
+def test_many_lanes_inside_a_scan(d):
+    """XLA's CPU compiler leaves part of some reductions inside loops uncomputed, from the
+    32,768th number on; nothing here may be one of them."""
+    num_lanes = 10_000
+    rng = np.random.default_rng(0)
+    matrix = (rng.normal(size=(d, d)) / d).astype(np.float32)
+    start, noise = rng.normal(size=(2, d, num_lanes)).astype(np.float32)
+
+    def step(x, _):
+        def one_lane(x, w):
+            full = matrix * (1 + 0.1 * jnp.tanh(x)) + 2 * jnp.eye(d, dtype=x.dtype)
+            drift = solve(full, matvec(full.T, x) + matvec(jnp.asarray(matrix), x))
+            return 0.5 * drift / (1 + dot(x, x)) + 0.1 * matmul(full, full)[0] + 0.2 * w
+
+        return jax.vmap(one_lane, in_axes=-1, out_axes=-1)(x, noise), None
+
+    out = jax.jit(lambda x: jax.lax.scan(step, x, None, length=4)[0])(jnp.asarray(start))
+    x = np.asarray(start, float).T
+    for _ in range(4):
+        full = matrix * (1 + 0.1 * np.tanh(x))[:, None] + 2 * np.eye(d)
+        right = np.einsum("lij,li->lj", full, x) + x @ matrix.T
+        drift = np.linalg.solve(full, right[..., None])[..., 0]
+        square = (x**2).sum(1, keepdims=True)
+        x = 0.5 * drift / (1 + square) + 0.1 * (full @ full)[:, 0] + 0.2 * noise.T
+    np.testing.assert_allclose(out, x.T, atol=1e-4)
