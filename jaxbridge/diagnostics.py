@@ -16,8 +16,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key
 
+from .arrays import Numbers, as_floating
 from .bridges import check_key
 from .hitting import BridgePaths, hitting_counts
 from .intervals import check_count
@@ -90,11 +91,15 @@ def hitting_variation(
         key, model, bridges, sizes[-1], start_law=start_law, max_trials=max_trials
     )
     usable = bridges.met & ~counted.truncated
-    weights = bridges.weights if isinstance(bridges, WeightedBridges) else usable * 1.0
-    weights = jnp.where(usable, weights, 0)
+    dtype = bridges.paths.dtype
+    given = (
+        bridges.weights if isinstance(bridges, WeightedBridges) else jnp.ones(usable.shape, dtype)
+    )
+    weights = jnp.where(usable, given, 0)
     sums = jnp.cumsum(jnp.where(usable[:, None], counted.counts, 1), axis=1)
     ends = np.asarray(sizes)
-    rho = sums[:, ends - 1] / ends.astype(weights.dtype)  # ρ̂_N of each bridge, (n, K)
+    # ρ̂_N of each bridge, (n, K)
+    rho = sums[:, ends - 1].astype(weights.dtype) / ends.astype(weights.dtype)
     drawn = jax.random.randint(jax.random.fold_in(key, 0), (200, len(rho)), 0, len(rho))
     estimates = _regress(rho, weights, ends)
     replicates = jax.vmap(lambda i: _regress(rho[i], weights[i], ends))(drawn)
@@ -125,7 +130,7 @@ def _regress(rho: Float[Array, "n K"], weights: Float[Array, " n"], sizes: Int[n
     return variances, intercept, slope, mean[-1], ratio
 
 
-def effective_sample_size(draws: ArrayLike) -> Float[Array, "..."]:
+def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
     """How many independent draws a chain is worth: n / (1 + 2 Σ_t ρ_t), with autocorrelations
     summed as far as sums of adjacent pairs are positive, and made to decrease (Geyer 1992).
 
@@ -137,7 +142,7 @@ def effective_sample_size(draws: ArrayLike) -> Float[Array, "..."]:
         jb.effective_sample_size(chain.paths[:, 25])  # shape (d,)
         ```
     """
-    draws = jnp.asarray(draws)
+    draws = as_floating("draws", draws)
     if draws.ndim == 0 or draws.shape[0] < 4:
         raise ValueError(
             f"`draws` must be a chain of at least 4, shape (n, ...); got {draws.shape}."

@@ -265,7 +265,8 @@ class WeightedBridges(eqx.Module):
     @property
     def efficiency(self) -> Float[Array, "*I"]:
         """Effective sample size per simulated path."""
-        return self.effective_sample_size / jnp.maximum(self.num_simulated, 1)
+        size = self.effective_sample_size
+        return size / jnp.maximum(self.num_simulated, 1).astype(size.dtype)
 
     def mean(self, fn: Callable[[Array], PyTree] = lambda path: path) -> PyTree:
         """The weighted mean of `fn(path)`, a function of one path of shape (K, d), by default

@@ -1,0 +1,80 @@
+"""The regression of the paper's section 3.2, and effective sample sizes."""
+
+import blackjax.diagnostics
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import PAPER_CASES, paper_model
+
+import jaxbridge as jb
+from jaxbridge.diagnostics import _regress
+
+
+def test_regression_separates_the_variance_of_probabilities_from_that_of_counts():
+    """Geometric counts with known probabilities: V(1/π) and E[(1-π)/π²] are known."""
+    rng, n, sizes = np.random.default_rng(0), 40_000, np.array([5, 10, 20, 40])
+    probability = rng.choice([0.2, 0.5, 0.8], size=n)
+    rho = np.cumsum(rng.geometric(probability[:, None], size=(n, 40)), axis=1)[:, sizes - 1] / sizes
+    values = jnp.asarray(rho), jnp.ones(n)
+    variances, intercept, slope, mean, ratio = _regress(*values, sizes)
+    inverse = 1 / np.array([0.2, 0.5, 0.8])
+    noise = np.mean((1 - 1 / inverse) * inverse**2)
+    np.testing.assert_allclose(variances, inverse.var() + noise / sizes, rtol=0.03)
+    np.testing.assert_allclose(intercept, inverse.var(), rtol=0.03)
+    np.testing.assert_allclose(slope, noise, rtol=0.06)
+    np.testing.assert_allclose(mean, inverse.mean(), rtol=0.01)
+    np.testing.assert_allclose(ratio, inverse.std() / inverse.mean(), rtol=0.03)
+
+
+def test_paper_figures_with_its_own_settings():
+    """Section 3.2 gives 0.16 for γ = 0.9 and 0.04 for γ = 0.99 with the printed start law, to
+    which chance contributes a few hundredths."""
+    model, ends = paper_model(), PAPER_CASES["unlikely"]
+
+    def ratio(gamma):
+        coupling = jb.Coupling.as_published(gamma)
+        bridges = jb.sample_bridges(
+            jax.random.key(0), model, *ends, 1.0, num_bridges=400, coupling=coupling
+        )
+        weighted = jb.weigh_bridges(jax.random.key(1), model, bridges)
+        return jb.hitting_variation(
+            jax.random.key(2), model, weighted, num_counts=(20, 40, 80), max_trials=100_000
+        )
+
+    first, second = ratio(0.5), ratio(0.9)
+    assert first.num_truncated == second.num_truncated == 0
+    assert 0.4 < first.ratio < 1.5  # "of the same order as the mean"
+    assert abs(second.ratio - 0.14) < 5 * second.ratio_error + 0.03
+    assert second.ratio < first.ratio / 2
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
+def test_effective_sample_size_of_an_autoregression(correlation):
+    n, rng = 40_000, np.random.default_rng(0)
+    noise = rng.normal(size=(n, 2))
+    values = np.empty((n, 2))
+    values[0] = noise[0] / np.sqrt(1 - correlation**2)
+    for i in range(1, n):
+        values[i] = correlation * values[i - 1] + noise[i]
+    size = jb.effective_sample_size(values)
+    exact = n * (1 - correlation) / (1 + correlation)
+    np.testing.assert_allclose(size, exact, rtol=0.15)
+    other = blackjax.diagnostics.effective_sample_size(jnp.asarray(values)[None])
+    np.testing.assert_allclose(size, other, rtol=0.05)
+
+
+def test_chains_that_do_not_move():
+    assert jb.effective_sample_size(np.ones(100)) == 1
+    with pytest.raises(ValueError, match="at least 4"):
+        jb.effective_sample_size([1.0, 2.0])
+
+
+def test_errors_say_what_to_change():
+    model, key = paper_model(), jax.random.key(0)
+    bridges = jb.sample_bridges(key, model, [0.0, 0.0], [0.5, 0.0], 1.0, num_bridges=3)
+    with pytest.raises(ValueError, match="two or more increasing"):
+        jb.hitting_variation(key, model, bridges, num_counts=(5, 5))
+    several = jb.sample_bridges(key, model, jnp.zeros((2, 2)), jnp.zeros((2, 2)), 1.0)
+    with pytest.raises(ValueError, match="one interval"):
+        jb.hitting_variation(key, model, several)
