@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array, ArrayLike, PyTree
 
 # Anything `jnp.asarray` takes: an array, a number, a (nested) list of numbers.
 Numbers = ArrayLike | Sequence[Any]
@@ -43,3 +44,26 @@ def as_floating(name: str, value: Numbers) -> Array:
 def is_traced(*trees) -> bool:
     """Whether any value in the trees is abstract, so that it cannot be looked at."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def cast_floats(tree: PyTree, dtype) -> PyTree:
+    """The tree with all its floating point arrays in one precision."""
+    return jax.tree.map(
+        lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, tree
+    )
+
+
+@eqx.filter_custom_jvp
+def nondifferentiable(tree: PyTree) -> PyTree:
+    """The tree, of which no derivative may be taken."""
+    return tree
+
+
+@nondifferentiable.def_jvp
+def _refuse(primals, tangents):
+    raise TypeError(
+        "what corrects bridges to their exact law has no derivative path by path: whether a pair "
+        "meets, and how often a bridge is hit, depends on the parameters too. Apply "
+        "`jax.lax.stop_gradient` to the parameters where bridges are made, and differentiate a "
+        "likelihood of their paths."
+    )

@@ -15,10 +15,11 @@ any look at a finite run: give `Stationary(burn_in=...)`, or a start law with a 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key
 
-from .arrays import Numbers
+from .arrays import Numbers, is_traced
 from .bridges import check_key
 from .coupling import AbstractCoupling, Coupling, rotate, rotation_between
 from .diffusion import Diffusion, check_diffusion
@@ -26,11 +27,9 @@ from .intervals import as_intervals, check_count, check_model
 from .meeting import PairStep, frame
 from .noise import noisy_scan
 from .search import key_for
-from .start_laws import Stationary, needs_burn_in, run_for
+from .start_laws import MOST_STEPS, Stationary, needs_burn_in, run_for
 
 _NUM_PAIRS = 512
-# s is doubled at most until it takes this many steps: some seconds of work.
-_MOST_STEPS = 2**17
 
 
 def with_burn_in(
@@ -45,7 +44,7 @@ def with_burn_in(
     if not needs_burn_in(coupling.start_law, model):
         return coupling
     key = key_for("burn-in", key)
-    pairs = jnp.arange(_NUM_PAIRS) % end.shape[0]
+    pairs = jnp.arange(_NUM_PAIRS) * end.shape[0] // _NUM_PAIRS
     usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
     end = jnp.where(usable, end, end[jnp.argmax(usable)])  # bridges that were not found are NaN
     dt = duration[pairs] / num_steps
@@ -65,7 +64,13 @@ def measure_burn_in(
     """A time after which the reversed diffusion from `end` is stationary to about 1e-5 in total
     variation, for `Stationary(burn_in=...)`: a multiple of `duration`, found by coupling.
 
+    It sees wells only if they are left within the run: where a diffusion stays in one well for
+    very many relaxation times of it, give a longer time yourself.
+
     **Arguments:** as in `sample_bridges`; only the scheme and the step matter.
+
+    **Raises:** `ValueError` where the diffusion has not forgotten its start after 2¹⁷ steps
+    (inside `jit` the time is then infinite), or for arguments that do not fit.
 
     !!! example
 
@@ -81,12 +86,19 @@ def measure_burn_in(
     coupling = Coupling() if coupling is None else coupling
     check_model(model, intervals, coupling.scheme)
     model.check_reversal()
-    return _measure_compiled(key_for("burn-in", key), model, coupling, intervals, num_steps)
+    time = _measure_compiled(key_for("burn-in", key), model, coupling, intervals, num_steps)
+    if not is_traced(time) and not np.isfinite(time):
+        raise ValueError(
+            "two copies of the reversed diffusion have not all met after 2¹⁷ steps, so it has "
+            "not forgotten its start: take longer steps (a longer `duration` or fewer "
+            "`num_steps`), or give `Diffusion` a sampler of its stationary law."
+        )
+    return time
 
 
 @eqx.filter_jit
 def _measure_compiled(key, model, coupling, intervals, num_steps):
-    pairs = jnp.arange(_NUM_PAIRS) % len(intervals.end)
+    pairs = jnp.arange(_NUM_PAIRS) * len(intervals.end) // _NUM_PAIRS
     end, dt = intervals.end[pairs].T, intervals.duration[pairs] / num_steps
     return _measure(key, model.prepared(), coupling, end, dt, num_steps)
 
@@ -132,7 +144,8 @@ def _measure(
         repeats = 2**doublings
         ahead_key, pair_key = jax.random.split(jax.random.fold_in(key, doublings))
         ahead_keys = jax.random.split(ahead_key, _NUM_PAIRS)
-        driven = run_for(dynamics, scheme, ahead_keys, end, dt, num_steps, repeats)
+        ahead = jnp.full(_NUM_PAIRS, repeats)
+        driven = run_for(dynamics, scheme, ahead_keys, end, dt, num_steps, ahead)
         keys = jax.random.split(pair_key, _NUM_PAIRS)
 
         def once(repeat, pairs):
@@ -148,7 +161,7 @@ def _measure(
         pairs = (end, driven, jnp.zeros(_NUM_PAIRS, bool))
         return jnp.all(lax.fori_loop(0, repeats, once, pairs)[2])
 
-    most = max(0, (_MOST_STEPS // num_steps).bit_length() - 1)
+    most = max(0, (MOST_STEPS // 2 // num_steps).bit_length() - 1)
 
     def going_on(state):
         doublings, all_met = state
@@ -158,5 +171,7 @@ def _measure(
         doublings, _ = state
         return doublings + 1, attempt(doublings + 1)
 
-    doublings, _ = lax.while_loop(going_on, double, (jnp.int32(0), attempt(jnp.int32(0))))
-    return 2 * num_steps * jnp.max(dt) * (2**doublings).astype(dt.dtype)
+    init = (jnp.int32(0), attempt(jnp.int32(0)))
+    doublings, all_met = lax.while_loop(going_on, double, init)
+    time = 2 * num_steps * jnp.max(dt) * (2**doublings).astype(dt.dtype)
+    return jnp.where(all_met, time, jnp.inf)

@@ -21,10 +21,11 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from .arrays import Numbers
+from .arrays import Numbers, as_floating, is_traced, nondifferentiable
 from .associated import run_associated
 from .bridges import (
     Inputs,
@@ -86,12 +87,13 @@ class RenewalState(NamedTuple):
 
 
 class RenewalInfo(NamedTuple):
-    """Of one step: whether the associated diffusion hit, whether the path was replaced, and the
-    number of paths simulated."""
+    """Of one step: whether the associated diffusion hit, whether the path was replaced, the
+    number of paths simulated, and of those that left the finite numbers."""
 
     is_hit: Bool[Array, ""]
     is_accepted: Bool[Array, ""]
     num_simulated: Int[Array, ""]
+    num_nonfinite: Int[Array, ""]
 
 
 def pseudo_marginal(
@@ -102,7 +104,7 @@ def pseudo_marginal(
     *,
     num_steps: int = 50,
     proposal: Any = None,
-    num_counts: int = 1,
+    num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
 ) -> Kernel:
@@ -145,13 +147,15 @@ def pseudo_marginal(
 
 @eqx.filter_jit
 def _draw_state(rng_key, model, proposal, intervals, num_steps):
-    drawn = proposal.draw(rng_key[None], model.prepared(), intervals, num_steps, None, False)
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    drawn = proposal.draw(rng_key[None], model, intervals, num_steps, None, False)
     return _first(drawn), drawn.num_simulated[0]
 
 
 @eqx.filter_jit
 def _reweigh_state(rng_key, path, model, proposal, intervals, num_steps):
-    return _first(proposal.reweigh(rng_key[None], model.prepared(), intervals, path[None]))
+    model, intervals, path = nondifferentiable((model.prepared(), intervals, path))
+    return _first(proposal.reweigh(rng_key[None], model, intervals, path[None]))
 
 
 def _first(drawn: WeightedPaths) -> PseudoMarginalState:
@@ -217,8 +221,8 @@ def renewal(
 @eqx.filter_jit
 def _renewal_step(rng_key, state, model, pairs, intervals):
     everything = jnp.ones(1, bool)
-    keys, paths = rng_key[None], state.position[None]
-    paths, info = _renew(keys, model.prepared(), pairs, intervals, paths, everything)
+    model, intervals, path = nondifferentiable((model.prepared(), intervals, state.position))
+    paths, info = _renew(rng_key[None], model, pairs, intervals, path[None], everything)
     return RenewalState(paths[0]), jax.tree.map(lambda leaf: leaf[0], info)
 
 
@@ -234,6 +238,8 @@ class Chain(eqx.Module):
     - `truncated`: whether the state's counts were cut off by `max_trials`: then it has too
         little weight, and the chain's law is not exact. Shape (n,), or `None` as `log_weights`.
     - `num_simulated`: paths simulated in all, shape ().
+    - `num_nonfinite`: how many of them left the finite numbers.
+    - `num_truncated`: how many proposals, accepted or not, had counts cut off.
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
     - `num_steps`: N.
     """
@@ -245,6 +251,8 @@ class Chain(eqx.Module):
     met: Bool[Array, "*I n"]
     truncated: Bool[Array, "*I n"] | None
     num_simulated: Int[Array, "*I"]
+    num_nonfinite: Int[Array, "*I"]
+    num_truncated: Int[Array, "*I"]
     proposal: AbstractWeightedProposal
     num_steps: int = eqx.field(static=True)
 
@@ -270,7 +278,7 @@ def sample_exact_bridges(
     num_steps: int = 50,
     proposal: Any = None,
     method: Literal["pseudo_marginal", "renewal"] = "pseudo_marginal",
-    num_counts: int = 1,
+    num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
     save_at: Numbers | None = None,
@@ -292,8 +300,9 @@ def sample_exact_bridges(
     - `proposal`: a `Coupling`, with its start law; by default `Coupling(gamma=0.0)`.
     - `method`: "pseudo_marginal", or "renewal", which needs many more iterations for bridges
         as good, each of which costs less.
-    - `num_counts`: N, hitting counts for each proposal of the pseudo-marginal chain.
-    - `max_proposals`: bounds the tries for each new path; by default 100,000.
+    - `num_counts`: N, hitting counts for each proposal of the pseudo-marginal chain; by default
+        one.
+    - `max_proposals`: bounds the tries for each new path; by default 10,000.
     - `max_trials`: bounds the trials for the counts of each path; by default 10,000 for each
         count. See `Chain.truncated`.
 
@@ -339,7 +348,8 @@ def _run_pseudo_marginal(
     batched: bool,
     several_durations: bool,
 ) -> Chain:
-    model, num_intervals = model.prepared(), intervals.start.shape[0]
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    num_intervals = intervals.start.shape[0]
     proposal = proposal.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = _chain_keys(key, num_intervals, num_bridges, batched)
     draw_keys, accept_keys = jax.vmap(jax.random.split, out_axes=1)(step_keys.reshape(-1))
@@ -366,7 +376,10 @@ def _run_pseudo_marginal(
     def of_states(leaf):
         return unflatten_rows(leaf[row], num_intervals, batched)
 
-    num_simulated = jnp.sum(drawn.num_simulated.reshape(num_intervals, -1), axis=1)
+    def total(leaf):
+        leaf = jnp.sum(leaf.reshape(num_intervals, -1), axis=1, dtype=jnp.int32)
+        return leaf if batched else leaf[0]
+
     return Chain(
         stored_times(intervals, stored, num_steps, several_durations),
         of_states(drawn.paths),
@@ -374,7 +387,9 @@ def _run_pseudo_marginal(
         log_weights.T if batched else log_weights[:, 0],
         of_states(drawn.found),
         of_states(drawn.truncated),
-        num_simulated if batched else num_simulated[0],
+        total(drawn.num_simulated),
+        total(drawn.num_nonfinite),
+        total(drawn.truncated),
         proposal,
         num_steps,
     )
@@ -406,6 +421,7 @@ class _Segments(NamedTuple):
     ends: Float[Array, "S points d"]
     stale: Bool[Array, " S"]
     num_simulated: Int[Array, " S"]
+    num_nonfinite: Int[Array, " S"]
 
 
 @eqx.filter_jit
@@ -425,7 +441,8 @@ def _run_renewal(
     one, since a proposal depends on the key of its step only: from there on they are one, and
     the rest of the record holds. So a repair is short, and the result that of one long run.
     """
-    model, num_intervals = model.prepared(), intervals.start.shape[0]
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    num_intervals = intervals.start.shape[0]
     pairs = pairs.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = _chain_keys(key, num_intervals, num_bridges, batched)
     first = _first_paths(init_keys, model, pairs, intervals, num_steps)
@@ -460,6 +477,7 @@ def _run_renewal(
                 paths=segments.paths.at[i, row].set(kept, mode="drop"),
                 moved=segments.moved.at[i, row].set(info.is_accepted, mode="drop"),
                 num_simulated=segments.num_simulated.at[row].add(info.num_simulated, mode="drop"),
+                num_nonfinite=segments.num_nonfinite.at[row].add(info.num_nonfinite, mode="drop"),
             )
             return i + 1, positions, active & ~rejoined, segments
 
@@ -484,6 +502,7 @@ def _run_renewal(
         jnp.repeat(first, num_segments, axis=0),
         jnp.zeros(num, bool),
         jnp.zeros(num, jnp.int32),
+        jnp.zeros(num, jnp.int32),
     )
     segments = run_again(segments, jnp.arange(num))
     # The first stale segment starts from where the chain is, so each pass settles it at least.
@@ -495,7 +514,11 @@ def _run_renewal(
         return leaf if batched else leaf[0]
 
     paths = of_steps(segments.paths)
-    num_simulated = jnp.sum(segments.num_simulated.reshape(num_intervals, -1), axis=1)
+
+    def total(leaf):
+        leaf = jnp.sum(leaf.reshape(num_intervals, -1), axis=1, dtype=jnp.int32)
+        return leaf if batched else leaf[0]
+
     return Chain(
         stored_times(intervals, stored, num_steps, several_durations),
         paths,
@@ -503,7 +526,9 @@ def _run_renewal(
         None,
         jnp.all(jnp.isfinite(paths), axis=(-2, -1)),
         None,
-        num_simulated if batched else num_simulated[0],
+        total(segments.num_simulated),
+        total(segments.num_nonfinite),
+        total(jnp.zeros(num, jnp.int32)),
         pairs,
         num_steps,
     )
@@ -538,7 +563,10 @@ def _renew(
     uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=paths.dtype))(accept_keys)
     accepted = found & (missing | (uniform < jnp.exp(jnp.minimum(log_rate, 0))))
     info = RenewalInfo(
-        associated.hit & active, accepted, active.astype(jnp.int32) + proposed.num_trials
+        associated.hit & active,
+        accepted,
+        active.astype(jnp.int32) + proposed.num_trials,
+        (active & ~missing & ~associated.finite).astype(jnp.int32) + proposed.num_nonfinite,
     )
     return jnp.where(accepted[:, None, None], new_paths, paths), info
 
@@ -581,10 +609,16 @@ def _one_interval(start: Numbers, end: Numbers, duration: Numbers) -> Intervals:
 
 
 def _check_path(position: Numbers, intervals: Intervals, num_steps: int) -> Array:
-    path = jnp.asarray(position)
+    path = as_floating("position", position)
     shape = (num_steps + 1, intervals.start.shape[1])
     if path.shape != shape:
         raise ValueError(f"`position` must be a path, shape {shape}, or `None`; got {path.shape}.")
+    if not is_traced(path, intervals):
+        ends = np.stack([intervals.start[0], intervals.end[0]])
+        if not (
+            np.all(np.isfinite(path)) and np.allclose(path[np.array([0, -1])], ends, atol=1e-3)
+        ):
+            raise ValueError(f"`position` must be a finite path from and to {ends}.")
     return path.astype(intervals.start.dtype)
 
 
@@ -594,7 +628,7 @@ def check_proposal(
     if isinstance(proposal, CoupledPairs):
         check_model(model, intervals, proposal.coupling.scheme)
         model.check_reversal()
-    check_density(proposal, model)
+        check_density(proposal.coupling.start_law, model)
 
 
 def _as_pairs(proposal: AbstractWeightedProposal) -> CoupledPairs:

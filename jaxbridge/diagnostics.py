@@ -10,6 +10,7 @@ intercept. It holds for **fresh** counts drawn for each exact bridge; the counts
 itself has kept are size-biased.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,8 +21,10 @@ from jaxtyping import Array, Float, Int, Key
 
 from .arrays import Numbers, as_floating
 from .bridges import check_key
-from .hitting import BridgePaths, hitting_counts
+from .chains import Chain
+from .hitting import hitting_counts
 from .intervals import check_count
+from .search import key_for
 from .start_laws import AnyStartLaw
 from .weighted import WeightedBridges
 
@@ -52,7 +55,7 @@ class HittingVariation(NamedTuple):
 def hitting_variation(
     key: Key[Array, ""],
     model,
-    bridges: BridgePaths,
+    bridges: WeightedBridges | Chain,
     num_counts: Sequence[int] = (50, 100, 150, 200, 300),
     *,
     start_law: AnyStartLaw | None = None,
@@ -85,10 +88,20 @@ def hitting_variation(
     sizes = [check_count("num_counts", n) for n in num_counts]
     if len(sizes) < 2 or sorted(set(sizes)) != sizes:
         raise ValueError(f"`num_counts` must be two or more increasing numbers; got {num_counts}.")
+    if not isinstance(bridges, WeightedBridges | Chain):
+        raise TypeError(
+            "`bridges` must have the exact law: pass what `weigh_bridges` or "
+            f"`sample_exact_bridges` returned; got {type(bridges).__name__}."
+        )
     if bridges.paths.ndim != 3:
         raise ValueError("`bridges` must be those of one interval, paths of shape (n, N+1, d).")
     counted = hitting_counts(
-        key, model, bridges, sizes[-1], start_law=start_law, max_trials=max_trials
+        key_for("variation", key),
+        model,
+        bridges,
+        sizes[-1],
+        start_law=start_law,
+        max_trials=max_trials,
     )
     usable = bridges.met & ~counted.truncated
     dtype = bridges.paths.dtype
@@ -100,7 +113,7 @@ def hitting_variation(
     ends = np.asarray(sizes)
     # ρ̂_N of each bridge, (n, K)
     rho = sums[:, ends - 1].astype(weights.dtype) / ends.astype(weights.dtype)
-    drawn = jax.random.randint(jax.random.fold_in(key, 0), (200, len(rho)), 0, len(rho))
+    drawn = jax.random.randint(key_for("bootstrap", key), (200, len(rho)), 0, len(rho))
     estimates = _regress(rho, weights, ends)
     replicates = jax.vmap(lambda i: _regress(rho[i], weights[i], ends))(drawn)
     variances, intercept, slope, mean, ratio = estimates
@@ -132,7 +145,8 @@ def _regress(rho: Float[Array, "n K"], weights: Float[Array, " n"], sizes: Int[n
 
 def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
     """How many independent draws a chain is worth: n / (1 + 2 Σ_t ρ_t), with autocorrelations
-    summed as far as sums of adjacent pairs are positive, and made to decrease (Geyer 1992).
+    summed as far as sums of adjacent pairs are positive, and made to decrease (Geyer 1992). NaN
+    where a draw is.
 
     `draws`: one chain, shape (n, ...), for instance `chain.paths[:, 25]`.
 
@@ -158,5 +172,6 @@ def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
     pairs = jax.lax.cummin(jnp.where(positive, pairs, 0), axis=0)
     time = 2 * jnp.sum(pairs, axis=0) - 1
     # A chain that alternates can be worth more than n, but how much is not well determined.
-    size = jnp.minimum(n / jnp.maximum(time, 1 / n), n * np.log10(n))
-    return jnp.where(moving, size, 1)
+    size = jnp.minimum(n / jnp.maximum(time, 1 / n), n * math.log10(n))
+    size = jnp.where(moving, size, 1)
+    return jnp.where(jnp.isfinite(covariance[0]), size, jnp.nan)

@@ -206,7 +206,7 @@ class Diffusion(eqx.Module):
         params = self._prepared_params()
 
         def drift(x):
-            return _check_value("drift", self._drift(x, params), x.shape, x)
+            return check_value("drift", self._drift(x, params), x.shape, x)
 
         if self._diffusion is not None:
             diffusion = self._diffusion
@@ -231,7 +231,7 @@ class Diffusion(eqx.Module):
             params, reverse_drift = self._prepared_params(), self._reverse_drift
 
             def drift(x):
-                return _check_value("reverse_drift", reverse_drift(x, params), x.shape, x)
+                return check_value("reverse_drift", reverse_drift(x, params), x.shape, x)
 
         else:
             log_nu = self._log_stationary_function()
@@ -250,7 +250,7 @@ class Diffusion(eqx.Module):
                 "this model has no stationary density: pass `log_stationary=` to `Diffusion`."
             )
         params, log_stationary = self._prepared_params(), self._log_stationary
-        return lambda x: _check_value("log_stationary", log_stationary(x, params), (), x)
+        return lambda x: check_value("log_stationary", log_stationary(x, params), (), x)
 
 
 def ito_correction(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
@@ -325,7 +325,7 @@ def _uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:
     return any_reached(jaxpr.outvars)
 
 
-def _check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) -> Array:
+def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) -> Array:
     value = jnp.asarray(value)
     if value.shape != shape:
         raise ValueError(

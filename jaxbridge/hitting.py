@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from .arrays import nondifferentiable
 from .associated import run_associated
 from .bridges import check_key
 from .burn_in import with_burn_in
@@ -64,22 +65,28 @@ class HittingCounts(eqx.Module):
         """ρ̂, the mean of the counts: an unbiased estimate of 1/π(x).
 
         Where the trials ran out, all of them divided by the hits, or their number if nothing
-        hit: finite, and too small on average.
+        hit: finite, and too small on average. NaN for a bridge that is missing.
         """
         hits = jnp.maximum(self._num_hits, 1).astype(self.start.dtype)
-        return self.num_trials.astype(self.start.dtype) / hits
+        mean = self.num_trials.astype(self.start.dtype) / hits
+        return jnp.where(self.num_trials > 0, mean, jnp.nan)
 
     @property
     def probability(self) -> Float[Array, "*I n"]:
         """An unbiased estimate of the hitting probability π(x), (N - 1)/(Σ_j T_j - 1) for N
-        counts (Haldane 1945); with N = 1, whether the first trial hit."""
+        counts (Haldane 1945); with N = 1, whether the first trial hit. NaN for a bridge that is
+        missing."""
         hits, trials = self._num_hits, self.num_trials
         # Trials that ran out are a binomial sample, estimated by hits / trials.
         less = jnp.where(self.truncated, 0, 1)
         numerator, denominator = hits - less, trials - less
         certain = denominator <= 0  # one trial, one hit
-        ratio = numerator / jnp.where(certain, 1, denominator)
-        return jnp.where(certain & (hits > 0), 1, ratio).astype(self.start.dtype)
+        numerator, denominator = (
+            value.astype(self.start.dtype)
+            for value in (numerator, jnp.where(certain, 1, denominator))
+        )
+        ratio = jnp.where(certain & (hits > 0), 1, numerator / denominator)
+        return jnp.where(trials > 0, ratio, jnp.nan)
 
     @property
     def standard_error(self) -> Float[Array, "*I n"]:
@@ -92,7 +99,7 @@ class HittingCounts(eqx.Module):
 
     @property
     def _num_hits(self) -> Int[Array, "*I n"]:
-        return jnp.sum(self.counts > 0, axis=-1)
+        return jnp.sum(self.counts > 0, axis=-1, dtype=jnp.int32)
 
 
 def hitting_counts(
@@ -134,19 +141,33 @@ def hitting_counts(
     coupling = coupling_of(bridges, start_law)
     num_counts = check_count("num_counts", num_counts)
     bound = check_max_trials(max_trials, num_counts)
+    batch_size = None if batch_size is None else check_count("batch_size", batch_size)
     return _hitting_counts(key, model, coupling, bridges, num_counts, bound, batch_size)
 
 
 @eqx.filter_jit
-def _hitting_counts(key, model, coupling, bridges, num_counts, max_trials, batch_size):
-    model = model.prepared()
-    shape = bridges.met.shape
+def _hitting_counts(key, model, coupling, bridges, num_counts, max_trials, num_lanes):
+    key = key_for("hitting counts", key)
+    return counts_of(key, model, coupling, bridges, num_counts, max_trials, num_lanes)[0]
+
+
+def counts_of(
+    key: Key[Array, ""],
+    model: Diffusion,
+    coupling: AbstractCoupling,
+    bridges: BridgePaths,
+    num_counts: int,
+    max_trials: Int[Array, ""],
+    num_lanes: int | None,
+) -> tuple[HittingCounts, AbstractCoupling]:
+    """Counts for all the bridges, and the coupling with its burn-in measured."""
+    model, coupling, bridges = nondifferentiable((model.prepared(), coupling, bridges))
+    shape, num_steps = bridges.met.shape, bridges.num_steps
     paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
     duration = durations_of(bridges)
-    coupling = with_burn_in(key, model, coupling, paths[:, -1], duration, bridges.num_steps)
-    keys = jax.random.split(key_for("hitting counts", key), paths.shape[0])
+    coupling = with_burn_in(key, model, coupling, paths[:, -1], duration, num_steps)
     counts = count_hits(
-        keys,
+        jax.random.split(key, len(paths)),
         model,
         coupling,
         paths,
@@ -154,9 +175,10 @@ def _hitting_counts(key, model, coupling, bridges, num_counts, max_trials, batch
         bridges.met.reshape(-1),
         num_counts,
         max_trials,
-        batch_size,
+        num_lanes,
     )
-    return jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), counts)
+    counts = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), counts)
+    return counts, coupling
 
 
 def count_hits(

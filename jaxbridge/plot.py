@@ -1,6 +1,7 @@
 """Pictures of bridges, and of their law beside an exact one. Needs the extra `plot`."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -160,6 +161,46 @@ def bridges_overview(bridges: Bridges, exact: GaussianBridge) -> Figure:
         bottom, top = ax.get_ylim()
         ax.set_ylim(bottom - 0.2 * (top - bottom), top)  # room for the legend
         ax.legend(frameon=False, fontsize="x-small", ncols=2, loc="lower center")
+    return figure
+
+
+def variation(results: Sequence[Any]) -> Figure:
+    """std/mean of 1/π_T against γ for each bridge: results of `exact_study.run_variation`."""
+    bridges = list(dict.fromkeys(result.bridge for result in results))
+    figure = Figure(figsize=(3.6 * len(bridges), 3.4), layout="constrained")
+    for ax, bridge in zip(figure.subplots(1, len(bridges), squeeze=False)[0], bridges, strict=True):
+        group = [result for result in results if result.bridge == bridge]
+        place = np.arange(len(group))
+        for i, (label, name) in enumerate([("ν", "right"), ("as printed", "published")]):
+            found = [getattr(result, name) for result in group]
+            ratio = [float(v.ratio) for v in found]
+            error = [2 * float(v.ratio_error) for v in found]
+            style = {"color": _COLOURS[i], "marker": _MARKERS[i], "capsize": 3, "markersize": 5}
+            ax.errorbar(place + 0.08 * i, ratio, error, label=label, **style)
+        ax.set(xticks=place, xticklabels=[f"{result.gamma:g}" for result in group], xlabel="γ")
+        ax.set(ylim=(-0.02, 0.8))
+        ax.set_title(bridge.replace("->", "→").replace("-", "−"), fontsize="medium")
+        _finish(ax, title="start law")
+    figure.axes[0].set_ylabel("std / mean of $1/\\pi_T$, ± 2 s.e.")
+    return figure
+
+
+def cost(costs: Sequence[Any], slope: float) -> Figure:
+    """Seconds per effective bridge against the duration: results of `exact_study.run_cost`."""
+    figure = Figure(figsize=(7.6, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    duration = np.array([c.duration for c in costs])
+    seconds = np.array([c.seconds for c in costs])
+    left.loglog(duration, seconds, _MARKERS[0] + "-", color=_COLOURS[0], label="measured")
+    last = duration >= 10
+    line = seconds[-1] * (duration[last] / duration[-1]) ** slope
+    left.loglog(duration[last], line, "--", color=_EXACT, label=f"slope {slope:.2f}")
+    left.set(xlabel="duration T", ylabel="seconds per effective bridge")
+    _finish(left)
+    acceptance = [c.acceptance for c in costs]
+    right.semilogx(duration, acceptance, _MARKERS[0] + "-", color=_COLOURS[0])
+    right.set(xlabel="duration T", ylabel="share of steps accepted", ylim=(0, 1.03))
+    right.spines[["top", "right"]].set_visible(False)
     return figure
 
 

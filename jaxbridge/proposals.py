@@ -12,11 +12,11 @@ equation (bridgesim), where ρ - 1 is the first step in which the two meet.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from .arrays import cast_floats
 from .coupling import AbstractCoupling, rotate, rotation_between
 from .diffusion import Diffusion
 from .linalg import all_finite
@@ -142,9 +142,7 @@ def pair_noise(coupling: AbstractCoupling, draws_uniform: bool, dtype) -> Callab
 
 def realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
     """Each lane's coupling, and the axes of lanes in its leaves."""
-    coupling = jax.tree.map(
-        lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, coupling
-    )
+    coupling = cast_floats(coupling, dtype)
     realised = coupling.realise(keys)
     axes = jax.tree.map(lambda old, new: None if old is new else -1, coupling, realised)
     return realised, axes

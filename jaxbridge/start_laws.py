@@ -22,17 +22,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
-from .arrays import Numbers, as_floating, is_traced
-from .diffusion import Diffusion, Dynamics
+from .arrays import Numbers, as_floating, cast_floats, is_traced
+from .diffusion import Diffusion, Dynamics, check_value
+from .gaussian import GaussianLaw
 from .noise import noisy_scan
 from .schemes import AbstractScheme
+
+# No run that replaces a sampler of ν takes more steps than this.
+MOST_STEPS = 2**18
 
 
 @runtime_checkable
 class StartLaw(Protocol):
-    """Any law with a sampler and a normalised density; `GaussianLaw` is one."""
+    """Any law with a sampler and a normalised density; `GaussianLaw` is one.
+
+    Make it an `equinox.Module` with arrays as its fields. Any other object serves too, but is
+    read once, when a program is compiled for it: later changes of its attributes are not seen.
+    """
 
     def sample(self, key: Key[Array, ""], model: Diffusion) -> Float[Array, " d"]:
         """One draw, shape (d,)."""
@@ -49,7 +57,8 @@ class Stationary(eqx.Module):
 
     Draws come from the model's sampler. A model without one is run: the reversed diffusion
     starts at b and is taken after `burn_in` units of time, afresh for every draw. By default
-    that time is measured (`burn_in`), and the results that used it say what it was.
+    that time is measured, as `measure_burn_in` does, and the results that used it say what it
+    was: infinite where none was found, and then bridges are not exact.
     """
 
     burn_in: Float[Array, ""] | None = None
@@ -68,16 +77,30 @@ class Reversed(eqx.Module):
     the paper prints it. It does **not** give the exact law: for comparisons only."""
 
 
-class Opaque(eqx.Module):
-    """A start law that is not made of arrays, kept out of the sight of JAX."""
+class _Identity:
+    """An object that equals itself only."""
 
-    law: Any = eqx.field(static=True)
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __eq__(self, other):
+        return isinstance(other, _Identity) and other.value is self.value
+
+    def __hash__(self):
+        return id(self.value)
+
+
+class Opaque(eqx.Module):
+    """A start law that is not made of arrays, kept out of the sight of JAX: what it does is
+    read once, when a program is compiled for it."""
+
+    law: _Identity = eqx.field(static=True)
 
     def sample(self, key, model):
-        return self.law.sample(key, model)
+        return self.law.value.sample(key, model)
 
     def log_density(self, x):
-        return self.law.log_density(x)
+        return self.law.value.log_density(x)
 
 
 AnyStartLaw = Stationary | Reversed | StartLaw
@@ -92,8 +115,16 @@ def as_start_law(law: Any) -> AnyStartLaw:
             "`start_law` must be `Stationary()`, `GaussianLaw(mean, covariance)`, `Reversed()`, or "
             f"an object with `sample(key, model)` and `log_density(x)`; got {law!r}."
         )
-    opaque = not all(eqx.is_array_like(leaf) for leaf in jax.tree.leaves(law))
-    return Opaque(law) if opaque else law
+    if isinstance(law, GaussianLaw) and not is_traced(law):
+        matrix = np.asarray(law.covariance, float)
+        if not (np.all(np.isfinite(law.mean)) and np.linalg.eigvalsh(matrix).min() > 0):
+            raise ValueError(
+                "a start law must have a finite mean and a positive definite covariance; got "
+                f"{law.mean} and {law.covariance}."
+            )
+    if not all(eqx.is_array_like(leaf) for leaf in jax.tree.leaves(law)):
+        return Opaque(_Identity(law))
+    return jax.tree.map(jnp.asarray, law)  # numbers are traced, so that they may change
 
 
 def log_ratio(law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]) -> Float[Array, ""]:
@@ -101,7 +132,8 @@ def log_ratio(law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]) -> Floa
     `Reversed`, as printed."""
     if isinstance(law, Stationary | Reversed):
         return jnp.zeros((), x.dtype)
-    return law.log_density(x).astype(x.dtype) - model.log_stationary(x)
+    log_density = check_value("log_density", cast_floats(law, x.dtype).log_density(x), (), x)
+    return log_density - model.log_stationary(x)
 
 
 def needs_burn_in(law: AnyStartLaw, model: Diffusion) -> bool:
@@ -121,10 +153,12 @@ def draw_starts(
     """A draw from the law in each lane."""
     if isinstance(law, Stationary) and not model.has_sampler:
         assert law.burn_in is not None
-        repeats = jnp.ceil(law.burn_in / (num_steps * jnp.min(dt))).astype(jnp.int32)
+        repeats = jnp.ceil(law.burn_in.astype(dt.dtype) / (num_steps * dt))
+        repeats = jnp.minimum(repeats, MOST_STEPS // num_steps).astype(jnp.int32)
         return run_for(model.backward(end[:, 0]), scheme, keys, end, dt, num_steps, repeats)
     if isinstance(law, Reversed):
-        return run_for(model.backward(end[:, 0]), scheme, keys, end, dt, num_steps, 1)
+        once = jnp.ones(dt.shape, jnp.int32)
+        return run_for(model.backward(end[:, 0]), scheme, keys, end, dt, num_steps, once)
     if isinstance(law, Stationary):
         draws = jax.vmap(model.sample_stationary)(keys)
     else:
@@ -144,9 +178,9 @@ def run_for(
     x: Float[Array, "d lanes"],
     dt: Float[Array, " lanes"],
     num_steps: int,
-    repeats,
+    repeats: Int[Array, " lanes"],
 ) -> Float[Array, "d lanes"]:
-    """The state after `repeats` times `num_steps` steps; `repeats` may be traced."""
+    """The state after `repeats` times `num_steps` steps, in each lane."""
     root_dt = jnp.sqrt(dt)
     step = jax.vmap(
         lambda x, dw, dt, root_dt: scheme.step(dynamics, x, dt, root_dt * dw),
@@ -155,13 +189,14 @@ def run_for(
     )
 
     def once(repeat, x):
-        return noisy_scan(
+        end, _ = noisy_scan(
             lambda x, inputs: (step(x, inputs[0], dt, root_dt), None),
             x,
             jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, repeat),
             lambda key, k: jax.random.normal(key, (k, x.shape[0]), x.dtype),
             None,
             num_steps,
-        )[0]
+        )
+        return jnp.where(repeat < repeats, end, x)
 
-    return lax.fori_loop(0, repeats, once, x)
+    return lax.fori_loop(0, jnp.max(repeats), once, x)

@@ -4,21 +4,21 @@ Unbiased on the natural scale, up to the step error, and so fit for pseudo-margi
 Metropolis–Hastings over the parameters of a model.
 """
 
+import math
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int, Key
 
-from .arrays import Numbers
+from .arrays import Numbers, nondifferentiable
 from .bridges import check_key
 from .chains import check_proposal
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count
-from .weighted import AbstractWeightedProposal, as_proposal
+from .weighted import AbstractWeightedProposal, CoupledPairs, as_proposal
 
 
 class TransitionLogDensity(eqx.Module):
@@ -32,6 +32,7 @@ class TransitionLogDensity(eqx.Module):
     - `num_truncated`: how many of their weights were cut off by `max_trials`. Each makes the
         estimate too small on average.
     - `num_simulated`: paths simulated in all.
+    - `num_nonfinite`: how many of them left the finite numbers.
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
     """
 
@@ -41,6 +42,7 @@ class TransitionLogDensity(eqx.Module):
     num_met: Int[Array, "*I"]
     num_truncated: Int[Array, "*I"]
     num_simulated: Int[Array, "*I"]
+    num_nonfinite: Int[Array, "*I"]
     proposal: AbstractWeightedProposal
 
 
@@ -54,7 +56,7 @@ def transition_log_density(
     num_proposals: int = 1000,
     num_steps: int = 50,
     proposal: Any = None,
-    num_counts: int = 1,
+    num_counts: int | None = None,
     max_trials: int | None = None,
 ) -> TransitionLogDensity:
     """An estimate of log p_T(a, b) with its standard error, for one pair or thousands.
@@ -68,7 +70,7 @@ def transition_log_density(
         `Stationary()` the model's `log_stationary` must be normalised (those of
         `ornstein_uhlenbeck` and `hyperbolic` are); with a start law that has a density it
         need not be, for its constant cancels.
-    - `num_counts`: N hitting counts for each proposal.
+    - `num_counts`: N hitting counts for each proposal, by default one.
     - `max_trials`: bounds the trials of each proposal; by default 10,000 for each count.
 
     **Returns:** `TransitionLogDensity`. Not differentiable.
@@ -92,6 +94,11 @@ def transition_log_density(
     intervals, batched, _ = as_intervals(start, end, duration)
     proposal = as_proposal(proposal, num_counts, None, max_trials)
     check_proposal(proposal, model, intervals)
+    if isinstance(proposal, CoupledPairs) and not model.has_density:
+        raise ValueError(
+            "the transition density needs the stationary one: give `Diffusion` a "
+            "`log_stationary`, normalised if the start law is `Stationary()`."
+        )
     return _estimate(key, model, proposal, intervals, num_proposals, num_steps, batched)
 
 
@@ -105,7 +112,8 @@ def _estimate(
     num_steps: int,
     batched: bool,
 ) -> TransitionLogDensity:
-    model, num_intervals = model.prepared(), intervals.start.shape[0]
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    num_intervals = intervals.start.shape[0]
     proposal = proposal.prepared(key, model, intervals, num_steps)
     fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
     keys = fold_in(key, jnp.arange(num_intervals * num_proposals))
@@ -129,12 +137,16 @@ def _estimate(
     def of_interval(leaf):
         return leaf if batched else leaf[0]
 
+    def total(leaf):
+        return of_interval(jnp.sum(by_interval(leaf), axis=1, dtype=jnp.int32))
+
     return TransitionLogDensity(
-        of_interval(log_sum - np.log(num_proposals)),
+        of_interval(log_sum - math.log(num_proposals)),
         of_interval(jnp.where(some, error, jnp.inf)),
         of_interval(jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0)),
-        of_interval(jnp.sum(by_interval(drawn.found), axis=1)),
-        of_interval(jnp.sum(by_interval(drawn.truncated), axis=1)),
-        of_interval(jnp.sum(by_interval(drawn.num_simulated), axis=1)),
+        total(drawn.found),
+        total(drawn.truncated),
+        total(drawn.num_simulated),
+        total(drawn.num_nonfinite),
         proposal,
     )

@@ -18,16 +18,17 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from .arrays import Numbers, is_traced
-from .bridges import Bridges, check_key, sample_bridges
+from .bridges import check_key, sample_bridges
 from .burn_in import measure_burn_in
 from .coupling import Coupling
 from .diffusion import Diffusion, check_diffusion
 from .gaussian import GaussianLaw
-from .intervals import check_count
-from .start_laws import AnyStartLaw, Stationary, draw_starts
+from .intervals import Intervals, as_intervals, check_count
+from .search import key_for, most_lanes
+from .start_laws import AnyStartLaw, Stationary, draw_starts, needs_burn_in
 from .weighted import weigh_bridges
 
-_WEIGHTS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+_SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 # Efficiencies this close are not told apart by a pilot run; of such laws the one closest to ν
 # is taken, whose weights are bounded more safely.
 _TOLERANCE = 1.1
@@ -36,12 +37,12 @@ _PILOT_TRIALS = 1_000
 
 
 class Pilot(NamedTuple):
-    """One pilot run: γ; λ, the weight of the Gaussian fit in the start law; the share of
-    proposals that met; trials for a hitting count; effective samples per simulated path, nan
-    where counts took too long; and the coupling."""
+    """One pilot run: γ; λ, the share of the Gaussian fit in the start law; the share of proposals
+    that met; trials for a hitting count; effective samples per simulated path, NaN where counts
+    took too long or too few pairs met; and the coupling."""
 
     gamma: float
-    weight: float
+    fit_share: float
     acceptance: float
     trials_per_count: float
     efficiency: float
@@ -55,11 +56,11 @@ class Tuning(NamedTuple):
     pilots: list[Pilot]
 
     def __str__(self) -> str:
-        lines = ["  gamma  weight of fit  met share  trials per count  efficiency"]
+        lines = ["  gamma  share of fit  met share  trials per count  efficiency"]
         for p in self.pilots:
             chosen = "  <- chosen" if p.coupling is self.coupling else ""
             lines.append(
-                f"{p.gamma:7.3g}  {p.weight:13.1f}  {p.acceptance:9.1%}  "
+                f"{p.gamma:7.3g}  {p.fit_share:12.1f}  {p.acceptance:9.1%}  "
                 f"{p.trials_per_count:16.1f}  {p.efficiency:10.4f}{chosen}"
             )
         return "\n".join(lines)
@@ -133,6 +134,8 @@ def tune_coupling(
     """
     if couplings is None:
         couplings = [Coupling(gamma) for gamma in (-1.0, 0.0, 0.5, 0.9)]
+    if len(couplings) == 0:
+        raise ValueError("`couplings` must have at least one candidate.")
     runs = (
         _pilots(key, model, start, end, duration, num_steps, coupling, num_pilot)
         for coupling in couplings
@@ -153,12 +156,18 @@ def _pilots(
 ) -> list[Pilot]:
     check_key(key)
     check_diffusion(model)
-    num_pilot = check_count("num_pilot", num_pilot, 10)
+    if not isinstance(coupling, Coupling):
+        raise TypeError(f"a start law is chosen for a `Coupling`; got {coupling!r}.")
     if is_traced(key, model, coupling, start, end, duration):
         raise TypeError(
             "a start law is chosen by looking at numbers, which `jit` and `vmap` hide: choose it "
             "before, and pass the coupling that has it."
         )
+    intervals, batched, _ = as_intervals(start, end, duration)
+    if batched:
+        raise ValueError("a start law is chosen for one interval: `start` of shape (d,).")
+    d = intervals.start.shape[1]
+    num_pilot = check_count("num_pilot", num_pilot, 20 * d)
     bridge_key, law_key, weigh_key = jax.random.split(key, 3)
     bridges = sample_bridges(
         bridge_key,
@@ -170,65 +179,69 @@ def _pilots(
         num_steps=num_steps,
         coupling=coupling,
     )
-    if bridges.paths.ndim != 3:
-        raise ValueError("a start law is chosen for one interval: `start` of shape (d,).")
-    met, d = np.asarray(bridges.met), bridges.paths.shape[-1]
+    gamma, met = float(np.asarray(coupling.gamma)), np.asarray(bridges.met)
+    acceptance = met.sum() / float(bridges.num_proposals)
     if met.sum() < 10 * d:
-        raise ValueError(
-            f"only {met.sum()} of {num_pilot} pilot bridges were found: the pair hardly ever "
-            "meets here. Lengthen the duration or choose a smaller `gamma`."
-        )
+        return [Pilot(gamma, 0.0, acceptance, np.nan, np.nan, coupling)]
     starts = np.asarray(bridges.reverse_start, float)[met]
-    stationary, draws = _stationary_draws(law_key, model, coupling, bridges, num_pilot)
+    stationary, draws = _stationary_draws(law_key, model, coupling, intervals, num_steps, num_pilot)
     laws: list[AnyStartLaw] = [stationary]
     if model.has_density:
         fits = (_gaussian_fit(draws), _gaussian_fit(starts))
-        dtype = bridges.paths.dtype
-        laws += [_between(*fits, weight, dtype) for weight in _WEIGHTS[1:]]
+        laws += [_between(*fits, share, bridges.paths.dtype) for share in _SHARES[1:]]
     pilots = []
-    for weight, law in zip(_WEIGHTS, laws, strict=False):
+    for share, law in zip(_SHARES, laws, strict=False):
         weighted = weigh_bridges(weigh_key, model, bridges, start_law=law, max_trials=_PILOT_TRIALS)
-        acceptance = met.sum() / float(bridges.num_proposals)
         trials = (float(weighted.num_simulated) - float(bridges.num_proposals)) / met.sum()
         usable = np.asarray(weighted.truncated).mean() < 0.01
         efficiency = float(weighted.efficiency) if usable else np.nan
-        gamma = float(np.asarray(coupling.gamma))
         tuned = eqx.tree_at(lambda c: c.start_law, coupling, law)
-        pilots.append(Pilot(gamma, weight, acceptance, trials, efficiency, tuned))
+        pilots.append(Pilot(gamma, share, acceptance, trials, efficiency, tuned))
     return pilots
 
 
 def _best(pilots: list[Pilot]) -> Pilot:
     if all(np.isnan(pilot.efficiency) for pilot in pilots):
         raise ValueError(
-            "hitting counts took too long with every start law that was tried: these bridges "
-            "are hardly ever hit. Lengthen the duration or choose a smaller `gamma`."
+            "no pilot run succeeded: either the pair hardly ever meets here, or bridges are hardly "
+            f"ever hit (met share, trials per count: "
+            f"{[(p.acceptance, p.trials_per_count) for p in pilots]}). Lengthen the duration or "
+            "choose a smaller `gamma`."
         )
     best = np.nanmax([pilot.efficiency for pilot in pilots])
     near_best = [pilot for pilot in pilots if pilot.efficiency > best / _TOLERANCE]
-    return min(near_best, key=lambda pilot: (pilot.weight, -pilot.efficiency))
+    return min(near_best, key=lambda pilot: (pilot.fit_share, -pilot.efficiency))
 
 
 def _stationary_draws(
-    key: Key[Array, ""], model: Diffusion, coupling: Coupling, bridges: Bridges, num_draws: int
+    key: Key[Array, ""],
+    model: Diffusion,
+    coupling: Coupling,
+    intervals: Intervals,
+    num_steps: int,
+    num_draws: int,
 ) -> tuple[Stationary, Float[np.ndarray, "n d"]]:
     """ν as a start law, with a burn-in where the model needs one, and draws from it."""
-    law, end, duration = Stationary(), bridges.paths[0, -1], bridges.times[-1]
-    keys = jax.random.split(key, num_draws)
-    if not model.has_sampler:
-        end = jnp.where(jnp.isfinite(end), end, 0)
+    given = coupling.start_law
+    law = given if isinstance(given, Stationary) else Stationary()
+    if needs_burn_in(law, model):
+        _, end, duration = intervals
         burn_in = measure_burn_in(
-            key, model, end, duration, num_steps=bridges.num_steps, coupling=coupling
+            key, model, end[0], duration[0], num_steps=num_steps, coupling=coupling
         )
         law = Stationary(burn_in)
-    lanes = jnp.broadcast_to(end[:, None], (len(end), num_draws))
-    dt = jnp.full(num_draws, duration / bridges.num_steps, end.dtype)
-    draws = jax.jit(
-        lambda keys: draw_starts(
-            law, model.prepared(), coupling.scheme, keys, lanes, dt, bridges.num_steps
-        )
-    )(keys)
+    num_draws = min(num_draws, most_lanes(intervals.end.shape[1]))
+    keys = jax.random.split(key_for("stationary draws", key), num_draws)
+    draws = _draw_stationary(law, model, coupling.scheme, keys, intervals, num_steps)
     return law, np.asarray(draws, float).T
+
+
+@eqx.filter_jit
+def _draw_stationary(law, model, scheme, keys, intervals, num_steps):
+    _, end, duration = intervals
+    lanes = jnp.broadcast_to(end.T, (end.shape[1], len(keys)))
+    dt = jnp.broadcast_to(duration / num_steps, len(keys))
+    return draw_starts(law, model.prepared(), scheme, keys, lanes, dt, num_steps)
 
 
 def _gaussian_fit(
@@ -239,11 +252,11 @@ def _gaussian_fit(
     return draws.mean(0), np.linalg.inv(np.atleast_2d(np.cov(draws.T)))
 
 
-def _between(stationary, reverse, weight: float, dtype) -> GaussianLaw:
+def _between(stationary, reverse, share: float, dtype) -> GaussianLaw:
     """The normalised `N_ν^{1-λ} G^λ`."""
     (mean, precision), (other_mean, other_precision) = stationary, reverse
-    combined = (1 - weight) * precision + weight * other_precision
+    combined = (1 - share) * precision + share * other_precision
     covariance = np.linalg.inv(combined)
-    shift = (1 - weight) * precision @ mean + weight * other_precision @ other_mean
+    shift = (1 - share) * precision @ mean + share * other_precision @ other_mean
     covariance = (covariance + covariance.T) / 2
     return GaussianLaw(jnp.asarray(covariance @ shift, dtype), jnp.asarray(covariance, dtype))

@@ -26,8 +26,8 @@ from .hitting import (
     HittingCounts,
     check_max_trials,
     count_hits,
+    counts_of,
     coupling_of,
-    durations_of,
 )
 from .intervals import Intervals, check_count
 from .search import check_bound, default_num_lanes, key_for
@@ -39,7 +39,7 @@ class WeightedPaths(NamedTuple):
 
     `log_weights` are -inf and `paths` NaN where none was `found`; `truncated` says where a
     weight is not exact because a bound on the work was reached; `num_simulated` counts the
-    simulated paths.
+    simulated paths, and `num_nonfinite` those that left the finite numbers.
     """
 
     paths: Float[Array, "P K d"]
@@ -47,6 +47,7 @@ class WeightedPaths(NamedTuple):
     found: Bool[Array, " P"]
     truncated: Bool[Array, " P"]
     num_simulated: Int[Array, " P"]
+    num_nonfinite: Int[Array, " P"]
 
 
 class AbstractWeightedProposal(eqx.Module):
@@ -99,11 +100,6 @@ class CoupledPairs(AbstractWeightedProposal):
         return eqx.tree_at(lambda p: p.coupling, self, coupling)
 
     def draw(self, keys, model, intervals, num_steps, stored, misses_count):
-        if misses_count and not model.has_density:
-            raise ValueError(
-                "the transition density needs the stationary one: give `Diffusion` a "
-                "`log_stationary`, normalised if the start law is `Stationary()`."
-            )
         max_proposals = jnp.int32(1) if misses_count else self.max_proposals
 
         def block(keys, intervals):
@@ -120,14 +116,15 @@ class CoupledPairs(AbstractWeightedProposal):
             log_weights = _log_weights(
                 self.coupling.start_law, model, intervals.end, reverse_start, counts.mean
             )
+            log_weights, unusable = _usable(log_weights, found)
+            kept = paths if stored is None else paths[:, stored]
             return WeightedPaths(
-                jnp.where(
-                    found[:, None, None], paths if stored is None else paths[:, stored], jnp.nan
-                ),
-                jnp.where(found, log_weights, -jnp.inf),
+                jnp.where(found[:, None, None], kept, jnp.nan),
+                log_weights,
                 found,
-                counts.truncated,
+                counts.truncated | unusable,
                 proposed.num_trials + counts.num_trials,
+                proposed.num_nonfinite + counts.num_nonfinite,
             )
 
         return _in_blocks(block, (keys, intervals), num_steps)
@@ -137,20 +134,20 @@ class CoupledPairs(AbstractWeightedProposal):
         # hit had started: N + 1 counts, less one trial.
         found = jnp.all(jnp.isfinite(paths), axis=(1, 2))
         counts = self._counts(keys, model, intervals, paths, found, self.num_counts + 1)
-        num_hits = jnp.maximum(jnp.sum(counts.counts > 0, axis=1) - 1, 1)
-        mean = jnp.maximum(counts.num_trials - 1, 1) / num_hits
-        log_weights = _log_weights(
-            self.coupling.start_law, model, intervals.end, counts.start, mean.astype(paths.dtype)
-        )
-        # Where nothing hit, x_0 is unknown and the ratio of the densities there is left out.
-        fallback = jnp.log(mean).astype(paths.dtype)
-        log_weights = jnp.where(jnp.isfinite(log_weights), log_weights, fallback)
+        num_hits = jnp.sum(counts.counts > 0, axis=1, dtype=jnp.int32)
+        one_less = jnp.maximum(counts.num_trials - 1, 1).astype(paths.dtype)
+        mean = one_less / jnp.maximum(num_hits - 1, 1).astype(paths.dtype)
+        # Where nothing hit, x_0 is unknown; any point serves for a weight that is flagged.
+        start = jnp.where((num_hits > 0)[:, None], counts.start, intervals.start)
+        log_weights = _log_weights(self.coupling.start_law, model, intervals.end, start, mean)
+        log_weights, unusable = _usable(log_weights, found)
         return WeightedPaths(
             paths,
-            jnp.where(found, log_weights, -jnp.inf),
+            log_weights,
             found,
-            counts.truncated,
+            counts.truncated | unusable,
             counts.num_trials,
+            counts.num_nonfinite,
         )
 
     def _counts(self, keys, model, intervals, paths, found, num_counts) -> HittingCounts:
@@ -181,32 +178,38 @@ def _log_weights(
     return log_weights
 
 
+# Bounds the tries for one bridge, unless the user says otherwise.
+_MAX_PROPOSALS = 10_000
+
+
 def as_proposal(
     proposal: Any,
-    num_counts: int = 1,
+    num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
 ) -> AbstractWeightedProposal:
     """What the user gave as `proposal`, as a weighted proposal."""
     proposal = Coupling() if proposal is None else proposal
     if isinstance(proposal, AbstractWeightedProposal):
+        if not (num_counts is None and max_proposals is None and max_trials is None):
+            raise ValueError(
+                "`num_counts`, `max_proposals` and `max_trials` are for a `Coupling`; this "
+                "`proposal` has its own."
+            )
         return proposal
     if not isinstance(proposal, AbstractCoupling):
         raise TypeError(f"`proposal` must be a `Coupling`; got {proposal!r}.")
-    num_counts = check_count("num_counts", num_counts)
+    num_counts = 1 if num_counts is None else check_count("num_counts", num_counts)
     return CoupledPairs(
         proposal,
-        check_bound("max_proposals", max_proposals, 100_000),
+        check_bound("max_proposals", max_proposals, _MAX_PROPOSALS),
         check_max_trials(max_trials, num_counts),
         num_counts,
     )
 
 
-def check_density(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
+def check_density(law: AnyStartLaw, model: Diffusion) -> None:
     """Raise `ValueError` where a start law has a density but the model's ν is not known."""
-    if not isinstance(proposal, CoupledPairs):
-        return
-    law = proposal.coupling.start_law
     if not isinstance(law, Stationary | Reversed) and not model.has_density:
         raise ValueError(
             "a start law other than `Stationary()` is paid for with ν(x): give `Diffusion` a "
@@ -233,7 +236,9 @@ class WeightedBridges(eqx.Module):
     - `met`: whether the bridge was found, shape (n,).
     - `truncated`: whether its counts were cut off by `max_trials`, shape (n,). Such a weight is
         finite and too small on average, so that paths that are hard to hit weigh too little.
+        Also where the start law's density was not a number: then the weight is zero.
     - `num_simulated`: paths simulated in all, proposals and trials.
+    - `num_nonfinite`: how many of them left the finite numbers.
     - `coupling`, `num_steps`: those they were made with. The coupling has the start law of the
         weights; a `Stationary` that had to be run has its `burn_in` in it.
     """
@@ -244,6 +249,7 @@ class WeightedBridges(eqx.Module):
     met: Bool[Array, "*I n"]
     truncated: Bool[Array, "*I n"]
     num_simulated: Int[Array, "*I"]
+    num_nonfinite: Int[Array, "*I"]
     coupling: AbstractCoupling
     num_steps: int = eqx.field(static=True)
 
@@ -289,6 +295,8 @@ class WeightedBridges(eqx.Module):
         """Equally weighted paths by systematic resampling, shape (m, K, d): many effective ones
         are needed for few repetitions. NaN where no bridge was found."""
         num_bridges = check_count("num_bridges", num_bridges)
+
+        check_key(key)
 
         def one_interval(key, weights, paths):
             shift = jax.random.uniform(key, dtype=weights.dtype)
@@ -355,38 +363,53 @@ def weigh_bridges(
     """
     check_key(key)
     check_diffusion(model)
+    if not isinstance(bridges, Bridges):
+        raise TypeError(
+            f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}. (Those of "
+            "`sample_exact_bridges` and `weigh_bridges` are exact already.)"
+        )
     coupling = coupling_of(bridges, start_law)
     num_counts = check_count("num_counts", num_counts)
     bound = check_max_trials(max_trials, num_counts)
-    check_density(as_proposal(coupling), model)
+    check_density(coupling.start_law, model)
+    batch_size = None if batch_size is None else check_count("batch_size", batch_size)
     return _weigh_bridges(key, model, coupling, bridges, num_counts, bound, batch_size)
 
 
 @eqx.filter_jit
 def _weigh_bridges(key, model, coupling, bridges, num_counts, max_trials, num_lanes):
-    model = model.prepared()
-    d = bridges.paths.shape[-1]
-    paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
-    reverse_start, end = bridges.reverse_start.reshape(-1, d), paths[:, -1]
-    duration, met = durations_of(bridges), bridges.met
-    coupling = with_burn_in(key, model, coupling, end, duration, bridges.num_steps)
-    keys = jax.random.split(key_for("hitting counts", key), len(paths))
-    active = met.reshape(-1)
-    counts = count_hits(
-        keys, model, coupling, paths, duration, active, num_counts, max_trials, num_lanes
-    )
-    log_weights = _log_weights(coupling.start_law, model, end, reverse_start, counts.mean)
-    num_trials = jnp.sum(counts.num_trials.reshape(met.shape), axis=-1)
+    key = key_for("weights", key)
+    counts, coupling = counts_of(key, model, coupling, bridges, num_counts, max_trials, num_lanes)
+    d, shape = bridges.paths.shape[-1], bridges.met.shape
+    log_weights = _log_weights(
+        coupling.start_law,
+        model.prepared(),
+        bridges.paths[..., -1, :].reshape(-1, d),
+        bridges.reverse_start.reshape(-1, d),
+        counts.mean.reshape(-1),
+    ).reshape(shape)
+    log_weights, unusable = _usable(log_weights, bridges.met)
+    num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)
+    num_nonfinite = jnp.sum(counts.num_nonfinite, axis=-1, dtype=jnp.int32)
     return WeightedBridges(
         bridges.times,
         bridges.paths,
-        jnp.where(met, log_weights.reshape(met.shape), -jnp.inf),
-        met,
-        counts.truncated.reshape(met.shape),
+        log_weights,
+        bridges.met,
+        counts.truncated | unusable,
         bridges.num_proposals + num_trials,
+        bridges.num_nonfinite + num_nonfinite,
         coupling,
         bridges.num_steps,
     )
+
+
+def _usable(
+    log_weights: Float[Array, "*I n"], found: Bool[Array, "*I n"]
+) -> tuple[Float[Array, "*I n"], Bool[Array, "*I n"]]:
+    """Weights of which none spoils the others, and where one would have."""
+    number = log_weights < jnp.inf  # false for NaN, as densities of start laws may give
+    return jnp.where(found & number, log_weights, -jnp.inf), found & ~number
 
 
 def _split(keys: Key[Array, " P"]) -> tuple[Key[Array, " P"], Key[Array, " P"]]:

@@ -141,6 +141,15 @@ def test_missing_bridges_are_not_tried():
     )
     counts = jb.hitting_counts(jax.random.key(1), paper_model(), bridges)
     assert counts.num_trials[0] == 0 and not counts.truncated[0]
+    assert np.isnan(counts.mean[0]) and np.isnan(counts.probability[0])
+
+
+def test_weights_and_counts_from_one_key_are_independent():
+    """A bridge's weight is the mean of counts of its own."""
+    model, bridges, key = paper_model(), some_bridges(200), jax.random.key(0)
+    weights = np.exp(np.asarray(jb.weigh_bridges(key, model, bridges).log_weights))
+    counts = np.asarray(jb.hitting_counts(key, model, bridges).mean)
+    assert (np.round(weights / weights.min()) != counts).mean() > 0.3
 
 
 def test_exploding_paths_do_not_hit_and_are_counted():

@@ -104,6 +104,27 @@ def test_any_law_with_a_density_and_a_sampler_serves():
         np.testing.assert_allclose(first.log_weights, other.log_weights, atol=1e-4)
 
 
+def test_run_for_a_sampler_depends_on_its_own_interval_only():
+    """Intervals of other step lengths beside it change nothing, nor does the number of lanes."""
+    model = without_sampler(paper_model())
+    starts, ends = jnp.zeros((2, 2)), jnp.full((2, 2), 0.3)
+    law = jb.Stationary(1.5)
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        model,
+        starts,
+        ends,
+        jnp.array([1.0, 0.2]),
+        num_bridges=4,
+        num_steps=10,
+        coupling=jb.Coupling(0.5, start_law=law),
+    )
+    counts = [
+        jb.hitting_counts(jax.random.key(1), model, bridges, 4, batch_size=size) for size in (1, 64)
+    ]
+    np.testing.assert_array_equal(counts[0].counts, counts[1].counts)
+
+
 def test_gaussian_law_is_normalised_and_sampled():
     law = jb.GaussianLaw([1.0, -2.0, 0.5], [[2.0, 0.3, 0.1], [0.3, 1.0, -0.2], [0.1, -0.2, 0.5]])
     draws = jax.vmap(law.sample)(jax.random.split(jax.random.key(0), 20_000))
@@ -123,6 +144,8 @@ def test_errors_say_what_to_change(unchecked):
         jb.GaussianLaw([0.0, 0.0], jnp.eye(3))
     with pytest.raises(ValueError, match="positive definite"):
         jb.GaussianLaw([0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]])
+    with pytest.raises(ValueError, match="positive definite"):
+        jb.Coupling(start_law=jb.GaussianLaw([0.0, 0.0], [[1.0, 1.0], [1.0, 1.0]]))
     bridges = jb.sample_bridges(jax.random.key(0), paper_model(), [0.0, 0.0], [0.5, 0.0], 1.0)
     with pytest.raises(ValueError, match=r"must give points of shape \(2,\)"):
         law = jb.GaussianLaw([0.0], [[1.0]])

@@ -153,6 +153,39 @@ def test_a_law_that_does_not_cover_is_flagged_and_finite(mean, covariance):
     assert weighted.truncated.mean() > 0.05 or weighted.effective_sample_size < 50
 
 
+def test_derivatives_are_refused():
+    """Forward mode would go through, and give a pathwise derivative that is not one."""
+    model = paper_model()
+
+    def middle(end):
+        bridges = jb.sample_bridges(jax.random.key(0), model, [0.0, 0.0], end, 1.0, num_steps=10)
+        return jb.weigh_bridges(jax.random.key(1), model, bridges).mean()[5]
+
+    for derivative in (jax.jacfwd, jax.jacrev):
+        with pytest.raises(TypeError, match="stop_gradient"):
+            derivative(middle)(jnp.array([0.5, 0.0]))
+
+
+def test_double_precision():
+    """A start law in single precision beside points in double, and the other way round."""
+    with jax.enable_x64(True):
+        for point, law in (("float64", "float32"), ("float32", "float64")):
+            mu = jb.GaussianLaw(jnp.zeros(2, law), jnp.eye(2, dtype=law))
+            a, b = jnp.zeros(2, point), jnp.full(2, 0.3, point)
+            model = jb.ornstein_uhlenbeck(jnp.eye(2, dtype=point))
+            coupling = jb.Coupling(0.5, start_law=mu)
+            options = dict(num_steps=5, proposal=coupling)
+            estimate = jb.transition_log_density(
+                jax.random.key(0), model, a, b, jnp.asarray(1.0, point), num_proposals=10, **options
+            )
+            assert estimate.value.dtype == estimate.standard_error.dtype == point
+            chain = jb.sample_exact_bridges(
+                jax.random.key(0), model, a, b, jnp.asarray(1.0, point), num_bridges=5, **options
+            )
+            assert chain.paths.dtype == chain.log_weights.dtype == point
+            assert chain.num_simulated.dtype == "int32"
+
+
 def test_numbers_change_without_compiling_again():
     model = paper_model()
 
