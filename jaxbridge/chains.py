@@ -371,7 +371,8 @@ def _run_pseudo_marginal(
     candidates = jnp.arange(1, num_bridges + 1, dtype=jnp.int32), log_weights[:, 1:].T
     inputs = (*candidates, uniform.reshape(step_keys.shape).T)
     _, (row, log_weights, accepted) = lax.scan(step, init, inputs)
-    row = (row + jnp.arange(num_intervals) * (num_bridges + 1)).T.reshape(-1)
+    first_row = jnp.arange(num_intervals, dtype=jnp.int32) * (num_bridges + 1)
+    row = (row + first_row).T.reshape(-1)
 
     def of_states(leaf):
         return unflatten_rows(leaf[row], num_intervals, batched)

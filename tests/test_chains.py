@@ -22,6 +22,7 @@ from jaxbridge.weighted import as_proposal
 
 CASES = exact_cases()
 EVERYWHERE = {"unlikely, gamma 0.5", "very unlikely, fitted law"}
+slow = pytest.mark.slow
 FITTED = jb.GaussianLaw([0.4, 0.3], [[0.5, -0.3], [-0.3, 0.5]])
 
 
@@ -92,8 +93,15 @@ def run_kernel(kernel, key, num_bridges):
 ARGUMENTS = (paper_model(), [0.785, 0.785], [1.091, 1.091], 1.0)
 
 
-@pytest.mark.parametrize("law", [None, FITTED], ids=["nu", "mu"])
-@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
+@pytest.mark.parametrize(
+    "method, law",
+    [
+        pytest.param("pseudo_marginal", None, id="pseudo_marginal-nu"),
+        pytest.param("pseudo_marginal", FITTED, id="pseudo_marginal-mu", marks=slow),
+        pytest.param("renewal", None, id="renewal-nu", marks=slow),
+        pytest.param("renewal", FITTED, id="renewal-mu"),
+    ],
+)
 def test_batched_chain_is_the_kernel_stepped(method, law):
     """Also where the renewal chain runs in several segments."""
     key, num_bridges = jax.random.key(5), 300
@@ -117,6 +125,7 @@ def test_batched_chain_is_the_kernel_stepped(method, law):
         assert (infos.is_accepted <= infos.is_hit).all() and infos.is_accepted.any()
 
 
+@slow
 def test_segments_of_hard_bridges_are_mended_to_one_chain():
     """Few renewals: trajectories seldom rejoin within their segment."""
     arguments = (paper_model(), *PAPER_CASES["very unlikely"], 1.0)
@@ -134,7 +143,7 @@ def test_segments_of_hard_bridges_are_mended_to_one_chain():
     np.testing.assert_allclose(chain.paths, states.position[:, [5, 10]], atol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
+@pytest.mark.parametrize("method", ["pseudo_marginal", pytest.param("renewal", marks=slow)])
 def test_several_intervals_are_several_chains(method):
     model = paper_model()
     starts, ends = jnp.array([[0.3, 0.1], [0.785, 0.785]]), jnp.array([[0.0, 0.5], [1.0, 1.0]])
@@ -169,8 +178,8 @@ def test_blackjax_runs_the_kernels(method):
     np.testing.assert_allclose(final.position, state.position, atol=1e-5)
 
 
-@pytest.mark.parametrize("law", [None, FITTED], ids=["nu", "mu"])
-@pytest.mark.parametrize("num_counts", [1, 3])
+@pytest.mark.parametrize("law", [None, pytest.param(FITTED, marks=slow)], ids=["nu", "mu"])
+@pytest.mark.parametrize("num_counts", [1, pytest.param(3, marks=slow)])
 def test_weights_of_given_bridges_have_their_law_in_the_chain(law, num_counts):
     """Over exact bridges with weights from their law in the chain, E[1/w] = P(met)/p: one over
     the mean weight of proposals. Plain counts are size-unbiased and fail."""
@@ -213,6 +222,7 @@ def test_weights_of_given_bridges_have_their_law_in_the_chain(law, num_counts):
         assert abs((1 / weights).mean() - expected) > 20 * error
 
 
+@slow
 def test_chain_without_a_bridge_is_nan_and_said():
     arguments = (paper_model(), [0.0, 0.0], [9.0, 0.0], 0.01)
     for method in ("pseudo_marginal", "renewal"):
@@ -227,6 +237,7 @@ def test_chain_without_a_bridge_is_nan_and_said():
         assert np.isnan(state.position).all() and not info.is_accepted
 
 
+@slow
 def test_chain_that_finds_its_first_bridge_late_goes_on():
     arguments = (paper_model(), [0.0, 0.0], [2.0, -2.0], 1.0)  # 7 % of the pairs meet
     for method in ("pseudo_marginal", "renewal"):

@@ -8,16 +8,26 @@ import pytest
 
 def run(*arguments, cwd):
     command = [sys.executable, "-m", "jaxbridge", *arguments]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=600)
 
 
 def test_quick_run_prints_a_table_and_writes_pictures(tmp_path):
-    done = run("--quick", "--out", "pictures", "--seed", "3", cwd=tmp_path)
+    done = run("approximate", "--quick", "--out", "pictures", "--seed", "3", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "2,000 bridges a case (--quick" in done.stdout
     assert done.stdout.count("as published") >= 8
     assert "[16/16]" in done.stderr
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 9
+
+
+@pytest.mark.slow
+def test_quick_run_of_the_exact_part(tmp_path):
+    done = run("exact", "--quick", "--out", "pictures", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for words in ("pseudo-marginal", "renewal", "std/mean", "per effective bridge"):
+        assert words in done.stdout
+    assert "nan" not in done.stdout
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 4
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), 
 
 
 def test_readme_code_runs():
-    assert len(BLOCKS) == 4
+    assert len(BLOCKS) == 6
     namespace = {}
     for block in BLOCKS:
         exec(block, namespace)
@@ -17,6 +17,9 @@ def test_readme_code_runs():
     assert namespace["many"].paths.shape == (500, 4, 51, 2)
     assert bool(namespace["many"].met.all())
     assert namespace["exact"].mean.shape == (2, 2)
+    assert namespace["weighted"].effective_sample_size > 100
+    assert namespace["chain"].paths.shape == (1000, 101, 2)
+    assert namespace["density"].standard_error < 0.2
 
 
 def test_readme_names_the_two_commands():
