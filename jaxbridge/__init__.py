@@ -2,9 +2,13 @@
 
 Data flows one way: a model (`diffusion`, `models`, `gaussian`) and a scheme (`schemes`) make
 steps; a coupling (`coupling`) with a meeting rule (`meeting`) makes pairs of paths and joins
-them (`proposals`); a search keeps the pairs that met (`bridges`). Exact laws stand beside
-(`gaussian`), the study of the paper on top (`study`, `plot`). References to equations and
-sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*.
+them (`proposals`); a search (`search`) keeps the pairs that met (`bridges`). The diffusion
+associated with a bridge (`associated`), started from some law (`start_laws`, `burn_in`), hits
+it or not (`hitting`), which makes a weight (`weighted`); chains (`chains`) and transition
+densities (`transition`) are built on weighted proposals, and pilot runs (`tuning`) and
+`diagnostics` on top. Exact laws stand beside (`gaussian`), the study of the paper above all
+(`study`, `exact_study`, `plot`). References to equations and sections are to Bladt, Finch &
+Sørensen, *Simulation of multivariate diffusion bridges*.
 """
 
 from .bridges import Bridges as Bridges, sample_bridges as sample_bridges
@@ -76,6 +80,7 @@ from .tuning import (
 )
 from .weighted import (
     AbstractWeightedProposal as AbstractWeightedProposal,
+    CoupledPairs as CoupledPairs,
     WeightedBridges as WeightedBridges,
     weigh_bridges as weigh_bridges,
 )

@@ -135,7 +135,8 @@ def _exact(options: argparse.Namespace) -> list[Path]:
     _end_progress()
     print(f"{format_variation(variation)}\n\n{_WHAT_TO_SEE_VARIATION}\n\nWhat duration costs\n")
     durations = (1.0, 3.0, 10.0) if options.quick else (1.0, 3.0, 10.0, 30.0, 100.0)
-    costs = run_cost(key, 512, durations, on_start=_say)
+    work = 5_000 if options.quick else 200_000
+    costs = run_cost(key, work, durations, on_start=_say)
     _end_progress()
     print(format_cost(costs))
     if not options.quick:

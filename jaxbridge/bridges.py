@@ -93,7 +93,7 @@ def sample_bridges(
     - `save_at`: times in [0, duration] on the grid, increasing, shape (K,), at which paths are
         kept; with several durations, fractions of them. By default the whole grid.
     - `batch_size`: proposals simulated side by side; bounds memory, and changes results by
-        rounding only. By default as many as fit in 64 MiB, and no more than are useful.
+        rounding only. By default as many as fit in 16 MiB, and no more than are useful.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time where a bridge was not found.
 

@@ -63,6 +63,8 @@ class AbstractCoupling(eqx.Module):
     `independent_noise` is false, in which case none is drawn. Each map must turn N(0, δ I)
     noise into N(0, δ I) noise, and the two must be the two conditional laws of one joint law.
 
+    Fields are arrays, or static: bridges carry their coupling with them out of `jit`.
+
     Write another coupling by subclassing. Synchronous up to a distance, then reflection:
 
     ```python

@@ -219,17 +219,18 @@ def _variation(key, model, ends: Ends, coupling, law, num_bridges) -> HittingVar
 
 def run_cost(
     key: Key[Array, ""],
-    num_bridges: int,
+    work: int,
     durations: Sequence[float] = (1.0, 3.0, 10.0, 30.0, 100.0),
     on_start: Callable[[str], None] = lambda what: None,
 ) -> list[Cost]:
-    """Seconds per effective bridge against the duration, at a fixed step of 0.02 and with the
-    same number of bridges side by side."""
+    """Seconds per effective bridge against the duration, at a fixed step of 0.02; each duration
+    has as many bridges as make `work` units of time, 50,000 at most."""
     model, costs = study_model(), []
     for duration in durations:
         on_start(f"cost of an exact bridge of duration {duration:g}")
+        num_bridges = min(round(work / duration), 50_000)
 
-        def run(key, duration=duration):
+        def run(key, duration=duration, num_bridges=num_bridges):
             return jax.block_until_ready(
                 sample_exact_bridges(
                     key,

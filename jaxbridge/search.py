@@ -177,7 +177,7 @@ def default_num_lanes(num_wanted: int, num_steps: int, point: Float[Array, "P d"
     """
     d = point.shape[1]
     bytes_per_lane = 3 * d * (num_steps + 1) * point.dtype.itemsize
-    bounds = (2**26 // bytes_per_lane, most_lanes(d), max(num_wanted, 64))
+    bounds = (2**24 // bytes_per_lane, most_lanes(d), max(num_wanted, 64))
     return max(1, min(bounds))
 
 
