@@ -18,6 +18,7 @@ does the work of very many steps at once and returns the same chain.
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -282,6 +283,7 @@ def sample_exact_bridges(
     max_proposals: int | None = None,
     max_trials: int | None = None,
     save_at: Numbers | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> Chain:
     """A Markov chain of bridges with the exact law: section 2.3 of the paper.
 
@@ -305,6 +307,7 @@ def sample_exact_bridges(
     - `max_proposals`: bounds the tries for each new path; by default 10,000.
     - `max_trials`: bounds the trials for the counts of each path; by default 10,000 for each
         count. See `Chain.truncated`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
     **Returns:** `Chain`. Not differentiable.
 
@@ -333,7 +336,7 @@ def sample_exact_bridges(
         raise ValueError(f'`method` must be "pseudo_marginal" or "renewal"; got {method!r}.')
     arguments = (key, model, proposal, intervals, stored, num_bridges, num_steps, batched)
     chain = _run_pseudo_marginal if method == "pseudo_marginal" else _run_renewal
-    return chain(*arguments, several_durations)
+    return chain(*arguments, several_durations, progress_meter)
 
 
 @eqx.filter_jit
@@ -347,6 +350,7 @@ def _run_pseudo_marginal(
     num_steps: int,
     batched: bool,
     several_durations: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Chain:
     model, intervals = nondifferentiable((model.prepared(), intervals))
     num_intervals = intervals.start.shape[0]
@@ -356,7 +360,9 @@ def _run_pseudo_marginal(
     # Row 0 of each interval is its first state, and row i the candidate of step i.
     draw_keys = jnp.concatenate([init_keys[:, None], draw_keys.reshape(step_keys.shape)], axis=1)
     each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_bridges + 1, axis=0), intervals)
-    drawn = proposal.draw(draw_keys.reshape(-1), model, each, num_steps, stored, False)
+    drawn = proposal.draw(
+        draw_keys.reshape(-1), model, each, num_steps, stored, False, progress_meter
+    )
     log_weights = drawn.log_weights.reshape(num_intervals, -1)
     uniform = jax.vmap(lambda k: jax.random.uniform(k, dtype=log_weights.dtype))(accept_keys)
 
@@ -436,6 +442,7 @@ def _run_renewal(
     num_steps: int,
     batched: bool,
     several_durations: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Chain:
     """Segments of the chain start from guesses, and are run again from where the segment before
     them ends until all fit. Two trajectories that take new paths in the same step take the same
@@ -458,7 +465,7 @@ def _run_renewal(
     head = jnp.tile(jnp.arange(num_segments) == 0, num_intervals)
     before = jnp.maximum(jnp.arange(num) - 1, 0)
 
-    def run_again(segments: _Segments, chosen: Int[Array, " W"]) -> _Segments:
+    def run_again(segments: _Segments, chosen: Int[Array, " W"], progress_meter) -> _Segments:
         """Run these segments from where the ones before them end, until they rejoin."""
         place = jnp.minimum(chosen, num - 1)  # those beyond the last only fill the width
         chosen_keys, chosen_intervals = keys[place], jax.tree.map(lambda x: x[place], each)
@@ -467,7 +474,7 @@ def _run_renewal(
         )
 
         def one_step(state):
-            i, positions, active, segments = state
+            i, positions, active, segments, meter = state
             positions, info = _renew(
                 chosen_keys[:, i], model, pairs, chosen_intervals, positions, active
             )
@@ -480,11 +487,13 @@ def _run_renewal(
                 num_simulated=segments.num_simulated.at[row].add(info.num_simulated, mode="drop"),
                 num_nonfinite=segments.num_nonfinite.at[row].add(info.num_nonfinite, mode="drop"),
             )
-            return i + 1, positions, active & ~rejoined, segments
+            meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / length)
+            return i + 1, positions, active & ~rejoined, segments, meter
 
-        state = (jnp.int32(0), entry, chosen < num, segments)
+        state = (jnp.int32(0), entry, chosen < num, segments, progress_meter.init())
         state = lax.while_loop(lambda s: (s[0] < length) & jnp.any(s[2]), one_step, state)
-        _, positions, changed, segments = state
+        _, positions, changed, segments, meter = state
+        progress_meter.close(meter)
         ends = segments.ends.at[jnp.where(changed, chosen, num)].set(positions, mode="drop")
         stale = segments.stale.at[chosen].set(False, mode="drop")
         after = jnp.where(changed, chosen + 1, num)
@@ -493,7 +502,7 @@ def _run_renewal(
 
     def repair(segments):
         chosen = jnp.nonzero(segments.stale, size=min(_REPAIR_WIDTH, num), fill_value=num)[0]
-        return run_again(segments, chosen)
+        return run_again(segments, chosen, diffrax.NoProgressMeter())
 
     num_stored = num_steps + 1 if stored is None else stored.shape[0]
     d, dtype = intervals.start.shape[1], intervals.start.dtype
@@ -505,7 +514,8 @@ def _run_renewal(
         jnp.zeros(num, jnp.int32),
         jnp.zeros(num, jnp.int32),
     )
-    segments = run_again(segments, jnp.arange(num))
+    progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    segments = run_again(segments, jnp.arange(num), progress_meter)
     # The first stale segment starts from where the chain is, so each pass settles it at least.
     segments = lax.while_loop(lambda s: jnp.any(s.stale), repair, segments)
 

@@ -13,6 +13,7 @@ from a to b in T is Gaussian. With the gain `K_t = Γ_t e^{-Bᵀ(T-t)} Γ_T⁻¹
 (The paper prints the gain without these transposes; that is right for reversible processes.)
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -57,6 +58,10 @@ class GaussianLaw(eqx.Module):
             raise ValueError(
                 f"`covariance` must be symmetric and positive definite; got {covariance}."
             )
+
+    def __iter__(self) -> Iterator[Array]:
+        """`mean, covariance = law`."""
+        yield from (self.mean, self.covariance)
 
     def sample(self, key: Key[Array, ""], model: Diffusion | None = None) -> Float[Array, " d"]:
         """One draw, shape (d,). The model is not looked at: start laws are called with one."""

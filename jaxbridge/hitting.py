@@ -9,6 +9,7 @@ mean of N counts is the number of trials up to the N-th hit, divided by N.
 
 from typing import Protocol, runtime_checkable
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -111,6 +112,7 @@ def hitting_counts(
     start_law: AnyStartLaw | None = None,
     max_trials: int | None = None,
     batch_size: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> HittingCounts:
     """Independent counts T(x) for each of the bridges, and so their hitting probabilities.
 
@@ -124,6 +126,7 @@ def hitting_counts(
     - `start_law`: μ, by default that of the bridges' coupling.
     - `max_trials`: bounds the trials of each bridge; by default 10,000 for each count.
     - `batch_size`: trials simulated side by side; changes results by rounding only.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
     **Returns:** `HittingCounts`.
 
@@ -142,13 +145,13 @@ def hitting_counts(
     num_counts = check_count("num_counts", num_counts)
     bound = check_max_trials(max_trials, num_counts)
     batch_size = None if batch_size is None else check_count("batch_size", batch_size)
-    return _hitting_counts(key, model, coupling, bridges, num_counts, bound, batch_size)
+    budget = (num_counts, bound, batch_size, progress_meter)
+    return _hitting_counts(key_for("hitting counts", key), model, coupling, bridges, budget)
 
 
 @eqx.filter_jit
-def _hitting_counts(key, model, coupling, bridges, num_counts, max_trials, num_lanes):
-    key = key_for("hitting counts", key)
-    return counts_of(key, model, coupling, bridges, num_counts, max_trials, num_lanes)[0]
+def _hitting_counts(key, model, coupling, bridges, budget):
+    return counts_of(key, model, coupling, bridges, *budget)[0]
 
 
 def counts_of(
@@ -159,6 +162,7 @@ def counts_of(
     num_counts: int,
     max_trials: Int[Array, ""],
     num_lanes: int | None,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> tuple[HittingCounts, AbstractCoupling]:
     """Counts for all the bridges, and the coupling with its burn-in measured."""
     model, coupling, bridges = nondifferentiable((model.prepared(), coupling, bridges))
@@ -176,6 +180,7 @@ def counts_of(
         num_counts,
         max_trials,
         num_lanes,
+        progress_meter,
     )
     counts = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), counts)
     return counts, coupling
@@ -191,6 +196,7 @@ def count_hits(
     num_counts: int,
     max_trials: Int[Array, ""],
     num_lanes: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> HittingCounts:
     """Counts for each of P bridges that is active, from trials that share the lanes."""
     num_steps = paths.shape[1] - 1
@@ -209,7 +215,7 @@ def count_hits(
 
     num_rows = paths.shape[0] * num_counts
     rows = jnp.full((num_rows, paths.shape[2]), jnp.nan, paths.dtype)
-    found = search(trial, rows, active, num_counts, max_trials, num_lanes)
+    found = search(trial, rows, active, num_counts, max_trials, num_lanes, progress_meter)
     number = found.number.reshape(-1, num_counts)
     before = jnp.concatenate([jnp.full_like(number[:, :1], -1), number[:, :-1]], axis=1)
     last = jnp.maximum(found.num_found - 1, 0)

@@ -7,6 +7,7 @@ Metropolis–Hastings over the parameters of a model.
 import math
 from typing import Any
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -58,6 +59,7 @@ def transition_log_density(
     proposal: Any = None,
     num_counts: int | None = None,
     max_trials: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> TransitionLogDensity:
     """An estimate of log p_T(a, b) with its standard error, for one pair or thousands.
 
@@ -72,6 +74,7 @@ def transition_log_density(
         need not be, for its constant cancels.
     - `num_counts`: N hitting counts for each proposal, by default one.
     - `max_trials`: bounds the trials of each proposal; by default 10,000 for each count.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
     **Returns:** `TransitionLogDensity`. Not differentiable.
 
@@ -99,7 +102,8 @@ def transition_log_density(
             "the transition density needs the stationary one: give `Diffusion` a "
             "`log_stationary`, normalised if the start law is `Stationary()`."
         )
-    return _estimate(key, model, proposal, intervals, num_proposals, num_steps, batched)
+    size = (num_proposals, num_steps, batched, progress_meter)
+    return _estimate(key, model, proposal, intervals, *size)
 
 
 @eqx.filter_jit
@@ -111,6 +115,7 @@ def _estimate(
     num_proposals: int,
     num_steps: int,
     batched: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> TransitionLogDensity:
     model, intervals = nondifferentiable((model.prepared(), intervals))
     num_intervals = intervals.start.shape[0]
@@ -119,7 +124,7 @@ def _estimate(
     keys = fold_in(key, jnp.arange(num_intervals * num_proposals))
     each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_proposals, axis=0), intervals)
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
-    drawn = proposal.draw(keys, model, each, num_steps, nothing, True)
+    drawn = proposal.draw(keys, model, each, num_steps, nothing, True, progress_meter)
 
     def by_interval(leaf):
         return leaf.reshape(num_intervals, num_proposals)

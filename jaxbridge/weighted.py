@@ -12,6 +12,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -68,6 +69,7 @@ class AbstractWeightedProposal(eqx.Module):
         num_steps: int,
         stored: Int[Array, " K"] | None,
         misses_count: bool,
+        progress_meter: diffrax.AbstractProgressMeter | None = None,
     ) -> WeightedPaths:
         """One weighted path for each key and each of P `intervals`, a function of its key.
 
@@ -99,7 +101,7 @@ class CoupledPairs(AbstractWeightedProposal):
         coupling = with_burn_in(key, model, self.coupling, end, duration, num_steps)
         return eqx.tree_at(lambda p: p.coupling, self, coupling)
 
-    def draw(self, keys, model, intervals, num_steps, stored, misses_count):
+    def draw(self, keys, model, intervals, num_steps, stored, misses_count, progress_meter=None):
         max_proposals = jnp.int32(1) if misses_count else self.max_proposals
 
         def block(keys, intervals):
@@ -112,7 +114,9 @@ class CoupledPairs(AbstractWeightedProposal):
             )
             paths, reverse_start, _ = proposed.outputs
             found = proposed.num_found > 0
-            counts = self._counts(count_keys, model, intervals, paths, found, self.num_counts)
+            counts = self._counts(
+                count_keys, model, intervals, paths, found, self.num_counts, progress_meter
+            )
             log_weights = _log_weights(
                 self.coupling.start_law, model, intervals.end, reverse_start, counts.mean
             )
@@ -150,7 +154,9 @@ class CoupledPairs(AbstractWeightedProposal):
             counts.num_nonfinite,
         )
 
-    def _counts(self, keys, model, intervals, paths, found, num_counts) -> HittingCounts:
+    def _counts(
+        self, keys, model, intervals, paths, found, num_counts, progress_meter=None
+    ) -> HittingCounts:
         return count_hits(
             keys,
             model,
@@ -160,6 +166,7 @@ class CoupledPairs(AbstractWeightedProposal):
             found,
             num_counts,
             self.max_trials,
+            progress_meter=progress_meter,
         )
 
 
@@ -334,6 +341,7 @@ def weigh_bridges(
     start_law: AnyStartLaw | None = None,
     max_trials: int | None = None,
     batch_size: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> WeightedBridges:
     """Weights that correct approximate bridges to the exact law: importance sampling.
 
@@ -348,6 +356,7 @@ def weigh_bridges(
     - `max_trials`: bounds the trials of each bridge; by default 10,000 for each count. See
         `WeightedBridges.truncated`.
     - `batch_size`: trials simulated side by side; changes results by rounding only.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
     **Returns:** `WeightedBridges`. Not differentiable.
 
@@ -373,13 +382,13 @@ def weigh_bridges(
     bound = check_max_trials(max_trials, num_counts)
     check_density(coupling.start_law, model)
     batch_size = None if batch_size is None else check_count("batch_size", batch_size)
-    return _weigh_bridges(key, model, coupling, bridges, num_counts, bound, batch_size)
+    budget = (num_counts, bound, batch_size, progress_meter)
+    return _weigh_bridges(key_for("weights", key), model, coupling, bridges, budget)
 
 
 @eqx.filter_jit
-def _weigh_bridges(key, model, coupling, bridges, num_counts, max_trials, num_lanes):
-    key = key_for("weights", key)
-    counts, coupling = counts_of(key, model, coupling, bridges, num_counts, max_trials, num_lanes)
+def _weigh_bridges(key, model, coupling, bridges, budget):
+    counts, coupling = counts_of(key, model, coupling, bridges, *budget)
     d, shape = bridges.paths.shape[-1], bridges.met.shape
     log_weights = _log_weights(
         coupling.start_law,

@@ -31,6 +31,7 @@ def test_regression_separates_the_variance_of_probabilities_from_that_of_counts(
     "name, gamma, paper",
     [("very unlikely", 0.5, 0.06), pytest.param("unlikely", 0.9, 0.16, marks=pytest.mark.slow)],
 )
+@pytest.mark.slow
 def test_paper_figures_with_its_own_settings(name, gamma, paper):
     """Section 3.2, with the printed start law; its figures have an error of their own."""
     model, key = paper_model(), jax.random.key

@@ -77,6 +77,7 @@ def test_estimates_from_counts_are_unbiased(probability, num_counts):
         assert stated == pytest.approx(float(jnp.std(counts.probability)), rel=0.1, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_start_of_a_hit_follows_its_law():
     """x_0 of the trial that hit has a density ∝ μ(x) h(z|x): with γ = -1 and the reflection of
     a one-dimensional Brownian-like pair, starts close to the path's own start hit more often."""
@@ -152,6 +153,7 @@ def test_weights_and_counts_from_one_key_are_independent():
     assert (np.round(weights / weights.min()) != counts).mean() > 0.3
 
 
+@pytest.mark.slow
 def test_exploding_paths_do_not_hit_and_are_counted():
     """x - x³ in an Euler step from very far out overflows at once."""
     model = jb.langevin(lambda x, p: x @ x - (x @ x) ** 2 / 2)

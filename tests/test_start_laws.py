@@ -56,6 +56,7 @@ def test_a_run_replaces_the_sampler_from_far_away():
         assert_moments(starts(jb.Stationary(1.0), blind, end), exact.mean, exact.covariance)
 
 
+@pytest.mark.slow
 def test_burn_in_does_not_depend_on_the_duration_much():
     """Short intervals must not pass for mixing: what spreads little also joins little."""
     model = without_sampler(jb.ornstein_uhlenbeck(np.eye(1)))
@@ -104,6 +105,7 @@ def test_any_law_with_a_density_and_a_sampler_serves():
         np.testing.assert_allclose(first.log_weights, other.log_weights, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_run_for_a_sampler_depends_on_its_own_interval_only():
     """Intervals of other step lengths beside it change nothing, nor does the number of lanes."""
     model = without_sampler(paper_model())

@@ -67,6 +67,7 @@ def test_standard_error_is_that_of_repetitions_and_the_estimate_unbiased():
     assert abs(stated / spread - 1) < 5 / np.sqrt(2 * len(ratio)) + 0.05
 
 
+@pytest.mark.slow
 def test_normaliser_of_the_stationary_density_cancels_where_the_start_law_has_one():
     ends = ([0.3, 0.1], [-0.2, 0.4])
     law = jb.GaussianLaw([0.0, 0.0], 0.5 * jnp.eye(2))

@@ -70,6 +70,7 @@ def test_tuning_chooses_the_best_pilot_and_prints_all():
     assert {pilot.gamma for pilot in tuning.pilots} == {0.0, np.float32(0.9)}
 
 
+@pytest.mark.slow
 def test_model_without_a_density_or_a_sampler():
     """Then ν, by a run, is the only law there is."""
     model = jb.Diffusion(lambda x, p: -x, reversible=True)

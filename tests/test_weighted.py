@@ -73,6 +73,7 @@ def test_random_gamma_and_more_counts_keep_the_law():
     )
 
 
+@pytest.mark.slow
 def test_model_without_a_sampler_is_run_and_says_for_how_long():
     """The same model with and without its sampler; the burn-in is in the result."""
     with_sampler = jb.ornstein_uhlenbeck([[1.0, 0.5], [0.5, 1.0]])
@@ -91,6 +92,7 @@ def test_model_without_a_sampler_is_run_and_says_for_how_long():
     assert given.coupling.start_law.burn_in == 7.0
 
 
+@pytest.mark.slow
 def test_several_intervals_are_weighed_as_one_by_one():
     model, durations = paper_model(), jnp.array([1.0, 1.5])
     starts, ends = jnp.array([[0.3, 0.1], [0.785, 0.785]]), jnp.array([[0.0, 0.5], [1.0, 1.0]])
@@ -125,6 +127,7 @@ def test_means_errors_and_resampling_follow_the_weights():
         assert abs(count - 1000 * weights[i]) < 1 + 1e-3
 
 
+@pytest.mark.slow
 def test_missing_bridges_weigh_nothing():
     model = paper_model()
     bridges = jb.sample_bridges(
