@@ -139,6 +139,7 @@ def test_non_reversible_process_on_a_long_interval():
         )
 
 
+@pytest.mark.slow
 def test_state_dependent_full_sigma_on_a_long_interval():
     """Bridges of the swirled process, unswirled. The allowance is for its first-order step."""
     inner = jb.ornstein_uhlenbeck(NON_REVERSIBLE)

@@ -41,7 +41,7 @@ def assert_chain_moments(values, mean, covariance):
         assert error.max() < 0.1
 
 
-@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
+@pytest.mark.parametrize("method", ["pseudo_marginal", pytest.param("renewal", marks=slow)])
 @pytest.mark.parametrize("name", slow_cases(CASES, EVERYWHERE))
 def test_chain_midpoints_have_the_exact_law(name, method):
     case = CASES[name]()

@@ -145,6 +145,7 @@ def test_missing_bridges_are_not_tried():
     assert np.isnan(counts.mean[0]) and np.isnan(counts.probability[0])
 
 
+@pytest.mark.slow
 def test_weights_and_counts_from_one_key_are_independent():
     """A bridge's weight is the mean of counts of its own."""
     model, bridges, key = paper_model(), some_bridges(200), jax.random.key(0)

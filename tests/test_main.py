@@ -11,6 +11,7 @@ def run(*arguments, cwd):
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=600)
 
 
+@pytest.mark.slow
 def test_quick_run_prints_a_table_and_writes_pictures(tmp_path):
     done = run("approximate", "--quick", "--out", "pictures", "--seed", "3", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -83,7 +83,7 @@ def test_meeting_step_is_the_first_sign_change():
     np.testing.assert_array_equal(found[later], expected[later])
 
 
-def teststored_steps_are_those_of_the_whole_path():
+def test_stored_steps_are_those_of_the_whole_path():
     model = paper_model()
     keys = jax.random.split(jax.random.key(0), 50)
     lanes = lambda value: jnp.full((2, 50), value)
@@ -104,6 +104,7 @@ def test_exploding_lanes_are_told_apart():
     assert (np.asarray(made.meeting_step) == 21).all()
 
 
+@pytest.mark.slow
 def test_state_dependent_noise_is_recovered_and_coupled():
     """The driven path of an Ornstein–Uhlenbeck process in swirled coordinates, unswirled,
     averaged over the stationary law of the end point."""

@@ -50,6 +50,7 @@ def test_law_stays_close_to_the_stationary_one_where_that_is_best():
         assert (jnp.diag(law.covariance) > 0.5 * sd**2).all()
 
 
+@pytest.mark.slow
 def test_tuning_chooses_the_best_pilot_and_prints_all():
     couplings = [jb.Coupling(0.0), jb.Coupling(0.9)]
     tuning = jb.tune_coupling(
