@@ -4,22 +4,20 @@ Data flows one way: a model (`diffusion`, `models`, `gaussian`) and a scheme (`s
 steps; a coupling (`coupling`) with a meeting rule (`meeting`) makes pairs of paths and joins
 them (`proposals`); a search (`search`) keeps the pairs that met (`bridges`). The diffusion
 associated with a bridge (`associated`), started from some law (`start_laws`, `burn_in`), hits
-it or not (`hitting`), which makes a weight (`weighted`); chains (`chains`) and transition
-densities (`transition`) are built on weighted proposals, and pilot runs (`tuning`) and
-`diagnostics` on top. Exact laws stand beside (`gaussian`), the study of the paper above all
-(`study`, `exact_study`, `plot`). References to equations and sections are to Bladt, Finch &
-Sørensen, *Simulation of multivariate diffusion bridges*.
+it or not (`hitting`), which makes a weight (`coupled_pairs`). Proposals that are pulled to the
+end point (`guided`) have weights too, and pilot runs choose (`choice`, `tuning`). On weighted
+proposals (`weighted`) are built importance sampling (`importance`), transition densities
+(`transition`) and Markov chains (`chains`, one method a module), with `diagnostics` on top.
+Exact laws stand beside (`gaussian`), the studies above all (`study`, `exact_study`, `plot`).
+References to equations and sections are to Bladt, Finch & Sørensen, *Simulation of
+multivariate diffusion bridges*.
 """
 
 from .bridges import Bridges as Bridges, sample_bridges as sample_bridges
 from .burn_in import measure_burn_in as measure_burn_in
-from .chains import (
-    Chain as Chain,
-    Kernel as Kernel,
-    pseudo_marginal as pseudo_marginal,
-    renewal as renewal,
-    sample_exact_bridges as sample_exact_bridges,
-)
+from .chains import sample_exact_bridges as sample_exact_bridges
+from .choice import Choice as Choice
+from .coupled_pairs import CoupledPairs as CoupledPairs
 from .coupling import (
     AbstractCoupling as AbstractCoupling,
     Coupling as Coupling,
@@ -27,6 +25,7 @@ from .coupling import (
     polar_rotation as polar_rotation,
     published_rotation as published_rotation,
 )
+from .crank_nicolson_chain import crank_nicolson as crank_nicolson
 from .diagnostics import (
     HittingVariation as HittingVariation,
     effective_sample_size as effective_sample_size,
@@ -42,7 +41,21 @@ from .gaussian import (
     ou_stationary as ou_stationary,
     ou_transition as ou_transition,
 )
+from .guided import (
+    AbstractGuidedProposal as AbstractGuidedProposal,
+    Guided as Guided,
+    ModifiedDiffusionBridge as ModifiedDiffusionBridge,
+    NoiseLaw as NoiseLaw,
+    ResidualBridge as ResidualBridge,
+    Step as Step,
+)
 from .hitting import HittingCounts as HittingCounts, hitting_counts as hitting_counts
+from .importance import (
+    WeightedBridges as WeightedBridges,
+    sample_weighted_bridges as sample_weighted_bridges,
+    weigh_bridges as weigh_bridges,
+)
+from .kernels import Chain as Chain, Kernel as Kernel
 from .meeting import (
     AbstractMeeting as AbstractMeeting,
     BrownianCrossing as BrownianCrossing,
@@ -56,6 +69,8 @@ from .models import (
     langevin as langevin,
     stationary_diffusion as stationary_diffusion,
 )
+from .pseudo_marginal_chain import pseudo_marginal as pseudo_marginal
+from .renewal_chain import renewal as renewal
 from .schemes import (
     AbstractScheme as AbstractScheme,
     Euler as Euler,
@@ -75,12 +90,8 @@ from .transition import (
 from .tuning import (
     Pilot as Pilot,
     Tuning as Tuning,
+    choose_proposal as choose_proposal,
     fit_start_law as fit_start_law,
     tune_coupling as tune_coupling,
 )
-from .weighted import (
-    AbstractWeightedProposal as AbstractWeightedProposal,
-    CoupledPairs as CoupledPairs,
-    WeightedBridges as WeightedBridges,
-    weigh_bridges as weigh_bridges,
-)
+from .weighted import AbstractWeightedProposal as AbstractWeightedProposal

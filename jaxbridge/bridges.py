@@ -127,7 +127,8 @@ def sample_bridges(
     intervals, batched, several_durations = as_intervals(start, end, duration)
     check_model(model, intervals, coupling.scheme)
     model.check_reversal()
-    stored = stored_steps(save_at, 1.0 if several_durations else duration, num_steps)
+    fractions = uniform_fractions(num_steps)
+    stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
     max_proposals = check_bound("max_proposals", max_proposals, max(1_000 * num_bridges, 100_000))
     if batch_size is None:
         num_wanted = num_bridges * intervals.start.shape[0]
@@ -206,7 +207,7 @@ def _sample_bridges(
     paths = _with_replayed_tangents(inputs, accepted, paths, num_steps)
     paths = jnp.where(met[:, None, None], paths, jnp.nan)
     return Bridges(
-        stored_times(intervals, stored, num_steps, several_durations),
+        grid_times(intervals, stored, uniform_fractions(num_steps), several_durations),
         unflatten_rows(paths, num_intervals, batched),
         unflatten_rows(met, num_intervals, batched),
         unflatten_rows(jnp.where(met, rho, -1), num_intervals, batched),
@@ -261,13 +262,16 @@ def unflatten_rows(rows: Shaped[Array, "rows ..."], num_intervals: int, batched:
     return rows.reshape(num_intervals, -1, *rows.shape[1:]) if batched else rows
 
 
-def stored_times(
-    intervals: Intervals, stored: Int[Array, " K"] | None, num_steps: int, several_durations: bool
+def grid_times(
+    intervals: Intervals,
+    stored: Int[Array, " K"] | None,
+    fractions: Float[np.ndarray, " points"],
+    several_durations: bool,
 ) -> Float[Array, "*durations K"]:
     """The times of the stored steps, for each interval where durations differ."""
     duration = intervals.duration[:, None] if several_durations else intervals.duration[0]
-    steps = jnp.arange(num_steps + 1) if stored is None else stored
-    return steps.astype(duration.dtype) / num_steps * duration
+    kept = jnp.asarray(fractions, duration.dtype)
+    return (kept if stored is None else kept[stored]) * duration
 
 
 def _propose_numbered(
@@ -326,26 +330,36 @@ def check_key(key) -> None:
         raise ValueError(f"`key` must be a single key; got an array of keys, {key.shape}.")
 
 
+def uniform_fractions(num_steps: int) -> Float[np.ndarray, " points"]:
+    """t_i / T on the grid of equal steps."""
+    return np.arange(num_steps + 1) / num_steps
+
+
 def stored_steps(
-    save_at: Numbers | None, duration: Numbers, num_steps: int
+    save_at: Numbers | None, duration: Numbers, fractions: Float[np.ndarray, " points"]
 ) -> Int[Array, " K"] | None:
+    """The grid points, t_i = T × fraction, at which paths are kept."""
     if save_at is None:
         return None
     save_at = as_floating("save_at", save_at)
     if save_at.ndim != 1 or save_at.shape[0] == 0:
         raise ValueError(f"`save_at` must be times in an array of shape (K,); got {save_at.shape}.")
+    between = (fractions[1:] + fractions[:-1]) / 2
     if is_traced(save_at, duration):
-        steps = jnp.round(save_at / jnp.asarray(duration) * num_steps)
-        return jnp.clip(steps, 0, num_steps).astype(jnp.int32)
-    steps = np.asarray(save_at, float) / np.asarray(duration, float) * num_steps
-    nearest = np.round(steps)
-    tolerance = 1e-3 + num_steps * float(jnp.finfo(save_at.dtype).eps)
-    if np.any(steps < -tolerance) or np.any(steps > num_steps + tolerance):
+        wanted = save_at / jnp.asarray(duration)
+        middle = jnp.asarray(between, wanted.dtype)
+        return jnp.searchsorted(middle, wanted).astype(jnp.int32)
+    length = float(np.asarray(duration, float))
+    wanted = np.asarray(save_at, float) / length
+    nearest = np.searchsorted(between, wanted)
+    # A thousandth of a step, and what rounding makes of times.
+    tolerance = 1e-3 * np.diff(fractions).min() + float(jnp.finfo(save_at.dtype).eps)
+    if np.any(wanted < -tolerance) or np.any(wanted > 1 + tolerance):
         raise ValueError(f"`save_at` must lie in [0, {duration}]; got {save_at}.")
-    if np.any(np.abs(steps - nearest) > tolerance):
+    if np.any(np.abs(fractions[nearest] - wanted) > tolerance):
         raise ValueError(
             "`save_at` must lie on the grid of `num_steps` steps: the times nearest to "
-            f"those given are {nearest / num_steps * np.asarray(duration)}."
+            f"those given are {fractions[nearest] * length}."
         )
     if np.any(np.diff(nearest) <= 0):
         raise ValueError(f"`save_at` must increase from one grid point on; got {save_at}.")

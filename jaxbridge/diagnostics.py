@@ -23,10 +23,10 @@ from .arrays import Numbers, as_floating
 from .bridges import check_key
 from .chains import Chain
 from .hitting import hitting_counts
+from .importance import WeightedBridges
 from .intervals import check_count
 from .search import key_for
 from .start_laws import AnyStartLaw
-from .weighted import WeightedBridges
 
 
 class HittingVariation(NamedTuple):

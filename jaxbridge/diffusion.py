@@ -191,13 +191,20 @@ class Diffusion(eqx.Module):
             reversible=self.reversible,
         )
 
+    @property
+    def has_reversal(self) -> bool:
+        """Whether the time reversal of this model is known."""
+        given = (self._reverse_drift, self._log_stationary)
+        return self.reversible or any(function is not None for function in given)
+
     def check_reversal(self) -> None:
         """Raise `ValueError` where the time reversal of this model is unknown."""
-        if not self.reversible and self._reverse_drift is None and self._log_stationary is None:
+        if not self.has_reversal:
             raise ValueError(
                 "the time reversal of this model is unknown, and couplings need it: give "
                 "`Diffusion` a `log_stationary` (up to a constant), a `reverse_drift`, or "
-                "`reversible=True`."
+                "`reversible=True`; or choose a proposal that does not need it, such as "
+                "`ModifiedDiffusionBridge()` or `Guided()`."
             )
 
     def forward(self, like: Float[Array, " d"]) -> Dynamics:

@@ -21,10 +21,10 @@ from .chains import sample_exact_bridges
 from .coupling import Coupling
 from .diagnostics import HittingVariation, effective_sample_size, hitting_variation
 from .gaussian import GaussianLaw, gaussian_bridge
+from .importance import weigh_bridges
 from .start_laws import AnyStartLaw, Reversed, Stationary
 from .study import CASES, Fit, Point, compare, study_model
 from .tuning import fit_start_law
-from .weighted import weigh_bridges
 
 Ends = tuple[Point, Point]
 UNLIKELY: Ends = ((0.785, 0.785), (1.091, 1.091))

@@ -25,6 +25,11 @@ def all_finite(vector: Float[Array, " d"]) -> Bool[Array, ""]:
     return jnp.isfinite(_sum(list(vector)))
 
 
+def total(vector: Float[Array, " d"]) -> Float[Array, ""]:
+    """The sum of the coordinates."""
+    return _sum([vector[i] for i in range(vector.shape[0])])
+
+
 def matvec(matrix: Float[Array, "n m"], vector: Float[Array, " m"]) -> Float[Array, " n"]:
     """`matrix @ vector`, column by column."""
     return _sum([matrix[:, j] * vector[j] for j in range(matrix.shape[1])])
@@ -80,16 +85,27 @@ def inverse(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
 
 
 def cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """The lower triangular L with `L Lᵀ = matrix`, unrolled; NaN where there is none."""
-    d = matrix.shape[0]
-    entries = [[jnp.zeros_like(matrix[0, 0])] * d for _ in range(d)]
-    for i in range(d):
-        for j in range(i + 1):
-            rest = matrix[i, j]
-            for k in range(j):
-                rest -= entries[i][k] * entries[j][k]
-            entries[i][j] = jnp.sqrt(rest) if i == j else rest / entries[j][j]
-    return jnp.stack([jnp.stack(row) for row in entries])
+    """The lower triangular L with `L Lᵀ = matrix`, column by column; NaN where there is none."""
+    d, rest, columns = matrix.shape[0], matrix, []
+    for k in range(d):
+        column = jnp.where(np.arange(d) < k, 0, rest[:, k] / jnp.sqrt(rest[k, k]))
+        columns.append(column)
+        rest = rest - column[:, None] * column
+    return jnp.stack(columns, axis=1)
+
+
+def log_abs_det(matrix: Float[Array, "d d"]) -> Float[Array, ""]:
+    """log |det matrix|, by elimination with partial pivoting."""
+    d, rows, logs = matrix.shape[0], matrix, []
+    for k in range(d):
+        below = jnp.where(np.arange(d) < k, -1, jnp.abs(rows[:, k]))
+        chosen = jnp.arange(d) == jnp.argmax(below)
+        pivot_row = _sum([jnp.where(chosen[i], rows[i], 0) for i in range(d)])
+        logs.append(jnp.log(jnp.abs(pivot_row[k])))
+        rows = jnp.where(chosen[:, None], rows[k], rows)  # the other half of the swap
+        eliminated = rows - rows[:, k : k + 1] * (pivot_row / pivot_row[k])
+        rows = jnp.where((np.arange(d) > k)[:, None], eliminated, rows)
+    return _sum(logs)
 
 
 def polar_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:

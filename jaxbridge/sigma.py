@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .linalg import inverse, matvec, solve
+from .linalg import inverse, log_abs_det, matvec, solve, total
 
 
 class AbstractSigma(eqx.Module):
@@ -34,6 +34,10 @@ class AbstractSigma(eqx.Module):
         """`½ (σ + other)`, for two coefficients of one model."""
 
     @abstractmethod
+    def log_abs_det(self) -> Float[Array, ""]:
+        """`log |det σ|`."""
+
+    @abstractmethod
     def as_matrix(self, dim: int, dtype) -> Float[Array, "d d"]:
         """`σ` as a dense matrix."""
 
@@ -52,6 +56,9 @@ class Identity(AbstractSigma):
 
     def average(self, other):
         return self
+
+    def log_abs_det(self):
+        return jnp.asarray(0.0)
 
     def as_matrix(self, dim, dtype):
         return jnp.eye(dim, dtype=dtype)
@@ -80,6 +87,9 @@ class Constant(AbstractSigma):
     def average(self, other):
         return self
 
+    def log_abs_det(self):
+        return log_abs_det(self.matrix)
+
     def as_matrix(self, dim, dtype):
         return self.matrix
 
@@ -102,6 +112,9 @@ class Diagonal(AbstractSigma):
         assert isinstance(other, Diagonal)
         return Diagonal((self.diagonal + other.diagonal) / 2)
 
+    def log_abs_det(self):
+        return total(jnp.log(jnp.abs(self.diagonal)))
+
     def as_matrix(self, dim, dtype):
         return jnp.diag(self.diagonal)
 
@@ -123,6 +136,9 @@ class Full(AbstractSigma):
     def average(self, other):
         assert isinstance(other, Full)
         return Full((self.matrix + other.matrix) / 2)
+
+    def log_abs_det(self):
+        return log_abs_det(self.matrix)
 
     def as_matrix(self, dim, dtype):
         return self.matrix

@@ -14,12 +14,14 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int, Key
 
-from .arrays import Numbers, nondifferentiable
+from .arrays import Numbers
 from .bridges import check_key
-from .chains import check_proposal
+from .choice import as_proposal, settled, singles
+from .coupled_pairs import CoupledPairs
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count
-from .weighted import AbstractWeightedProposal, CoupledPairs, as_proposal
+from .kernels import sum_by_interval
+from .weighted import AbstractWeightedProposal
 
 
 class TransitionLogDensity(eqx.Module):
@@ -95,13 +97,16 @@ def transition_log_density(
     num_proposals = check_count("num_proposals", num_proposals)
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, _ = as_intervals(start, end, duration)
-    proposal = as_proposal(proposal, num_counts, None, max_trials)
-    check_proposal(proposal, model, intervals)
-    if isinstance(proposal, CoupledPairs) and not model.has_density:
+    proposal = as_proposal(proposal, model, num_counts, None, max_trials)
+    proposal.check(model, intervals)
+    pairs = [single for single in singles(proposal) if isinstance(single, CoupledPairs)]
+    if pairs and not model.has_density:
         raise ValueError(
-            "the transition density needs the stationary one: give `Diffusion` a "
-            "`log_stationary`, normalised if the start law is `Stationary()`."
+            "with couplings the transition density needs the stationary one: give `Diffusion` a "
+            "`log_stationary`, normalised if the start law is `Stationary()`; or choose a "
+            "proposal that does not need it, such as `ModifiedDiffusionBridge()` or `Guided()`."
         )
+    proposal = settled(proposal, key, model, intervals, num_steps)
     size = (num_proposals, num_steps, batched, progress_meter)
     return _estimate(key, model, proposal, intervals, *size)
 
@@ -117,19 +122,15 @@ def _estimate(
     batched: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> TransitionLogDensity:
-    model, intervals = nondifferentiable((model.prepared(), intervals))
-    num_intervals = intervals.start.shape[0]
+    model, num_intervals = model.prepared(), intervals.start.shape[0]
     proposal = proposal.prepared(key, model, intervals, num_steps)
     fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
-    keys = fold_in(key, jnp.arange(num_intervals * num_proposals))
-    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_proposals, axis=0), intervals)
+    keys = fold_in(key, jnp.arange(num_intervals * num_proposals)).reshape(num_intervals, -1)
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
-    drawn = proposal.draw(keys, model, each, num_steps, nothing, True, progress_meter)
-
-    def by_interval(leaf):
-        return leaf.reshape(num_intervals, num_proposals)
-
-    log_weights = by_interval(drawn.log_weights)
+    drawn = proposal.draw(
+        keys, model, intervals, num_steps, nothing, True, progress_meter=progress_meter
+    )
+    log_weights = drawn.log_weights
     log_sum = logsumexp(log_weights, axis=1)
     log_squares = logsumexp(2 * log_weights, axis=1)
     some = log_sum > -jnp.inf
@@ -143,7 +144,7 @@ def _estimate(
         return leaf if batched else leaf[0]
 
     def total(leaf):
-        return of_interval(jnp.sum(by_interval(leaf), axis=1, dtype=jnp.int32))
+        return sum_by_interval(leaf, num_intervals, batched)
 
     return TransitionLogDensity(
         of_interval(log_sum - math.log(num_proposals)),

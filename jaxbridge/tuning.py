@@ -1,5 +1,6 @@
 """Which start law, and which γ? By pilot runs: the one with most effective samples per
 simulated path, proposals and trials alike (end of section 3 of the paper: an open question).
+And which proposal at all? The one with most effective samples per second (`choice`).
 
 Start laws are sought between ν, the best one for likely end points, and the Gaussian fit G to
 the starts X*_T of the reversed paths that met, which hits an unlikely bridge far more often:
@@ -7,9 +8,10 @@ the starts X*_T of the reversed paths that met, which hits an unlikely bridge fa
 all starts, met or not, is worse where few pairs meet.)
 """
 
+import contextlib
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,18 +22,27 @@ from jaxtyping import Array, Float, Key
 from .arrays import Numbers, is_traced
 from .bridges import check_key, sample_bridges
 from .burn_in import measure_burn_in
+from .choice import (
+    GUIDED_CANDIDATES,
+    Choice,
+    default_candidates,
+    run_pilots,
+    undecided_between,
+)
 from .coupling import Coupling
 from .diffusion import Diffusion, check_diffusion
 from .gaussian import GaussianLaw
+from .importance import weigh_bridges
 from .intervals import Intervals, as_intervals, check_count
 from .search import key_for, most_lanes
 from .start_laws import AnyStartLaw, Stationary, draw_starts, needs_burn_in
-from .weighted import weigh_bridges
 
 _SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 # Efficiencies this close are not told apart by a pilot run; of such laws the one closest to ν
 # is taken, whose weights are bounded more safely.
 _TOLERANCE = 1.1
+# Bridges of a pilot run that looks for the coupling to compare with other proposals.
+_TUNING_PILOT = 500
 # Pilot counts that take longer are cut off: the law is not a candidate then.
 _PILOT_TRIALS = 1_000
 
@@ -142,6 +153,84 @@ def tune_coupling(
     )
     pilots = list(itertools.chain.from_iterable(runs))
     return Tuning(_best(pilots).coupling, pilots)
+
+
+def choose_proposal(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_steps: int = 50,
+    candidates: Sequence[Any] | None = None,
+    num_pilot: int | None = None,
+) -> Choice:
+    """The proposal with most effective samples per second for each interval, by a pilot run.
+
+    What `proposal="auto"` does in each call, done once: pass what it returns as `proposal=` for
+    the same intervals. Seconds are measured, compile time left out, so this is a choice made
+    outside `jit`; inside `jit` "auto" goes by a rule for the seconds. Where two are about as
+    fast, either may be chosen.
+
+    **Arguments:**
+
+    - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`.
+    - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge()`, `Guided()`, and
+        where the time reversal of the model is known `Coupling(0.0)` and `Coupling(0.5)`, or for
+        a single interval in their place the coupling that `tune_coupling` finds.
+    - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
+        all intervals, at least 32 and at most 1,024.
+
+    **Returns:** `Choice`; printed, it is a table.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit; `TypeError` inside
+    `jit`.
+
+    !!! example
+
+        ```python
+        choice = jb.choose_proposal(jax.random.key(0), model, a, b, 1.0)
+        print(choice)
+        chain = jb.sample_exact_bridges(key, model, a, b, 1.0, proposal=choice)
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    if is_traced(key, model, start, end, duration):
+        raise TypeError(
+            "a choice by the clock cannot be made inside `jit` or `vmap`: make it before, or use "
+            '`proposal="auto"`.'
+        )
+    num_steps = check_count("num_steps", num_steps)
+    if num_pilot is not None:
+        num_pilot = check_count("num_pilot", num_pilot, 2)
+    intervals, batched, _ = as_intervals(start, end, duration)
+    tuned = candidates is None and not batched and model.has_reversal
+    if candidates is None:
+        candidates = GUIDED_CANDIDATES if tuned else default_candidates(model)
+
+    def choose_between(candidates):
+        undecided = undecided_between(candidates, model, num_pilot)
+        undecided.check(model, intervals)
+        return run_pilots(key, model, undecided, intervals, num_steps, timed=True)
+
+    choice = choose_between(candidates)
+    if tuned and choice.coupling_could_win:
+        with contextlib.suppress(ValueError):  # no pair met, or no bridge was hit
+            couplings = [Coupling(0.0), Coupling(0.5)]
+            tuning = tune_coupling(
+                key,
+                model,
+                start,
+                end,
+                duration,
+                num_steps=num_steps,
+                couplings=couplings,
+                num_pilot=_TUNING_PILOT,
+            )
+            choice = choose_between([*candidates, tuning.coupling])
+    return choice
 
 
 def _pilots(

@@ -1,0 +1,364 @@
+"""Which proposal for which interval? The one with most effective samples per second.
+
+On short intervals proposals that are pulled to the end point are nearly exact, and coupled
+pairs do not meet; on long ones it is the other way round. Where the one becomes better than
+the other depends on the model, the end points and the step, so a pilot run decides, interval
+by interval: each candidate draws a few weighted paths, and
+
+    (effective samples - 1) / (simulated paths × seconds per path)
+
+is compared, with the one sample taken off that even hopeless weights are worth. A candidate
+makes no pilot run where it could not win: of a coupling's simulated paths at most one in
+1 + N is an effective sample, for each proposal needs N hitting counts.
+
+A wrong choice costs time only. Weights stay exact, for the pilot's paths are not used again.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from .arrays import is_traced, nondifferentiable
+from .coupled_pairs import CoupledPairs
+from .coupling import AbstractCoupling, Coupling
+from .diffusion import Diffusion
+from .guided import Guided, ModifiedDiffusionBridge
+from .hitting import check_max_trials
+from .intervals import Intervals, check_count
+from .search import check_bound, key_for
+from .start_laws import Stationary
+from .weighted import AbstractWeightedProposal, WeightedPaths
+
+# Bounds the tries for one bridge, unless the user says otherwise.
+_MAX_PROPOSALS = 10_000
+# A pilot run draws about so many paths of each candidate in all, and so many of each interval.
+_PILOT_PATHS = 4_096
+_PILOT_RANGE = (32, 1_024)
+# Hits that take longer than this are not worth waiting for.
+_PILOT_TRIALS = 64
+# Seconds per simulated path beside those of a modified diffusion bridge, as measured for models
+# whose functions cost little beside the random numbers.
+_GUIDED_SECONDS, _COUPLED_SECONDS = 1.2, 5.0
+
+
+class Choice(AbstractWeightedProposal):
+    """A proposal for each interval, and why: what `proposal="auto"` comes to. Printed, it is a
+    table.
+
+    - `candidates`: C proposals.
+    - `seconds`: per simulated path, shape (C, I): measured, or inside `jit` relative to those of
+        a modified diffusion bridge, by rule.
+    - `efficiency`: effective samples per simulated path in the pilot run, shape (C, I); NaN
+        where none was needed because the candidate could not win.
+    - `chosen`: the number of each interval's candidate, shape (I,).
+    """
+
+    candidates: tuple[AbstractWeightedProposal, ...]
+    seconds: Float[Array, "C I"] | None
+    efficiency: Float[Array, "C I"] | None
+    chosen: Int[Array, " I"] | None
+    num_pilot: int | None = eqx.field(static=True)
+    _used: tuple[int, ...] = eqx.field(static=True)
+
+    def check(self, model, intervals):
+        for candidate in self.candidates:
+            candidate.check(model, intervals)
+        if self.chosen is not None and self.chosen.shape != intervals.duration.shape:
+            raise ValueError(
+                f"this choice is one for {self.chosen.shape[0]} intervals, but there are "
+                f"{len(intervals.duration)}: use `choose_proposal` with the same intervals."
+            )
+
+    def check_prepared(self, model):
+        if self.chosen is None:
+            raise ValueError(
+                'a kernel makes no pilot run, so `proposal="auto"` has nothing to go by: choose '
+                "with `choose_proposal` before, and pass what it returns."
+            )
+        for candidate in self.candidates:
+            candidate.check_prepared(model)
+
+    def prepared(self, key, model, intervals, num_steps):
+        if self.chosen is not None:
+            return self
+        model, intervals = nondifferentiable((model, intervals))
+        return run_pilots(key, model, self, intervals, num_steps, timed=False)
+
+    def fractions(self, num_steps):
+        return self.candidates[0].fractions(num_steps)
+
+    def draw(
+        self,
+        keys,
+        model,
+        intervals,
+        num_steps,
+        stored,
+        misses_count,
+        active=None,
+        progress_meter=None,
+    ):
+        if len(self._used) > 1:
+            model, intervals = nondifferentiable((model, intervals))
+
+        def draw(candidate, active):
+            arguments = (keys, model, intervals, num_steps, stored, misses_count, active)
+            return candidate.draw(*arguments, progress_meter)
+
+        return self._of_each(draw, active)
+
+    def reweigh(self, keys, model, intervals, paths, active=None):
+        def reweigh(candidate, active):
+            return candidate.reweigh(keys, model, intervals, paths, active)
+
+        return self._of_each(reweigh, active)
+
+    def _of_each(
+        self,
+        make: Callable[[AbstractWeightedProposal, Bool[Array, " I"] | None], WeightedPaths],
+        active: Bool[Array, " I"] | None,
+    ) -> WeightedPaths:
+        """What each interval's candidate makes."""
+        if len(self._used) == 1:
+            return make(self.candidates[self._used[0]], active)
+        made = None
+        for i in self._used:
+            mine = self.chosen == i
+            mine = mine if active is None else mine & active
+            part = make(self.candidates[i], mine)
+            made = part if made is None else jax.tree.map(_pick(mine), part, made)
+        assert made is not None
+        return made
+
+    @property
+    def coupling_could_win(self) -> bool:
+        """Whether a coupling might be faster than what is chosen for some interval."""
+        assert self.efficiency is not None and self.seconds is not None
+        rates = np.asarray(self.efficiency) / np.asarray(self.seconds)
+        seconds = np.asarray(self.seconds)[0] * _COUPLED_SECONDS
+        return bool(np.any(np.nanmax(rates, axis=0) < 1 / (2 * seconds)))
+
+    def __str__(self) -> str:
+        made = self.chosen is not None and not is_traced(self.chosen, self.efficiency, self.seconds)
+        if not made:
+            names = ", ".join(describe(candidate) for candidate in self.candidates)
+            return f"a choice to be made between {names}"
+        chosen, efficiency = np.asarray(self.chosen), np.asarray(self.efficiency, float)
+        seconds = np.asarray(self.seconds, float)
+        rates = efficiency / seconds
+        best = np.nanmax(rates, axis=0)
+        head = ("", "effective per path", "cost of a path", "speed")
+        lines = ["{:<44}  {:>18}  {:>14}  {:>6}  chosen for".format(*head)]
+        for i, candidate in enumerate(self.candidates):
+            known = ~np.isnan(efficiency[i])
+            share, speed = "-", "-"
+            if known.any():
+                share = f"{np.median(efficiency[i, known]):.3g}"
+                speed = f"{np.median(rates[i, known] / best[known]):.2f}"
+            cost = f"{np.median(seconds[i] / seconds[0]):.2f}"
+            lines.append(
+                f"{describe(candidate):<44}  {share:>18}  {cost:>14}  {speed:>6}  "
+                f"{np.sum(chosen == i)} of {len(chosen)}"
+            )
+        return "\n".join(lines)
+
+
+def _pick(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
+    return lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+def describe(proposal: AbstractWeightedProposal) -> str:
+    """The proposal in a few words."""
+    if not isinstance(proposal, CoupledPairs):
+        return type(proposal).__name__
+    coupling, words = proposal.coupling, type(proposal.coupling).__name__
+    if isinstance(coupling, Coupling) and not is_traced(coupling.gamma):
+        words += f"({float(coupling.gamma):.3g})"
+    if not isinstance(coupling.start_law, Stationary):
+        words += f" from {type(coupling.start_law).__name__}"
+    return words
+
+
+def most_efficient(proposal: AbstractWeightedProposal) -> float:
+    """A bound on effective samples per simulated path."""
+    return 1 / (1 + proposal.num_counts) if isinstance(proposal, CoupledPairs) else 1.0
+
+
+@eqx.filter_jit
+def _pilot(
+    key: Key[Array, ""],
+    model: Diffusion,
+    candidate: AbstractWeightedProposal,
+    intervals: Intervals,
+    active: Bool[Array, " I"],
+    num_steps: int,
+    num_pilot: int,
+) -> tuple[Float[Array, " I"], Int[Array, " I"]]:
+    """(Effective samples - 1) per simulated path of each active interval, NaN for the others;
+    and the simulated paths."""
+    if isinstance(candidate, CoupledPairs):
+        bound = jnp.asarray(_PILOT_TRIALS * candidate.num_counts, jnp.int32)
+        candidate = eqx.tree_at(lambda c: c.max_trials, candidate, bound)
+    keys = jax.random.split(key, (len(intervals.duration), num_pilot))
+    nothing = jnp.zeros(0, jnp.int32)  # no path is kept
+    drawn = candidate.draw(keys, model.prepared(), intervals, num_steps, nothing, True, active)
+    largest = jnp.max(drawn.log_weights, axis=1, keepdims=True)
+    weights = jnp.exp(drawn.log_weights - jnp.where(largest > -jnp.inf, largest, 0))
+    squares = jnp.sum(weights**2, axis=1)
+    size = jnp.sum(weights, axis=1) ** 2 / jnp.where(squares > 0, squares, 1)
+    num_simulated = jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32)
+    paths = jnp.maximum(num_simulated - 1, 1).astype(size.dtype)
+    efficiency = jnp.maximum(size - 1, 0) / paths
+    return jnp.where(active, efficiency, jnp.nan), num_simulated
+
+
+def as_proposal(
+    proposal: Any,
+    model: Diffusion,
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+) -> AbstractWeightedProposal:
+    """What the user gave as `proposal`, as a weighted proposal."""
+    proposal = Coupling() if proposal is None else proposal
+    bounds = (num_counts, max_proposals, max_trials)
+    if isinstance(proposal, str) and proposal == "auto":
+        return undecided_between(default_candidates(model), model, None, *bounds)
+    if isinstance(proposal, AbstractWeightedProposal):
+        if bounds != (None, None, None):
+            raise ValueError(
+                "`num_counts`, `max_proposals` and `max_trials` are for a `Coupling`; this "
+                "`proposal` has its own, or none."
+            )
+        return proposal
+    if not isinstance(proposal, AbstractCoupling):
+        raise TypeError(
+            "`proposal` must be a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, "
+            f'`Guided()`, what `choose_proposal` returns, or "auto"; got {proposal!r}.'
+        )
+    num_counts = 1 if num_counts is None else check_count("num_counts", num_counts)
+    return CoupledPairs(
+        proposal,
+        check_bound("max_proposals", max_proposals, _MAX_PROPOSALS),
+        check_max_trials(max_trials, num_counts),
+        num_counts,
+    )
+
+
+def singles(proposal: AbstractWeightedProposal) -> tuple[AbstractWeightedProposal, ...]:
+    """The candidates of a choice, or the proposal itself."""
+    return proposal.candidates if isinstance(proposal, Choice) else (proposal,)
+
+
+GUIDED_CANDIDATES = (ModifiedDiffusionBridge(), Guided())
+
+
+def default_candidates(model: Diffusion) -> list[Any]:
+    """Couplings only where the time reversal is known."""
+    couplings = [Coupling(0.0), Coupling(0.5)] if model.has_reversal else []
+    return [*GUIDED_CANDIDATES, *couplings]
+
+
+def undecided_between(
+    candidates: Sequence[Any], model: Diffusion, num_pilot: int | None, *bounds: int | None
+) -> Choice:
+    """A choice between these, not yet made."""
+    if len(candidates) == 0:
+        raise ValueError("`candidates` must have at least one proposal.")
+    proposals = []
+    for candidate in candidates:
+        own = bounds if isinstance(candidate, AbstractCoupling) else ()
+        proposals.append(as_proposal(candidate, model, *own))
+    if any(isinstance(proposal, Choice) for proposal in proposals):
+        raise ValueError("`candidates` must be single proposals, not choices.")
+    grids = {tuple(proposal.fractions(8)) for proposal in proposals}
+    if len(grids) > 1:
+        raise ValueError("`candidates` must be on one grid: give all the same `refinement`.")
+    everything = tuple(range(len(proposals)))
+    return Choice(tuple(proposals), None, None, None, num_pilot, everything)
+
+
+def run_pilots(
+    key: Key[Array, ""],
+    model: Diffusion,
+    undecided: Choice,
+    intervals: Intervals,
+    num_steps: int,
+    timed: bool,
+) -> Choice:
+    """The choice, from pilot runs of the candidates that could win."""
+    num_intervals, num_pilot = len(intervals.duration), undecided.num_pilot
+    if num_pilot is None:
+        num_pilot = np.clip(_PILOT_PATHS // num_intervals, *_PILOT_RANGE).item()
+    candidates, efficiencies, all_seconds = [], [], []
+    dtype = intervals.start.dtype
+    best, unit = jnp.zeros(num_intervals, dtype), 1.0
+    for i, candidate in enumerate(undecided.candidates):
+
+        def look_at(candidate, best=best, unit=unit):
+            seconds = unit * _relative_seconds(candidate, model, intervals)
+            active = best < most_efficient(candidate) / seconds
+            return seconds, active, is_traced(active) or np.any(active)
+
+        seconds, active, called_for = look_at(candidate)
+        if called_for:
+            candidate = candidate.prepared(key, model, intervals, num_steps)
+            seconds, active, called_for = look_at(candidate)
+        efficiency = jnp.full(num_intervals, jnp.nan, dtype)
+        if called_for:
+            arguments = (model, candidate, intervals, active, num_steps, num_pilot)
+            efficiency, num_simulated = _pilot(key_for(f"pilot {i}", key), *arguments)
+            if timed:
+                begin = time.perf_counter()
+                jax.block_until_ready(_pilot(key_for(f"pilot {i}", key), *arguments))
+                took = time.perf_counter() - begin
+                expected = float(jnp.sum(seconds * num_simulated.astype(dtype)))
+                seconds *= took / expected
+                unit = unit if i > 0 else float(seconds[0])
+        candidates.append(candidate)
+        all_seconds.append(seconds)
+        efficiencies.append(efficiency)
+        best = jnp.fmax(best, efficiency / seconds)
+    efficiency, seconds = jnp.stack(efficiencies), jnp.stack(all_seconds)
+    rates = jnp.where(jnp.isnan(efficiency), -1, efficiency / seconds)
+    chosen = jnp.argmax(rates, axis=0).astype(jnp.int32)
+    used = range(len(candidates)) if is_traced(chosen) else np.unique(chosen).tolist()
+    return Choice(tuple(candidates), seconds, efficiency, chosen, num_pilot, tuple(used))
+
+
+def _relative_seconds(
+    candidate: AbstractWeightedProposal, model: Diffusion, intervals: Intervals
+) -> Float[Array, " I"]:
+    """Seconds per simulated path, by rule."""
+    ones = jnp.ones_like(intervals.duration)
+    if isinstance(candidate, ModifiedDiffusionBridge):
+        return ones
+    if not isinstance(candidate, CoupledPairs):
+        return _GUIDED_SECONDS * ones
+    law, seconds = candidate.coupling.start_law, _COUPLED_SECONDS * ones
+    if isinstance(law, Stationary) and not model.has_sampler and law.burn_in is not None:
+        # A run for the start of each trial, in steps that cost half as much; and of the
+        # simulated paths at least half are trials.
+        seconds *= 1 + law.burn_in.astype(ones.dtype) / intervals.duration / 4
+    return seconds
+
+
+def settled(
+    proposal: AbstractWeightedProposal,
+    key: Key[Array, ""],
+    model: Diffusion,
+    intervals: Intervals,
+    num_steps: int,
+) -> AbstractWeightedProposal:
+    """A choice made by the clock and before compiling, where that can be, so that only what was
+    chosen is compiled."""
+    undecided = isinstance(proposal, Choice) and proposal.chosen is None
+    if undecided and not is_traced(key, model, proposal, intervals):
+        return run_pilots(key, model, proposal, intervals, num_steps, timed=True)
+    return proposal

@@ -1,0 +1,298 @@
+"""Importance sampling: bridges whose weights make them exact.
+
+    E_bridge[h] = E[w h(path)] / E[w],
+
+by weighing approximate bridges, or from any weighted proposal.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from .arrays import Numbers
+from .bridges import Bridges, check_key, grid_times, stored_steps
+from .choice import as_proposal, settled
+from .coupled_pairs import CoupledPairs, check_density, pair_log_weights, usable
+from .coupling import AbstractCoupling
+from .diffusion import Diffusion, check_diffusion
+from .hitting import check_max_trials, counts_of, coupling_of
+from .intervals import Intervals, as_intervals, check_count
+from .search import key_for
+from .start_laws import AnyStartLaw
+from .weighted import AbstractWeightedProposal
+
+
+class WeightedBridges(eqx.Module):
+    """Bridges whose weights make them exact; with I intervals arrays have a leading axis I.
+
+    - `times`, `paths`: as in `Bridges`, shapes (K,) and (n, K, d).
+    - `log_weights`: shape (n,), up to a common constant; -inf for a bridge that is missing.
+    - `met`: whether the bridge was found, shape (n,).
+    - `truncated`: whether its counts were cut off by `max_trials`, shape (n,). Such a weight is
+        finite and too small on average, so that paths that are hard to hit weigh too little.
+        Also where the start law's density was not a number: then the weight is zero.
+    - `num_simulated`: paths simulated in all, proposals and trials.
+    - `num_nonfinite`: how many of them left the finite numbers.
+    - `proposal`, `num_steps`: those they were made with. The coupling of a proposal has the
+        start law of the weights; a `Stationary` that had to be run has its `burn_in` in it.
+    """
+
+    times: Float[Array, "*durations K"]
+    paths: Float[Array, "*I n K d"]
+    log_weights: Float[Array, "*I n"]
+    met: Bool[Array, "*I n"]
+    truncated: Bool[Array, "*I n"]
+    num_simulated: Int[Array, "*I"]
+    num_nonfinite: Int[Array, "*I"]
+    proposal: AbstractWeightedProposal
+    num_steps: int = eqx.field(static=True)
+
+    @property
+    def coupling(self) -> AbstractCoupling | None:
+        """That of the proposal, if it has one."""
+        return self.proposal.coupling if isinstance(self.proposal, CoupledPairs) else None
+
+    @property
+    def weights(self) -> Float[Array, "*I n"]:
+        """The weights, normalised to sum to one; all zero where no bridge was found."""
+        largest = jnp.max(self.log_weights, axis=-1, keepdims=True)
+        weights = jnp.exp(self.log_weights - jnp.where(jnp.isfinite(largest), largest, 0))
+        total = jnp.sum(weights, axis=-1, keepdims=True)
+        return weights / jnp.where(total > 0, total, 1)
+
+    @property
+    def effective_sample_size(self) -> Float[Array, "*I"]:
+        """(Σw)²/Σw²: how many exact bridges these are worth, between 0 and n."""
+        squares = jnp.sum(self.weights**2, axis=-1)
+        positive = squares > 0
+        return jnp.where(positive, 1 / jnp.where(positive, squares, 1), 0)
+
+    @property
+    def efficiency(self) -> Float[Array, "*I"]:
+        """Effective sample size per simulated path."""
+        size = self.effective_sample_size
+        return size / jnp.maximum(self.num_simulated, 1).astype(size.dtype)
+
+    def mean(self, fn: Callable[[Array], PyTree] = lambda path: path) -> PyTree:
+        """The weighted mean of `fn(path)`, a function of one path of shape (K, d), by default
+        the path itself: an estimate of its expectation over exact bridges."""
+        values, weights = self._values(fn), self.weights
+        return jax.tree.map(lambda value: _weighted_sum(weights, value), values)
+
+    def standard_error(self, fn: Callable[[Array], PyTree] = lambda path: path) -> PyTree:
+        """That of `mean(fn)`, by the delta method, entry by entry."""
+        values, weights = self._values(fn), self.weights
+
+        def error(value):
+            mean = _weighted_sum(weights, value)
+            deviation = value - jnp.expand_dims(mean, weights.ndim - 1)
+            return jnp.sqrt(_weighted_sum(weights**2, deviation**2))
+
+        return jax.tree.map(error, values)
+
+    def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:
+        """Equally weighted paths by systematic resampling, shape (m, K, d): many effective ones
+        are needed for few repetitions. NaN where no bridge was found."""
+        num_bridges = check_count("num_bridges", num_bridges)
+
+        check_key(key)
+
+        def one_interval(key, weights, paths):
+            shift = jax.random.uniform(key, dtype=weights.dtype)
+            points = (jnp.arange(num_bridges, dtype=weights.dtype) + shift) / num_bridges
+            cumulated = jnp.cumsum(weights)
+            chosen = jnp.searchsorted(cumulated, points * cumulated[-1], side="right")
+            # Rounding may lead past the last positive weight.
+            last = jnp.max(jnp.where(weights > 0, jnp.arange(len(weights)), 0))
+            return paths[jnp.minimum(chosen, last)]
+
+        if self.log_weights.ndim == 1:
+            return one_interval(key, self.weights, self.paths)
+        keys = jax.random.split(key, len(self.log_weights))
+        return jax.vmap(one_interval)(keys, self.weights, self.paths)
+
+    def _values(self, fn: Callable[[Array], PyTree]) -> PyTree:
+        each = jax.vmap(fn) if self.log_weights.ndim == 1 else jax.vmap(jax.vmap(fn))
+        # Missing bridges are NaN and weigh nothing.
+        paths = jnp.where(self.met[..., None, None], self.paths, 0)
+        return each(paths)
+
+
+def _weighted_sum(weights: Float[Array, "*I n"], values: Array) -> Array:
+    axis = weights.ndim - 1
+    weights = weights.reshape(*weights.shape, *[1] * (values.ndim - weights.ndim))
+    return jnp.sum(jnp.where(weights > 0, weights * values, 0), axis=axis)
+
+
+def weigh_bridges(
+    key: Key[Array, ""],
+    model: Diffusion,
+    bridges: Bridges,
+    num_counts: int = 1,
+    *,
+    start_law: AnyStartLaw | None = None,
+    max_trials: int | None = None,
+    batch_size: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> WeightedBridges:
+    """Weights that correct approximate bridges to the exact law: importance sampling.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: the model the bridges were made with.
+    - `bridges`: from `sample_bridges`, with their whole paths (no `save_at`).
+    - `num_counts`: N hitting counts for each bridge. More make a weight less noisy; one is often
+        the best use of time.
+    - `start_law`: μ, by default that of the bridges' coupling.
+    - `max_trials`: bounds the trials of each bridge; by default 10,000 for each count. See
+        `WeightedBridges.truncated`.
+    - `batch_size`: trials simulated side by side; changes results by rounding only.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Returns:** `WeightedBridges`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000)
+        weighted = jb.weigh_bridges(jax.random.key(1), model, bridges)
+        weighted.mean(lambda path: path[25]), weighted.effective_sample_size
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    if not isinstance(bridges, Bridges):
+        raise TypeError(
+            f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}. (Those of "
+            "`sample_exact_bridges` and `weigh_bridges` are exact already.)"
+        )
+    coupling = coupling_of(bridges, start_law)
+    num_counts = check_count("num_counts", num_counts)
+    bound = check_max_trials(max_trials, num_counts)
+    check_density(coupling.start_law, model)
+    batch_size = None if batch_size is None else check_count("batch_size", batch_size)
+    budget = (num_counts, bound, batch_size, progress_meter)
+    pairs = as_proposal(coupling, model, num_counts, None, max_trials)
+    return _weigh_bridges(key_for("weights", key), model, pairs, bridges, budget)
+
+
+@eqx.filter_jit
+def _weigh_bridges(key, model, pairs, bridges, budget):
+    counts, coupling = counts_of(key, model, pairs.coupling, bridges, *budget)
+    d, shape = bridges.paths.shape[-1], bridges.met.shape
+    log_weights = pair_log_weights(
+        coupling.start_law,
+        model.prepared(),
+        bridges.paths[..., -1, :].reshape(-1, d),
+        bridges.reverse_start.reshape(-1, d),
+        counts.mean.reshape(-1),
+    ).reshape(shape)
+    log_weights, unusable = usable(log_weights, bridges.met)
+    num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)
+    num_nonfinite = jnp.sum(counts.num_nonfinite, axis=-1, dtype=jnp.int32)
+    return WeightedBridges(
+        bridges.times,
+        bridges.paths,
+        log_weights,
+        bridges.met,
+        counts.truncated | unusable,
+        bridges.num_proposals + num_trials,
+        bridges.num_nonfinite + num_nonfinite,
+        eqx.tree_at(lambda p: p.coupling, pairs, coupling),
+        bridges.num_steps,
+    )
+
+
+def sample_weighted_bridges(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_bridges: int = 1000,
+    num_steps: int = 50,
+    proposal: Any = None,
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+    save_at: Numbers | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> WeightedBridges:
+    """Independent weighted bridges from any proposal: importance sampling.
+
+    **Arguments:**
+
+    - `key`, `model`, `start`, `end`, `duration`, `num_steps`, `save_at`: as in `sample_bridges`.
+    - `num_bridges`: n, for each interval.
+    - `proposal`, `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Returns:** `WeightedBridges`.
+
+    **Gradients.** From proposals that are pulled to the end point (`ModifiedDiffusionBridge`,
+    `ResidualBridge`, `Guided`) paths and weights are smooth functions of `params`, `start`, `end`
+    and `duration`, so derivatives of weighted means, forward and reverse, are estimates of the
+    derivatives of expectations. Those of couplings, and of a choice that uses several
+    proposals, raise `TypeError`.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        proposal = jb.ModifiedDiffusionBridge()
+        weighted = jb.sample_weighted_bridges(key, model, a, b, 0.1, proposal=proposal)
+        weighted.mean(lambda path: path[25]), weighted.effective_sample_size
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_bridges = check_count("num_bridges", num_bridges)
+    num_steps = check_count("num_steps", num_steps)
+    intervals, batched, several_durations = as_intervals(start, end, duration)
+    proposal = as_proposal(proposal, model, num_counts, max_proposals, max_trials)
+    proposal.check(model, intervals)
+    proposal = settled(proposal, key, model, intervals, num_steps)
+    fractions = proposal.fractions(num_steps)
+    stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
+    sizes = (num_bridges, num_steps, batched, several_durations, progress_meter)
+    return _sample_weighted(key, model, proposal, intervals, stored, *sizes)
+
+
+@eqx.filter_jit
+def _sample_weighted(
+    key: Key[Array, ""],
+    model: Diffusion,
+    proposal: AbstractWeightedProposal,
+    intervals: Intervals,
+    stored: Int[Array, " K"] | None,
+    num_bridges: int,
+    num_steps: int,
+    batched: bool,
+    several_durations: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> WeightedBridges:
+    model, num_intervals = model.prepared(), intervals.start.shape[0]
+    proposal = proposal.prepared(key, model, intervals, num_steps)
+    fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
+    keys = fold_in(key, jnp.arange(num_intervals * num_bridges)).reshape(num_intervals, -1)
+    drawn = proposal.draw(
+        keys, model, intervals, num_steps, stored, False, progress_meter=progress_meter
+    )
+    drawn = drawn._replace(
+        num_simulated=jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32),
+        num_nonfinite=jnp.sum(drawn.num_nonfinite, axis=1, dtype=jnp.int32),
+    )
+    times = grid_times(intervals, stored, proposal.fractions(num_steps), several_durations)
+    if not batched:
+        drawn = jax.tree.map(lambda leaf: leaf[0], drawn)
+    return WeightedBridges(times, *drawn, proposal, num_steps)
