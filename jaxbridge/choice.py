@@ -175,6 +175,8 @@ def _pick(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
 
 def describe(proposal: AbstractWeightedProposal) -> str:
     """The proposal in a few words."""
+    if isinstance(proposal, Guided):
+        return f"Guided({proposal.linearisation})"
     if not isinstance(proposal, CoupledPairs):
         return type(proposal).__name__
     coupling, words = proposal.coupling, type(proposal.coupling).__name__
@@ -256,7 +258,7 @@ def singles(proposal: AbstractWeightedProposal) -> tuple[AbstractWeightedProposa
     return proposal.candidates if isinstance(proposal, Choice) else (proposal,)
 
 
-GUIDED_CANDIDATES = (ModifiedDiffusionBridge(), Guided())
+GUIDED_CANDIDATES = (ModifiedDiffusionBridge(), Guided(), Guided("path"))
 
 
 def default_candidates(model: Diffusion) -> list[Any]:
@@ -358,7 +360,8 @@ def settled(
 ) -> AbstractWeightedProposal:
     """A choice made by the clock and before compiling, where that can be, so that only what was
     chosen is compiled."""
-    undecided = isinstance(proposal, Choice) and proposal.chosen is None
-    if undecided and not is_traced(key, model, proposal, intervals):
+    if not isinstance(proposal, Choice) or proposal.chosen is not None:
+        return proposal
+    if not is_traced(key, model, proposal, intervals):
         return run_pilots(key, model, proposal, intervals, num_steps, timed=True)
     return proposal

@@ -35,7 +35,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Dynamics
 from .intervals import Intervals, check_model
-from .linalg import cholesky, dot, inverse, matmul, matvec, solve, total
+from .linalg import all_finite, cholesky, dot, inverse, matmul, matvec, solve, total
 from .noise import Store, noisy_scan
 from .schemes import Euler
 from .search import most_lanes
@@ -71,9 +71,9 @@ class Step(NamedTuple):
     """One step of one interval: what the proposal worked out for it, δ_i, T - t_i, and b."""
 
     guide: PyTree
-    dt: Float[Array, ""]
-    remaining: Float[Array, ""]
-    end: Float[Array, " d"]
+    dt: Float[Array, "*I"]
+    remaining: Float[Array, "*I"]
+    end: Float[Array, "d *I"]
 
 
 class AbstractGuidedProposal(AbstractWeightedProposal):
@@ -264,6 +264,11 @@ class Guided(AbstractGuidedProposal):
         if not is_traced(self._matrix) and not np.all(np.isfinite(self._matrix)):
             raise ValueError(f"`linearisation` must be finite; got {self._matrix}.")
 
+    @property
+    def linearisation(self) -> str:
+        """What the drift is linearised along, in a word."""
+        return f'"{self._along}"' if self._matrix is None else "matrix"
+
     def guide(self, dynamics, start, end, dt):
         d = end.shape[0]
         if self._matrix is not None and self._matrix.shape != (d, d):
@@ -316,6 +321,17 @@ class Guided(AbstractGuidedProposal):
         return F, dynamics.drift(x) + matvec(F, end - x), V
 
 
+class _Steps(NamedTuple):
+    """The fields of `Step` that change from step to step, for a scan."""
+
+    guide: PyTree
+    dt: Float[Array, "*steps I"]
+    remaining: Float[Array, "*steps I"]
+
+    def to(self, end: Float[Array, "d I"]) -> Step:
+        return Step(self.guide, self.dt, self.remaining, end)
+
+
 class _Lanes:
     """The steps of a proposal for I intervals, on points of shape (d, I, n): what belongs to an
     interval is worked out once and shared by its n paths."""
@@ -335,26 +351,30 @@ class _Lanes:
             dynamics, start, end, dt
         )
         self.end, self.last_dt = end.T, dt[-1]
-        self.steps = (guide, dt[:-1], remaining[:-1])
+        self.steps = _Steps(guide, dt[:-1], remaining[:-1])
         self._proposal, self._dynamics = proposal, dynamics
 
     def advance(self, x, log_weights, xi, step):
         """One step with the noise ξ, and the weight with its factor."""
 
         def one(x, log_weight, xi, step):
-            step = Step(*step)
             law, mu, sigma = _step_law(self._proposal, self._dynamics, step, x)
             y = law.bend(xi)
             x_next = mu + jnp.sqrt(step.dt) * sigma.mv(y)
             return x_next, log_weight + law.log_weight(xi, y)
 
-        return _over_lanes(one, 3)(x, log_weights, xi, (*step, self.end))
+        return _over_lanes(one, 3)(x, log_weights, xi, step.to(self.end))
 
     def finish(self, x, log_weights):
         """The weight with that of the last step, N(b; μ_{N-1}, V δ)."""
 
         def one(x, log_weight, last):
-            return log_weight + _log_euler_density(self._dynamics, x, *last)
+            end, dt = last
+            # Euler steps may lead out of the state space, where no bridge ends.
+            inside = all_finite(self._dynamics.drift(end))
+            inside &= jnp.isfinite(self._dynamics.sigma(end).log_abs_det())
+            density = _log_euler_density(self._dynamics, x, end, dt)
+            return log_weight + jnp.where(inside, density, jnp.nan)
 
         return _over_lanes(one, 2)(x, log_weights, (self.end, self.last_dt))
 
@@ -397,7 +417,6 @@ def noise_of(
     x = jnp.moveaxis(paths, 0, -1)
 
     def one(x, x_next, step):
-        step = Step(*step)
         law, mu, sigma = _step_law(proposal, dynamics, step, x)
         y = sigma.solve(x_next - mu) / jnp.sqrt(step.dt)
         xi = law.unbend(y)
@@ -407,7 +426,7 @@ def noise_of(
 
     def each(log_weights, inputs):
         x, x_next, step = inputs
-        xi, log_weight = over_intervals(x, x_next, (*step, lanes.end))
+        xi, log_weight = over_intervals(x, x_next, step.to(lanes.end))
         return log_weights + log_weight, xi
 
     zero = jnp.zeros(paths.shape[0], paths.dtype)
@@ -429,8 +448,8 @@ def path_of(
     zero = jnp.zeros((len(xi), 1), xi.dtype)
 
     def each(carry, inputs):
-        noise, step = inputs
-        x, log_weights = lanes.advance(*carry, noise[..., None], step)
+        (x, log_weights), (noise, step) = carry, inputs
+        x, log_weights = lanes.advance(x, log_weights, noise[..., None], step)
         return (x, log_weights), x
 
     noise = jnp.moveaxis(xi, 0, -1)
@@ -468,7 +487,7 @@ def _draw(
     start = jnp.broadcast_to(intervals.start.T[..., None], shape)
     end = jnp.broadcast_to(intervals.end.T[..., None], shape)
     x, log_weights, path = start, jnp.zeros(keys.shape, dtype), start[:0]
-    store = None
+    store = slots = None
     if stored is not None:
         # Row K is for waste; rows of the first and the last step are filled by hand.
         rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *shape))
@@ -477,8 +496,8 @@ def _draw(
     if num_steps > 1:
 
         def step(carry, inputs):
-            xi, at = inputs
-            x, log_weights = lanes.advance(*carry, xi.reshape(shape), at)
+            (x, log_weights), (xi, at) = carry, inputs
+            x, log_weights = lanes.advance(x, log_weights, xi.reshape(shape), at)
             return (x, log_weights), x
 
         (x, log_weights), path = noisy_scan(
@@ -493,7 +512,7 @@ def _draw(
     elif store is not None:
         path = store.rows
     log_weights = lanes.finish(x, log_weights)
-    if stored is None:
+    if slots is None:
         path = jnp.concatenate([start[None], path, end[None]])
     else:
         path = path.at[slots[-1]].set(end)[:-1]

@@ -295,4 +295,14 @@ def _sample_weighted(
     times = grid_times(intervals, stored, proposal.fractions(num_steps), several_durations)
     if not batched:
         drawn = jax.tree.map(lambda leaf: leaf[0], drawn)
-    return WeightedBridges(times, *drawn, proposal, num_steps)
+    return WeightedBridges(
+        times,
+        drawn.paths,
+        drawn.log_weights,
+        drawn.found,
+        drawn.truncated,
+        drawn.num_simulated,
+        drawn.num_nonfinite,
+        proposal,
+        num_steps,
+    )

@@ -55,6 +55,12 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
             raise ValueError(f"`{name}` must be finite; got {value}.")
     if not is_traced(duration) and not np.all(np.asarray(duration) > 0):
         raise ValueError(f"`duration` must be positive; got {duration}.")
+    shortest = 2**30 * float(jnp.finfo(dtype).tiny)  # divided into steps it is still a number
+    if not is_traced(duration) and np.any(np.asarray(duration) < shortest):
+        raise ValueError(
+            f"`duration` = {duration} is too short for steps of type {dtype}: choose another unit "
+            "of time."
+        )
     num_intervals = max(lengths, default=1)
     d = points["start"].shape[-1]
     intervals = Intervals(

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from .arrays import Numbers, as_floating, is_traced
 from .coupled_pairs import CoupledPairs
@@ -110,7 +110,7 @@ def check_path(position: Numbers, intervals: Intervals, num_steps: int) -> Array
 
 
 def sum_by_interval(
-    counts: Int[Array, "..."], num_intervals: int, batched: bool
+    counts: Shaped[Array, "..."], num_intervals: int, batched: bool
 ) -> Int[Array, "*I"]:
     """The sums of counts of which each interval has as many, in order."""
     sums = jnp.sum(counts.reshape(num_intervals, -1), axis=1, dtype=jnp.int32)

@@ -70,10 +70,10 @@ def noisy_scan(
         (carry, rows), ys = one_stretch((init, rows), (0, None, slots, xs))
         return carry, ys if store is None else rows
 
-    def split(leaf, fill=0):
+    def split(leaf, **padding):
         idle = (num_idle, 0) if reverse else (0, num_idle)
         widths = [idle] + [(0, 0)] * (leaf.ndim - 1)
-        padded = jnp.pad(leaf, widths, constant_values=fill)
+        padded = jnp.pad(leaf, widths, **padding)
         return padded.reshape(num_stretches, length, *leaf.shape[1:])
 
     def join(leaf):
@@ -81,9 +81,11 @@ def noisy_scan(
         return leaf[num_idle:] if reverse else leaf[:num_steps]
 
     if store is not None:
-        slots = split(slots, fill=store.rows.shape[0] - 1)
+        slots = split(slots, constant_values=store.rows.shape[0] - 1)
     active = split(jnp.ones(num_steps, dtype=bool)) if num_idle else None
-    inputs = (jnp.arange(num_stretches), active, slots, jax.tree.map(split, xs))
+    # Idle steps repeat an input, for what they made of zeros could spoil derivatives.
+    xs = jax.tree.map(lambda leaf: split(leaf, mode="edge"), xs)
+    inputs = (jnp.arange(num_stretches), active, slots, xs)
     if over is not None:
 
         def next_stretch(state):

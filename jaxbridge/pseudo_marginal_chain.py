@@ -123,7 +123,7 @@ def _pseudo_marginal_step(rng_key, state, *setting):
     draw_key, accept_key = jax.random.split(rng_key)
     candidate, num_simulated = _draw_state(draw_key, *setting)
     uniform = jax.random.uniform(accept_key, dtype=candidate.position.dtype)
-    rate = _acceptance_rate(state.log_weight, candidate.log_weight)
+    rate = acceptance_rate(state.log_weight, candidate.log_weight)
     accepted = uniform < rate
     kept = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
     return kept, PseudoMarginalInfo(rate, accepted, candidate.log_weight, num_simulated)

@@ -176,9 +176,10 @@ def choose_proposal(
     **Arguments:**
 
     - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`.
-    - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge()`, `Guided()`, and
-        where the time reversal of the model is known `Coupling(0.0)` and `Coupling(0.5)`, or for
-        a single interval in their place the coupling that `tune_coupling` finds.
+    - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge()`,
+        `Guided("end")`, `Guided("path")`, and where the time reversal of the model is known
+        `Coupling(0.0)` and `Coupling(0.5)`, or for a single interval in their place the
+        coupling that `tune_coupling` finds, tried only if it could win.
     - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
         all intervals, at least 32 and at most 1,024.
 

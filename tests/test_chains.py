@@ -18,8 +18,8 @@ from helpers import (
 )
 
 import jaxbridge as jb
+from jaxbridge.choice import as_proposal
 from jaxbridge.intervals import Intervals
-from jaxbridge.weighted import as_proposal
 
 CASES = exact_cases()
 EVERYWHERE = {"unlikely, gamma 0.5"}
@@ -204,7 +204,7 @@ def test_weights_of_given_bridges_have_their_law_in_the_chain(law, num_counts):
     expected = met / float(jnp.exp(density))
 
     def inverse_weights(num_counts):
-        proposal = as_proposal(coupling, num_counts)
+        proposal = as_proposal(coupling, model, num_counts)
         intervals = jax.tree.map(
             lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, jnp.float32), (n, *jnp.shape(leaf))),
             Intervals(jnp.asarray(start), jnp.asarray(end), jnp.asarray(duration)),

@@ -1,0 +1,195 @@
+"""A proposal for each interval: the choice is the best one, and what is chosen stays exact."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import assert_weighted_moments, count_compilations, paper_model
+
+import jaxbridge as jb
+from jaxbridge.choice import Choice, as_proposal
+
+slow = pytest.mark.slow
+HYPERBOLIC = jb.hyperbolic(0.8, 2)
+BLIND = jb.Diffusion(lambda x, p: -p * x, None, None, 1.0)
+CANDIDATES = [jb.ModifiedDiffusionBridge(), jb.Guided(), jb.Coupling(0.0)]
+
+
+def mixed_choice(model, num_intervals):
+    """Proposals in turn, whatever is best."""
+    proposals = tuple(as_proposal(candidate, model) for candidate in CANDIDATES)
+    chosen = jnp.arange(num_intervals, dtype=jnp.int32) % 3
+    return Choice(proposals, None, None, chosen, None, (0, 1, 2))
+
+
+def test_each_interval_gets_what_its_own_proposal_gives():
+    """In one compiled call: the same paths and weights, lane by lane, as one by one."""
+    model, num = paper_model(), 7
+    rng = np.random.default_rng(0)
+    starts, ends = rng.normal(size=(2, num, 2)).astype(np.float32) * 0.5
+    durations = rng.uniform(0.3, 1.0, num).astype(np.float32)
+    options = dict(num_bridges=5, num_steps=10)
+    arguments = (jax.random.key(0), model, starts, ends, durations)
+    mixed = jb.sample_weighted_bridges(*arguments, **options, proposal=mixed_choice(model, num))
+    for i, candidate in enumerate(CANDIDATES):
+        alone = jb.sample_weighted_bridges(*arguments, **options, proposal=candidate)
+        mine = np.arange(num) % 3 == i
+        np.testing.assert_allclose(mixed.paths[mine], alone.paths[mine], atol=1e-5)
+        np.testing.assert_allclose(mixed.log_weights[mine], alone.log_weights[mine], atol=1e-4)
+        np.testing.assert_array_equal(mixed.num_simulated[mine], alone.num_simulated[mine])
+    assert mixed.met.all()
+
+
+def test_thousands_of_intervals_with_different_choices_keep_the_law():
+    """Densities of 1,500 intervals, a third by each proposal, against the closed form, without
+    compiling again when numbers change."""
+    model, num, steps = paper_model(), 1_500, 60
+    rng = np.random.default_rng(1)
+    starts, ends = rng.normal(size=(2, num, 2)).astype(np.float32) * 0.4
+
+    def run(seed, duration):
+        durations = jnp.full(num, duration)
+        return jb.transition_log_density(
+            jax.random.key(seed), model, starts, ends, durations, num_proposals=60,
+            num_steps=steps, proposal=mixed_choice(model, num),
+        )  # fmt: skip
+
+    run(0, 0.5)
+    with count_compilations() as compiled:
+        estimate = run(1, 0.4)
+        jax.block_until_ready(estimate.value)
+    assert len(compiled) == 0
+    exact = jax.vmap(lambda a, b: jb.ou_transition(model, a, 0.4).log_density(b))(starts, ends)
+    ratio = np.exp(np.asarray(estimate.value - exact, float))
+    chosen = np.arange(num) % 3
+    for i in range(3):
+        mine = ratio[chosen == i]
+        error = mine.std() / np.sqrt(len(mine))
+        assert error < 0.05
+        assert abs(mine.mean() - 1) < 5 * error + 0.02  # the allowance is for the step
+
+
+@pytest.mark.parametrize(
+    "duration, model, winners",
+    [
+        (0.05, HYPERBOLIC, {"ModifiedDiffusionBridge"}),
+        (1.0, HYPERBOLIC, {"ModifiedDiffusionBridge"}),
+        (2.0, paper_model(), {'Guided("end")', 'Guided("path")'}),
+        (4.0, BLIND, {'Guided("end")', 'Guided("path")'}),
+        pytest.param(60.0, HYPERBOLIC, {"Coupling(0)", "Coupling(0.5)"}, marks=slow),
+    ],
+)
+def test_auto_takes_what_theory_says_is_best(duration, model, winners):
+    """Brownian bridges where the drift hardly matters, the true density of a linear process, and
+    couplings on long intervals of a nonlinear one."""
+    chain = jb.sample_exact_bridges(
+        jax.random.key(0), model, [0.3, 0.1], [2.0, -1.0], duration, num_bridges=200,
+        num_steps=max(50, round(10 * duration)), proposal="auto", save_at=[duration / 2],
+    )  # fmt: skip
+    lines = str(chain.proposal).splitlines()
+    assert next(line.split("  ")[0] for line in lines if "1 of 1" in line) in winners
+    assert chain.met.all() and chain.acceptance_rate > 0.3
+
+
+def test_a_candidate_that_cannot_win_makes_no_pilot_run():
+    """Of a coupling's simulated paths at most one in two is an effective sample."""
+    choice = jb.choose_proposal(
+        jax.random.key(0), paper_model(), [[0.0, 0.0]], [[0.3, 0.1]], [0.05], num_steps=20
+    )
+    efficiency = np.asarray(choice.efficiency)[:, 0]
+    assert efficiency[0] > 0.9 and np.isnan(efficiency[-2:]).all()
+    assert "chosen for" in str(choice) and "1 of 1" in str(choice)
+
+
+@slow
+def test_no_coupling_is_more_efficient_than_the_bound():
+    """What the rule rests on: effective samples per simulated path, for pairs that always meet
+    and for pairs that seldom do."""
+    for model, duration, counts in [(paper_model(), 8.0, 1), (HYPERBOLIC, 2.0, 3)]:
+        weighted = jb.sample_weighted_bridges(
+            jax.random.key(0), model, [0.3, 0.1], [0.9, -0.5], duration, num_bridges=2_000,
+            num_steps=40, proposal=jb.Coupling(0.0), num_counts=counts,
+        )  # fmt: skip
+        assert weighted.efficiency <= 1 / (1 + counts)
+
+
+def test_inside_jit_the_choice_goes_by_rule():
+    model = HYPERBOLIC
+    starts, ends = jnp.zeros((3, 2)), jnp.array([[0.1, 0.0], [0.5, 0.5], [1.0, -1.0]])
+
+    @jax.jit
+    def run(durations):
+        return jb.transition_log_density(
+            jax.random.key(0), model, starts, ends, durations, num_proposals=50, num_steps=20,
+            proposal="auto",
+        )  # fmt: skip
+
+    estimate = run(jnp.array([0.02, 0.1, 0.5]))
+    assert np.isfinite(estimate.value).all() and (estimate.standard_error < 0.1).all()
+    assert (estimate.proposal.chosen == 0).all()
+    alone = jb.transition_log_density(
+        jax.random.key(0), model, starts, ends, jnp.array([0.02, 0.1, 0.5]), num_proposals=50,
+        num_steps=20, proposal=jb.ModifiedDiffusionBridge(),
+    )  # fmt: skip
+    np.testing.assert_allclose(alone.value, estimate.value, atol=1e-4)
+
+
+@slow
+def test_choice_for_one_interval_tunes_a_coupling():
+    choice = jb.choose_proposal(
+        jax.random.key(0), HYPERBOLIC, [0.0, 0.0], [2.0, 1.0], 60.0, num_steps=600
+    )
+    assert len(choice.candidates) == 4 and choice.chosen[0] == 3
+    kernel = jb.pseudo_marginal(
+        HYPERBOLIC, [0.0, 0.0], [2.0, 1.0], 60.0, num_steps=600, proposal=choice
+    )
+    state = kernel.init(None, jax.random.key(0))
+    state, _ = kernel.step(jax.random.key(1), state)
+    assert np.isfinite(state.log_weight)
+
+
+@slow
+def test_auto_has_the_exact_law():
+    model, ends = paper_model(), ([0.785, 0.785], [1.091, 1.091])
+    weighted = jb.sample_weighted_bridges(
+        jax.random.key(0), model, *ends, 1.0, num_bridges=20_000, num_steps=400, proposal="auto",
+        save_at=[0.5],
+    )  # fmt: skip
+    law = jb.gaussian_bridge(model, *ends, 1.0, [0.5])
+    assert_weighted_moments(
+        weighted.paths[:, 0], weighted.weights, law.mean[0], law.covariance[0], allowance=0.015
+    )
+
+
+def test_errors_say_what_to_change(unchecked):
+    key, model = jax.random.key(0), paper_model()
+    arguments = (key, model, [0.0, 0.0], [0.5, 0.0], 1.0)
+    with pytest.raises(TypeError, match='what `choose_proposal` returns, or "auto"'):
+        jb.sample_exact_bridges(*arguments, proposal="best")
+    with pytest.raises(ValueError, match="a kernel makes no pilot run"):
+        jb.pseudo_marginal(*arguments[1:], proposal="auto")
+    with pytest.raises(TypeError, match="by the clock"):
+        jax.jit(lambda end: jb.choose_proposal(key, model, [0.0, 0.0], end, 1.0).chosen)(
+            jnp.array([0.5, 0.0])
+        )
+    with pytest.raises(ValueError, match="at least one proposal"):
+        jb.choose_proposal(*arguments, candidates=[])
+    with pytest.raises(ValueError, match="on one grid"):
+        jb.choose_proposal(*arguments, candidates=[jb.Guided(), jb.Guided(refinement=2.0)])
+    with pytest.raises(ValueError, match="one for 3 intervals, but there are 1"):
+        jb.sample_exact_bridges(*arguments, proposal=mixed_choice(model, 3))
+    with pytest.raises(ValueError, match="single proposals"):
+        jb.choose_proposal(*arguments, candidates=[mixed_choice(model, 1)])
+    with pytest.raises(TypeError, match="renewal is for couplings"):
+        jb.sample_exact_bridges(*arguments, proposal="auto", method="renewal")
+    with pytest.raises(TypeError, match="paths from normal noise"):
+        jb.sample_exact_bridges(*arguments, proposal="auto", method="crank_nicolson")
+    with pytest.raises(ValueError, match="`num_pilot` must be at least 2"):
+        jb.choose_proposal(*arguments, num_pilot=1)
+    with pytest.raises(TypeError, match="stop_gradient"):
+        mixed = mixed_choice(model, 3)
+        jax.grad(
+            lambda b: jb.sample_weighted_bridges(
+                key, model, jnp.zeros((3, 2)), b, 1.0, num_bridges=2, proposal=mixed
+            ).mean()[0, 5, 0]
+        )(jnp.full((3, 2), 0.3))

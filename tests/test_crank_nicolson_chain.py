@@ -1,0 +1,120 @@
+"""Chains that move the noise of a path: the exact law, step by step or in one call."""
+
+import functools
+
+import blackjax.util
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import paper_model
+
+import jaxbridge as jb
+
+# Well to well: proposals from scratch are seldom accepted.
+WELLS = jb.langevin(lambda x, p: -p * ((x[0] ** 2 - 1) ** 2 + x[1] ** 2), 1.7)
+HARD = (WELLS, [-1.0, 0.0], [1.0, 0.0], 2.0)
+
+
+def batch_means(values, num_batches=40):
+    batches = np.asarray(values, float)
+    batches = batches[: len(batches) // num_batches * num_batches].reshape(num_batches, -1).mean(1)
+    return batches.mean(), batches.std(ddof=1) / np.sqrt(num_batches)
+
+
+@pytest.mark.parametrize(
+    "proposal, step_size", [(jb.ModifiedDiffusionBridge(), 0.4), (jb.Guided(), 0.7)]
+)
+def test_chain_has_the_law_that_weights_give(proposal, step_size):
+    """Mean and variance at a third of the time, and the share of paths that have crossed."""
+    third = lambda path: path[20, 0]
+    functions = [
+        third,
+        lambda path: path[20, 0] ** 2,
+        lambda path: jnp.where(path[30, 0] > 0, 1.0, 0.0),
+    ]
+    weighted = jb.sample_weighted_bridges(
+        jax.random.key(0), *HARD, num_bridges=200_000, num_steps=60, proposal=jb.Guided()
+    )
+    chain = jb.sample_exact_bridges(
+        jax.random.key(1), *HARD, num_bridges=20_000, num_steps=60, proposal=proposal,
+        method="crank_nicolson", step_size=step_size,
+    )  # fmt: skip
+    assert chain.met.all() and 0.1 < chain.acceptance_rate < 0.9
+    for fn in functions:
+        exact, exact_error = float(weighted.mean(fn)), float(weighted.standard_error(fn))
+        mean, error = batch_means(jax.vmap(fn)(chain.paths)[1000:])
+        assert np.hypot(error, exact_error) < 0.05
+        assert abs(mean - exact) < 5 * np.hypot(error, exact_error)
+
+
+def test_chain_is_that_of_the_kernel_and_runs_in_blackjax():
+    arguments, options = (paper_model(), [0.3, 0.1], [-0.2, 0.4], 1.0), dict(num_steps=8)
+    run_key, init_key = jax.random.split(jax.random.key(0))
+    kernel = jb.crank_nicolson(*arguments, **options, step_size=0.3, proposal=jb.Guided())
+    state, positions = kernel.init(None, init_key), []
+    for key in jax.random.split(run_key, 20):
+        state, info = kernel.step(key, state)
+        positions.append(state.position)
+    chain = jb.sample_exact_bridges(
+        jax.random.key(0), *arguments, **options, num_bridges=20, proposal=jb.Guided(),
+        method="crank_nicolson", step_size=0.3,
+    )  # fmt: skip
+    np.testing.assert_allclose(chain.paths, jnp.stack(positions), atol=1e-5)
+    assert float(chain.log_weights[-1]) == pytest.approx(float(state.log_weight), abs=1e-4)
+    assert info.acceptance_rate.shape == ()
+    _, (states, _) = blackjax.util.run_inference_algorithm(
+        jax.random.key(0),
+        kernel,
+        num_steps=20,
+        initial_state=kernel.init(None, init_key),
+        transform=lambda state, info: (state, info),
+    )
+    assert states.position.shape == (20, 9, 2)
+
+
+def test_a_path_that_enters_is_the_state():
+    """`init` finds the noise of a path, so a step of size β moves it by no more than that."""
+    weighted = jb.sample_weighted_bridges(
+        jax.random.key(0), *HARD, num_bridges=1, num_steps=30, proposal=jb.ModifiedDiffusionBridge()
+    )
+    kernel = jb.crank_nicolson(*HARD, num_steps=30, step_size=1e-4, proposal=jb.Guided())
+    state = kernel.init(weighted.paths[0], jax.random.key(1))
+    np.testing.assert_array_equal(state.position, weighted.paths[0])
+    moved, info = kernel.step(jax.random.key(2), state)
+    assert info.acceptance_rate > 0.9
+    np.testing.assert_allclose(moved.position, state.position, atol=5e-3)
+
+
+def test_several_intervals_have_chains_of_their_own():
+    starts, ends = jnp.array([[0.3, 0.1], [0.5, 0.0]]), jnp.array([[-0.2, 0.4], [0.0, 0.0]])
+    model, durations = paper_model(), jnp.array([0.5, 1.0])
+    run = functools.partial(
+        jb.sample_exact_bridges, num_bridges=300, num_steps=10, proposal=jb.Guided(),
+        method="crank_nicolson", step_size=1.0,
+    )  # fmt: skip
+    chains = run(jax.random.key(0), model, starts, ends, durations, save_at=[0.0, 0.5])
+    assert chains.paths.shape == (2, 300, 2, 2) and chains.times.shape == (2, 2)
+    alone = run(jax.random.fold_in(jax.random.key(0), 1), model, starts[1], ends[1], durations[1])
+    np.testing.assert_allclose(chains.paths[1, :, 1], alone.paths[:, 5], atol=1e-5)
+    # Weights of a linear process are equal, so every move is accepted.
+    assert (chains.acceptance_rate > 0.99).all()
+
+
+def test_progress_is_shown(capfd):
+    jb.sample_exact_bridges(
+        jax.random.key(0), *HARD, num_bridges=20, num_steps=5, proposal=jb.Guided(),
+        method="crank_nicolson", progress_meter=diffrax.TextProgressMeter(),
+    )  # fmt: skip
+    jax.effects_barrier()
+    assert "100.00%" in capfd.readouterr().out
+
+
+def test_errors_say_what_to_change(unchecked):
+    with pytest.raises(ValueError, match=r"`step_size` must be a number in \(0, 1\]"):
+        jb.crank_nicolson(*HARD, step_size=1.5)
+    with pytest.raises(TypeError, match="paths from normal noise"):
+        jb.crank_nicolson(*HARD, proposal=jb.Coupling())
+    with pytest.raises(ValueError, match='`step_size` is for method="crank_nicolson"'):
+        jb.sample_exact_bridges(jax.random.key(0), *HARD, step_size=0.5)
