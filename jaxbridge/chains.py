@@ -90,7 +90,8 @@ def sample_exact_bridges(
     num_bridges = check_count("num_bridges", num_bridges)
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, several_durations = as_intervals(start, end, duration)
-    proposal = as_proposal(proposal, model, num_counts, max_proposals, max_trials)
+    like = intervals.start[0]
+    proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
     proposal.check(model, intervals)
     if step_size is not None and method != "crank_nicolson":
         raise ValueError('`step_size` is for method="crank_nicolson".')

@@ -33,13 +33,14 @@ from .hitting import check_max_trials
 from .intervals import Intervals, check_count
 from .search import check_bound, key_for
 from .start_laws import Stationary
+from .step_density import EulerDensity, TrapezoidDensity
 from .weighted import AbstractWeightedProposal, WeightedPaths
 
 # Bounds the tries for one bridge, unless the user says otherwise.
 _MAX_PROPOSALS = 10_000
 # A pilot run draws about so many paths of each candidate in all, and so many of each interval.
 _PILOT_PATHS = 4_096
-_PILOT_RANGE = (32, 1_024)
+_PILOT_RANGE = (32, 512)
 # Hits that take longer than this are not worth waiting for.
 _PILOT_TRIALS = 64
 # Seconds per simulated path beside those of a modified diffusion bridge, as measured for models
@@ -223,15 +224,16 @@ def _pilot(
 def as_proposal(
     proposal: Any,
     model: Diffusion,
+    like: Float[Array, " d"],
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
 ) -> AbstractWeightedProposal:
-    """What the user gave as `proposal`, as a weighted proposal."""
+    """What the user gave as `proposal`, as a weighted proposal, for points like this one."""
     proposal = Coupling() if proposal is None else proposal
     bounds = (num_counts, max_proposals, max_trials)
     if isinstance(proposal, str) and proposal == "auto":
-        return undecided_between(default_candidates(model), model, None, *bounds)
+        return undecided_between(default_candidates(model, like), model, like, None, *bounds)
     if isinstance(proposal, AbstractWeightedProposal):
         if bounds != (None, None, None):
             raise ValueError(
@@ -258,17 +260,25 @@ def singles(proposal: AbstractWeightedProposal) -> tuple[AbstractWeightedProposa
     return proposal.candidates if isinstance(proposal, Choice) else (proposal,)
 
 
-GUIDED_CANDIDATES = (ModifiedDiffusionBridge(), Guided(), Guided("path"))
+def guided_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[AbstractWeightedProposal]:
+    """With the same order of step error as couplings, where that is to be had."""
+    density = EulerDensity() if model.forward(like).sigma_varies else TrapezoidDensity()
+    guided = [Guided(along, density) for along in ("end", "path")]
+    return [ModifiedDiffusionBridge(density), *guided]
 
 
-def default_candidates(model: Diffusion) -> list[Any]:
+def default_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[Any]:
     """Couplings only where the time reversal is known."""
     couplings = [Coupling(0.0), Coupling(0.5)] if model.has_reversal else []
-    return [*GUIDED_CANDIDATES, *couplings]
+    return [*guided_candidates(model, like), *couplings]
 
 
 def undecided_between(
-    candidates: Sequence[Any], model: Diffusion, num_pilot: int | None, *bounds: int | None
+    candidates: Sequence[Any],
+    model: Diffusion,
+    like: Float[Array, " d"],
+    num_pilot: int | None,
+    *bounds: int | None,
 ) -> Choice:
     """A choice between these, not yet made."""
     if len(candidates) == 0:
@@ -276,7 +286,7 @@ def undecided_between(
     proposals = []
     for candidate in candidates:
         own = bounds if isinstance(candidate, AbstractCoupling) else ()
-        proposals.append(as_proposal(candidate, model, *own))
+        proposals.append(as_proposal(candidate, model, like, *own))
     if any(isinstance(proposal, Choice) for proposal in proposals):
         raise ValueError("`candidates` must be single proposals, not choices.")
     grids = {tuple(proposal.fractions(8)) for proposal in proposals}

@@ -86,8 +86,9 @@ def crank_nicolson(
         ```
     """
     check_diffusion(model)
-    proposal = as_guided(as_proposal(Guided() if proposal is None else proposal, model))
     intervals = one_interval(start, end, duration)
+    proposal = Guided() if proposal is None else proposal
+    proposal = as_guided(as_proposal(proposal, model, intervals.start[0]))
     num_steps = check_count("num_steps", num_steps)
     proposal.check(model, intervals)
     beta = check_step_size(step_size)

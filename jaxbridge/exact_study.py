@@ -245,7 +245,7 @@ def run_cost(
             )
 
         run(key)
-        seconds, chain = _fastest(lambda key=key, run=run: run(key))
+        seconds, chain = fastest(lambda key=key, run=run: run(key))
         acceptance = float(chain.acceptance_rate)
         # Of a chain that moves with probability p in each step, whatever it looks at.
         effective = num_bridges * acceptance / (2 - acceptance)
@@ -286,7 +286,7 @@ def draw_as_many(key: Key[Array, ""], result: ExactResult) -> Floor:
         return total
 
     run(key).block_until_ready()
-    seconds, _ = _fastest(lambda: run(key).block_until_ready())
+    seconds, _ = fastest(lambda: run(key).block_until_ready())
     return Floor(_NUM_STEPS * lanes * (4 * rounds[0] + 2 * rounds[1]), seconds)
 
 
@@ -370,7 +370,7 @@ def _words(ends: Ends) -> str:
     return f"{start} -> {end}"
 
 
-def _fastest(function: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
+def fastest(function: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
     """The shortest of some runs in seconds, and the last result."""
     times, result = [], None
     for _ in range(repeats):

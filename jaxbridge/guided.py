@@ -10,7 +10,9 @@ weight is the Euler density of the path over that of the proposal,
     w = N(b; μ_{N-1}, V(x_{N-1}) δ_{N-1}) Π_{i<N-1} N(y_i; 0, I) / N(y_i; m_i, C_i),
 
 so E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b] for the Euler scheme without any further error, and
-for the diffusion up to its step error, O(δ). No stationary law is called for.
+for the diffusion up to its step error, O(δ). With the densities of another discretisation in
+the place of Euler's (`step_density`) that is the target: for constant σ O(δ²) is to be had. No
+stationary law is called for.
 
 m and C follow from a guess h_{i+1}(x) of the density of b seen from x at t_{i+1}. Where log h
 is quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting N(0, I) by h gives
@@ -40,6 +42,7 @@ from .noise import Store, noisy_scan
 from .schemes import Euler
 from .search import most_lanes
 from .sigma import AbstractSigma
+from .step_density import AbstractStepDensity, EulerDensity
 from .weighted import AbstractWeightedProposal, WeightedPaths, in_blocks, masked
 
 
@@ -80,9 +83,11 @@ class AbstractGuidedProposal(AbstractWeightedProposal):
     """Euler paths whose noise is bent so that they end in b.
 
     A proposal is a law of the noise, `noise_law`, and what can be worked out for it before any
-    path is simulated, `guide`. `refinement` is ρ in t_i = T [1 - (1 - i/N)^ρ].
+    path is simulated, `guide`. `density` is that of the target's steps, and `refinement` is ρ
+    in t_i = T [1 - (1 - i/N)^ρ].
     """
 
+    density: eqx.AbstractVar[AbstractStepDensity]
     refinement: eqx.AbstractVar[float]
 
     @abstractmethod
@@ -153,7 +158,11 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
     The best and cheapest proposal on intervals so short that the drift matters little. For
     σ = I it is the Brownian bridge.
 
-    `refinement` is ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end.
+    **Arguments:**
+
+    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
+        `TrapezoidDensity()` is far closer to the diffusion.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end.
 
     !!! example
 
@@ -163,9 +172,11 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
         ```
     """
 
+    density: AbstractStepDensity
     refinement: float = eqx.field(static=True)
 
-    def __init__(self, refinement: float = 1.0):
+    def __init__(self, density: AbstractStepDensity | None = None, refinement: float = 1.0):
+        self.density = _check_density(density)
         self.refinement = _check_refinement(refinement)
 
     def guide(self, dynamics, start, end, dt):
@@ -184,7 +195,11 @@ class ResidualBridge(AbstractGuidedProposal):
     Better where the drift carries all paths along, on intervals that are short beside the time
     in which it would pull them together.
 
-    `refinement` is ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end.
+    **Arguments:**
+
+    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
+        `TrapezoidDensity()` is far closer to the diffusion.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end.
 
     !!! example
 
@@ -194,9 +209,11 @@ class ResidualBridge(AbstractGuidedProposal):
         ```
     """
 
+    density: AbstractStepDensity
     refinement: float = eqx.field(static=True)
 
-    def __init__(self, refinement: float = 1.0):
+    def __init__(self, density: AbstractStepDensity | None = None, refinement: float = 1.0):
+        self.density = _check_density(density)
         self.refinement = _check_refinement(refinement)
 
     def guide(self, dynamics, start, end, dt):
@@ -229,9 +246,11 @@ class Guided(AbstractGuidedProposal):
     - `linearisation`: "end", the drift linearised at b, F = ∇α(b), α̃ = α(b), σ̃ = σ(b); "path", all
         of them linearised along the deterministic path dξ = α(ξ) dt from the start, bent so that
         it ends in b; or a matrix F of shape (d, d), with α(b) and σ(b).
+    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
+        `TrapezoidDensity()` is far closer to the diffusion.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end.
 
-    **Raises:** `ValueError` for anything else.
+    **Raises:** `ValueError` and `TypeError` for anything else.
 
     !!! example
 
@@ -241,13 +260,18 @@ class Guided(AbstractGuidedProposal):
         ```
     """
 
+    density: AbstractStepDensity
     refinement: float = eqx.field(static=True)
     _along: str = eqx.field(static=True)
     _matrix: Float[Array, "d d"] | None
 
     def __init__(
-        self, linearisation: Literal["end", "path"] | Numbers = "end", refinement: float = 1.0
+        self,
+        linearisation: Literal["end", "path"] | Numbers = "end",
+        density: AbstractStepDensity | None = None,
+        refinement: float = 1.0,
     ):
+        self.density = _check_density(density)
         self.refinement = _check_refinement(refinement)
         if isinstance(linearisation, str):
             if linearisation not in ("end", "path"):
@@ -332,6 +356,14 @@ class _Steps(NamedTuple):
         return Step(self.guide, self.dt, self.remaining, end)
 
 
+class _State(NamedTuple):
+    """The point where a path is, its log weight so far, and what was seen at that point."""
+
+    x: Float[Array, "d *lanes"]
+    log_weight: Float[Array, "*lanes"]
+    seen: PyTree
+
+
 class _Lanes:
     """The steps of a proposal for I intervals, on points of shape (d, I, n): what belongs to an
     interval is worked out once and shared by its n paths."""
@@ -352,35 +384,63 @@ class _Lanes:
         )
         self.end, self.last_dt = end.T, dt[-1]
         self.steps = _Steps(guide, dt[:-1], remaining[:-1])
-        self._proposal, self._dynamics = proposal, dynamics
+        self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.density
 
-    def advance(self, x, log_weights, xi, step):
+    def begin(self, start: Float[Array, "d I n"]) -> _State:
+        """Paths at their start, with weight one."""
+        look = _over_lanes(lambda x, step: self._density.look(self._dynamics, x), 1)
+        nothing = jnp.zeros(start.shape[1:], start.dtype)
+        return _State(start, nothing, look(start, None))
+
+    def advance(self, state: _State, xi: Float[Array, "d I n"], steps: _Steps) -> _State:
         """One step with the noise ξ, and the weight with its factor."""
 
-        def one(x, log_weight, xi, step):
-            law, mu, sigma = _step_law(self._proposal, self._dynamics, step, x)
+        def one(state, xi, step):
+            law, mu, sigma = _step_law(self._proposal, self._dynamics, step, state.x)
             y = law.bend(xi)
             x_next = mu + jnp.sqrt(step.dt) * sigma.mv(y)
-            return x_next, log_weight + law.log_weight(xi, y)
+            return self._weighed(state, x_next, law.log_weight(xi, y), step.dt)
 
-        return _over_lanes(one, 3)(x, log_weights, xi, step.to(self.end))
+        return _over_lanes(one, 2)(state, xi, steps.to(self.end))
 
-    def finish(self, x, log_weights):
-        """The weight with that of the last step, N(b; μ_{N-1}, V δ)."""
+    def retrace(
+        self, state: _State, x_next: Float[Array, "d I n"], steps: _Steps
+    ) -> tuple[_State, Float[Array, "d I n"]]:
+        """The step to these points, and the noise ξ that it takes."""
 
-        def one(x, log_weight, last):
+        def one(state, x_next, step):
+            law, mu, sigma = _step_law(self._proposal, self._dynamics, step, state.x)
+            y = sigma.solve(x_next - mu) / jnp.sqrt(step.dt)
+            xi = law.unbend(y)
+            return self._weighed(state, x_next, law.log_weight(xi, y), step.dt), xi
+
+        return _over_lanes(one, 2)(state, x_next, steps.to(self.end))
+
+    def finish(self, state: _State) -> Float[Array, "I n"]:
+        """The log weights with that of the last step, to b."""
+
+        def one(state, last):
             end, dt = last
             # Euler steps may lead out of the state space, where no bridge ends.
             inside = all_finite(self._dynamics.drift(end))
             inside &= jnp.isfinite(self._dynamics.sigma(end).log_abs_det())
-            density = _log_euler_density(self._dynamics, x, end, dt)
-            return log_weight + jnp.where(inside, density, jnp.nan)
+            density = _log_euler_density(self._dynamics, state.x, end, dt)
+            weighed = self._weighed(state, end, density, dt)
+            return jnp.where(inside, weighed.log_weight, jnp.nan)
 
-        return _over_lanes(one, 2)(x, log_weights, (self.end, self.last_dt))
+        return _over_lanes(one, 1)(state, (self.end, self.last_dt))
+
+    def _weighed(self, state: _State, x_next, log_weight, dt) -> _State:
+        """The state at x_next, given the weight of the Euler step."""
+        seen = self._density.look(self._dynamics, x_next)
+        both = (state.x, x_next, state.seen, seen)
+        log_weight += self._density.log_ratio(self._dynamics, *both, dt)
+        return _State(x_next, state.log_weight + log_weight, seen)
 
 
 def _over_lanes(function, num_lane_arguments: int):
-    """`function` of points and a step, on points (d, I, n) and a step that has I only."""
+    """`function` of points and a step, on points (d, I, n) and a step that has I only (`None`
+    for none)."""
     lanes = num_lane_arguments * (-1,)
     over_draws = jax.vmap(function, in_axes=(*lanes, None), out_axes=-1)
     return jax.vmap(over_draws, in_axes=(*(-2 for _ in lanes), -1), out_axes=-2)
@@ -412,27 +472,15 @@ def noise_of(
 ) -> tuple[Float[Array, "I steps d"], Float[Array, " I"]]:
     """The noise ξ_0, ..., ξ_{N-2} from which the proposal makes these paths, one for each
     interval, and their log weights."""
-    num_steps = paths.shape[1] - 1
-    lanes = _Lanes(proposal, dynamics, intervals, num_steps)
-    x = jnp.moveaxis(paths, 0, -1)
+    lanes = _Lanes(proposal, dynamics, intervals, paths.shape[1] - 1)
+    x = jnp.moveaxis(paths, 0, -1)[..., None]
 
-    def one(x, x_next, step):
-        law, mu, sigma = _step_law(proposal, dynamics, step, x)
-        y = sigma.solve(x_next - mu) / jnp.sqrt(step.dt)
-        xi = law.unbend(y)
-        return xi, law.log_weight(xi, y)
+    def each(state, inputs):
+        x_next, steps = inputs
+        return lanes.retrace(state, x_next, steps)
 
-    over_intervals = jax.vmap(one, in_axes=-1, out_axes=-1)
-
-    def each(log_weights, inputs):
-        x, x_next, step = inputs
-        xi, log_weight = over_intervals(x, x_next, step.to(lanes.end))
-        return log_weights + log_weight, xi
-
-    zero = jnp.zeros(paths.shape[0], paths.dtype)
-    log_weights, xi = lax.scan(each, zero, (x[:-2], x[1:-1], lanes.steps))
-    log_weights = lanes.finish(x[-2][..., None], log_weights[:, None])[:, 0]
-    return jnp.moveaxis(xi, -1, 0), log_weights
+    state, xi = lax.scan(each, lanes.begin(x[0]), (x[1:-1], lanes.steps))
+    return jnp.moveaxis(xi[..., 0], -1, 0), lanes.finish(state)[:, 0]
 
 
 def path_of(
@@ -445,18 +493,16 @@ def path_of(
     `noise_of`."""
     lanes = _Lanes(proposal, dynamics, intervals, xi.shape[1] + 1)
     start, end = intervals.start.T[..., None], intervals.end.T[..., None]
-    zero = jnp.zeros((len(xi), 1), xi.dtype)
 
-    def each(carry, inputs):
-        (x, log_weights), (noise, step) = carry, inputs
-        x, log_weights = lanes.advance(x, log_weights, noise[..., None], step)
-        return (x, log_weights), x
+    def each(state, inputs):
+        noise, steps = inputs
+        state = lanes.advance(state, noise[..., None], steps)
+        return state, state.x
 
     noise = jnp.moveaxis(xi, 0, -1)
-    (x, log_weights), path = lax.scan(each, (start, zero), (noise, lanes.steps))
-    log_weights = lanes.finish(x, log_weights)
+    state, path = lax.scan(each, lanes.begin(start), (noise, lanes.steps))
     path = jnp.concatenate([start[None], path, end[None]])
-    return jnp.moveaxis(path[..., 0], -1, 0), log_weights[:, 0]
+    return jnp.moveaxis(path[..., 0], -1, 0), lanes.finish(state)[:, 0]
 
 
 def _weighted(paths: Float[Array, "I n K d"], log_weights: Float[Array, "I n"]) -> WeightedPaths:
@@ -486,7 +532,7 @@ def _draw(
     lanes = _Lanes(proposal, dynamics, intervals, num_steps)
     start = jnp.broadcast_to(intervals.start.T[..., None], shape)
     end = jnp.broadcast_to(intervals.end.T[..., None], shape)
-    x, log_weights, path = start, jnp.zeros(keys.shape, dtype), start[:0]
+    state, path = lanes.begin(start), start[:0]
     store = slots = None
     if stored is not None:
         # Row K is for waste; rows of the first and the last step are filled by hand.
@@ -495,14 +541,14 @@ def _draw(
         store = Store(slots[1:-1], rows)
     if num_steps > 1:
 
-        def step(carry, inputs):
-            (x, log_weights), (xi, at) = carry, inputs
-            x, log_weights = lanes.advance(x, log_weights, xi.reshape(shape), at)
-            return (x, log_weights), x
+        def step(state, inputs):
+            xi, steps = inputs
+            state = lanes.advance(state, xi.reshape(shape), steps)
+            return state, state.x
 
-        (x, log_weights), path = noisy_scan(
+        state, path = noisy_scan(
             step,
-            (x, log_weights),
+            state,
             keys.reshape(-1),
             lambda key, k: jax.random.normal(key, (k, d), dtype),
             lanes.steps,
@@ -511,7 +557,7 @@ def _draw(
         )
     elif store is not None:
         path = store.rows
-    log_weights = lanes.finish(x, log_weights)
+    log_weights = lanes.finish(state)
     if slots is None:
         path = jnp.concatenate([start[None], path, end[None]])
     else:
@@ -543,6 +589,15 @@ def _congruence_of_root(sigma: AbstractSigma, x: Float[Array, " d"]) -> Float[Ar
     """V = σ σᵀ."""
     matrix = sigma.as_matrix(x.shape[0], x.dtype)
     return matmul(matrix, matrix.T)
+
+
+def _check_density(density: AbstractStepDensity | None) -> AbstractStepDensity:
+    density = EulerDensity() if density is None else density
+    if not isinstance(density, AbstractStepDensity):
+        raise TypeError(
+            f"`density` must be `EulerDensity()` or `TrapezoidDensity()`; got {density!r}."
+        )
+    return density
 
 
 def _check_refinement(refinement: float) -> float:

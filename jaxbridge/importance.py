@@ -180,7 +180,8 @@ def weigh_bridges(
     check_density(coupling.start_law, model)
     batch_size = None if batch_size is None else check_count("batch_size", batch_size)
     budget = (num_counts, bound, batch_size, progress_meter)
-    pairs = as_proposal(coupling, model, num_counts, None, max_trials)
+    like = bridges.paths[..., 0, :].reshape(-1, bridges.paths.shape[-1])[0]
+    pairs = as_proposal(coupling, model, like, num_counts, None, max_trials)
     return _weigh_bridges(key_for("weights", key), model, pairs, bridges, budget)
 
 
@@ -259,7 +260,8 @@ def sample_weighted_bridges(
     num_bridges = check_count("num_bridges", num_bridges)
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, several_durations = as_intervals(start, end, duration)
-    proposal = as_proposal(proposal, model, num_counts, max_proposals, max_trials)
+    like = intervals.start[0]
+    proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
     proposal.check(model, intervals)
     proposal = settled(proposal, key, model, intervals, num_steps)
     fractions = proposal.fractions(num_steps)

@@ -204,6 +204,37 @@ def cost(costs: Sequence[Any], slope: float) -> Figure:
     return figure
 
 
+def crossover(rates: Sequence[Any]) -> Figure:
+    """Effective samples per second against the duration, a panel for each process: results of
+    `crossover_study.run_crossover`."""
+    names = list(dict.fromkeys(rate.process for rate in rates))
+    figure = Figure(figsize=(4.1 * len(names), 3.8), layout="constrained")
+    panels = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
+    for ax, name in zip(panels, names, strict=True):
+        group = [rate for rate in rates if rate.process == name]
+        for i, proposal in enumerate(dict.fromkeys(rate.proposal for rate in group)):
+            points = [(r.duration, r.per_second) for r in group if r.proposal == proposal]
+            duration, value = np.array(points).T
+            if proposal == '"auto"':
+                style = {"color": _EXACT, "linestyle": "--", "marker": "", "linewidth": 1.4}
+            else:
+                style = {"color": _COLOURS[i % len(_COLOURS)], "marker": _MARKERS[i % 4]}
+                style |= {"markersize": 4, "linewidth": 1.2}
+            ax.loglog(duration, np.maximum(value, 1e-1), label=proposal, **style)
+        ax.set(xlabel="duration T", title=name.replace("-", "–"))
+        ax.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("effective samples per second")
+    panels[0].set_ylim(bottom=3)
+    figure.legend(
+        *panels[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=6,
+        frameon=False,
+        fontsize="small",
+    )
+    return figure
+
+
 def gaussian_copula(
     u: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."], correlation: float
 ) -> Float[np.ndarray, "..."]:

@@ -81,8 +81,9 @@ def pseudo_marginal(
         ```
     """
     check_diffusion(model)
-    proposal = as_proposal(proposal, model, num_counts, max_proposals, max_trials)
     intervals = one_interval(start, end, duration)
+    like = intervals.start[0]
+    proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
     num_steps = check_count("num_steps", num_steps)
     proposal.check(model, intervals)
     proposal.check_prepared(model)

@@ -74,8 +74,8 @@ def renewal(
         ```
     """
     check_diffusion(model)
-    pairs = as_pairs(as_proposal(proposal, model, 1, max_proposals))
     intervals = one_interval(start, end, duration)
+    pairs = as_pairs(as_proposal(proposal, model, intervals.start[0], 1, max_proposals))
     num_steps = check_count("num_steps", num_steps)
     pairs.check(model, intervals)
     pairs.check_prepared(model)

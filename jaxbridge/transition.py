@@ -97,7 +97,7 @@ def transition_log_density(
     num_proposals = check_count("num_proposals", num_proposals)
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, _ = as_intervals(start, end, duration)
-    proposal = as_proposal(proposal, model, num_counts, None, max_trials)
+    proposal = as_proposal(proposal, model, intervals.start[0], num_counts, None, max_trials)
     proposal.check(model, intervals)
     pairs = [single for single in singles(proposal) if isinstance(single, CoupledPairs)]
     if pairs and not model.has_density:

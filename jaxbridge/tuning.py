@@ -23,9 +23,9 @@ from .arrays import Numbers, is_traced
 from .bridges import check_key, sample_bridges
 from .burn_in import measure_burn_in
 from .choice import (
-    GUIDED_CANDIDATES,
     Choice,
     default_candidates,
+    guided_candidates,
     run_pilots,
     undecided_between,
 )
@@ -176,12 +176,13 @@ def choose_proposal(
     **Arguments:**
 
     - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`.
-    - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge()`,
-        `Guided("end")`, `Guided("path")`, and where the time reversal of the model is known
-        `Coupling(0.0)` and `Coupling(0.5)`, or for a single interval in their place the
-        coupling that `tune_coupling` finds, tried only if it could win.
+    - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge`,
+        `Guided("end")` and `Guided("path")`, with `TrapezoidDensity()` where the model is given
+        with a constant σ, and so with the same order of step error as couplings; and where the
+        time reversal of the model is known `Coupling(0.0)` and `Coupling(0.5)`, or for a single
+        interval in their place the coupling that `tune_coupling` finds, tried if it could win.
     - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
-        all intervals, at least 32 and at most 1,024.
+        all intervals, at least 32 and at most 512.
 
     **Returns:** `Choice`; printed, it is a table.
 
@@ -207,12 +208,13 @@ def choose_proposal(
     if num_pilot is not None:
         num_pilot = check_count("num_pilot", num_pilot, 2)
     intervals, batched, _ = as_intervals(start, end, duration)
+    like = intervals.start[0]
     tuned = candidates is None and not batched and model.has_reversal
     if candidates is None:
-        candidates = GUIDED_CANDIDATES if tuned else default_candidates(model)
+        candidates = (guided_candidates if tuned else default_candidates)(model, like)
 
     def choose_between(candidates):
-        undecided = undecided_between(candidates, model, num_pilot)
+        undecided = undecided_between(candidates, model, like, num_pilot)
         undecided.check(model, intervals)
         return run_pilots(key, model, undecided, intervals, num_steps, timed=True)
 

@@ -204,7 +204,7 @@ def test_weights_of_given_bridges_have_their_law_in_the_chain(law, num_counts):
     expected = met / float(jnp.exp(density))
 
     def inverse_weights(num_counts):
-        proposal = as_proposal(coupling, model, num_counts)
+        proposal = as_proposal(coupling, model, jnp.asarray(start), num_counts)
         intervals = jax.tree.map(
             lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, jnp.float32), (n, *jnp.shape(leaf))),
             Intervals(jnp.asarray(start), jnp.asarray(end), jnp.asarray(duration)),
@@ -291,7 +291,7 @@ def test_numbers_change_without_compiling_again():
 
 def test_errors_say_what_to_change(unchecked):
     model, key, interval = ARGUMENTS[0], jax.random.key(0), ARGUMENTS[1:]
-    with pytest.raises(ValueError, match='"pseudo_marginal" or "renewal"'):
+    with pytest.raises(ValueError, match='`method` must be "pseudo_marginal", "renewal"'):
         jb.sample_exact_bridges(key, model, *interval, method="gibbs")
     with pytest.raises(ValueError, match="for one interval"):
         jb.pseudo_marginal(model, jnp.zeros((3, 2)), jnp.zeros((3, 2)), 1.0)

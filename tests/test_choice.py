@@ -17,7 +17,7 @@ CANDIDATES = [jb.ModifiedDiffusionBridge(), jb.Guided(), jb.Coupling(0.0)]
 
 def mixed_choice(model, num_intervals):
     """Proposals in turn, whatever is best."""
-    proposals = tuple(as_proposal(candidate, model) for candidate in CANDIDATES)
+    proposals = tuple(as_proposal(candidate, model, jnp.zeros(2)) for candidate in CANDIDATES)
     chosen = jnp.arange(num_intervals, dtype=jnp.int32) % 3
     return Choice(proposals, None, None, chosen, None, (0, 1, 2))
 

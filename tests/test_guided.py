@@ -30,6 +30,7 @@ PROPOSALS = {
     "refined": jb.Guided(refinement=2.0),
     "refined modified diffusion bridge": jb.ModifiedDiffusionBridge(refinement=1.5),
 }
+TRAPEZOID = jb.TrapezoidDensity()
 # One dimension, nonlinear drift and σ that depends on the state.
 BENT = jb.Diffusion(
     lambda x, p: p * (x - x**3), lambda x, p: 0.5 + 0.4 / (1 + x**2), None, jnp.asarray(0.8)
@@ -106,7 +107,7 @@ def test_linear_drift_is_guided_without_error(x64, linearisation, refinement):
     """Every weight is the density of the Euler chain, a Gaussian recursion."""
     model = jb.ornstein_uhlenbeck(NON_REVERSIBLE, [0.2, -0.1], FULL_SIGMA)
     start, end, duration, n = jnp.array([0.8, -0.3]), jnp.array([-0.5, 0.4]), 1.5, 12
-    proposal = jb.Guided(linearisation, refinement)
+    proposal = jb.Guided(linearisation, refinement=refinement)
     weighted = jb.sample_weighted_bridges(
         jax.random.key(0),
         model,
@@ -446,6 +447,8 @@ def test_errors_say_what_to_change(unchecked):
         jb.Guided([[jnp.nan]])
     with pytest.raises(ValueError, match="`refinement` must be between 1"):
         jb.ModifiedDiffusionBridge(refinement=0.5)
+    with pytest.raises(TypeError, match="`density` must be `EulerDensity"):
+        jb.Guided("end", 2.0)
     with pytest.raises(TypeError, match="`refinement` must be a Python number"):
         jb.ResidualBridge(refinement="2")
     arguments = (jax.random.key(0), paper_model(), [0.0, 0.0], [0.5, 0.0], 1.0)
