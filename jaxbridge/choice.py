@@ -5,18 +5,20 @@ pairs do not meet; on long ones it is the other way round. Where the one becomes
 the other depends on the model, the end points and the step, so a pilot run decides, interval
 by interval: each candidate draws a few weighted paths, and
 
-    (effective samples - 1) / (simulated paths × seconds per path)
+    effective samples / (simulated paths × seconds per path)
 
-is compared, with the one sample taken off that even hopeless weights are worth. A candidate
-makes no pilot run where it could not win: of a coupling's simulated paths at most one in
-1 + N is an effective sample, for each proposal needs N hitting counts.
+is compared, after a discount of effective samples that are few. A candidate makes no pilot run
+where it could not win: of a coupling's simulated paths at most one in 1 + N is an effective
+sample, for each proposal needs N hitting counts. Seconds go by a rule, and where that leaves it
+open by the clock (but not inside `jit`).
 
 A wrong choice costs time only. Weights stay exact, for the pilot's paths are not used again.
 """
 
+import functools
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,12 +42,17 @@ from .weighted import AbstractWeightedProposal, WeightedPaths
 _MAX_PROPOSALS = 10_000
 # A pilot run draws about so many paths of each candidate in all, and so many of each interval.
 _PILOT_PATHS = 4_096
-_PILOT_RANGE = (32, 512)
+_PILOT_RANGE = (32, 256)
 # Hits that take longer than this are not worth waiting for.
 _PILOT_TRIALS = 64
 # Seconds per simulated path beside those of a modified diffusion bridge, as measured for models
 # whose functions cost little beside the random numbers.
-_GUIDED_SECONDS, _COUPLED_SECONDS = 1.2, 5.0
+_GUIDED_SECONDS, _COUPLED_SECONDS = 1.3, 3.5
+# The rule may be wrong by this factor, so that faster candidates are told apart by the clock.
+_CONTENDS = 3.0
+# Effective samples of a pilot run count by half where they are so many: where they are few, the
+# largest weights have not been seen, and there are fewer of them than it seems.
+_CREDIBLE = 30.0
 
 
 class Choice(AbstractWeightedProposal):
@@ -53,10 +60,10 @@ class Choice(AbstractWeightedProposal):
     table.
 
     - `candidates`: C proposals.
-    - `seconds`: per simulated path, shape (C, I): measured, or inside `jit` relative to those of
-        a modified diffusion bridge, by rule.
-    - `efficiency`: effective samples per simulated path in the pilot run, shape (C, I); NaN
-        where none was needed because the candidate could not win.
+    - `seconds`: per simulated path, shape (C, I): by rule relative to those of a modified
+        diffusion bridge, or measured where that could change the choice.
+    - `efficiency`: effective samples per simulated path in the pilot run, discounted where they
+        are few, shape (C, I); NaN where none was needed because the candidate could not win.
     - `chosen`: the number of each interval's candidate, shape (I,).
     """
 
@@ -203,7 +210,7 @@ def _pilot(
     num_steps: int,
     num_pilot: int,
 ) -> tuple[Float[Array, " I"], Int[Array, " I"]]:
-    """(Effective samples - 1) per simulated path of each active interval, NaN for the others;
+    """Credible effective samples per simulated path of each active interval, NaN for the others;
     and the simulated paths."""
     if isinstance(candidate, CoupledPairs):
         bound = jnp.asarray(_PILOT_TRIALS * candidate.num_counts, jnp.int32)
@@ -216,8 +223,8 @@ def _pilot(
     squares = jnp.sum(weights**2, axis=1)
     size = jnp.sum(weights, axis=1) ** 2 / jnp.where(squares > 0, squares, 1)
     num_simulated = jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32)
-    paths = jnp.maximum(num_simulated - 1, 1).astype(size.dtype)
-    efficiency = jnp.maximum(size - 1, 0) / paths
+    paths = jnp.maximum(num_simulated, 1).astype(size.dtype)
+    efficiency = size / (1 + _CREDIBLE / jnp.maximum(size, 1)) / paths
     return jnp.where(active, efficiency, jnp.nan), num_simulated
 
 
@@ -308,40 +315,66 @@ def run_pilots(
     num_intervals, num_pilot = len(intervals.duration), undecided.num_pilot
     if num_pilot is None:
         num_pilot = np.clip(_PILOT_PATHS // num_intervals, *_PILOT_RANGE).item()
-    candidates, efficiencies, all_seconds = [], [], []
     dtype = intervals.start.dtype
-    best, unit = jnp.zeros(num_intervals, dtype), 1.0
+    best = jnp.zeros(num_intervals, dtype)
+    candidates, pilots = [], []
     for i, candidate in enumerate(undecided.candidates):
 
-        def look_at(candidate, best=best, unit=unit):
-            seconds = unit * _relative_seconds(candidate, model, intervals)
+        def look_at(candidate, best=best):
+            seconds = _relative_seconds(candidate, model, intervals)
             active = best < most_efficient(candidate) / seconds
-            return seconds, active, is_traced(active) or np.any(active)
+            return seconds, active, is_traced(active) or bool(np.any(active))
 
         seconds, active, called_for = look_at(candidate)
         if called_for:
             candidate = candidate.prepared(key, model, intervals, num_steps)
             seconds, active, called_for = look_at(candidate)
-        efficiency = jnp.full(num_intervals, jnp.nan, dtype)
+        run, efficiency, num_simulated = None, jnp.full(num_intervals, jnp.nan, dtype), None
         if called_for:
             arguments = (model, candidate, intervals, active, num_steps, num_pilot)
-            efficiency, num_simulated = _pilot(key_for(f"pilot {i}", key), *arguments)
-            if timed:
-                begin = time.perf_counter()
-                jax.block_until_ready(_pilot(key_for(f"pilot {i}", key), *arguments))
-                took = time.perf_counter() - begin
-                expected = float(jnp.sum(seconds * num_simulated.astype(dtype)))
-                seconds *= took / expected
-                unit = unit if i > 0 else float(seconds[0])
+            run = functools.partial(_pilot, key_for(f"pilot {i}", key), *arguments)
+            efficiency, num_simulated = run()
         candidates.append(candidate)
-        all_seconds.append(seconds)
-        efficiencies.append(efficiency)
+        pilots.append(_Pilot(run, efficiency, num_simulated, seconds))
         best = jnp.fmax(best, efficiency / seconds)
-    efficiency, seconds = jnp.stack(efficiencies), jnp.stack(all_seconds)
+    seconds = _measured(pilots, best) if timed else [pilot.seconds for pilot in pilots]
+    efficiency, seconds = jnp.stack([pilot.efficiency for pilot in pilots]), jnp.stack(seconds)
     rates = jnp.where(jnp.isnan(efficiency), -1, efficiency / seconds)
     chosen = jnp.argmax(rates, axis=0).astype(jnp.int32)
     used = range(len(candidates)) if is_traced(chosen) else np.unique(chosen).tolist()
     return Choice(tuple(candidates), seconds, efficiency, chosen, num_pilot, tuple(used))
+
+
+class _Pilot(NamedTuple):
+    """A pilot run, if there was one, what it gave, and the seconds per path that it should
+    take."""
+
+    run: Callable[[], Any] | None
+    efficiency: Float[Array, " I"]
+    num_simulated: Int[Array, " I"] | None
+    seconds: Float[Array, " I"]
+
+
+def _measured(pilots: list[_Pilot], best: Float[Array, " I"]) -> list[Float[Array, " I"]]:
+    """Seconds per path, where the clock could change the choice; else as they were."""
+
+    def contends(pilot: _Pilot) -> bool:
+        rate = pilot.efficiency / pilot.seconds
+        return pilot.run is not None and bool(np.any(rate * _CONTENDS > best))
+
+    contenders = [pilot for pilot in pilots if contends(pilot)]
+    if len(contenders) < 2:
+        return [pilot.seconds for pilot in pilots]
+    factors = {}
+    for pilot in contenders:
+        assert pilot.run is not None and pilot.num_simulated is not None
+        begin = time.perf_counter()
+        jax.block_until_ready(pilot.run())
+        took = time.perf_counter() - begin
+        expected = pilot.seconds * pilot.num_simulated.astype(pilot.seconds.dtype)
+        factors[id(pilot)] = took / float(jnp.sum(expected))
+    others = float(np.median(list(factors.values())))
+    return [pilot.seconds * factors.get(id(pilot), others) for pilot in pilots]
 
 
 def _relative_seconds(

@@ -23,8 +23,10 @@ from .study import Point, study_model
 from .transition import TransitionLogDensity, transition_log_density
 
 DURATIONS = (0.01, 0.05, 0.25, 1.0, 5.0, 20.0, 50.0)
-# A simulated path of a coupling costs several times one that is pulled to the end.
-_COUPLED_SHARE = 0.04
+# Durations from which on there are more steps, and twice as many of them in all.
+_LONG = 5.0
+# Couplings are slower: a share of the proposals will do, the more so on short intervals.
+_COUPLED_SHARE, _LONG_COUPLED_SHARE = 0.04, 0.5
 _MOST_TRIALS = 1_000
 
 
@@ -141,8 +143,9 @@ def _rate(key, process: Process, duration: float, candidate, work: int, on_start
     )
     name = '"auto"' if candidate == "auto" else describe(proposal)
     on_start(f"{process.name}, T = {duration:g}, {name}")
-    num_steps = 50 if duration <= 1 else 1_000
-    num_proposals = round(work / num_steps * (_COUPLED_SHARE if coupled else 1))
+    num_steps, share = (50, _COUPLED_SHARE) if duration < _LONG else (1_000, _LONG_COUPLED_SHARE)
+    work = work if duration < _LONG else 2 * work
+    num_proposals = round(work / num_steps * (share if coupled else 1))
 
     def run() -> TransitionLogDensity:
         return jax.block_until_ready(
@@ -159,7 +162,7 @@ def _rate(key, process: Process, duration: float, candidate, work: int, on_start
         )
 
     run()
-    seconds, estimate = fastest(run)
+    seconds, estimate = fastest(run, repeats=2)
     effective = float(estimate.effective_sample_size)
     chosen = ""
     made = estimate.proposal

@@ -169,9 +169,9 @@ def choose_proposal(
     """The proposal with most effective samples per second for each interval, by a pilot run.
 
     What `proposal="auto"` does in each call, done once: pass what it returns as `proposal=` for
-    the same intervals. Seconds are measured, compile time left out, so this is a choice made
-    outside `jit`; inside `jit` "auto" goes by a rule for the seconds. Where two are about as
-    fast, either may be chosen.
+    the same intervals. Seconds are measured where they could change the choice, compile time
+    left out, so this is made outside `jit`; inside `jit` "auto" goes by a rule. Where two are
+    about as fast, either may be chosen.
 
     **Arguments:**
 
@@ -182,7 +182,7 @@ def choose_proposal(
         time reversal of the model is known `Coupling(0.0)` and `Coupling(0.5)`, or for a single
         interval in their place the coupling that `tune_coupling` finds, tried if it could win.
     - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
-        all intervals, at least 32 and at most 512.
+        all intervals, at least 32 and at most 256.
 
     **Returns:** `Choice`; printed, it is a table.
 
