@@ -31,6 +31,14 @@ def test_quick_run_of_the_exact_part(tmp_path):
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 4
 
 
+@pytest.mark.slow
+def test_quick_run_of_the_crossover_part(tmp_path):
+    done = run("crossover", "--quick", "--out", "pictures", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("auto / best") == 3 and "Guided" in done.stdout
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 1
+
+
 @pytest.mark.parametrize(
     "arguments", [["--sed", "1"], ["--seed", "-1"], ["--seed", "x"], ["--out", "a-file"]]
 )
