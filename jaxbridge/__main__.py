@@ -10,7 +10,13 @@ from typing import NoReturn
 
 import jax
 
-from .crossover_study import DURATIONS, format_crossover, run_crossover, write_crossover_figure
+from .crossover_study import (
+    DURATIONS,
+    format_crossover,
+    processes,
+    run_crossover,
+    write_crossover_figure,
+)
 from .exact_study import (
     draw_as_many,
     format_cost,
@@ -157,10 +163,11 @@ def _exact(options: argparse.Namespace) -> list[Path]:
 
 def _crossover(options: argparse.Namespace) -> list[Path]:
     work = 400_000 if options.quick else 10_000_000
-    durations = (0.05, 1.0, 5.0) if options.quick else DURATIONS
+    durations = (0.05, 5.0) if options.quick else DURATIONS
+    chosen = processes()[:1] if options.quick else None
     quick = " (--quick: too short a run for the clock)" if options.quick else ""
     print(f"Which proposal for which duration{quick}\n")
-    rates = run_crossover(jax.random.key(options.seed), work, durations, on_start=_say)
+    rates = run_crossover(jax.random.key(options.seed), work, durations, chosen, _say)
     _end_progress()
     print(f"{format_crossover(rates)}\n\n{_WHAT_TO_SEE_CROSSOVER}\n")
     return write_crossover_figure(rates, options.out)

@@ -7,10 +7,10 @@ by interval: each candidate draws a few weighted paths, and
 
     effective samples / (simulated paths × seconds per path)
 
-is compared, after a discount of effective samples that are few. A candidate makes no pilot run
-where it could not win: of a coupling's simulated paths at most one in 1 + N is an effective
-sample, for each proposal needs N hitting counts. Seconds go by a rule, and where that leaves it
-open by the clock (but not inside `jit`).
+is compared, as it would be in a larger sample. A candidate makes no pilot run where it could
+not win: of a coupling's simulated paths at most one in 1 + N is an effective sample, for each
+proposal needs N hitting counts. Seconds go by a rule, and where that leaves open whether a
+coupling is faster than the others, by the clock (but not inside `jit`).
 
 A wrong choice costs time only. Weights stay exact, for the pilot's paths are not used again.
 """
@@ -42,17 +42,14 @@ from .weighted import AbstractWeightedProposal, WeightedPaths
 _MAX_PROPOSALS = 10_000
 # A pilot run draws about so many paths of each candidate in all, and so many of each interval.
 _PILOT_PATHS = 4_096
-_PILOT_RANGE = (32, 256)
+_PILOT_RANGE = (32, 512)
 # Hits that take longer than this are not worth waiting for.
 _PILOT_TRIALS = 64
 # Seconds per simulated path beside those of a modified diffusion bridge, as measured for models
 # whose functions cost little beside the random numbers.
 _GUIDED_SECONDS, _COUPLED_SECONDS = 1.3, 3.5
-# The rule may be wrong by this factor, so that faster candidates are told apart by the clock.
+# Between couplings and others the rule may be wrong by this factor: then the clock decides.
 _CONTENDS = 3.0
-# Effective samples of a pilot run count by half where they are so many: where they are few, the
-# largest weights have not been seen, and there are fewer of them than it seems.
-_CREDIBLE = 30.0
 
 
 class Choice(AbstractWeightedProposal):
@@ -62,8 +59,8 @@ class Choice(AbstractWeightedProposal):
     - `candidates`: C proposals.
     - `seconds`: per simulated path, shape (C, I): by rule relative to those of a modified
         diffusion bridge, or measured where that could change the choice.
-    - `efficiency`: effective samples per simulated path in the pilot run, discounted where they
-        are few, shape (C, I); NaN where none was needed because the candidate could not win.
+    - `efficiency`: effective samples per simulated path in the pilot run, extrapolated to
+        a larger one, shape (C, I); NaN where none was needed because the candidate could not win.
     - `chosen`: the number of each interval's candidate, shape (I,).
     """
 
@@ -210,22 +207,42 @@ def _pilot(
     num_steps: int,
     num_pilot: int,
 ) -> tuple[Float[Array, " I"], Int[Array, " I"]]:
-    """Credible effective samples per simulated path of each active interval, NaN for the others;
-    and the simulated paths."""
+    """Effective samples per simulated path of each active interval, NaN for the others; and the
+    simulated paths."""
     if isinstance(candidate, CoupledPairs):
         bound = jnp.asarray(_PILOT_TRIALS * candidate.num_counts, jnp.int32)
         candidate = eqx.tree_at(lambda c: c.max_trials, candidate, bound)
     keys = jax.random.split(key, (len(intervals.duration), num_pilot))
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
     drawn = candidate.draw(keys, model.prepared(), intervals, num_steps, nothing, True, active)
-    largest = jnp.max(drawn.log_weights, axis=1, keepdims=True)
-    weights = jnp.exp(drawn.log_weights - jnp.where(largest > -jnp.inf, largest, 0))
-    squares = jnp.sum(weights**2, axis=1)
-    size = jnp.sum(weights, axis=1) ** 2 / jnp.where(squares > 0, squares, 1)
     num_simulated = jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32)
-    paths = jnp.maximum(num_simulated, 1).astype(size.dtype)
-    efficiency = size / (1 + _CREDIBLE / jnp.maximum(size, 1)) / paths
+    size = _extrapolated_size(drawn.log_weights)
+    efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
     return jnp.where(active, efficiency, jnp.nan), num_simulated
+
+
+def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
+    """Effective samples of n paths, as they would be in a sample 64 times as large.
+
+    Where weights have heavy tails the effective share falls with the sample, about as a power
+    of its size, since the largest weights are yet to come: a small sample looks too good. The
+    power is seen between eighths of the sample and the whole.
+    """
+    num_intervals, n = log_weights.shape
+    eighth = max(n // 8, 1)
+    share = _effective_size(log_weights) / n
+    parts = log_weights[:, : n // eighth * eighth].reshape(num_intervals, -1, eighth)
+    share_of_part = jnp.mean(_effective_size(parts), axis=1) / eighth
+    fall = jnp.minimum(share / jnp.where(share_of_part > 0, share_of_part, 1), 1)
+    return n * share * fall**2
+
+
+def _effective_size(log_weights: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
+    """(Σw)²/Σw²."""
+    largest = jnp.max(log_weights, axis=-1, keepdims=True)
+    weights = jnp.exp(log_weights - jnp.where(largest > -jnp.inf, largest, 0))
+    squares = jnp.sum(weights**2, axis=-1)
+    return jnp.sum(weights, axis=-1) ** 2 / jnp.where(squares > 0, squares, 1)
 
 
 def as_proposal(
@@ -335,7 +352,8 @@ def run_pilots(
             run = functools.partial(_pilot, key_for(f"pilot {i}", key), *arguments)
             efficiency, num_simulated = run()
         candidates.append(candidate)
-        pilots.append(_Pilot(run, efficiency, num_simulated, seconds))
+        coupled = isinstance(candidate, CoupledPairs)
+        pilots.append(_Pilot(run, efficiency, num_simulated, seconds, coupled))
         best = jnp.fmax(best, efficiency / seconds)
     seconds = _measured(pilots, best) if timed else [pilot.seconds for pilot in pilots]
     efficiency, seconds = jnp.stack([pilot.efficiency for pilot in pilots]), jnp.stack(seconds)
@@ -353,6 +371,7 @@ class _Pilot(NamedTuple):
     efficiency: Float[Array, " I"]
     num_simulated: Int[Array, " I"] | None
     seconds: Float[Array, " I"]
+    coupled: bool
 
 
 def _measured(pilots: list[_Pilot], best: Float[Array, " I"]) -> list[Float[Array, " I"]]:
@@ -363,7 +382,7 @@ def _measured(pilots: list[_Pilot], best: Float[Array, " I"]) -> list[Float[Arra
         return pilot.run is not None and bool(np.any(rate * _CONTENDS > best))
 
     contenders = [pilot for pilot in pilots if contends(pilot)]
-    if len(contenders) < 2:
+    if len({pilot.coupled for pilot in contenders}) < 2:
         return [pilot.seconds for pilot in pilots]
     factors = {}
     for pilot in contenders:

@@ -26,7 +26,7 @@ DURATIONS = (0.01, 0.05, 0.25, 1.0, 5.0, 20.0, 50.0)
 # Durations from which on there are more steps, and twice as many of them in all.
 _LONG = 5.0
 # Couplings are slower: a share of the proposals will do, the more so on short intervals.
-_COUPLED_SHARE, _LONG_COUPLED_SHARE = 0.04, 0.5
+_COUPLED_SHARE, _LONG_COUPLED_SHARE = 0.04, 0.25
 _MOST_TRIALS = 1_000
 
 
@@ -117,12 +117,13 @@ def run_crossover(
     key: Key[Array, ""],
     work: int,
     durations: Sequence[float] = DURATIONS,
+    chosen: Sequence[Process] | None = None,
     on_start: Callable[[str], None] = lambda what: None,
 ) -> list[Rate]:
     """Each candidate of "auto", and "auto" itself, for each process and duration, in about `work`
     simulated steps of each run."""
     rates = []
-    for process in processes():
+    for process in processes() if chosen is None else chosen:
         candidates = [*default_candidates(process.model, jnp.asarray(process.start)), "auto"]
         for duration in durations:
             for candidate in candidates:

@@ -182,7 +182,7 @@ def choose_proposal(
         time reversal of the model is known `Coupling(0.0)` and `Coupling(0.5)`, or for a single
         interval in their place the coupling that `tune_coupling` finds, tried if it could win.
     - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
-        all intervals, at least 32 and at most 256.
+        all intervals, at least 32 and at most 512.
 
     **Returns:** `Choice`; printed, it is a table.
 

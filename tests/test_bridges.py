@@ -161,6 +161,7 @@ def test_state_dependent_full_sigma_on_a_long_interval():
         assert_moments(y, exact.mean[k], exact.covariance[k], mean_allowance=0.02)
 
 
+@pytest.mark.slow
 def test_one_dimension_and_independent_copies():
     """d = 1 and γ = 0: the method of Bladt & Sørensen (2014)."""
     model = jb.ornstein_uhlenbeck([[1.0]])
@@ -489,6 +490,7 @@ def test_models_that_close_over_traced_values_can_be_batched():
     np.testing.assert_allclose(jax.vmap(paths)(rates)[1], paths(1.0), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_params_may_hold_a_neural_network():
     network = eqx.nn.MLP(2, 2, 8, 1, key=jax.random.key(0))
     model = jb.Diffusion(

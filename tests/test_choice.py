@@ -113,6 +113,7 @@ def test_no_coupling_is_more_efficient_than_the_bound():
         assert weighted.efficiency <= 1 / (1 + counts)
 
 
+@pytest.mark.slow
 def test_inside_jit_the_choice_goes_by_rule():
     model = HYPERBOLIC
     starts, ends = jnp.zeros((3, 2)), jnp.array([[0.1, 0.0], [0.5, 0.5], [1.0, -1.0]])

@@ -107,6 +107,7 @@ def acceptance(model, rotation, num_bridges=10_000):
     return share, share * np.sqrt((1 - share) / num_bridges)
 
 
+@pytest.mark.slow
 def test_the_right_rotation_meets_more_often_and_the_printed_one_less():
     model = rotating_model()
     right, none, printed = (

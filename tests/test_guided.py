@@ -149,7 +149,7 @@ def test_density_is_that_of_the_closed_form(name, duration, num_steps):
     assert abs(float(estimate.value - law.log_density(end))) < 5 * error + 0.01
 
 
-@pytest.mark.parametrize("name", ["modified diffusion bridge", "guided"])
+@pytest.mark.parametrize("name", ["guided", pytest.param("modified diffusion bridge", marks=slow)])
 def test_full_state_dependent_sigma_has_the_exact_law(name):
     """OU turned by a rotation that depends on the radius: density and mid-point."""
     ou = jb.ornstein_uhlenbeck(NON_REVERSIBLE)

@@ -46,6 +46,7 @@ def test_weighted_midpoints_have_the_exact_law(name):
     assert size > 800 and not weighted.truncated.any()
 
 
+@pytest.mark.slow
 def test_unweighted_and_published_midpoints_fail_the_same_test():
     case = exact_case(paper_model(), *PAPER_CASES["very unlikely"], 1.0, 0.5)
     raw = weighted_bridges(case, 10_000)

@@ -35,7 +35,7 @@ def test_quick_run_of_the_exact_part(tmp_path):
 def test_quick_run_of_the_crossover_part(tmp_path):
     done = run("crossover", "--quick", "--out", "pictures", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.count("auto / best") == 3 and "Guided" in done.stdout
+    assert done.stdout.count("auto / best") == 1 and "Guided" in done.stdout
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 1
 
 

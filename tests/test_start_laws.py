@@ -42,6 +42,7 @@ def test_reversed_is_the_law_of_the_reversed_diffusion():
     assert_moments(drawn, exact.mean, exact.covariance, mean_allowance=0.002)
 
 
+@pytest.mark.slow
 def test_a_run_replaces_the_sampler_from_far_away():
     model = jb.ornstein_uhlenbeck(NON_REVERSIBLE)
     end = jnp.array([6.0, -6.0])

@@ -32,6 +32,7 @@ def fitted(ends):
     )
 
 
+@pytest.mark.slow
 def test_fitted_law_is_eight_times_better_on_a_very_unlikely_bridge():
     law = fitted(VERY_UNLIKELY)
     assert isinstance(law, jb.GaussianLaw)
