@@ -65,5 +65,6 @@ def _refuse(primals, tangents):
         "what corrects bridges to their exact law has no derivative path by path: whether a pair "
         "meets, and how often a bridge is hit, depends on the parameters too. Apply "
         "`jax.lax.stop_gradient` to the parameters where bridges are made, and differentiate a "
-        "likelihood of their paths."
+        "likelihood of their paths. (Of a choice between proposals: make it before, with "
+        "`choose_proposal`, between those that are pulled to the end point.)"
     )

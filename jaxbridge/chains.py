@@ -18,6 +18,7 @@ from .bridges import check_key, stored_steps
 from .choice import as_proposal, settled
 from .crank_nicolson_chain import as_guided, check_step_size, run_crank_nicolson
 from .diffusion import Diffusion, check_diffusion
+from .guided import Guided
 from .intervals import as_intervals, check_count
 from .kernels import Chain
 from .pseudo_marginal_chain import run_pseudo_marginal
@@ -57,8 +58,9 @@ def sample_exact_bridges(
     - `model`, `start`, `end`, `duration`, `num_steps`, `save_at`: as in `sample_bridges`.
     - `num_bridges`: n, the number of iterations.
     - `proposal`: a `Coupling`, with its start law, by default `Coupling(gamma=0.0)`; or
-        `ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()`, whose target is the Euler
-        scheme on the grid; or "auto", which finds the best for each interval by a pilot run, or
+        `ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()` (the default of
+        "crank_nicolson"), whose target is made of the densities of their steps; or "auto",
+        which finds the best for each interval by a pilot run, or
         what `choose_proposal` returns.
     - `method`: "pseudo_marginal"; "renewal", for couplings, which needs many more iterations for
         bridges as good, each of which costs less; or "crank_nicolson", for proposals that are
@@ -90,6 +92,8 @@ def sample_exact_bridges(
     num_bridges = check_count("num_bridges", num_bridges)
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, several_durations = as_intervals(start, end, duration)
+    if proposal is None and method == "crank_nicolson":
+        proposal = Guided()
     like = intervals.start[0]
     proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
     proposal.check(model, intervals)

@@ -9,8 +9,8 @@ by interval: each candidate draws a few weighted paths, and
 
 is compared, as it would be in a larger sample. A candidate makes no pilot run where it could
 not win: of a coupling's simulated paths at most one in 1 + N is an effective sample, for each
-proposal needs N hitting counts. Seconds go by a rule, and where that leaves open whether a
-coupling is faster than the others, by the clock (but not inside `jit`).
+proposal needs N hitting counts. Seconds go by a rule, so that one key gives one choice; or by
+the clock, where `choose_proposal` makes the choice.
 
 A wrong choice costs time only. Weights stay exact, for the pilot's paths are not used again.
 """
@@ -48,7 +48,7 @@ _PILOT_TRIALS = 64
 # Seconds per simulated path beside those of a modified diffusion bridge, as measured for models
 # whose functions cost little beside the random numbers.
 _GUIDED_SECONDS, _COUPLED_SECONDS = 1.3, 3.5
-# Between couplings and others the rule may be wrong by this factor: then the clock decides.
+# The rule may be wrong by this factor.
 _CONTENDS = 3.0
 
 
@@ -62,6 +62,8 @@ class Choice(AbstractWeightedProposal):
     - `efficiency`: effective samples per simulated path in the pilot run, extrapolated to
         a larger one, shape (C, I); NaN where none was needed because the candidate could not win.
     - `chosen`: the number of each interval's candidate, shape (I,).
+    - `used`: the numbers of those that were chosen for any interval; inside `jit`, where that is
+        not known, of all. Only they are compiled, so that another set compiles again.
     """
 
     candidates: tuple[AbstractWeightedProposal, ...]
@@ -69,7 +71,7 @@ class Choice(AbstractWeightedProposal):
     efficiency: Float[Array, "C I"] | None
     chosen: Int[Array, " I"] | None
     num_pilot: int | None = eqx.field(static=True)
-    _used: tuple[int, ...] = eqx.field(static=True)
+    used: tuple[int, ...] = eqx.field(static=True)
 
     def check(self, model, intervals):
         for candidate in self.candidates:
@@ -86,7 +88,7 @@ class Choice(AbstractWeightedProposal):
                 'a kernel makes no pilot run, so `proposal="auto"` has nothing to go by: choose '
                 "with `choose_proposal` before, and pass what it returns."
             )
-        for candidate in self.candidates:
+        for candidate in singles(self):
             candidate.check_prepared(model)
 
     def prepared(self, key, model, intervals, num_steps):
@@ -109,7 +111,7 @@ class Choice(AbstractWeightedProposal):
         active=None,
         progress_meter=None,
     ):
-        if len(self._used) > 1:
+        if len(self.used) > 1:
             model, intervals = nondifferentiable((model, intervals))
 
         def draw(candidate, active):
@@ -130,24 +132,16 @@ class Choice(AbstractWeightedProposal):
         active: Bool[Array, " I"] | None,
     ) -> WeightedPaths:
         """What each interval's candidate makes."""
-        if len(self._used) == 1:
-            return make(self.candidates[self._used[0]], active)
+        if len(self.used) == 1:
+            return make(self.candidates[self.used[0]], active)
         made = None
-        for i in self._used:
+        for i in self.used:
             mine = self.chosen == i
             mine = mine if active is None else mine & active
             part = make(self.candidates[i], mine)
             made = part if made is None else jax.tree.map(_pick(mine), part, made)
         assert made is not None
         return made
-
-    @property
-    def coupling_could_win(self) -> bool:
-        """Whether a coupling might be faster than what is chosen for some interval."""
-        assert self.efficiency is not None and self.seconds is not None
-        rates = np.asarray(self.efficiency) / np.asarray(self.seconds)
-        seconds = np.asarray(self.seconds)[0] * _COUPLED_SECONDS
-        return bool(np.any(np.nanmax(rates, axis=0) < 1 / (2 * seconds)))
 
     def __str__(self) -> str:
         made = self.chosen is not None and not is_traced(self.chosen, self.efficiency, self.seconds)
@@ -157,7 +151,7 @@ class Choice(AbstractWeightedProposal):
         chosen, efficiency = np.asarray(self.chosen), np.asarray(self.efficiency, float)
         seconds = np.asarray(self.seconds, float)
         rates = efficiency / seconds
-        best = np.nanmax(rates, axis=0)
+        best = np.maximum(np.nanmax(rates, axis=0), np.finfo(float).tiny)
         head = ("", "effective per path", "cost of a path", "speed")
         lines = ["{:<44}  {:>18}  {:>14}  {:>6}  chosen for".format(*head)]
         for i, candidate in enumerate(self.candidates):
@@ -210,13 +204,14 @@ def _pilot(
     """Effective samples per simulated path of each active interval, NaN for the others; and the
     simulated paths."""
     if isinstance(candidate, CoupledPairs):
-        bound = jnp.asarray(_PILOT_TRIALS * candidate.num_counts, jnp.int32)
+        bound = jnp.minimum(candidate.max_trials, _PILOT_TRIALS * candidate.num_counts)
         candidate = eqx.tree_at(lambda c: c.max_trials, candidate, bound)
     keys = jax.random.split(key, (len(intervals.duration), num_pilot))
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
     drawn = candidate.draw(keys, model.prepared(), intervals, num_steps, nothing, True, active)
     num_simulated = jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32)
-    size = _extrapolated_size(drawn.log_weights)
+    # What takes too long to hit would have a weight beyond those that are seen.
+    size = _extrapolated_size(jnp.where(drawn.truncated, -jnp.inf, drawn.log_weights))
     efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
     return jnp.where(active, efficiency, jnp.nan), num_simulated
 
@@ -252,12 +247,15 @@ def as_proposal(
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
+    for_density: bool = False,
 ) -> AbstractWeightedProposal:
-    """What the user gave as `proposal`, as a weighted proposal, for points like this one."""
+    """What the user gave as `proposal`, as a weighted proposal, for points like this one;
+    `for_density` if the size of its weights matters, and not only their proportion."""
     proposal = Coupling() if proposal is None else proposal
     bounds = (num_counts, max_proposals, max_trials)
     if isinstance(proposal, str) and proposal == "auto":
-        return undecided_between(default_candidates(model, like), model, like, None, *bounds)
+        candidates = default_candidates(model, like, for_density)
+        return undecided_between(candidates, model, like, None, *bounds)
     if isinstance(proposal, AbstractWeightedProposal):
         if bounds != (None, None, None):
             raise ValueError(
@@ -280,8 +278,10 @@ def as_proposal(
 
 
 def singles(proposal: AbstractWeightedProposal) -> tuple[AbstractWeightedProposal, ...]:
-    """The candidates of a choice, or the proposal itself."""
-    return proposal.candidates if isinstance(proposal, Choice) else (proposal,)
+    """The candidates of a choice that may be used, or the proposal itself."""
+    if not isinstance(proposal, Choice):
+        return (proposal,)
+    return tuple(proposal.candidates[i] for i in proposal.used)
 
 
 def guided_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[AbstractWeightedProposal]:
@@ -291,9 +291,12 @@ def guided_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[Abstra
     return [ModifiedDiffusionBridge(density), *guided]
 
 
-def default_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[Any]:
-    """Couplings only where the time reversal is known."""
-    couplings = [Coupling(0.0), Coupling(0.5)] if model.has_reversal else []
+def default_candidates(
+    model: Diffusion, like: Float[Array, " d"], for_density: bool = False
+) -> list[Any]:
+    """Couplings only where the time reversal is known; and for a density, where ν is."""
+    coupled = model.has_reversal and (model.normalised or not for_density)
+    couplings = [Coupling(0.0), Coupling(0.5)] if coupled else []
     return [*guided_candidates(model, like), *couplings]
 
 
@@ -302,15 +305,18 @@ def undecided_between(
     model: Diffusion,
     like: Float[Array, " d"],
     num_pilot: int | None,
-    *bounds: int | None,
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
 ) -> Choice:
     """A choice between these, not yet made."""
     if len(candidates) == 0:
         raise ValueError("`candidates` must have at least one proposal.")
     proposals = []
     for candidate in candidates:
-        own = bounds if isinstance(candidate, AbstractCoupling) else ()
-        proposals.append(as_proposal(candidate, model, like, *own))
+        coupled = isinstance(candidate, AbstractCoupling)
+        bounds = (num_counts, max_proposals, max_trials) if coupled else (None, None, None)
+        proposals.append(as_proposal(candidate, model, like, *bounds))
     if any(isinstance(proposal, Choice) for proposal in proposals):
         raise ValueError("`candidates` must be single proposals, not choices.")
     grids = {tuple(proposal.fractions(8)) for proposal in proposals}
@@ -352,8 +358,7 @@ def run_pilots(
             run = functools.partial(_pilot, key_for(f"pilot {i}", key), *arguments)
             efficiency, num_simulated = run()
         candidates.append(candidate)
-        coupled = isinstance(candidate, CoupledPairs)
-        pilots.append(_Pilot(run, efficiency, num_simulated, seconds, coupled))
+        pilots.append(_Pilot(run, efficiency, num_simulated, seconds))
         best = jnp.fmax(best, efficiency / seconds)
     seconds = _measured(pilots, best) if timed else [pilot.seconds for pilot in pilots]
     efficiency, seconds = jnp.stack([pilot.efficiency for pilot in pilots]), jnp.stack(seconds)
@@ -371,29 +376,32 @@ class _Pilot(NamedTuple):
     efficiency: Float[Array, " I"]
     num_simulated: Int[Array, " I"] | None
     seconds: Float[Array, " I"]
-    coupled: bool
 
 
 def _measured(pilots: list[_Pilot], best: Float[Array, " I"]) -> list[Float[Array, " I"]]:
-    """Seconds per path, where the clock could change the choice; else as they were."""
+    """Seconds per path by the clock, where that could change the choice; else by rule."""
 
     def contends(pilot: _Pilot) -> bool:
         rate = pilot.efficiency / pilot.seconds
         return pilot.run is not None and bool(np.any(rate * _CONTENDS > best))
 
     contenders = [pilot for pilot in pilots if contends(pilot)]
-    if len({pilot.coupled for pilot in contenders}) < 2:
+    if len(contenders) < 2:
         return [pilot.seconds for pilot in pilots]
     factors = {}
     for pilot in contenders:
         assert pilot.run is not None and pilot.num_simulated is not None
-        begin = time.perf_counter()
-        jax.block_until_ready(pilot.run())
-        took = time.perf_counter() - begin
+        took = min(_seconds_of(pilot.run) for _ in range(3))
         expected = pilot.seconds * pilot.num_simulated.astype(pilot.seconds.dtype)
         factors[id(pilot)] = took / float(jnp.sum(expected))
     others = float(np.median(list(factors.values())))
     return [pilot.seconds * factors.get(id(pilot), others) for pilot in pilots]
+
+
+def _seconds_of(run: Callable[[], Any]) -> float:
+    begin = time.perf_counter()
+    jax.block_until_ready(run())
+    return time.perf_counter() - begin
 
 
 def _relative_seconds(
@@ -420,10 +428,10 @@ def settled(
     intervals: Intervals,
     num_steps: int,
 ) -> AbstractWeightedProposal:
-    """A choice made by the clock and before compiling, where that can be, so that only what was
-    chosen is compiled."""
+    """A choice made before compiling, where that can be, so that only what was chosen is
+    compiled."""
     if not isinstance(proposal, Choice) or proposal.chosen is not None:
         return proposal
     if not is_traced(key, model, proposal, intervals):
-        return run_pilots(key, model, proposal, intervals, num_steps, timed=True)
+        return run_pilots(key, model, proposal, intervals, num_steps, timed=False)
     return proposal

@@ -123,6 +123,7 @@ def _init(
         paths, log_weights = path_of(proposal, dynamics, intervals, noise)
     else:
         noise, log_weights = noise_of(proposal, dynamics, intervals, paths)
+        noise = jnp.where(jnp.isfinite(noise), noise, 0)  # a path outside the state space is left
     return CrankNicolsonState(paths, noise, _finite(log_weights))
 
 

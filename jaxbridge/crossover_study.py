@@ -84,6 +84,7 @@ def double_well(barrier: float = 1.7) -> Diffusion:
         _log_well,
         barrier,
         reversible=True,
+        normalised=True,
         sample_stationary=_sample_well,
         prepare=_prepare_well,
     )

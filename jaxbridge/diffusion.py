@@ -60,6 +60,8 @@ class Diffusion(eqx.Module):
     - `sample_stationary`: an exact sampler of ν, `(key, params) -> (d,)`.
     - `reversible`: declare α* = α; then no reverse drift is computed. See
         `reversibility_residual` for a check.
+    - `normalised`: declare that `log_stationary` is the logarithm of a density, not only up to a
+        constant. Transition densities by couplings from the stationary law rest on it.
     - `prepare`: maps `params` to what the functions above receive in their place, for
         quantities that depend on the parameters but not on the point. It runs once per call,
         outside every loop.
@@ -84,6 +86,7 @@ class Diffusion(eqx.Module):
     _constant_sigma: Inexact[Array, "..."] | None
     params: PyTree
     reversible: bool = eqx.field(static=True)
+    normalised: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -95,6 +98,7 @@ class Diffusion(eqx.Module):
         reverse_drift: Callable | None = None,
         sample_stationary: Callable | None = None,
         reversible: bool = False,
+        normalised: bool = False,
         prepare: Callable | None = None,
     ):
         for name, function in [
@@ -117,6 +121,7 @@ class Diffusion(eqx.Module):
             self._diffusion, self._constant_sigma = None, _check_constant_sigma(diffusion)
         self.params = jax.tree.map(_as_leaf, params)
         self.reversible = reversible
+        self.normalised = normalised
 
     def drift(self, x: Numbers) -> Float[Array, " d"]:
         """α(x), shape (d,)."""
@@ -189,6 +194,7 @@ class Diffusion(eqx.Module):
             reverse_drift=self._reverse_drift,
             sample_stationary=self._sample_stationary,
             reversible=self.reversible,
+            normalised=self.normalised,
         )
 
     @property

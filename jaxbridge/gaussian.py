@@ -157,6 +157,7 @@ def ornstein_uhlenbeck(
         params=OrnsteinUhlenbeckParams(B, mean, sigma),
         reverse_drift=_reverse_drift,
         sample_stationary=_sample_stationary,
+        normalised=True,
         prepare=_prepare,
     )
 

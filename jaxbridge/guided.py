@@ -32,10 +32,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers, as_floating, is_traced
-from .diffusion import Dynamics
+from .diffusion import Diffusion, Dynamics
 from .intervals import Intervals, check_model
 from .linalg import all_finite, cholesky, dot, inverse, matmul, matvec, solve, total
 from .noise import Store, noisy_scan
@@ -44,6 +44,9 @@ from .search import most_lanes
 from .sigma import AbstractSigma
 from .step_density import AbstractStepDensity, EulerDensity
 from .weighted import AbstractWeightedProposal, WeightedPaths, in_blocks, masked
+
+# Of the duration: shorter steps are lost in the rounding of points.
+_SHORTEST_STEP = 1e-10
 
 
 class NoiseLaw(NamedTuple):
@@ -120,7 +123,16 @@ class AbstractGuidedProposal(AbstractWeightedProposal):
         return self
 
     def fractions(self, num_steps):
-        return 1 - (1 - np.arange(num_steps + 1) / num_steps) ** self.refinement
+        return 1 - self.remaining(num_steps)
+
+    def remaining(self, num_steps: int) -> Float[np.ndarray, " points"]:
+        """(T - t_i) / T, down to zero."""
+        if num_steps**-self.refinement < _SHORTEST_STEP:
+            raise ValueError(
+                f"`refinement` = {self.refinement:g} makes the last of {num_steps} steps too short "
+                "to be told from none: choose a smaller one."
+            )
+        return (1 - np.arange(num_steps + 1) / num_steps) ** self.refinement
 
     def draw(
         self,
@@ -133,10 +145,8 @@ class AbstractGuidedProposal(AbstractWeightedProposal):
         active=None,
         progress_meter=None,
     ):
-        dynamics = model.forward(intervals.start[0])
-
         def block(keys, intervals, active):
-            return _draw(self, dynamics, keys, intervals, num_steps, stored)
+            return _weighted(*_draw(_Inputs(self, model, intervals), keys, stored, num_steps))
 
         rows = most_lanes(intervals.start.shape[1])
         return in_blocks(block, keys, intervals, rows, active, progress_meter)
@@ -239,7 +249,8 @@ class Guided(AbstractGuidedProposal):
 
         dX̃ = [α̃ + F (X̃ - b)] dt + σ̃ dW,
 
-    on the same Euler grid, so that for an Ornstein–Uhlenbeck process all weights are equal.
+    on the same Euler grid, so that for an Ornstein–Uhlenbeck process and `EulerDensity` all
+    weights are equal.
 
     **Arguments:**
 
@@ -376,9 +387,9 @@ class _Lanes:
         num_steps: int,
     ):
         start, end, duration = intervals
-        fractions = proposal.fractions(num_steps)
-        dt = jnp.asarray(np.diff(fractions), start.dtype)[:, None] * duration
-        remaining = jnp.asarray(1 - fractions[:-1], start.dtype)[:, None] * duration
+        fractions = proposal.remaining(num_steps)
+        dt = jnp.asarray(-np.diff(fractions), start.dtype)[:, None] * duration
+        remaining = jnp.asarray(fractions[:-1], start.dtype)[:, None] * duration
         guide = jax.vmap(proposal.guide, in_axes=(None, 0, 0, 1), out_axes=-1)(
             dynamics, start, end, dt
         )
@@ -518,21 +529,53 @@ def _weighted(paths: Float[Array, "I n K d"], log_weights: Float[Array, "I n"]) 
     )
 
 
+class _Inputs(NamedTuple):
+    """Everything that paths and weights may be differentiated with respect to."""
+
+    proposal: AbstractGuidedProposal
+    model: Diffusion
+    intervals: Intervals
+
+
+@eqx.filter_custom_jvp
 def _draw(
-    proposal: AbstractGuidedProposal,
-    dynamics: Dynamics,
+    inputs: _Inputs, keys: Key[Array, "I n"], stored: Int[Array, " K"] | None, num_steps: int
+) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"]]:
+    """One path for each key, and its log weight."""
+    return _simulate(inputs, keys, stored, num_steps, None)
+
+
+@_draw.def_jvp
+def _draw_tangents(primals, tangents):
+    """Paths that left the finite numbers have no derivatives. They are run without noise here, for
+    in reverse mode a masked 0 · ∞ would be NaN."""
+    inputs, keys, stored, num_steps = primals
+    drawn = _draw(inputs, keys, stored, num_steps)
+    found = jnp.isfinite(drawn[1])
+
+    def again(inputs):
+        paths, log_weights = _simulate(inputs, keys, stored, num_steps, found)
+        return jnp.where(found[..., None, None], paths, 0), jnp.where(found, log_weights, 0)
+
+    return drawn, eqx.filter_jvp(again, (inputs,), (tangents[0],))[1]
+
+
+def _simulate(
+    inputs: _Inputs,
     keys: Key[Array, "I n"],
-    intervals: Intervals,
-    num_steps: int,
     stored: Int[Array, " K"] | None,
-) -> WeightedPaths:
-    """One path for each key."""
+    num_steps: int,
+    noisy: Bool[Array, "I n"] | None,
+) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"]]:
+    """Paths and log weights; without noise where `noisy` is given and false."""
+    proposal, model, intervals = inputs
+    dynamics = model.forward(intervals.start[0])
     d, dtype = intervals.start.shape[1], intervals.start.dtype
     shape = (d, *keys.shape)
     lanes = _Lanes(proposal, dynamics, intervals, num_steps)
     start = jnp.broadcast_to(intervals.start.T[..., None], shape)
     end = jnp.broadcast_to(intervals.end.T[..., None], shape)
-    state, path = lanes.begin(start), start[:0]
+    state, path = lanes.begin(start), start[None][:0]
     store = slots = None
     if stored is not None:
         # Row K is for waste; rows of the first and the last step are filled by hand.
@@ -543,7 +586,9 @@ def _draw(
 
         def step(state, inputs):
             xi, steps = inputs
-            state = lanes.advance(state, xi.reshape(shape), steps)
+            xi = xi.reshape(shape)
+            xi = xi if noisy is None else jnp.where(noisy, xi, 0)
+            state = lanes.advance(state, xi, steps)
             return state, state.x
 
         state, path = noisy_scan(
@@ -562,7 +607,7 @@ def _draw(
         path = jnp.concatenate([start[None], path, end[None]])
     else:
         path = path.at[slots[-1]].set(end)[:-1]
-    return _weighted(jnp.moveaxis(path, (2, 3), (0, 1)), log_weights)
+    return jnp.moveaxis(path, (2, 3), (0, 1)), log_weights
 
 
 def deterministic_path(
@@ -605,6 +650,6 @@ def _check_refinement(refinement: float) -> float:
         raise TypeError(
             f"`refinement` must be a Python number, known when compiling; got {refinement!r}."
         )
-    if not 1 <= refinement <= 8:
-        raise ValueError(f"`refinement` must be between 1 (equal steps) and 8; got {refinement}.")
+    if not 1 <= refinement <= 4:
+        raise ValueError(f"`refinement` must be between 1 (equal steps) and 4; got {refinement}.")
     return float(refinement)

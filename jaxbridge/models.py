@@ -98,6 +98,7 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
         params=alpha,
         sample_stationary=_HyperbolicSampler(dim),
         reversible=True,
+        normalised=True,
         prepare=_PrepareHyperbolic(dim),
     )
 

@@ -75,6 +75,8 @@ def renewal(
     """
     check_diffusion(model)
     intervals = one_interval(start, end, duration)
+    if isinstance(proposal, AbstractWeightedProposal):
+        as_pairs(proposal)
     pairs = as_pairs(as_proposal(proposal, model, intervals.start[0], 1, max_proposals))
     num_steps = check_count("num_steps", num_steps)
     pairs.check(model, intervals)

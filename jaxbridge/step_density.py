@@ -7,10 +7,12 @@ over Brownian bridges from x to x' of
 
     exp[∫ β · ∘dw - ½ ∫ (|β|² + div β) dt].
 
-The trapezoid rule for both integrals leaves an error that adds up to O(δ²) where β is a
-gradient. Otherwise ∫ β · ∘dw has a part that the end points do not determine: by Lévy's area
-formula, with Ω the antisymmetric part of ∇β, its exponential has a mean of
-exp[δ²|Ω|²/12 + δ|ΩΔw|²/6] to leading order. This is a density up to terms of higher order only.
+The trapezoid rule for ∫ β · ∘dw is too large by β''[Δw, Δw, Δw]/12, in the mean over steps by
+δ/4 times the increment of div β, which with the trapezoid rule for the other integral leaves
+½ div β(x') δ. Further, ∫ β · ∘dw has a part that the end points do not determine unless β is a
+gradient: by Lévy's area formula, with Ω the antisymmetric part of ∇β, its exponential has a mean
+of exp[δ²|Ω|²/12 + δ|ΩΔw|²/6] to leading order. What is left adds up to O(δ²). This is a density
+up to terms of higher order only.
 """
 
 from abc import abstractmethod
@@ -98,7 +100,7 @@ class TrapezoidDensity(AbstractStepDensity):
         change = seen_next.beta - seen.beta
         dw = dynamics.sigma(x).solve(x_next - x)
         noise = dw - dt * (seen.beta + seen_next.beta) / 2
-        ratio = dot(change, noise) / 2 - dt * (seen.divergence + seen_next.divergence) / 4
+        ratio = dot(change, noise) / 2 - dt * seen_next.divergence / 2
         if seen.curl is not None:
             turned, square = matvec(seen.curl, dw), total((seen.curl**2).ravel())
             ratio += dt**2 * square / 12 + dt * dot(turned, turned) / 6

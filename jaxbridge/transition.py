@@ -11,6 +11,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int, Key
 
@@ -21,6 +22,7 @@ from .coupled_pairs import CoupledPairs
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count
 from .kernels import sum_by_interval
+from .start_laws import Reversed, Stationary
 from .weighted import AbstractWeightedProposal
 
 
@@ -73,12 +75,16 @@ def transition_log_density(
     - `proposal`: a `Coupling`, with its start law; by default `Coupling(gamma=0.0)`. With
         `Stationary()` the model's `log_stationary` must be normalised (those of
         `ornstein_uhlenbeck` and `hyperbolic` are); with a start law that has a density it
-        need not be, for its constant cancels.
+        need not be, for its constant cancels. Or `ModifiedDiffusionBridge()`,
+        `ResidualBridge()` or `Guided()`, which need no stationary law; or "auto", which tries
+        couplings only if the model is declared `normalised`; or what `choose_proposal` returns.
     - `num_counts`: N hitting counts for each proposal, by default one.
     - `max_trials`: bounds the trials of each proposal; by default 10,000 for each count.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
-    **Returns:** `TransitionLogDensity`. Not differentiable.
+    **Returns:** `TransitionLogDensity`. With proposals that are pulled to the end point `value` is
+    differentiable, forward and reverse: an estimate of the score. With couplings, and with a
+    choice between several proposals, a derivative raises `TypeError`.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
@@ -97,7 +103,8 @@ def transition_log_density(
     num_proposals = check_count("num_proposals", num_proposals)
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, _ = as_intervals(start, end, duration)
-    proposal = as_proposal(proposal, model, intervals.start[0], num_counts, None, max_trials)
+    like = intervals.start[0]
+    proposal = as_proposal(proposal, model, like, num_counts, None, max_trials, for_density=True)
     proposal.check(model, intervals)
     pairs = [single for single in singles(proposal) if isinstance(single, CoupledPairs)]
     if pairs and not model.has_density:
@@ -105,6 +112,13 @@ def transition_log_density(
             "with couplings the transition density needs the stationary one: give `Diffusion` a "
             "`log_stationary`, normalised if the start law is `Stationary()`; or choose a "
             "proposal that does not need it, such as `ModifiedDiffusionBridge()` or `Guided()`."
+        )
+    stationary = [isinstance(pair.coupling.start_law, Stationary | Reversed) for pair in pairs]
+    if any(stationary) and len(singles(proposal)) > 1 and not model.normalised:
+        raise ValueError(
+            "this choice uses a coupling from the stationary law beside other proposals, and their "
+            "densities agree only if `log_stationary` is normalised: declare that by "
+            "`Diffusion(..., normalised=True)`, or choose between other proposals."
         )
     proposal = settled(proposal, key, model, intervals, num_steps)
     size = (num_proposals, num_steps, batched, progress_meter)
@@ -130,9 +144,11 @@ def _estimate(
     drawn = proposal.draw(
         keys, model, intervals, num_steps, nothing, True, progress_meter=progress_meter
     )
-    log_weights = drawn.log_weights
-    log_sum = logsumexp(log_weights, axis=1)
-    log_squares = logsumexp(2 * log_weights, axis=1)
+    # Relative to the largest, so that sums of squares keep their digits.
+    largest = lax.stop_gradient(jnp.max(drawn.log_weights, axis=1, keepdims=True))
+    largest = jnp.where(largest > -jnp.inf, largest, 0)
+    log_sum = logsumexp(drawn.log_weights - largest, axis=1)
+    log_squares = logsumexp(2 * (drawn.log_weights - largest), axis=1)
     some = log_sum > -jnp.inf
     inverse_size = jnp.where(some, jnp.exp(log_squares - 2 * log_sum), jnp.inf)
     # The variance of the mean, in squares of the mean: (Σw²/(Σw)² - 1/n) n/(n-1).
@@ -147,7 +163,7 @@ def _estimate(
         return sum_by_interval(leaf, num_intervals, batched)
 
     return TransitionLogDensity(
-        of_interval(log_sum - math.log(num_proposals)),
+        of_interval(log_sum + largest[:, 0] - math.log(num_proposals)),
         of_interval(jnp.where(some, error, jnp.inf)),
         of_interval(jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0)),
         total(drawn.found),

@@ -8,7 +8,6 @@ the starts X*_T of the reversed paths that met, which hits an unlikely bridge fa
 all starts, met or not, is worse where few pairs meet.)
 """
 
-import contextlib
 import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -25,10 +24,10 @@ from .burn_in import measure_burn_in
 from .choice import (
     Choice,
     default_candidates,
-    guided_candidates,
     run_pilots,
     undecided_between,
 )
+from .coupled_pairs import CoupledPairs
 from .coupling import Coupling
 from .diffusion import Diffusion, check_diffusion
 from .gaussian import GaussianLaw
@@ -43,6 +42,8 @@ _SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 _TOLERANCE = 1.1
 # Bridges of a pilot run that looks for the coupling to compare with other proposals.
 _TUNING_PILOT = 500
+# What a fitted start law may gain.
+_GAIN_OF_TUNING = 10.0
 # Pilot counts that take longer are cut off: the law is not a candidate then.
 _PILOT_TRIALS = 1_000
 
@@ -168,19 +169,19 @@ def choose_proposal(
 ) -> Choice:
     """The proposal with most effective samples per second for each interval, by a pilot run.
 
-    What `proposal="auto"` does in each call, done once: pass what it returns as `proposal=` for
-    the same intervals. Seconds are measured where they could change the choice, compile time
-    left out, so this is made outside `jit`; inside `jit` "auto" goes by a rule. Where two are
-    about as fast, either may be chosen.
+    What `proposal="auto"` does in each call by a rule for the seconds, done once and by the
+    clock, compile time left out: for models whose functions take long, and to choose once and
+    use it often. Pass what it returns as `proposal=` for the same intervals. A choice made
+    outside `jit`; where two proposals are about as fast, either may be chosen.
 
     **Arguments:**
 
     - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`.
     - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge`,
-        `Guided("end")` and `Guided("path")`, with `TrapezoidDensity()` where the model is given
-        with a constant σ, and so with the same order of step error as couplings; and where the
-        time reversal of the model is known `Coupling(0.0)` and `Coupling(0.5)`, or for a single
-        interval in their place the coupling that `tune_coupling` finds, tried if it could win.
+        `Guided("end")` and `Guided("path")`, with `TrapezoidDensity()` for constant σ, and so
+        with the same order of step error as couplings; where the time reversal of the model is
+        known `Coupling(0.0)` and `Coupling(0.5)`; and for a single interval for which one of them
+        comes near the best, one with its start law tuned.
     - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
         all intervals, at least 32 and at most 512.
 
@@ -199,7 +200,8 @@ def choose_proposal(
     """
     check_key(key)
     check_diffusion(model)
-    if is_traced(key, model, start, end, duration):
+    intervals, batched, _ = as_intervals(start, end, duration)
+    if is_traced(key, model, intervals):
         raise TypeError(
             "a choice by the clock cannot be made inside `jit` or `vmap`: make it before, or use "
             '`proposal="auto"`.'
@@ -207,33 +209,47 @@ def choose_proposal(
     num_steps = check_count("num_steps", num_steps)
     if num_pilot is not None:
         num_pilot = check_count("num_pilot", num_pilot, 2)
-    intervals, batched, _ = as_intervals(start, end, duration)
     like = intervals.start[0]
-    tuned = candidates is None and not batched and model.has_reversal
-    if candidates is None:
-        candidates = (guided_candidates if tuned else default_candidates)(model, like)
+    given = default_candidates(model, like) if candidates is None else list(candidates)
 
     def choose_between(candidates):
         undecided = undecided_between(candidates, model, like, num_pilot)
         undecided.check(model, intervals)
         return run_pilots(key, model, undecided, intervals, num_steps, timed=True)
 
-    choice = choose_between(candidates)
-    if tuned and choice.coupling_could_win:
-        with contextlib.suppress(ValueError):  # no pair met, or no bridge was hit
-            couplings = [Coupling(0.0), Coupling(0.5)]
-            tuning = tune_coupling(
-                key,
-                model,
-                start,
-                end,
-                duration,
-                num_steps=num_steps,
-                couplings=couplings,
-                num_pilot=_TUNING_PILOT,
-            )
-            choice = choose_between([*candidates, tuning.coupling])
+    choice = choose_between(given)
+    if candidates is None and not batched and _worth_tuning(choice):
+        tuned = _tuned_coupling(key, model, start, end, duration, num_steps, intervals)
+        choice = choice if tuned is None else choose_between([*given, tuned])
     return choice
+
+
+def _worth_tuning(choice: Choice) -> bool:
+    """Whether a coupling comes near the best proposal, so that a start law might put it first."""
+    assert choice.efficiency is not None and choice.seconds is not None
+    rates = np.asarray(choice.efficiency / choice.seconds)[:, 0]
+    coupled = [isinstance(candidate, CoupledPairs) for candidate in choice.candidates]
+    rates = np.where(np.isnan(rates), 0, rates)
+    return bool(np.max(rates, where=coupled, initial=0) * _GAIN_OF_TUNING > rates.max())
+
+
+def _tuned_coupling(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    num_steps: int,
+    intervals: Intervals,
+) -> Coupling | None:
+    """The best of a few couplings, `None` where no pilot run succeeded."""
+    num_pilot = max(_TUNING_PILOT, 20 * intervals.start.shape[1])
+    pilots = []
+    for coupling in (Coupling(0.0), Coupling(0.5)):
+        pilots += _pilots(key, model, start, end, duration, num_steps, coupling, num_pilot)
+    if all(np.isnan(pilot.efficiency) for pilot in pilots):
+        return None
+    return _best(pilots).coupling
 
 
 def _pilots(

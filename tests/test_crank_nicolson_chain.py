@@ -49,6 +49,24 @@ def test_chain_has_the_law_that_weights_give(proposal, step_size):
         assert abs(mean - exact) < 5 * np.hypot(error, exact_error)
 
 
+def test_chain_has_the_law_of_the_closed_form():
+    """An Ornstein–Uhlenbeck bridge from Brownian bridges whose weights vary."""
+    model, ends = paper_model(), ([0.785, 0.785], [1.091, 1.091])
+    chain = jb.sample_exact_bridges(
+        jax.random.key(0), model, *ends, 1.0, num_bridges=20_000, num_steps=40, step_size=0.6,
+        proposal=jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()), method="crank_nicolson",
+        save_at=[0.5],
+    )  # fmt: skip
+    law = jb.gaussian_bridge(model, *ends, 1.0, [0.5])
+    sd = np.sqrt(np.diag(law.covariance[0]))
+    deviations = (np.asarray(chain.paths[500:, 0]) - np.asarray(law.mean[0])) / sd
+    for moment, exact in [(deviations, 0.0), (deviations**2, 1.0)]:
+        for values in moment.T:
+            mean, error = batch_means(values)
+            assert error < 0.1
+            assert abs(mean - exact) < 5 * error + 0.01  # the allowance is for the step
+
+
 def test_chain_is_that_of_the_kernel_and_runs_in_blackjax():
     arguments, options = (paper_model(), [0.3, 0.1], [-0.2, 0.4], 1.0), dict(num_steps=8)
     run_key, init_key = jax.random.split(jax.random.key(0))
@@ -104,7 +122,7 @@ def test_several_intervals_have_chains_of_their_own():
 
 def test_progress_is_shown(capfd):
     jb.sample_exact_bridges(
-        jax.random.key(0), *HARD, num_bridges=20, num_steps=5, proposal=jb.Guided(),
+        jax.random.key(0), *HARD, num_bridges=20, num_steps=5,
         method="crank_nicolson", progress_meter=diffrax.TextProgressMeter(),
     )  # fmt: skip
     jax.effects_barrier()

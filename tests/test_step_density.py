@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from helpers import FULL_SIGMA, NON_REVERSIBLE, loglog_slope, paper_model
 
 import jaxbridge as jb
@@ -30,8 +31,8 @@ def test_trapezoid_density_is_of_second_order(reversible, x64):
         )
         errors.append(float(estimate.value) - exact)
         assert estimate.standard_error < 0.002
-    print(errors)
-    assert abs(errors[1]) > 4 * float(estimate.standard_error)
+        if num_steps < 16:
+            assert abs(errors[-1]) > 4 * float(estimate.standard_error)
     assert abs(loglog_slope(1 / sizes, np.abs(errors)) - 2) < 0.3
 
 
@@ -47,6 +48,44 @@ def test_curl_is_called_for():
     # Without it log p̂ lacks δ T |Ω|²/12 and, with E ΔwΔwᵀ = δ I, δ T |Ω|²/6; here |Ω|² = 18.
     lacking = 18 / 40 / 12 + 18 / 40 / 6
     assert abs(float(estimate.value) - exact) < 5 * float(estimate.standard_error) + lacking / 10
+
+
+def test_nonlinear_drift_by_quadrature(x64):
+    """A double well in one dimension: the chain of trapezoid densities against e^{-TH}, H being
+    the Schrödinger operator of the process, without any Monte Carlo."""
+    model = jb.Diffusion(lambda x, p: 1.2 * (x - x**3))
+    grid = np.linspace(-3.5, 3.5, 1401)
+    width, start, end, duration = grid[1] - grid[0], 640, 900, 1.0
+
+    def beta(x):
+        return 1.2 * (x - x**3)
+
+    potential = (beta(grid) ** 2 + 1.2 * (1 - 3 * grid**2)) / 2
+    diagonal, off = potential + 1 / width**2, np.full(len(grid) - 1, -0.5 / width**2)
+    energies, states = scipy.linalg.eigh_tridiagonal(diagonal, off)
+    A = 1.2 * (grid**2 / 2 - grid**4 / 4)
+    kernel = (states[start] * np.exp(-duration * energies)) @ states[end] / width
+    exact = np.log(kernel) + A[end] - A[start]
+
+    density, dynamics = jb.TrapezoidDensity(), model.forward(jnp.zeros(1))
+    sizes, errors = np.array([10, 20, 40]), []
+    for num_steps in sizes:
+        dt = jnp.asarray(duration / num_steps)
+
+        def log_step(x, y, dt=dt):
+            seen, seen_next = density.look(dynamics, x), density.look(dynamics, y)
+            euler = jb.GaussianLaw(x + dynamics.drift(x) * dt, jnp.eye(1) * dt).log_density(y)
+            return euler + density.log_ratio(dynamics, x, y, seen, seen_next, dt)
+
+        points = jnp.asarray(grid)[:, None]
+        step = jax.jit(jax.vmap(jax.vmap(log_step, (None, 0)), (0, None)))(points, points)
+        step = np.exp(np.asarray(step))
+        forward = step[start]
+        for _ in range(num_steps - 1):
+            forward = forward @ step * width
+        errors.append(np.log(forward[end]) - exact)
+    assert abs(loglog_slope(1 / sizes, np.abs(errors)) - 2) < 0.25
+    assert abs(errors[-1]) < 0.01
 
 
 def test_linear_step_in_one_dimension_against_the_exact_density(x64):
