@@ -372,6 +372,16 @@ def test_no_stationary_law_is_called_for_and_a_coupling_says_so():
         jb.sample_exact_bridges(jax.random.key(0), *arguments, proposal=jb.Coupling())
 
 
+@pytest.mark.parametrize("ends", [([0.0, 0.0], [1.0, 1.0]), ([0.5, -0.3], [-0.4, 0.8])])
+def test_brownian_bridges_are_nearly_exact_for_the_hyperbolic_diffusion(ends):
+    """On unit intervals, as in the paper's section 4."""
+    weighted = jb.sample_weighted_bridges(
+        jax.random.key(0), jb.hyperbolic(0.8, 2), *ends, 1.0, num_bridges=20_000,
+        proposal=jb.ModifiedDiffusionBridge(),
+    )  # fmt: skip
+    assert weighted.effective_sample_size > 0.95 * 20_000
+
+
 def test_results_do_not_depend_on_blocks_and_keep_what_is_stored():
     model, arguments = paper_model(), ([0.3, 0.1], [-0.2, 0.4], 0.5)
     options = dict(num_steps=7, proposal=jb.Guided())
