@@ -30,7 +30,6 @@ PROPOSALS = {
     "refined": jb.Guided(refinement=2.0),
     "refined modified diffusion bridge": jb.ModifiedDiffusionBridge(refinement=1.5),
 }
-TRAPEZOID = jb.TrapezoidDensity()
 # One dimension, nonlinear drift and σ that depends on the state.
 BENT = jb.Diffusion(
     lambda x, p: p * (x - x**3), lambda x, p: 0.5 + 0.4 / (1 + x**2), None, jnp.asarray(0.8)
@@ -154,7 +153,8 @@ def test_density_is_that_of_the_closed_form(name, duration, num_steps):
     assert abs(float(estimate.value - law.log_density(end))) < 5 * error + 0.01
 
 
-@pytest.mark.parametrize("name", ["guided", pytest.param("modified diffusion bridge", marks=slow)])
+@slow
+@pytest.mark.parametrize("name", ["guided", "modified diffusion bridge"])
 def test_full_state_dependent_sigma_has_the_exact_law(name):
     """OU turned by a rotation that depends on the radius: density and mid-point."""
     ou = jb.ornstein_uhlenbeck(NON_REVERSIBLE)
@@ -265,7 +265,7 @@ def test_noise_makes_the_path_and_the_path_gives_the_noise(precision):
     dynamics = model.forward(intervals.start[0])
     xi = jax.random.normal(jax.random.key(0), (2, 9, 2))
     tolerance = 2e-4 if precision == "float32" else 1e-11
-    for proposal in list(PROPOSALS.values())[:4]:
+    for proposal in (jb.ModifiedDiffusionBridge(), jb.Guided("path", refinement=1.5)):
         paths, log_weights = jax.jit(
             lambda xi, proposal=proposal: path_of(proposal, dynamics, intervals, xi)
         )(xi)
@@ -280,7 +280,7 @@ def test_both_families_converge_to_one_law():
     """The error of log p̂ against the closed form: O(δ) for the Euler target."""
     model, ends = paper_model(), (jnp.array([0.785, 0.785]), jnp.array([0.5, 0.2]))
     exact = float(jb.ou_transition(model, ends[0], 1.0).log_density(ends[1]))
-    sizes = np.array([10, 20, 40, 80])
+    sizes = np.array([10, 20, 40])
     errors = [
         float(
             jb.transition_log_density(
@@ -306,7 +306,7 @@ def test_derivatives_of_the_density_are_those_of_the_closed_form():
     """The score by autodiff of the estimate, and of a weighted mean, within 5 standard errors."""
     start, end, duration = jnp.array([0.4, -0.2]), jnp.array([0.1, 0.3]), 0.5
     B = jnp.array([[1.0, 0.4], [-0.3, 0.8]])
-    steps = 200
+    steps = 100
 
     def estimates(B, key):
         model = jb.ornstein_uhlenbeck(NON_REVERSIBLE)
