@@ -172,7 +172,8 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
 
     - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
         `TrapezoidDensity()` is far closer to the diffusion.
-    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
+        which pays where σ varies much on the way.
 
     !!! example
 
@@ -209,7 +210,8 @@ class ResidualBridge(AbstractGuidedProposal):
 
     - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
         `TrapezoidDensity()` is far closer to the diffusion.
-    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
+        which pays where σ varies much on the way.
 
     !!! example
 
@@ -259,7 +261,8 @@ class Guided(AbstractGuidedProposal):
         it ends in b; or a matrix F of shape (d, d), with α(b) and σ(b).
     - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
         `TrapezoidDensity()` is far closer to the diffusion.
-    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
+        which pays where σ varies much on the way.
 
     **Raises:** `ValueError` and `TypeError` for anything else.
 

@@ -199,6 +199,7 @@ def test_precisions_agree_in_law(precision):
 # The search
 
 
+@pytest.mark.slow
 def test_result_does_not_depend_on_the_batch_size():
     sample = lambda **settings: jb.sample_bridges(
         jax.random.key(0),
@@ -256,6 +257,7 @@ def test_many_intervals_share_one_search():
     np.testing.assert_allclose(alone.paths, bridges.paths[0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_saved_times_are_a_subset_of_the_path():
     sample = lambda **settings: jb.sample_bridges(
         jax.random.key(0), paper_model(), [0.5, 0.5], [1.0, 1.0], 2.0, num_bridges=20, **settings

@@ -75,7 +75,7 @@ def test_thousands_of_intervals_with_different_choices_keep_the_law():
     [
         (0.05, HYPERBOLIC, {"ModifiedDiffusionBridge"}),
         (1.0, HYPERBOLIC, {"ModifiedDiffusionBridge"}),
-        (2.0, paper_model(), {'Guided("end")', 'Guided("path")'}),
+        pytest.param(2.0, paper_model(), {'Guided("end")', 'Guided("path")'}, marks=slow),
         pytest.param(4.0, BLIND, {'Guided("end")', 'Guided("path")'}, marks=slow),
         pytest.param(60.0, HYPERBOLIC, {"Coupling(0)", "Coupling(0.5)"}, marks=slow),
     ],

@@ -49,6 +49,7 @@ def test_paper_figures_with_its_own_settings(name, gamma, paper):
     assert abs(published.ratio - paper) < 5 * published.ratio_error + 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.5, 0.9])
 def test_effective_sample_size_of_an_autoregression(correlation):
     n, rng = 40_000, np.random.default_rng(0)

@@ -276,6 +276,7 @@ def test_noise_makes_the_path_and_the_path_gives_the_noise(precision):
         np.testing.assert_allclose(again, log_weights, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_both_families_converge_to_one_law():
     """The error of log p̂ against the closed form: O(δ) for the Euler target."""
     model, ends = paper_model(), (jnp.array([0.785, 0.785]), jnp.array([0.5, 0.2]))

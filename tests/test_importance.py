@@ -158,6 +158,7 @@ def test_a_law_that_does_not_cover_is_flagged_and_finite(mean, covariance):
     assert weighted.truncated.mean() > 0.05 or weighted.effective_sample_size < 50
 
 
+@pytest.mark.slow
 def test_derivatives_are_refused():
     """Forward mode would go through, and give a pathwise derivative that is not one."""
     model = paper_model()

@@ -10,7 +10,8 @@ from helpers import FULL_SIGMA, NON_REVERSIBLE, loglog_slope, paper_model
 import jaxbridge as jb
 
 
-@pytest.mark.parametrize("reversible", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("reversible", [False, True])
 def test_trapezoid_density_is_of_second_order(reversible, x64):
     """log p̂ against the closed form, for a drift that is a gradient and for one with a curl and
     a full σ; each error is far beyond its standard error."""

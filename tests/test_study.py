@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 import scipy.stats
 
 from jaxbridge.gaussian import GaussianLaw
@@ -24,6 +25,7 @@ def test_comparison_finds_the_bias_put_in():
     assert fit.ks_distance[0] > due.ks_critical
 
 
+@pytest.mark.slow
 def test_study_reproduces_the_law_of_the_likely_bridge():
     started = []
     (default, published) = run_study(
