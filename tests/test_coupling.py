@@ -126,6 +126,7 @@ def test_rotation_aligns_the_two_coefficients(x64):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "coupling",
     [
@@ -134,7 +135,6 @@ def test_rotation_aligns_the_two_coefficients(x64):
         jb.Coupling(-0.7),
     ],
     ids=["synchronous then reflection", "random gamma", "negative gamma"],
-@pytest.mark.slow
 )
 def test_other_couplings_make_bridges_too(coupling):
     """On a long interval nearly every pair meets, so any coupling gives the exact law."""
