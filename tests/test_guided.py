@@ -303,6 +303,7 @@ def test_both_families_converge_to_one_law():
     assert abs(float(coupled.value) - extrapolated) < 5 * error + 0.01
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_density_are_those_of_the_closed_form():
     """The score by autodiff of the estimate, and of a weighted mean, within 5 standard errors."""
     start, end, duration = jnp.array([0.4, -0.2]), jnp.array([0.1, 0.3]), 0.5
@@ -338,6 +339,7 @@ def test_derivatives_of_the_density_are_those_of_the_closed_form():
         np.testing.assert_array_less(np.abs(derivative.mean(0) - truth), 5 * error + 0.01)
 
 
+@pytest.mark.slow
 def test_lost_paths_do_not_spoil_derivatives():
     """√x is not a number where Euler steps have left the half line: forward and reverse agree, and
     with the derivative over the paths that were found."""

@@ -40,6 +40,7 @@ def test_fitted_law_is_eight_times_better_on_a_very_unlikely_bridge():
     assert ratio > 8
 
 
+@pytest.mark.slow
 def test_law_stays_close_to_the_stationary_one_where_that_is_best():
     ends = ([0.0, 0.0], [2.0, -2.0])
     law = fitted(ends)
