@@ -71,9 +71,11 @@ from .models import (
 )
 from .pseudo_marginal_chain import pseudo_marginal as pseudo_marginal
 from .renewal_chain import renewal as renewal
+from .scene import effects as effects
 from .schemes import (
     AbstractScheme as AbstractScheme,
     Euler as Euler,
+    GaussianTransition as GaussianTransition,
     Heun as Heun,
     Milstein as Milstein,
 )

@@ -21,6 +21,7 @@ from .linalg import all_finite
 from .meeting import PairStep, frame
 from .noise import noisy_scan
 from .proposals import over_lanes, pair_noise, realise
+from .schemes import fitted_in_lanes
 from .start_laws import draw_starts
 
 
@@ -47,16 +48,19 @@ def run_associated(
     lane's key alone. Simulation ends when all lanes have hit."""
     num_steps, dtype = path.shape[0] - 1, path.dtype
     forward = model.forward(path[0, :, 0])
-    scheme, rule = coupling.scheme, coupling.meeting
+    rule = coupling.meeting
     split_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
     start_keys, path_keys, coupling_keys = split_keys
     coupling, coupling_axes = realise(coupling, coupling_keys, dtype)
-    start = draw_starts(coupling.start_law, model, scheme, start_keys, path[-1], dt, num_steps)
+    start = draw_starts(
+        coupling.start_law, model, coupling.scheme, start_keys, path[-1], dt, num_steps
+    )
+    scheme = fitted_in_lanes(coupling.scheme, forward, path[0, :, 0], dt)
     root_dt = jnp.sqrt(dt)
 
     @over_lanes(-1, -1, -1, -1, -1, -1, coupling_axes)
     def step_associated(y, hit, z, z_next, noise, lane, coupling):
-        dt, root_dt = lane
+        dt, root_dt, scheme = lane
         normal, uniform = noise
         sigma, driven_sigma = forward.sigma(y), forward.sigma(z)
         seen = frame(driven_sigma, y, z)
@@ -70,13 +74,13 @@ def run_associated(
     def step(carry, inputs):
         y, hit = carry
         noise, (z, z_next) = inputs
-        return step_associated(y, hit, z, z_next, noise, (dt, root_dt), coupling), None
+        return step_associated(y, hit, z, z_next, noise, (dt, root_dt, scheme), coupling), None
 
     (y_end, hit), _ = noisy_scan(
         step,
         (start, jnp.zeros(dt.shape, bool)),
         path_keys,
-        pair_noise(coupling, rule.draws_uniform, dtype),
+        pair_noise(coupling, dtype),
         (path[:-1], path[1:]),
         num_steps,
         over=lambda carry: carry[1],

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from .arrays import Numbers, as_floating, is_traced
-from .coupling import AbstractCoupling, Coupling
+from .coupling import AbstractCoupling, Coupling, check_coupling
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count, check_model
 from .proposals import Proposals, propose
@@ -118,8 +118,7 @@ def sample_bridges(
         ```
     """
     coupling = Coupling() if coupling is None else coupling
-    if not isinstance(coupling, AbstractCoupling):
-        raise TypeError(f"`coupling` must be a `Coupling`; got {coupling!r}.")
+    check_coupling(coupling)
     check_key(key)
     check_diffusion(model)
     num_bridges = check_count("num_bridges", num_bridges)

@@ -26,6 +26,7 @@ from .diffusion import Diffusion, check_diffusion
 from .intervals import as_intervals, check_count, check_model
 from .meeting import PairStep, frame
 from .noise import noisy_scan
+from .schemes import fitted_in_lanes
 from .search import key_for
 from .start_laws import MOST_STEPS, Stationary, needs_burn_in, run_for
 
@@ -113,10 +114,11 @@ def _measure(
 ) -> Float[Array, ""]:
     """2s for the first s = 1, 2, 4, ... times `num_steps` steps within which all pairs meet."""
     dynamics, scheme = model.backward(end[:, 0]), coupling.scheme
+    fitted = fitted_in_lanes(scheme, dynamics, end[:, 0], dt)
     reflection = Coupling(-1.0, scheme=scheme, rotation=coupling.rotation)
     rule, root_dt = reflection.meeting, jnp.sqrt(dt)
 
-    def step_pair(x, driven, met, dw, uniform, dt, root_dt):
+    def step_pair(x, driven, met, dw, uniform, dt, root_dt, scheme):
         sigma, driven_sigma = dynamics.sigma(x), dynamics.sigma(driven)
         seen = frame(driven_sigma, x, driven)
         dw = root_dt * dw
@@ -132,7 +134,7 @@ def _measure(
         x, driven, met = pairs
         (dw, uniform), _ = inputs
         return jax.vmap(step_pair, in_axes=-1, out_axes=-1)(
-            x, driven, met, dw, uniform, dt, root_dt
+            x, driven, met, dw, uniform, dt, root_dt, fitted
         ), None
 
     def draw(key, k):

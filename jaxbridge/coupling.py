@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from . import decisions
 from .arrays import as_floating, is_traced
 from .linalg import dot, matmul, matvec, polar_factor
 from .meeting import (
@@ -229,10 +230,24 @@ def rotation_between(
     coupling: AbstractCoupling, sigma: AbstractSigma, driven_sigma: AbstractSigma
 ) -> Float[Array, "d d"] | None:
     """O(x, x'), or `None` where σ calls for no rotation."""
-    if not (isinstance(sigma, Full) and isinstance(driven_sigma, Full)):
+    if not rotation_effect(coupling, type(sigma), type(driven_sigma)).simulated:
         return None
+    assert isinstance(sigma, Full) and isinstance(driven_sigma, Full)
     rotation = polar_rotation if coupling.rotation is None else coupling.rotation
     return rotation(sigma.matrix, driven_sigma.matrix)
+
+
+def rotation_effect(
+    coupling: AbstractCoupling, sigma: type[AbstractSigma], driven_sigma: type[AbstractSigma]
+) -> decisions.Effect:
+    """Whether the pair calls for a rotation."""
+    return decisions.rotation(sigma, driven_sigma, coupling.rotation is no_rotation)
+
+
+def check_coupling(coupling) -> None:
+    """Raise `TypeError` for anything but a coupling."""
+    if not isinstance(coupling, AbstractCoupling):
+        raise TypeError(f"`coupling` must be a `Coupling`; got {coupling!r}.")
 
 
 def rotate(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Float[Array, " d"]:

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Key, PyTree
 
+from . import decisions
 from .arrays import Numbers, as_floating, is_traced
 from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
 
@@ -173,9 +174,9 @@ class Diffusion(eqx.Module):
         """
         points = as_floating("points", points)
         forward, log_nu = self.forward(points[0]), self._log_stationary_function()
-        return jax.vmap(lambda x: forward.drift(x) - _stationary_flux(forward, log_nu, x) / 2)(
-            points
-        )
+        divergence = forward.sigma_varies
+        flux = functools.partial(_stationary_flux, forward, log_nu, divergence=divergence)
+        return jax.vmap(lambda x: forward.drift(x) - flux(x) / 2)(points)
 
     def with_params(self, params: PyTree) -> "Diffusion":
         """The same functions with other parameters."""
@@ -213,6 +214,11 @@ class Diffusion(eqx.Module):
                 "`ModifiedDiffusionBridge()` or `Guided()`."
             )
 
+    @property
+    def reverse_drift_effect(self) -> decisions.Effect:
+        """Whether α* comes by automatic differentiation."""
+        return decisions.reverse_drift(self.reversible, self._reverse_drift is not None)
+
     def forward(self, like: Float[Array, " d"]) -> Dynamics:
         """The coefficients α and σ at points like this one (only its shape and dtype count),
         with everything done that does not depend on the point."""
@@ -227,7 +233,7 @@ class Diffusion(eqx.Module):
             def sigma(x):
                 return _as_sigma(diffusion(x, params), x, constant=False)
 
-            if _uses_argument(lambda x: diffusion(x, params), like):
+            if uses_argument(lambda x: diffusion(x, params), like):
                 return Dynamics(drift, sigma, sigma_varies=True)
             constant_sigma = _as_sigma(diffusion(jnp.zeros_like(like), params), like)
         else:
@@ -240,17 +246,19 @@ class Diffusion(eqx.Module):
         forward = self.forward(like)
         if self.reversible:
             return forward
-        if self._reverse_drift is not None:
-            params, reverse_drift = self._prepared_params(), self._reverse_drift
+        derived = self.reverse_drift_effect
+        params, reverse_drift = self._prepared_params(), self._reverse_drift
+        if reverse_drift is not None and not derived.simulated:
 
             def drift(x):
                 return check_value("reverse_drift", reverse_drift(x, params), x.shape, x)
 
         else:
             log_nu = self._log_stationary_function()
+            divergence = decisions.divergence(derived, forward.sigma_varies).simulated
 
             def drift(x):
-                return -forward.drift(x) + _stationary_flux(forward, log_nu, x)
+                return -forward.drift(x) + _stationary_flux(forward, log_nu, x, divergence)
 
         return forward._replace(drift=drift)
 
@@ -295,15 +303,15 @@ def weighted_divergence(
 
 
 def _stationary_flux(
-    dynamics: Dynamics, log_nu: Callable, x: Float[Array, " d"]
+    dynamics: Dynamics, log_nu: Callable, x: Float[Array, " d"], divergence: bool
 ) -> Float[Array, " d"]:
-    """V ∇log ν + div V = α + α*."""
+    """V ∇log ν + div V = α + α*, div V only where it is called for."""
 
     def product(y, v):
         sigma = dynamics.sigma(y)
         return sigma.mv(sigma.mv_transpose(v))
 
-    return weighted_divergence(product, log_nu, x, dynamics.sigma_varies)
+    return weighted_divergence(product, log_nu, x, divergence)
 
 
 def _as_sigma(
@@ -324,7 +332,7 @@ def _as_sigma(
     return Constant(values) if constant else Full(values)
 
 
-def _uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:
+def uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:
     """Whether the values of `function` depend on its argument, by following its jaxpr."""
     jaxpr = jax.make_jaxpr(function)(like).jaxpr
     reached = set(jaxpr.invars)

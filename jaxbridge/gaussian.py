@@ -19,7 +19,6 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.scipy.linalg
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key
@@ -28,6 +27,7 @@ from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Diffusion, check_invertible
 from .intervals import as_intervals
 from .linalg import cholesky, dot, inverse, matvec
+from .linear import linear_transition
 
 
 class GaussianLaw(eqx.Module):
@@ -320,29 +320,8 @@ def _decay_and_covariance(
     params: OrnsteinUhlenbeckParams, t: Float[Array, ""]
 ) -> tuple[Float[Array, "d d"], Float[Array, "d d"]]:
     """e^{-tB} and Γ_t."""
-    B, V = params.B, _noise_covariance(params)
-    d = B.shape[0]
-    # By Van Loan's block exponential (1978) over a time s = t / 2^k short enough for it, and
-    # then k times e^{-2sB} = (e^{-sB})², Γ_2s = Γ_s + e^{-sB} Γ_s e^{-sBᵀ}: sums of positive
-    # terms, so no digits are lost for short times and nothing overflows for long ones.
-    rate = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(B), axis=1)))
-    doublings = jnp.ceil(jnp.log2(jnp.maximum(lax.stop_gradient(t) * rate, 1)))
-    s = t / 2**doublings
-    block = jax.scipy.linalg.expm(jnp.block([[-B, V], [jnp.zeros_like(B), B.T]]) * s)
-    decay = block[:d, :d]
-    covariance = block[:d, d:] @ decay.T
-
-    def double(i, moments):
-        decay, covariance = moments
-        doubled = decay @ decay, covariance + decay @ covariance @ decay.T
-        return jax.tree.map(lambda new, old: jnp.where(i < doublings, new, old), doubled, moments)
-
-    decay, covariance = lax.fori_loop(0, _MAX_DOUBLINGS, double, (decay, covariance))
-    return decay, (covariance + covariance.T) / 2
-
-
-# Enough for durations of 2^64 times the shortest relaxation time.
-_MAX_DOUBLINGS = 64
+    moments = linear_transition(-params.B, _noise_covariance(params), t)
+    return moments.decay, moments.covariance
 
 
 def _one_interval(

@@ -13,6 +13,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Int, Key, PyTree, Shaped
 
+from . import decisions
+
 # Drawing for many steps at once spreads the cost of deriving keys; drawing for all of them
 # would double the memory of a long path.
 _LONGEST_STRETCH = 64
@@ -23,6 +25,12 @@ class Store(NamedTuple):
 
     slots: Int[Array, " N"]
     rows: Shaped[Array, "rows ..."]
+
+
+def stretches(num_steps: int) -> tuple[int, int]:
+    """How many stretches of noise there are, and how many steps each is for."""
+    num_stretches = -(-num_steps // _LONGEST_STRETCH)
+    return num_stretches, -(-num_steps // num_stretches)
 
 
 def noisy_scan(
@@ -45,8 +53,7 @@ def noisy_scan(
     for are kept, and returned in place of all `y`. With `over`, nothing but the carry is
     returned, and it is final once every lane is over: no further stretch is simulated.
     """
-    num_stretches = -(-num_steps // _LONGEST_STRETCH)
-    length = -(-num_steps // num_stretches)
+    num_stretches, length = stretches(num_steps)
     num_idle = num_stretches * length - num_steps  # steps that fill up the last stretch
     slots, rows = (None, None) if store is None else store
 
@@ -86,7 +93,7 @@ def noisy_scan(
     # Idle steps repeat an input, for what they made of zeros could spoil derivatives.
     xs = jax.tree.map(lambda leaf: split(leaf, mode="edge"), xs)
     inputs = (jnp.arange(num_stretches), active, slots, xs)
-    if over is not None:
+    if over is not None and decisions.early_stop(num_stretches).simulated:
 
         def next_stretch(state):
             index, carry = state

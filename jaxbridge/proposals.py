@@ -16,12 +16,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from . import decisions
 from .arrays import cast_floats
 from .coupling import AbstractCoupling, rotate, rotation_between
 from .diffusion import Diffusion
 from .linalg import all_finite
 from .meeting import PairStep, frame
 from .noise import Store, noisy_scan
+from .schemes import fitted_in_lanes
 
 
 class Proposals(NamedTuple):
@@ -55,21 +57,22 @@ def propose(
     With `meeting_step` the pair is joined there, not where the coupling's rule says: a replay.
     """
     forward, backward = model.forward(start[:, 0]), model.backward(start[:, 0])
-    scheme, rule = coupling.scheme, coupling.meeting
+    rule, replayed = coupling.meeting, meeting_step is not None
+    forward_scheme = fitted_in_lanes(coupling.scheme, forward, start[:, 0], dt)
+    backward_scheme = fitted_in_lanes(coupling.scheme, backward, start[:, 0], dt)
     (d, _), dtype = start.shape, start.dtype
-    draws_uniform = rule.draws_uniform and meeting_step is None
     split_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
     reverse_keys, driven_keys, coupling_keys = split_keys
     coupling, coupling_axes = realise(coupling, coupling_keys, dtype)
     root_dt = jnp.sqrt(dt)
 
     # The reversed path: X_N = b, ..., X_0, kept in forward order as X_1, ..., X_N.
-    @over_lanes(-1, -1, -1, -1)
-    def step_back(x, dw, dt, root_dt):
+    @over_lanes(-1, -1, -1, -1, -1)
+    def step_back(x, dw, dt, root_dt, scheme):
         return scheme.step(backward, x, dt, root_dt * dw)
 
     x_start, x_path = noisy_scan(
-        lambda x, inputs: (step_back(x, inputs[0], dt, root_dt), x),
+        lambda x, inputs: (step_back(x, inputs[0], dt, root_dt, backward_scheme), x),
         end,
         reverse_keys,
         lambda key, k: jax.random.normal(key, (k, d), dtype),
@@ -81,7 +84,7 @@ def propose(
     # The joined path Z: X' until the pair meets, X from then on.
     @over_lanes(-1, -1, -1, -1, -1, -1, None, coupling_axes)
     def step_joined(x, z, rho, x_next, noise, lane, i, coupling):
-        dt, root_dt, fixed_rho = lane
+        dt, root_dt, fixed_rho, scheme = lane
         normal, uniform = noise
         sigma, driven_sigma = forward.sigma(x), forward.sigma(z)
         seen = frame(driven_sigma, x, z)
@@ -100,7 +103,7 @@ def propose(
     def step(carry, inputs):
         x, z, rho = carry
         noise, (i, x_next) = inputs
-        lane = (dt, root_dt, meeting_step)
+        lane = (dt, root_dt, meeting_step, forward_scheme)
         z, rho = step_joined(x, z, rho, x_next, noise, lane, i, coupling)
         return (x_next, z, rho), z
 
@@ -110,7 +113,7 @@ def propose(
         step,
         (x_start, start, rho),
         driven_keys,
-        pair_noise(coupling, draws_uniform, dtype),
+        pair_noise(coupling, dtype, replayed),
         (jnp.arange(num_steps, dtype=jnp.int32), x_path),
         num_steps,
         store=None if stored is None else _store(stored, start, num_steps),
@@ -124,16 +127,18 @@ def propose(
     return Proposals(z_path, x_start, rho, finite)
 
 
-def pair_noise(coupling: AbstractCoupling, draws_uniform: bool, dtype) -> Callable:
+def pair_noise(coupling: AbstractCoupling, dtype, replayed: bool = False) -> Callable:
     """A lane's random numbers of k steps beyond the noise of the path that drives: N(0, 1)
     for dU and U(0, 1) for the meeting rule, each only where it is called for."""
+    own = decisions.independent_noise(coupling.independent_noise)
+    crossing = decisions.crossing_uniforms(coupling.meeting.draws_uniform, replayed)
 
     def draw(key, k):
         normal_key, uniform_key = jax.random.split(key)
         normal = uniform = None
-        if coupling.independent_noise:
+        if own.simulated:
             normal = jax.random.normal(normal_key, (k,), dtype)
-        if draws_uniform:
+        if crossing.simulated:
             uniform = jax.random.uniform(uniform_key, (k,), dtype)
         return normal, uniform
 

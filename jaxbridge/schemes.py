@@ -9,18 +9,34 @@ reversed path would be wrong by O(δ) per step, which adds up to the drift itsel
 """
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .diffusion import Dynamics, ito_correction
+from . import decisions
+from .diffusion import Dynamics, ito_correction, uses_argument
+from .linalg import cholesky, inverse, matmul, matvec, solve
+from .linear import linear_transition
 from .sigma import Diagonal
 
 
 class AbstractScheme(eqx.Module):
-    """A one-step scheme. All methods act on one point of shape (d,); `dt` is a scalar."""
+    """A one-step scheme. All methods act on one point of shape (d,); `dt` is a scalar.
+
+    `stratonovich` says whether it works with Stratonovich's form of the equation.
+    """
+
+    stratonovich: ClassVar[bool]
+
+    @abstractmethod
+    def fitted(
+        self, dynamics: Dynamics, like: Float[Array, " d"], dt: Float[Array, ""]
+    ) -> "AbstractScheme":
+        """The scheme with all that depends on the equation and the step size but not on the
+        point, such as matrix functions, worked out. One without such things returns itself."""
 
     @abstractmethod
     def step(
@@ -49,6 +65,11 @@ class Euler(AbstractScheme):
     Strong order ½ (1 for constant σ), weak order 1.
     """
 
+    stratonovich: ClassVar[bool] = False
+
+    def fitted(self, dynamics, like, dt):
+        return self
+
     def step(self, dynamics, x, dt, dw):
         return x + dynamics.drift(x) * dt + dynamics.sigma(x).mv(dw)
 
@@ -67,6 +88,11 @@ class Milstein(AbstractScheme):
 
     **Raises:** `ValueError` for a σ that is a full, state-dependent matrix.
     """
+
+    stratonovich: ClassVar[bool] = False
+
+    def fitted(self, dynamics, like, dt):
+        return self
 
     def step(self, dynamics, x, dt, dw):
         sigma = dynamics.sigma(x)
@@ -115,6 +141,11 @@ class Heun(AbstractScheme):
     returns the noise up to O(δ^{3/2}), for constant σ up to O(δ^{5/2}).
     """
 
+    stratonovich: ClassVar[bool] = True
+
+    def fitted(self, dynamics, like, dt):
+        return self
+
     def step(self, dynamics, x, dt, dw):
         drift, sigma = self._stratonovich_drift(dynamics, x), dynamics.sigma(x)
         predicted = x + drift * dt + sigma.mv(dw)
@@ -126,7 +157,70 @@ class Heun(AbstractScheme):
         sigma = dynamics.sigma(x).average(dynamics.sigma(x_next))
         return sigma.solve(x_next - x - drift * dt / 2)
 
-    @staticmethod
-    def _stratonovich_drift(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
+    def _stratonovich_drift(self, dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
         drift = dynamics.drift(x)
-        return drift - ito_correction(dynamics, x) if dynamics.sigma_varies else drift
+        corrected = decisions.stratonovich(self.stratonovich, dynamics.sigma_varies).simulated
+        return drift - ito_correction(dynamics, x) if corrected else drift
+
+
+class GaussianTransition(AbstractScheme):
+    """The exact transition of a linear diffusion, α(x) = α(0) + A x with constant σ,
+
+        x + M_δ α(x) + R ΔW,    M_δ = ∫_0^δ e^{sA} ds,   R Rᵀ δ = Γ_δ,
+
+    with the root R = σ L, L lower triangular, that tends to σ as δ → 0. Paths of the diffusion
+    and of its time reversal have no step error at all; whether two of them met between grid
+    points is still decided by the meeting rule.
+
+    **Raises:** `ValueError` for a drift that is not linear, or σ that depends on the state.
+    """
+
+    stratonovich: ClassVar[bool] = False
+
+    def fitted(self, dynamics, like, dt):
+        jacobian = jax.jacfwd(dynamics.drift)
+        if dynamics.sigma_varies or uses_argument(jacobian, like):
+            raise ValueError(
+                "`GaussianTransition` is for linear drift and constant σ; this model has "
+                f"{'a σ that depends on the state' if dynamics.sigma_varies else 'another drift'}. "
+                "Choose `Heun()`."
+            )
+        sigma = dynamics.sigma(like).as_matrix(like.shape[0], like.dtype)
+        moments = linear_transition(jacobian(like), matmul(sigma, sigma.T), dt)
+        whitened = solve(sigma, solve(sigma, moments.covariance / dt).T)
+        root = matmul(sigma, cholesky(whitened))
+        return _FittedTransition(moments.integral, root, inverse(root))
+
+    def step(self, dynamics, x, dt, dw):
+        return self.fitted(dynamics, x, dt).step(dynamics, x, dt, dw)
+
+    def noise(self, dynamics, x, x_next, dt):
+        return self.fitted(dynamics, x, dt).noise(dynamics, x, x_next, dt)
+
+
+class _FittedTransition(AbstractScheme):
+    """The same for one equation and one step size."""
+
+    integral: Float[Array, "d d"]
+    root: Float[Array, "d d"]
+    inverse_root: Float[Array, "d d"]
+    stratonovich: ClassVar[bool] = False
+
+    def fitted(self, dynamics, like, dt):
+        return self
+
+    def step(self, dynamics, x, dt, dw):
+        return x + matvec(self.integral, dynamics.drift(x)) + matvec(self.root, dw)
+
+    def noise(self, dynamics, x, x_next, dt):
+        return matvec(self.inverse_root, x_next - x - matvec(self.integral, dynamics.drift(x)))
+
+
+def fitted_in_lanes(
+    scheme: AbstractScheme,
+    dynamics: Dynamics,
+    like: Float[Array, " d"],
+    dt: Float[Array, " lanes"],
+) -> AbstractScheme:
+    """The scheme of each lane: arrays get a trailing axis."""
+    return jax.vmap(lambda dt: scheme.fitted(dynamics, like, dt), out_axes=-1)(dt)

@@ -28,7 +28,7 @@ from .arrays import Numbers, as_floating, cast_floats, is_traced
 from .diffusion import Diffusion, Dynamics, check_value
 from .gaussian import GaussianLaw
 from .noise import noisy_scan
-from .schemes import AbstractScheme
+from .schemes import AbstractScheme, fitted_in_lanes
 
 # No run that replaces a sampler of ν takes more steps than this.
 MOST_STEPS = 2**18
@@ -182,15 +182,16 @@ def run_for(
 ) -> Float[Array, "d lanes"]:
     """The state after `repeats` times `num_steps` steps, in each lane."""
     root_dt = jnp.sqrt(dt)
+    fitted = fitted_in_lanes(scheme, dynamics, x[:, 0], dt)
     step = jax.vmap(
-        lambda x, dw, dt, root_dt: scheme.step(dynamics, x, dt, root_dt * dw),
+        lambda x, dw, dt, root_dt, scheme: scheme.step(dynamics, x, dt, root_dt * dw),
         in_axes=-1,
         out_axes=-1,
     )
 
     def once(repeat, x):
         end, _ = noisy_scan(
-            lambda x, inputs: (step(x, inputs[0], dt, root_dt), None),
+            lambda x, inputs: (step(x, inputs[0], dt, root_dt, fitted), None),
             x,
             jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, repeat),
             lambda key, k: jax.random.normal(key, (k, x.shape[0]), x.dtype),

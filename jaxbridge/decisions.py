@@ -1,0 +1,130 @@
+"""Which effects a scene calls for: the one table of decisions.
+
+A model and a coupling are a scene. What its compiled program contains is decided here and
+nowhere else, when it is traced: the model asks for the rules of the reversal, the scheme for
+that of its drift, the pair for those of its noise and its rotation. `scene.effects` asks the
+same rules and prints their answers, so what it says is what is simulated.
+"""
+
+from typing import NamedTuple
+
+from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
+
+
+class Effect(NamedTuple):
+    """Whether something is simulated, and why, or why not."""
+
+    simulated: bool
+    why: str
+
+
+class Effects(NamedTuple):
+    """The decisions for one scene.
+
+    - `reverse_drift`: α* by automatic differentiation of log ν, in each step of the reversed path.
+    - `divergence`: div V in α*.
+    - `solves`: elimination with a matrix σ in each step.
+    - `rotation`: O(x, x') in each step of the pair.
+    - `independent_noise`: dU, one normal number a step.
+    - `crossing_uniforms`: one uniform number a step, for the meeting rule.
+    - `stratonovich`: the correction of the drift by which Itô's form exceeds Stratonovich's.
+    - `stored_times`: whole paths kept, rather than the times asked for.
+    - `early_stop`: associated paths looked at on the way, and stopped where all have hit.
+    """
+
+    reverse_drift: Effect
+    divergence: Effect
+    solves: Effect
+    rotation: Effect
+    independent_noise: Effect
+    crossing_uniforms: Effect
+    stratonovich: Effect
+    stored_times: Effect
+    early_stop: Effect
+
+    def __str__(self) -> str:
+        lines = [f"{'effect':<18}  {'':<9}  why"]
+        for name, effect in self._asdict().items():
+            word = "simulated" if effect.simulated else "left out"
+            lines.append(f"{name.replace('_', ' '):<18}  {word:<9}  {effect.why}")
+        return "\n".join(lines)
+
+
+def reverse_drift(reversible: bool, given: bool) -> Effect:
+    """α* by automatic differentiation."""
+    if reversible:
+        return Effect(False, "the model is declared reversible: α* = α")
+    if given:
+        return Effect(False, "the model brings its `reverse_drift`")
+    return Effect(True, "α* = -α + V ∇log ν + div V, from `log_stationary`")
+
+
+def divergence(reverse_drift: Effect, sigma_varies: bool) -> Effect:
+    """div V."""
+    if not reverse_drift.simulated:
+        return Effect(False, "α* needs no derivative")
+    if not sigma_varies:
+        return Effect(False, "σ does not depend on the state: div V = 0")
+    return Effect(True, "σ depends on the state")
+
+
+def solves(sigma: type[AbstractSigma]) -> Effect:
+    """σ⁻¹ v by elimination."""
+    reasons = {
+        Identity: "σ is the identity",
+        Constant: "σ is constant: inverted once, before the steps",
+        Diagonal: "σ is diagonal: a division",
+    }
+    if sigma is Full:
+        return Effect(True, "σ is a full matrix that depends on the state")
+    return Effect(False, reasons[sigma])
+
+
+def rotation(
+    sigma: type[AbstractSigma], driven_sigma: type[AbstractSigma], left_out: bool
+) -> Effect:
+    """O(x, x')."""
+    if not (sigma is Full and driven_sigma is Full):
+        return Effect(False, "σ is not a full matrix that depends on the state: O = I")
+    if left_out:
+        return Effect(False, "the coupling's choice, `no_rotation`")
+    return Effect(True, "so that σ(x')O points where σ(x) does")
+
+
+def independent_noise(has_own: bool) -> Effect:
+    """dU."""
+    if has_own:
+        return Effect(True, "the pair shares only a part of its noise along u")
+    return Effect(False, "the noise of one path is a function of the other's")
+
+
+def crossing_uniforms(draws: bool, replayed: bool = False) -> Effect:
+    """The meeting rule's own randomness."""
+    if replayed:
+        return Effect(False, "the meeting is known already")
+    if draws:
+        return Effect(True, "whether the gap closed inside a step is drawn")
+    return Effect(False, "the meeting rule looks at the grid points only")
+
+
+def stratonovich(asked_for: bool, sigma_varies: bool) -> Effect:
+    """½ Σ_jk ∂_kσ_ij σ_kj."""
+    if not asked_for:
+        return Effect(False, "the scheme works with Itô's form")
+    if not sigma_varies:
+        return Effect(False, "σ does not depend on the state: both forms are one")
+    return Effect(True, "the scheme works with Stratonovich's form")
+
+
+def stored_times(num_stored: int | None) -> Effect:
+    """The joined path at every step."""
+    if num_stored is None:
+        return Effect(True, "the whole path was asked for")
+    return Effect(False, f"only {num_stored} times were asked for")
+
+
+def early_stop(num_stretches: int) -> Effect:
+    """Looking on the way whether all associated paths have hit."""
+    if num_stretches == 1:
+        return Effect(False, "the path is one stretch of noise, drawn at once")
+    return Effect(True, f"after each of {num_stretches} stretches of noise")
