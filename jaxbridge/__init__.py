@@ -102,3 +102,8 @@ from .tuning import (
     tune_coupling as tune_coupling,
 )
 from .weighted import AbstractWeightedProposal as AbstractWeightedProposal
+from .work_precision import (
+    Setting as Setting,
+    WorkPrecision as WorkPrecision,
+    work_precision as work_precision,
+)

@@ -332,6 +332,12 @@ def _as_sigma(
     return Constant(values) if constant else Full(values)
 
 
+def is_linear(dynamics: Dynamics, like: Float[Array, " d"]) -> bool:
+    """Whether the drift is linear, α(0) + A x, and σ constant."""
+    jacobian = jax.jacfwd(dynamics.drift)
+    return not (dynamics.sigma_varies or uses_argument(jacobian, like))
+
+
 def uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:
     """Whether the values of `function` depend on its argument, by following its jaxpr."""
     jaxpr = jax.make_jaxpr(function)(like).jaxpr

@@ -235,6 +235,63 @@ def crossover(rates: Sequence[Any]) -> Figure:
     return figure
 
 
+def work_precision(result: Any, ax: Axes | None = None) -> Axes:
+    """Error against time, a curve for each proposal and method, its points labelled with their
+    numbers of steps: a result of `jaxbridge.work_precision`.
+
+    The error is that which stays however many bridges are made, ± its uncertainty; the time is
+    that of 1,000 effective samples. The dotted line is the Monte Carlo error of so many.
+    """
+    ax = _axes(ax)
+    for i, (curve, group) in enumerate(result.curves()):
+        seconds = np.array([1_000 / s.per_second for s in group])
+        error, uncertainty = (
+            np.array([getattr(s, name) for s in group]) for name in ("error", "uncertainty")
+        )
+        below = np.minimum(uncertainty, 0.9 * error)  # the axis is logarithmic
+        style: dict[str, Any] = {"color": _COLOURS[i % 5], "marker": _MARKERS[i % 4]}
+        style |= {"markersize": 4, "linewidth": 1.1, "capsize": 2, "elinewidth": 0.7}
+        style["linestyle"] = "-" if i < len(_COLOURS) else "--"
+        ax.errorbar(seconds, error, [below, uncertainty], label=curve, **style)
+        for s, x, y in zip(group, seconds, error, strict=True):
+            label = {"fontsize": "x-small", "color": style["color"], "xytext": (4, 3)}
+            ax.annotate(str(s.num_steps), (x, y), textcoords="offset points", **label)
+    if result.target is not None:
+        ax.axhline(result.target, color=_EXACT, linewidth=0.8, linestyle="--", label="target")
+    ax.axhline(1_000**-0.5, color=_EXACT, linewidth=0.8, linestyle=":")
+    ax.set(xscale="log", yscale="log", xlabel="seconds for 1,000 effective samples")
+    ax.set_ylabel("error in standard deviations")
+    return _finish(ax)
+
+
+def accuracy(results: Mapping[str, Any]) -> Figure:
+    """Error against time for the paper's process and for a full σ(x): results of
+    `accuracy_study.run_accuracy`."""
+    chosen = [results[title] for title in ("the paper's process", "a full σ(x)")]
+    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    for ax, result in zip(figure.subplots(1, 2, sharey=True), chosen, strict=True):
+        work_precision(result, ax)
+        ax.legend(frameon=False, fontsize="x-small", loc="lower left")
+        ax.set_ylim(1e-3, 1)
+    figure.axes[1].set_ylabel("")
+    return figure
+
+
+def effect_costs(costs: Sequence[Any], ax: Axes | None = None) -> Axes:
+    """What each effect adds to the time of a path and step: results of
+    `accuracy_study.run_effect_costs`."""
+    ax = _axes(ax)
+    names = [cost.scene for cost in costs]
+    nanoseconds = [cost.nanoseconds for cost in costs]
+    place = np.arange(len(costs))[::-1]
+    ax.barh(place, nanoseconds, color=_COLOURS[0], height=0.6)
+    for y, value in zip(place, nanoseconds, strict=True):
+        ax.annotate(f" {value:.0f}", (value, y), va="center", fontsize="small")
+    ax.set(yticks=place, yticklabels=names, xlabel="nanoseconds a path and step")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
+
+
 def gaussian_copula(
     u: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."], correlation: float
 ) -> Float[np.ndarray, "..."]:

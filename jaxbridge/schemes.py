@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import decisions
-from .diffusion import Dynamics, ito_correction, uses_argument
+from .diffusion import Dynamics, is_linear, ito_correction
 from .linalg import cholesky, inverse, matmul, matvec, solve
 from .linear import linear_transition
 from .sigma import Diagonal
@@ -178,15 +178,14 @@ class GaussianTransition(AbstractScheme):
     stratonovich: ClassVar[bool] = False
 
     def fitted(self, dynamics, like, dt):
-        jacobian = jax.jacfwd(dynamics.drift)
-        if dynamics.sigma_varies or uses_argument(jacobian, like):
+        if not is_linear(dynamics, like):
             raise ValueError(
                 "`GaussianTransition` is for linear drift and constant σ; this model has "
                 f"{'a σ that depends on the state' if dynamics.sigma_varies else 'another drift'}. "
                 "Choose `Heun()`."
             )
         sigma = dynamics.sigma(like).as_matrix(like.shape[0], like.dtype)
-        moments = linear_transition(jacobian(like), matmul(sigma, sigma.T), dt)
+        moments = linear_transition(jax.jacfwd(dynamics.drift)(like), matmul(sigma, sigma.T), dt)
         whitened = solve(sigma, solve(sigma, moments.covariance / dt).T)
         root = matmul(sigma, cholesky(whitened))
         return _FittedTransition(moments.integral, root, inverse(root))
