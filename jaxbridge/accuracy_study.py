@@ -313,9 +313,13 @@ def write_accuracy_figures(
 
     **Raises:** `ImportError` without matplotlib.
     """
+    from matplotlib.figure import Figure
+
     from . import plot
 
     paths = [directory / "accuracy.png", directory / "effects.png"]
     plot.accuracy(results).savefig(paths[0], dpi=150)
-    plot.effect_costs(costs).figure.savefig(paths[1], dpi=150)
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    plot.effect_costs(costs, figure.subplots())
+    figure.savefig(paths[1], dpi=150)
     return paths

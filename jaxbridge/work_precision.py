@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from .arrays import Numbers, cast_floats
-from .bridges import check_key, sample_bridges
+from .bridges import check_key, sample_bridges, stored_steps
 from .chains import sample_exact_bridges
 from .choice import as_proposal, describe, singles
 from .coupled_pairs import CoupledPairs
@@ -270,6 +270,8 @@ def work_precision(
         raise ValueError('`proposals` must be single ones; "auto" chooses between several.')
     if save_at is None:
         save_at = [float(intervals.duration[0]) / 2]
+    for candidate, n in itertools.product(candidates, steps):
+        stored_steps(save_at, duration, candidate.fractions(n))
     scene = _Scene(
         model,
         np.asarray(intervals.start[0]),

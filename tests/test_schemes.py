@@ -141,3 +141,43 @@ def test_milstein_refuses_full_noise():
     model = jb.Diffusion(lambda x, p: -x, lambda x, p: jnp.diag(1 + x**2))
     with pytest.raises(ValueError, match="scalar or diagonal noise"):
         jb.Milstein().step(model.forward(jnp.ones(2)), jnp.ones(2), jnp.asarray(0.1), jnp.ones(2))
+
+
+# Exact transitions
+
+
+def test_exact_transitions_have_the_law_of_the_process(precision):
+    model = jb.ornstein_uhlenbeck(
+        [[1.0, 1.5], [-1.0, 0.5]], mean=[0.3, -0.2], sigma=[[1.0, 0.4], [-0.2, 0.7]]
+    )
+    x, dt = jnp.array([0.5, -1.0]), jnp.asarray(0.4)
+    forward = model.forward(x)
+    scheme = jb.GaussianTransition().fitted(forward, x, dt)
+    law = jb.ou_transition(model, x, dt)
+    tolerance = dict(rtol=1e-5 if precision == "float32" else 1e-12)
+    np.testing.assert_allclose(scheme.step(forward, x, dt, jnp.zeros(2)), law.mean, **tolerance)
+    root = jax.jacfwd(lambda dw: scheme.step(forward, x, dt, dw))(jnp.zeros(2))
+    np.testing.assert_allclose(root @ root.T * dt, law.covariance, **tolerance)
+    dw = jnp.array([0.3, -0.8])
+    x_next = jb.GaussianTransition().step(forward, x, dt, dw)
+    np.testing.assert_allclose(scheme.noise(forward, x, x_next, dt), dw, rtol=1e-4)
+
+
+def test_exact_transitions_tend_to_euler():
+    """The root of the covariance is the one near σ, so that noise means the same to couplings."""
+    model = jb.ornstein_uhlenbeck([[1.0, 1.5], [-1.0, 0.5]], sigma=[[0.0, 0.4], [-0.7, 0.1]])
+    x, dt = jnp.array([0.5, -1.0]), jnp.asarray(1e-3)
+    forward, dw = model.forward(x), jnp.array([0.02, -0.03])
+    exact = jb.GaussianTransition().step(forward, x, dt, dw)
+    np.testing.assert_allclose(exact, jb.Euler().step(forward, x, dt, dw), atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [jb.hyperbolic(0.8, 2), jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + x**2, reversible=True)],
+)
+def test_exact_transitions_need_a_linear_drift_and_a_constant_sigma(model):
+    with pytest.raises(ValueError, match="`GaussianTransition` is for linear drift"):
+        jb.GaussianTransition().step(
+            model.forward(jnp.ones(2)), jnp.ones(2), jnp.asarray(0.1), jnp.ones(2)
+        )

@@ -1,0 +1,190 @@
+"""The table of decisions, held to the primitives of the traced program."""
+
+import math
+from collections import Counter
+
+import jax
+import jax.extend
+import jax.numpy as jnp
+import pytest
+from jax.scipy.special import gammaln
+
+import jaxbridge as jb
+
+D, N = 3, 10
+
+
+# Each effect has a primitive of its own here: digamma comes from the derivative of log ν alone,
+# cosh from that of σ, argmax from elimination, atan2 from the rotation.
+def drift(x, p):
+    return -x
+
+
+def log_density(x, p):
+    return -jnp.sum(gammaln(2 + x**2))
+
+
+def diagonal(x, p):
+    return 2 + jnp.sinh(x) ** 2
+
+
+def full(x, p):
+    return jnp.diag(diagonal(x, p)) + 0.1 * jnp.sinh(x)[:, None]
+
+
+def turn(sigma, driven_sigma):
+    return jnp.eye(D) * jnp.cos(jnp.arctan2(sigma[0, 1], driven_sigma[0, 0]))
+
+
+def model(sigma=None, **options):
+    return jb.Diffusion(drift, sigma, log_density, **options)
+
+
+def coupling(gamma=0.5, meeting=None, scheme=None, rotation=turn):
+    return jb.Coupling(gamma, meeting, scheme or jb.Euler(), rotation)
+
+
+CONSTANT = jnp.eye(D) + 0.1
+SCENES = {
+    "reflection": (model(reversible=True), coupling(-1.0, jb.SignTest())),
+    "crossing": (model(reversible=True), coupling(-1.0)),
+    "crossing, Heun": (model(reversible=True), coupling(-1.0, scheme=jb.Heun())),
+    "own noise": (model(reversible=True), coupling(0.5)),
+    "autodiff": (model(), coupling(-1.0)),
+    "given reversal": (model(reverse_drift=drift), coupling(-1.0)),
+    "constant": (model(CONSTANT), coupling()),
+    "constant function": (model(lambda x, p: CONSTANT), coupling(scheme=jb.Heun())),
+    "diagonal": (model(diagonal, reversible=True), coupling()),
+    "diagonal, Heun": (model(diagonal, reversible=True), coupling(scheme=jb.Heun())),
+    "full": (model(full, reversible=True), coupling()),
+    "full, Heun": (model(full, reversible=True), coupling(scheme=jb.Heun())),
+    "full, not turned": (model(full), coupling(rotation=jb.no_rotation)),
+    "everything": (model(full), coupling(scheme=jb.Heun())),
+}
+
+
+def equations(jaxpr, in_loop=False):
+    """All equations of a program, and whether each is inside a loop over time."""
+    for equation in jaxpr.eqns:
+        yield equation, in_loop
+        inside = in_loop or equation.primitive.name == "scan"
+        for value in jax.tree.leaves(equation.params, is_leaf=is_program):
+            if is_program(value):
+                yield from equations(getattr(value, "jaxpr", value), inside)
+
+
+def is_program(value):
+    return isinstance(value, jax.extend.core.ClosedJaxpr | jax.extend.core.Jaxpr)
+
+
+def program_of(function):
+    return list(equations(jax.make_jaxpr(function)(jax.random.key(0)).jaxpr))
+
+
+def proposals(model, coupling, **options):
+    def sample(key):
+        return jb.sample_bridges(
+            key, model, jnp.zeros(D), jnp.ones(D), 1.0, num_steps=N, coupling=coupling, **options
+        ).paths
+
+    return program_of(sample)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_program_contains_what_the_table_says(name):
+    scene, program = SCENES[name], proposals(*SCENES[name])
+    table = jb.effects(*scene, at=jnp.zeros(D), num_steps=N)
+    in_loops = Counter(eqn.primitive.name for eqn, in_loop in program if in_loop)
+    assert table.reverse_drift.simulated == (in_loops["digamma"] > 0)
+    assert table.solves.simulated == (in_loops["argmax"] > 0)
+    assert table.rotation.simulated == (in_loops["atan2"] > 0)
+    derivative_of_sigma = table.divergence.simulated or table.stratonovich.simulated
+    assert derivative_of_sigma == (in_loops["cosh"] > 0)
+    normals, uniforms = drawn(program)
+    assert normals == N * (D + table.independent_noise.simulated)
+    assert uniforms == N * table.crossing_uniforms.simulated
+
+
+def drawn(program):
+    """Normal and uniform numbers that each lane draws."""
+    shapes = [eqn.params["shape"] for eqn, _ in program if eqn.primitive.name == "random_bits"]
+    normal = sum(eqn.primitive.name == "erf_inv" for eqn, _ in program)
+    # Normal numbers of the reversed path are drawn first, then those of dU, then uniforms.
+    counts = [math.prod(shape) for shape in shapes]
+    return sum(counts[:normal]), sum(counts[normal:])
+
+
+def test_reflection_of_a_reversible_model_is_one_draw_a_step():
+    """One normal number for each step and dimension, one uniform, no autodiff, no solve."""
+    program = proposals(*SCENES["crossing"])
+    assert drawn(program) == (N * D, N)
+    names = {eqn.primitive.name for eqn, _ in program}
+    assert not names & {"digamma", "cosh", "argmax", "atan2", "while_loop", "triangular_solve"}
+
+
+def test_every_effect_is_seen_and_left_out_by_some_scene():
+    tables = [jb.effects(*scene, at=jnp.zeros(D), num_steps=N) for scene in SCENES.values()]
+    for name in ("reverse_drift", "divergence", "solves", "rotation", "independent_noise"):
+        assert {getattr(table, name).simulated for table in tables} == {True, False}
+    for name in ("crossing_uniforms", "stratonovich"):
+        assert {getattr(table, name).simulated for table in tables} == {True, False}
+
+
+def test_divergence_and_correction_are_told_apart():
+    """Both differentiate σ; each alone is there in one scene of these two."""
+    euler = jb.effects(*SCENES["full, not turned"], at=jnp.zeros(D))
+    heun = jb.effects(*SCENES["full, Heun"], at=jnp.zeros(D))
+    assert euler.divergence.simulated and not euler.stratonovich.simulated
+    assert heun.stratonovich.simulated and not heun.divergence.simulated
+
+
+@pytest.mark.parametrize("save_at", [None, [0.0, 0.5]])
+def test_paths_are_stored_where_they_are_asked_for(save_at):
+    scene = SCENES["crossing"]
+    table = jb.effects(*scene, at=jnp.zeros(D), save_at=save_at)
+    program = proposals(*scene, num_bridges=64, save_at=save_at)
+    kept = [
+        out.aval.shape
+        for eqn, _ in program
+        if eqn.primitive.name == "scan"
+        for out in eqn.outvars
+        if out.aval.shape == (N, D, 64)
+    ]
+    assert len(kept) == 1 + table.stored_times.simulated  # the reversed path is always
+
+
+@pytest.mark.parametrize("num_steps", [50, 200])
+def test_associated_paths_stop_early_where_the_table_says(num_steps):
+    scene = SCENES["crossing"]
+    table = jb.effects(*scene, at=jnp.zeros(D), num_steps=num_steps)
+    ou = jb.ornstein_uhlenbeck(jnp.eye(D))
+    bridges = jb.sample_bridges(
+        jax.random.key(0), ou, jnp.zeros(D), jnp.ones(D), 1.0, num_steps=num_steps
+    )
+    program = program_of(lambda key: jb.hitting_counts(key, ou, bridges).counts)
+    loops = [eqn for eqn, _ in program if eqn.primitive.name == "while"]
+    assert len(loops) == 1 + table.early_stop.simulated  # the search is one
+
+
+def test_the_table_reads_well():
+    text = str(jb.effects(jb.hyperbolic(0.8, 2), jb.Coupling(-1.0)))
+    assert len(text.splitlines()) == 10
+    assert "reverse drift" in text and "declared reversible" in text and "left out" in text
+
+
+def test_the_dimension_is_found():
+    three = jb.Diffusion(lambda x, p: -jnp.diag(jnp.arange(1.0, 4.0)) @ x, None, log_density)
+    assert jb.effects(three).reverse_drift.simulated
+    full_in_three = jb.Diffusion(drift, lambda x, p: full(x[:3], p), log_density)
+    assert jb.effects(full_in_three).solves.simulated
+
+
+def test_errors_say_what_to_change(unchecked):
+    with pytest.raises(ValueError, match="pass a point"):
+        jb.effects(jb.Diffusion(lambda x, p: jnp.zeros(100), None, log_density))
+    with pytest.raises(ValueError, match=r"shape \(d,\)"):
+        jb.effects(model(), at=jnp.zeros((2, 2)))
+    with pytest.raises(TypeError, match="`coupling` must be"):
+        jb.effects(model(), 0.5)
+    with pytest.raises(ValueError, match="time reversal"):
+        jb.effects(jb.Diffusion(drift))
