@@ -10,13 +10,16 @@ from typing import NoReturn
 
 import jax
 
-from .crossover_study import (
-    DURATIONS,
-    format_crossover,
-    processes,
-    run_crossover,
-    write_crossover_figure,
+from .accuracy_study import (
+    format_accuracy,
+    format_costs,
+    run_accuracy,
+    run_effect_costs,
+    run_sigma_costs,
+    write_accuracy_figures,
 )
+from .benchmark import DURATIONS, format_ratios, run_benchmark, save
+from .crossover_study import format_crossover, processes, write_crossover_figure
 from .exact_study import (
     draw_as_many,
     format_cost,
@@ -53,6 +56,13 @@ not vary. std/mean of 1/pi shrinks as gamma -> 1 with either start law, while 1/
 approximate bridges become exact as they become rare."""
 
 
+_WHAT_TO_SEE_ACCURACY = """\
+"error" is the distance of the mean half way from the exact one, in standard deviations (of orders:
+of the transition density, relative); "step", "method" and "Monte Carlo" are its parts. The method's
+own error, that of approximate bridges, no number of steps removes. The Brownian crossing sees the
+meetings that the sign test overlooks, which is an error of order 1/2; Heun's scheme brings what is
+left from first to second order where sigma is constant, and improves only the constant elsewhere."""
+
 _WHAT_TO_SEE_CROSSOVER = """\
 Thousands of effective samples per second, compile time left out, of a run of 200,000 proposals in
 50 steps (T up to 1) or 20,000 in 1,000 (from T = 5 on); fewer for couplings alone. The step error
@@ -82,10 +92,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "part",
         nargs="?",
-        choices=("paper", "approximate", "exact", "crossover", "all"),
+        choices=("paper", "approximate", "exact", "accuracy", "bench", "all"),
         default="paper",
-        help="approximate or exact bridges; which proposal is best for which duration; both parts "
-        "on the paper's process (the default); or all",
+        help="approximate or exact bridges, or both, the paper's study (the default); what accuracy "
+        "costs in time; how fast it is, and which proposal is best for which duration; or all",
     )
     parser.add_argument("--quick", action="store_true", help="a twenty-fifth of the bridges")
     parser.add_argument("--seed", type=_seed, default=0, help="of the random numbers (default 0)")
@@ -111,7 +121,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = _parse(arguments)
     begin = time.perf_counter()
     print(f"JAX {jax.__version__} on {jax.devices()[0].device_kind}\n")
-    parts = {"approximate": _approximate, "exact": _exact, "crossover": _crossover}
+    parts = {
+        "approximate": _approximate,
+        "exact": _exact,
+        "accuracy": _accuracy,
+        "bench": _bench,
+    }
     groups = {"paper": ["approximate", "exact"], "all": list(parts)}
     chosen = groups.get(options.part, [options.part])
     for part in chosen:
@@ -161,16 +176,33 @@ def _exact(options: argparse.Namespace) -> list[Path]:
     return write_exact_figures(results, variation, costs, options.out)
 
 
-def _crossover(options: argparse.Namespace) -> list[Path]:
-    work = 400_000 if options.quick else 10_000_000
+def _accuracy(options: argparse.Namespace) -> list[Path]:
+    key = jax.random.key(options.seed)
+    quick = " (--quick: expect larger errors)" if options.quick else ""
+    print(f"What accuracy costs in time{quick}\n")
+    results = run_accuracy(key, 1_000 if options.quick else 50_000, _say)
+    num_bridges = 1_000 if options.quick else 20_000
+    effects = run_effect_costs(key, num_bridges, _say)
+    sigmas = run_sigma_costs(key, num_bridges, (2,) if options.quick else (2, 5, 10), _say)
+    _end_progress()
+    print(f"{format_accuracy(results)}\n\n{_WHAT_TO_SEE_ACCURACY}\n")
+    print(f"{format_costs(effects, sigmas)}\n")
+    return write_accuracy_figures(results, effects, options.out)
+
+
+def _bench(options: argparse.Namespace) -> list[Path]:
+    scale = 0.04 if options.quick else 1.0
     durations = (0.05, 5.0) if options.quick else DURATIONS
     chosen = processes()[:1] if options.quick else None
     quick = " (--quick: too short a run for the clock)" if options.quick else ""
-    print(f"Which proposal for which duration{quick}\n")
-    rates = run_crossover(jax.random.key(options.seed), work, durations, chosen, _say)
+    print(f"How fast it is{quick}\n")
+    results = run_benchmark(jax.random.key(options.seed), scale, durations, chosen, _say)
     _end_progress()
-    print(f"{format_crossover(rates)}\n\n{_WHAT_TO_SEE_CROSSOVER}\n")
-    return write_crossover_figure(rates, options.out)
+    save(results, options.out / "benchmark.json")
+    print(f"{format_ratios(results)}\n\n{format_costs(results.effects, results.sigmas)}\n")
+    print(f"Which proposal for which duration\n\n{format_crossover(results.rates)}\n")
+    print(f"{_WHAT_TO_SEE_CROSSOVER}\n\nall figures in {options.out / 'benchmark.json'}\n")
+    return write_crossover_figure(results.rates, options.out)
 
 
 def _say(what: str) -> None:

@@ -200,7 +200,7 @@ def format_crossover(rates: Sequence[Rate]) -> str:
         table = {(r.proposal, r.duration): r for r in group}
         for proposal in dict.fromkeys(r.proposal for r in group):
             row = [table[proposal, t] for t in durations]
-            lines.append(f"  {proposal:<24}" + "".join(f"{_thousands(r):>12}" for r in row))
+            lines.append(f"  {proposal:<24}" + "".join(f"{thousands(r):>12}" for r in row))
         shares = [share_of_best(group, t) for t in durations]
         lines.append(f"  {'auto / best':<24}" + "".join(f"{share:>12.2f}" for share in shares))
         chosen = [table['"auto"', t].chosen for t in durations]
@@ -215,7 +215,8 @@ def share_of_best(rates: Sequence[Rate], duration: float) -> float:
     return auto / max(r.per_second for r in here if r.proposal != '"auto"')
 
 
-def _thousands(rate: Rate) -> str:
+def thousands(rate: Rate) -> str:
+    """Thousands of effective samples per second, in two figures."""
     value = rate.per_second / 1e3
     return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 

@@ -21,10 +21,10 @@ from helpers import (
     unswirl,
     warped_model,
 )
-from reference import approximate_bridges
 
 import jaxbridge as jb
 import jaxbridge.bridges
+from jaxbridge.numpy_bridges import approximate_bridges
 from jaxbridge.proposals import propose
 
 NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
@@ -99,6 +99,7 @@ def test_same_law_as_an_independent_implementation(gamma, meeting, crossing):
         gamma,
         crossing,
     )
+    other = np.moveaxis(other, -1, 0)
     bridges = jb.sample_bridges(
         jax.random.key(0),
         paper_model(),

@@ -5,6 +5,8 @@ import sys
 
 import pytest
 
+from jaxbridge.benchmark import load
+
 
 def run(*arguments, cwd):
     command = [sys.executable, "-m", "jaxbridge", *arguments]
@@ -32,11 +34,23 @@ def test_quick_run_of_the_exact_part(tmp_path):
 
 
 @pytest.mark.slow
-def test_quick_run_of_the_crossover_part(tmp_path):
-    done = run("crossover", "--quick", "--out", "pictures", cwd=tmp_path)
+def test_quick_run_of_the_benchmark(tmp_path):
+    done = run("bench", "--quick", "--out", "pictures", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("auto / best") == 1 and "Guided" in done.stdout
+    assert "NumPy" in done.stdout and "random numbers" in done.stdout
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 1
+    stored = load(tmp_path / "pictures" / "benchmark.json")
+    assert stored.ratios and stored.sigmas and stored.effects and stored.rates
+
+
+@pytest.mark.slow
+def test_quick_run_of_the_accuracy_part(tmp_path):
+    done = run("accuracy", "--quick", "--out", "pictures", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("accuracy 0.") == 4  # the target of the table, and three more
+    assert "Orders of the step error" in done.stdout and "Nanoseconds" in done.stdout
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 2
 
 
 @pytest.mark.parametrize(
