@@ -61,7 +61,7 @@ _WHAT_TO_SEE_ACCURACY = """\
 of the transition density, relative); "step", "method" and "Monte Carlo" are its parts. The method's
 own error, that of approximate bridges, no number of steps removes. The Brownian crossing sees the
 meetings that the sign test overlooks, which is an error of order 1/2; Heun's scheme brings what is
-left from first to second order where sigma is constant, and improves only the constant elsewhere."""
+left from first to second order where sigma is constant; elsewhere it gains less."""
 
 _WHAT_TO_SEE_CROSSOVER = """\
 Thousands of effective samples per second, compile time left out, of a run of 200,000 proposals in
@@ -94,8 +94,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         nargs="?",
         choices=("paper", "approximate", "exact", "accuracy", "bench", "all"),
         default="paper",
-        help="approximate or exact bridges, or both, the paper's study (the default); what accuracy "
-        "costs in time; how fast it is, and which proposal is best for which duration; or all",
+        help="approximate or exact bridges, or both: the paper's study (the default); what "
+        "accuracy costs in time; how fast it is, and which proposal is best for which duration; or "
+        "all",
     )
     parser.add_argument("--quick", action="store_true", help="a twenty-fifth of the bridges")
     parser.add_argument("--seed", type=_seed, default=0, help="of the random numbers (default 0)")

@@ -1,0 +1,70 @@
+"""Benchmarks: how they are stored and shown. Their speed is for the clock, not for tests."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jaxbridge.accuracy_study import EffectCost
+from jaxbridge.benchmark import (
+    Benchmark,
+    Ratio,
+    draw_floor,
+    format_ratios,
+    in_turns,
+    load,
+    markdown,
+    save,
+)
+from jaxbridge.crossover_study import Rate
+
+ROOT = Path(__file__).parent.parent
+
+
+def made_up():
+    ratio = Ratio("ours", "theirs", 0.2, 0.1, 1.3)
+    rates = [
+        Rate("double well", t, name, 1e4, 0.5, 0.1, -1.0, 0.01, "")
+        for name in ("Coupling(0)", '"auto"')
+        for t in (0.05, 1.0)
+    ]
+    return Benchmark(
+        "cpu",
+        "x, 2 cores",
+        {"jax": "0.10"},
+        "2026-01-01",
+        [ratio],
+        [EffectCost("a", 1.0)],
+        [(2, 10.0, 30.0)],
+        rates,
+    )
+
+
+def test_results_survive_their_file(tmp_path):
+    save(made_up(), tmp_path / "a.json")
+    assert load(tmp_path / "a.json") == made_up()
+
+
+def test_tables_show_ratios_and_shares():
+    text = markdown(made_up())
+    assert "| ours | 0.2 | theirs | 2 |" in text and "| 2 | 10 | 30 | 3.0 |" in text
+    assert "T = 0.05 | 1 |" in text and "*auto / best* | 1.00 | 1.00 |" in text
+    assert "(at most 1.3)" in format_ratios(made_up())
+
+
+def test_the_readme_shows_the_stored_results():
+    stored = load(ROOT / "notebooks" / "benchmark.json")
+    assert markdown(stored) in (ROOT / "README.md").read_text()
+
+
+def test_functions_are_timed_in_turns():
+    order = []
+    times = in_turns(lambda: order.append(1), lambda: order.append(2), repeats=3)
+    assert order == [1, 2] * 4 and all(seconds >= 0 for seconds in times)
+
+
+@pytest.mark.parametrize("own_noise", [False, True])
+def test_the_floor_draws_every_number(own_noise):
+    drawn = draw_floor(own_noise, 100)(jax.random.key(0))
+    assert sum(np.size(leaf) for leaf in drawn) == 50 * 100 * (3 + own_noise)
