@@ -125,7 +125,13 @@ def sinh_model() -> tuple[Diffusion, np.ndarray, np.ndarray, tuple[np.ndarray, n
     """Y = M sinh(X), coordinate by coordinate, for the paper's X: a diffusion with the full
     σ(y) = M diag(cosh x); the unlikely bridge's end points in its coordinates, and the exact mean
     and standard deviation of its bridge half way."""
-    model = Diffusion(_sinh_drift, _sinh_sigma, _sinh_log_density, np.array(_MIXING))
+    model = Diffusion(
+        _sinh_drift,
+        _sinh_sigma,
+        _sinh_log_density,
+        np.array(_MIXING),
+        sample_stationary=_sample_sinh,
+    )
     bridge = gaussian_bridge(study_model(), *UNLIKELY, 1.0, times=[0.5])
     mean, covariance = np.asarray(bridge.mean[0], float), np.asarray(bridge.covariance[0], float)
     variance = np.diag(covariance)
@@ -162,6 +168,11 @@ def _sinh_log_density(y: Float[Array, " d"], mixing: Float[Array, "d d"]) -> Flo
     # The paper's B is symmetric and σ = I, so Γ⁻¹ = 2B.
     quadratic = jnp.sum(x * matvec(study_model().params.B.astype(y.dtype), x))
     return -quadratic - jnp.sum(jnp.log(jnp.cosh(x)))
+
+
+def _sample_sinh(key: Key[Array, ""], mixing: Float[Array, "d d"]) -> Float[Array, " d"]:
+    x = study_model().sample_stationary(key)
+    return matvec(mixing.astype(x.dtype), jnp.sinh(x))
 
 
 def format_accuracy(results: dict[str, WorkPrecision]) -> str:
