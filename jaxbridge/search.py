@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers, is_traced
+from .devices import over_devices
 from .intervals import check_count
 
 # Trials are numbered in 32 bits.
@@ -67,10 +68,12 @@ def search(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> Found:
     """Run `trial(problem, number)` until each active problem has `wanted` successes, or has
-    run out of tries. `rows`: arrays with leading axis P × wanted, to be filled."""
+    run out of tries. `rows`: arrays with leading axis P × wanted, to be filled. Lanes are split
+    over devices: see `over_devices` for the arrays that `trial` needs."""
     num_problems = active.shape[0]
     num_rows = num_problems * wanted
     progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    trials = over_devices(trial, (0, 0))
 
     def pending(state: _Search):
         return active & (state.found.num_found < wanted) & (state.num_tried < max_trials)
@@ -81,7 +84,7 @@ def search(
             found.num_found, num_tried, pending(state), wanted, num_lanes
         )
         number = num_tried[problem] + place
-        made = trial(problem, number)
+        made = trials(problem, number)
         tried = number < max_trials
         success = tried & made.success
         # The lanes of one problem lie side by side, in the order of their numbers.
