@@ -94,7 +94,8 @@ def sample_bridges(
     - `save_at`: times in [0, duration] on the grid, increasing, shape (K,), at which paths are
         kept; with several durations, fractions of them. By default the whole grid.
     - `batch_size`: proposals simulated side by side; bounds memory, and changes results by
-        rounding only. By default as many as fit in 16 MiB, and no more than are useful.
+        rounding only. By default no more than are useful, and as many as fit in 16 MiB, or 256
+        if these fit in 512 MiB.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time where a bridge was not found.
 
