@@ -37,7 +37,7 @@ def over_devices(
 
     Lanes are in those axes of the arguments that `in_axes` says (`None` for an argument without),
     and in `out_axis` of all results. Traced arrays that `function` needs besides must be in an
-    `eqx.Partial`: JAX does not let a `shard_map` close over them.
+    `eqx.Partial`, for JAX lets a `shard_map` close over few of them.
     """
     if num_devices() == 1:
         return function
