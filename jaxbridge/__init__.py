@@ -2,15 +2,16 @@
 
 Data flows one way: a model (`diffusion`, `models`, `gaussian`) and a scheme (`schemes`) make
 steps; a coupling (`coupling`) with a meeting rule (`meeting`) makes pairs of paths and joins
-them (`proposals`); a search (`search`) keeps the pairs that met (`bridges`). The diffusion
-associated with a bridge (`associated`), started from some law (`start_laws`, `burn_in`), hits
-it or not (`hitting`), which makes a weight (`coupled_pairs`). Proposals that are pulled to the
-end point (`guided`) have a weight made of the densities of their steps (`step_density`), and
-pilot runs choose (`choice`, `tuning`). On weighted proposals (`weighted`) are built importance
-sampling (`importance`), transition densities (`transition`) and Markov chains (`chains`, one
-method a module), with `diagnostics` on top. Exact laws stand beside (`gaussian`), the studies
-above all (`study`, `exact_study`, `plot`). References to equations and sections are to Bladt,
-Finch & Sørensen, *Simulation of multivariate diffusion bridges*.
+them (`proposals`); a search (`search`), on one device or several (`devices`), keeps the pairs
+that met (`bridges`). The diffusion associated with a bridge (`associated`), started from some
+law (`start_laws`, `burn_in`), hits it or not (`hitting`), which makes a weight
+(`coupled_pairs`). Proposals that are pulled to the end point (`guided`) have a weight made of
+the densities of their steps (`step_density`), and pilot runs choose (`choice`, `tuning`). On
+weighted proposals (`weighted`) are built importance sampling (`importance`), transition
+densities (`transition`) and Markov chains (`chains`, one method a module), with `diagnostics`
+on top. Exact laws stand beside (`gaussian`), the studies above all (`study`, `exact_study`,
+`plot`). References to equations and sections are to Bladt, Finch & Sørensen, *Simulation of
+multivariate diffusion bridges*.
 """
 
 from .bridges import Bridges as Bridges, sample_bridges as sample_bridges

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
 from .arrays import Numbers, as_floating, is_traced
 from .coupling import AbstractCoupling, Coupling, check_coupling
+from .devices import over_devices
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count, check_model
 from .proposals import Proposals, propose
@@ -93,7 +94,8 @@ def sample_bridges(
     - `save_at`: times in [0, duration] on the grid, increasing, shape (K,), at which paths are
         kept; with several durations, fractions of them. By default the whole grid.
     - `batch_size`: proposals simulated side by side; bounds memory, and changes results by
-        rounding only. By default as many as fit in 16 MiB, and no more than are useful.
+        rounding only. By default no more than are useful, and as many as fit in 16 MiB, or 256
+        if these fit in 512 MiB.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time where a bridge was not found.
 
@@ -239,12 +241,7 @@ def find_bridges(
 ) -> Found:
     """Propose for each of P active problems, one interval and one key each, until it has its
     bridges. The outputs are `Joined`."""
-
-    def trial(problem, number):
-        made = _propose_numbered(inputs, keys, problem, number, num_steps, stored)
-        joined = Joined(jnp.moveaxis(made.paths, -1, 0), made.reverse_start.T, made.meeting_step)
-        return Trials(made.meeting_step <= num_steps, made.finite, joined)
-
+    trial = eqx.Partial(_trial, inputs, keys, num_steps, stored)
     (num_problems, d), dtype = inputs.intervals.start.shape, inputs.intervals.start.dtype
     num_rows = num_problems * num_bridges
     num_stored = num_steps + 1 if stored is None else stored.shape[0]
@@ -254,6 +251,19 @@ def find_bridges(
         jnp.full(num_rows, num_steps + 1, jnp.int32),
     )
     return search(trial, rows, active, num_bridges, max_proposals, num_lanes, progress_meter)
+
+
+def _trial(
+    inputs: Inputs,
+    keys: Key[Array, " P"],
+    num_steps: int,
+    stored: Int[Array, " K"] | None,
+    problem: Int[Array, " lanes"],
+    number: Int[Array, " lanes"],
+) -> Trials:
+    made = _propose_numbered(inputs, keys, problem, number, num_steps, stored)
+    joined = Joined(jnp.moveaxis(made.paths, -1, 0), made.reverse_start.T, made.meeting_step)
+    return Trials(made.meeting_step <= num_steps, made.finite, joined)
 
 
 def unflatten_rows(rows: Shaped[Array, "rows ..."], num_intervals: int, batched: bool) -> Array:
@@ -315,10 +325,24 @@ def _replay_tangents(primals, tangents):
         # A row without a bridge replays a proposal of no duration, which cannot overflow: its
         # tangent is masked by the caller, and in reverse mode 0 · ∞ would be NaN.
         brief = jnp.where(rho <= num_steps, 1, 1e-12).astype(paths.dtype)
-        made = _propose_numbered(inputs, keys, interval, number, num_steps, stored, rho, brief)
-        return jnp.moveaxis(made.paths, -1, 0)
+        again = eqx.Partial(_replayed_paths, inputs, keys, num_steps, stored)
+        return over_devices(again, (0, 0, 0, 0))(interval, number, rho, brief)
 
     return paths, eqx.filter_jvp(replay, (inputs,), (tangents[0],))[1]
+
+
+def _replayed_paths(
+    inputs: Inputs,
+    keys: Key[Array, " I"],
+    num_steps: int,
+    stored: Int[Array, " K"] | None,
+    interval: Int[Array, " rows"],
+    number: Int[Array, " rows"],
+    rho: Int[Array, " rows"],
+    time_scale: Float[Array, " rows"],
+) -> Float[Array, "rows K d"]:
+    made = _propose_numbered(inputs, keys, interval, number, num_steps, stored, rho, time_scale)
+    return jnp.moveaxis(made.paths, -1, 0)
 
 
 def check_key(key) -> None:

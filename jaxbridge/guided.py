@@ -35,6 +35,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers, as_floating, is_traced
+from .devices import num_devices
 from .diffusion import Diffusion, Dynamics
 from .intervals import Intervals, check_model
 from .linalg import all_finite, cholesky, dot, inverse, matmul, matvec, solve, total
@@ -43,7 +44,13 @@ from .schemes import Euler
 from .search import most_lanes
 from .sigma import AbstractSigma
 from .step_density import AbstractStepDensity, EulerDensity
-from .weighted import AbstractWeightedProposal, WeightedPaths, in_blocks, masked
+from .weighted import (
+    AbstractWeightedProposal,
+    WeightedPaths,
+    block_over_devices,
+    in_blocks,
+    masked,
+)
 
 # Of the duration: shorter steps are lost in the rounding of points.
 _SHORTEST_STEP = 1e-10
@@ -145,10 +152,8 @@ class AbstractGuidedProposal(AbstractWeightedProposal):
         active=None,
         progress_meter=None,
     ):
-        def block(keys, intervals, active):
-            return _weighted(*_draw(_Inputs(self, model, intervals), keys, stored, num_steps))
-
-        rows = most_lanes(intervals.start.shape[1])
+        block = block_over_devices(eqx.Partial(_draw_block, self, model, stored, num_steps))
+        rows = num_devices() * most_lanes(intervals.start.shape[1])
         return in_blocks(block, keys, intervals, rows, active, progress_meter)
 
     def reweigh(self, keys, model, intervals, paths, active=None):
@@ -538,6 +543,18 @@ class _Inputs(NamedTuple):
     proposal: AbstractGuidedProposal
     model: Diffusion
     intervals: Intervals
+
+
+def _draw_block(
+    proposal: AbstractGuidedProposal,
+    model: Diffusion,
+    stored: Int[Array, " K"] | None,
+    num_steps: int,
+    keys: Key[Array, "I n"],
+    intervals: Intervals,
+    active: Bool[Array, " I"] | None,
+) -> WeightedPaths:
+    return _weighted(*_draw(_Inputs(proposal, model, intervals), keys, stored, num_steps))
 
 
 @eqx.filter_custom_jvp

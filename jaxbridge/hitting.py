@@ -203,16 +203,7 @@ def count_hits(
     if num_lanes is None:
         num_lanes = default_num_lanes(paths.shape[0] * num_counts, num_steps, paths[:, 0])
 
-    def trial(problem, number):
-        made = run_associated(
-            model,
-            coupling,
-            numbered_keys(keys, problem, number),
-            jnp.moveaxis(paths[problem], 0, -1),
-            duration[problem] / num_steps,
-        )
-        return Trials(made.hit, made.finite, made.start.T)
-
+    trial = eqx.Partial(_trial, keys, model, coupling, paths, duration)
     num_rows = paths.shape[0] * num_counts
     rows = jnp.full((num_rows, paths.shape[2]), jnp.nan, paths.dtype)
     found = search(trial, rows, active, num_counts, max_trials, num_lanes, progress_meter)
@@ -227,6 +218,26 @@ def count_hits(
         found.num_nonfinite,
         starts[jnp.arange(len(number)), last],
     )
+
+
+def _trial(
+    keys: Key[Array, " P"],
+    model: Diffusion,
+    coupling: AbstractCoupling,
+    paths: Float[Array, "P points d"],
+    duration: Float[Array, " P"],
+    problem: Int[Array, " lanes"],
+    number: Int[Array, " lanes"],
+) -> Trials:
+    num_steps = paths.shape[1] - 1
+    made = run_associated(
+        model,
+        coupling,
+        numbered_keys(keys, problem, number),
+        jnp.moveaxis(paths[problem], 0, -1),
+        duration[problem] / num_steps,
+    )
+    return Trials(made.hit, made.finite, made.start.T)
 
 
 def durations_of(bridges: BridgePaths) -> Float[Array, " P"]:

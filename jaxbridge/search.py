@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers, is_traced
+from .devices import num_devices, over_devices
 from .intervals import check_count
 
 # Trials are numbered in 32 bits.
@@ -67,10 +68,12 @@ def search(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> Found:
     """Run `trial(problem, number)` until each active problem has `wanted` successes, or has
-    run out of tries. `rows`: arrays with leading axis P × wanted, to be filled."""
+    run out of tries. `rows`: arrays with leading axis P × wanted, to be filled. Lanes are split
+    over devices: see `over_devices` for the arrays that `trial` needs."""
     num_problems = active.shape[0]
     num_rows = num_problems * wanted
     progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    trials = over_devices(trial, (0, 0))
 
     def pending(state: _Search):
         return active & (state.found.num_found < wanted) & (state.num_tried < max_trials)
@@ -81,7 +84,7 @@ def search(
             found.num_found, num_tried, pending(state), wanted, num_lanes
         )
         number = num_tried[problem] + place
-        made = trial(problem, number)
+        made = trials(problem, number)
         tried = number < max_trials
         success = tried & made.success
         # The lanes of one problem lie side by side, in the order of their numbers.
@@ -169,16 +172,20 @@ def key_for(purpose: str, key: Key[Array, ""]) -> Key[Array, ""]:
 # are not safe in XLA's loops on CPU.
 _MOST_NUMBERS = 2**15
 
+# With fewer, much of the time of a step goes into what it costs however many lanes there are.
+_ENOUGH_LANES = 256
+
 
 def default_num_lanes(num_wanted: int, num_steps: int, point: Float[Array, "P d"]) -> int:
-    """As many lanes as successes are wanted, within a bound on the memory of their paths.
+    """As many lanes as successes are wanted, within a bound on the memory of their paths on each
+    device: 16 MiB, or what `_ENOUGH_LANES` need, up to 512 MiB.
 
     A lane holds two paths and their noise.
     """
     d = point.shape[1]
     bytes_per_lane = 3 * d * (num_steps + 1) * point.dtype.itemsize
-    bounds = (2**24 // bytes_per_lane, most_lanes(d), max(num_wanted, 64))
-    return max(1, min(bounds))
+    fitting = max(2**24 // bytes_per_lane, min(_ENOUGH_LANES, 2**29 // bytes_per_lane), 1)
+    return min(num_devices() * min(fitting, most_lanes(d)), max(num_wanted, 64))
 
 
 def most_lanes(d: int) -> int:

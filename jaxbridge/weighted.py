@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from .devices import over_devices, share
 from .diffusion import Diffusion
 from .intervals import Intervals
 
@@ -94,8 +95,24 @@ class AbstractWeightedProposal(eqx.Module):
         target of a chain."""
 
 
+Block = Callable[[Key[Array, "I n"], Intervals, Bool[Array, " I"] | None], WeightedPaths]
+
+
+def block_over_devices(function: Block) -> Block:
+    """`function` with its draws split over devices: interval by interval, which each then has its
+    own work done on one device only, or across all of them where that balances better."""
+
+    def split(keys, intervals, active):
+        num_intervals, num_draws = keys.shape
+        if share(num_intervals) * num_draws <= num_intervals * share(num_draws):
+            return over_devices(function, (0, 0, 0))(keys, intervals, active)
+        return over_devices(function, (1, None, None), out_axis=1)(keys, intervals, active)
+
+    return split
+
+
 def in_blocks(
-    function: Callable[[Key[Array, "I n"], Intervals, Bool[Array, " I"] | None], WeightedPaths],
+    function: Block,
     keys: Key[Array, "I n"],
     intervals: Intervals,
     most_rows: int,

@@ -1,6 +1,10 @@
 """Oracles and gates shared by the tests."""
 
 import contextlib
+import os
+import subprocess
+import sys
+import textwrap
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -22,6 +26,15 @@ PAPER_CASES = {
 
 def paper_model():
     return jb.ornstein_uhlenbeck(jnp.asarray(PAPER_B))
+
+
+def run_program(program, deadline=240, num_devices=1):
+    """Run it in a process of its own, on CPU, as if that were several devices, within a deadline
+    in seconds."""
+    command = [sys.executable, "-c", textwrap.dedent(program)]
+    flags = f"--xla_force_host_platform_device_count={num_devices}"
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
+    subprocess.run(command, check=True, timeout=deadline, env=environment)
 
 
 def assert_moments(samples, mean, covariance, num_sigma=5.0, mean_allowance=0.0):

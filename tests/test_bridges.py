@@ -1,10 +1,5 @@
 """Approximate bridges: their law, the search for them, gradients, compilation and errors."""
 
-import os
-import subprocess
-import sys
-import textwrap
-
 import diffrax
 import equinox as eqx
 import jax
@@ -17,6 +12,7 @@ from helpers import (
     assert_moments,
     count_compilations,
     paper_model,
+    run_program,
     swirl,
     unswirl,
     warped_model,
@@ -49,13 +45,6 @@ def mid_points(case, gamma, coupling=None, num_bridges=50_000, seed=0):
     assert bridges.met.all()
     scale = np.sqrt(np.diag(exact.covariance[0]))
     return (np.asarray(bridges.paths[:, 0]) - np.asarray(exact.mean[0])) / scale
-
-
-def run_program(program, deadline=240):
-    """Run it in a process of its own, on CPU, within a deadline in seconds."""
-    command = [sys.executable, "-c", textwrap.dedent(program)]
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    subprocess.run(command, check=True, timeout=deadline, env=environment)
 
 
 # The law
@@ -525,6 +514,23 @@ def test_sixty_thousand_lanes_with_full_sigma_finish(scheme):
         assert bridges.met.all()
     """
     run_program(program)
+
+
+@pytest.mark.slow
+def test_a_thousand_long_bridges_take_less_than_two_gibibytes():
+    """Measured where nothing else has been run: the peak of a process does not come down."""
+    run_program("""
+        import resource
+        import jax, jax.numpy as jnp, jaxbridge as jb
+        from jaxbridge.study import study_model
+        bridges = jb.sample_bridges(
+            jax.random.key(0), study_model(), [0.0, 0.0], [1.0, 0.0], 1_000.0, num_bridges=1_000,
+            num_steps=50_000, save_at=jnp.linspace(0, 1_000, 11),
+        )
+        assert bridges.met.all()
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+        assert peak < 2**31, peak
+    """)
 
 
 # Errors

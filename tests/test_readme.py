@@ -8,7 +8,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), 
 
 
 def test_readme_code_runs():
-    assert len(BLOCKS) == 7
+    assert len(BLOCKS) == 8
     namespace = {}
     for block in BLOCKS:
         exec(block, namespace)
@@ -16,6 +16,7 @@ def test_readme_code_runs():
     assert bool(namespace["bridges"].met.all())
     assert namespace["many"].paths.shape == (500, 4, 51, 2)
     assert bool(namespace["many"].met.all())
+    assert bool(namespace["spread"].met.all())
     assert namespace["exact"].mean.shape == (2, 2)
     assert namespace["weighted"].effective_sample_size > 100
     assert namespace["chain"].paths.shape == (1000, 101, 2)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge.search import Trials, _assign_lanes, search
+from jaxbridge.search import Trials, _assign_lanes, default_num_lanes, search
 
 
 def test_lanes_of_each_problem_carry_consecutive_numbers():
@@ -66,3 +66,21 @@ def test_search_finds_the_first_successes(num_lanes):
         squares = np.asarray(found.outputs["square"]).reshape(9, wanted)[p]
         assert list(squares[: len(successes)]) == [s**2 for s in successes]
         assert (squares[len(successes) :] == -5).all()
+
+
+@pytest.mark.parametrize(
+    ("num_wanted", "num_steps", "d", "expected"),
+    [
+        (1, 50, 2, 64),
+        (1_000, 50, 2, 1_000),
+        (10**6, 50, 2, 8_192),  # many lanes anyhow
+        (10**6, 20, 8, 4_096),  # arrays within bounds
+        (10**6, 1_000, 2, 698),  # 16 MiB
+        (10**6, 50_000, 2, 256),  # more than that, for the sake of enough lanes
+        (10**6, 50_000, 8, 111),  # 512 MiB
+        (10**6, 10**9, 2, 1),
+    ],
+)
+def test_default_number_of_lanes(num_wanted, num_steps, d, expected):
+    point = jnp.zeros((1, d), jnp.float32)
+    assert default_num_lanes(num_wanted, num_steps, point) == expected
