@@ -10,7 +10,7 @@ equation (bridgesim), where ρ - 1 is the first step in which the two meet.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from . import decisions
 from .arrays import cast_floats
 from .coupling import AbstractCoupling, rotate, rotation_between
 from .diffusion import Diffusion
+from .lanes import over_lanes
 from .linalg import all_finite
 from .meeting import PairStep, frame
 from .noise import Store, noisy_scan
@@ -151,10 +152,6 @@ def realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
     realised = coupling.realise(keys)
     axes = jax.tree.map(lambda old, new: None if old is new else -1, coupling, realised)
     return realised, axes
-
-
-def over_lanes(*in_axes) -> Callable[[Callable], Callable[..., Any]]:
-    return lambda function: jax.vmap(function, in_axes=in_axes, out_axes=-1)
 
 
 def _store(stored: Int[Array, " K"], start: Float[Array, "d lanes"], num_steps: int) -> Store:
