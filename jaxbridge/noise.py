@@ -27,6 +27,30 @@ class Store(NamedTuple):
     rows: Shaped[Array, "rows ..."]
 
 
+class Rows(tuple):
+    """x"""
+
+
+jax.tree_util.register_pytree_node(Rows, lambda r: (tuple(r), None), lambda _, c: Rows(c))
+
+
+def split_rows(tree, axis=0):
+    def split(leaf):
+        if jnp.ndim(leaf) != axis + 2 or leaf.shape[axis] > 8:
+            return leaf
+        return Rows(lax.index_in_dim(leaf, i, axis, keepdims=False) for i in range(leaf.shape[axis]))
+
+    return jax.tree.map(split, tree)
+
+
+def join_rows(tree, axis=0):
+    return jax.tree.map(
+        lambda leaf: jnp.stack(list(leaf), axis) if isinstance(leaf, Rows) else leaf,
+        tree,
+        is_leaf=lambda leaf: isinstance(leaf, Rows),
+    )
+
+
 def stretches(num_steps: int) -> tuple[int, int]:
     """How many stretches of noise there are, and how many steps each is for."""
     num_stretches = -(-num_steps // _LONGEST_STRETCH)
@@ -60,18 +84,32 @@ def noisy_scan(
     def one_step(carry, inputs):
         carry, rows = carry
         noise, active, slot, x = inputs
-        stepped, y = step(carry, (noise, x))
+        carry = join_rows(carry)
+        stepped, y = step(carry, (noise, join_rows(x)))
         if active is not None:
             stepped = jax.tree.map(lambda new, old: jnp.where(active, new, old), stepped, carry)
+        stepped, y = split_rows(stepped), split_rows(y)
         if rows is None:
             return (stepped, None), y
-        return (stepped, lax.dynamic_update_index_in_dim(rows, y, slot, 0)), None
+        if not isinstance(y, Rows):
+            return (stepped, lax.dynamic_update_index_in_dim(rows, y, slot, 0)), None
+        for j, row in enumerate(y):
+            rows = lax.dynamic_update_slice(rows, row[None, None], (slot, j, 0))
+        return (stepped, rows), None
 
     def one_stretch(carry, inputs):
         index, *inputs = inputs
         stretch_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, index)
         noise = jax.vmap(lambda key: draw(key, length), out_axes=-1)(stretch_keys)
-        return lax.scan(one_step, carry, (noise, *inputs), reverse=reverse)
+        carry, rows = carry
+        active, slots, xs = inputs
+        (carry, rows), ys = lax.scan(
+            one_step,
+            (split_rows(carry), rows),
+            (noise, active, slots, split_rows(xs, 1)),
+            reverse=reverse,
+        )
+        return (join_rows(carry), rows), join_rows(ys, 1)
 
     if num_stretches == 1:
         (carry, rows), ys = one_stretch((init, rows), (0, None, slots, xs))

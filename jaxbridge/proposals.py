@@ -117,11 +117,9 @@ def propose(
         pair_noise(coupling, dtype, replayed),
         (jnp.arange(num_steps, dtype=jnp.int32), x_path),
         num_steps,
-        store=None if stored is None else _store(stored, start, num_steps),
+        store=_store(stored, start, num_steps),
     )
-    if stored is None:
-        z_path = jnp.concatenate([start[None], z_path])
-    else:
+    if stored is not None:
         z_path = z_path[:-1]
     # Non-finite numbers stay non-finite from step to step, so the last states tell.
     finite = jnp.all(jnp.isfinite(x_start) & jnp.isfinite(z_end), axis=0) | (rho <= num_steps)
@@ -156,6 +154,9 @@ def realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
 
 def _store(stored: Int[Array, " K"], start: Float[Array, "d lanes"], num_steps: int) -> Store:
     """Rows for the stored steps; all begin as the start, which is what step 0 keeps."""
+    if stored is None:
+        rows = jnp.broadcast_to(start, (num_steps + 1, *start.shape))
+        return Store(jnp.arange(1, num_steps + 1, dtype=jnp.int32), rows)
     rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *start.shape))
     slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(stored.shape[0]))
     return Store(slots[1:], rows)
