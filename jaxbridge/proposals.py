@@ -152,7 +152,9 @@ def realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
     return realised, axes
 
 
-def _store(stored: Int[Array, " K"], start: Float[Array, "d lanes"], num_steps: int) -> Store:
+def _store(
+    stored: Int[Array, " K"] | None, start: Float[Array, "d lanes"], num_steps: int
+) -> Store:
     """Rows for the stored steps; all begin as the start, which is what step 0 keeps."""
     if stored is None:
         rows = jnp.broadcast_to(start, (num_steps + 1, *start.shape))
