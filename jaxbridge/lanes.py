@@ -12,7 +12,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -128,6 +128,10 @@ def _coordinates(value) -> np.ndarray:
     return value if _is_split(value) else _objects(np.shape(value), lambda index: value[index])
 
 
+def _aval(atom: Var | Literal) -> jax.core.ShapedArray:
+    return cast(jax.core.ShapedArray, atom.aval)
+
+
 def _inner(equation: JaxprEqn) -> ClosedJaxpr | None:
     """The body of a call that is no more than its body."""
     return equation.params["jaxpr"] if equation.primitive.name in ("jit", "pjit") else None
@@ -143,10 +147,10 @@ def _count_numbers(jaxpr: Jaxpr) -> int:
         if name in _MOVES:
             return 0
         counted = equation.invars if name in _REDUCTIONS else equation.outvars
-        numbers = sum(math.prod(atom.aval.shape) for atom in counted)
+        numbers = sum(math.prod(_aval(atom).shape) for atom in counted)
         if name == "dot_general":
             (axes, _), _ = equation.params["dimension_numbers"]
-            numbers *= math.prod(equation.invars[0].aval.shape[axis] for axis in axes)
+            numbers *= math.prod(_aval(equation.invars[0]).shape[axis] for axis in axes)
         return numbers
 
     return sum(map(of, jaxpr.eqns))
@@ -159,7 +163,7 @@ def _evaluate(closed: ClosedJaxpr, args: Sequence, lanes: int) -> list:
 
     def read(atom):
         if isinstance(atom, Literal):
-            return np.asarray(atom.val, atom.aval.dtype)
+            return np.asarray(atom.val, _aval(atom).dtype)
         return values[atom]
 
     for equation in jaxpr.eqns:
@@ -204,7 +208,7 @@ def _alone(jaxpr: Jaxpr, equation: JaxprEqn, operands: list) -> tuple[Callable[.
 
 
 def _elementwise(equation: JaxprEqn, operands: list) -> np.ndarray:
-    shape = equation.outvars[0].aval.shape
+    shape = _aval(equation.outvars[0]).shape
     operands = [np.broadcast_to(_coordinates(operand), shape) for operand in operands]
 
     def entry(index):
@@ -214,7 +218,7 @@ def _elementwise(equation: JaxprEqn, operands: list) -> np.ndarray:
     return _objects(shape, entry)
 
 
-def _reduced(combine: Callable, value: np.ndarray, axes: Sequence[int]) -> np.ndarray:
+def _reduced(combine: Callable, value: np.ndarray, axes: Sequence) -> np.ndarray:
     value = np.moveaxis(value, axes, range(len(axes)))
     rest = value.shape[len(axes) :]
     rows = value.reshape(-1, *rest)
@@ -222,7 +226,7 @@ def _reduced(combine: Callable, value: np.ndarray, axes: Sequence[int]) -> np.nd
 
 
 def _product(equation: JaxprEqn, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    aval = equation.outvars[0].aval
+    aval = _aval(equation.outvars[0])
     axes, _ = equation.params["dimension_numbers"]
     product = np.asarray(np.tensordot(left, right, axes), object)
     return _objects(aval.shape, lambda index: product[index].astype(aval.dtype))

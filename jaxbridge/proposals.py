@@ -157,8 +157,8 @@ def _store(
 ) -> Store:
     """Rows for the stored steps; all begin as the start, which is what step 0 keeps."""
     if stored is None:
-        rows = jnp.broadcast_to(start, (num_steps + 1, *start.shape))
-        return Store(jnp.arange(1, num_steps + 1, dtype=jnp.int32), rows)
+        slots = jnp.arange(1, num_steps + 1, dtype=jnp.int32)
+        return Store(slots, jnp.broadcast_to(start, (num_steps + 1, *start.shape)))
     rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *start.shape))
     slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(stored.shape[0]))
     return Store(slots[1:], rows)

@@ -120,7 +120,7 @@ def test_trees_of_arguments_and_what_lanes_share():
     @over_lanes(-1, axes, None, None, -1)
     def function(x, tree, flag, i, dt):
         assert flag is True
-        return {"a": x * tree["shared"] * dt + i, "b": (tree["own"], i, None)}
+        return {"a": x * tree["shared"] * dt + i.astype(x.dtype), "b": (tree["own"], i, None)}
 
     made = jax.jit(lambda i: function(x, tree, True, i, dt))(jnp.int32(2))
     _assert_close(made["a"], x * dt + 2)
@@ -156,5 +156,5 @@ def test_steps_of_a_proposal_are_not_interleaved(scheme):
     text = jax.jit(run).lower(keys).compile().as_text()
     made_in_steps = [line for line in text.splitlines() if "while/body" in line]
     assert len(made_in_steps) > 50
-    floats = [line for line in made_in_steps if re.search(r"= f32\[6400,\d|= f32\[2,6400\]", line)]
-    assert floats == []
+    whole_points = r"= f32\[(6400,2|2,6400)\]\S* (fusion|concatenate|copy)\("
+    assert [line for line in made_in_steps if re.search(whole_points, line)] == []
