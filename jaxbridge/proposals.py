@@ -108,6 +108,9 @@ def propose(
         z, rho = step_joined(x, z, rho, x_next, noise, lane, i, coupling)
         return (x_next, z, rho), z
 
+    # A whole path is written next to its start; but not by a replay, which is there to be
+    # differentiated, in reverse mode too.
+    storing = not (replayed and stored is None)
     never = jnp.full(dt.shape, num_steps + 1, jnp.int32)
     rho = never if meeting_step is None else meeting_step
     (_, z_end, rho), z_path = noisy_scan(
@@ -117,9 +120,11 @@ def propose(
         pair_noise(coupling, dtype, replayed),
         (jnp.arange(num_steps, dtype=jnp.int32), x_path),
         num_steps,
-        store=_store(stored, start, num_steps),
+        store=_store(stored, start, num_steps) if storing else None,
     )
-    if stored is not None:
+    if not storing:
+        z_path = jnp.concatenate([start[None], z_path])
+    elif stored is not None:
         z_path = z_path[:-1]
     # Non-finite numbers stay non-finite from step to step, so the last states tell.
     finite = jnp.all(jnp.isfinite(x_start) & jnp.isfinite(z_end), axis=0) | (rho <= num_steps)
