@@ -17,10 +17,11 @@ from jaxtyping import Array, Bool, Float, Key
 
 from .coupling import AbstractCoupling, rotate_back, rotation_between
 from .diffusion import Diffusion
+from .lanes import over_lanes
 from .linalg import all_finite
 from .meeting import PairStep, frame
 from .noise import noisy_scan
-from .proposals import over_lanes, pair_noise, realise
+from .proposals import pair_noise, realise
 from .schemes import fitted_in_lanes
 from .start_laws import draw_starts
 

@@ -24,6 +24,7 @@ from .bridges import check_key
 from .coupling import AbstractCoupling, Coupling, rotate, rotation_between
 from .diffusion import Diffusion, check_diffusion
 from .intervals import as_intervals, check_count, check_model
+from .lanes import over_lanes
 from .meeting import PairStep, frame
 from .noise import noisy_scan
 from .schemes import fitted_in_lanes
@@ -118,6 +119,7 @@ def _measure(
     reflection = Coupling(-1.0, scheme=scheme, rotation=coupling.rotation)
     rule, root_dt = reflection.meeting, jnp.sqrt(dt)
 
+    @over_lanes(-1, -1, -1, -1, -1, -1, -1, -1)
     def step_pair(x, driven, met, dw, uniform, dt, root_dt, scheme):
         sigma, driven_sigma = dynamics.sigma(x), dynamics.sigma(driven)
         seen = frame(driven_sigma, x, driven)
@@ -133,9 +135,7 @@ def _measure(
     def step_pairs(pairs, inputs):
         x, driven, met = pairs
         (dw, uniform), _ = inputs
-        return jax.vmap(step_pair, in_axes=-1, out_axes=-1)(
-            x, driven, met, dw, uniform, dt, root_dt, fitted
-        ), None
+        return step_pair(x, driven, met, dw, uniform, dt, root_dt, fitted), None
 
     def draw(key, k):
         normal_key, uniform_key = jax.random.split(key)

@@ -14,6 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Int, Key, PyTree, Shaped
 
 from . import decisions
+from .lanes import Rows, join_rows, split_rows
 
 # Drawing for many steps at once spreads the cost of deriving keys; drawing for all of them
 # would double the memory of a long path.
@@ -57,21 +58,29 @@ def noisy_scan(
     num_idle = num_stretches * length - num_steps  # steps that fill up the last stretch
     slots, rows = (None, None) if store is None else store
 
+    # Between steps the coordinates of points are arrays of their own. The compiler sees that they
+    # are joined only to be taken apart again.
     def one_step(carry, inputs):
         carry, rows = carry
         noise, active, slot, x = inputs
-        stepped, y = step(carry, (noise, x))
+        carry = join_rows(carry)
+        stepped, y = step(carry, (noise, join_rows(x)))
         if active is not None:
             stepped = jax.tree.map(lambda new, old: jnp.where(active, new, old), stepped, carry)
+        stepped, y = split_rows(stepped), split_rows(y)
         if rows is None:
             return (stepped, None), y
-        return (stepped, lax.dynamic_update_index_in_dim(rows, y, slot, 0)), None
+        return (stepped, _keep(rows, y, slot)), None
 
     def one_stretch(carry, inputs):
-        index, *inputs = inputs
+        index, active, slots, xs = inputs
         stretch_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, index)
         noise = jax.vmap(lambda key: draw(key, length), out_axes=-1)(stretch_keys)
-        return lax.scan(one_step, carry, (noise, *inputs), reverse=reverse)
+        carry, rows = carry
+        init = split_rows(carry), rows
+        inputs = noise, active, slots, split_rows(xs, axis=1)
+        (carry, rows), ys = lax.scan(one_step, init, inputs, reverse=reverse)
+        return (join_rows(carry), rows), join_rows(ys, axis=1)
 
     if num_stretches == 1:
         (carry, rows), ys = one_stretch((init, rows), (0, None, slots, xs))
@@ -108,3 +117,14 @@ def noisy_scan(
         return lax.while_loop(going_on, next_stretch, (0, init))[1], None
     (carry, rows), ys = lax.scan(one_stretch, (init, rows), inputs, reverse=reverse)
     return carry, jax.tree.map(join, ys) if store is None else rows
+
+
+def _keep(
+    rows: Shaped[Array, "rows ..."], y: Shaped[Array, "..."] | Rows, slot: Int[Array, ""]
+) -> Shaped[Array, "rows ..."]:
+    """The rows of a store with `y` in this one."""
+    if not isinstance(y, Rows):
+        return lax.dynamic_update_index_in_dim(rows, y, slot, 0)
+    for j, row in enumerate(y):
+        rows = lax.dynamic_update_slice(rows, row[None, None], (slot, j, 0))
+    return rows

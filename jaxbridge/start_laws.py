@@ -27,6 +27,7 @@ from jaxtyping import Array, Float, Int, Key
 from .arrays import Numbers, as_floating, cast_floats, is_traced
 from .diffusion import Diffusion, Dynamics, check_value
 from .gaussian import GaussianLaw
+from .lanes import over_lanes
 from .noise import noisy_scan
 from .schemes import AbstractScheme, fitted_in_lanes
 
@@ -183,11 +184,10 @@ def run_for(
     """The state after `repeats` times `num_steps` steps, in each lane."""
     root_dt = jnp.sqrt(dt)
     fitted = fitted_in_lanes(scheme, dynamics, x[:, 0], dt)
-    step = jax.vmap(
-        lambda x, dw, dt, root_dt, scheme: scheme.step(dynamics, x, dt, root_dt * dw),
-        in_axes=-1,
-        out_axes=-1,
-    )
+
+    @over_lanes(-1, -1, -1, -1, -1)
+    def step(x, dw, dt, root_dt, scheme):
+        return scheme.step(dynamics, x, dt, root_dt * dw)
 
     def once(repeat, x):
         end, _ = noisy_scan(

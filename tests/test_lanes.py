@@ -1,0 +1,160 @@
+"""Functions of one point over lanes: the results of `vmap`, without interleaved arrays."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+import jaxbridge as jb
+from jaxbridge.lanes import join_rows, over_lanes, split_rows
+from jaxbridge.linalg import cholesky, inverse, polar_factor, safe_norm
+from jaxbridge.proposals import propose
+
+B = np.array([[1.5, 1.0, 0.2], [0.3, -1.0, 1.5], [0.0, 0.5, 2.0]])
+
+
+def _matrix(x):
+    return jnp.stack([jnp.stack([x[i] * x[j] + float(i == j) for j in range(3)]) for i in range(3)])
+
+
+@jax.custom_jvp
+def _softened(x):
+    return jnp.sqrt(1 + x * x)
+
+
+_softened.defjvp(lambda primals, tangents: (_softened(*primals), 3 * tangents[0]))
+
+
+def _energy(x):
+    return _softened(x[0]) * (x @ x) - jnp.sum(jnp.where(x > 0, x**3, jnp.sin(x)))
+
+
+FUNCTIONS = {
+    "linear": lambda x: -jnp.asarray(B, x.dtype) @ (x - 1),
+    "hyperbolic": lambda x: -0.8 * x / jnp.sqrt(1 + x @ x),
+    "vector times matrix": lambda x: x @ jnp.asarray(B, x.dtype),
+    "outer": lambda x: jnp.outer(x, x) @ x,
+    "scalar": lambda x: x @ x,
+    "constant": lambda x: jnp.ones(3, x.dtype),
+    "where": lambda x: jnp.where(x > 0, jnp.sin(x), 1 / (1 + x * x)),
+    "reductions": lambda x: jnp.stack([x.sum(), x.max(), x.min(), jnp.prod(x), x.mean()]),
+    "any": lambda x: (jnp.any(x > 1), jnp.all(jnp.isfinite(x)), jnp.argmax(x)),
+    "stacked": lambda x: jnp.concatenate([x[::-1], jnp.stack([x[0] * x[1], -x[2]]), x[1:]]),
+    "moved": lambda x: jnp.broadcast_to(x[:, None], (3, 2)).T.reshape(-1)[::2],
+    "roll": lambda x: jnp.roll(x, 1) - jnp.diff(x, append=x[:1]),
+    "set": lambda x: x.at[1].set(x[0]).at[2].add(2.0),
+    "norm": lambda x: safe_norm(x - x),
+    "matrix": lambda x: inverse(_matrix(x)) @ cholesky(_matrix(x)),
+    "polar": lambda x: polar_factor(_matrix(x)),
+    "einsum": lambda x: jnp.einsum("ij,jk,k->i", _matrix(x), jnp.asarray(B, x.dtype), x),
+    "batched product": lambda x: jnp.einsum("ij,ij->i", _matrix(x), _matrix(2 * x)),
+    "relu": lambda x: jax.nn.relu(x) + jax.nn.softplus(x) + jax.nn.sigmoid(x),
+    "own derivative": _softened,
+    "cond": lambda x: lax.cond(x[0] > 0, lambda y: y * y, lambda y: jnp.cos(y), x),
+    "loop": lambda x: lax.fori_loop(0, 4, lambda i, y: y - 0.1 * jnp.sin(y), x),
+    "scan": lambda x: lax.scan(lambda c, b: (c + b @ x, c), x[0], jnp.asarray(B, x.dtype)),
+    "traced index": lambda x: x[jnp.argmax(jnp.abs(x))] * x[jnp.array([2, 0])],
+    "gradient": jax.grad(_energy),
+    "hessian": jax.hessian(_energy),
+    "jacobian": lambda x: jax.jacfwd(lambda y: jnp.asarray(B, y.dtype) @ jnp.tanh(y))(x),
+    "converted": lambda x: (x > 0).astype(jnp.int32) + jnp.round(x).astype(jnp.int32),
+    "special": lambda x: jax.scipy.special.gammaln(1 + x * x) + jax.scipy.special.erf(x),
+}
+
+
+def _points(lanes=7, seed=0):
+    return jax.random.normal(jax.random.key(seed), (3, lanes))
+
+
+def _assert_close(got, wanted):
+    def check(got, wanted):
+        assert got.shape == wanted.shape and got.dtype == wanted.dtype
+        tolerance = 1e-12 if wanted.dtype == jnp.float64 else 2e-5
+        np.testing.assert_allclose(got, wanted, rtol=tolerance, atol=tolerance)
+
+    jax.tree.map(check, got, wanted)
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_equals_vmap(name, precision):
+    function, x = FUNCTIONS[name], _points()
+    wanted = jax.vmap(function, in_axes=-1, out_axes=-1)(x)
+    _assert_close(over_lanes(-1)(function)(x), wanted)
+    _assert_close(jax.jit(over_lanes(-1)(function))(x), wanted)
+
+
+@pytest.mark.parametrize("name", sorted(set(FUNCTIONS) - {"any", "converted", "constant"}))
+def test_derivatives_equal_those_of_vmap(name):
+    function, x, tangent = FUNCTIONS[name], _points(), _points(seed=1)
+    by_lanes, by_vmap = over_lanes(-1)(function), jax.vmap(function, in_axes=-1, out_axes=-1)
+    _assert_close(jax.jvp(by_lanes, (x,), (tangent,)), jax.jvp(by_vmap, (x,), (tangent,)))
+    total = lambda f: lambda x: sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(f(x)))
+    if name != "set":
+        _assert_close(jax.grad(total(by_lanes))(x), jax.grad(total(by_vmap))(x))
+
+
+def test_derivatives_by_what_the_function_closes_over():
+    x = _points()
+
+    def loss(over, matrix):
+        step = over(lambda x: jnp.tanh(matrix @ x) * matrix[0, 1])
+        return jnp.sum(lax.scan(lambda x, _: (step(x), None), x, length=3)[0] ** 2)
+
+    matrices = jnp.stack([jnp.asarray(B, x.dtype), jnp.asarray(B.T, x.dtype)])
+    over_vmap = lambda function: jax.vmap(function, in_axes=-1, out_axes=-1)
+    got, wanted = [
+        jax.jit(jax.vmap(jax.grad(lambda matrix: loss(over, matrix))))(matrices)  # noqa: B023
+        for over in (over_lanes(-1), over_vmap)
+    ]
+    _assert_close(got, wanted)
+
+
+def test_trees_of_arguments_and_what_lanes_share():
+    x, dt = _points(), jnp.arange(1.0, 8.0)
+    tree = {"own": x[:2], "shared": jnp.ones(3), "nothing": None}
+    axes = {"own": -1, "shared": None, "nothing": None}
+
+    @over_lanes(-1, axes, None, None, -1)
+    def function(x, tree, flag, i, dt):
+        assert flag is True
+        return {"a": x * tree["shared"] * dt + i.astype(x.dtype), "b": (tree["own"], i, None)}
+
+    made = jax.jit(lambda i: function(x, tree, True, i, dt))(jnp.int32(2))
+    _assert_close(made["a"], x * dt + 2)
+    _assert_close(made["b"][0], x[:2])
+    _assert_close(made["b"][1], jnp.full(7, 2, jnp.int32))
+
+
+def test_a_function_of_many_numbers_is_vmapped():
+    function = lambda x: jnp.sin(jnp.outer(x, jnp.arange(400.0))).sum(1)
+    jaxpr = jax.make_jaxpr(over_lanes(-1)(function))(_points())
+    assert len(jaxpr.jaxpr.eqns) < 20
+    _assert_close(over_lanes(-1)(function)(_points()), jax.vmap(function, -1, -1)(_points()))
+
+
+def test_rows():
+    tree = (_points(), jnp.ones(7), None)
+    _assert_close(join_rows(split_rows(tree)), tree)
+    assert len(jax.tree.leaves(split_rows(tree))) == 4
+
+
+@pytest.mark.parametrize("scheme", [jb.Euler(), jb.Heun()])
+def test_steps_of_a_proposal_are_not_interleaved(scheme):
+    lanes, B = 6400, jnp.array([[1.5, 1.0], [1.0, 1.5]])
+    model = jb.Diffusion(
+        lambda x, p: -B @ x, log_stationary=lambda x, p: -x @ B @ x, reversible=True
+    )
+    coupling, points = jb.Coupling(0.5, scheme=scheme), jnp.zeros((2, lanes))
+
+    def run(keys):
+        return propose(model, coupling, keys, points, points, jnp.full(lanes, 0.1), 10)
+
+    keys = jax.random.split(jax.random.key(0), lanes)
+    text = jax.jit(run).lower(keys).compile().as_text()
+    made_in_steps = [line for line in text.splitlines() if "while/body" in line]
+    assert len(made_in_steps) > 50
+    whole_points = r"= f32\[(6400,2|2,6400)\]\S* (fusion|concatenate|copy)\("
+    assert [line for line in made_in_steps if re.search(whole_points, line)] == []
