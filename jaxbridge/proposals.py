@@ -161,7 +161,8 @@ def _store(
     stored: Int[Array, " K"] | None, start: Float[Array, "d lanes"], num_steps: int
 ) -> Store:
     """Rows for the stored steps; all begin as the start, which is what step 0 keeps."""
-    if stored is None:
+    whole = decisions.stored_times(None if stored is None else stored.shape[0])
+    if stored is None or whole.simulated:
         slots = jnp.arange(1, num_steps + 1, dtype=jnp.int32)
         return Store(slots, jnp.broadcast_to(start, (num_steps + 1, *start.shape)))
     rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *start.shape))
