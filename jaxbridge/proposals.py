@@ -109,8 +109,9 @@ def propose(
         return (x_next, z, rho), z
 
     # A whole path is written next to its start; but not by a replay, which is there to be
-    # differentiated, in reverse mode too.
-    storing = not (replayed and stored is None)
+    # differentiated, and a store is slow in reverse mode.
+    if stored is None and not replayed:
+        stored = jnp.arange(num_steps + 1)
     never = jnp.full(dt.shape, num_steps + 1, jnp.int32)
     rho = never if meeting_step is None else meeting_step
     (_, z_end, rho), z_path = noisy_scan(
@@ -120,11 +121,11 @@ def propose(
         pair_noise(coupling, dtype, replayed),
         (jnp.arange(num_steps, dtype=jnp.int32), x_path),
         num_steps,
-        store=_store(stored, start, num_steps) if storing else None,
+        store=None if stored is None else _store(stored, start, num_steps),
     )
-    if not storing:
+    if stored is None:
         z_path = jnp.concatenate([start[None], z_path])
-    elif stored is not None:
+    else:
         z_path = z_path[:-1]
     # Non-finite numbers stay non-finite from step to step, so the last states tell.
     finite = jnp.all(jnp.isfinite(x_start) & jnp.isfinite(z_end), axis=0) | (rho <= num_steps)
@@ -157,14 +158,15 @@ def realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
     return realised, axes
 
 
-def _store(
-    stored: Int[Array, " K"] | None, start: Float[Array, "d lanes"], num_steps: int
-) -> Store:
+def _store(stored: Int[Array, " K"], start: Float[Array, "d lanes"], num_steps: int) -> Store:
     """Rows for the stored steps; all begin as the start, which is what step 0 keeps."""
+<<<<<<< HEAD
     whole = decisions.stored_times(None if stored is None else stored.shape[0])
     if stored is None or whole.simulated:
         slots = jnp.arange(1, num_steps + 1, dtype=jnp.int32)
         return Store(slots, jnp.broadcast_to(start, (num_steps + 1, *start.shape)))
+=======
+>>>>>>> lanes
     rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *start.shape))
     slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(stored.shape[0]))
     return Store(slots[1:], rows)
