@@ -110,7 +110,8 @@ def propose(
 
     # A whole path is written next to its start; but not by a replay, which is there to be
     # differentiated, and a store is slow in reverse mode.
-    if stored is None and not replayed:
+    num_stored = None if stored is None else stored.shape[0]
+    if decisions.stored_times(num_stored).simulated and not replayed:
         stored = jnp.arange(num_steps + 1)
     never = jnp.full(dt.shape, num_steps + 1, jnp.int32)
     rho = never if meeting_step is None else meeting_step
@@ -160,13 +161,6 @@ def realise(coupling: AbstractCoupling, keys: Key[Array, " lanes"], dtype):
 
 def _store(stored: Int[Array, " K"], start: Float[Array, "d lanes"], num_steps: int) -> Store:
     """Rows for the stored steps; all begin as the start, which is what step 0 keeps."""
-<<<<<<< HEAD
-    whole = decisions.stored_times(None if stored is None else stored.shape[0])
-    if stored is None or whole.simulated:
-        slots = jnp.arange(1, num_steps + 1, dtype=jnp.int32)
-        return Store(slots, jnp.broadcast_to(start, (num_steps + 1, *start.shape)))
-=======
->>>>>>> lanes
     rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *start.shape))
     slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(stored.shape[0]))
     return Store(slots[1:], rows)
