@@ -163,7 +163,7 @@ def test_several_intervals_are_several_chains(method):
     np.testing.assert_allclose(both.paths[1], states.position, atol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
+@pytest.mark.parametrize("method", [pytest.param("pseudo_marginal", marks=slow), "renewal"])
 def test_blackjax_runs_the_kernels(method):
     """The runner touches `init(position, key)` and `step(key, state)` only."""
     kernel = getattr(jb, method)(*ARGUMENTS, num_steps=20, proposal=jb.Coupling(0.5))

@@ -41,6 +41,7 @@ def test_each_interval_gets_what_its_own_proposal_gives():
     assert mixed.met.all()
 
 
+@pytest.mark.slow
 def test_thousands_of_intervals_with_different_choices_keep_the_law():
     """Densities of 1,500 intervals, a third by each proposal, against the closed form, without
     compiling again when numbers change."""
@@ -73,7 +74,7 @@ def test_thousands_of_intervals_with_different_choices_keep_the_law():
 @pytest.mark.parametrize(
     "duration, model, winners",
     [
-        (0.05, HYPERBOLIC, {"ModifiedDiffusionBridge"}),
+        pytest.param(0.05, HYPERBOLIC, {"ModifiedDiffusionBridge"}, marks=slow),
         (1.0, HYPERBOLIC, {"ModifiedDiffusionBridge"}),
         pytest.param(2.0, paper_model(), {'Guided("end")', 'Guided("path")'}, marks=slow),
         pytest.param(4.0, BLIND, {'Guided("end")', 'Guided("path")'}, marks=slow),

@@ -24,7 +24,8 @@ def batch_means(values, num_batches=40):
 
 
 @pytest.mark.parametrize(
-    "proposal, step_size", [(jb.ModifiedDiffusionBridge(), 0.4), (jb.Guided(), 0.7)]
+    "proposal, step_size",
+    [pytest.param(jb.ModifiedDiffusionBridge(), 0.4, marks=pytest.mark.slow), (jb.Guided(), 0.7)],
 )
 def test_chain_has_the_law_that_weights_give(proposal, step_size):
     """Mean and variance at a third of the time, and the share of paths that have crossed."""
@@ -105,6 +106,7 @@ def test_a_path_that_enters_is_the_state():
     np.testing.assert_allclose(moved.position, state.position, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_several_intervals_have_chains_of_their_own():
     starts, ends = jnp.array([[0.3, 0.1], [0.5, 0.0]]), jnp.array([[-0.2, 0.4], [0.0, 0.0]])
     model, durations = paper_model(), jnp.array([0.5, 1.0])

@@ -118,6 +118,7 @@ def test_results_do_not_depend_on_lanes_and_paths_stop_when_they_have_hit():
     np.testing.assert_allclose(many.start, few.start, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_bounds_are_kept_and_flagged():
     bridges = some_bridges(20)
     far = jb.GaussianLaw([50.0, 50.0], 0.01 * jnp.eye(2))

@@ -114,6 +114,7 @@ def test_several_intervals_are_weighed_as_one_by_one():
     assert resampled.shape == (2, 500, 31, 2)
 
 
+@pytest.mark.slow
 def test_means_errors_and_resampling_follow_the_weights():
     weighted = weighted_bridges(exact_case(paper_model(), [0.0, 0.0], [0.5, 0.0], 1.0, 0.5), 200)
     weights, paths = np.asarray(weighted.weights, float), np.asarray(weighted.paths, float)

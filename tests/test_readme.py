@@ -8,7 +8,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), 
 
 
 def test_readme_code_runs():
-    assert len(BLOCKS) == 8
+    assert len(BLOCKS) == 9
     namespace = {}
     for block in BLOCKS:
         exec(block, namespace)
@@ -22,6 +22,7 @@ def test_readme_code_runs():
     assert namespace["chain"].paths.shape == (1000, 101, 2)
     assert namespace["density"].standard_error < 0.2
     assert namespace["short"].acceptance_rate > 0.95
+    assert namespace["costs"].cheapest() is not None
     assert namespace["densities"].value.shape == (500,)
     assert (namespace["densities"].standard_error < 0.5).mean() > 0.95
 

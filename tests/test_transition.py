@@ -90,6 +90,7 @@ def test_normaliser_of_the_stationary_density_cancels_where_the_start_law_has_on
     assert abs(float(first.value) - exact) < 5 * float(first.standard_error) + 0.01
 
 
+@pytest.mark.slow
 def test_thousands_of_pairs_at_once_without_compiling_again():
     model = paper_model()
     rng = np.random.default_rng(0)

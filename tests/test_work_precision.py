@@ -60,6 +60,7 @@ def test_step_errors_of_euler_are_of_first_order(euler):
     assert abs(weights.order - 1) < 0.35 + 5 * weights.error
 
 
+@pytest.mark.slow
 def test_exact_transitions_have_hardly_a_step_error():
     result = jb.work_precision(
         KEY,
@@ -94,6 +95,7 @@ def test_the_closed_form_serves_functions_of_the_path():
     assert setting.error < 5 * setting.uncertainty
 
 
+@pytest.mark.slow
 def test_other_models_have_a_finer_reference_with_its_own_error():
     result = jb.work_precision(
         KEY,
