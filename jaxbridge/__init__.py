@@ -9,9 +9,12 @@ law (`start_laws`, `burn_in`), hits it or not (`hitting`), which makes a weight
 the densities of their steps (`step_density`), and pilot runs choose (`choice`, `tuning`). On
 weighted proposals (`weighted`) are built importance sampling (`importance`), transition
 densities (`transition`) and Markov chains (`chains`, one method a module), with `diagnostics`
-on top. Exact laws stand beside (`gaussian`), the studies above all (`study`, `exact_study`,
-`plot`). References to equations and sections are to Bladt, Finch & Sørensen, *Simulation of
-multivariate diffusion bridges*.
+on top. What a program simulates is decided in one table (`decisions`, `scene`), and its loops
+run over many lanes of small points (`lanes`, `noise`). Exact laws stand beside (`gaussian`,
+`linear`), what accuracy costs above (`work_precision`), and the studies above all (`study`,
+`exact_study`, `accuracy_study`, `crossover_study`, `benchmark`, `plot`). References to
+equations and sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion
+bridges*.
 """
 
 from .bridges import Bridges as Bridges, sample_bridges as sample_bridges

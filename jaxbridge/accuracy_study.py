@@ -1,10 +1,9 @@
 """What accuracy costs in time: the paper's setting beside better ones, and what effects cost.
 
 The paper's unlikely bridge, by Euler's scheme with the sign test in a radius, as published, and
-then with one thing changed after the other: the radius, the meeting rule, the scheme. Exact
-Gaussian transitions leave the meeting rule as the only error of discretisation. The same for a
-process with a full σ(x), whose bridges are known because it is an Ornstein–Uhlenbeck process in
-other coordinates.
+then with another meeting rule and other schemes. Exact Gaussian transitions leave the meeting
+rule as the only error of discretisation. The same for a process with a full σ(x), whose bridges
+are known because it is an Ornstein–Uhlenbeck process in other coordinates.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,7 +42,7 @@ class Curve(NamedTuple):
 
 
 def curves() -> list[Curve]:
-    """From the paper's setting to the best, the error of one thing at a time."""
+    """Couplings in each of which one error of discretisation dominates."""
     fine, coarse = (20, 40, 80, 160), (6, 10, 16, 24)
     return [
         Curve(

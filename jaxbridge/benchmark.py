@@ -37,8 +37,7 @@ from .work_precision import work_precision
 
 _NUM_STEPS = 50
 DURATIONS = (0.05, 0.25, 1.0, 5.0, 20.0, 50.0)
-# As many lanes as `sample_bridges` would take.
-_LANES = 5_000
+_LANES = 5_000  # a divisor of the number of proposals
 _TARGETS = (0.1, 0.05)
 
 
@@ -330,9 +329,13 @@ def format_ratios(benchmark: Benchmark) -> str:
 
 
 def _times(r: Ratio) -> str:
-    if not math.isfinite(r.ratio):
-        return "not reached"
+    if not (math.isfinite(r.seconds) and math.isfinite(r.reference_seconds)):
+        return f"{_seconds(r.seconds)} / {_seconds(r.reference_seconds)}"
     return f"{r.seconds:.3g} s / {r.reference_seconds:.3g} s = {r.ratio:.3g}"
+
+
+def _seconds(value: float) -> str:
+    return f"{value:.2g} s" if math.isfinite(value) else "not reached"
 
 
 def markdown(benchmark: Benchmark) -> str:
@@ -341,11 +344,14 @@ def markdown(benchmark: Benchmark) -> str:
     lines = [
         f"{benchmark.device}, {benchmark.processor}, JAX {versions['jax']}, {benchmark.date}:",
         "",
-        "| call | seconds | against | ratio |",
+        "| call | takes | against | ratio |",
         "|---|---|---|---|",
     ]
     for r in benchmark.ratios:
-        lines.append(f"| {r.what} | {r.seconds:.2g} | {r.against} | {r.ratio:.2g} |")
+        both = math.isfinite(r.seconds) and math.isfinite(r.reference_seconds)
+        ratio = f"{r.ratio:.2g}" if both else "-"
+        against = r.against if both else f"{r.against}: {_seconds(r.reference_seconds)}"
+        lines.append(f"| {r.what} | {_seconds(r.seconds)} | {against} | {ratio} |")
     lines += [
         "",
         "| σ(x), d = | ns a path and step, σ = I | full σ(x) | ratio |",

@@ -2,27 +2,27 @@
 
 `jax.vmap` takes lanes through a function as an axis of its arrays, the first wherever a number
 meets a vector: states are then interleaved lane by lane, and loops over time do not vectorise.
-Here a function of one small point is traced and evaluated on coordinates, each of them an array
-of lanes. What only moves numbers about (indexing, stacking, transposing, broadcasting) happens
-while tracing, and a product of matrices is a sum of products; what is left to compile is
-arithmetic on arrays of lanes, which XLA fuses into a few passes.
+Here a function of one small point is traced and evaluated, equation by equation, with lanes last:
+coordinate by coordinate if there are few, else array by array (`lane_forms`). Short sums and
+products of matrices are written out, and what is left to compile is arithmetic on arrays of
+lanes, which XLA fuses into a few passes. Equations that have no rule here go through `vmap`.
 """
 
-import functools
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
-from jaxtyping import Array, PyTree, Shaped
+from jaxtyping import Array, PyTree
 
-# Beyond these, what is written out takes long to compile, and vectors are long enough for `vmap`.
+from .lane_forms import AbstractForm, Coordinates, LanesLast, aval, is_short
+
+# Beyond these, what is written out in coordinates takes long to compile.
 _MOST_NUMBERS = 512
 _MOST_ROWS = 4
 
@@ -49,12 +49,11 @@ def over_lanes(*in_axes: PyTree) -> Callable[[Callable], Callable[..., Any]]:
             arrays = [leaf for leaf, own in zip(leaves, in_lanes, strict=True) if own]
             points = [jax.ShapeDtypeStruct(array.shape[:-1], array.dtype) for array in arrays]
             closed, out = jax.make_jaxpr(of_point, return_shape=True)(*points)
-            if _count_numbers(closed.jaxpr) > _MOST_NUMBERS:
-                results = jax.vmap(jaxpr_as_fun(closed), in_axes=-1, out_axes=-1)(*arrays)
-            else:
-                lanes = arrays[0].shape[-1]
-                values = _evaluate(closed, [_split(array) for array in arrays], lanes)
-                results = [_join(value, lanes) for value in values]
+            few = _count_numbers(closed.jaxpr) <= _MOST_NUMBERS
+            form = Coordinates() if few else LanesLast()
+            lanes = arrays[0].shape[-1]
+            values = _evaluate(closed, [form.split(array) for array in arrays], form, lanes)
+            results = [form.join(value, lanes) for value in values]
             return jax.tree.unflatten(jax.tree.structure(out), results)
 
         return over
@@ -89,21 +88,6 @@ def join_rows(tree: PyTree, axis: int = 0) -> PyTree:
     )
 
 
-# While a function is evaluated, a value is an array that all lanes share, or its coordinates: an
-# `np.ndarray` of objects, each of them an array of lanes or a number that all lanes share.
-
-
-def _split(array: Shaped[Array, "*shape lanes"]) -> np.ndarray:
-    return _objects(array.shape[:-1], lambda index: array[index])
-
-
-def _join(value, lanes: int) -> Shaped[Array, "*shape lanes"]:
-    if not _is_split(value):
-        return jnp.broadcast_to(jnp.asarray(value)[..., None], (*np.shape(value), lanes))
-    rows = [jnp.broadcast_to(number, (lanes,)) for number in value.flat]
-    return jnp.stack(rows).reshape(*value.shape, lanes) if value.ndim else rows[0]
-
-
 def _axes_of_leaves(in_axes: Sequence[PyTree], args: Sequence[PyTree]) -> list[int | None]:
     def spread(axis, part):
         return [axis] * len(jax.tree.leaves(part))
@@ -113,88 +97,88 @@ def _axes_of_leaves(in_axes: Sequence[PyTree], args: Sequence[PyTree]) -> list[i
     return jax.tree.leaves(axes, is_leaf=is_none)
 
 
-def _is_split(value) -> bool:
-    return isinstance(value, np.ndarray) and value.dtype == object
-
-
-def _objects(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], Any]) -> np.ndarray:
-    """The array of objects with these entries."""
-    objects = np.empty(shape, object)
-    for index in np.ndindex(shape):
-        objects[index] = entry(index)
-    return objects
-
-
-def _coordinates(value) -> np.ndarray:
-    return value if _is_split(value) else _objects(np.shape(value), lambda index: value[index])
-
-
-def _aval(atom: Var | Literal) -> jax.core.ShapedArray:
-    return cast(jax.core.ShapedArray, atom.aval)
-
-
 def _inner(equation: JaxprEqn) -> ClosedJaxpr | None:
     """The body of a call that is no more than its body."""
     return equation.params["jaxpr"] if equation.primitive.name in ("jit", "pjit") else None
 
 
-def _count_numbers(jaxpr: Jaxpr) -> int:
-    """How many numbers the function computes in one lane."""
+def _count_numbers(jaxpr: Jaxpr) -> int | float:
+    """How many numbers the function computes in one lane; without end where some array is empty,
+    of which coordinates know nothing."""
 
-    def of(equation: JaxprEqn) -> int:
+    def of(equation: JaxprEqn) -> int | float:
         inner, name = _inner(equation), equation.primitive.name
+        if any(0 in aval(atom).shape for atom in (*equation.invars, *equation.outvars)):
+            return math.inf
         if inner is not None:
             return _count_numbers(inner.jaxpr)
-        if name in _MOVES:
+        if name in Coordinates.moves:
             return 0
         counted = equation.invars if name in _REDUCTIONS else equation.outvars
-        numbers = sum(math.prod(_aval(atom).shape) for atom in counted)
+        numbers = sum(math.prod(aval(atom).shape) for atom in counted)
         if name == "dot_general":
             (axes, _), _ = equation.params["dimension_numbers"]
-            numbers *= math.prod(_aval(equation.invars[0]).shape[axis] for axis in axes)
+            numbers *= math.prod(aval(equation.invars[0]).shape[axis] for axis in axes)
         return numbers
 
     return sum(map(of, jaxpr.eqns))
 
 
-def _evaluate(closed: ClosedJaxpr, args: Sequence, lanes: int) -> list:
+def _evaluate(closed: ClosedJaxpr, args: Sequence, form: AbstractForm, lanes: int) -> list:
     jaxpr = closed.jaxpr
     values: dict[Var, Any] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
 
     def read(atom):
         if isinstance(atom, Literal):
-            return np.asarray(atom.val, _aval(atom).dtype)
+            return np.asarray(atom.val, aval(atom).dtype)
         return values[atom]
 
     for equation in jaxpr.eqns:
         operands = [read(atom) for atom in equation.invars]
-        results = _apply(jaxpr, equation, operands, lanes)
+        results = _apply(jaxpr, equation, operands, form, lanes)
         values.update(zip(equation.outvars, results, strict=True))
     return [read(atom) for atom in jaxpr.outvars]
 
 
-def _apply(jaxpr: Jaxpr, equation: JaxprEqn, operands: list, lanes: int) -> list:
+def _apply(
+    jaxpr: Jaxpr, equation: JaxprEqn, operands: list, form: AbstractForm, lanes: int
+) -> list:
     name, params = equation.primitive.name, equation.params
-    if not any(map(_is_split, operands)):
+    if not any(map(form.is_own, operands)):
         function, operands = _alone(jaxpr, equation, operands)
         return function(*operands)
     inner = _inner(equation)
     if inner is not None:
-        return _evaluate(inner, operands, lanes)
+        return _evaluate(inner, operands, form, lanes)
     if name in _ELEMENTWISE:
-        return [_elementwise(equation, operands)]
-    if name in _MOVES:
-        moved = _MOVES[name](*map(_coordinates, operands), **params)
-        return list(moved) if equation.primitive.multiple_results else [moved]
-    if name in _REDUCTIONS:
-        return [_reduced(_REDUCTIONS[name], operands[0], params["axes"])]
-    if name == "dot_general" and not any(params["dimension_numbers"][1]):
-        return [_product(equation, *map(_coordinates, operands))]
+        return [form.elementwise(equation, operands)]
+    if name in form.moves:
+        return form.moved(equation, operands)
+    if name in _REDUCTIONS and is_short(equation, params["axes"]):
+        return [form.reduced(_REDUCTIONS[name], operands[0], params["axes"])]
+    if name == "dot_general" and _is_plain(equation):
+        return [form.product(equation, *operands)]
+    return _by_vmap(jaxpr, equation, operands, form, lanes)
+
+
+def _is_plain(equation: JaxprEqn) -> bool:
+    """Whether it is a short sum of outer products."""
+    (axes, _), batched = equation.params["dimension_numbers"]
+    return not any(batched) and len(axes) == 1 and is_short(equation, axes)
+
+
+def _by_vmap(
+    jaxpr: Jaxpr, equation: JaxprEqn, operands: list, form: AbstractForm, lanes: int
+) -> list:
     function, operands = _alone(jaxpr, equation, operands)
-    axes = [-1 if _is_split(operand) else None for operand in operands]
-    joined = [_join(operand, lanes) if _is_split(operand) else operand for operand in operands]
-    return [_split(result) for result in jax.vmap(function, axes, -1)(*joined)]
+    own = [form.is_own(operand) for operand in operands]
+    arrays = [
+        form.join(operand, lanes) if mine else operand
+        for operand, mine in zip(operands, own, strict=True)
+    ]
+    results = jax.vmap(function, [-1 if mine else None for mine in own], -1)(*arrays)
+    return [form.split(result) for result in results]
 
 
 def _alone(jaxpr: Jaxpr, equation: JaxprEqn, operands: list) -> tuple[Callable[..., list], list]:
@@ -208,52 +192,6 @@ def _alone(jaxpr: Jaxpr, equation: JaxprEqn, operands: list) -> tuple[Callable[.
     return jaxpr_as_fun(ClosedJaxpr(alone, [])), list(own.values())
 
 
-def _elementwise(equation: JaxprEqn, operands: list) -> np.ndarray:
-    shape = _aval(equation.outvars[0]).shape
-    operands = [np.broadcast_to(_coordinates(operand), shape) for operand in operands]
-
-    def entry(index):
-        numbers = jnp.broadcast_arrays(*(operand[index] for operand in operands))
-        return equation.primitive.bind(*numbers, **equation.params)
-
-    return _objects(shape, entry)
-
-
-def _reduced(combine: Callable, value: np.ndarray, axes: Sequence) -> np.ndarray:
-    value = np.moveaxis(value, axes, range(len(axes)))
-    rest = value.shape[len(axes) :]
-    rows = value.reshape(-1, *rest)
-    return _objects(rest, lambda index: functools.reduce(combine, rows[:, *index]))
-
-
-def _product(equation: JaxprEqn, left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    aval = _aval(equation.outvars[0])
-    axes, _ = equation.params["dimension_numbers"]
-    product = np.asarray(np.tensordot(left, right, axes), object)
-    return _objects(aval.shape, lambda index: product[index].astype(aval.dtype))
-
-
-def _broadcast(value, *, shape, broadcast_dimensions, **_):
-    unit = np.ones(len(shape), int)
-    unit[list(broadcast_dimensions)] = value.shape
-    return np.broadcast_to(value.reshape(unit), shape)
-
-
-def _slice(value, *, start_indices, limit_indices, strides):
-    return value[tuple(map(slice, start_indices, limit_indices, strides or [None] * value.ndim))]
-
-
-_MOVES: dict[str, Callable] = {
-    "broadcast_in_dim": _broadcast,
-    "concatenate": lambda *values, dimension: np.concatenate(values, dimension),
-    "reshape": lambda value, *, new_sizes, **_: value.reshape(new_sizes),
-    "rev": lambda value, *, dimensions: np.flip(value, dimensions),
-    "slice": _slice,
-    "split": lambda value, *, sizes, axis: np.split(value, np.cumsum(sizes)[:-1], axis),
-    "squeeze": lambda value, *, dimensions: value.squeeze(dimensions),
-    "stack": lambda *values, axis: np.stack(values, axis),
-    "transpose": lambda value, *, permutation: value.transpose(permutation),
-}
 _REDUCTIONS: dict[str, Callable] = {
     "reduce_and": operator.and_,
     "reduce_max": lax.max,

@@ -24,7 +24,7 @@ from .linalg import matmul
 
 # ‖A‖ s ≤ 1/16 and ten terms leave an error below 1e-16, also of Γ, whose series goes by 2 ‖A‖ s.
 _SHORT, _NUM_TERMS = 1 / 16, 10
-# For derivatives: enough for times of 2^60 times the shortest relaxation time.
+# Enough for times of 2^60 times the shortest relaxation time.
 _MAX_DOUBLINGS = 64
 
 
@@ -72,6 +72,7 @@ def _over_short_time(A, V, t) -> tuple[Float[Array, ""], LinearTransition]:
     identity = jnp.eye(A.shape[0], dtype=A.dtype)
     rate = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(A), axis=1)))
     doublings = jnp.ceil(jnp.log2(jnp.maximum(lax.stop_gradient(t) * rate / _SHORT, 1)))
+    doublings = jnp.minimum(doublings, _MAX_DOUBLINGS)  # there is an end, whatever the numbers
     s = t / 2**doublings
     term, covariance_term = s * identity, s * V
     integral, covariance = term, covariance_term

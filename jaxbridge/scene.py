@@ -31,8 +31,8 @@ def effects(
     **Arguments:**
 
     - `model`, `coupling`: as in `sample_bridges`.
-    - `at`: any point of the state space, shape (d,). By default zero, in the first dimension that
-        the model's functions accept.
+    - `at`: any point of the state space, shape (d,). By default zero, in the first of the
+        dimensions 2, 1, 3, 4, ... that the model's functions accept.
     - `num_steps`, `save_at`: as in `sample_bridges`.
 
     **Returns:** `Effects`, a table when printed.

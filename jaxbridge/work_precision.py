@@ -41,6 +41,7 @@ from .intervals import as_intervals, check_count
 from .meeting import AbstractMeeting, BrownianCrossing
 from .schemes import AbstractScheme, Euler, GaussianTransition, Heun
 from .search import key_for
+from .start_laws import Reversed, Stationary
 from .step_density import AbstractStepDensity, TrapezoidDensity
 from .transition import transition_log_density
 
@@ -56,7 +57,7 @@ class Setting(NamedTuple):
         NaN where there is none.
     - `error`: of the estimate, in standard deviations of the estimated variable (of a density:
         relative), with its `uncertainty`, a standard error.
-    - `step_error`, `method_error`, `monte_carlo_error`: its parts.
+    - `step_error` with its `step_uncertainty`, `method_error`, `monte_carlo_error`: its parts.
     - `seconds` of a run, and `compile_seconds`, which are apart.
     - `num_simulated`: paths simulated.
     - `effective_samples`: how many independent exact bridges have this Monte Carlo error.
@@ -73,6 +74,7 @@ class Setting(NamedTuple):
     error: float
     uncertainty: float
     step_error: float
+    step_uncertainty: float
     method_error: float
     monte_carlo_error: float
     seconds: float
@@ -88,8 +90,9 @@ class Setting(NamedTuple):
         return ", ".join(word for word in words if word)
 
     def seconds_for(self, target: float) -> float:
-        """Seconds until the root of the squared errors, the one that stays at its upper end, is
-        below `target`; infinite where it stays above."""
+        """Seconds until the root of the sum of both squared errors is below `target`: the one that
+        stays, at its upper end, and the Monte Carlo error of a longer run. Infinite where the
+        former is above, be it for its uncertainty alone."""
         stays = self.error + self.uncertainty
         if not stays < target:
             return np.inf
@@ -97,8 +100,9 @@ class Setting(NamedTuple):
 
 
 class Order(NamedTuple):
-    """The fitted exponent of the step error in the step length, and its standard error; NaN
-    where fewer than two step errors can be told from noise."""
+    """The fitted exponent of the step error in the step length, and its standard error, in which
+    the error of the reference, common to all points, is not counted; NaN where fewer than two step
+    errors can be told from noise."""
 
     order: float
     error: float
@@ -164,7 +168,8 @@ class WorkPrecision(NamedTuple):
             fitted = f"   order {order.order:.2f} ± {order.error:.2f}"
             lines.append(curve + ("" if np.isnan(order.order) else fitted))
             for s in group:
-                errors = (f"{e:.4f}" for e in s[s._fields.index("error") :][:5])
+                parts = (s.error, s.uncertainty, s.step_error, s.method_error, s.monte_carlo_error)
+                errors = (f"{part:.4f}" for part in parts)
                 times = (f"{s.seconds:.3f}", f"{s.compile_seconds:.1f}")
                 work = (f"{s.num_simulated:,}", f"{s.per_second:,.0f}")
                 lines.append(row.format(s.num_steps, *errors, *times, *work))
@@ -175,12 +180,14 @@ class WorkPrecision(NamedTuple):
 
 
 class _Estimate(NamedTuple):
-    """The mean of m variables, its standard error and their standard deviation."""
+    """The mean of m variables, its standard error and their standard deviation, from simulated
+    paths, or another source in words."""
 
     mean: Float[np.ndarray, " m"]
     error: Float[np.ndarray, " m"]
     sd: Float[np.ndarray, " m"]
     num_simulated: int = 0
+    source: str = "exact"
 
 
 def work_precision(
@@ -253,6 +260,8 @@ def work_precision(
     steps = [check_count("num_steps", n) for n in num_steps]
     for name, count in [("num_bridges", num_bridges), ("repeats", repeats)]:
         check_count(name, count)
+    if not steps:
+        raise ValueError("`num_steps` must have at least one number of steps.")
     unknown = [method for method in methods if method not in METHODS]
     if unknown or not methods:
         raise ValueError(f"`methods` must be some of {METHODS}; got {tuple(methods)}.")
@@ -303,8 +312,8 @@ def work_precision(
     with jax.enable_x64(True):  # references are made in double precision
         exact = {
             density: _given(reference, log_density, density)
-            or _closed_form(fine_key, scene, density, 20 * most)
-            or _finest(fine_key, scene, name, candidates[0], finest, most)
+            or _closed_form(fine_key, scene, density, min(20 * most, 1_000_000))
+            or _finest(fine_key, scene, name, _judge(candidates, model, density), finest, most)
             for name, density in [("weights", False), ("density", True)]
             if density in {method == "density" for method, *_ in runs}
         }
@@ -312,6 +321,8 @@ def work_precision(
             i: _finest(fine_key, scene, "approximate", candidates[i], finest, most)
             for i in {i for method, i, *_ in runs if method == "approximate"}
         }
+    if not all(np.any(estimate.sd > 0) for estimate in exact.values()):
+        raise ValueError("`fn` at `save_at` is the same for all bridges: nothing to estimate.")
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     state = meter.init()
     settings = []
@@ -322,10 +333,8 @@ def work_precision(
         settings.append(_measure(key, scene, truth, limit, *arguments, repeats))
         state = meter.step(state, jnp.asarray(done / len(runs)))
     meter.close(state)
-    words = "exact"
-    if any(np.any(estimate.error > 0) for estimate in exact.values()):
-        words = f"{describe(candidates[0])}, {finest} steps, {most:,} bridges, weights"
-    return WorkPrecision(tuple(settings), words, target)
+    sources = dict.fromkeys(estimate.source for estimate in exact.values())
+    return WorkPrecision(tuple(settings), "; ".join(sources), target)
 
 
 class _Scene(NamedTuple):
@@ -397,6 +406,23 @@ def _estimate(scene: _Scene, method: str, result: Any) -> _Estimate:
     return _Estimate(mean, error, sd, int(simulated))
 
 
+def _judge(candidates: Sequence[Any], model: Diffusion, density: bool) -> Any:
+    """The proposal of the reference: the first, or for densities the first whose do not rest on a
+    normalised ν."""
+    if not density or model.normalised:
+        return candidates[0]
+    for candidate in candidates:
+        if not isinstance(candidate, CoupledPairs) or not isinstance(
+            candidate.coupling.start_law, Stationary | Reversed
+        ):
+            return candidate
+    raise ValueError(
+        'for method="density" these couplings need a normalised `log_stationary`: declare that by '
+        "`Diffusion(..., normalised=True)`, pass `log_density`, or add a proposal that does "
+        "without, such as `Guided()`."
+    )
+
+
 def _given(
     reference: tuple[Numbers, Numbers] | None, log_density: Numbers | None, density: bool
 ) -> _Estimate | None:
@@ -426,7 +452,9 @@ def _closed_form(
     bridge = gaussian_bridge(model, start, end, duration, scene.save_at)
     if not scene.is_path:
         values = scene.values(bridge.sample(key, num_draws))
-        return _Estimate(values.mean(0), values.std(0) / np.sqrt(num_draws), values.std(0))
+        mean, sd = values.mean(0), values.std(0)
+        words = f"{num_draws:,} draws of the exact law"
+        return _Estimate(mean, sd / np.sqrt(num_draws), sd, source=words)
     mean = np.asarray(bridge.mean, float).ravel()
     sd = np.sqrt(np.diagonal(np.asarray(bridge.covariance), axis1=1, axis2=2)).ravel()
     return _Estimate(mean, np.zeros_like(mean), sd)
@@ -440,8 +468,8 @@ def _finest(
     num_steps: int,
     num_bridges: int,
 ) -> _Estimate:
-    """A fine run by a second-order scheme; to its error belongs what half the steps change."""
-    limit = _of_second_order(candidate, scene)
+    """A fine run by the best scheme there is; to its error belongs what half the steps change."""
+    limit = _at_its_best(candidate, scene)
 
     def run(key, num_steps):
         result = _run(key, scene, method, limit, "float64", num_steps, num_bridges)
@@ -450,10 +478,11 @@ def _finest(
     fine, coarse = run(key, num_steps), run(jax.random.fold_in(key, 1), max(num_steps // 2, 1))
     chance = fine.error**2 + coarse.error**2
     changed = np.maximum((fine.mean - coarse.mean) ** 2 - chance, 0)
-    return fine._replace(error=np.sqrt(fine.error**2 + changed))
+    words = f"{describe(limit)}, {method}, {num_steps} steps, {num_bridges:,} bridges"
+    return fine._replace(error=np.sqrt(fine.error**2 + changed), source=words)
 
 
-def _of_second_order(candidate: Any, scene: _Scene) -> Any:
+def _at_its_best(candidate: Any, scene: _Scene) -> Any:
     """The same proposal with the best scheme there is for it."""
 
     def is_leaf(node):
@@ -496,11 +525,13 @@ def _measure(
         seconds = float(np.median([run()[1] for _ in range(repeats)]))
         found = _estimate(scene, method, result)
 
+    random = exact.sd > 0  # what is the same for all bridges has no error
+
     def size(difference):
-        return float(np.sqrt(np.mean((difference / exact.sd) ** 2)))
+        return float(np.sqrt(np.mean((difference[random] / exact.sd[random]) ** 2)))
 
     monte_carlo = size(found.error)
-    effective = monte_carlo**-2
+    effective = monte_carlo**-2 if monte_carlo > 0 else np.nan
     scheme, meeting, gamma = _describe_parts(candidate)
     return Setting(
         method,
@@ -513,6 +544,7 @@ def _measure(
         size(found.mean - exact.mean),
         size(np.hypot(found.error, exact.error)),
         size(found.mean - limit.mean),
+        size(np.hypot(found.error, limit.error)),
         size(limit.mean - exact.mean),
         monte_carlo,
         seconds,
@@ -544,12 +576,12 @@ def _describe_parts(candidate: Any) -> tuple[str, str, float]:
 def _fit_order(group: Sequence[Setting]) -> Order:
     """Least squares of log step error against log number of steps, weighted by how well each is
     known; those within two standard errors of zero are left out."""
-    known = [s for s in group if s.step_error > 2 * s.uncertainty]
+    known = [s for s in group if s.step_error > 2 * s.step_uncertainty]
     if len({s.num_steps for s in known}) < 2:
         return Order(np.nan, np.nan)
     x = -np.log([s.num_steps for s in known])
     y = np.log([s.step_error for s in known])
-    weight = np.array([(s.step_error / s.uncertainty) ** 2 for s in known])
+    weight = np.array([(s.step_error / s.step_uncertainty) ** 2 for s in known])
     centred = x - np.average(x, weights=weight)
     spread = weight @ centred**2
     return Order(float(weight * centred @ y / spread), float(spread**-0.5))

@@ -1,5 +1,4 @@
-"""Several devices: the same numbers as on one, from lanes that are really
-split.
+"""Several devices: the same numbers as on one, from lanes that are really split.
 
 Each test is a process of its own, in which the CPU passes for eight devices.
 """

@@ -44,6 +44,11 @@ FUNCTIONS = {
     "any": lambda x: (jnp.any(x > 1), jnp.all(jnp.isfinite(x)), jnp.argmax(x)),
     "stacked": lambda x: jnp.concatenate([x[::-1], jnp.stack([x[0] * x[1], -x[2]]), x[1:]]),
     "moved": lambda x: jnp.broadcast_to(x[:, None], (3, 2)).T.reshape(-1)[::2],
+    "column by column": lambda x: jnp.outer(x, jnp.arange(2.0, dtype=x.dtype)).reshape(
+        -1, order="F"
+    ),
+    "nothing": lambda x: (jnp.sum(x[3:] ** 2), x[3:] @ x[3:], x[:0]),
+    "extremes": lambda x: (jnp.maximum(x, 0.5), jnp.clip(x, -0.1, 0.2), jax.nn.logsumexp(x)),
     "roll": lambda x: jnp.roll(x, 1) - jnp.diff(x, append=x[:1]),
     "set": lambda x: x.at[1].set(x[0]).at[2].add(2.0),
     "norm": lambda x: safe_norm(x - x),
@@ -128,7 +133,7 @@ def test_trees_of_arguments_and_what_lanes_share():
     _assert_close(made["b"][1], jnp.full(7, 2, jnp.int32))
 
 
-def test_a_function_of_many_numbers_is_vmapped():
+def test_long_sums_are_not_written_out():
     function = lambda x: jnp.sin(jnp.outer(x, jnp.arange(400.0))).sum(1)
     jaxpr = jax.make_jaxpr(over_lanes(-1)(function))(_points())
     assert len(jaxpr.jaxpr.eqns) < 20

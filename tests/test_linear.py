@@ -75,3 +75,9 @@ def test_one_compiled_program_serves_a_batch(x64):
         single = linear_transition(A, jnp.asarray(V), t)
         for one, many in zip(single, batched, strict=True):
             np.testing.assert_allclose(one, many[i])
+
+
+def test_infinite_numbers_come_to_an_end():
+    A = jnp.array([[jnp.inf, 0.0], [0.0, -1.0]])
+    found = linear_transition(A, jnp.asarray(V, jnp.float32), jnp.asarray(1.0))
+    assert not jnp.isfinite(found.covariance).all()

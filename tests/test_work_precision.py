@@ -92,6 +92,7 @@ def test_the_closed_form_serves_functions_of_the_path():
     )
     (setting,) = result.settings
     assert setting.scheme == "TrapezoidDensity" and np.isnan(setting.gamma)
+    assert result.reference == "1,000,000 draws of the exact law"
     assert setting.error < 5 * setting.uncertainty
 
 
@@ -120,7 +121,7 @@ def test_other_models_have_a_finer_reference_with_its_own_error():
 
 def made_up(num_steps, error, per_second, method="weights", uncertainty=1e-4):
     words = (method, "Coupling(0)", "Heun", "BrownianCrossing", 0.0, "float32", num_steps)
-    errors = (error, uncertainty, error, 0.0, uncertainty)
+    errors = (error, uncertainty, error, uncertainty, 0.0, uncertainty)
     return Setting(*words, *errors, 1.0, 2.0, 100, per_second, per_second)
 
 
@@ -170,6 +171,8 @@ def test_the_table_reads_well_and_exports():
         (dict(dtypes=("float16",)), "`dtypes` must be"),
         (dict(target=0.0), "`target` must be positive"),
         (dict(num_steps=(0,)), "`num_steps` must be at least 1"),
+        (dict(num_steps=()), "at least one number of steps"),
+        (dict(save_at=[0.0, 1.0]), "nothing to estimate"),
         (dict(num_bridges=0), "`num_bridges` must be at least 1"),
         (dict(start=[[0.0, 0.0]] * 2), "one interval"),
         (dict(proposals=["auto"]), "must be single ones"),

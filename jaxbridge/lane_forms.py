@@ -1,0 +1,235 @@
+"""Two forms of a value that every lane has for itself, and what can be done with each.
+
+`Coordinates`: an array of objects, each of them one coordinate in all lanes. What only moves
+numbers about (indexing, stacking, transposing, broadcasting) happens while tracing; what is left
+to compile is arithmetic on arrays of lanes. For functions of few numbers.
+
+`LanesLast`: an array whose last axis are the lanes. For functions of more, as with full matrices
+in higher dimension.
+"""
+
+import functools
+import math
+import operator
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, cast
+
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.extend.core import JaxprEqn, Literal, Var
+from jaxtyping import Array, Shaped
+
+# Sums of more terms take long to compile.
+_MOST_TERMS = 16
+
+
+class AbstractForm:
+    """How values are held while a function of one point is evaluated in all lanes."""
+
+    moves: ClassVar[dict[str, Callable]]
+
+    @abstractmethod
+    def split(self, array: Shaped[Array, "*shape lanes"]) -> Any:
+        """The value in this form."""
+
+    @abstractmethod
+    def join(self, value: Any, num_lanes: int) -> Shaped[Array, "*shape lanes"]:
+        """The array of a value, or of one that all lanes share."""
+
+    @abstractmethod
+    def is_own(self, value: Any) -> bool:
+        """Whether lanes have the value for themselves."""
+
+    @abstractmethod
+    def elementwise(self, equation: JaxprEqn, operands: Sequence) -> Any:
+        """An operation on operands of one shape, or numbers (predicates, bounds)."""
+
+    @abstractmethod
+    def moved(self, equation: JaxprEqn, operands: Sequence) -> list:
+        """One of `moves`."""
+
+    @abstractmethod
+    def reduced(self, combine: Callable, value: Any, axes: Sequence) -> Any:
+        """A reduction over some axes, written out."""
+
+    @abstractmethod
+    def product(self, equation: JaxprEqn, left: Any, right: Any) -> Any:
+        """A sum of products over one axis of each, written out."""
+
+
+class Coordinates(AbstractForm):
+    """Coordinate by coordinate."""
+
+    def split(self, array):
+        return _objects(array.shape[:-1], lambda index: array[index])
+
+    def join(self, value, num_lanes):
+        if not self.is_own(value):
+            return shared_by(value, num_lanes)
+        rows = [jnp.broadcast_to(number, (num_lanes,)) for number in value.flat]
+        return jnp.stack(rows).reshape(*value.shape, num_lanes) if value.ndim else rows[0]
+
+    def is_own(self, value):
+        return isinstance(value, np.ndarray) and value.dtype == object
+
+    def elementwise(self, equation, operands):
+        shape = aval(equation.outvars[0]).shape
+        operands = [np.broadcast_to(self._all(operand), shape) for operand in operands]
+
+        def entry(index):
+            numbers = jnp.broadcast_arrays(*(operand[index] for operand in operands))
+            return equation.primitive.bind(*numbers, **equation.params)
+
+        return _objects(shape, entry)
+
+    def moved(self, equation, operands):
+        move = self.moves[equation.primitive.name]
+        made = move(*map(self._all, operands), **equation.params)
+        return made if isinstance(made, list) else [made]
+
+    def reduced(self, combine, value, axes):
+        value = np.moveaxis(value, axes, range(len(axes)))
+        rest = value.shape[len(axes) :]
+        rows = value.reshape(-1, *rest)
+        return _objects(rest, lambda index: functools.reduce(combine, rows[:, *index]))
+
+    def product(self, equation, left, right):
+        result = aval(equation.outvars[0])
+        axes, _ = equation.params["dimension_numbers"]
+        left, right = (
+            _objects(value.shape, lambda index, value=value: value[index].astype(result.dtype))
+            for value in map(self._all, (left, right))
+        )
+        product = np.asarray(np.tensordot(left, right, axes), object)
+        return _objects(result.shape, lambda index: product[index])
+
+    def _all(self, value) -> np.ndarray:
+        if self.is_own(value):
+            return value
+        return _objects(np.shape(value), lambda index: value[index])
+
+    moves: ClassVar[dict[str, Callable]] = {
+        "broadcast_in_dim": lambda value, **params: _broadcast(value, **params),
+        "concatenate": lambda *values, dimension: np.concatenate(values, dimension),
+        "reshape": lambda value, **params: _reshape(value, **params),
+        "rev": lambda value, *, dimensions: np.flip(value, dimensions),
+        "slice": lambda value, **params: value[_slices(**params)],
+        "split": lambda value, *, sizes, axis: np.split(value, np.cumsum(sizes)[:-1], axis),
+        "squeeze": lambda value, *, dimensions: value.squeeze(dimensions),
+        "transpose": lambda value, *, permutation: value.transpose(permutation),
+    }
+
+
+class _Lanes:
+    """An array that is marked as having an axis of lanes."""
+
+    def __init__(self, array: Shaped[Array, "*shape lanes"]):
+        self.array = array
+
+
+class LanesLast(AbstractForm):
+    """Array by array. What lanes share has an axis of length one, and broadcasts."""
+
+    def split(self, array):
+        return _Lanes(array)
+
+    def join(self, value, num_lanes):
+        if not self.is_own(value):
+            return shared_by(value, num_lanes)
+        return jnp.broadcast_to(value.array, (*value.array.shape[:-1], num_lanes))
+
+    def is_own(self, value):
+        return isinstance(value, _Lanes)
+
+    def elementwise(self, equation, operands):
+        arrays = jnp.broadcast_arrays(*map(self._array, operands))
+        return _Lanes(equation.primitive.bind(*arrays, **equation.params))
+
+    def moved(self, equation, operands):
+        move = self.moves[equation.primitive.name]
+        made = move(*map(self._array, operands), **equation.params)
+        return [_Lanes(part) for part in made] if isinstance(made, list) else [_Lanes(made)]
+
+    def reduced(self, combine, value, axes):
+        array = jnp.moveaxis(value.array, axes, range(len(axes)))
+        rows = array.reshape(-1, *array.shape[len(axes) :])
+        return _Lanes(functools.reduce(combine, list(rows)))
+
+    def product(self, equation, left, right):
+        ((left_axis,), (right_axis,)), _ = equation.params["dimension_numbers"]
+        dtype = aval(equation.outvars[0]).dtype
+        lefts, rights = (
+            list(jnp.moveaxis(self._array(value).astype(dtype), axis, 0))
+            for value, axis in ((left, left_axis), (right, right_axis))
+        )
+        ones = [1] * (rights[0].ndim - 1)  # for the axes of the result that come from the right
+        lefts = [row.reshape(*row.shape[:-1], *ones, row.shape[-1]) for row in lefts]
+        products = [a * b for a, b in zip(lefts, rights, strict=True)]
+        return _Lanes(functools.reduce(operator.add, products))
+
+    def _array(self, value) -> Shaped[Array, "*shape lanes"]:
+        return value.array if self.is_own(value) else jnp.asarray(value)[..., None]
+
+    moves: ClassVar[dict[str, Callable]] = {
+        "broadcast_in_dim": lambda array, *, shape, broadcast_dimensions, **_: lax.broadcast_in_dim(
+            array, (*shape, array.shape[-1]), (*broadcast_dimensions, len(shape))
+        ),
+        "concatenate": lambda *arrays, dimension: _concatenate(arrays, dimension),
+        "reshape": lambda array, **params: _reshape(array, **params, kept=1),
+        "rev": lambda array, *, dimensions: jnp.flip(array, dimensions),
+        "slice": lambda array, **params: array[_slices(**params)],
+        "split": lambda array, *, sizes, axis: jnp.split(array, np.cumsum(sizes)[:-1], axis),
+        "squeeze": lambda array, *, dimensions: array.squeeze(dimensions),
+        "transpose": lambda array, *, permutation: array.transpose(*permutation, array.ndim - 1),
+    }
+
+
+def aval(atom: Var | Literal) -> jax.core.ShapedArray:
+    """Shape and dtype."""
+    return cast(jax.core.ShapedArray, atom.aval)
+
+
+def is_short(equation: JaxprEqn, axes: Sequence) -> bool:
+    """Whether a sum over these axes of the first operand may be written out."""
+    shape = aval(equation.invars[0]).shape
+    return 0 < math.prod(shape[axis] for axis in axes) <= _MOST_TERMS
+
+
+def shared_by(value, num_lanes: int) -> Shaped[Array, "*shape lanes"]:
+    """The same for all lanes."""
+    return jnp.broadcast_to(jnp.asarray(value)[..., None], (*np.shape(value), num_lanes))
+
+
+def _objects(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], Any]) -> np.ndarray:
+    """The array of objects with these entries."""
+    objects = np.empty(shape, object)
+    for index in np.ndindex(shape):
+        objects[index] = entry(index)
+    return objects
+
+
+def _broadcast(value, *, shape, broadcast_dimensions, **_):
+    unit = np.ones(len(shape), int)
+    unit[list(broadcast_dimensions)] = value.shape
+    return np.broadcast_to(value.reshape(unit), shape)
+
+
+def _reshape(value, *, new_sizes, dimensions=None, kept=0, **_):
+    """With the last axes kept as they are, and the others first put in the order asked for."""
+    last = range(value.ndim - kept, value.ndim)
+    if dimensions is not None:
+        value = value.transpose(*dimensions, *last)
+    return value.reshape(*new_sizes, *(value.shape[axis] for axis in last))
+
+
+def _slices(*, start_indices, limit_indices, strides) -> tuple[slice, ...]:
+    return tuple(map(slice, start_indices, limit_indices, strides or [None] * len(start_indices)))
+
+
+def _concatenate(arrays, dimension):
+    num_lanes = max(array.shape[-1] for array in arrays)
+    wide = [jnp.broadcast_to(array, (*array.shape[:-1], num_lanes)) for array in arrays]
+    return jnp.concatenate(wide, dimension)
