@@ -159,7 +159,31 @@ def _apply(
         return [form.reduced(_REDUCTIONS[name], operands[0], params["axes"])]
     if name == "dot_general" and _is_plain(equation):
         return [form.product(equation, *operands)]
+    if name == "scan" and _is_plain_loop(equation):
+        return _repeat(equation, operands, form, lanes)
     return _by_vmap(jaxpr, equation, operands, form, lanes)
+
+
+def _is_plain_loop(equation: JaxprEqn) -> bool:
+    """Whether it is a loop of known length whose steps have no inputs or outputs of their own."""
+    params = equation.params
+    inputs = len(equation.invars) - params["num_consts"] - params["num_carry"]
+    outputs = len(equation.outvars) - params["num_carry"]
+    return inputs == outputs == 0
+
+
+def _repeat(equation: JaxprEqn, operands: list, form: AbstractForm, lanes: int) -> list:
+    body, num_consts = equation.params["jaxpr"], equation.params["num_consts"]
+    consts, init = operands[:num_consts], operands[num_consts:]
+
+    def step(_, arrays):
+        carry = _evaluate(body, [*consts, *map(form.split, arrays)], form, lanes)
+        return [form.join(value, lanes) for value in carry]
+
+    arrays = lax.fori_loop(
+        0, equation.params["length"], step, [form.join(value, lanes) for value in init]
+    )
+    return list(map(form.split, arrays))
 
 
 def _is_plain(equation: JaxprEqn) -> bool:

@@ -11,6 +11,7 @@ import operator
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 
@@ -126,12 +127,12 @@ def polar_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
         p, q = p / length, q / length
         return jnp.stack([jnp.stack([p, -sign * q]), jnp.stack([q, sign * p])])
 
-    factor = matrix
-    for _ in range(_NEWTON_STEPS):
+    def newton(_, factor):
         inverse_transpose = inverse(factor).T
         scale = jnp.sqrt(safe_norm(inverse_transpose.ravel()) / safe_norm(factor.ravel()))
-        factor = (scale * factor + inverse_transpose / scale) / 2
-    return factor
+        return (scale * factor + inverse_transpose / scale) / 2
+
+    return lax.fori_loop(0, _NEWTON_STEPS, newton, matrix)
 
 
 # With this scaling a condition number of 1e8 is orthogonal to 1e-15 after nine steps.

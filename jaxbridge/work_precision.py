@@ -189,6 +189,12 @@ class _Estimate(NamedTuple):
     num_simulated: int = 0
     source: str = "exact"
 
+    @property
+    def is_random(self) -> np.ndarray:
+        """Not the same for all bridges, as end points are, up to rounding."""
+        scale = max(np.abs(self.mean).max(), self.sd.max())
+        return self.sd > 1e-6 * scale
+
 
 def work_precision(
     key: Key[Array, ""],
@@ -321,7 +327,7 @@ def work_precision(
             i: _finest(fine_key, scene, "approximate", candidates[i], finest, most)
             for i in {i for method, i, *_ in runs if method == "approximate"}
         }
-    if not all(np.any(estimate.sd > 0) for estimate in exact.values()):
+    if not all(np.any(estimate.is_random) for estimate in exact.values()):
         raise ValueError("`fn` at `save_at` is the same for all bridges: nothing to estimate.")
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     state = meter.init()
@@ -525,10 +531,9 @@ def _measure(
         seconds = float(np.median([run()[1] for _ in range(repeats)]))
         found = _estimate(scene, method, result)
 
-    random = exact.sd > 0  # what is the same for all bridges has no error
-
     def size(difference):
-        return float(np.sqrt(np.mean((difference[random] / exact.sd[random]) ** 2)))
+        ratio = difference[exact.is_random] / exact.sd[exact.is_random]
+        return float(np.sqrt(np.mean(ratio**2)))
 
     monte_carlo = size(found.error)
     effective = monte_carlo**-2 if monte_carlo > 0 else np.nan

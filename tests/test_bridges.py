@@ -80,8 +80,8 @@ def test_same_law_as_an_independent_implementation(gamma, meeting, crossing):
     other = approximate_bridges(
         np.random.default_rng(0),
         PAPER_B,
-        start,
-        end,
+        np.array(start),
+        np.array(end),
         1.0,
         num_steps,
         num_proposals,

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxbridge as jb
 from jaxbridge.linalg import (
     all_finite,
     cholesky,
@@ -236,3 +237,24 @@ def test_many_lanes_inside_a_scan(d):
         square = (x**2).sum(1, keepdims=True)
         x = 0.5 * drift / (1 + square) + 0.1 * (full @ full)[:, 0] + 0.2 * noise.T
     np.testing.assert_allclose(out, x.T, atol=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("what", ["bridges", "chain", "guided"])
+@pytest.mark.parametrize("d", [2, 5])
+def test_no_simulation_calls_lapack(d, what):
+    """In loops of compiled programs, where such calls can hang for ever; here all is in loops."""
+    mix = lambda x: jnp.eye(d) + 0.1 * jnp.outer(jnp.tanh(x), jnp.cos(x))
+    model = jb.Diffusion(lambda x, p: -x, lambda x, p: mix(x), lambda x, p: -x @ x, reversible=True)
+    law = jb.GaussianLaw(jnp.zeros(d), jnp.eye(d))
+    proposals = {"guided": jb.Guided(), "chain": jb.Coupling(0.5, start_law=law)}
+
+    def simulate(key):
+        arguments = (key, model, jnp.zeros(d), jnp.ones(d), 1.0)
+        if what == "bridges":
+            return jb.sample_bridges(*arguments, num_steps=4).paths
+        return jb.sample_exact_bridges(
+            *arguments, num_bridges=4, num_steps=4, proposal=proposals[what]
+        ).paths
+
+    assert "lapack" not in jax.jit(simulate).lower(jax.random.key(0)).compile().as_text()
