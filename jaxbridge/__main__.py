@@ -181,7 +181,7 @@ def _accuracy(options: argparse.Namespace) -> list[Path]:
     key = jax.random.key(options.seed)
     quick = " (--quick: expect larger errors)" if options.quick else ""
     print(f"What accuracy costs in time{quick}\n")
-    results = run_accuracy(key, 1_000 if options.quick else 50_000, _say)
+    results = run_accuracy(key, 1_000 if options.quick else 50_000, _say, options.quick)
     num_bridges = 1_000 if options.quick else 20_000
     effects = run_effect_costs(key, num_bridges, _say)
     sigmas = run_sigma_costs(key, num_bridges, (2,) if options.quick else (2, 5, 10), _say)
@@ -197,7 +197,9 @@ def _bench(options: argparse.Namespace) -> list[Path]:
     chosen = processes()[:1] if options.quick else None
     quick = " (--quick: too short a run for the clock)" if options.quick else ""
     print(f"How fast it is{quick}\n")
-    results = run_benchmark(jax.random.key(options.seed), scale, durations, chosen, _say)
+    dimensions = (2,) if options.quick else (2, 5, 10)
+    key = jax.random.key(options.seed)
+    results = run_benchmark(key, scale, durations, chosen, dimensions, _say)
     _end_progress()
     save(results, options.out / "benchmark.json")
     print(f"{format_ratios(results)}\n\n{format_costs(results.effects, results.sigmas)}\n")

@@ -57,10 +57,13 @@ def curves() -> list[Curve]:
 
 
 def run_accuracy(
-    key: Key[Array, ""], num_bridges: int, on_start: Callable[[str], None] = lambda what: None
+    key: Key[Array, ""],
+    num_bridges: int,
+    on_start: Callable[[str], None] = lambda what: None,
+    brief: bool = False,
 ) -> dict[str, WorkPrecision]:
-    """The parts of the study, by their titles."""
-    model = study_model()
+    """The parts of the study, by their titles; a `brief` one has the fewest settings."""
+    model, all_steps = study_model(), (10, 80) if brief else (10, 20, 40, 80)
     ends = (*UNLIKELY, 1.0)
     results = {}
     for curve in curves():
@@ -70,7 +73,7 @@ def run_accuracy(
             model,
             *ends,
             proposals=[curve.coupling],
-            num_steps=curve.num_steps,
+            num_steps=curve.num_steps[:: 3 if brief else 1],
             methods=("density",),
             num_bridges=20 * num_bridges if curve.expected == 2 else 4 * num_bridges,
             repeats=1,
@@ -88,7 +91,7 @@ def run_accuracy(
         model,
         *ends,
         proposals=better,
-        num_steps=(10, 20, 40, 80),
+        num_steps=all_steps,
         methods=("approximate", "weights"),
         **options,
     )
@@ -98,7 +101,7 @@ def run_accuracy(
         model,
         *ends,
         proposals=[better[2]],
-        num_steps=(10, 20),
+        num_steps=(10,) if brief else (10, 20),
         methods=("weights",),
         dtypes=("float32", "float64"),
         **options,
@@ -112,7 +115,7 @@ def run_accuracy(
         end,
         1.0,
         proposals=better[1:3],
-        num_steps=(10, 20, 40, 80),
+        num_steps=all_steps,
         methods=("weights",),
         reference=reference,
         **options,

@@ -74,6 +74,7 @@ def run_benchmark(
     scale: float = 1.0,
     durations: Sequence[float] = DURATIONS,
     chosen: Sequence[Process] | None = None,
+    dimensions: Sequence[int] = (2, 5, 10),
     on_start: Callable[[str], None] = lambda what: None,
 ) -> Benchmark:
     """All parts; `scale` shortens them."""
@@ -94,7 +95,7 @@ def run_benchmark(
     ratios += _against_published(key, round(100_000 * scale))
     num_bridges = max(1_000, round(20_000 * scale))
     effects = run_effect_costs(key, num_bridges, on_start)
-    sigmas = run_sigma_costs(key, num_bridges, on_start=on_start)
+    sigmas = run_sigma_costs(key, num_bridges, dimensions, on_start)
     rates = run_crossover(key, round(1e7 * scale), durations, chosen, on_start)
     packages = ("jaxbridge", "jax", "jaxlib", "diffrax", "equinox", "numpy")
     return Benchmark(

@@ -257,4 +257,5 @@ def test_no_simulation_calls_lapack(d, what):
             *arguments, num_bridges=4, num_steps=4, proposal=proposals[what]
         ).paths
 
-    assert "lapack" not in jax.jit(simulate).lower(jax.random.key(0)).compile().as_text()
+    compiled = jax.jit(simulate).lower(jax.random.key(0)).compile().as_text()
+    assert "fusion" in compiled and 'custom_call_target="lapack' not in compiled
