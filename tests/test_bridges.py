@@ -471,6 +471,7 @@ def test_arguments_are_checked_inside_jit_too():
     assert not couplings[0].independent_noise
 
 
+@pytest.mark.slow
 def test_models_that_close_over_traced_values_can_be_batched():
     def paths(rate):
         model = jb.Diffusion(lambda x, p: -rate * x, reversible=True)

@@ -116,6 +116,7 @@ def test_densities_are_not_mixed_where_they_have_different_constants():
         jb.transition_log_density(*arguments, num_steps=10, num_proposals=2, proposal=mixed)
 
 
+@pytest.mark.slow
 def test_what_is_not_used_asks_for_nothing():
     """A kernel from a choice that left the couplings out, for a model that they could not start
     from; and a model whose ν is unknown."""

@@ -38,6 +38,7 @@ def run_on_eight_devices(program):
     run_program(PRELUDE + program, deadline=300, num_devices=8)
 
 
+@pytest.mark.slow
 def test_same_numbers_on_one_two_and_eight_devices():
     run_on_eight_devices("""
 def approximate(key):

@@ -102,6 +102,7 @@ def test_a_singular_matrix_gives_nonfinite_numbers(d):
     assert not np.isfinite(many_solve(matrices, vectors)).all(1).any()
 
 
+@pytest.mark.slow
 def test_ten_dimensions(x64):
     rng = np.random.default_rng(10)
     matrices = with_singular_values(rng, np.geomspace(1e-6, 1, 10))

@@ -34,6 +34,7 @@ def by_method(result, method):
     return [setting for setting in result.settings if setting.method == method]
 
 
+@pytest.mark.slow
 def test_errors_are_told_apart(euler):
     assert euler.reference == "exact"
     for setting in euler.settings:
@@ -54,6 +55,7 @@ def test_errors_are_told_apart(euler):
     assert coarse.error > 0.3 > fine.error > 0.12
 
 
+@pytest.mark.slow
 def test_step_errors_of_euler_are_of_first_order(euler):
     orders = euler.orders()
     (weights,) = [order for curve, order in orders.items() if curve.startswith("weights")]
