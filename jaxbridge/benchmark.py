@@ -24,7 +24,7 @@ from jax import lax
 from jaxtyping import Array, Key
 
 from .accuracy_study import EffectCost, run_effect_costs, run_sigma_costs
-from .bridges import sample_bridges
+from .bridges import Bridges, sample_bridges
 from .coupling import Coupling
 from .crossover_study import Process, Rate, run_crossover, share_of_best, thousands
 from .exact_study import UNLIKELY
@@ -169,22 +169,26 @@ def _proposals(
     )
 
 
+def _likely_bridges(key: Key[Array, ""], coupling: Coupling, num_bridges: int) -> Bridges:
+    return sample_bridges(
+        key,
+        study_model(),
+        [0.0, 0.0],
+        [0.0, 0.0],
+        1.0,
+        num_bridges=num_bridges,
+        num_steps=_NUM_STEPS,
+        coupling=coupling,
+    )
+
+
 def _whole_call(key: Key[Array, ""], gamma: float, num_bridges: int) -> Ratio:
     """`sample_bridges` as a whole, for the likely bridge, against random numbers of as many
     proposals as bridges."""
-    model, draw = study_model(), draw_floor(gamma > -1, num_bridges)
+    draw = draw_floor(gamma > -1, num_bridges)
 
     def sample():
-        return sample_bridges(
-            key,
-            model,
-            [0.0, 0.0],
-            [0.0, 0.0],
-            1.0,
-            num_bridges=num_bridges,
-            num_steps=_NUM_STEPS,
-            coupling=Coupling(gamma, scheme=Euler()),
-        )
+        return _likely_bridges(key, Coupling(gamma, scheme=Euler()), num_bridges)
 
     share = num_bridges / float(sample().num_proposals)
     return Ratio(
@@ -217,19 +221,9 @@ def _batch(key: Key[Array, ""], num_intervals: int) -> Ratio:
         )
 
     expected = float(jnp.sum(sample(trials).num_proposals / trials))
-    many = 50_000
 
     def proposals():
-        return sample_bridges(
-            key,
-            model,
-            [0.0, 0.0],
-            [0.0, 0.0],
-            1.0,
-            num_bridges=many,
-            num_steps=_NUM_STEPS,
-            coupling=coupling,
-        )
+        return _likely_bridges(key, coupling, 50_000)
 
     each = float(proposals().num_proposals)
     seconds, reference = in_turns(sample, proposals)

@@ -62,6 +62,8 @@ class Setting(NamedTuple):
     - `num_simulated`: paths simulated.
     - `effective_samples`: how many independent exact bridges have this Monte Carlo error.
     - `per_second`: those, per second.
+    - `num_missing`: bridges that were not found, or whose weights were cut off: the estimate is
+        that of the others, or NaN if there are none.
     """
 
     method: str
@@ -82,6 +84,7 @@ class Setting(NamedTuple):
     num_simulated: int
     effective_samples: float
     per_second: float
+    num_missing: int = 0
 
     @property
     def curve(self) -> str:
@@ -172,7 +175,8 @@ class WorkPrecision(NamedTuple):
                 errors = (f"{part:.4f}" for part in parts)
                 times = (f"{s.seconds:.3f}", f"{s.compile_seconds:.1f}")
                 work = (f"{s.num_simulated:,}", f"{s.per_second:,.0f}")
-                lines.append(row.format(s.num_steps, *errors, *times, *work))
+                missing = f"   {s.num_missing:,} missing" if s.num_missing else ""
+                lines.append(row.format(s.num_steps, *errors, *times, *work) + missing)
         lines.append(f"reference: {self.reference}")
         if self.target is not None:
             lines.append(self.statement())
@@ -187,6 +191,7 @@ class _Estimate(NamedTuple):
     error: Float[np.ndarray, " m"]
     sd: Float[np.ndarray, " m"]
     num_simulated: int = 0
+    num_missing: int = 0
     source: str = "exact"
 
     @property
@@ -392,11 +397,19 @@ def _run(
 def _estimate(scene: _Scene, method: str, result: Any) -> _Estimate:
     """Means and their errors, in double precision, from what a run returned."""
     if method == "density":
-        value = np.exp(np.asarray(result.value, float))[None]
+        found = np.isfinite(result.value)
+        value = np.where(found, np.exp(np.asarray(result.value, float)), np.nan)[None]
         relative = float(result.standard_error)
-        return _Estimate(value, value * relative, value, int(result.num_simulated))
+        simulated, truncated = int(result.num_simulated), int(result.num_truncated)
+        return _Estimate(value, value * relative, value, simulated, truncated)
     met = np.asarray(result.met)
     values = scene.values(result.paths)[met]
+    truncated = np.asarray(getattr(result, "truncated", False))
+    missing = int(np.sum(~met | truncated))
+    simulated = result.num_proposals if method == "approximate" else result.num_simulated
+    if len(values) == 0:
+        unknown = np.full(values.shape[1], np.nan)
+        return _Estimate(unknown, unknown, unknown, int(simulated), missing)
     if method == "weights":
         weights = np.asarray(result.weights, float)[met]
         weights /= weights.sum()
@@ -408,8 +421,7 @@ def _estimate(scene: _Scene, method: str, result: Any) -> _Estimate:
         independent = method == "approximate"
         size = len(values) if independent else np.asarray(effective_sample_size(values), float)
         error = sd / np.sqrt(size)
-    simulated = result.num_proposals if method == "approximate" else result.num_simulated
-    return _Estimate(mean, error, sd, int(simulated))
+    return _Estimate(mean, error, sd, int(simulated), missing)
 
 
 def _judge(candidates: Sequence[Any], model: Diffusion, density: bool) -> Any:
@@ -482,6 +494,11 @@ def _finest(
         return _estimate(scene, method, result)
 
     fine, coarse = run(key, num_steps), run(jax.random.fold_in(key, 1), max(num_steps // 2, 1))
+    if not np.all(np.isfinite(fine.mean) & np.isfinite(coarse.mean)):
+        raise ValueError(
+            f"the reference, {describe(limit)} in {num_steps} steps, found no bridges: choose "
+            "other `proposals`, or pass what is known as `reference`."
+        )
     chance = fine.error**2 + coarse.error**2
     changed = np.maximum((fine.mean - coarse.mean) ** 2 - chance, 0)
     words = f"{describe(limit)}, {method}, {num_steps} steps, {num_bridges:,} bridges"
@@ -557,6 +574,7 @@ def _measure(
         found.num_simulated,
         effective,
         effective / seconds,
+        found.num_missing,
     )
 
 

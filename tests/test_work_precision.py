@@ -185,3 +185,21 @@ def test_errors_say_what_to_change(changes, message, unchecked):
     arguments = dict(start=[0.0, 0.0], end=[1.0, 0.0], duration=1.0, num_steps=(4,)) | changes
     with pytest.raises(ValueError, match=message):
         jb.work_precision(KEY, paper_model(), **arguments)
+
+
+def test_bridges_that_are_not_found_are_counted():
+    """Ends that no pair joins in so short a time."""
+    (setting,) = jb.work_precision(
+        KEY,
+        paper_model(),
+        [0.0, 0.0],
+        [60.0, -60.0],
+        0.01,
+        proposals=[jb.Coupling(-1.0, jb.SignTest(), jb.Euler())],
+        num_steps=(2,),
+        methods=("weights",),
+        num_bridges=3,
+        repeats=1,
+    ).settings
+    assert setting.num_missing == 3
+    assert np.isnan(setting.error) and setting.seconds_for(1.0) == np.inf
