@@ -34,6 +34,7 @@ from .diagnostics import (
     HittingVariation as HittingVariation,
     effective_sample_size as effective_sample_size,
     hitting_variation as hitting_variation,
+    potential_scale_reduction as potential_scale_reduction,
 )
 from .diffusion import Diffusion as Diffusion
 from .gaussian import (
@@ -45,6 +46,7 @@ from .gaussian import (
     ou_stationary as ou_stationary,
     ou_transition as ou_transition,
 )
+from .gibbs import GibbsState as GibbsState, Posterior as Posterior, gibbs as gibbs
 from .guided import (
     AbstractGuidedProposal as AbstractGuidedProposal,
     Guided as Guided,
@@ -60,6 +62,7 @@ from .importance import (
     weigh_bridges as weigh_bridges,
 )
 from .kernels import Chain as Chain, Kernel as Kernel
+from .likelihood import path_log_likelihood as path_log_likelihood
 from .meeting import (
     AbstractMeeting as AbstractMeeting,
     BrownianCrossing as BrownianCrossing,
@@ -105,6 +108,7 @@ from .tuning import (
     fit_start_law as fit_start_law,
     tune_coupling as tune_coupling,
 )
+from .unknowns import NormalPrior as NormalPrior
 from .weighted import AbstractWeightedProposal as AbstractWeightedProposal
 from .work_precision import (
     Setting as Setting,

@@ -175,3 +175,27 @@ def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
     size = jnp.minimum(n / jnp.maximum(time, 1 / n), n * math.log10(n))
     size = jnp.where(moving, size, 1)
     return jnp.where(jnp.isfinite(covariance[0]), size, jnp.nan)
+
+
+def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
+    """R̂ from the halves of several chains (Gelman & Rubin 1992, split): near one if they agree.
+
+    `draws`: shape (chains, n, ...).
+
+    !!! example
+
+        ```python
+        jb.potential_scale_reduction(posterior.theta)  # shape (p,)
+        ```
+    """
+    draws = as_floating("draws", draws)
+    if draws.ndim < 2 or draws.shape[1] < 4:
+        raise ValueError(
+            "`draws` must be chains of at least 4 draws each, shape (chains, n, ...); got "
+            f"{draws.shape}."
+        )
+    n = draws.shape[1] // 2
+    halves = jnp.concatenate([draws[:, :n], draws[:, -n:]])
+    between = jnp.var(jnp.mean(halves, axis=1), axis=0, ddof=1)
+    within = jnp.mean(jnp.var(halves, axis=1, ddof=1), axis=0)
+    return jnp.sqrt((n - 1) / n + between / within)

@@ -341,15 +341,24 @@ def is_linear(dynamics: Dynamics, like: Float[Array, " d"]) -> bool:
 def uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:
     """Whether the values of `function` depend on its argument, by following its jaxpr."""
     jaxpr = jax.make_jaxpr(function)(like).jaxpr
-    reached = set(jaxpr.invars)
+    return any(_reached(jaxpr, [True] * len(jaxpr.invars)))
 
-    def any_reached(atoms) -> bool:
-        return any(a in reached for a in atoms if not isinstance(a, jax.extend.core.Literal))
+
+def _reached(jaxpr: jax.extend.core.Jaxpr, given: list[bool]) -> list[bool]:
+    """Which results depend on the given arguments."""
+    reached = {var for var, own in zip(jaxpr.invars, given, strict=True) if own}
+
+    def is_reached(atom) -> bool:
+        return not isinstance(atom, jax.extend.core.Literal) and atom in reached
 
     for equation in jaxpr.eqns:
-        if any_reached(equation.invars):
-            reached.update(equation.outvars)
-    return any_reached(jaxpr.outvars)
+        into = [is_reached(atom) for atom in equation.invars]
+        if equation.primitive.name in ("jit", "pjit"):
+            out = _reached(equation.params["jaxpr"].jaxpr, into)
+        else:
+            out = [any(into)] * len(equation.outvars)
+        reached.update(var for var, own in zip(equation.outvars, out, strict=True) if own)
+    return [is_reached(atom) for atom in jaxpr.outvars]
 
 
 def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) -> Array:

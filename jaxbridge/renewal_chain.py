@@ -27,7 +27,7 @@ from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, check_count
 from .kernels import Chain, Kernel, chain_keys, check_path, one_interval, sum_by_interval
-from .search import default_num_lanes, most_lanes
+from .search import Found, default_num_lanes, most_lanes
 from .start_laws import log_ratio
 from .weighted import AbstractWeightedProposal
 
@@ -39,11 +39,13 @@ class RenewalState(NamedTuple):
 
 
 class RenewalInfo(NamedTuple):
-    """Of one step: whether the associated diffusion hit, whether the path was replaced, the
-    number of paths simulated, and of those that left the finite numbers."""
+    """Of one step: whether the associated diffusion hit, whether the path was replaced, whether
+    none was found to replace it, the number of paths simulated, and of those that left the
+    finite numbers."""
 
     is_hit: Bool[Array, ""]
     is_accepted: Bool[Array, ""]
+    is_missing: Bool[Array, ""]
     num_simulated: Int[Array, ""]
     num_nonfinite: Int[Array, ""]
 
@@ -86,7 +88,7 @@ def renewal(
     def init(position, rng_key):
         check_key(rng_key)
         if position is None:
-            return RenewalState(_first_paths(rng_key[None], *setting, num_steps)[0])
+            return RenewalState(first_paths(rng_key[None], *setting, num_steps)[0])
         return RenewalState(check_path(position, intervals, num_steps))
 
     def step(rng_key, state):
@@ -99,7 +101,7 @@ def renewal(
 def _renewal_step(rng_key, state, model, pairs, intervals):
     everything = jnp.ones(1, bool)
     model, intervals, path = nondifferentiable((model.prepared(), intervals, state.position))
-    paths, info = _renew(rng_key[None], model, pairs, intervals, path[None], everything)
+    paths, info = renew(rng_key[None], model, pairs, intervals, path[None], everything)
     return RenewalState(paths[0]), jax.tree.map(lambda leaf: leaf[0], info)
 
 
@@ -146,7 +148,7 @@ def run_renewal(
     num_intervals = intervals.start.shape[0]
     pairs = pairs.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, num_intervals, num_bridges, batched)
-    first = _first_paths(init_keys, model, pairs, intervals, num_steps)
+    first = first_paths(init_keys, model, pairs, intervals, num_steps)
     most_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
     num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, most_segments))
     length = -(-num_bridges // num_segments)
@@ -168,7 +170,7 @@ def run_renewal(
 
         def one_step(state):
             i, positions, active, segments, meter = state
-            positions, info = _renew(
+            positions, info = renew(
                 chosen_keys[:, i], model, pairs, chosen_intervals, positions, active
             )
             rejoined = info.is_accepted & segments.moved[i, place]
@@ -237,7 +239,7 @@ def run_renewal(
     )
 
 
-def _renew(
+def renew(
     keys: Key[Array, " S"],
     model: Diffusion,
     pairs: CoupledPairs,
@@ -255,7 +257,7 @@ def _renew(
     associated = run_associated(model, pairs.coupling, trial_keys, lanes, dt)
     missing = ~jnp.all(jnp.isfinite(paths), axis=(1, 2))
     called_for = active & (associated.hit | missing)
-    proposed = _propose(propose_keys, model, pairs, intervals, called_for, num_steps)
+    proposed = propose_paths(propose_keys, model, pairs, intervals, called_for, num_steps)
     found = proposed.num_found > 0
     new_paths, new_start, _ = proposed.outputs
 
@@ -268,24 +270,39 @@ def _renew(
     info = RenewalInfo(
         associated.hit & active,
         accepted,
+        called_for & ~found,
         active.astype(jnp.int32) + proposed.num_trials,
         (active & ~missing & ~associated.finite).astype(jnp.int32) + proposed.num_nonfinite,
     )
     return jnp.where(accepted[:, None, None], new_paths, paths), info
 
 
-def _propose(keys, model, pairs, intervals, active, num_steps):
-    """A bridge by proposal for each of those that are active, which often are few."""
-    num_lanes = default_num_lanes(len(keys) // 4, num_steps, intervals.start)
+def propose_paths(
+    keys: Key[Array, " I"],
+    model: Diffusion,
+    pairs: CoupledPairs,
+    intervals: Intervals,
+    active: Bool[Array, " I"] | None,
+    num_steps: int,
+) -> Found:
+    """A bridge by proposal for each interval; or for those that are active, which often are few."""
+    num_wanted = len(keys) if active is None else len(keys) // 4
+    active = jnp.ones(len(keys), bool) if active is None else active
+    num_lanes = default_num_lanes(num_wanted, num_steps, intervals.start)
     inputs = Inputs(model, pairs.coupling, intervals)
     return find_bridges(keys, inputs, active, 1, pairs.max_proposals, num_steps, None, num_lanes)
 
 
 @eqx.filter_jit
-def _first_paths(keys, model, pairs, intervals, num_steps) -> Float[Array, "I points d"]:
+def first_paths(
+    keys: Key[Array, " I"],
+    model: Diffusion,
+    pairs: CoupledPairs,
+    intervals: Intervals,
+    num_steps: int,
+) -> Float[Array, "I points d"]:
     """A bridge by proposal for each interval, NaN where none was found."""
-    everything = jnp.ones(len(keys), bool)
-    proposed = _propose(keys, model.prepared(), pairs, intervals, everything, num_steps)
+    proposed = propose_paths(keys, model.prepared(), pairs, intervals, None, num_steps)
     joined: Joined = proposed.outputs
     return jnp.where((proposed.num_found > 0)[:, None, None], joined.paths, jnp.nan)
 

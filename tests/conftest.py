@@ -30,3 +30,11 @@ def unchecked():
     jaxtyping_config.update("jaxtyping_disable", True)
     yield
     jaxtyping_config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def compiled_programs_end_with_the_module():
+    """Compiled programs hold memory maps, of which a process may have 65,530 on Linux: a suite of
+    some thousand programs would run out of them, and the compiler would crash."""
+    yield
+    jax.clear_caches()

@@ -1,0 +1,346 @@
+"""Bayesian inference by Gibbs sampling (section 4 of the paper, for any model).
+
+The path between the observations is part of the state: bridges of all intervals given θ and the
+data (`completion`), and θ given the whole path (`parameter_steps`), in turn. With exact bridges
+the posterior is exact up to the step error; with approximate ones, as in the paper, it is
+shifted by the error of the bridges.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from .arrays import Numbers, nondifferentiable
+from .bridges import check_key
+from .completion import Completion, Paths, complete, is_there
+from .diagnostics import effective_sample_size, potential_scale_reduction
+from .diffusion import Diffusion, check_diffusion
+from .intervals import check_count
+from .likelihood import Form, forms_of
+from .observations import as_observations, step_groups
+from .parameter_steps import (
+    AbstractParameterKernel,
+    CompleteData,
+    NormalDraw,
+    choose_kernel,
+    quadratic_form,
+)
+from .unknowns import (
+    Constraint,
+    Prior,
+    Unknowns,
+    as_log_prior,
+    as_unknowns,
+    check_allowed,
+    check_sigma_known,
+)
+
+
+class GibbsState(NamedTuple):
+    """Where a chain is: θ, shape (p,), and the paths of all intervals, in parts of one number of
+    steps; with chains in a leading axis if there are several."""
+
+    theta: Float[Array, "*chains p"]
+    paths: tuple[Float[Array, "..."], ...]
+
+
+class Posterior(eqx.Module):
+    """Draws of the unknown parameters; arrays have a leading axis of chains if there are several.
+
+    - `params`: all parameters of the model, each with leading axes (*chains, n).
+    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `log_likelihood`: of the completed path, before θ moved, shape (*chains, n).
+    - `parameters_moved`: whether θ moved, shape (*chains, n).
+    - `bridges_moved`: the share of bridges that were replaced, shape (*chains, n).
+    - `num_simulated`: paths simulated or weighed, shape (*chains, n).
+    - `num_missing`: bridges that were not found, though called for, within `max_proposals`: they
+        stayed as they were, or are left out of the likelihood where there never was one.
+        Shape (*chains, n); zero if all is well.
+    - `state`: where it ended; pass it as `init` to go on.
+    - `exact_parameters`: whether θ is drawn from its normal law given the path.
+    - `completion`: how the observations were completed, with the proposals that were chosen.
+    """
+
+    params: PyTree
+    theta: Float[Array, "*chains n p"]
+    log_likelihood: Float[Array, "*chains n"]
+    parameters_moved: Bool[Array, "*chains n"]
+    bridges_moved: Float[Array, "*chains n"]
+    num_simulated: Int[Array, "*chains n"]
+    num_missing: Int[Array, "*chains n"]
+    state: GibbsState
+    completion: Completion
+    exact_parameters: bool = eqx.field(static=True)
+
+    @property
+    def effective_sample_size(self) -> Float[Array, " p"]:
+        """Of each unknown parameter, over all chains."""
+        if self.theta.ndim == 2:
+            return effective_sample_size(self.theta)
+        return jnp.sum(jax.vmap(effective_sample_size)(self.theta), axis=0)
+
+    @property
+    def r_hat(self) -> Float[Array, " p"]:
+        """R̂ of each unknown parameter, from the halves of all chains."""
+        return potential_scale_reduction(self.theta if self.theta.ndim == 3 else self.theta[None])
+
+    def to_arviz(self):
+        """As an `arviz.InferenceData` (or the `DataTree` of newer versions). Needs ArviZ."""
+        import arviz
+
+        def with_chains(leaf):
+            return leaf if self.theta.ndim == 3 else leaf[None]
+
+        names = {
+            jax.tree_util.keystr(path).strip(".[]'\"") or "params": with_chains(leaf)
+            for path, leaf in jax.tree_util.tree_leaves_with_path(self.params)
+        }
+        stats = {
+            "lp": with_chains(self.log_likelihood),
+            "acceptance_rate": with_chains(self.bridges_moved),
+        }
+        groups = {
+            "posterior": {name: jax.device_get(leaf) for name, leaf in names.items()},
+            "sample_stats": {name: jax.device_get(leaf) for name, leaf in stats.items()},
+        }
+        if int(arviz.__version__.split(".")[0]) > 0:
+            return arviz.from_dict(groups)
+        return arviz.from_dict(**groups)
+
+
+def gibbs(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    *,
+    prior: Prior,
+    num_iterations: int = 1000,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    proposal: Any = None,
+    bridges: Literal["exact", "approximate"] = "exact",
+    method: Literal["pseudo_marginal", "renewal"] | None = None,
+    where: Callable[[PyTree], PyTree] | None = None,
+    constraint: Constraint | None = None,
+    parameter_kernel: Callable[[Callable], Any] | None = None,
+    num_chains: int | None = None,
+    thin: int = 1,
+    init: PyTree | GibbsState = None,
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> Posterior:
+    """Draws from the posterior of a model's parameters, given discrete observations.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: its `params` are where chains start. σ must not depend on those that are unknown.
+    - `times`: increasing, shape (n + 1,), in the model's units of time.
+    - `observations`: of the diffusion at these times, shape (n + 1, d).
+    - `prior`: a `NormalPrior`, or a function that maps the unknown parameters to the log of a
+        density. It is restricted to `constraint`.
+    - `num_iterations`: draws that are kept; between two of them are `thin` iterations.
+    - `num_steps`: N for each interval, by default 50; or `step_size`, the longest step, from
+        which each interval gets its own number of steps.
+    - `proposal`: a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, `Guided()`, or
+        "auto", the default, which finds the best for each interval by a pilot run; or, for
+        approximate bridges, a `Coupling`, by default `Coupling(gamma=0.0)`.
+    - `bridges`: "exact", or "approximate" as in the paper.
+    - `method`: of exact bridges by a coupling, "renewal" (the default if `proposal` is one) or
+        "pseudo_marginal".
+    - `where`: a function that picks the unknown ones from `model.params`, by default all, for
+        instance `lambda params: params.B`. Prior and constraint are about these.
+    - `constraint`: a function that maps the unknown parameters to whether they are allowed, for
+        instance `lambda alpha: alpha > 0`, without which the model is not ergodic.
+    - `parameter_kernel`: makes a kernel `(init, step)` from a log density of the unknown
+        parameters, as BlackJAX does. By default θ is drawn from its normal law given the path
+        where the log likelihood is quadratic and the prior normal; otherwise moved by
+        Metropolis–Hastings with Newton steps.
+    - `num_chains`: several chains at once, which then have a leading axis in all results.
+    - `init`: unknown parameters to start from, with a leading axis of chains if there are
+        several and they differ; or the `state` of earlier draws, to go on from there.
+    - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Returns:** `Posterior`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        posterior = jb.gibbs(
+            jax.random.key(0), jb.hyperbolic(0.8, 2), times, observations,
+            prior=jb.NormalPrior(1.0, 1.0), constraint=lambda alpha: alpha > 0,
+        )
+        posterior.params.mean(), posterior.effective_sample_size
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
+    chains = () if num_chains is None else (check_count("num_chains", num_chains),)
+    intervals = as_observations(model, times, observations)
+    like = intervals.start[0]
+    unknowns, theta = as_unknowns(model, where, like)
+    check_sigma_known(
+        unknowns,
+        theta,
+        like,
+        "use `pmmh`, which needs no path, or pick the others with `where=`.",
+    )
+    log_prior = as_log_prior(prior, unknowns, theta)
+    state = init if isinstance(init, GibbsState) else None
+    if state is not None:
+        theta = state.theta
+    elif init is not None:
+        rows = _init_vectors(unknowns, init, chains)
+        theta = rows.astype(like.dtype)
+    if theta.ndim == 1:
+        theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
+    check_allowed(constraint, unknowns, theta)
+    pilot_model = unknowns.at(theta.reshape(-1, theta.shape[-1])[0])
+    complete_key, run_key = jax.random.split(key)
+    groups = step_groups(intervals.duration, num_steps, step_size)
+    bounds = (num_counts, max_proposals, max_trials)
+    arguments = (intervals, groups, proposal, bridges, method, *bounds)
+    completion = complete(complete_key, pilot_model, *arguments)
+    form = quadratic_form(unknowns, theta.reshape(-1, theta.shape[-1])[0], like)
+    kernel = choose_kernel(parameter_kernel, form is not None, log_prior)
+    form = forms_of(model, like)[0] if form is None else form
+    setting = _Setting(unknowns, completion, log_prior, constraint, kernel, form)
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    if state is None:
+        state = _start(run_key, setting, theta)
+    return _run(run_key, setting, state, num_iterations, thin, meter)
+
+
+class _Setting(eqx.Module):
+    """What does not change from iteration to iteration."""
+
+    unknowns: Unknowns
+    completion: Completion
+    log_prior: Callable[[Array], Array]
+    constraint: Constraint | None = eqx.field(static=True)
+    kernel: AbstractParameterKernel
+    form: Form = eqx.field(static=True)
+
+    def data(self, paths: Paths) -> CompleteData:
+        return CompleteData(
+            self.unknowns, self.completion, paths, self.log_prior, self.constraint, self.form
+        )
+
+
+class _Sweep(NamedTuple):
+    """What is told of one iteration."""
+
+    log_likelihood: Float[Array, "*chains"]
+    parameters_moved: Bool[Array, "*chains"]
+    bridges_moved: Float[Array, "*chains"]
+    num_simulated: Int[Array, "*chains"]
+    num_missing: Int[Array, "*chains"]
+
+
+def _init_vectors(unknowns: Unknowns, init: PyTree, chains: tuple[int, ...]) -> Array:
+    init = jax.tree.map(jnp.asarray, init)
+    known = unknowns.params
+    if jax.tree.structure(init) != jax.tree.structure(known):
+        raise ValueError(
+            "`init` must be the `state` of earlier draws, or have the structure of the unknown "
+            f"parameters, {jax.tree.structure(known)}; got {jax.tree.structure(init)}."
+        )
+    shapes = [
+        (given.shape, leaf.shape)
+        for given, leaf in zip(jax.tree.leaves(init), jax.tree.leaves(known), strict=True)
+    ]
+    if all(given == leaf for given, leaf in shapes):
+        return unknowns.vector(init)
+    if chains and all(given == (*chains, *leaf) for given, leaf in shapes):
+        return jax.vmap(unknowns.vector)(init)
+    raise ValueError(
+        f"`init` must have leaves of the shapes of the unknown parameters, {[s for _, s in shapes]}"
+        f", with a leading axis of chains if they differ; got {[s for s, _ in shapes]}."
+    )
+
+
+@eqx.filter_jit
+def _start(key: Key[Array, ""], setting: _Setting, theta: Float[Array, "*chains p"]) -> GibbsState:
+    def first(key, theta):
+        model = nondifferentiable(setting.unknowns.at(theta))
+        return setting.completion.first(key, model)
+
+    key = jax.random.fold_in(key, 0)
+    if theta.ndim == 1:
+        return GibbsState(theta, first(key, theta))
+    return GibbsState(theta, jax.vmap(first)(jax.random.split(key, len(theta)), theta))
+
+
+def _iterate(
+    key: Key[Array, ""], setting: _Setting, state: GibbsState
+) -> tuple[GibbsState, _Sweep]:
+    """Bridges given θ, then θ given bridges."""
+    bridge_key, parameter_key = jax.random.split(key)
+    model = setting.unknowns.at(state.theta)
+    paths, renewed = setting.completion.renew(bridge_key, model, state.paths)
+    step = setting.kernel.step(parameter_key, state.theta, setting.data(paths))
+    there = jnp.concatenate([is_there(mine) for mine in paths])
+    sweep = _Sweep(
+        step.log_likelihood,
+        step.accepted,
+        jnp.mean(renewed.moved.astype(state.theta.dtype)),
+        jnp.sum(renewed.num_simulated, dtype=jnp.int32),
+        jnp.sum(renewed.missing | ~there, dtype=jnp.int32),
+    )
+    return GibbsState(step.theta, paths), sweep
+
+
+@eqx.filter_jit
+def _run(
+    key: Key[Array, ""],
+    setting: _Setting,
+    state: GibbsState,
+    num_iterations: int,
+    thin: int,
+    progress_meter: diffrax.AbstractProgressMeter,
+) -> Posterior:
+    setting, state = nondifferentiable((setting, state))
+
+    def iterate(state, key):
+        if state.theta.ndim == 1:
+            return _iterate(key, setting, state)
+        keys = jax.random.split(key, len(state.theta))
+        return jax.vmap(lambda key, state: _iterate(key, setting, state))(keys, state)
+
+    def kept(carry, i):
+        state, meter = carry
+        # Number 0 made the first paths.
+        keys = jax.random.split(jax.random.fold_in(key, i + 1), thin)
+        state, sweeps = lax.scan(iterate, state, keys)
+        meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / num_iterations)
+        told = _Sweep(
+            sweeps.log_likelihood[-1],
+            jnp.any(sweeps.parameters_moved, axis=0),
+            jnp.mean(sweeps.bridges_moved, axis=0),
+            jnp.sum(sweeps.num_simulated, axis=0, dtype=jnp.int32),
+            jnp.sum(sweeps.num_missing, axis=0, dtype=jnp.int32),
+        )
+        return (state, meter), (state.theta, told)
+
+    carry = (state, progress_meter.init())
+    (state, meter), (theta, told) = lax.scan(kept, carry, jnp.arange(num_iterations))
+    progress_meter.close(meter)
+    if theta.ndim == 3:
+        theta, told = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, told))
+    as_params = jax.vmap(setting.unknowns.all)
+    params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
+    exact = isinstance(setting.kernel, NormalDraw)
+    return Posterior(params, theta, *told, state, setting.completion, exact)

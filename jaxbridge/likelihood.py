@@ -1,0 +1,189 @@
+"""The likelihood of a path (section 4 of the paper, for any model).
+
+Of a path seen at times t_0 < ... < t_K, relative to the law of σW where σ does not depend on the
+parameters. By Girsanov's theorem its logarithm is
+
+    ∫ αᵀ V⁻¹ dX - ½ ∫ αᵀ V⁻¹ α dt,
+
+in three forms that have one limit, and as the Euler density itself:
+
+* "girsanov": sums over left points, the Euler density without what does not depend on the drift.
+  For any σ(x); an error of O(δ).
+* "trapezoid": for constant σ, `TrapezoidDensity` step by step; an error of O(δ²).
+* "ito": for a gradient drift V⁻¹α = ∇A with constant V, that is for reversible models, where
+  A = ½ log ν. By Itô's formula no stochastic integral is left,
+
+      A(X_T) - A(X_0) - ½ ∫ [tr(V ∇²A) + ∇AᵀV ∇A] dt,
+
+  in which tr(V ∇²A) = div α; the integral is by the trapezoid rule, with an error of O(δ²). For
+  the hyperbolic diffusion this is α H_T - ½ α² B_T, equation (likelihood).
+* "euler": Σ log N(x_{i+1}; x_i + α(x_i) δ_i, V(x_i) δ_i), a density in the points of the path.
+  The one form in which σ may depend on parameters.
+"""
+
+import math
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from .arrays import Numbers, as_floating, is_traced
+from .diffusion import Diffusion, Dynamics, check_diffusion
+from .lanes import over_lanes
+from .linalg import dot, total
+from .step_density import TrapezoidDensity
+
+Form = Literal["girsanov", "trapezoid", "ito", "euler"]
+
+
+def path_log_likelihood(
+    model: Diffusion, times: Numbers, path: Numbers, *, form: Form | None = None
+) -> Float[Array, "*batch"]:
+    """The log likelihood of paths, differentiable in `model.params`.
+
+    **Arguments:**
+
+    - `model`: the diffusion.
+    - `times`: increasing, shape (K,); or (I, K), for each of I intervals its own.
+    - `path`: points at these times, shape (..., K, d); (I, ..., K, d) with times of shape (I, K).
+        So the paths of bridges fit, for one interval or several.
+    - `form`: "girsanov", "trapezoid", "ito" or "euler"; by default the most accurate that the
+        model has: "ito" if it is reversible with a known ν and constant σ, "trapezoid" if σ is
+        constant, else "girsanov".
+
+    **Returns:** shape (...), in the dtype of `path`: relative to the law of σW, or, as "euler",
+    to Lebesgue's measure.
+
+    **Raises:** `ValueError` for shapes that do not fit, times that do not increase, or a form
+    that the model does not have.
+
+    !!! example
+
+        ```python
+        def log_likelihood(alpha):
+            return jb.path_log_likelihood(model.with_params(alpha), bridges.times, bridges.paths)
+
+        jax.jacfwd(log_likelihood)(0.8)  # the score of each path
+        ```
+    """
+    check_diffusion(model)
+    times, path = as_floating("times", times), as_floating("path", path)
+    if path.ndim < 2 or path.shape[-2] < 2:
+        raise ValueError(
+            "`path` must hold two or more points in the axis before the last, shape (..., K, d); "
+            f"got {path.shape}."
+        )
+    batch, (num_times, d) = path.shape[:-2], path.shape[-2:]
+    fits = times.shape == (num_times,) or (
+        path.ndim > 2 and times.shape == (path.shape[0], num_times)
+    )
+    if not fits:
+        raise ValueError(
+            f"`times` must have shape ({num_times},), as many as the path has points, or (I, "
+            f"{num_times}) for paths of shape (I, ..., {num_times}, d); got {times.shape} for "
+            f"paths of shape {path.shape}."
+        )
+    steps = jnp.diff(times.astype(path.dtype))
+    if not is_traced(times) and not np.all(np.diff(np.asarray(times)) > 0):
+        raise ValueError("`times` must be finite and increase.")
+    if steps.ndim == 2:
+        steps = steps.reshape(len(steps), *[1] * (len(batch) - 1), num_times - 1)
+    steps = jnp.broadcast_to(steps, (*batch, num_times - 1)).reshape(-1, num_times - 1)
+    values = log_likelihoods(model, steps.T, path.reshape(-1, num_times, d), form)
+    return values.reshape(batch)
+
+
+def log_likelihoods(
+    model: Diffusion,
+    steps: Float[Array, "K P"],
+    paths: Float[Array, "P points d"],
+    form: Form | None = None,
+) -> Float[Array, " P"]:
+    """Those of P paths, with steps δ in the columns of `steps`."""
+    like = paths[0, 0]
+    model = model.prepared()
+    dynamics, form = model.forward(like), _form(model, like, form)
+    points = jnp.moveaxis(paths, (0, 1), (-1, -2))  # (d, K+1, P)
+    if form == "ito":
+        return _ito(model, dynamics, steps, points)
+    d, num_points, num_paths = points.shape
+    lanes = points.reshape(d, -1)
+    density = TrapezoidDensity() if form == "trapezoid" else None
+    look = (lambda x: ()) if density is None else (lambda x: density.look(dynamics, x))
+    seen = over_lanes(-1)(look)(lanes)
+
+    def of_steps(leaf, shift):
+        leaf = leaf.reshape(*leaf.shape[:-1], num_points, num_paths)
+        leaf = lax.slice_in_dim(leaf, shift, num_points - 1 + shift, axis=-2)
+        return leaf.reshape(*leaf.shape[:-2], -1)
+
+    def of_step(x, x_next, dt, seen, seen_next):
+        value = _girsanov(dynamics, x, x_next, dt)
+        if density is not None:
+            value += density.log_ratio(dynamics, x, x_next, seen, seen_next, dt)
+        return value + _driftless(dynamics, x, x_next, dt) if form == "euler" else value
+
+    before, after = (
+        jax.tree.map(lambda leaf, s=shift: of_steps(leaf, s), (lanes, seen)) for shift in (0, 1)
+    )
+    values = over_lanes(-1, -1, -1, -1, -1)(of_step)(
+        before[0], after[0], steps.reshape(-1), before[1], after[1]
+    )
+    return jnp.sum(values.reshape(num_points - 1, num_paths), axis=0)
+
+
+def _ito(model: Diffusion, dynamics: Dynamics, steps, points) -> Float[Array, " P"]:
+    def integrand(x):
+        """½ [div α + αᵀ V⁻¹ α]."""
+        alpha, slope = jax.linearize(dynamics.drift, x)
+        directions = [jnp.asarray(direction, x.dtype) for direction in np.eye(x.shape[0])]
+        divergence = total(jnp.stack([slope(e)[i] for i, e in enumerate(directions)]))
+        beta = dynamics.sigma(x).solve(alpha)
+        return (divergence + dot(beta, beta)) / 2
+
+    values = over_lanes(-1)(integrand)(points.reshape(points.shape[0], -1))
+    values = values.reshape(points.shape[1:])
+    integral = jnp.sum((values[1:] + values[:-1]) / 2 * steps, axis=0)
+    log_nu = over_lanes(-1)(model.log_stationary)
+    return (log_nu(points[:, -1]) - log_nu(points[:, 0])) / 2 - integral
+
+
+def _girsanov(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
+    """αᵀ V⁻¹ Δx - ½ αᵀ V⁻¹ α δ."""
+    sigma = dynamics.sigma(x)
+    beta = sigma.solve(dynamics.drift(x))
+    return dot(beta, sigma.solve(x_next - x) - dt / 2 * beta)
+
+
+def _driftless(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
+    """log N(x'; x, V(x) δ)."""
+    sigma, d = dynamics.sigma(x), x.shape[0]
+    dw = sigma.solve(x_next - x)
+    return -dot(dw, dw) / (2 * dt) - sigma.log_abs_det() - d / 2 * jnp.log(2 * math.pi * dt)
+
+
+def forms_of(model: Diffusion, like: Float[Array, " d"]) -> tuple[Form, ...]:
+    """The forms relative to the law of σW that the model has, the most accurate first."""
+    if model.forward(like).sigma_varies:
+        return ("girsanov",)
+    gradient = model.reversible and model.has_density
+    return ("ito", "trapezoid", "girsanov") if gradient else ("trapezoid", "girsanov")
+
+
+def _form(model: Diffusion, like: Float[Array, " d"], form: Form | None) -> Form:
+    forms = forms_of(model, like)
+    if form is None:
+        return forms[0]
+    if form not in get_args(Form):
+        raise ValueError(f"`form` must be one of {', '.join(get_args(Form))}; got {form!r}.")
+    if form in (*forms, "euler"):
+        return form
+    if "trapezoid" not in forms:
+        raise ValueError(f'`form="{form}"` is for constant σ: choose "girsanov" or "euler".')
+    raise ValueError(
+        '`form="ito"` is for models with `reversible=True` and a `log_stationary`, whose drift is '
+        'a gradient: choose "trapezoid".'
+    )

@@ -1,0 +1,220 @@
+"""What is not known: the parameters to be inferred, as a vector θ in R^p, and their prior.
+
+All parameters of the model are unknown, or those that a function `where(params)` picks, as in
+`equinox.tree_at`. What is observed in between is a path in the coordinates of the model, so σ must
+not depend on θ wherever paths are part of the state: two σ's give singular laws of paths, and a
+path would never let go of the θ it was made with.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+from .arrays import as_floating, cast_floats, is_traced
+from .diffusion import Diffusion, uses_argument
+from .linalg import dot, inverse, matvec
+
+
+class Unknowns(eqx.Module):
+    """The model, and which of its parameters are unknown."""
+
+    model: Diffusion
+    where: Callable[[PyTree], PyTree] | None = eqx.field(static=True)
+
+    @property
+    def params(self) -> PyTree:
+        """The unknown parameters, as they are in the model."""
+        return self.model.params if self.where is None else self.where(self.model.params)
+
+    def vector(self, params: PyTree) -> Float[Array, " p"]:
+        """θ of these unknown parameters."""
+        return ravel_pytree(eqx.filter(params, eqx.is_inexact_array))[0]
+
+    def pick(self, theta: Float[Array, " p"]) -> PyTree:
+        """The unknown parameters of θ, in its dtype."""
+        floats, others = eqx.partition(self.params, eqx.is_inexact_array)
+        _, unravel = ravel_pytree(cast_floats(floats, theta.dtype))
+        return eqx.combine(unravel(theta), others)
+
+    def all(self, theta: Float[Array, " p"]) -> PyTree:
+        """All parameters of the model, the unknown ones from θ."""
+        if self.where is None:
+            return self.pick(theta)
+        return eqx.tree_at(self.where, self.model.params, self.pick(theta))
+
+    def at(self, theta: Float[Array, " p"]) -> Diffusion:
+        """The model at θ."""
+        return self.model.with_params(self.all(theta))
+
+
+class NormalPrior(eqx.Module):
+    """A normal prior of the unknown parameters.
+
+    **Arguments:**
+
+    - `mean`: a number for all of them, a vector of shape (p,), or a pytree like the parameters.
+    - `variance`: likewise; or a covariance matrix of shape (p, p). A vector has the parameters in
+        the order of `jax.flatten_util.ravel_pytree`.
+
+    **Raises:** `ValueError`, by the function it is passed to, if shapes do not fit the parameters.
+
+    !!! example
+
+        ```python
+        jb.NormalPrior(1.0, 1.0)
+        jb.NormalPrior(jnp.zeros(4), 0.5 * jnp.eye(4))
+        ```
+    """
+
+    mean: PyTree
+    variance: PyTree
+
+
+class NormalDensity(eqx.Module):
+    """N(mean, precision⁻¹), up to the constant."""
+
+    mean: Float[Array, " p"]
+    precision: Float[Array, "p p"]
+
+    def __call__(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
+        deviation = theta - self.mean
+        return -dot(deviation, matvec(self.precision, deviation)) / 2
+
+
+Prior = NormalPrior | Callable[[PyTree], Any]
+Constraint = Callable[[PyTree], Any]
+
+
+def as_unknowns(
+    model: Diffusion, where: Callable[[PyTree], PyTree] | None, like: Float[Array, " d"]
+) -> tuple[Unknowns, Float[Array, " p"]]:
+    """The unknown parameters and θ as it is in the model, in the dtype of the points."""
+    if where is not None and not callable(where):
+        raise TypeError(
+            f"`where` must be a function that picks from `model.params`; got {where!r}."
+        )
+    unknowns = Unknowns(model, where)
+    theta = unknowns.vector(cast_floats(unknowns.params, like.dtype))
+    if theta.size == 0:
+        raise ValueError(
+            "this model has no parameters to be inferred: give `Diffusion` its unknown numbers as "
+            "`params=`."
+        )
+    if not is_traced(theta) and not np.all(np.isfinite(theta)):
+        raise ValueError(f"the unknown parameters must be finite; the model has {unknowns.params}.")
+    return unknowns, theta
+
+
+def check_sigma_known(
+    unknowns: Unknowns, theta: Float[Array, " p"], like: Float[Array, " d"], instead: str
+) -> None:
+    """Raise `ValueError` where σ depends on the unknown parameters."""
+    if uses_argument(lambda theta: unknowns.at(theta).diffusion(like), theta):
+        raise ValueError(
+            "σ depends on the unknown parameters, and given a whole path σ is known: " + instead
+        )
+
+
+def as_normal(prior: NormalPrior, unknowns: Unknowns, theta: Float[Array, " p"]) -> NormalDensity:
+    """The prior of θ, with its shapes checked."""
+    p = theta.shape[0]
+
+    def as_vector(name, value):
+        structure = jax.tree.structure(unknowns.params)
+        if jax.tree.structure(value) == structure and not hasattr(value, "ndim"):
+            like = jax.tree.leaves(unknowns.params)
+            leaves = [as_floating(f"prior.{name}", leaf) for leaf in jax.tree.leaves(value)]
+            for leaf, known in zip(leaves, like, strict=True):
+                if leaf.shape not in ((), known.shape):
+                    raise ValueError(
+                        f"`prior.{name}` has a leaf of shape {leaf.shape} for parameters of shape "
+                        f"{known.shape}."
+                    )
+            full = [jnp.broadcast_to(a, b.shape) for a, b in zip(leaves, like, strict=True)]
+            value = unknowns.vector(jax.tree.unflatten(structure, full))
+        return as_floating(f"prior.{name}", value).astype(theta.dtype)
+
+    mean, variance = as_vector("mean", prior.mean), as_vector("variance", prior.variance)
+    if mean.shape not in ((), (p,)):
+        raise ValueError(
+            f"`prior.mean` must be a number, a vector of shape ({p},) or a pytree like the unknown "
+            f"parameters; got shape {mean.shape}."
+        )
+    if variance.shape not in ((), (p,), (p, p)):
+        raise ValueError(
+            f"`prior.variance` must be a number, a vector of shape ({p},), a matrix of shape "
+            f"({p}, {p}) or a pytree like the unknown parameters; got shape {variance.shape}."
+        )
+    if not is_traced(mean, variance):
+        least = np.linalg.eigvalsh(variance).min() if variance.ndim == 2 else np.min(variance)
+        if not (np.all(np.isfinite(mean)) and np.isfinite(least) and least > 0):
+            raise ValueError(
+                "`prior` must have a finite mean and a positive (definite) variance; got "
+                f"{prior.mean} and {prior.variance}."
+            )
+    if variance.ndim == 2:
+        precision = inverse(variance) if p <= 16 else jnp.linalg.inv(variance)
+        precision = (precision + precision.T) / 2
+    else:
+        precision = jnp.diag(jnp.broadcast_to(1 / variance, (p,)))
+    return NormalDensity(jnp.broadcast_to(mean, (p,)), precision)
+
+
+def as_log_prior(
+    prior: Prior, unknowns: Unknowns, theta: Float[Array, " p"]
+) -> Callable[[Array], Array]:
+    """The prior's log density, a function of θ; a `NormalDensity` where it is normal."""
+    if isinstance(prior, NormalPrior):
+        return as_normal(prior, unknowns, theta)
+    if not callable(prior):
+        raise TypeError(
+            "`prior` must be a `NormalPrior`, or a function that maps the unknown parameters to "
+            f"the log of a density; got {prior!r}."
+        )
+
+    def log_prior(theta):
+        value = jnp.asarray(prior(unknowns.pick(theta)))
+        if value.shape != ():
+            raise ValueError(f"`prior` must return a number; it returned shape {value.shape}.")
+        return value.astype(theta.dtype)
+
+    return log_prior
+
+
+def allowed(
+    constraint: Constraint | None, unknowns: Unknowns, theta: Float[Array, " p"]
+) -> Bool[Array, ""]:
+    """Whether θ is finite and satisfies the constraint."""
+    finite = jnp.all(jnp.isfinite(theta))
+    if constraint is None:
+        return finite
+    value = jnp.asarray(constraint(unknowns.pick(theta)))
+    if value.shape != () or value.dtype != bool:
+        raise ValueError(
+            "`constraint` must map the unknown parameters to one truth value; it returned shape "
+            f"{value.shape} and dtype {value.dtype}."
+        )
+    return finite & value
+
+
+def check_allowed(
+    constraint: Constraint | None, unknowns: Unknowns, theta: Float[Array, "*chains p"]
+) -> None:
+    """Raise `ValueError` where a visible θ does not satisfy the constraint."""
+    if constraint is not None and not callable(constraint):
+        raise TypeError(
+            "`constraint` must be a function that maps the unknown parameters to a truth value; "
+            f"got {constraint!r}."
+        )
+    for row in theta.reshape(-1, theta.shape[-1]):
+        ok = allowed(constraint, unknowns, row)
+        if not is_traced(ok) and not bool(ok):
+            raise ValueError(
+                f"the parameters to start from, {unknowns.pick(row)}, do not satisfy `constraint`."
+            )
