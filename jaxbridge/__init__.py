@@ -37,6 +37,7 @@ from .diagnostics import (
     potential_scale_reduction as potential_scale_reduction,
 )
 from .diffusion import Diffusion as Diffusion
+from .expectation import expectation as expectation
 from .gaussian import (
     GaussianBridge as GaussianBridge,
     GaussianLaw as GaussianLaw,
@@ -46,7 +47,11 @@ from .gaussian import (
     ou_stationary as ou_stationary,
     ou_transition as ou_transition,
 )
-from .gibbs import GibbsState as GibbsState, Posterior as Posterior, gibbs as gibbs
+from .gibbs import (
+    GibbsPosterior as GibbsPosterior,
+    GibbsState as GibbsState,
+    gibbs as gibbs,
+)
 from .guided import (
     AbstractGuidedProposal as AbstractGuidedProposal,
     Guided as Guided,
@@ -63,6 +68,10 @@ from .importance import (
 )
 from .kernels import Chain as Chain, Kernel as Kernel
 from .likelihood import path_log_likelihood as path_log_likelihood
+from .maximum_likelihood import (
+    MaximumLikelihood as MaximumLikelihood,
+    maximum_likelihood as maximum_likelihood,
+)
 from .meeting import (
     AbstractMeeting as AbstractMeeting,
     BrownianCrossing as BrownianCrossing,
@@ -76,6 +85,8 @@ from .models import (
     langevin as langevin,
     stationary_diffusion as stationary_diffusion,
 )
+from .pmmh import PMMHPosterior as PMMHPosterior, PMMHState as PMMHState, pmmh as pmmh
+from .posterior import AbstractPosterior as AbstractPosterior
 from .pseudo_marginal_chain import pseudo_marginal as pseudo_marginal
 from .renewal_chain import renewal as renewal
 from .scene import effects as effects
@@ -86,6 +97,7 @@ from .schemes import (
     Heun as Heun,
     Milstein as Milstein,
 )
+from .score import Score as Score, score as score
 from .simulate import simulate as simulate
 from .start_laws import (
     Reversed as Reversed,

@@ -19,7 +19,6 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from .arrays import Numbers, nondifferentiable
 from .bridges import check_key
 from .completion import Completion, Paths, complete, is_there
-from .diagnostics import effective_sample_size, potential_scale_reduction
 from .diffusion import Diffusion, check_diffusion
 from .intervals import check_count
 from .likelihood import Form, forms_of
@@ -31,6 +30,7 @@ from .parameter_steps import (
     choose_kernel,
     quadratic_form,
 )
+from .posterior import AbstractPosterior
 from .unknowns import (
     Constraint,
     Prior,
@@ -39,6 +39,7 @@ from .unknowns import (
     as_unknowns,
     check_allowed,
     check_sigma_known,
+    init_vectors,
 )
 
 
@@ -50,7 +51,7 @@ class GibbsState(NamedTuple):
     paths: tuple[Float[Array, "..."], ...]
 
 
-class Posterior(eqx.Module):
+class GibbsPosterior(AbstractPosterior):
     """Draws of the unknown parameters; arrays have a leading axis of chains if there are several.
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
@@ -78,41 +79,6 @@ class Posterior(eqx.Module):
     completion: Completion
     exact_parameters: bool = eqx.field(static=True)
 
-    @property
-    def effective_sample_size(self) -> Float[Array, " p"]:
-        """Of each unknown parameter, over all chains."""
-        if self.theta.ndim == 2:
-            return effective_sample_size(self.theta)
-        return jnp.sum(jax.vmap(effective_sample_size)(self.theta), axis=0)
-
-    @property
-    def r_hat(self) -> Float[Array, " p"]:
-        """R̂ of each unknown parameter, from the halves of all chains."""
-        return potential_scale_reduction(self.theta if self.theta.ndim == 3 else self.theta[None])
-
-    def to_arviz(self):
-        """As an `arviz.InferenceData` (or the `DataTree` of newer versions). Needs ArviZ."""
-        import arviz
-
-        def with_chains(leaf):
-            return leaf if self.theta.ndim == 3 else leaf[None]
-
-        names = {
-            jax.tree_util.keystr(path).strip(".[]'\"") or "params": with_chains(leaf)
-            for path, leaf in jax.tree_util.tree_leaves_with_path(self.params)
-        }
-        stats = {
-            "lp": with_chains(self.log_likelihood),
-            "acceptance_rate": with_chains(self.bridges_moved),
-        }
-        groups = {
-            "posterior": {name: jax.device_get(leaf) for name, leaf in names.items()},
-            "sample_stats": {name: jax.device_get(leaf) for name, leaf in stats.items()},
-        }
-        if int(arviz.__version__.split(".")[0]) > 0:
-            return arviz.from_dict(groups)
-        return arviz.from_dict(**groups)
-
 
 def gibbs(
     key: Key[Array, ""],
@@ -137,7 +103,7 @@ def gibbs(
     max_proposals: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
-) -> Posterior:
+) -> GibbsPosterior:
     """Draws from the posterior of a model's parameters, given discrete observations.
 
     **Arguments:**
@@ -171,7 +137,7 @@ def gibbs(
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
-    **Returns:** `Posterior`. Not differentiable.
+    **Returns:** `GibbsPosterior`. Not differentiable.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
@@ -203,8 +169,7 @@ def gibbs(
     if state is not None:
         theta = state.theta
     elif init is not None:
-        rows = _init_vectors(unknowns, init, chains)
-        theta = rows.astype(like.dtype)
+        theta = init_vectors(unknowns, init, chains).astype(like.dtype)
     if theta.ndim == 1:
         theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
     check_allowed(constraint, unknowns, theta)
@@ -250,28 +215,6 @@ class _Sweep(NamedTuple):
     num_missing: Int[Array, "*chains"]
 
 
-def _init_vectors(unknowns: Unknowns, init: PyTree, chains: tuple[int, ...]) -> Array:
-    init = jax.tree.map(jnp.asarray, init)
-    known = unknowns.params
-    if jax.tree.structure(init) != jax.tree.structure(known):
-        raise ValueError(
-            "`init` must be the `state` of earlier draws, or have the structure of the unknown "
-            f"parameters, {jax.tree.structure(known)}; got {jax.tree.structure(init)}."
-        )
-    shapes = [
-        (given.shape, leaf.shape)
-        for given, leaf in zip(jax.tree.leaves(init), jax.tree.leaves(known), strict=True)
-    ]
-    if all(given == leaf for given, leaf in shapes):
-        return unknowns.vector(init)
-    if chains and all(given == (*chains, *leaf) for given, leaf in shapes):
-        return jax.vmap(unknowns.vector)(init)
-    raise ValueError(
-        f"`init` must have leaves of the shapes of the unknown parameters, {[s for _, s in shapes]}"
-        f", with a leading axis of chains if they differ; got {[s for s, _ in shapes]}."
-    )
-
-
 @eqx.filter_jit
 def _start(key: Key[Array, ""], setting: _Setting, theta: Float[Array, "*chains p"]) -> GibbsState:
     def first(key, theta):
@@ -311,7 +254,7 @@ def _run(
     num_iterations: int,
     thin: int,
     progress_meter: diffrax.AbstractProgressMeter,
-) -> Posterior:
+) -> GibbsPosterior:
     setting, state = nondifferentiable((setting, state))
 
     def iterate(state, key):
@@ -343,4 +286,4 @@ def _run(
     as_params = jax.vmap(setting.unknowns.all)
     params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
     exact = isinstance(setting.kernel, NormalDraw)
-    return Posterior(params, theta, *told, state, setting.completion, exact)
+    return GibbsPosterior(params, theta, *told, state, setting.completion, exact)

@@ -120,7 +120,7 @@ class NormalDraw(AbstractParameterKernel):
 
     def step(self, key, theta, data):
         value, gradient, hessian = _expansion(data.log_posterior_inside, theta)
-        root = _cholesky(-hessian)
+        root = small_cholesky(-hessian)
         mean = theta + _solve_root(root, gradient)
 
         def draw(carry):
@@ -147,7 +147,7 @@ class NewtonStep(AbstractParameterKernel):
         def look(theta):
             """The log density at θ, and mean and root of the proposals from it."""
             value, gradient = jax.value_and_grad(data.log_posterior_inside)(theta)
-            root = _cholesky(data.information(theta))
+            root = small_cholesky(data.information(theta))
             mean = theta + (1 - jnp.sqrt((1 - tau) * (1 + tau))) * _solve_root(root, gradient)
             return value, mean, root
 
@@ -210,7 +210,8 @@ def _expansion(
     return function(theta), gradient(theta), jax.jacfwd(gradient)(theta)
 
 
-def _cholesky(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
+def small_cholesky(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """Unrolled for few parameters."""
     return cholesky(matrix) if matrix.shape[0] <= 16 else jnp.linalg.cholesky(matrix)
 
 

@@ -106,6 +106,14 @@ def transition_log_density(
     like = intervals.start[0]
     proposal = as_proposal(proposal, model, like, num_counts, None, max_trials, for_density=True)
     proposal.check(model, intervals)
+    check_for_density(proposal, model)
+    proposal = settled(proposal, key, model, intervals, num_steps)
+    size = (num_proposals, num_steps, batched, progress_meter)
+    return estimate_log_density(key, model, proposal, intervals, *size)
+
+
+def check_for_density(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
+    """Raise `ValueError` where the size of the proposal's weights is not known."""
     pairs = [single for single in singles(proposal) if isinstance(single, CoupledPairs)]
     if pairs and not model.has_density:
         raise ValueError(
@@ -120,22 +128,20 @@ def transition_log_density(
             "densities agree only if `log_stationary` is normalised: declare that by "
             "`Diffusion(..., normalised=True)`, or choose between other proposals."
         )
-    proposal = settled(proposal, key, model, intervals, num_steps)
-    size = (num_proposals, num_steps, batched, progress_meter)
-    return _estimate(key, model, proposal, intervals, *size)
 
 
 @eqx.filter_jit
-def _estimate(
+def estimate_log_density(
     key: Key[Array, ""],
     model: Diffusion,
     proposal: AbstractWeightedProposal,
     intervals: Intervals,
     num_proposals: int,
     num_steps: int,
-    batched: bool,
-    progress_meter: diffrax.AbstractProgressMeter | None,
+    batched: bool = True,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> TransitionLogDensity:
+    """The estimates, for arguments that have been checked."""
     model, num_intervals = model.prepared(), intervals.start.shape[0]
     proposal = proposal.prepared(key, model, intervals, num_steps)
     fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))

@@ -218,3 +218,29 @@ def check_allowed(
             raise ValueError(
                 f"the parameters to start from, {unknowns.pick(row)}, do not satisfy `constraint`."
             )
+
+
+def init_vectors(
+    unknowns: Unknowns, init: PyTree, chains: tuple[int, ...]
+) -> Float[Array, "*chains p"]:
+    """θ of the unknown parameters that the user wants to start from, for each chain its own if
+    they have such an axis."""
+    init = jax.tree.map(jnp.asarray, init)
+    known = unknowns.params
+    if jax.tree.structure(init) != jax.tree.structure(known):
+        raise ValueError(
+            "`init` must be the `state` of earlier draws, or have the structure of the unknown "
+            f"parameters, {jax.tree.structure(known)}; got {jax.tree.structure(init)}."
+        )
+    shapes = [
+        (given.shape, leaf.shape)
+        for given, leaf in zip(jax.tree.leaves(init), jax.tree.leaves(known), strict=True)
+    ]
+    if all(given == leaf for given, leaf in shapes):
+        return unknowns.vector(init)
+    if chains and all(given == (*chains, *leaf) for given, leaf in shapes):
+        return jax.vmap(unknowns.vector)(init)
+    raise ValueError(
+        f"`init` must have leaves of the shapes of the unknown parameters, {[s for _, s in shapes]}"
+        f", with a leading axis of chains if they differ; got {[s for s, _ in shapes]}."
+    )

@@ -1,0 +1,106 @@
+"""Expectations over exact bridges whose derivatives in the parameters are right.
+
+With bridges Z of weights w, made at θ, and f_θ the density of a path relative to that of σW,
+
+    E_θ'[h_θ'] ≈ Σ w (f_θ'/f_θ)(Z) h_θ'(Z) / Σ w (f_θ'/f_θ)(Z),
+
+as a function of θ' at fixed paths. At θ' = θ it is the weighted mean, and its derivative is
+
+    Cov(h, ∇ log f_θ(Z)) + E[∂_θ h_θ],
+
+that of the expectation: which bridge is proposed, met and accepted depends on θ as well, so the
+derivative of the paths themselves is not. Higher derivatives are right, too.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, PyTree
+
+from .diffusion import Diffusion, check_diffusion
+from .importance import WeightedBridges
+from .kernels import Chain
+from .likelihood import path_log_likelihood
+
+
+def expectation(
+    fn: Callable[[Array], PyTree], bridges: WeightedBridges | Chain, model: Diffusion
+) -> PyTree:
+    """The mean of `fn(path)` over exact bridges, differentiable in the parameters of `model`.
+
+    **Arguments:**
+
+    - `fn`: a function of one path, shape (N+1, d). It may depend on parameters itself.
+    - `bridges`: weighted ones, or a chain, at all steps of their grid (no `save_at`), made with
+        the same parameters. They are held fixed; so is σ, which must not depend on parameters
+        that derivatives are taken in.
+    - `model`: the model, at the parameters in which derivatives are taken.
+
+    **Returns:** what `fn` returns, averaged; with a leading axis I for I intervals. Bridges that
+    are missing have no weight.
+
+    **Raises:** `TypeError` for other bridges; `ValueError` where they were not kept whole.
+
+    !!! example
+
+        ```python
+        bridges = jb.sample_weighted_bridges(key, model, a, b, 1.0, num_bridges=10_000)
+
+        def middle(theta):
+            return jb.expectation(lambda path: path[25], bridges, model.with_params(theta))
+
+        jax.jacfwd(middle)(model.params)
+        ```
+    """
+    check_diffusion(model)
+    if not isinstance(bridges, WeightedBridges | Chain):
+        raise TypeError(
+            "`bridges` must have the exact law: pass what `sample_weighted_bridges`, "
+            f"`weigh_bridges` or `sample_exact_bridges` returned; got {type(bridges).__name__}."
+        )
+    if bridges.paths.shape[-2] != bridges.num_steps + 1:
+        raise ValueError(
+            "the likelihood of a bridge is that of its whole path, but these were kept at "
+            f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points: make them without "
+            "`save_at`."
+        )
+    paths = lax.stop_gradient(bridges.paths)
+    batched = bridges.met.ndim == 2
+    paths = paths if batched else paths[None]
+    met = bridges.met if batched else bridges.met[None]
+    # Missing bridges are NaN and weigh nothing: another path takes their place.
+    some = jnp.take_along_axis(paths, jnp.argmax(met, axis=1)[:, None, None, None], axis=1)
+    paths = jnp.where(met[..., None, None], paths, some)
+    _known_sigma(model.diffusion(paths[0, 0, 0]))
+    log_weights = jnp.where(met, 0.0, -jnp.inf).astype(paths.dtype)
+    if isinstance(bridges, WeightedBridges):
+        log_weights = lax.stop_gradient(bridges.log_weights).reshape(met.shape)
+    times = lax.stop_gradient(bridges.times)
+    log_f = path_log_likelihood(model, times, paths)
+    largest = jnp.max(log_weights, axis=1, keepdims=True)
+    ratios = jnp.exp(log_weights - largest + log_f - lax.stop_gradient(log_f))
+    weights = ratios / jnp.sum(ratios, axis=1, keepdims=True)
+
+    def mean(values):
+        each = weights.reshape(*weights.shape, *[1] * (values.ndim - 2))
+        total = jnp.sum(jnp.where(each > 0, each * values, 0), axis=1)
+        return total if batched else total[0]
+
+    return jax.tree.map(mean, jax.vmap(jax.vmap(fn))(paths))
+
+
+@eqx.filter_custom_jvp
+def _known_sigma(sigma: Array) -> Array:
+    """σ, of which no derivative may be taken."""
+    return sigma
+
+
+@_known_sigma.def_jvp
+def _refuse(primals, tangents):
+    raise TypeError(
+        "σ depends on parameters in which a derivative is taken, and paths have no density that "
+        "depends on σ: differentiate in the parameters of the drift only."
+    )

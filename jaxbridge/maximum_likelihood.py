@@ -1,0 +1,265 @@
+"""Maximum likelihood by stochastic approximation over bridges.
+
+Bridges are moved by their exact kernel at the current θ, once an iteration (Gu & Kong 1998), and
+θ by what the completed path says:
+
+* "gradient": a step of an optimiser along ∇ log f_θ(Z), whose mean over bridges is the score;
+  the estimate is the average of the second half of the iterates.
+* "em": with c and P of the expansion of log f at θ, cᵀθ - ½ θᵀPθ, averaged over iterations, θ
+  becomes P⁻¹c. For a drift that is linear in θ this is the EM algorithm with averaged
+  statistics (Delyon, Lavielle & Moulines 1999); in any case a fixed point has score zero.
+
+Then, at the estimate, `score` with independent bridges gives the observed information I, one step
+of Newton's method, θ + I⁻¹ ∇ log L(θ), and the Monte Carlo error that is left.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from .arrays import Numbers, nondifferentiable
+from .bridges import check_key
+from .completion import Completion, Paths, complete
+from .diffusion import Diffusion, check_diffusion
+from .intervals import check_count
+from .likelihood import Form, forms_of
+from .observations import as_observations, step_groups
+from .parameter_steps import CompleteData, quadratic_form
+from .score import Score, score
+from .unknowns import (
+    Constraint,
+    Unknowns,
+    allowed,
+    as_unknowns,
+    check_allowed,
+    check_sigma_known,
+)
+
+
+class MaximumLikelihood(eqx.Module):
+    """The maximum likelihood estimate.
+
+    - `params`: all parameters of the model, the unknown ones estimated.
+    - `standard_errors`: a pytree like the unknown parameters, from the observed information.
+    - `monte_carlo_errors`: likewise, of the search for the maximum; more `num_bridges` make them
+        smaller.
+    - `theta`, `covariance`: the unknown parameters as a vector, shape (p,), and the inverse of
+        the observed information, shape (p, p).
+    - `iterates`: of the stochastic approximation, shape (n, p).
+    - `score`: at the average of the iterates, before the last step.
+    - `num_missing`: iterations' bridges that were not found, in all.
+    - `newton`: whether the last step was made; not so if the information was not positive
+        definite, or the step led out of the constraint: then more iterations are needed.
+    """
+
+    params: PyTree
+    standard_errors: PyTree
+    monte_carlo_errors: PyTree
+    theta: Float[Array, " p"]
+    covariance: Float[Array, "p p"]
+    iterates: Float[Array, "n p"]
+    score: Score
+    num_missing: Int[Array, ""]
+    newton: Bool[Array, ""]
+
+
+def maximum_likelihood(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    optimizer: optax.GradientTransformation | None = None,
+    *,
+    method: Literal["gradient", "em"] = "gradient",
+    num_iterations: int = 500,
+    num_bridges: int = 100,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    proposal: Any = "auto",
+    where: Callable[[PyTree], PyTree] | None = None,
+    constraint: Constraint | None = None,
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> MaximumLikelihood:
+    """The maximum likelihood estimate of a model's parameters, given discrete observations.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: its `params` are where the search starts.
+    - `times`, `observations`, `num_steps`, `step_size`, `proposal`, `where`, `constraint`: as in
+        `gibbs`. A step that would leave the constraint is not made.
+    - `optimizer`: any of optax's, by default `optax.adam(0.01)`; it is given the gradient of minus
+        the mean log likelihood per interval, in the unknown parameters as a vector.
+    - `method`: "gradient", or "em", which takes no optimiser and needs fewer iterations.
+    - `num_iterations`: of the stochastic approximation.
+    - `num_bridges`: weighted bridges of each interval for the last step and the errors.
+    - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Returns:** `MaximumLikelihood`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        estimate = jb.maximum_likelihood(
+            jax.random.key(0), jb.hyperbolic(1.0, 2), times, observations, optax.adam(1e-2)
+        )
+        estimate.params, estimate.standard_errors
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_iterations = check_count("num_iterations", num_iterations, 2)
+    if method not in ("gradient", "em"):
+        raise ValueError(f'`method` must be "gradient" or "em"; got {method!r}.')
+    if method == "em" and optimizer is not None:
+        raise ValueError('`method="em"` takes no `optimizer`.')
+    intervals = as_observations(model, times, observations)
+    like = intervals.start[0]
+    unknowns, theta = as_unknowns(model, where, like)
+    check_sigma_known(
+        unknowns,
+        theta,
+        like,
+        "differentiate `transition_log_density` with a proposal that is pulled to the end point, "
+        "use `pmmh`, or pick the others with `where=`.",
+    )
+    check_allowed(constraint, unknowns, theta)
+    complete_key, run_key, score_key = jax.random.split(key, 3)
+    groups = step_groups(intervals.duration, num_steps, step_size)
+    bounds = (num_counts, max_proposals, max_trials)
+    completion = complete(complete_key, model, intervals, groups, proposal, "exact", None, *bounds)
+    form = quadratic_form(unknowns, theta, like) or forms_of(model, like)[0]
+    rule = _EM() if method == "em" else _Gradient(optimizer or optax.adam(1e-2))
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    setting = _Setting(unknowns, completion, constraint, rule, form)
+    iterates, num_missing = _approximate(run_key, setting, theta, num_iterations, meter)
+    rough = iterates[-1] if method == "em" else jnp.mean(iterates[num_iterations // 2 :], axis=0)
+    at_rough = score(
+        score_key,
+        unknowns.at(rough),
+        times,
+        observations,
+        num_bridges=num_bridges,
+        num_steps=num_steps,
+        step_size=step_size,
+        proposal=proposal,
+        where=where,
+        num_counts=num_counts,
+        max_proposals=max_proposals,
+        max_trials=max_trials,
+    )
+    covariance = jnp.linalg.inv(at_rough.information)
+    newton = rough + covariance @ at_rough.gradient
+    definite = jnp.all(jnp.linalg.eigvalsh(at_rough.information) > 0)
+    ok = definite & allowed(constraint, unknowns, newton)
+    estimate = jnp.where(ok, newton, rough)
+    left = covariance @ at_rough.covariance @ covariance
+    standard, monte_carlo = (
+        unknowns.pick(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
+    )
+    return MaximumLikelihood(
+        unknowns.all(estimate),
+        standard,
+        monte_carlo,
+        estimate,
+        covariance,
+        iterates,
+        at_rough,
+        num_missing,
+        ok,
+    )
+
+
+class _Gradient(eqx.Module):
+    """Steps of an optimiser."""
+
+    optimizer: optax.GradientTransformation = eqx.field(static=True)
+
+    def init(self, theta):
+        return self.optimizer.init(theta)
+
+    def update(self, i, theta, state, data: CompleteData, num_intervals):
+        gradient = jax.grad(data.log_likelihood)(theta) / num_intervals
+        updates, state = self.optimizer.update(-gradient, state, theta)
+        return optax.apply_updates(theta, updates), state
+
+
+class _EM(eqx.Module):
+    """The maximum of the averaged expansions of the log likelihood; they are averaged over the
+    later half of the iterations so far, about."""
+
+    def init(self, theta):
+        return theta, jnp.zeros((*theta.shape, *theta.shape), theta.dtype)
+
+    def update(self, i, theta, state, data: CompleteData, num_intervals):
+        gradient = jax.grad(data.log_likelihood)(theta)
+        P = data.information(theta)
+        made = gradient + P @ theta, P
+        gain = jnp.minimum(1.0, 2.0 / (i + 1).astype(theta.dtype))
+        state = jax.tree.map(lambda old, new: old + gain * (new - old), state, made)
+        c, P = state
+        return jnp.linalg.solve(P, c), state
+
+
+class _Setting(eqx.Module):
+    """What does not change from iteration to iteration."""
+
+    unknowns: Unknowns
+    completion: Completion
+    constraint: Constraint | None = eqx.field(static=True)
+    rule: _Gradient | _EM
+    form: Form = eqx.field(static=True)
+
+
+class _State(NamedTuple):
+    theta: Float[Array, " p"]
+    paths: Paths
+    rule: PyTree
+    meter: Any
+
+
+@eqx.filter_jit
+def _approximate(
+    key: Key[Array, ""],
+    setting: _Setting,
+    theta: Float[Array, " p"],
+    num_iterations: int,
+    meter: diffrax.AbstractProgressMeter,
+) -> tuple[Float[Array, "n p"], Int[Array, ""]]:
+    """The iterates, and how many bridges were missing."""
+    setting = nondifferentiable(setting)
+    unknowns, completion = setting.unknowns, setting.completion
+    first_key, run_key = jax.random.split(key)
+    num_intervals = sum(len(part.intervals.duration) for part in completion.parts)
+
+    def iterate(state, i):
+        paths, renewed = completion.renew(
+            jax.random.fold_in(run_key, i), unknowns.at(state.theta), state.paths
+        )
+        data = CompleteData(
+            unknowns, completion, paths, lambda _: 0.0, setting.constraint, setting.form
+        )
+        moved, rule = setting.rule.update(i, state.theta, state.rule, data, num_intervals)
+        inside = allowed(setting.constraint, unknowns, moved)
+        theta = jnp.where(inside, moved, state.theta)
+        progress = meter.step(state.meter, (i + 1).astype(jnp.float32) / num_iterations)
+        return _State(theta, paths, rule, progress), (theta, jnp.sum(renewed.missing))
+
+    first = completion.first(first_key, unknowns.at(theta))
+    state = _State(theta, first, setting.rule.init(theta), meter.init())
+    state, (iterates, missing) = lax.scan(iterate, state, jnp.arange(num_iterations))
+    meter.close(state.meter)
+    return iterates, jnp.sum(missing, dtype=jnp.int32)

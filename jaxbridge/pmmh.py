@@ -1,0 +1,317 @@
+"""Particle-marginal Metropolis–Hastings over any parameters, those of σ included.
+
+The likelihood of the observations is a product of transition densities, of which weighted
+proposals give unbiased estimates (`transition`). A chain that accepts with the ratio of
+estimates, and keeps that of its state, has the exact posterior (Andrieu & Roberts 2009), up to
+the step error. Proposals are normal random walks, whose covariance S Sᵀ is learnt in a warm-up
+
+    S Sᵀ ← S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,    η_i = min(1, p i^(-2/3)),
+
+from the acceptance rates α_i (Vihola 2012), and fixed thereafter.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from .arrays import Numbers, as_floating, nondifferentiable
+from .bridges import check_key
+from .choice import as_proposal, settled
+from .diffusion import Diffusion, check_diffusion
+from .intervals import Intervals, check_count
+from .kernels import acceptance_rate
+from .observations import as_observations, step_groups
+from .parameter_steps import small_cholesky
+from .posterior import AbstractPosterior
+from .transition import check_for_density, estimate_log_density
+from .unknowns import (
+    Constraint,
+    NormalPrior,
+    Prior,
+    Unknowns,
+    allowed,
+    as_log_prior,
+    as_normal,
+    as_unknowns,
+    check_allowed,
+    init_vectors,
+)
+from .weighted import AbstractWeightedProposal
+
+# Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
+_TARGET = 0.2
+
+
+class PMMHState(NamedTuple):
+    """Where a chain is: θ, the estimate of its log likelihood, and the root S of the covariance of
+    proposals; with chains in a leading axis if there are several."""
+
+    theta: Float[Array, "*chains p"]
+    log_likelihood: Float[Array, "*chains"]
+    root: Float[Array, "*chains p p"]
+
+
+class PMMHPosterior(AbstractPosterior):
+    """Draws of the unknown parameters; arrays have a leading axis of chains if there are several.
+
+    - `params`: all parameters of the model, each with leading axes (*chains, n).
+    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
+    - `accepted`: shape (*chains, n).
+    - `num_unknown`: iterations, with those of the warm-up, in which the proposed parameters
+        were refused because no estimate was to be had, shape (*chains,).
+    - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
+    """
+
+    params: PyTree
+    theta: Float[Array, "*chains n p"]
+    log_likelihood: Float[Array, "*chains n"]
+    accepted: Bool[Array, "*chains n"]
+    num_unknown: Int[Array, "*chains"]
+    state: PMMHState
+
+
+def pmmh(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    *,
+    prior: Prior,
+    num_iterations: int = 1000,
+    num_warmup: int = 500,
+    num_proposals: int = 50,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    proposal: Any = "auto",
+    where: Callable[[PyTree], PyTree] | None = None,
+    constraint: Constraint | None = None,
+    covariance: Numbers | None = None,
+    num_chains: int | None = None,
+    thin: int = 1,
+    init: PyTree | PMMHState = None,
+    num_counts: int | None = None,
+    max_trials: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> PMMHPosterior:
+    """Draws from the posterior of any parameters of a model, given discrete observations.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: its `params` are where chains start.
+    - `times`, `observations`, `prior`, `num_iterations`, `num_steps`, `step_size`, `where`,
+        `constraint`, `num_chains`, `thin`: as in `gibbs`. Parameters of σ are allowed; where σ
+        needs it to be invertible, say so in `constraint`.
+    - `num_warmup`: iterations before, in which the covariance of proposals is learnt.
+    - `num_proposals`: weighted paths for each interval in each estimate. The variance of the
+        estimated log likelihood should be about one: with n intervals that takes in
+        proportion to n.
+    - `proposal`: as in `transition_log_density`.
+    - `covariance`: of the first proposals, shape (p,) for a diagonal or (p, p); by default a tenth
+        of the prior's standard deviations, or a tenth of θ where the prior is not normal.
+    - `init`: unknown parameters to start from, or the `state` of earlier draws.
+    - `num_counts`, `max_trials`: as in `transition_log_density`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Returns:** `PMMHPosterior`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        posterior = jb.pmmh(
+            jax.random.key(0), jb.ornstein_uhlenbeck([[1.0]], sigma=[[0.5]]), times, observations,
+            where=lambda params: (params.B, params.sigma), prior=jb.NormalPrior(1.0, 1.0),
+            constraint=lambda unknown: (unknown[0][0, 0] > 0) & (unknown[1][0, 0] > 0),
+        )
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
+    num_warmup = check_count("num_warmup", num_warmup, 0)
+    num_proposals = check_count("num_proposals", num_proposals)
+    chains = () if num_chains is None else (check_count("num_chains", num_chains),)
+    intervals = as_observations(model, times, observations)
+    like = intervals.start[0]
+    unknowns, theta = as_unknowns(model, where, like)
+    log_prior = as_log_prior(prior, unknowns, theta)
+    root = _first_root(covariance, prior, unknowns, theta)
+    state = init if isinstance(init, PMMHState) else None
+    if state is not None:
+        theta = state.theta
+    elif init is not None:
+        theta = init_vectors(unknowns, init, chains).astype(like.dtype)
+    if theta.ndim == 1:
+        theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
+    check_allowed(constraint, unknowns, theta)
+    pilot_model = unknowns.at(theta.reshape(-1, theta.shape[-1])[0])
+    pilot_key, run_key = jax.random.split(key)
+    parts = []
+    groups = step_groups(intervals.duration, num_steps, step_size)
+    for part_key, group in zip(jax.random.split(pilot_key, len(groups)), groups, strict=True):
+        mine = jax.tree.map(lambda leaf, index=group.index: leaf[index], intervals)
+        chosen = as_proposal(
+            proposal, pilot_model, like, num_counts, None, max_trials, for_density=True
+        )
+        chosen.check(pilot_model, mine)
+        check_for_density(chosen, pilot_model)
+        chosen = settled(chosen, part_key, pilot_model, mine, group.num_steps)
+        chosen = chosen.prepared(part_key, pilot_model, mine, group.num_steps)
+        parts.append(_Part(mine, chosen, group.num_steps))
+    setting = _Setting(unknowns, tuple(parts), log_prior, constraint, num_proposals)
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    if state is None:
+        root = jnp.broadcast_to(root, (*chains, *root.shape))
+        state = _start(run_key, setting, theta, root)
+    return _run(run_key, setting, state, num_warmup, num_iterations, thin, meter)
+
+
+class _Part(eqx.Module):
+    """Intervals with one number of steps."""
+
+    intervals: Intervals
+    proposal: AbstractWeightedProposal
+    num_steps: int = eqx.field(static=True)
+
+
+class _Setting(eqx.Module):
+    """What does not change from iteration to iteration."""
+
+    unknowns: Unknowns
+    parts: tuple[_Part, ...]
+    log_prior: Callable[[Array], Array]
+    constraint: Constraint | None = eqx.field(static=True)
+    num_proposals: int = eqx.field(static=True)
+
+    def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Float[Array, ""]:
+        """log of an unbiased estimate of the likelihood; -inf where there is none."""
+        model, log_likelihood = self.unknowns.at(theta).prepared(), jnp.zeros((), theta.dtype)
+        for part_key, part in zip(jax.random.split(key, len(self.parts)), self.parts, strict=True):
+            log_likelihood += jnp.sum(
+                estimate_log_density(
+                    part_key,
+                    model,
+                    part.proposal,
+                    part.intervals,
+                    self.num_proposals,
+                    part.num_steps,
+                ).value
+            )
+        return jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood)
+
+
+def _first_root(
+    covariance: Numbers | None, prior: Prior, unknowns: Unknowns, theta: Float[Array, " p"]
+) -> Float[Array, "p p"]:
+    p = theta.shape[0]
+    if covariance is not None:
+        matrix = as_floating("covariance", covariance).astype(theta.dtype)
+        if matrix.shape not in ((p,), (p, p)):
+            raise ValueError(
+                f"`covariance` must have shape ({p},) or ({p}, {p}); got {matrix.shape}."
+            )
+        return jnp.diag(jnp.sqrt(matrix)) if matrix.ndim == 1 else small_cholesky(matrix)
+    if isinstance(prior, NormalPrior):
+        precision = as_normal(prior, unknowns, theta).precision
+        return 0.1 * jnp.diag(1 / jnp.sqrt(jnp.diagonal(precision)))
+    return 0.1 * jnp.diag(jnp.maximum(jnp.abs(theta), 0.1))
+
+
+@eqx.filter_jit
+def _start(key, setting: _Setting, theta, root) -> PMMHState:
+    key = jax.random.fold_in(key, 0)
+
+    def estimate(key, theta):
+        return setting.estimate(key, theta)
+
+    if theta.ndim == 1:
+        return PMMHState(theta, estimate(key, theta), root)
+    keys = jax.random.split(key, len(theta))
+    return PMMHState(theta, jax.vmap(estimate)(keys, theta), root)
+
+
+def _iterate(key, setting: _Setting, state: PMMHState, gain: Float[Array, ""]):
+    """One step, and whether it was accepted and an estimate was to be had; S moves by `gain`."""
+    walk_key, estimate_key, accept_key = jax.random.split(key, 3)
+    noise = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
+    proposed = state.theta + state.root @ noise
+    inside = allowed(setting.constraint, setting.unknowns, proposed)
+    # Outside the constraint the model may not be simulated: θ stands in, and is refused.
+    proposed = jnp.where(inside, proposed, state.theta)
+    estimated = setting.estimate(estimate_key, proposed)
+    new = jnp.where(inside, estimated + setting.log_prior(proposed), -jnp.inf)
+    rate = acceptance_rate(state.log_likelihood + setting.log_prior(state.theta), new)
+    accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
+    direction = noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6)
+    moved = state.root @ direction
+    change = gain * (jnp.where(jnp.isnan(rate), 0, rate) - _TARGET)
+    root = small_cholesky(state.root @ state.root.T + change * jnp.outer(moved, moved))
+    root = jnp.where((gain > 0) & jnp.all(jnp.isfinite(root)), root, state.root)
+    unknown = inside & (estimated == -jnp.inf)
+    state = PMMHState(
+        jnp.where(accepted, proposed, state.theta),
+        jnp.where(accepted, estimated, state.log_likelihood),
+        root,
+    )
+    return state, (accepted, unknown)
+
+
+@eqx.filter_jit
+def _run(
+    key: Key[Array, ""],
+    setting: _Setting,
+    state: PMMHState,
+    num_warmup: int,
+    num_iterations: int,
+    thin: int,
+    progress_meter: diffrax.AbstractProgressMeter,
+) -> PMMHPosterior:
+    setting, state = nondifferentiable((setting, state))
+    p, dtype = state.theta.shape[-1], state.theta.dtype
+    total = num_warmup + num_iterations * thin
+
+    def iterate(carry, i):
+        state, meter = carry
+        learning = jnp.minimum(1.0, p * (i + 1).astype(dtype) ** (-2 / 3))
+        gain = jnp.where(i < num_warmup, learning, 0)
+        mine = jax.random.fold_in(key, i + 1)  # number 0 made the first estimate
+        if state.theta.ndim == 1:
+            state, told = _iterate(mine, setting, state, gain)
+        else:
+            keys = jax.random.split(mine, len(state.theta))
+            state, told = jax.vmap(lambda key, state: _iterate(key, setting, state, gain))(
+                keys, state
+            )
+        meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / total)
+        return (state, meter), told
+
+    def kept(carry, i):
+        steps = num_warmup + i * thin + jnp.arange(thin)
+        carry, (accepted, unknown) = lax.scan(iterate, carry, steps)
+        state, _ = carry
+        made = state.theta, state.log_likelihood, jnp.any(accepted, axis=0)
+        return carry, (*made, jnp.sum(unknown, axis=0, dtype=jnp.int32))
+
+    carry = (state, progress_meter.init())
+    carry, (_, lost) = lax.scan(iterate, carry, jnp.arange(num_warmup))
+    (state, meter), (theta, log_likelihood, accepted, unknown) = lax.scan(
+        kept, carry, jnp.arange(num_iterations)
+    )
+    progress_meter.close(meter)
+    num_unknown = jnp.sum(lost, axis=0, dtype=jnp.int32) + jnp.sum(unknown, axis=0, dtype=jnp.int32)
+    if theta.ndim == 3:
+        theta, log_likelihood, accepted = jax.tree.map(
+            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, log_likelihood, accepted)
+        )
+    as_params = jax.vmap(setting.unknowns.all)
+    params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
+    return PMMHPosterior(params, theta, log_likelihood, accepted, num_unknown, state)

@@ -1,0 +1,203 @@
+"""The score of discrete observations, by Fisher's identity, and the observed information.
+
+With Z the exact bridge of an interval and f_θ the density of its path,
+
+    ∇ log p_T(a, b) = E[∇ log f_θ(Z)],
+    -∇² log p_T(a, b) = E[-∇² log f_θ(Z)] - Cov(∇ log f_θ(Z)),
+
+the latter by Louis (1982); both are sums over the intervals. Means are over weighted bridges.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int, Key, PyTree
+
+from .arrays import Numbers, nondifferentiable
+from .bridges import check_key
+from .choice import as_proposal, settled
+from .diffusion import Diffusion, check_diffusion
+from .intervals import Intervals, check_count
+from .likelihood import forms_of, log_likelihoods
+from .observations import as_observations, step_groups
+from .unknowns import Unknowns, as_unknowns, check_sigma_known
+from .weighted import AbstractWeightedProposal
+
+# Bridges of all intervals that are made at a time.
+_PATHS = 8_192
+
+
+class Score(eqx.Module):
+    """The gradient of the log likelihood at the model's parameters, with Monte Carlo errors.
+
+    - `value`, `standard_error`: pytrees like the unknown parameters.
+    - `gradient`, `covariance`: the same as a vector of shape (p,) with the covariance of its
+        Monte Carlo error, shape (p, p).
+    - `information`: the observed information, -∇² of the log likelihood, shape (p, p).
+    - `effective_sample_size`: of the bridges of each interval, shape (I,). Errors can be trusted
+        where it is large.
+    - `num_missing`: intervals without any bridge. They are left out.
+    """
+
+    value: PyTree
+    standard_error: PyTree
+    gradient: Float[Array, " p"]
+    covariance: Float[Array, "p p"]
+    information: Float[Array, "p p"]
+    effective_sample_size: Float[Array, " I"]
+    num_missing: Int[Array, ""]
+
+
+def score(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    *,
+    num_bridges: int = 100,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    proposal: Any = "auto",
+    where: Callable[[PyTree], PyTree] | None = None,
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> Score:
+    """The score and the observed information of discrete observations, at `model.params`.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`, `times`, `observations`, `num_steps`, `step_size`, `where`: as in `gibbs`.
+    - `num_bridges`: weighted bridges for each interval. Means over them have a bias of the order
+        of one over their effective number, beside the Monte Carlo error.
+    - `proposal`: anything that `sample_weighted_bridges` takes.
+    - `num_counts`, `max_proposals`, `max_trials`: as in `sample_weighted_bridges`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Returns:** `Score`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    !!! example
+
+        ```python
+        estimate = jb.score(jax.random.key(0), jb.hyperbolic(0.8, 2), times, observations)
+        estimate.value, estimate.standard_error
+        ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_bridges = check_count("num_bridges", num_bridges, 2)
+    intervals = as_observations(model, times, observations)
+    like = intervals.start[0]
+    unknowns, theta = as_unknowns(model, where, like)
+    check_sigma_known(
+        unknowns,
+        theta,
+        like,
+        "differentiate `transition_log_density` with a proposal that is pulled to the end point, "
+        "or pick the others with `where=`.",
+    )
+    moments, sizes, order = [], [], []
+    groups = step_groups(intervals.duration, num_steps, step_size)
+    for group_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
+        mine = jax.tree.map(lambda leaf, index=group.index: leaf[index], intervals)
+        chosen = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
+        chosen.check(model, mine)
+        chosen = settled(chosen, group_key, model, mine, group.num_steps)
+        fractions = jnp.asarray(np.diff(chosen.fractions(group.num_steps)), like.dtype)
+        made, size = _interval_moments(
+            group_key, unknowns, theta, chosen, mine, fractions, num_bridges, progress_meter
+        )
+        moments.append(made)
+        sizes.append(size)
+        order.append(group.index)
+    gradient, covariance, information = jax.tree.map(lambda *parts: sum(parts), *moments)
+    size = jnp.concatenate(sizes)[np.argsort(np.concatenate(order))]
+    error = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
+    return Score(
+        unknowns.pick(gradient),
+        unknowns.pick(error),
+        gradient,
+        covariance,
+        information,
+        size,
+        jnp.sum(size == 0, dtype=jnp.int32),
+    )
+
+
+@eqx.filter_jit
+def _interval_moments(
+    key: Key[Array, ""],
+    unknowns: Unknowns,
+    theta: Float[Array, " p"],
+    proposal: AbstractWeightedProposal,
+    intervals: Intervals,
+    fractions: Float[Array, " N"],
+    num_bridges: int,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> tuple[tuple[Array, Array, Array], Float[Array, " I"]]:
+    """Σ over intervals of the score, of the covariance of its error, and of the information; and
+    the effective number of bridges of each."""
+    unknowns, intervals = nondifferentiable((unknowns, intervals))
+    model = unknowns.at(theta).prepared()
+    num_intervals, num_steps = intervals.start.shape[0], fractions.shape[0]
+    proposal = proposal.prepared(key, model, intervals, num_steps)
+    form = forms_of(model, intervals.start[0])[0]
+    steps = fractions[:, None] * intervals.duration
+    at_once = min(num_bridges, max(1, _PATHS // num_intervals))
+    num_batches = -(-num_bridges // at_once)
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    steps = jnp.repeat(steps, at_once, axis=1)
+
+    def batch(state, i):
+        keys = jax.random.split(jax.random.fold_in(key, i), (num_intervals, at_once))
+        drawn = proposal.draw(keys, model, intervals, num_steps, None, False)
+        start = intervals.start[:, None, None]
+        paths = jnp.where(drawn.found[..., None, None], drawn.paths, start)
+        paths = paths.reshape(-1, *paths.shape[2:])
+
+        def log_f(theta):
+            return log_likelihoods(unknowns.at(theta), steps, paths, form)
+
+        gradient = jax.jacfwd(log_f)
+        g, H = (
+            derivative.reshape(num_intervals, at_once, *derivative.shape[1:])
+            for derivative in (gradient(theta), jax.jacfwd(gradient)(theta))
+        )
+        state = meter.step(state, (i + 1).astype(jnp.float32) / num_batches)
+        return state, (drawn.log_weights, g, H)
+
+    state, made = lax.scan(batch, meter.init(), jnp.arange(num_batches))
+    meter.close(state)
+
+    def join(leaf):
+        leaf = jnp.moveaxis(leaf, 0, 1)
+        leaf = leaf.reshape(num_intervals, -1, *leaf.shape[3:])
+        return leaf[:, :num_bridges]
+
+    log_weights, g, H = map(join, made)
+    largest = jnp.max(log_weights, axis=1, keepdims=True)
+    weights = jnp.exp(log_weights - jnp.where(jnp.isfinite(largest), largest, 0))
+    total = jnp.sum(weights, axis=1, keepdims=True)
+    weights = weights / jnp.where(total > 0, total, 1)
+    mean = jnp.sum(weights[..., None] * g, axis=1)
+    deviation = g - mean[:, None]
+    products = deviation[..., :, None] * deviation[..., None, :]
+    squares = jnp.sum(weights**2, axis=1)
+    # Of n independent bridges; a weighted mean of squares is too small by 1 - Σ w².
+    less = jnp.where(squares < 1, 1 - squares, 1)[:, None, None]
+    spread = jnp.sum(weights[..., None, None] * products, axis=1) / less
+    covariance = jnp.sum(weights[..., None, None] ** 2 * products, axis=1)
+    information = -jnp.sum(weights[..., None, None] * H, axis=1) - spread
+    size = jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1), 0)
+    sums = tuple(jnp.sum(part, axis=0) for part in (mean, covariance, information))
+    return sums, size
