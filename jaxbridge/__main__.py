@@ -18,6 +18,7 @@ from .accuracy_study import (
     run_sigma_costs,
     write_accuracy_figures,
 )
+from .bayes_study import format_bayes, run_bayes, write_bayes_figures
 from .benchmark import DURATIONS, format_ratios, run_benchmark, save
 from .crossover_study import format_crossover, processes, write_crossover_figure
 from .exact_study import (
@@ -63,6 +64,15 @@ own error, that of approximate bridges, no number of steps removes. The Brownian
 meetings that the sign test overlooks, which is an error of order 1/2; Heun's scheme brings what is
 left from first to second order where sigma is constant; elsewhere it gains less."""
 
+_WHAT_TO_SEE_BAYES = """\
+"shift / sd" is the distance from the exact posterior mean in posterior standard deviations, with
+its Monte Carlo error; "worth" is the effective number of draws, "moved" the share of bridges
+that an iteration replaces, "first" the seconds with compilation, and "/numbers" those without,
+in multiples of the time to draw one path's numbers for each interval and iteration. The exact
+posterior is by Brownian bridges; where observations are far apart, by the stationary law.
+Approximate bridges shift the posterior, exact ones do not; with Heun's scheme 12 steps give the
+posterior of 50."""
+
 _WHAT_TO_SEE_CROSSOVER = """\
 Thousands of effective samples per second, compile time left out, of a run of 200,000 proposals in
 50 steps (T up to 1) or 20,000 in 1,000 (from T = 5 on); fewer for couplings alone. The step error
@@ -92,11 +102,11 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "part",
         nargs="?",
-        choices=("paper", "approximate", "exact", "accuracy", "bench", "all"),
+        choices=("paper", "approximate", "exact", "accuracy", "bayes", "bench", "all"),
         default="paper",
         help="approximate or exact bridges, or both: the paper's study (the default); what "
-        "accuracy costs in time; how fast it is, and which proposal is best for which duration; or "
-        "all",
+        "accuracy costs in time; Bayesian inference, the paper's section 4; how fast it is, and which "
+        "proposal is best for which duration; or all",
     )
     parser.add_argument("--quick", action="store_true", help="a twenty-fifth of the bridges")
     parser.add_argument("--seed", type=_seed, default=0, help="of the random numbers (default 0)")
@@ -126,6 +136,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "approximate": _approximate,
         "exact": _exact,
         "accuracy": _accuracy,
+        "bayes": _bayes,
         "bench": _bench,
     }
     groups = {"paper": ["approximate", "exact"], "all": list(parts)}
@@ -189,6 +200,16 @@ def _accuracy(options: argparse.Namespace) -> list[Path]:
     print(f"{format_accuracy(results)}\n\n{_WHAT_TO_SEE_ACCURACY}\n")
     print(f"{format_costs(effects, sigmas)}\n")
     return write_accuracy_figures(results, effects, options.out)
+
+
+def _bayes(options: argparse.Namespace) -> list[Path]:
+    quick = " (--quick: expect larger errors)" if options.quick else ""
+    print(f"Bayesian estimation of the hyperbolic diffusion{quick}\n")
+    key = jax.random.key(options.seed)
+    examples = run_bayes(key, 0.04 if options.quick else 1.0, on_start=_say)
+    _end_progress()
+    print(f"{format_bayes(examples)}\n\n{_WHAT_TO_SEE_BAYES}\n")
+    return write_bayes_figures(examples, options.out)
 
 
 def _bench(options: argparse.Namespace) -> list[Path]:

@@ -292,6 +292,57 @@ def effect_costs(costs: Sequence[Any], ax: Axes | None = None) -> Axes:
     return ax
 
 
+def posterior(
+    draws: Mapping[str, Float[Reals, " n"]],
+    grid: Float[Reals, " m"] | None = None,
+    curves: Mapping[str, Float[Reals, " m"]] | None = None,
+    label: str = "parameter",
+    ax: Axes | None = None,
+) -> Axes:
+    """Histograms of each sampler's draws of one parameter, over densities that are known.
+
+    `draws` are those of each sampler by its name, `curves` densities on the `grid`, likewise.
+    """
+    ax = _axes(ax)
+    everything = np.concatenate([np.asarray(values, float) for values in draws.values()])
+    bins = np.linspace(everything.min(), everything.max(), 60)
+    for i, (name, values) in enumerate(draws.items()):
+        colour = _COLOURS[i % len(_COLOURS)]
+        ax.hist(
+            np.asarray(values, float),
+            bins,
+            density=True,
+            histtype="step",
+            color=colour,
+            linewidth=1.2,
+            label=name,
+        )
+    for i, (name, density) in enumerate((curves or {}).items()):
+        dashes = ("-", *_DASHES)[i % (len(_DASHES) + 1)]
+        ax.plot(grid, density, color=_EXACT, linestyle=dashes, linewidth=1.0, label=name)
+    spread = everything.max() - everything.min()
+    ax.set_xlim(everything.min() - spread / 2, everything.max() + spread / 2)
+    ax.set(xlabel=label, ylabel="density")
+    return _finish(ax)
+
+
+def trace(
+    draws: Mapping[str, Float[Reals, " n"]],
+    level: float | None = None,
+    label: str = "parameter",
+    ax: Axes | None = None,
+) -> Axes:
+    """The draws of one parameter in the order in which they were made, by each sampler."""
+    ax = _axes(ax)
+    for i, (name, values) in enumerate(draws.items()):
+        colour = _COLOURS[i % len(_COLOURS)]
+        ax.plot(np.asarray(values, float), color=colour, linewidth=0.4, label=name)
+    if level is not None:
+        ax.axhline(level, color=_EXACT, linewidth=0.8)
+    ax.set(xlabel="iteration", ylabel=label)
+    return _finish(ax)
+
+
 def gaussian_copula(
     u: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."], correlation: float
 ) -> Float[np.ndarray, "..."]:

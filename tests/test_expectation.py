@@ -1,0 +1,120 @@
+"""Derivatives of expectations over bridges, against those of Gaussian bridges."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from inference import multivariate_ou
+
+import jaxbridge as jb
+
+ENDS = ([0.5, -0.3], [1.0, 0.8], 1.0)
+
+
+def exact_mean(B):
+    model = multivariate_ou()[0]
+    model = model.with_params(model.params._replace(B=B))
+    return jb.gaussian_bridge(model, *ENDS, times=[0.5]).mean[0]
+
+
+@pytest.fixture(scope="module")
+def bridges():
+    model = multivariate_ou()[0]
+    return jb.sample_weighted_bridges(
+        jax.random.key(0),
+        model,
+        *ENDS,
+        num_bridges=100_000,
+        num_steps=20,
+        proposal=jb.Guided(density=jb.TrapezoidDensity()),
+    )
+
+
+def of_drift(bridges, fn):
+    model = multivariate_ou()[0]
+    return lambda B: jb.expectation(fn, bridges, model.with_params(model.params._replace(B=B)))
+
+
+def test_derivative_is_that_of_the_expectation(bridges):
+    """Cov(h, ∇ log f) to five standard errors, about √(V(h) V(∇ log f) / n)."""
+    B = multivariate_ou()[0].params.B
+    middle = lambda path: path[10]
+    forward = jax.jit(jax.jacfwd(of_drift(bridges, middle)))(B)
+    exact = jax.jacfwd(exact_mean)(B)
+    model = multivariate_ou()[0]
+
+    def scores(B):
+        at_B = model.with_params(model.params._replace(B=B))
+        return jb.path_log_likelihood(at_B, bridges.times, bridges.paths)
+
+    score = jax.jacfwd(scores)(B)
+    spread = np.std(np.asarray(bridges.paths[:, 10]), axis=0)[:, None, None] * np.std(score, axis=0)
+    error = 1.5 * spread / np.sqrt(100_000)
+    np.testing.assert_array_less(np.abs(forward - exact), 5 * error + 0.001)
+    assert np.abs(exact).max() > 0.05 and error.max() < 0.002
+    reverse = jax.jit(jax.jacrev(of_drift(bridges, middle)))(B)
+    np.testing.assert_allclose(reverse, forward, atol=1e-4)
+    np.testing.assert_allclose(of_drift(bridges, middle)(B), bridges.mean(middle), atol=1e-5)
+
+
+def test_derivative_of_the_paths_is_not():
+    """The pathwise derivative of accepted bridges leaves out that other bridges are accepted."""
+    model = multivariate_ou()[0]
+
+    def pathwise(B):
+        made = jb.sample_bridges(
+            jax.random.key(1),
+            model.with_params(model.params._replace(B=B)),
+            *ENDS,
+            num_bridges=2_000,
+            num_steps=20,
+            coupling=jb.Coupling(0.0),
+        )
+        return jnp.mean(made.paths[:, 10], axis=0)
+
+    B = model.params.B
+    naive, exact = jax.jacfwd(pathwise)(B), jax.jacfwd(exact_mean)(B)
+    assert np.abs(naive - exact).max() > 0.05
+
+
+def test_function_may_depend_on_parameters(bridges):
+    B = multivariate_ou()[0].params.B
+
+    def scaled(B):
+        return of_drift(bridges, lambda path: B[0, 0] * path[10])(B)
+
+    plain = of_drift(bridges, lambda path: path[10])
+    expected = B[0, 0] * jax.jacfwd(plain)(B)
+    expected = expected.at[:, 0, 0].add(plain(B))
+    np.testing.assert_allclose(jax.jacfwd(scaled)(B), expected, atol=1e-4)
+
+
+def test_chains_and_several_intervals():
+    model = multivariate_ou()[0]
+    starts = jnp.array([ENDS[0], [0.0, 0.0]])
+    options = dict(num_steps=10, proposal=jb.Guided())
+    chain = jb.sample_exact_bridges(
+        jax.random.key(0), model, starts, ENDS[1], 1.0, num_bridges=50, **options
+    )
+    value = jb.expectation(lambda path: path[5], chain, model)
+    np.testing.assert_allclose(value, chain.paths[:, :, 5].mean(1), atol=1e-5)
+
+
+def test_what_cannot_be_differentiated_is_refused(bridges):
+    model = multivariate_ou()[0]
+    with pytest.raises(TypeError, match="σ depends on parameters"):
+        jax.grad(
+            lambda sigma: jb.expectation(
+                lambda path: path[3, 0],
+                bridges,
+                model.with_params(model.params._replace(sigma=sigma)),
+            )
+        )(model.params.sigma)
+    approximate = jb.sample_bridges(jax.random.key(0), model, *ENDS, num_steps=5)
+    with pytest.raises(TypeError, match="exact law"):
+        jb.expectation(lambda path: path, approximate, model)
+    sparse = jb.sample_weighted_bridges(
+        jax.random.key(0), model, *ENDS, num_steps=5, save_at=[1.0], proposal=jb.Guided()
+    )
+    with pytest.raises(ValueError, match="whole path"):
+        jb.expectation(lambda path: path, sparse, model)

@@ -1,0 +1,291 @@
+"""Gibbs sampling against posteriors that are known: quadrature of exact likelihoods."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from inference import grid_moments, multivariate_ou, ou_1d, ou_data, ou_log_likelihood
+
+import jaxbridge as jb
+
+TIMES = np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 20, 1.0)])
+DATA = ou_data(3, TIMES)
+RATE = lambda params: params[0]
+POSITIVE = lambda rate: rate > 0
+PRIOR = jb.NormalPrior(1.0, 1.0)
+OPTIONS = dict(prior=PRIOR, where=RATE, constraint=POSITIVE)
+TRAPEZOID = jb.TrapezoidDensity()
+
+
+def exact_moments(log_prior=lambda rate: -((rate - 1) ** 2) / 2):
+    grid = np.linspace(0.001, 4, 4_000)
+    return grid_moments(grid, ou_log_likelihood(TIMES, DATA, grid, 1.0) + log_prior(grid))
+
+
+def assert_posterior(draws, mean, sd, allowance=0.02):
+    """Mean and standard deviation within five Monte Carlo errors, and the step error."""
+    draws = np.asarray(draws, float)
+    n = float(jnp.sum(jnp.atleast_1d(jb.effective_sample_size(jnp.asarray(draws, jnp.float32)))))
+    assert n > 200
+    assert abs(draws.mean() - mean) < (5 / np.sqrt(n) + allowance) * sd
+    assert abs(draws.std() / sd - 1) < 5 / np.sqrt(2 * n) + allowance
+
+
+PROPOSALS = {
+    "bridge": (jb.ModifiedDiffusionBridge(TRAPEZOID), None),
+    "renewal": (jb.Coupling(0.5), None),
+    "counts": (jb.Coupling(0.0), "pseudo_marginal"),
+    "auto": ("auto", None),
+}
+
+
+@pytest.mark.parametrize("name", PROPOSALS)
+def test_posterior_is_exact(name):
+    proposal, method = PROPOSALS[name]
+    made = jb.gibbs(
+        jax.random.key(0),
+        ou_1d(),
+        TIMES,
+        DATA,
+        num_iterations=4_000,
+        num_steps=15,
+        proposal=proposal,
+        method=method,
+        **OPTIONS,
+    )
+    assert made.exact_parameters and made.num_missing.sum() == 0
+    assert made.params[0].shape == (4_000,) and (made.params[1] == 1).all()
+    assert_posterior(made.params[0][100:], *exact_moments())
+
+
+def test_approximate_bridges_shift_the_posterior():
+    """The very gates of the exact sampler, which must fail here."""
+    times = np.arange(0, 60, 1.0)
+    data = ou_data(5, times)
+    grid = np.linspace(0.001, 4, 4_000)
+    mean, sd = grid_moments(grid, ou_log_likelihood(times, data, grid, 1.0) - (grid - 1) ** 2 / 2)
+    made = jb.gibbs(
+        jax.random.key(0),
+        ou_1d(),
+        times,
+        data,
+        num_iterations=2_000,
+        num_steps=15,
+        proposal=jb.Coupling(-1.0),
+        bridges="approximate",
+        **OPTIONS,
+    )
+    shift = (made.params[0][100:].mean() - mean) / sd
+    assert shift > 0.2
+
+
+def test_other_priors_and_kernels_have_their_posteriors():
+    """A prior that is not normal calls for Metropolis–Hastings; so does a kernel of the user's."""
+    import blackjax
+
+    log_prior = lambda rate: jnp.where(rate > 0, 2 * jnp.log(jnp.abs(rate)) - 3 * rate, -jnp.inf)
+    moments = exact_moments(lambda rate: 2 * np.log(rate) - 3 * rate)
+    options = dict(OPTIONS, prior=log_prior, num_iterations=4_000, num_steps=15)
+    options["proposal"] = jb.ModifiedDiffusionBridge(TRAPEZOID)
+    kernels = [None, lambda f: blackjax.mala(f, 0.05)]
+    for kernel, key in zip(kernels, jax.random.split(jax.random.key(1), 2), strict=True):
+        made = jb.gibbs(key, ou_1d(), TIMES, DATA, parameter_kernel=kernel, **options)
+        assert not made.exact_parameters
+        assert 0.3 < made.parameters_moved.mean() < 1
+        assert_posterior(made.params[0][100:], *moments)
+
+
+def test_newton_steps_are_exact_draws_where_these_exist():
+    """A normal prior, given as a function, for a quadratic log likelihood."""
+    log_prior = lambda rate: -((rate - 1) ** 2) / 2
+    made = jb.gibbs(
+        jax.random.key(0),
+        ou_1d(),
+        TIMES,
+        DATA,
+        num_iterations=4_000,
+        num_steps=15,
+        proposal=jb.ModifiedDiffusionBridge(TRAPEZOID),
+        **dict(OPTIONS, prior=log_prior),
+    )
+    assert not made.exact_parameters
+    assert_posterior(made.params[0][100:], *exact_moments())
+
+
+def test_chains_start_where_they_are_told_and_go_on():
+    options = dict(OPTIONS, num_steps=10, proposal=jb.ModifiedDiffusionBridge(), num_chains=3)
+    starts = jnp.array([0.3, 1.0, 3.0])
+    arguments = (ou_1d(), TIMES, DATA)
+    made = jb.gibbs(
+        jax.random.key(0), *arguments, num_iterations=300, init=starts, thin=2, **options
+    )
+    assert made.params[0].shape == (3, 300) and made.theta.shape == (3, 300, 1)
+    assert made.num_simulated.shape == (3, 300)
+    assert made.r_hat.shape == (1,) and made.r_hat[0] < 1.05
+    assert 100 < made.effective_sample_size[0] <= 900 * 2.5
+    more = jb.gibbs(jax.random.key(1), *arguments, num_iterations=5, init=made.state, **options)
+    assert more.state.theta.shape == (3, 1)
+    # The first θ depends on the paths it starts from, not on where chains began.
+    again = jb.gibbs(jax.random.key(1), *arguments, num_iterations=5, init=made.state, **options)
+    np.testing.assert_array_equal(more.theta, again.theta)
+
+
+def test_a_chain_is_the_same_alone_inside_jit_and_vmap():
+    options = dict(OPTIONS, num_steps=8, proposal=jb.Coupling(0.5), num_iterations=20)
+    data = jnp.stack([jnp.asarray(ou_data(seed, TIMES)) for seed in (3, 4)])
+
+    def run(key, data):
+        return jb.gibbs(key, ou_1d(), TIMES, data, **options).theta
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    alone = run(keys[1], data[1])
+    np.testing.assert_allclose(jax.jit(run)(keys[1], data[1]), alone, rtol=1e-3)
+    np.testing.assert_allclose(jax.jit(jax.vmap(run))(keys, data)[1], alone, rtol=1e-3)
+
+
+def test_intervals_of_many_lengths():
+    times = np.array([0.0, 0.1, 0.2, 1.2, 5.2, 5.3, 5.7, 6.7, 7.7])
+    made = jb.gibbs(
+        jax.random.key(0),
+        ou_1d(),
+        times,
+        ou_data(0, times),
+        num_iterations=5,
+        step_size=0.1,
+        **OPTIONS,
+    )
+    steps = {part.num_steps for part in made.completion.parts}
+    assert len(steps) <= 4 and max(steps) == 40
+    durations = np.diff(times)
+    for part in made.completion.parts:
+        assert (durations[np.asarray(part.index)] / part.num_steps < 0.1001).all()
+
+
+def test_four_unknown_drifts_of_a_rotating_process():
+    """Given the paths B is normal with the moments of least squares; B may be any stable matrix."""
+    model, times, data = multivariate_ou()
+    stable = lambda B: (jnp.trace(B) > 0) & (B[0, 0] * B[1, 1] > B[0, 1] * B[1, 0])
+    made = jb.gibbs(
+        jax.random.key(0),
+        model,
+        times,
+        data,
+        prior=jb.NormalPrior(jnp.zeros(4), jnp.eye(4)),
+        num_iterations=200,
+        num_steps=10,
+        where=lambda params: params.B,
+        constraint=stable,
+        proposal=jb.ModifiedDiffusionBridge(TRAPEZOID),
+    )
+    assert made.exact_parameters and made.params.B.shape == (200, 2, 2)
+    assert bool(jax.vmap(stable)(made.params.B).all())
+    assert (made.params.sigma == model.params.sigma).all()
+
+
+def test_arviz_takes_the_draws():
+    arviz = pytest.importorskip("arviz")
+    made = jb.gibbs(
+        jax.random.key(0), ou_1d(), TIMES, DATA, num_iterations=10, num_steps=5, **OPTIONS
+    )
+    data = made.to_arviz()
+    assert set(data.posterior.data_vars) == {"0", "1"}
+    assert arviz.summary(data, var_names=["0"]).shape[0] == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(times=[0.0, 2.0, 1.0]), r"`times\[1\]`.*sort them"),
+        (dict(times=[0.0, np.nan, 1.0]), r"`times\[1\]` = nan is missing"),
+        (dict(times=[0.0, 1.0]), "`observations` must have shape"),
+        (dict(times=[0.0], data=[[1.0]]), "two observations or more"),
+        (dict(data=[[0.0], [np.nan], [1.0]]), r"`observations\[1\]`.*leave out"),
+        (dict(data=[0.0, 1.0, 2.0]), "`observations` must have shape"),
+        (dict(prior=jb.NormalPrior(jnp.zeros(3), 1.0)), "`prior.mean` must be"),
+        (dict(prior=jb.NormalPrior(0.0, jnp.ones((2, 2)))), "`prior.variance` must be"),
+        (dict(prior=jb.NormalPrior(0.0, -1.0)), "positive"),
+        (dict(where=None), "σ depends on the unknown parameters"),
+        (dict(where=lambda p: p[1]), "use `pmmh`"),
+        (dict(constraint=lambda rate: rate > 5), "do not satisfy `constraint`"),
+        (dict(bridges="other"), "`bridges` must be"),
+        (dict(method="other"), "`method` must be"),
+        (dict(num_steps=3, step_size=0.1), "not both"),
+        (dict(step_size=-1.0), "`step_size` must be"),
+        (dict(init=jnp.zeros(3)), "`init` must have"),
+        (dict(num_iterations=0), "`num_iterations`"),
+    ],
+)
+def test_bad_input_is_refused_with_a_sentence(change, message, unchecked):
+    change = {"times": [0.0, 1.0, 2.0], "data": [[0.0], [0.5], [1.0]], **OPTIONS, **change}
+    times, data = change.pop("times"), change.pop("data")
+    with pytest.raises(ValueError, match=message):
+        jb.gibbs(jax.random.key(0), ou_1d(), times, data, **change)
+
+
+def test_observations_outside_the_state_space_are_named(unchecked):
+    root = jb.Diffusion(
+        lambda x, p: p * (1 - x), lambda x, p: jnp.sqrt(x), lambda x, p: jnp.sum(jnp.log(x)), 1.0
+    )
+    with pytest.raises(ValueError, match=r"`observations\[2\]`.*outside the state space"):
+        jb.gibbs(jax.random.key(0), root, [0.0, 1.0, 2.0], [[1.0], [0.5], [-0.1]], prior=PRIOR)
+
+
+def test_other_types_are_refused(unchecked):
+    arguments = (jax.random.key(0), ou_1d(), [0.0, 1.0], [[0.0], [1.0]])
+    with pytest.raises(TypeError, match="`prior` must be"):
+        jb.gibbs(*arguments, prior=3.0, where=RATE)
+    with pytest.raises(TypeError, match="renewal is for couplings"):
+        jb.gibbs(*arguments, prior=PRIOR, where=RATE, proposal=jb.Guided(), method="renewal")
+    with pytest.raises(TypeError, match="`constraint` must be"):
+        jb.gibbs(*arguments, prior=PRIOR, where=RATE, constraint=3.0)
+
+
+@pytest.mark.slow
+def test_ranks_of_true_parameters_are_uniform():
+    """Simulation-based calibration (Talts et al. 2018): parameters from the prior, data given
+    them, and the rank of the truth among draws, for a drift matrix of four unknowns."""
+    stable = lambda B: (jnp.trace(B) > 0.5) & (B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0] > 0.2)
+    num_sets, num_draws, times = 400, 31, jnp.arange(11) * 0.5
+    mean = jnp.array([[1.0, 0.3], [-0.3, 1.0]])
+
+    def draw_parameters(key):
+        def again(state):
+            key, _ = state
+            key, mine = jax.random.split(key)
+            return key, mean + 0.4 * jax.random.normal(mine, (2, 2))
+
+        return jax.lax.while_loop(lambda s: ~stable(s[1]), again, again((key, mean)))[1]
+
+    def one_set(key):
+        parameter_key, data_key, run_key = jax.random.split(key, 3)
+        B = draw_parameters(parameter_key)
+        model = jb.ornstein_uhlenbeck(B)
+        keys = jax.random.split(data_key, len(times) - 1)
+
+        def advance(x, key):
+            x = jb.ou_transition(model, x, 0.5).sample(key)
+            return x, x
+
+        x = jnp.zeros(2)
+        _, later = jax.lax.scan(advance, x, keys)
+        made = jb.gibbs(
+            run_key,
+            jb.ornstein_uhlenbeck(mean),
+            times,
+            jnp.concatenate([x[None], later]),
+            prior=jb.NormalPrior(mean.reshape(-1), 0.16),
+            num_iterations=num_draws,
+            thin=12,
+            num_steps=8,
+            where=lambda params: params.B,
+            constraint=stable,
+            proposal=jb.Guided(density=TRAPEZOID),
+        )
+        return jnp.sum(made.params.B < B, axis=0)
+
+    keys = jax.random.split(jax.random.key(0), num_sets)
+    ranks = np.asarray(jax.jit(jax.vmap(one_set))(keys)).reshape(num_sets, 4)
+    for rank in ranks.T:
+        counts = np.bincount(rank * 8 // (num_draws + 1), minlength=8)
+        chi_square = ((counts - num_sets / 8) ** 2 / (num_sets / 8)).sum()
+        assert chi_square < 7 + 5 * np.sqrt(14)  # five standard deviations of χ²_7

@@ -1,0 +1,68 @@
+"""Maximum likelihood against the maximum of the closed form."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from inference import multivariate_ou, ou_transitions_log_density
+
+import jaxbridge as jb
+
+OPTIONS = dict(
+    where=lambda params: params.B,
+    num_steps=20,
+    proposal=jb.Guided(density=jb.TrapezoidDensity()),
+)
+
+
+def exact_maximum():
+    """By Newton's method, and the inverse of the information there."""
+    model, times, observations = multivariate_ou()
+
+    def log_likelihood(b):
+        params = model.params._replace(B=b.reshape(2, 2))
+        return ou_transitions_log_density(model.with_params(params), times, observations)
+
+    b = model.params.B.reshape(-1)
+    for _ in range(30):
+        information = -jax.hessian(log_likelihood)(b)
+        b = b + 0.7 * jnp.linalg.solve(information, jax.grad(log_likelihood)(b))
+    assert jnp.abs(jax.grad(log_likelihood)(b)).max() < 0.01
+    return b, jnp.linalg.inv(-jax.hessian(log_likelihood)(b))
+
+
+@pytest.mark.parametrize("method", ["em", "gradient"])
+def test_finds_the_maximum(method):
+    model, times, observations = multivariate_ou()
+    exact, covariance = exact_maximum()
+    made = jb.maximum_likelihood(
+        jax.random.key(0),
+        model,
+        times,
+        observations,
+        optax.adam(optax.linear_schedule(0.1, 0.005, 200)) if method == "gradient" else None,
+        method=method,
+        num_iterations=300 if method == "gradient" else 80,
+        num_bridges=2_000,
+        **OPTIONS,
+    )
+    assert made.newton and made.num_missing == 0
+    sd = np.sqrt(np.diagonal(covariance))
+    error = np.asarray(made.monte_carlo_errors).reshape(-1)
+    # Beside the Monte Carlo error: what Newton's last step leaves, and the step error.
+    np.testing.assert_array_less(np.abs(made.theta - exact), 5 * error + 0.03 * sd)
+    assert (error < 0.05 * sd).all()
+    np.testing.assert_allclose(made.standard_errors.reshape(-1), sd, rtol=0.1)
+    assert np.abs(exact - model.params.B.reshape(-1)).max() > 0.3 * sd.max()
+    np.testing.assert_allclose(made.params.B, made.theta.reshape(2, 2))
+
+
+def test_bad_input_is_refused(unchecked):
+    arguments = (jax.random.key(0), *multivariate_ou())
+    with pytest.raises(ValueError, match="`method` must be"):
+        jb.maximum_likelihood(*arguments, method="other", **OPTIONS)
+    with pytest.raises(ValueError, match="takes no `optimizer`"):
+        jb.maximum_likelihood(*arguments, optax.sgd(0.1), method="em", **OPTIONS)
+    with pytest.raises(ValueError, match="σ depends"):
+        jb.maximum_likelihood(*arguments)

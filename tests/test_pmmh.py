@@ -1,0 +1,132 @@
+"""Parameters of σ as well: posteriors by quadrature of exact likelihoods."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from inference import ou_1d, ou_data, ou_log_likelihood
+
+import jaxbridge as jb
+
+TIMES = np.arange(0, 12, 0.5)
+DATA = ou_data(7, TIMES, rate=0.8, sigma=0.7)
+POSITIVE = lambda unknown: (unknown[0] > 0) & (unknown[1] > 0)
+PRIOR = jb.NormalPrior((1.0, 1.0), (0.5, 0.5))
+OPTIONS = dict(prior=PRIOR, constraint=POSITIVE, num_steps=8)
+
+
+def exact_moments():
+    rate, sigma = np.meshgrid(np.linspace(0.005, 4, 800), np.linspace(0.3, 2, 600), indexing="ij")
+    log_density = ou_log_likelihood(TIMES, DATA, rate, sigma)
+    log_density -= (rate - 1) ** 2 + (sigma - 1) ** 2
+    weights = np.exp(log_density - log_density.max())
+    weights /= weights.sum()
+    means = [(weights * each).sum() for each in (rate, sigma)]
+    pairs = zip((rate, sigma), means, strict=True)
+    return np.array(means), np.sqrt([(weights * (each - m) ** 2).sum() for each, m in pairs])
+
+
+@pytest.mark.parametrize(
+    "proposal",
+    [
+        jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+        pytest.param(jb.Coupling(0.0), marks=pytest.mark.slow),
+    ],
+    ids=["bridge", "coupling"],
+)
+def test_posterior_is_exact(proposal):
+    made = jb.pmmh(
+        jax.random.key(0),
+        ou_1d(0.8, 0.7),
+        TIMES,
+        DATA,
+        num_iterations=6_000,
+        num_proposals=20,
+        num_chains=2,
+        proposal=proposal,
+        **OPTIONS,
+    )
+    draws = np.asarray(made.theta, float).reshape(-1, 2)
+    n = np.asarray(made.effective_sample_size)
+    mean, sd = exact_moments()
+    assert (n > 300).all() and (made.r_hat < 1.05).all() and made.num_unknown.sum() == 0
+    np.testing.assert_array_less(np.abs(draws.mean(0) - mean) / sd, 5 / np.sqrt(n) + 0.03)
+    np.testing.assert_array_less(np.abs(draws.std(0) / sd - 1), 5 / np.sqrt(2 * n) + 0.03)
+    assert 0.08 < made.accepted.mean() < 0.5
+    assert (made.params[1] > 0).all()
+
+
+def test_goes_on_from_its_state_and_may_start_anywhere():
+    options = dict(OPTIONS, num_proposals=5, num_chains=2, proposal=jb.ModifiedDiffusionBridge())
+    arguments = (ou_1d(), TIMES, DATA)
+    starts = (jnp.array([0.5, 2.0]), jnp.array([0.5, 1.5]))
+    made = jb.pmmh(
+        jax.random.key(0), *arguments, num_iterations=20, num_warmup=10, init=starts, **options
+    )
+    assert made.params[0].shape == (2, 20) and made.state.root.shape == (2, 2, 2)
+    more = jb.pmmh(
+        jax.random.key(1), *arguments, num_iterations=3, num_warmup=0, init=made.state, **options
+    )
+    np.testing.assert_array_equal(more.state.root, made.state.root)
+
+
+def test_bad_input_is_refused(unchecked):
+    arguments = (jax.random.key(0), ou_1d(), TIMES, DATA)
+    with pytest.raises(ValueError, match="`covariance` must have shape"):
+        jb.pmmh(*arguments, covariance=jnp.ones(3), **OPTIONS)
+    with pytest.raises(ValueError, match="normalised"):
+        unknown = jb.Diffusion(lambda x, p: -p * x, None, lambda x, p: -p * x @ x, 1.0)
+        choice = [jb.Coupling(0.0), jb.Guided()]
+        picked = jb.choose_proposal(
+            jax.random.key(0), unknown, DATA[:-1], DATA[1:], 0.5, candidates=choice, num_steps=4
+        )
+        picked = jax.tree.map(lambda leaf: leaf, picked)
+        jb.pmmh(jax.random.key(0), unknown, TIMES, DATA, prior=PRIOR, num_steps=4, proposal=picked)
+
+
+@pytest.mark.slow
+def test_ranks_of_true_parameters_are_uniform():
+    """Simulation-based calibration with an unknown σ."""
+    num_sets, num_draws, times = 400, 31, jnp.arange(9) * 0.5
+
+    def one_set(key):
+        parameter_key, data_key, run_key = jax.random.split(key, 3)
+
+        def again(state):
+            key, _ = state
+            key, mine = jax.random.split(key)
+            return key, 1 + 0.3 * jax.random.normal(mine, (2,))
+
+        start = again((parameter_key, jnp.zeros(2)))
+        _, (rate, sigma) = jax.lax.while_loop(lambda s: ~(s[1] > 0.2).all(), again, start)
+
+        def advance(x, key):
+            decay = jnp.exp(-rate * 0.5)
+            sd = sigma * jnp.sqrt((1 - decay**2) / (2 * rate))
+            x = decay * x + sd * jax.random.normal(key, (1,))
+            return x, x
+
+        first = jnp.zeros(1)
+        _, later = jax.lax.scan(advance, first, jax.random.split(data_key, 8))
+        made = jb.pmmh(
+            run_key,
+            ou_1d(1.0, 1.0),
+            times,
+            jnp.concatenate([first[None], later]),
+            prior=jb.NormalPrior((1.0, 1.0), (0.09, 0.09)),
+            constraint=lambda unknown: (unknown[0] > 0.2) & (unknown[1] > 0.2),
+            num_iterations=num_draws,
+            num_warmup=200,
+            thin=25,
+            num_proposals=10,
+            num_steps=6,
+            proposal=jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+        )
+        return jnp.array([jnp.sum(made.params[0] < rate), jnp.sum(made.params[1] < sigma)])
+
+    keys = jax.random.split(jax.random.key(0), num_sets)
+    ranks = np.asarray(jax.jit(jax.vmap(one_set))(keys))
+    for rank in ranks.T:
+        counts = np.bincount(rank * 8 // (num_draws + 1), minlength=8)
+        chi_square = ((counts - num_sets / 8) ** 2 / (num_sets / 8)).sum()
+        assert chi_square < 7 + 5 * np.sqrt(14)

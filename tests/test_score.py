@@ -1,0 +1,71 @@
+"""Fisher's identity and Louis's formula against derivatives of the closed form."""
+
+import jax
+import numpy as np
+import pytest
+from inference import multivariate_ou, ou_1d, ou_transitions_log_density
+
+import jaxbridge as jb
+
+DRIFT = lambda params: params.B
+
+
+def exact_derivatives():
+    model, times, observations = multivariate_ou()
+
+    def log_likelihood(b):
+        params = model.params._replace(B=b.reshape(2, 2))
+        return ou_transitions_log_density(model.with_params(params), times, observations)
+
+    b = model.params.B.reshape(-1)
+    return jax.grad(log_likelihood)(b), -jax.hessian(log_likelihood)(b)
+
+
+@pytest.mark.parametrize(
+    "proposal",
+    [
+        jb.Guided(density=jb.TrapezoidDensity()),
+        pytest.param(jb.Coupling(0.0), marks=pytest.mark.slow),
+    ],
+    ids=["guided", "coupling"],
+)
+def test_score_and_information_are_derivatives_of_the_closed_form(proposal):
+    gradient, information = exact_derivatives()
+    made = jb.score(
+        jax.random.key(0),
+        *multivariate_ou(),
+        num_bridges=4_000,
+        num_steps=20,
+        proposal=proposal,
+        where=DRIFT,
+    )
+    error = np.sqrt(np.diagonal(made.covariance))
+    # The step error is of second order: about 0.002 of the drift's scale, in 30 intervals.
+    np.testing.assert_array_less(np.abs(made.gradient - gradient), 5 * error + 0.02)
+    np.testing.assert_allclose(made.value, made.gradient.reshape(2, 2))
+    np.testing.assert_allclose(made.information, information, atol=0.04 * information.max())
+    assert made.num_missing == 0 and (made.effective_sample_size > 500).all()
+    assert (error < 0.3).all()  # small beside the gradient itself
+    assert np.abs(gradient).max() > 1
+
+
+def test_intervals_may_have_numbers_of_steps_of_their_own():
+    model, times, observations = multivariate_ou()
+    keep = np.array([0, 1, 2, 5, 6, 10, 11, 12])
+    options = dict(num_bridges=2_000, proposal=jb.Guided(), where=DRIFT)
+    data = times[keep], observations[keep]
+    one = jb.score(jax.random.key(0), model, *data, num_steps=40, **options)
+    two = jb.score(jax.random.key(1), model, *data, step_size=0.05, **options)
+    error = np.sqrt(np.diagonal(one.covariance + two.covariance))
+    np.testing.assert_array_less(np.abs(one.gradient - two.gradient), 5 * error + 0.1)
+    assert two.effective_sample_size.shape == (7,)
+
+
+def test_sigma_must_be_known():
+    with pytest.raises(ValueError, match="σ depends on the unknown parameters"):
+        jb.score(jax.random.key(0), ou_1d(), [0.0, 1.0], [[0.0], [1.0]])
+    model, times, observations = multivariate_ou()
+    with pytest.raises(ValueError, match="σ depends"):
+        jb.score(jax.random.key(0), model, times, observations)
+    with pytest.raises(ValueError, match="no parameters"):
+        jb.score(jax.random.key(0), jb.Diffusion(lambda x, p: -x), [0.0, 1.0], [[0.0], [1.0]])
