@@ -13,11 +13,11 @@ on top. The likelihood of a path (`likelihood`) and what is not known (`unknowns
 `observations`) make inference: bridges complete the observations (`completion`), and parameters
 follow from complete paths (`parameter_steps`), in turn (`gibbs`), or from densities (`pmmh`), or
 as maximum likelihood estimates (`score`, `maximum_likelihood`); `expectation` has derivatives
-that are right. What a program simulates is decided in one table (`decisions`, `scene`), and its loops
-run over many lanes of small points (`lanes`, `noise`). Exact laws stand beside (`gaussian`,
+that are right. What a program simulates is decided in one table (`decisions`, `scene`), and its
+loops run over many lanes of small points (`lanes`, `noise`). Exact laws stand beside (`gaussian`,
 `linear`), what accuracy costs above (`work_precision`), and the studies above all (`study`,
-`exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`, `benchmark`, `plot`). References to
-equations and sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion
+`exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`, `benchmark`, `plot`). References
+to equations and sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion
 bridges*.
 """
 

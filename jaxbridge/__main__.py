@@ -105,8 +105,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         choices=("paper", "approximate", "exact", "accuracy", "bayes", "bench", "all"),
         default="paper",
         help="approximate or exact bridges, or both: the paper's study (the default); what "
-        "accuracy costs in time; Bayesian inference, the paper's section 4; how fast it is, and which "
-        "proposal is best for which duration; or all",
+        "accuracy costs in time; Bayesian inference, the paper's section 4; how fast it is, and "
+        "which proposal is best for which duration; or all",
     )
     parser.add_argument("--quick", action="store_true", help="a twenty-fifth of the bridges")
     parser.add_argument("--seed", type=_seed, default=0, help="of the random numbers (default 0)")
