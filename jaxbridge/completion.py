@@ -36,8 +36,9 @@ Paths = tuple[Float[Array, "I points d"], ...]
 
 class Renewed(NamedTuple):
     """Of one step on all intervals: whether the path of each was replaced; how many paths were
-    simulated, or weighed, for it; whether no proposal was found though one was called for, so
-    that the step was not exact."""
+    simulated, or weighed, for it; whether no proposal was found though one was called for. Then
+    the path stays, which leaves the exact law invariant, for whether one is found does not
+    depend on the path."""
 
     moved: Bool[Array, " I"]
     num_simulated: Int[Array, " I"]

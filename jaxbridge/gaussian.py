@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Key
 from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Diffusion, check_invertible
 from .intervals import as_intervals
-from .linalg import cholesky, dot, inverse, matvec
+from .linalg import any_cholesky, any_inverse, dot, matvec, solve
 from .linear import linear_transition
 
 
@@ -66,23 +66,13 @@ class GaussianLaw(eqx.Module):
     def sample(self, key: Key[Array, ""], model: Diffusion | None = None) -> Float[Array, " d"]:
         """One draw, shape (d,). The model is not looked at: start laws are called with one."""
         noise = jax.random.normal(key, self.mean.shape, self.mean.dtype)
-        return self.mean + matvec(_cholesky(self.covariance), noise)
+        return self.mean + matvec(any_cholesky(self.covariance), noise)
 
     def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
         """The normalised log density at a point."""
-        root = _cholesky(self.covariance)
-        white = matvec(_inverse(root), (x - self.mean).astype(root.dtype))
+        root = any_cholesky(self.covariance)
+        white = matvec(any_inverse(root), (x - self.mean).astype(root.dtype))
         return -dot(white, white) / 2 - jnp.sum(jnp.log(jnp.sqrt(2 * np.pi) * jnp.diag(root)))
-
-
-# Laws are sampled inside compiled loops, where LAPACK is a hazard; from some size on writing
-# the elimination out costs too much compilation.
-def _cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    return cholesky(matrix) if matrix.shape[0] <= 16 else jnp.linalg.cholesky(matrix)
-
-
-def _inverse(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    return inverse(matrix) if matrix.shape[0] <= 16 else jnp.linalg.inv(matrix)
 
 
 class OrnsteinUhlenbeckParams(NamedTuple):
@@ -293,9 +283,10 @@ def _sample_stationary(key, p: _Prepared):
 def _prepare(params: OrnsteinUhlenbeckParams) -> _Prepared:
     B, mean, sigma = params
     covariance = _lyapunov(B, _noise_covariance(params))
-    precision = jnp.linalg.inv(covariance)
+    precision = any_inverse(covariance)
     precision = (precision + precision.T) / 2
-    log_normaliser = jnp.linalg.slogdet(2 * jnp.pi * covariance)[1] / 2
+    root = any_cholesky(2 * jnp.pi * covariance)
+    log_normaliser = jnp.sum(jnp.log(jnp.diagonal(root)))
     reverse_B = covariance @ B.T @ precision
     return _Prepared(B, mean, sigma, covariance, precision, log_normaliser, reverse_B)
 
@@ -312,7 +303,9 @@ def _lyapunov(B: Float[Array, "d d"], V: Float[Array, "d d"]) -> Float[Array, "d
     """Γ with BΓ + ΓBᵀ = V, equation (Gamma), as one linear system of size d²."""
     identity = jnp.eye(B.shape[0], dtype=B.dtype)
     operator = jnp.kron(B, identity) + jnp.kron(identity, B)
-    solution = jnp.linalg.solve(operator, V.reshape(-1)).reshape(V.shape)
+    # Inference does this in a loop, where LAPACK is a hazard; but d² soon is much to write out.
+    solved = solve if B.shape[0] <= 3 else jnp.linalg.solve
+    solution = solved(operator, V.reshape(-1)).reshape(V.shape)
     return (solution + solution.T) / 2
 
 

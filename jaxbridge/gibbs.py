@@ -60,9 +60,9 @@ class GibbsPosterior(AbstractPosterior):
     - `parameters_moved`: whether θ moved, shape (*chains, n).
     - `bridges_moved`: the share of bridges that were replaced, shape (*chains, n).
     - `num_simulated`: paths simulated or weighed, shape (*chains, n).
-    - `num_missing`: bridges that were not found, though called for, within `max_proposals`: they
-        stayed as they were, or are left out of the likelihood where there never was one.
-        Shape (*chains, n); zero if all is well.
+    - `num_missing`: bridges that were not found, though called for, within `max_proposals`, shape
+        (*chains, n). They stayed as they were, so that the law is right but the chain moves
+        less; where there never was a path, the interval is left out of the likelihood.
     - `state`: where it ended; pass it as `init` to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.

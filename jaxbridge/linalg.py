@@ -94,6 +94,26 @@ def cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
     return jnp.stack(columns, axis=1)
 
 
+# Beyond this, writing the elimination out costs too much compilation.
+_UNROLLED = 16
+
+
+def any_solve(matrix: Float[Array, "p p"], right: Float[Array, "p *m"]) -> Float[Array, "p *m"]:
+    """`solve`, by LAPACK for large matrices: for use outside loops over lanes."""
+    small = matrix.shape[0] <= _UNROLLED
+    return solve(matrix, right) if small else jnp.linalg.solve(matrix, right)
+
+
+def any_inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """`inverse`, likewise."""
+    return inverse(matrix) if matrix.shape[0] <= _UNROLLED else jnp.linalg.inv(matrix)
+
+
+def any_cholesky(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """`cholesky`, likewise."""
+    return cholesky(matrix) if matrix.shape[0] <= _UNROLLED else jnp.linalg.cholesky(matrix)
+
+
 def log_abs_det(matrix: Float[Array, "d d"]) -> Float[Array, ""]:
     """log |det matrix|, by elimination with partial pivoting."""
     d, rows, logs = matrix.shape[0], matrix, []

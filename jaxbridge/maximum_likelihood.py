@@ -30,6 +30,7 @@ from .completion import Completion, Paths, complete
 from .diffusion import Diffusion, check_diffusion
 from .intervals import check_count
 from .likelihood import Form, forms_of
+from .linalg import any_solve
 from .observations import as_observations, step_groups
 from .parameter_steps import CompleteData, quadratic_form
 from .score import Score, score
@@ -211,7 +212,7 @@ class _EM(eqx.Module):
         gain = jnp.minimum(1.0, 2.0 / (i + 1).astype(theta.dtype))
         state = jax.tree.map(lambda old, new: old + gain * (new - old), state, made)
         c, P = state
-        return jnp.linalg.solve(P, c), state
+        return any_solve(P, c), state
 
 
 class _Setting(eqx.Module):

@@ -30,7 +30,7 @@ from .completion import Completion, Paths
 from .diffusion import uses_argument
 from .lanes import over_lanes
 from .likelihood import Form, forms_of, log_likelihoods
-from .linalg import cholesky, dot, matvec, solve
+from .linalg import any_cholesky, any_solve, dot, matvec
 from .unknowns import Constraint, NormalDensity, Unknowns, allowed
 
 # Draws from a normal law until one satisfies the constraint: if none does, θ stays, which leaves
@@ -120,13 +120,13 @@ class NormalDraw(AbstractParameterKernel):
 
     def step(self, key, theta, data):
         value, gradient, hessian = _expansion(data.log_posterior_inside, theta)
-        root = small_cholesky(-hessian)
+        root = any_cholesky(-hessian)
         mean = theta + _solve_root(root, gradient)
 
         def draw(carry):
             i, _, _ = carry
             noise = jax.random.normal(jax.random.fold_in(key, i), theta.shape, theta.dtype)
-            drawn = mean + _solve(root.T, noise)
+            drawn = mean + any_solve(root.T, noise)
             return i + 1, drawn, allowed(data.constraint, data.unknowns, drawn)
 
         def missed(carry):
@@ -147,7 +147,7 @@ class NewtonStep(AbstractParameterKernel):
         def look(theta):
             """The log density at θ, and mean and root of the proposals from it."""
             value, gradient = jax.value_and_grad(data.log_posterior_inside)(theta)
-            root = small_cholesky(data.information(theta))
+            root = any_cholesky(data.information(theta))
             mean = theta + (1 - jnp.sqrt((1 - tau) * (1 + tau))) * _solve_root(root, gradient)
             return value, mean, root
 
@@ -157,7 +157,7 @@ class NewtonStep(AbstractParameterKernel):
 
         value, mean, root = look(theta)
         noise = jax.random.normal(noise_key, theta.shape, theta.dtype)
-        proposed = mean + tau * _solve(root.T, noise)
+        proposed = mean + tau * any_solve(root.T, noise)
         ok = allowed(data.constraint, data.unknowns, proposed)
         proposed = jnp.where(ok, proposed, theta)
         other_value, other_mean, other_root = look(proposed)
@@ -210,15 +210,6 @@ def _expansion(
     return function(theta), gradient(theta), jax.jacfwd(gradient)(theta)
 
 
-def small_cholesky(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
-    """Unrolled for few parameters."""
-    return cholesky(matrix) if matrix.shape[0] <= 16 else jnp.linalg.cholesky(matrix)
-
-
-def _solve(matrix: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:
-    return solve(matrix, right) if matrix.shape[0] <= 16 else jnp.linalg.solve(matrix, right)
-
-
 def _solve_root(root: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:
     """(L Lᵀ)⁻¹ v."""
-    return _solve(root.T, _solve(root, right))
+    return any_solve(root.T, any_solve(root, right))

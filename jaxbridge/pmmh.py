@@ -26,8 +26,8 @@ from .choice import as_proposal, settled
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, check_count
 from .kernels import acceptance_rate
+from .linalg import any_cholesky
 from .observations import as_observations, step_groups
-from .parameter_steps import small_cholesky
 from .posterior import AbstractPosterior
 from .transition import check_for_density, estimate_log_density
 from .unknowns import (
@@ -219,7 +219,7 @@ def _first_root(
             raise ValueError(
                 f"`covariance` must have shape ({p},) or ({p}, {p}); got {matrix.shape}."
             )
-        return jnp.diag(jnp.sqrt(matrix)) if matrix.ndim == 1 else small_cholesky(matrix)
+        return jnp.diag(jnp.sqrt(matrix)) if matrix.ndim == 1 else any_cholesky(matrix)
     if isinstance(prior, NormalPrior):
         precision = as_normal(prior, unknowns, theta).precision
         return 0.1 * jnp.diag(1 / jnp.sqrt(jnp.diagonal(precision)))
@@ -254,7 +254,7 @@ def _iterate(key, setting: _Setting, state: PMMHState, gain: Float[Array, ""]):
     direction = noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6)
     moved = state.root @ direction
     change = gain * (jnp.where(jnp.isnan(rate), 0, rate) - _TARGET)
-    root = small_cholesky(state.root @ state.root.T + change * jnp.outer(moved, moved))
+    root = any_cholesky(state.root @ state.root.T + change * jnp.outer(moved, moved))
     root = jnp.where((gain > 0) & jnp.all(jnp.isfinite(root)), root, state.root)
     unknown = inside & (estimated == -jnp.inf)
     state = PMMHState(

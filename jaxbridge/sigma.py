@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .linalg import inverse, log_abs_det, matvec, solve, total
+from .linalg import any_inverse, log_abs_det, matvec, solve, total
 
 
 class AbstractSigma(eqx.Module):
@@ -72,8 +72,7 @@ class Constant(AbstractSigma):
 
     def __init__(self, matrix: Float[Array, "d d"]):
         self.matrix = matrix
-        # Outside every loop, so LAPACK may serve where unrolling would only cost compile time.
-        self.inverse = inverse(matrix) if matrix.shape[0] <= 16 else jnp.linalg.inv(matrix)
+        self.inverse = any_inverse(matrix)
 
     def mv(self, noise):
         return matvec(self.matrix, noise)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from .arrays import as_floating, cast_floats, is_traced
 from .diffusion import Diffusion, uses_argument
-from .linalg import dot, inverse, matvec
+from .linalg import any_inverse, dot, matvec
 
 
 class Unknowns(eqx.Module):
@@ -159,7 +159,7 @@ def as_normal(prior: NormalPrior, unknowns: Unknowns, theta: Float[Array, " p"])
                 f"{prior.mean} and {prior.variance}."
             )
     if variance.ndim == 2:
-        precision = inverse(variance) if p <= 16 else jnp.linalg.inv(variance)
+        precision = any_inverse(variance)
         precision = (precision + precision.T) / 2
     else:
         precision = jnp.diag(jnp.broadcast_to(1 / variance, (p,)))

@@ -1,6 +1,10 @@
 """Every test runs with the package's annotations checked at run time, strict promotion of
 dtypes and warnings as errors."""
 
+import os
+import shutil
+import tempfile
+
 from jaxtyping import config as jaxtyping_config, install_import_hook
 
 install_import_hook("jaxbridge", "beartype.beartype")
@@ -9,6 +13,19 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+# Modules, workers and the programs that tests start compile much the same: what one has
+# compiled the others read from disk, for the time of one run.
+_CACHE = "JAX_COMPILATION_CACHE_DIR"
+_OWNS_CACHE = _CACHE not in os.environ
+if _OWNS_CACHE:
+    os.environ[_CACHE] = tempfile.mkdtemp()
+jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
+
+
+def pytest_unconfigure():
+    if _OWNS_CACHE:
+        shutil.rmtree(os.environ[_CACHE], ignore_errors=True)
 
 
 @pytest.fixture(params=["float32", "float64"])
