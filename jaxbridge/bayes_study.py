@@ -86,9 +86,9 @@ def hyperbolic_data(key: Key[Array, ""], num_intervals: int, duration: float) ->
     """From the stationary law on, by diffrax."""
     model = hyperbolic(ALPHA, 2)
     start_key, path_key = jax.random.split(key)
-    times = jnp.arange(num_intervals + 1) * jnp.float32(duration)
+    times = jnp.arange(num_intervals + 1, dtype=jnp.float32) * duration
     start = model.sample_stationary(start_key)
-    return Data(times, simulate(path_key, model, start, times, num_paths=1).paths[0])
+    return Data(times, simulate(path_key, model, start, times, num_paths=1)[0])
 
 
 def brownian_posterior(
@@ -116,7 +116,7 @@ def _brownian_log_likelihood(
     alpha = jnp.asarray(_GRID, jnp.float32)
     start, end = data.observations[:-1], data.observations[1:]
     duration = jnp.diff(data.times)[:, None]
-    fractions = jnp.arange(_BRIDGE_STEPS + 1) / _BRIDGE_STEPS
+    fractions = jnp.linspace(0, 1, _BRIDGE_STEPS + 1)
 
     def integrals(key):
         shape = (_BRIDGE_STEPS, batch, *start.shape)

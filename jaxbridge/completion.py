@@ -31,7 +31,8 @@ from .observations import Group
 from .renewal_chain import as_pairs, first_paths, propose_paths, renew
 from .weighted import AbstractWeightedProposal
 
-Paths = tuple[Float[Array, "I points d"], ...]
+# One array of shape (I, N+1, d) for each part.
+Paths = tuple[Float[Array, "_ _ d"], ...]
 
 
 class Renewed(NamedTuple):

@@ -33,6 +33,8 @@ from .parameter_steps import (
 from .posterior import AbstractPosterior
 from .unknowns import (
     Constraint,
+    GivenDensity,
+    NormalDensity,
     Prior,
     Unknowns,
     as_log_prior,
@@ -194,7 +196,7 @@ class _Setting(eqx.Module):
 
     unknowns: Unknowns
     completion: Completion
-    log_prior: Callable[[Array], Array]
+    log_prior: NormalDensity | GivenDensity
     constraint: Constraint | None = eqx.field(static=True)
     kernel: AbstractParameterKernel
     form: Form = eqx.field(static=True)

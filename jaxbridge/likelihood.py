@@ -24,6 +24,7 @@ in three forms that have one limit, and as the Euler density itself:
 import math
 from typing import Literal, get_args
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,7 +93,7 @@ def path_log_likelihood(
     if steps.ndim == 2:
         steps = steps.reshape(len(steps), *[1] * (len(batch) - 1), num_times - 1)
     steps = jnp.broadcast_to(steps, (*batch, num_times - 1)).reshape(-1, num_times - 1)
-    values = log_likelihoods(model, steps.T, path.reshape(-1, num_times, d), form)
+    values = _compiled(model, steps.T, path.reshape(-1, num_times, d), form)
     return values.reshape(batch)
 
 
@@ -133,6 +134,9 @@ def log_likelihoods(
         before[0], after[0], steps.reshape(-1), before[1], after[1]
     )
     return jnp.sum(values.reshape(num_points - 1, num_paths), axis=0)
+
+
+_compiled = eqx.filter_jit(log_likelihoods)
 
 
 def _ito(model: Diffusion, dynamics: Dynamics, steps, points) -> Float[Array, " P"]:

@@ -32,6 +32,8 @@ from .posterior import AbstractPosterior
 from .transition import check_for_density, estimate_log_density
 from .unknowns import (
     Constraint,
+    GivenDensity,
+    NormalDensity,
     NormalPrior,
     Prior,
     Unknowns,
@@ -188,7 +190,7 @@ class _Setting(eqx.Module):
 
     unknowns: Unknowns
     parts: tuple[_Part, ...]
-    log_prior: Callable[[Array], Array]
+    log_prior: NormalDensity | GivenDensity
     constraint: Constraint | None = eqx.field(static=True)
     num_proposals: int = eqx.field(static=True)
 

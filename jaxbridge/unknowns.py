@@ -87,6 +87,19 @@ class NormalDensity(eqx.Module):
         return -dot(deviation, matvec(self.precision, deviation)) / 2
 
 
+class GivenDensity(eqx.Module):
+    """The user's log density of the unknown parameters, as a function of θ."""
+
+    unknowns: Unknowns
+    function: Callable[[PyTree], Any] = eqx.field(static=True)
+
+    def __call__(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
+        value = jnp.asarray(self.function(self.unknowns.pick(theta)))
+        if value.shape != ():
+            raise ValueError(f"`prior` must return a number; it returned shape {value.shape}.")
+        return value.astype(theta.dtype)
+
+
 Prior = NormalPrior | Callable[[PyTree], Any]
 Constraint = Callable[[PyTree], Any]
 
@@ -168,8 +181,8 @@ def as_normal(prior: NormalPrior, unknowns: Unknowns, theta: Float[Array, " p"])
 
 def as_log_prior(
     prior: Prior, unknowns: Unknowns, theta: Float[Array, " p"]
-) -> Callable[[Array], Array]:
-    """The prior's log density, a function of θ; a `NormalDensity` where it is normal."""
+) -> NormalDensity | GivenDensity:
+    """The prior's log density, a function of θ."""
     if isinstance(prior, NormalPrior):
         return as_normal(prior, unknowns, theta)
     if not callable(prior):
@@ -178,13 +191,7 @@ def as_log_prior(
             f"the log of a density; got {prior!r}."
         )
 
-    def log_prior(theta):
-        value = jnp.asarray(prior(unknowns.pick(theta)))
-        if value.shape != ():
-            raise ValueError(f"`prior` must return a number; it returned shape {value.shape}.")
-        return value.astype(theta.dtype)
-
-    return log_prior
+    return GivenDensity(unknowns, prior)
 
 
 def allowed(

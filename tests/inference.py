@@ -56,7 +56,7 @@ def multivariate_ou(seed=0, num_intervals=30, duration=0.5):
     """Exact observations of a process that is not reversible, and its model."""
     B = jnp.array([[1.2, 0.7], [-0.5, 0.9]])
     model = jb.ornstein_uhlenbeck(B, sigma=jnp.array([[0.9, 0.0], [0.2, 1.1]]))
-    times = jnp.arange(num_intervals + 1) * duration
+    times = jnp.linspace(0.0, num_intervals * duration, num_intervals + 1)
     keys = jax.random.split(jax.random.key(seed), num_intervals + 1)
     points = [model.sample_stationary(keys[0])]
     advance = jax.jit(lambda x, key: jb.ou_transition(model, x, duration).sample(key))

@@ -144,7 +144,7 @@ def test_a_chain_is_the_same_alone_inside_jit_and_vmap():
 
 
 def test_intervals_of_many_lengths():
-    times = np.array([0.0, 0.1, 0.2, 1.2, 5.2, 5.3, 5.7, 6.7, 7.7])
+    times = np.array([0.0, 0.1, 0.2, 1.2, 5.2, 5.3, 6.3, 7.3])
     made = jb.gibbs(
         jax.random.key(0),
         ou_1d(),
@@ -155,7 +155,7 @@ def test_intervals_of_many_lengths():
         **OPTIONS,
     )
     steps = {part.num_steps for part in made.completion.parts}
-    assert len(steps) <= 4 and max(steps) == 40
+    assert len(steps) == 3 and max(steps) == 40
     durations = np.diff(times)
     for part in made.completion.parts:
         assert (durations[np.asarray(part.index)] / part.num_steps < 0.1001).all()
@@ -245,7 +245,7 @@ def test_ranks_of_true_parameters_are_uniform():
     """Simulation-based calibration (Talts et al. 2018): parameters from the prior, data given
     them, and the rank of the truth among draws, for a drift matrix of four unknowns."""
     stable = lambda B: (jnp.trace(B) > 0.5) & (B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0] > 0.2)
-    num_sets, num_draws, times = 400, 31, jnp.arange(11) * 0.5
+    num_sets, num_draws, times = 400, 31, jnp.linspace(0, 5, 11)
     mean = jnp.array([[1.0, 0.3], [-0.3, 1.0]])
 
     def draw_parameters(key):

@@ -3,12 +3,15 @@
 import pathlib
 import re
 
-README = pathlib.Path(__file__).parent.parent / "README.md"
+from jaxbridge.benchmark import load, markdown
+
+ROOT = pathlib.Path(__file__).parent.parent
+README = ROOT / "README.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
 
 
 def test_readme_code_runs():
-    assert len(BLOCKS) == 9
+    assert len(BLOCKS) == 11
     namespace = {}
     for block in BLOCKS:
         exec(block, namespace)
@@ -23,6 +26,8 @@ def test_readme_code_runs():
     assert namespace["density"].standard_error < 0.2
     assert namespace["short"].acceptance_rate > 0.95
     assert namespace["costs"].cheapest() is not None
+    assert 0.2 < namespace["posterior"].params.mean() < 2
+    assert namespace["sensitivity"] < 0
     assert namespace["densities"].value.shape == (500,)
     assert (namespace["densities"].standard_error < 0.5).mean() > 0.95
 
@@ -31,3 +36,8 @@ def test_readme_names_the_two_commands():
     text = README.read_text(encoding="utf-8")
     assert 'pip install ".[plot]" && python -m jaxbridge' in text
     assert 'pip install ".[test]" && pytest' in text
+
+
+def test_tables_are_those_of_the_stored_run():
+    table = markdown(load(ROOT / "notebooks" / "benchmark.json"))
+    assert table in README.read_text(encoding="utf-8")

@@ -18,7 +18,7 @@ def exact_derivatives():
         return ou_transitions_log_density(model.with_params(params), times, observations)
 
     b = model.params.B.reshape(-1)
-    return jax.grad(log_likelihood)(b), -jax.hessian(log_likelihood)(b)
+    return jax.jit(jax.grad(log_likelihood))(b), -jax.jit(jax.hessian(log_likelihood))(b)
 
 
 @pytest.mark.parametrize(
@@ -49,6 +49,7 @@ def test_score_and_information_are_derivatives_of_the_closed_form(proposal):
     assert np.abs(gradient).max() > 1
 
 
+@pytest.mark.slow
 def test_intervals_may_have_numbers_of_steps_of_their_own():
     model, times, observations = multivariate_ou()
     keep = np.array([0, 1, 2, 5, 6, 10, 11, 12])
