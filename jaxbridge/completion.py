@@ -144,7 +144,7 @@ class Completion(eqx.Module):
 
     def first(self, key: Key[Array, ""], model: Diffusion) -> Paths:
         """Paths to start from. Where the proposal finds none, whatever its weight, a modified
-        diffusion bridge serves: a chain may start anywhere."""
+        diffusion bridge serves, or a straight line: a chain may start anywhere."""
         model = model.prepared()
 
         def of_part(part, keys):
@@ -154,7 +154,12 @@ class Completion(eqx.Module):
             other = ModifiedDiffusionBridge().draw(
                 other_keys[:, None], model, intervals, num_steps, None, False
             )
-            return jnp.where(jnp.isfinite(found), found, other.paths[:, 0])
+            done = jnp.concatenate([jnp.zeros(1), jnp.cumsum(part.fractions)]).astype(found.dtype)
+            start, end = intervals.start[:, None], intervals.end[:, None]
+            path = start + done[:, None] * (end - start)
+            for better in (other.paths[:, 0], found):
+                path = jnp.where(is_there(better)[:, None, None], better, path)
+            return path
 
         return tuple(map(of_part, self.parts, self._keys(key)))
 
@@ -172,31 +177,18 @@ class Completion(eqx.Module):
     def log_likelihoods(
         self, model: Diffusion, paths: Paths, form: Form
     ) -> Float[Array, " intervals"]:
-        """Those of the paths, part by part; zero for a path that is missing."""
-        values = []
-        for part, mine in zip(self.parts, paths, strict=True):
-            there = is_there(mine)
-            whole = jnp.where(there[:, None, None], mine, part.intervals.start[:, None])
-            values.append(jnp.where(there, log_likelihoods(model, part.steps, whole, form), 0))
+        """Those of the paths, part by part."""
+        values = [
+            log_likelihoods(model, part.steps, mine, form)
+            for part, mine in zip(self.parts, paths, strict=True)
+        ]
         return jnp.concatenate(values)
 
     def points(self, paths: Paths) -> tuple[Float[Array, "points d"], Float[Array, " points"]]:
-        """All points of the paths but their ends, and the steps that begin there; none for a path
-        that is missing."""
-        points, steps = [], []
-        for part, mine in zip(self.parts, paths, strict=True):
-            there = is_there(mine)
-            whole = jnp.where(there[:, None, None], mine, part.intervals.start[:, None])
-            points.append(whole[:, :-1].reshape(-1, mine.shape[-1]))
-            steps.append(jnp.where(there, part.steps, 0).T.reshape(-1))
+        """All points of the paths but their ends, and the steps that begin there."""
+        points = [mine[:, :-1].reshape(-1, mine.shape[-1]) for mine in paths]
+        steps = [part.steps.T.reshape(-1) for part in self.parts]
         return jnp.concatenate(points), jnp.concatenate(steps)
-
-    def in_order(
-        self, values: Float[Array, "intervals *other"]
-    ) -> Float[Array, "intervals *other"]:
-        """Values of parts in the order of the intervals."""
-        order = jnp.concatenate([part.index for part in self.parts])
-        return jnp.zeros_like(values).at[order].set(values)
 
     def _keys(self, key: Key[Array, ""]) -> list[Key[Array, " I"]]:
         keys = jax.random.split(key, len(self.parts))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers, nondifferentiable
 from .bridges import check_key
-from .completion import Completion, Paths, complete, is_there
+from .completion import Completion, Paths, complete
 from .diffusion import Diffusion, check_diffusion
 from .intervals import check_count
 from .likelihood import Form, forms_of
@@ -58,13 +58,11 @@ class GibbsPosterior(AbstractPosterior):
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
     - `theta`: the unknown ones as vectors, shape (*chains, n, p).
-    - `log_likelihood`: of the completed path, before θ moved, shape (*chains, n).
     - `parameters_moved`: whether θ moved, shape (*chains, n).
     - `bridges_moved`: the share of bridges that were replaced, shape (*chains, n).
     - `num_simulated`: paths simulated or weighed, shape (*chains, n).
     - `num_missing`: bridges that were not found, though called for, within `max_proposals`, shape
-        (*chains, n). They stayed as they were, so that the law is right but the chain moves
-        less; where there never was a path, the interval is left out of the likelihood.
+        (*chains, n). They stayed as they were: the law is right, but the chain moves less.
     - `state`: where it ended; pass it as `init` to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.
@@ -72,7 +70,6 @@ class GibbsPosterior(AbstractPosterior):
 
     params: PyTree
     theta: Float[Array, "*chains n p"]
-    log_likelihood: Float[Array, "*chains n"]
     parameters_moved: Bool[Array, "*chains n"]
     bridges_moved: Float[Array, "*chains n"]
     num_simulated: Int[Array, "*chains n"]
@@ -210,7 +207,6 @@ class _Setting(eqx.Module):
 class _Sweep(NamedTuple):
     """What is told of one iteration."""
 
-    log_likelihood: Float[Array, "*chains"]
     parameters_moved: Bool[Array, "*chains"]
     bridges_moved: Float[Array, "*chains"]
     num_simulated: Int[Array, "*chains"]
@@ -237,13 +233,11 @@ def _iterate(
     model = setting.unknowns.at(state.theta)
     paths, renewed = setting.completion.renew(bridge_key, model, state.paths)
     step = setting.kernel.step(parameter_key, state.theta, setting.data(paths))
-    there = jnp.concatenate([is_there(mine) for mine in paths])
     sweep = _Sweep(
-        step.log_likelihood,
         step.accepted,
         jnp.mean(renewed.moved.astype(state.theta.dtype)),
         jnp.sum(renewed.num_simulated, dtype=jnp.int32),
-        jnp.sum(renewed.missing | ~there, dtype=jnp.int32),
+        jnp.sum(renewed.missing, dtype=jnp.int32),
     )
     return GibbsState(step.theta, paths), sweep
 
@@ -272,7 +266,6 @@ def _run(
         state, sweeps = lax.scan(iterate, state, keys)
         meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / num_iterations)
         told = _Sweep(
-            sweeps.log_likelihood[-1],
             jnp.any(sweeps.parameters_moved, axis=0),
             jnp.mean(sweeps.bridges_moved, axis=0),
             jnp.sum(sweeps.num_simulated, axis=0, dtype=jnp.int32),

@@ -107,7 +107,8 @@ def log_likelihoods(
     like = paths[0, 0]
     model = model.prepared()
     dynamics, form = model.forward(like), _form(model, like, form)
-    points = jnp.moveaxis(paths, (0, 1), (-1, -2))  # (d, K+1, P)
+    # (d, K+1, P), written out: loops over lanes that are not adjacent would not vectorise.
+    points = lax.optimization_barrier(jnp.moveaxis(paths, (0, 1), (-1, -2)))
     if form == "ito":
         return _ito(model, dynamics, steps, points)
     d, num_points, num_paths = points.shape

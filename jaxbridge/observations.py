@@ -102,7 +102,7 @@ def step_groups(
         )
     if isinstance(step_size, bool) or not isinstance(step_size, int | float) or not step_size > 0:
         raise ValueError(f"`step_size` must be a positive number; got {step_size!r}.")
-    wanted = np.maximum(np.asarray(durations, float) / step_size * (1 - 1e-6), 1)
+    wanted = np.maximum(np.asarray(durations, float) / step_size * (1 - 1e-4), 1)
     levels = np.ceil(np.log2(wanted) * _STEPS_PER_OCTAVE) / _STEPS_PER_OCTAVE
     numbers = np.ceil(2**levels * (1 - 1e-9)).astype(int)
     groups = []

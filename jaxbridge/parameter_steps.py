@@ -41,12 +41,10 @@ _SCALES = (1.0, 0.3)
 
 
 class ParameterStep(NamedTuple):
-    """θ after a step, whether it moved, and the log likelihood of the paths before, at the old
-    θ."""
+    """θ after a step, and whether it moved."""
 
     theta: Float[Array, " p"]
     accepted: Bool[Array, ""]
-    log_likelihood: Float[Array, ""]
 
 
 class CompleteData(NamedTuple):
@@ -119,7 +117,7 @@ class NormalDraw(AbstractParameterKernel):
     """θ from its normal law given the paths."""
 
     def step(self, key, theta, data):
-        value, gradient, hessian = _expansion(data.log_posterior_inside, theta)
+        gradient, hessian = _derivatives(data.log_posterior_inside, theta)
         root = any_cholesky(-hessian)
         mean = theta + _solve_root(root, gradient)
 
@@ -134,7 +132,7 @@ class NormalDraw(AbstractParameterKernel):
             return (i < _MOST_DRAWS) & ~ok
 
         _, drawn, ok = lax.while_loop(missed, draw, (jnp.int32(0), theta, jnp.asarray(False)))
-        return ParameterStep(jnp.where(ok, drawn, theta), ok, value - data.log_prior(theta))
+        return ParameterStep(jnp.where(ok, drawn, theta), ok)
 
 
 class NewtonStep(AbstractParameterKernel):
@@ -165,8 +163,7 @@ class NewtonStep(AbstractParameterKernel):
         log_ratio -= log_density(proposed, mean, root)
         # A comparison with NaN is false, and refuses.
         accepted = ok & (jnp.log(jax.random.uniform(accept_key, dtype=theta.dtype)) < log_ratio)
-        log_likelihood = value - data.log_prior(theta)
-        return ParameterStep(jnp.where(accepted, proposed, theta), accepted, log_likelihood)
+        return ParameterStep(jnp.where(accepted, proposed, theta), accepted)
 
 
 class GivenKernel(AbstractParameterKernel):
@@ -184,7 +181,7 @@ class GivenKernel(AbstractParameterKernel):
         moved = data.unknowns.vector(state.position)
         ok = allowed(data.constraint, data.unknowns, moved)
         moved = jnp.where(ok, moved, theta)
-        return ParameterStep(moved, jnp.any(moved != theta), data.log_likelihood(theta))
+        return ParameterStep(moved, jnp.any(moved != theta))
 
 
 def choose_kernel(
@@ -202,12 +199,12 @@ def choose_kernel(
     return NormalDraw() if exact else NewtonStep()
 
 
-def _expansion(
+def _derivatives(
     function: Callable[[Array], Array], theta: Float[Array, " p"]
-) -> tuple[Float[Array, ""], Float[Array, " p"], Float[Array, "p p"]]:
-    """Value, gradient and Hessian; forward over reverse where there are many parameters."""
+) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
+    """Gradient and Hessian; forward over reverse where there are many parameters."""
     gradient = jax.jacfwd(function) if theta.shape[0] < 3 else jax.grad(function)
-    return function(theta), gradient(theta), jax.jacfwd(gradient)(theta)
+    return gradient(theta), jax.jacfwd(gradient)(theta)
 
 
 def _solve_root(root: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:

@@ -15,7 +15,6 @@ class AbstractPosterior(eqx.Module):
 
     params: eqx.AbstractVar[PyTree]
     theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
-    log_likelihood: eqx.AbstractVar[Float[Array, "*chains n"]]
 
     @property
     def _chains(self) -> Float[Array, "chains n p"]:
@@ -43,7 +42,6 @@ class AbstractPosterior(eqx.Module):
             jax.tree_util.keystr(path, simple=True, separator=".") or "theta": of_chains(leaf)
             for path, leaf in leaves
         }
-        groups = {"posterior": posterior, "sample_stats": {"lp": of_chains(self.log_likelihood)}}
         if int(arviz.__version__.split(".")[0]) >= 1:
-            return arviz.from_dict(groups)
-        return arviz.from_dict(**groups)
+            return arviz.from_dict({"posterior": posterior})
+        return arviz.from_dict(posterior=posterior)

@@ -31,6 +31,7 @@ def assert_posterior(draws, mean, sd, allowance=0.02):
     assert abs(draws.std() / sd - 1) < 5 / np.sqrt(2 * n) + allowance
 
 
+SLOW = pytest.mark.slow
 PROPOSALS = {
     "bridge": (jb.ModifiedDiffusionBridge(TRAPEZOID), None),
     "renewal": (jb.Coupling(0.5), None),
@@ -39,7 +40,9 @@ PROPOSALS = {
 }
 
 
-@pytest.mark.parametrize("name", PROPOSALS)
+@pytest.mark.parametrize(
+    "name", ["bridge", "renewal", *(pytest.param(n, marks=SLOW) for n in ("counts", "auto"))]
+)
 def test_posterior_is_exact(name):
     proposal, method = PROPOSALS[name]
     made = jb.gibbs(
@@ -58,6 +61,7 @@ def test_posterior_is_exact(name):
     assert_posterior(made.params[0][100:], *exact_moments())
 
 
+@SLOW
 def test_approximate_bridges_shift_the_posterior():
     """The very gates of the exact sampler, which must fail here."""
     times = np.arange(0, 60, 1.0)
@@ -79,6 +83,7 @@ def test_approximate_bridges_shift_the_posterior():
     assert shift > 0.2
 
 
+@SLOW
 def test_other_priors_and_kernels_have_their_posteriors():
     """A prior that is not normal calls for Metropolis–Hastings; so does a kernel of the user's."""
     import blackjax
@@ -130,6 +135,7 @@ def test_chains_start_where_they_are_told_and_go_on():
     np.testing.assert_array_equal(more.theta, again.theta)
 
 
+@SLOW
 def test_a_chain_is_the_same_alone_inside_jit_and_vmap():
     options = dict(OPTIONS, num_steps=8, proposal=jb.Coupling(0.5), num_iterations=20)
     data = jnp.stack([jnp.asarray(ou_data(seed, TIMES)) for seed in (3, 4)])
