@@ -333,5 +333,7 @@ def write_bayes_figures(examples: Sequence[Example], directory: Path) -> list[Pa
     }
     paths = [directory / name for name in pictures]
     for path, axes in zip(paths, pictures.values(), strict=True):
-        axes.figure.savefig(path, dpi=150)
+        figure = axes.get_figure(root=True)
+        assert figure is not None
+        figure.savefig(path, dpi=150)
     return paths

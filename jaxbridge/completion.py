@@ -211,7 +211,7 @@ def complete(
     proposal: Any,
     bridges: Literal["exact", "approximate"],
     method: Literal["pseudo_marginal", "renewal"] | None,
-    *bounds: int | None,
+    bounds: tuple[int | None, int | None, int | None],
 ) -> Completion:
     """The completion that the user asked for; pilot runs and burn-ins are at the parameters of
     this model.
@@ -230,7 +230,7 @@ def complete(
     keys = jax.random.split(key, len(groups))
     parts = []
     for part_key, group in zip(keys, groups, strict=True):
-        mine = jax.tree.map(lambda leaf, index=group.index: leaf[index], intervals)
+        mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
         chosen = as_proposal(given, model, mine.start[0], *bounds)
         chosen.check(model, mine)
         if bridges == "approximate" or method == "renewal":
@@ -245,5 +245,5 @@ def complete(
             kernel = ByWeights(chosen)
         fractions = np.diff(chosen.fractions(group.num_steps))
         fractions = jnp.asarray(fractions, mine.duration.dtype)
-        parts.append(_Part(mine, kernel, jnp.asarray(group.index), fractions))
+        parts.append(_Part(mine, kernel, jnp.asarray(group.which), fractions))
     return Completion(tuple(parts))

@@ -176,7 +176,7 @@ def gibbs(
     complete_key, run_key = jax.random.split(key)
     groups = step_groups(intervals.duration, num_steps, step_size)
     bounds = (num_counts, max_proposals, max_trials)
-    arguments = (intervals, groups, proposal, bridges, method, *bounds)
+    arguments = (intervals, groups, proposal, bridges, method, bounds)
     completion = complete(complete_key, pilot_model, *arguments)
     form = quadratic_form(unknowns, theta.reshape(-1, theta.shape[-1])[0], like)
     kernel = choose_kernel(parameter_kernel, form is not None, log_prior)
@@ -281,4 +281,14 @@ def _run(
     as_params = jax.vmap(setting.unknowns.all)
     params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
     exact = isinstance(setting.kernel, NormalDraw)
-    return GibbsPosterior(params, theta, *told, state, setting.completion, exact)
+    return GibbsPosterior(
+        params,
+        theta,
+        told.parameters_moved,
+        told.bridges_moved,
+        told.num_simulated,
+        told.num_missing,
+        state,
+        setting.completion,
+        exact,
+    )

@@ -141,7 +141,7 @@ def maximum_likelihood(
     complete_key, run_key, score_key = jax.random.split(key, 3)
     groups = step_groups(intervals.duration, num_steps, step_size)
     bounds = (num_counts, max_proposals, max_trials)
-    completion = complete(complete_key, model, intervals, groups, proposal, "exact", None, *bounds)
+    completion = complete(complete_key, model, intervals, groups, proposal, "exact", None, bounds)
     form = quadratic_form(unknowns, theta, like) or forms_of(model, like)[0]
     rule = _EM() if method == "em" else _Gradient(optimizer or optax.adam(1e-2))
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
@@ -195,7 +195,7 @@ class _Gradient(eqx.Module):
     def update(self, i, theta, state, data: CompleteData, num_intervals):
         gradient = jax.grad(data.log_likelihood)(theta) / num_intervals
         updates, state = self.optimizer.update(-gradient, state, theta)
-        return optax.apply_updates(theta, updates), state
+        return theta + jnp.asarray(updates), state
 
 
 class _EM(eqx.Module):
@@ -251,7 +251,7 @@ def _approximate(
             jax.random.fold_in(run_key, i), unknowns.at(state.theta), state.paths
         )
         data = CompleteData(
-            unknowns, completion, paths, lambda _: 0.0, setting.constraint, setting.form
+            unknowns, completion, paths, jnp.zeros_like, setting.constraint, setting.form
         )
         moved, rule = setting.rule.update(i, state.theta, state.rule, data, num_intervals)
         inside = allowed(setting.constraint, unknowns, moved)

@@ -19,7 +19,7 @@ _STEPS_PER_OCTAVE = 2
 class Group(NamedTuple):
     """Intervals with the same number of steps, and which of the intervals they are."""
 
-    index: Int[np.ndarray, " I"]
+    which: Int[np.ndarray, " I"]
     num_steps: int
 
 

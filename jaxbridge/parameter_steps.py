@@ -95,7 +95,7 @@ def quadratic_form(
     steps, paths = jnp.ones((1, 1), like.dtype), jnp.stack([like, like])[None]
     for form in forms_of(unknowns.model, like):
 
-        def log_likelihood(theta, form=form):
+        def log_likelihood(theta, form: Form = form):
             return log_likelihoods(unknowns.at(theta), steps, paths, form)[0]
 
         if not uses_argument(jax.jacfwd(jax.jacfwd(log_likelihood)), theta):

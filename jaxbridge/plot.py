@@ -294,8 +294,8 @@ def effect_costs(costs: Sequence[Any], ax: Axes | None = None) -> Axes:
 
 def posterior(
     draws: Mapping[str, Float[Reals, " n"]],
-    grid: Float[Reals, " m"] | None = None,
-    curves: Mapping[str, Float[Reals, " m"]] | None = None,
+    grid: Float[Reals, " m"],
+    curves: Mapping[str, Float[Reals, " m"]],
     label: str = "parameter",
     ax: Axes | None = None,
 ) -> Axes:
@@ -317,7 +317,7 @@ def posterior(
             linewidth=1.2,
             label=name,
         )
-    for i, (name, density) in enumerate((curves or {}).items()):
+    for i, (name, density) in enumerate(curves.items()):
         dashes = ("-", *_DASHES)[i % (len(_DASHES) + 1)]
         ax.plot(grid, density, color=_EXACT, linestyle=dashes, linewidth=1.0, label=name)
     spread = everything.max() - everything.min()

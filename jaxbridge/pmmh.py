@@ -160,7 +160,7 @@ def pmmh(
     parts = []
     groups = step_groups(intervals.duration, num_steps, step_size)
     for part_key, group in zip(jax.random.split(pilot_key, len(groups)), groups, strict=True):
-        mine = jax.tree.map(lambda leaf, index=group.index: leaf[index], intervals)
+        mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
         chosen = as_proposal(
             proposal, pilot_model, like, num_counts, None, max_trials, for_density=True
         )

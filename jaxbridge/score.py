@@ -109,7 +109,7 @@ def score(
     moments, sizes, order = [], [], []
     groups = step_groups(intervals.duration, num_steps, step_size)
     for group_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
-        mine = jax.tree.map(lambda leaf, index=group.index: leaf[index], intervals)
+        mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
         chosen = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
         chosen.check(model, mine)
         chosen = settled(chosen, group_key, model, mine, group.num_steps)
@@ -119,7 +119,7 @@ def score(
         )
         moments.append(made)
         sizes.append(size)
-        order.append(group.index)
+        order.append(group.which)
     gradient, covariance, information = jax.tree.map(lambda *parts: sum(parts), *moments)
     size = jnp.concatenate(sizes)[np.argsort(np.concatenate(order))]
     error = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
@@ -199,5 +199,4 @@ def _interval_moments(
     covariance = jnp.sum(weights[..., None, None] ** 2 * products, axis=1)
     information = -jnp.sum(weights[..., None, None] * H, axis=1) - spread
     size = jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1), 0)
-    sums = tuple(jnp.sum(part, axis=0) for part in (mean, covariance, information))
-    return sums, size
+    return (mean.sum(axis=0), covariance.sum(axis=0), information.sum(axis=0)), size
