@@ -67,9 +67,10 @@ left from first to second order where sigma is constant; elsewhere it gains less
 _WHAT_TO_SEE_BAYES = """\
 "shift / sd" is the distance from the exact posterior mean in posterior standard deviations, with
 its Monte Carlo error; "worth" is the effective number of draws, "moved" the share of bridges
-that an iteration replaces, "first" the seconds with compilation, and "/numbers" those without,
-in multiples of the time to draw one path's numbers for each interval and iteration. The exact
-posterior is by Brownian bridges; where observations are far apart, by the stationary law.
+that an iteration replaces. "seconds" are without "start", the seconds of compilation and of pilot
+runs; "/numbers" is in multiples of the time to draw one path's numbers for each interval and
+iteration; "paths" are those of an iteration in the second and in the last quarter of the run. The
+exact posterior is by Brownian bridges; where observations are far apart, by the stationary law.
 Approximate bridges shift the posterior, exact ones do not; with Heun's scheme 12 steps give the
 posterior of 50."""
 
