@@ -16,6 +16,7 @@ from jaxbridge.bayes_study import (
 )
 
 
+@pytest.mark.slow
 def test_brownian_bridges_give_the_likelihood_of_the_trapezoid_rule():
     """The same posterior from `transition_log_density` with modified diffusion bridges."""
     data = hyperbolic_data(jax.random.key(0), 20, 1.0)

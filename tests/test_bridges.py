@@ -170,6 +170,7 @@ def test_one_dimension_and_independent_copies():
         assert_moments(bridges.paths[:, k], exact.mean[k], exact.covariance[k])
 
 
+@pytest.mark.slow
 def test_precisions_agree_in_law(precision):
     bridges = jb.sample_bridges(
         jax.random.key(1),
@@ -335,6 +336,7 @@ def quantity(params, start, end, duration, coupling=None):
     return jnp.sum(bridges.paths[:, 10] ** 2)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_at_fixed_noise_and_meeting_step(x64):
     """Forward and reverse mode against central differences, too small to move a meeting."""
     params = jb.OrnsteinUhlenbeckParams(jnp.asarray(NON_REVERSIBLE), jnp.zeros(2), jnp.eye(2))
@@ -400,6 +402,7 @@ def test_gradients_stay_finite_where_no_bridge_was_found():
     assert jnp.isfinite(derivative)
 
 
+@pytest.mark.slow
 def test_derivatives_at_a_traced_reflection_are_finite():
     def path(start, gamma):
         bridges = jb.sample_bridges(
@@ -440,6 +443,7 @@ def test_changed_numbers_do_not_recompile():
     assert cached._cache_size() == 1
 
 
+@pytest.mark.slow
 def test_under_jit_and_inside_vmap_over_parameters():
     def mean(rate):
         model = jb.hyperbolic(1.0, 2).with_params(rate)

@@ -67,6 +67,7 @@ def test_chain_midpoints_have_the_exact_law(name, method):
     assert stationary or method == "renewal" or np.ptp(chain.log_weights) > 0
 
 
+@pytest.mark.slow
 def test_published_chain_fails_the_same_test():
     """The paper's exact algorithm with the printed start law is 0.18 standard deviations off."""
     case = exact_case(paper_model(), *PAPER_CASES["very unlikely"], 1.0, 0.5)
@@ -103,6 +104,7 @@ ARGUMENTS = (paper_model(), [0.785, 0.785], [1.091, 1.091], 1.0)
         pytest.param("renewal", FITTED, id="renewal-mu"),
     ],
 )
+@pytest.mark.slow
 def test_batched_chain_is_the_kernel_stepped(method, law):
     """Also where the renewal chain runs in several segments."""
     key, num_bridges = jax.random.key(5), 300
@@ -164,6 +166,7 @@ def test_several_intervals_are_several_chains(method):
 
 
 @pytest.mark.parametrize("method", [pytest.param("pseudo_marginal", marks=slow), "renewal"])
+@pytest.mark.slow
 def test_blackjax_runs_the_kernels(method):
     """The runner touches `init(position, key)` and `step(key, state)` only."""
     kernel = getattr(jb, method)(*ARGUMENTS, num_steps=20, proposal=jb.Coupling(0.5))
@@ -267,6 +270,7 @@ def test_cut_off_counts_are_flagged():
     assert np.isfinite(chain.log_weights).all() and np.isfinite(chain.paths).all()
 
 
+@pytest.mark.slow
 def test_numbers_change_without_compiling_again():
     model = paper_model()
 

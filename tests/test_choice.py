@@ -81,6 +81,7 @@ def test_thousands_of_intervals_with_different_choices_keep_the_law():
         pytest.param(60.0, HYPERBOLIC, {"Coupling(0)", "Coupling(0.5)"}, marks=slow),
     ],
 )
+@pytest.mark.slow
 def test_auto_takes_what_theory_says_is_best(duration, model, winners):
     """Brownian bridges where the drift hardly matters, the true density of a linear process, and
     couplings on long intervals of a nonlinear one."""
@@ -103,6 +104,7 @@ def test_a_candidate_that_cannot_win_makes_no_pilot_run():
     assert "chosen for" in str(choice) and "1 of 1" in str(choice)
 
 
+@pytest.mark.slow
 def test_densities_are_not_mixed_where_they_have_different_constants():
     """A coupling from the stationary law needs a normalised log ν; the others none."""
     model = jb.langevin(lambda x, p: p - 1.5 * x @ x, 7.0)

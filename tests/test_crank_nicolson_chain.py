@@ -27,6 +27,7 @@ def batch_means(values, num_batches=40):
     "proposal, step_size",
     [pytest.param(jb.ModifiedDiffusionBridge(), 0.4, marks=pytest.mark.slow), (jb.Guided(), 0.7)],
 )
+@pytest.mark.slow
 def test_chain_has_the_law_that_weights_give(proposal, step_size):
     """Mean and variance at a third of the time, and the share of paths that have crossed."""
     third = lambda path: path[20, 0]
@@ -68,6 +69,7 @@ def test_chain_has_the_law_of_the_closed_form():
             assert abs(mean - exact) < 5 * error + 0.01  # the allowance is for the step
 
 
+@pytest.mark.slow
 def test_chain_is_that_of_the_kernel_and_runs_in_blackjax():
     arguments, options = (paper_model(), [0.3, 0.1], [-0.2, 0.4], 1.0), dict(num_steps=8)
     run_key, init_key = jax.random.split(jax.random.key(0))

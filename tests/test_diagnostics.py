@@ -72,6 +72,7 @@ def test_chains_that_do_not_move():
         jb.effective_sample_size([1.0, 2.0])
 
 
+@pytest.mark.slow
 def test_errors_say_what_to_change(unchecked):
     model, key = paper_model(), jax.random.key(0)
     bridges = jb.sample_bridges(key, model, [0.0, 0.0], [0.5, 0.0], 1.0, num_bridges=3)

@@ -89,6 +89,7 @@ def test_function_may_depend_on_parameters(bridges):
     np.testing.assert_allclose(jax.jacfwd(scaled)(B), expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_chains_and_several_intervals():
     model = multivariate_ou()[0]
     starts = jnp.array([ENDS[0], [0.0, 0.0]])

@@ -148,6 +148,7 @@ def test_the_log_stationary_density_is_normalised(name, x64):
     np.testing.assert_allclose(model.log_stationary(x), stationary.logpdf(x), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_transition_density_is_differentiable_in_the_parameters(x64):
     step, x = 1e-5, jnp.array([0.3, 0.1])
 

@@ -149,6 +149,7 @@ def test_a_chain_is_the_same_alone_inside_jit_and_vmap():
     np.testing.assert_allclose(jax.jit(jax.vmap(run))(keys, data)[1], alone, rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_intervals_of_many_lengths():
     times = np.array([0.0, 0.1, 0.2, 1.2, 5.2, 5.3, 6.3, 7.3])
     made = jb.gibbs(
@@ -167,6 +168,7 @@ def test_intervals_of_many_lengths():
         assert (durations[np.asarray(part.index)] / part.num_steps < 0.1001).all()
 
 
+@pytest.mark.slow
 def test_four_unknown_drifts_of_a_rotating_process():
     """Given the paths B is normal with the moments of least squares; B may be any stable matrix."""
     model, times, data = multivariate_ou()
@@ -191,7 +193,14 @@ def test_four_unknown_drifts_of_a_rotating_process():
 def test_arviz_takes_the_draws():
     arviz = pytest.importorskip("arviz")
     made = jb.gibbs(
-        jax.random.key(0), ou_1d(), TIMES, DATA, num_iterations=10, num_steps=5, **OPTIONS
+        jax.random.key(0),
+        ou_1d(),
+        TIMES,
+        DATA,
+        num_iterations=10,
+        num_steps=5,
+        proposal=jb.ModifiedDiffusionBridge(),
+        **OPTIONS,
     )
     data = made.to_arviz()
     assert set(data.posterior.data_vars) == {"0", "1"}

@@ -385,6 +385,7 @@ def test_brownian_bridges_are_nearly_exact_for_the_hyperbolic_diffusion(ends):
     assert weighted.effective_sample_size > 0.95 * 20_000
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_blocks_and_keep_what_is_stored():
     model, arguments = paper_model(), ([0.3, 0.1], [-0.2, 0.4], 0.5)
     options = dict(num_steps=7, proposal=jb.Guided())
@@ -408,6 +409,7 @@ def test_results_do_not_depend_on_blocks_and_keep_what_is_stored():
     np.testing.assert_array_equal(some.paths, few.paths[:, np.array([0, 3, 7])])
 
 
+@pytest.mark.slow
 def test_thousands_of_intervals_without_compiling_again():
     rng = np.random.default_rng(0)
     model = paper_model()

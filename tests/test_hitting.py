@@ -138,6 +138,7 @@ def test_bounds_are_kept_and_flagged():
     assert np.isfinite(some.mean).all() and np.isfinite(some.probability).all()
 
 
+@pytest.mark.slow
 def test_missing_bridges_are_not_tried():
     bridges = jb.sample_bridges(
         jax.random.key(0), paper_model(), [0.0, 0.0], [9.0, 0.0], 0.01, max_proposals=3

@@ -150,6 +150,7 @@ def test_missing_bridges_weigh_nothing():
 @pytest.mark.parametrize(
     "mean, covariance", [([40.0, 40.0], 0.01), ([0.0, 0.0], 1e-4), ([5.0, -5.0], 0.2)]
 )
+@pytest.mark.slow
 def test_a_law_that_does_not_cover_is_flagged_and_finite(mean, covariance):
     law = jb.GaussianLaw(mean, covariance * jnp.eye(2))
     case = exact_case(paper_model(), [2.0, -2.0], [3.0, -3.0], 1.0, 0.5, law)
@@ -194,6 +195,7 @@ def test_double_precision():
             assert chain.num_simulated.dtype == "int32"
 
 
+@pytest.mark.slow
 def test_numbers_change_without_compiling_again():
     model = paper_model()
 

@@ -92,6 +92,7 @@ def test_equals_vmap(name, precision):
 
 
 @pytest.mark.parametrize("name", sorted(set(FUNCTIONS) - {"any", "converted", "constant"}))
+@pytest.mark.slow
 def test_derivatives_equal_those_of_vmap(name):
     function, x, tangent = FUNCTIONS[name], _points(), _points(seed=1)
     by_lanes, by_vmap = over_lanes(-1)(function), jax.vmap(function, in_axes=-1, out_axes=-1)

@@ -34,6 +34,7 @@ def exact_maximum():
 
 
 @pytest.mark.parametrize("method", ["em", pytest.param("gradient", marks=pytest.mark.slow)])
+@pytest.mark.slow
 def test_finds_the_maximum(method):
     model, times, observations = multivariate_ou()
     exact, covariance = exact_maximum()

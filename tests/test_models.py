@@ -57,6 +57,7 @@ def test_the_hyperbolic_sampler_follows_the_precision_of_alpha(precision):
     assert np.all(np.isfinite(point))
 
 
+@pytest.mark.slow
 def test_a_whole_number_alpha_is_a_number_like_any_other():
     whole, floating = jb.hyperbolic(1, 2), jb.hyperbolic(1.0, 2)
     x, key = jnp.ones(2), jax.random.key(0)

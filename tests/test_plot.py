@@ -42,6 +42,7 @@ def test_qq_of_the_exact_law_lies_on_the_diagonal():
     np.testing.assert_allclose(shifted[2:-2] - x, 1, atol=0.02)
 
 
+@pytest.mark.slow
 def test_figures_render(tmp_path):
     model, ends = paper_model(), ([0.0, 0.0], [1.0, 1.0])
     bridges = jb.sample_bridges(jax.random.key(0), model, *ends, 2.0, num_bridges=200)

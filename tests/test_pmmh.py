@@ -56,6 +56,7 @@ def test_posterior_is_exact(proposal):
     assert (made.params[1] > 0).all()
 
 
+@pytest.mark.slow
 def test_goes_on_from_its_state_and_may_start_anywhere():
     options = dict(OPTIONS, num_proposals=5, num_chains=2, proposal=jb.ModifiedDiffusionBridge())
     arguments = (ou_1d(), TIMES, DATA)

@@ -52,6 +52,7 @@ def test_driven_path_is_the_forward_diffusion(gamma, scheme):
     assert_moments(made.paths[-1].T, exact.mean, exact.covariance, mean_allowance=allowance)
 
 
+@pytest.mark.slow
 def test_replays_join_where_they_are_told():
     model, coupling = paper_model(), jb.Coupling(0.5)
     arguments = (model, coupling, [0.5, 0.5], [0.0, 1.0], 1.0, 500)
@@ -67,6 +68,7 @@ def test_replays_join_where_they_are_told():
     assert (np.asarray(joined.paths)[-1].T[met] == np.float32([0.0, 1.0])).all()
 
 
+@pytest.mark.slow
 def test_meeting_step_is_the_first_sign_change():
     """σ = I and the sign test, recomputed in NumPy from the two unjoined paths."""
     model = paper_model()
@@ -83,6 +85,7 @@ def test_meeting_step_is_the_first_sign_change():
     np.testing.assert_array_equal(found[later], expected[later])
 
 
+@pytest.mark.slow
 def test_stored_steps_are_those_of_the_whole_path():
     model = paper_model()
     keys = jax.random.split(jax.random.key(0), 50)

@@ -154,6 +154,7 @@ def test_paths_are_stored_where_they_are_asked_for(save_at):
 
 
 @pytest.mark.parametrize("num_steps", [50, 200])
+@pytest.mark.slow
 def test_associated_paths_stop_early_where_the_table_says(num_steps):
     scene = SCENES["crossing"]
     table = jb.effects(*scene, at=jnp.zeros(D), num_steps=num_steps)

@@ -110,6 +110,7 @@ def test_a_start_for_each_path():
     np.testing.assert_allclose(paths[:, 1], starts, atol=0.02)
 
 
+@pytest.mark.slow
 def test_without_a_start_paths_are_stationary():
     paths = jb.simulate(jax.random.key(0), process(), None, TIMES, num_paths=NUM_PATHS)
     stationary = scipy.linalg.solve_continuous_lyapunov(B, SIGMA @ SIGMA.T)

@@ -68,6 +68,7 @@ def test_burn_in_does_not_depend_on_the_duration_much():
     assert min(times) > 6 and max(times) <= 40, times
 
 
+@pytest.mark.slow
 def test_any_law_with_a_density_and_a_sampler_serves():
     """A module, a plain object and a `GaussianLaw` of the same law give the same starts."""
 

@@ -33,6 +33,7 @@ def test_density_is_that_of_the_closed_form(name):
     print(f"{name}: {np.exp(float(estimate.value) - case.log_density):.4f} +- {error:.4f}")
 
 
+@pytest.mark.slow
 def test_published_start_law_fails():
     """Theorem 1 as printed starts the associated diffusion from p*_T(b, ·), which finds the
     bridge far too easily: 0.02 of the density remains."""
@@ -123,6 +124,7 @@ def test_thousands_of_pairs_at_once_without_compiling_again():
     assert len(compiled) == 0
 
 
+@pytest.mark.slow
 def test_nothing_met_is_minus_infinity_and_said():
     estimate = jb.transition_log_density(
         jax.random.key(0), paper_model(), [0.0, 0.0], [5.0, 5.0], 0.01, num_proposals=50
@@ -131,6 +133,7 @@ def test_nothing_met_is_minus_infinity_and_said():
     assert estimate.num_met == 0 and estimate.effective_sample_size == 0
 
 
+@pytest.mark.slow
 def test_a_law_that_nothing_hits_from_is_flagged():
     law = jb.GaussianLaw([30.0, -30.0], 0.01 * jnp.eye(2))
     estimate = jb.transition_log_density(

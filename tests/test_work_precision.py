@@ -79,6 +79,7 @@ def test_exact_transitions_have_hardly_a_step_error():
     assert density.error < 5 * density.uncertainty + 0.12  # Heun's is 0.21 with so few steps
 
 
+@pytest.mark.slow
 def test_the_closed_form_serves_functions_of_the_path():
     result = jb.work_precision(
         KEY,
