@@ -65,6 +65,21 @@ def test_effective_sample_size_of_an_autoregression(correlation):
     np.testing.assert_allclose(size, other, rtol=0.05)
 
 
+def test_chains_that_agree_have_r_hat_near_one():
+    draws = np.random.default_rng(0).normal(size=(4, 500, 2))
+    made = jb.potential_scale_reduction(draws)
+    halves = jnp.asarray(np.concatenate([draws[:, :250], draws[:, 250:]]))
+    np.testing.assert_allclose(
+        made, blackjax.diagnostics.potential_scale_reduction(halves), rtol=1e-3
+    )
+    assert (made < 1.02).all()
+    draws[0, :, 1] += 1
+    apart = jb.potential_scale_reduction(draws)
+    assert apart[0] < 1.02 and apart[1] > 1.05
+    with pytest.raises(ValueError, match="at least 4 draws"):
+        jb.potential_scale_reduction(draws[:, :3])
+
+
 def test_chains_that_do_not_move():
     assert jb.effective_sample_size(np.ones(100)) == 1
     assert np.isnan(jb.effective_sample_size(np.full(100, np.nan)))

@@ -42,6 +42,16 @@ def test_qq_of_the_exact_law_lies_on_the_diagonal():
     np.testing.assert_allclose(shifted[2:-2] - x, 1, atol=0.02)
 
 
+def test_posteriors_and_traces_show_every_sampler():
+    draws = {name: np.random.default_rng(0).normal(size=200) for name in ("one", "two")}
+    grid = np.linspace(-3, 3, 50)
+    ax = plot.posterior(draws, grid, {"exact": np.exp(-(grid**2) / 2)}, label="α")
+    labels = {text.get_text() for text in ax.get_legend().get_texts()}
+    assert labels == {"one", "two", "exact"} and ax.get_xlabel() == "α"
+    ax = plot.trace(draws, level=0.0)
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), draws["one"])
+
+
 @pytest.mark.slow
 def test_figures_render(tmp_path):
     model, ends = paper_model(), ([0.0, 0.0], [1.0, 1.0])
