@@ -40,7 +40,7 @@ def expectation(
     - `model`: the model, at the parameters in which derivatives are taken.
 
     **Returns:** what `fn` returns, averaged; with a leading axis I for I intervals. Bridges that
-    are missing have no weight.
+    are missing have no weight; NaN where all of an interval are.
 
     **Raises:** `TypeError` for other bridges; `ValueError` where they were not kept whole.
 
