@@ -12,10 +12,10 @@ import jax
 
 from .accuracy_study import (
     format_accuracy,
-    format_costs,
+    format_effects,
+    format_sigmas,
     run_accuracy,
     run_effect_costs,
-    run_sigma_costs,
     write_accuracy_figures,
 )
 from .bayes_study import format_bayes, run_bayes, write_bayes_figures
@@ -194,12 +194,10 @@ def _accuracy(options: argparse.Namespace) -> list[Path]:
     quick = " (--quick: expect larger errors)" if options.quick else ""
     print(f"What accuracy costs in time{quick}\n")
     results = run_accuracy(key, 1_000 if options.quick else 50_000, _say, options.quick)
-    num_bridges = 1_000 if options.quick else 20_000
-    effects = run_effect_costs(key, num_bridges, _say)
-    sigmas = run_sigma_costs(key, num_bridges, (2,) if options.quick else (2, 5, 10), _say)
+    effects = run_effect_costs(key, 1_000 if options.quick else 20_000, _say)
     _end_progress()
     print(f"{format_accuracy(results)}\n\n{_WHAT_TO_SEE_ACCURACY}\n")
-    print(f"{format_costs(effects, sigmas)}\n")
+    print(f"{format_effects(effects)}\n")
     return write_accuracy_figures(results, effects, options.out)
 
 
@@ -224,7 +222,7 @@ def _bench(options: argparse.Namespace) -> list[Path]:
     results = run_benchmark(key, scale, durations, chosen, dimensions, _say)
     _end_progress()
     save(results, options.out / "benchmark.json")
-    print(f"{format_ratios(results)}\n\n{format_costs(results.effects, results.sigmas)}\n")
+    print(f"{format_ratios(results)}\n\n{format_sigmas(results.sigmas)}\n")
     print(f"Which proposal for which duration\n\n{format_crossover(results.rates)}\n")
     print(f"{_WHAT_TO_SEE_CROSSOVER}\n\nall figures in {options.out / 'benchmark.json'}\n")
     return write_crossover_figure(results.rates, options.out)

@@ -107,6 +107,7 @@ def run_accuracy(
         **options,
     )
     on_start("a full sigma(x)")
+    options |= {"num_bridges": num_bridges, "repeats": 1}
     other, start, end, reference = sinh_model()
     results["a full σ(x)"] = work_precision(
         key,
@@ -115,7 +116,7 @@ def run_accuracy(
         end,
         1.0,
         proposals=better[1:3],
-        num_steps=all_steps,
+        num_steps=all_steps[:3],
         methods=("weights",),
         reference=reference,
         **options,
@@ -308,11 +309,16 @@ def _not_declared(sigma: Callable | None = None) -> Diffusion:
     return Diffusion(lambda x, p: -x, sigma, lambda x, p: -jnp.sum(x * x))
 
 
-def format_costs(effects: Sequence[EffectCost], sigmas: Sequence[tuple[int, float, float]]) -> str:
-    """Nanoseconds of a path and step."""
+def format_effects(costs: Sequence[EffectCost]) -> str:
+    """What each effect costs."""
     lines = ["Nanoseconds of a path and step, d = 2"]
-    lines += [f"  {cost.scene:<34} {cost.nanoseconds:8.0f}" for cost in effects]
-    lines += ["", f"{'dimension':>10} {'σ = I':>8} {'full σ(x)':>10} {'ratio':>7}"]
+    return "\n".join(lines + [f"  {cost.scene:<34} {cost.nanoseconds:8.0f}" for cost in costs])
+
+
+def format_sigmas(sigmas: Sequence[tuple[int, float, float]]) -> str:
+    """What a full σ(x) costs."""
+    lines = ["Nanoseconds of a path and step"]
+    lines += [f"{'dimension':>10} {'σ = I':>8} {'full σ(x)':>10} {'ratio':>7}"]
     lines += [f"{d:>10} {one:>8.0f} {full:>10.0f} {full / one:>7.1f}" for d, one, full in sigmas]
     return "\n".join(lines)
 

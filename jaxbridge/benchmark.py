@@ -23,7 +23,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Key
 
-from .accuracy_study import EffectCost, run_effect_costs, run_sigma_costs
+from .accuracy_study import run_sigma_costs
 from .bridges import Bridges, sample_bridges
 from .coupling import Coupling
 from .crossover_study import Process, Rate, run_crossover, share_of_best, thousands
@@ -65,7 +65,6 @@ class Benchmark(NamedTuple):
     versions: dict[str, str]
     date: str
     ratios: list[Ratio]
-    effects: list[EffectCost]
     sigmas: list[tuple[int, float, float]]
     rates: list[Rate]
 
@@ -95,7 +94,6 @@ def run_benchmark(
     on_start("the paper's discretisation at equal accuracy")
     ratios += _against_published(key, round(100_000 * scale))
     num_bridges = max(1_000, round(20_000 * scale))
-    effects = run_effect_costs(key, num_bridges, on_start)
     sigmas = run_sigma_costs(key, num_bridges, dimensions, on_start)
     rates = run_crossover(key, round(1e7 * scale), durations, chosen, on_start)
     packages = ("jaxbridge", "jax", "jaxlib", "diffrax", "equinox", "numpy")
@@ -105,7 +103,6 @@ def run_benchmark(
         {name: version(name) for name in packages} | {"python": platform.python_version()},
         datetime.date.today().isoformat(),
         ratios,
-        effects,
         sigmas,
         rates,
     )
@@ -300,7 +297,7 @@ def _num_cores() -> int:
 def save(benchmark: Benchmark, path: Path) -> None:
     """Everything as JSON."""
     content = benchmark._asdict()
-    for name in ("ratios", "effects", "rates"):
+    for name in ("ratios", "rates"):
         content[name] = [row._asdict() for row in content[name]]
     path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
@@ -309,7 +306,6 @@ def load(path: Path) -> Benchmark:
     """What `save` wrote."""
     content = json.loads(path.read_text())
     content["ratios"] = [Ratio(**row) for row in content["ratios"]]
-    content["effects"] = [EffectCost(**row) for row in content["effects"]]
     content["rates"] = [Rate(**row) for row in content["rates"]]
     content["sigmas"] = [tuple(row) for row in content["sigmas"]]
     return Benchmark(**content)

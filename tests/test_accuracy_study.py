@@ -11,7 +11,8 @@ from jaxbridge.accuracy_study import (
     EffectCost,
     curves,
     format_accuracy,
-    format_costs,
+    format_effects,
+    format_sigmas,
     sinh_model,
     time_of_step,
     write_accuracy_figures,
@@ -48,7 +49,7 @@ def test_tables_and_figures_render(tmp_path):
     assert "Heun with 10 steps: error 0.0800" in text and "accuracy 0.1 costs" in text
     assert "crossing, Heun" in text and "none of these settings" in text
     costs = [EffectCost("one", 10.0), EffectCost("two", 25.0)]
-    assert "2.5" in format_costs(costs, [(2, 10.0, 25.0)])
+    assert "25" in format_effects(costs) and "2.5" in format_sigmas([(2, 10.0, 25.0)])
     assert all(path.exists() for path in write_accuracy_figures(results, costs, tmp_path))
     assert len(plot.effect_costs(costs).patches) == 2
 

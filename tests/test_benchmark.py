@@ -4,7 +4,6 @@ import jax
 import numpy as np
 import pytest
 
-from jaxbridge.accuracy_study import EffectCost
 from jaxbridge.benchmark import (
     Benchmark,
     Ratio,
@@ -31,7 +30,6 @@ def made_up():
         {"jax": "0.10"},
         "2026-01-01",
         [ratio],
-        [EffectCost("a", 1.0)],
         [(2, 10.0, 30.0)],
         rates,
     )

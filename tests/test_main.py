@@ -41,7 +41,7 @@ def test_quick_run_of_the_benchmark(tmp_path):
     assert "NumPy" in done.stdout and "random numbers" in done.stdout
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 1
     stored = load(tmp_path / "pictures" / "benchmark.json")
-    assert stored.ratios and stored.sigmas and stored.effects and stored.rates
+    assert stored.ratios and stored.sigmas and stored.rates
 
 
 @pytest.mark.slow
