@@ -17,10 +17,8 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from .choice import as_proposal, settled
 from .coupled_pairs import CoupledPairs
 from .diffusion import Diffusion
 from .guided import ModifiedDiffusionBridge
@@ -28,6 +26,7 @@ from .intervals import Intervals
 from .kernels import acceptance_rate
 from .likelihood import Form, log_likelihoods
 from .observations import Group
+from .parts import Bounds, Part, make_parts
 from .renewal_chain import as_pairs, first_paths, propose_paths, renew
 from .weighted import AbstractWeightedProposal
 
@@ -39,11 +38,12 @@ class Renewed(NamedTuple):
     """Of one step on all intervals: whether the path of each was replaced; how many paths were
     simulated, or weighed, for it; whether no proposal was found though one was called for. Then
     the path stays, which leaves the exact law invariant, for whether one is found does not
-    depend on the path."""
+    depend on the path. Last, whether a weight was cut off by a bound on its trials."""
 
     moved: Bool[Array, " I"]
     num_simulated: Int[Array, " I"]
     missing: Bool[Array, " I"]
+    truncated: Bool[Array, " I"]
 
 
 class AbstractBridgeKernel(eqx.Module):
@@ -77,7 +77,8 @@ class ByRenewal(AbstractBridgeKernel):
     def renew(self, keys, model, intervals, paths):
         everything = jnp.ones(len(keys), bool)
         paths, info = renew(keys, model, self.pairs, intervals, paths, everything)
-        return paths, Renewed(info.is_accepted, info.num_simulated, info.is_missing)
+        whole = jnp.zeros_like(everything)
+        return paths, Renewed(info.is_accepted, info.num_simulated, info.is_missing, whole)
 
 
 class ByWeights(AbstractBridgeKernel):
@@ -100,7 +101,8 @@ class ByWeights(AbstractBridgeKernel):
         accepted = uniform < acceptance_rate(old.log_weights[:, 0], new.log_weights[:, 0])
         num_simulated = old.num_simulated[:, 0] + new.num_simulated[:, 0]
         paths = jnp.where(accepted[:, None, None], new.paths[:, 0], paths)
-        return paths, Renewed(accepted, num_simulated, ~new.found[:, 0])
+        truncated = old.truncated[:, 0] | new.truncated[:, 0]
+        return paths, Renewed(accepted, num_simulated, ~new.found[:, 0], truncated)
 
 
 class Unweighted(AbstractBridgeKernel):
@@ -116,41 +118,29 @@ class Unweighted(AbstractBridgeKernel):
         proposed = propose_paths(keys, model, self.pairs, intervals, None, num_steps)
         found = proposed.num_found > 0
         paths = jnp.where(found[:, None, None], proposed.outputs.paths, paths)
-        return paths, Renewed(found, proposed.num_trials, ~found)
-
-
-class _Part(eqx.Module):
-    """Intervals with one number of steps, which are these fractions of their durations."""
-
-    intervals: Intervals
-    kernel: AbstractBridgeKernel
-    index: Int[Array, " I"]
-    fractions: Float[Array, " N"]
-
-    @property
-    def num_steps(self) -> int:
-        return self.fractions.shape[0]
-
-    @property
-    def steps(self) -> Float[Array, "N I"]:
-        return self.fractions[:, None] * self.intervals.duration
+        return paths, Renewed(found, proposed.num_trials, ~found, jnp.zeros_like(found))
 
 
 class Completion(eqx.Module):
     """How the observations are completed: by bridges of all intervals, in parts of one number of
-    steps each."""
+    steps each, with a kernel for each part."""
 
-    parts: tuple[_Part, ...]
+    parts: tuple[Part, ...]
+    kernels: tuple[AbstractBridgeKernel, ...]
+
+    @property
+    def num_intervals(self) -> int:
+        return sum(len(part.index) for part in self.parts)
 
     def first(self, key: Key[Array, ""], model: Diffusion) -> Paths:
         """Paths to start from. Where the proposal finds none, whatever its weight, a modified
         diffusion bridge serves, or a straight line: a chain may start anywhere."""
         model = model.prepared()
 
-        def of_part(part, keys):
+        def of_part(part, kernel, keys):
             intervals, num_steps = part.intervals, part.num_steps
             found_keys, other_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
-            found = part.kernel.first(found_keys, model, intervals, num_steps)
+            found = kernel.first(found_keys, model, intervals, num_steps)
             other = ModifiedDiffusionBridge().draw(
                 other_keys[:, None], model, intervals, num_steps, None, False
             )
@@ -161,14 +151,16 @@ class Completion(eqx.Module):
                 path = jnp.where(is_there(better)[:, None, None], better, path)
             return path
 
-        return tuple(map(of_part, self.parts, self._keys(key)))
+        return tuple(map(of_part, self.parts, self.kernels, self._keys(key)))
 
     def renew(self, key: Key[Array, ""], model: Diffusion, paths: Paths) -> tuple[Paths, Renewed]:
         """One step of every bridge, at the parameters of this model."""
         model = model.prepared()
         made = [
-            part.kernel.renew(keys, model, part.intervals, mine)
-            for part, keys, mine in zip(self.parts, self._keys(key), paths, strict=True)
+            kernel.renew(keys, model, part.intervals, mine)
+            for part, kernel, keys, mine in zip(
+                self.parts, self.kernels, self._keys(key), paths, strict=True
+            )
         ]
         renewed = [each for _, each in made]
         together = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *renewed)
@@ -211,7 +203,7 @@ def complete(
     proposal: Any,
     bridges: Literal["exact", "approximate"],
     method: Literal["pseudo_marginal", "renewal"] | None,
-    bounds: tuple[int | None, int | None, int | None],
+    bounds: Bounds,
 ) -> Completion:
     """The completion that the user asked for; pilot runs and burn-ins are at the parameters of
     this model.
@@ -227,23 +219,16 @@ def complete(
     given = proposal
     if proposal is None and bridges == "exact" and method is None:
         given = "auto"
-    keys = jax.random.split(key, len(groups))
-    parts = []
-    for part_key, group in zip(keys, groups, strict=True):
-        mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
-        chosen = as_proposal(given, model, mine.start[0], *bounds)
-        chosen.check(model, mine)
-        if bridges == "approximate" or method == "renewal":
-            chosen = as_pairs(chosen)
-        chosen = settled(chosen, part_key, model, mine, group.num_steps)
-        chosen = chosen.prepared(part_key, model, mine, group.num_steps)
-        if bridges == "approximate":
-            kernel = Unweighted(as_pairs(chosen))
-        elif method == "renewal" or (method is None and isinstance(chosen, CoupledPairs)):
-            kernel = ByRenewal(as_pairs(chosen))
-        else:
-            kernel = ByWeights(chosen)
-        fractions = np.diff(chosen.fractions(group.num_steps))
-        fractions = jnp.asarray(fractions, mine.duration.dtype)
-        parts.append(_Part(mine, kernel, jnp.asarray(group.which), fractions))
-    return Completion(tuple(parts))
+    only_couplings = bridges == "approximate" or method == "renewal"
+    parts = make_parts(key, model, intervals, groups, given, bounds, only_couplings=only_couplings)
+    return Completion(parts, tuple(_kernel(part.proposal, bridges, method) for part in parts))
+
+
+def _kernel(
+    proposal: AbstractWeightedProposal, bridges: str, method: str | None
+) -> AbstractBridgeKernel:
+    if bridges == "approximate":
+        return Unweighted(as_pairs(proposal))
+    if method == "renewal" or (method is None and isinstance(proposal, CoupledPairs)):
+        return ByRenewal(as_pairs(proposal))
+    return ByWeights(proposal)

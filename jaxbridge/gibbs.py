@@ -17,12 +17,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers, nondifferentiable
-from .bridges import check_key
 from .completion import Completion, Paths, complete
-from .diffusion import Diffusion, check_diffusion
+from .diffusion import Diffusion
 from .intervals import check_count
 from .likelihood import Form, forms_of
-from .observations import as_observations, step_groups
 from .parameter_steps import (
     AbstractParameterKernel,
     CompleteData,
@@ -31,6 +29,7 @@ from .parameter_steps import (
     quadratic_form,
 )
 from .posterior import AbstractPosterior
+from .problem import as_problem, first_chain, starting_points
 from .unknowns import (
     Constraint,
     GivenDensity,
@@ -38,10 +37,6 @@ from .unknowns import (
     Prior,
     Unknowns,
     as_log_prior,
-    as_unknowns,
-    check_allowed,
-    check_sigma_known,
-    init_vectors,
 )
 
 
@@ -63,6 +58,8 @@ class GibbsPosterior(AbstractPosterior):
     - `num_simulated`: paths simulated or weighed, shape (*chains, n).
     - `num_missing`: bridges that were not found, though called for, within `max_proposals`, shape
         (*chains, n). They stayed as they were: the law is right, but the chain moves less.
+    - `num_truncated`: weights that `max_trials` cut off, shape (*chains, n): where there are many
+        the law is not exact.
     - `state`: where it ended; pass it as `init` to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.
@@ -74,6 +71,7 @@ class GibbsPosterior(AbstractPosterior):
     bridges_moved: Float[Array, "*chains n"]
     num_simulated: Int[Array, "*chains n"]
     num_missing: Int[Array, "*chains n"]
+    num_truncated: Int[Array, "*chains n"]
     state: GibbsState
     completion: Completion
     exact_parameters: bool = eqx.field(static=True)
@@ -150,35 +148,25 @@ def gibbs(
         posterior.params.mean(), posterior.effective_sample_size
         ```
     """
-    check_key(key)
-    check_diffusion(model)
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
-    chains = () if num_chains is None else (check_count("num_chains", num_chains),)
-    intervals = as_observations(model, times, observations)
-    like = intervals.start[0]
-    unknowns, theta = as_unknowns(model, where, like)
-    check_sigma_known(
-        unknowns,
-        theta,
-        like,
+    problem = as_problem(
+        key,
+        model,
+        times,
+        observations,
+        where,
+        num_steps,
+        step_size,
         "use `pmmh`, which needs no path, or pick the others with `where=`.",
     )
-    log_prior = as_log_prior(prior, unknowns, theta)
-    state = init if isinstance(init, GibbsState) else None
-    if state is not None:
-        theta = state.theta
-    elif init is not None:
-        theta = init_vectors(unknowns, init, chains).astype(like.dtype)
-    if theta.ndim == 1:
-        theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
-    check_allowed(constraint, unknowns, theta)
-    pilot_model = unknowns.at(theta.reshape(-1, theta.shape[-1])[0])
+    unknowns, like = problem.unknowns, problem.like
+    log_prior = as_log_prior(prior, unknowns, problem.theta)
+    theta, state = starting_points(problem, init, num_chains, constraint, GibbsState)
     complete_key, run_key = jax.random.split(key)
-    groups = step_groups(intervals.duration, num_steps, step_size)
     bounds = (num_counts, max_proposals, max_trials)
-    arguments = (intervals, groups, proposal, bridges, method, bounds)
-    completion = complete(complete_key, pilot_model, *arguments)
-    form = quadratic_form(unknowns, theta.reshape(-1, theta.shape[-1])[0], like)
+    arguments = (problem.intervals, problem.groups, proposal, bridges, method, bounds)
+    completion = complete(complete_key, problem.pilot_model(theta), *arguments)
+    form = quadratic_form(unknowns, first_chain(theta), like)
     kernel = choose_kernel(parameter_kernel, form is not None, log_prior)
     form = forms_of(model, like)[0] if form is None else form
     setting = _Setting(unknowns, completion, log_prior, constraint, kernel, form)
@@ -211,6 +199,7 @@ class _Sweep(NamedTuple):
     bridges_moved: Float[Array, "*chains"]
     num_simulated: Int[Array, "*chains"]
     num_missing: Int[Array, "*chains"]
+    num_truncated: Int[Array, "*chains"]
 
 
 @eqx.filter_jit
@@ -238,6 +227,7 @@ def _iterate(
         jnp.mean(renewed.moved.astype(state.theta.dtype)),
         jnp.sum(renewed.num_simulated, dtype=jnp.int32),
         jnp.sum(renewed.missing, dtype=jnp.int32),
+        jnp.sum(renewed.truncated, dtype=jnp.int32),
     )
     return GibbsState(step.theta, paths), sweep
 
@@ -270,6 +260,7 @@ def _run(
             jnp.mean(sweeps.bridges_moved, axis=0),
             jnp.sum(sweeps.num_simulated, axis=0, dtype=jnp.int32),
             jnp.sum(sweeps.num_missing, axis=0, dtype=jnp.int32),
+            jnp.sum(sweeps.num_truncated, axis=0, dtype=jnp.int32),
         )
         return (state, meter), (state.theta, told)
 
@@ -288,6 +279,7 @@ def _run(
         told.bridges_moved,
         told.num_simulated,
         told.num_missing,
+        told.num_truncated,
         state,
         setting.completion,
         exact,

@@ -38,6 +38,7 @@ from .arrays import Numbers, as_floating, is_traced
 from .devices import num_devices
 from .diffusion import Diffusion, Dynamics
 from .intervals import Intervals, check_model
+from .lanes import join_rows, over_lanes, split_rows
 from .linalg import all_finite, cholesky, dot, inverse, matmul, matvec, solve, total
 from .noise import Store, noisy_scan
 from .schemes import Euler
@@ -84,9 +85,9 @@ class Step(NamedTuple):
     """One step of one interval: what the proposal worked out for it, δ_i, T - t_i, and b."""
 
     guide: PyTree
-    dt: Float[Array, "*I"]
-    remaining: Float[Array, "*I"]
-    end: Float[Array, "d *I"]
+    dt: Float[Array, "*lanes"]
+    remaining: Float[Array, "*lanes"]
+    end: Float[Array, "d *lanes"]
 
 
 class AbstractGuidedProposal(AbstractWeightedProposal):
@@ -371,9 +372,6 @@ class _Steps(NamedTuple):
     dt: Float[Array, "*steps I"]
     remaining: Float[Array, "*steps I"]
 
-    def to(self, end: Float[Array, "d I"]) -> Step:
-        return Step(self.guide, self.dt, self.remaining, end)
-
 
 class _State(NamedTuple):
     """The point where a path is, its log weight so far, and what was seen at that point."""
@@ -384,8 +382,8 @@ class _State(NamedTuple):
 
 
 class _Lanes:
-    """The steps of a proposal for I intervals, on points of shape (d, I, n): what belongs to an
-    interval is worked out once and shared by its n paths."""
+    """The steps of a proposal for n paths of each of I intervals, side by side: I n lanes. What
+    belongs to a single interval is worked out once and shared by its paths."""
 
     def __init__(
         self,
@@ -393,6 +391,7 @@ class _Lanes:
         dynamics: Dynamics,
         intervals: Intervals,
         num_steps: int,
+        num_draws: int = 1,
     ):
         start, end, duration = intervals
         fractions = proposal.remaining(num_steps)
@@ -401,17 +400,23 @@ class _Lanes:
         guide = jax.vmap(proposal.guide, in_axes=(None, 0, 0, 1), out_axes=-1)(
             dynamics, start, end, dt
         )
-        self.end, self.last_dt = end.T, dt[-1]
+        self._num_draws = num_draws
+        self._of_lane = None if start.shape[0] == 1 else -1
+        self.start, self.end, self._last_dt = start.T, end.T, dt[-1]
         self.steps = _Steps(guide, dt[:-1], remaining[:-1])
         self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.density
 
-    def begin(self, start: Float[Array, "d I n"]) -> _State:
-        """Paths at their start, with weight one."""
-        look = _over_lanes(lambda x, step: self._density.look(self._dynamics, x), 1)
-        nothing = jnp.zeros(start.shape[1:], start.dtype)
-        return _State(start, nothing, look(start, None))
+    def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
+        """What belongs to an interval, for each of its lanes."""
+        return jnp.repeat(leaf, self._num_draws, axis=-1)
 
-    def advance(self, state: _State, xi: Float[Array, "d I n"], steps: _Steps) -> _State:
+    def begin(self) -> _State:
+        """Paths at their start, with weight one."""
+        start = self.spread(self.start)
+        look = over_lanes(-1)(lambda x: self._density.look(self._dynamics, x))
+        return _State(start, jnp.zeros_like(start[0]), look(start))
+
+    def advance(self, state: _State, xi: Float[Array, "d lanes"], steps: _Steps) -> _State:
         """One step with the noise ξ, and the weight with its factor."""
 
         def one(state, xi, step):
@@ -420,11 +425,11 @@ class _Lanes:
             x_next = mu + jnp.sqrt(step.dt) * sigma.mv(y)
             return self._weighed(state, x_next, law.log_weight(xi, y), step.dt)
 
-        return _over_lanes(one, 2)(state, xi, steps.to(self.end))
+        return over_lanes(-1, -1, self._of_lane)(one)(state, xi, self._step(steps))
 
     def retrace(
-        self, state: _State, x_next: Float[Array, "d I n"], steps: _Steps
-    ) -> tuple[_State, Float[Array, "d I n"]]:
+        self, state: _State, x_next: Float[Array, "d lanes"], steps: _Steps
+    ) -> tuple[_State, Float[Array, "d lanes"]]:
         """The step to these points, and the noise ξ that it takes."""
 
         def one(state, x_next, step):
@@ -433,9 +438,9 @@ class _Lanes:
             xi = law.unbend(y)
             return self._weighed(state, x_next, law.log_weight(xi, y), step.dt), xi
 
-        return _over_lanes(one, 2)(state, x_next, steps.to(self.end))
+        return over_lanes(-1, -1, self._of_lane)(one)(state, x_next, self._step(steps))
 
-    def finish(self, state: _State) -> Float[Array, "I n"]:
+    def finish(self, state: _State) -> Float[Array, " lanes"]:
         """The log weights with that of the last step, to b."""
 
         def one(state, last):
@@ -447,7 +452,17 @@ class _Lanes:
             weighed = self._weighed(state, end, density, dt)
             return jnp.where(inside, weighed.log_weight, jnp.nan)
 
-        return _over_lanes(one, 1)(state, (self.end, self.last_dt))
+        last = self._for_lanes((self.end, self._last_dt))
+        return over_lanes(-1, self._of_lane)(one)(state, last)
+
+    def _step(self, steps: _Steps) -> Step:
+        return Step(*self._for_lanes((*steps, self.end)))
+
+    def _for_lanes(self, of_intervals: PyTree) -> PyTree:
+        """Without an axis for a single interval, which all lanes share."""
+        if self._of_lane is None:
+            return jax.tree.map(lambda leaf: leaf[..., 0], of_intervals)
+        return jax.tree.map(self.spread, of_intervals)
 
     def _weighed(self, state: _State, x_next, log_weight, dt) -> _State:
         """The state at x_next, given the weight of the Euler step."""
@@ -455,14 +470,6 @@ class _Lanes:
         both = (state.x, x_next, state.seen, seen)
         log_weight += self._density.log_ratio(self._dynamics, *both, dt)
         return _State(x_next, state.log_weight + log_weight, seen)
-
-
-def _over_lanes(function, num_lane_arguments: int):
-    """`function` of points and a step, on points (d, I, n) and a step that has I only (`None`
-    for none)."""
-    lanes = num_lane_arguments * (-1,)
-    over_draws = jax.vmap(function, in_axes=(*lanes, None), out_axes=-1)
-    return jax.vmap(over_draws, in_axes=(*(-2 for _ in lanes), -1), out_axes=-2)
 
 
 def _step_law(
@@ -492,14 +499,15 @@ def noise_of(
     """The noise ξ_0, ..., ξ_{N-2} from which the proposal makes these paths, one for each
     interval, and their log weights."""
     lanes = _Lanes(proposal, dynamics, intervals, paths.shape[1] - 1)
-    x = jnp.moveaxis(paths, 0, -1)[..., None]
 
     def each(state, inputs):
-        x_next, steps = inputs
-        return lanes.retrace(state, x_next, steps)
+        x_next, steps = join_rows(inputs)
+        state, xi = lanes.retrace(join_rows(state), x_next, steps)
+        return split_rows(state), split_rows(xi)
 
-    state, xi = lax.scan(each, lanes.begin(x[0]), (x[1:-1], lanes.steps))
-    return jnp.moveaxis(xi[..., 0], -1, 0), lanes.finish(state)[:, 0]
+    inputs = split_rows((jnp.moveaxis(paths, 0, -1)[1:-1], lanes.steps), axis=1)
+    state, xi = lax.scan(each, split_rows(lanes.begin()), inputs)
+    return jnp.moveaxis(join_rows(xi, axis=1), -1, 0), lanes.finish(join_rows(state))
 
 
 def path_of(
@@ -511,17 +519,15 @@ def path_of(
     """The paths that the proposal makes from this noise, and their log weights: the inverse of
     `noise_of`."""
     lanes = _Lanes(proposal, dynamics, intervals, xi.shape[1] + 1)
-    start, end = intervals.start.T[..., None], intervals.end.T[..., None]
 
     def each(state, inputs):
-        noise, steps = inputs
-        state = lanes.advance(state, noise[..., None], steps)
-        return state, state.x
+        state = lanes.advance(join_rows(state), *join_rows(inputs))
+        return split_rows(state), split_rows(state.x)
 
-    noise = jnp.moveaxis(xi, 0, -1)
-    state, path = lax.scan(each, lanes.begin(start), (noise, lanes.steps))
-    path = jnp.concatenate([start[None], path, end[None]])
-    return jnp.moveaxis(path[..., 0], -1, 0), lanes.finish(state)[:, 0]
+    inputs = split_rows((jnp.moveaxis(xi, 0, -1), lanes.steps), axis=1)
+    state, path = lax.scan(each, split_rows(lanes.begin()), inputs)
+    path = jnp.concatenate([lanes.start[None], join_rows(path, axis=1), lanes.end[None]])
+    return jnp.moveaxis(path, -1, 0), lanes.finish(join_rows(state))
 
 
 def _weighted(paths: Float[Array, "I n K d"], log_weights: Float[Array, "I n"]) -> WeightedPaths:
@@ -590,24 +596,23 @@ def _simulate(
     """Paths and log weights; without noise where `noisy` is given and false."""
     proposal, model, intervals = inputs
     dynamics = model.forward(intervals.start[0])
-    d, dtype = intervals.start.shape[1], intervals.start.dtype
-    shape = (d, *keys.shape)
-    lanes = _Lanes(proposal, dynamics, intervals, num_steps)
-    start = jnp.broadcast_to(intervals.start.T[..., None], shape)
-    end = jnp.broadcast_to(intervals.end.T[..., None], shape)
-    state, path = lanes.begin(start), start[None][:0]
+    (num_intervals, num_draws), (_, d) = keys.shape, intervals.start.shape
+    dtype = intervals.start.dtype
+    lanes = _Lanes(proposal, dynamics, intervals, num_steps, num_draws)
+    state, end = lanes.begin(), lanes.spread(lanes.end)
+    path = state.x[None][:0]
     store = slots = None
     if stored is not None:
         # Row K is for waste; rows of the first and the last step are filled by hand.
-        rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *shape))
+        rows = jnp.broadcast_to(state.x, (stored.shape[0] + 1, *state.x.shape))
         slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(len(stored)))
         store = Store(slots[1:-1], rows)
+    start = state.x
     if num_steps > 1:
 
         def step(state, inputs):
             xi, steps = inputs
-            xi = xi.reshape(shape)
-            xi = xi if noisy is None else jnp.where(noisy, xi, 0)
+            xi = xi if noisy is None else jnp.where(noisy.reshape(-1), xi, 0)
             state = lanes.advance(state, xi, steps)
             return state, state.x
 
@@ -622,11 +627,12 @@ def _simulate(
         )
     elif store is not None:
         path = store.rows
-    log_weights = lanes.finish(state)
+    log_weights = lanes.finish(state).reshape(keys.shape)
     if slots is None:
         path = jnp.concatenate([start[None], path, end[None]])
     else:
         path = path.at[slots[-1]].set(end)[:-1]
+    path = path.reshape(-1, d, num_intervals, num_draws)
     return jnp.moveaxis(path, (2, 3), (0, 1)), log_weights
 
 

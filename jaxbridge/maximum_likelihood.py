@@ -25,22 +25,19 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers, nondifferentiable
-from .bridges import check_key
 from .completion import Completion, Paths, complete
-from .diffusion import Diffusion, check_diffusion
+from .diffusion import Diffusion
 from .intervals import check_count
 from .likelihood import Form, forms_of
 from .linalg import any_solve
-from .observations import as_observations, step_groups
 from .parameter_steps import CompleteData, quadratic_form
+from .problem import as_problem
 from .score import Score, score
 from .unknowns import (
     Constraint,
     Unknowns,
     allowed,
-    as_unknowns,
     check_allowed,
-    check_sigma_known,
 )
 
 
@@ -120,29 +117,29 @@ def maximum_likelihood(
         estimate.params, estimate.standard_errors
         ```
     """
-    check_key(key)
-    check_diffusion(model)
     num_iterations = check_count("num_iterations", num_iterations, 2)
     if method not in ("gradient", "em"):
         raise ValueError(f'`method` must be "gradient" or "em"; got {method!r}.')
     if method == "em" and optimizer is not None:
         raise ValueError('`method="em"` takes no `optimizer`.')
-    intervals = as_observations(model, times, observations)
-    like = intervals.start[0]
-    unknowns, theta = as_unknowns(model, where, like)
-    check_sigma_known(
-        unknowns,
-        theta,
-        like,
+    problem = as_problem(
+        key,
+        model,
+        times,
+        observations,
+        where,
+        num_steps,
+        step_size,
         "differentiate `transition_log_density` with a proposal that is pulled to the end point, "
         "use `pmmh`, or pick the others with `where=`.",
     )
+    unknowns, theta = problem.unknowns, problem.theta
     check_allowed(constraint, unknowns, theta)
     complete_key, run_key, score_key = jax.random.split(key, 3)
-    groups = step_groups(intervals.duration, num_steps, step_size)
     bounds = (num_counts, max_proposals, max_trials)
-    completion = complete(complete_key, model, intervals, groups, proposal, "exact", None, bounds)
-    form = quadratic_form(unknowns, theta, like) or forms_of(model, like)[0]
+    arguments = (problem.intervals, problem.groups, proposal, "exact", None, bounds)
+    completion = complete(complete_key, model, *arguments)
+    form = quadratic_form(unknowns, theta, problem.like) or forms_of(model, problem.like)[0]
     rule = _EM() if method == "em" else _Gradient(optimizer or optax.adam(1e-2))
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     setting = _Setting(unknowns, completion, constraint, rule, form)
@@ -244,7 +241,7 @@ def _approximate(
     setting = nondifferentiable(setting)
     unknowns, completion = setting.unknowns, setting.completion
     first_key, run_key = jax.random.split(key)
-    num_intervals = sum(len(part.intervals.duration) for part in completion.parts)
+    num_intervals = completion.num_intervals
 
     def iterate(state, i):
         paths, renewed = completion.renew(

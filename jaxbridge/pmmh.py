@@ -21,15 +21,14 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers, as_floating, nondifferentiable
-from .bridges import check_key
-from .choice import as_proposal, settled
-from .diffusion import Diffusion, check_diffusion
-from .intervals import Intervals, check_count
+from .diffusion import Diffusion
+from .intervals import check_count
 from .kernels import acceptance_rate
 from .linalg import any_cholesky
-from .observations import as_observations, step_groups
+from .parts import Part, make_parts
 from .posterior import AbstractPosterior
-from .transition import check_for_density, estimate_log_density
+from .problem import as_problem, starting_points
+from .transition import estimate_log_density
 from .unknowns import (
     Constraint,
     GivenDensity,
@@ -40,11 +39,7 @@ from .unknowns import (
     allowed,
     as_log_prior,
     as_normal,
-    as_unknowns,
-    check_allowed,
-    init_vectors,
 )
-from .weighted import AbstractWeightedProposal
 
 # Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
 _TARGET = 0.2
@@ -68,6 +63,8 @@ class PMMHPosterior(AbstractPosterior):
     - `accepted`: shape (*chains, n).
     - `num_unknown`: iterations, with those of the warm-up, in which the proposed parameters
         were refused because no estimate was to be had, shape (*chains,).
+    - `num_truncated`: weights that `max_trials` cut off, in all these iterations, shape
+        (*chains,): where there are many the law is not exact.
     - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
     """
 
@@ -76,6 +73,7 @@ class PMMHPosterior(AbstractPosterior):
     log_likelihood: Float[Array, "*chains n"]
     accepted: Bool[Array, "*chains n"]
     num_unknown: Int[Array, "*chains"]
+    num_truncated: Int[Array, "*chains"]
     state: PMMHState
 
 
@@ -136,79 +134,47 @@ def pmmh(
         )
         ```
     """
-    check_key(key)
-    check_diffusion(model)
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
     num_warmup = check_count("num_warmup", num_warmup, 0)
     num_proposals = check_count("num_proposals", num_proposals)
-    chains = () if num_chains is None else (check_count("num_chains", num_chains),)
-    intervals = as_observations(model, times, observations)
-    like = intervals.start[0]
-    unknowns, theta = as_unknowns(model, where, like)
-    log_prior = as_log_prior(prior, unknowns, theta)
-    root = _first_root(covariance, prior, unknowns, theta)
-    state = init if isinstance(init, PMMHState) else None
-    if state is not None:
-        theta = state.theta
-    elif init is not None:
-        theta = init_vectors(unknowns, init, chains).astype(like.dtype)
-    if theta.ndim == 1:
-        theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
-    check_allowed(constraint, unknowns, theta)
-    pilot_model = unknowns.at(theta.reshape(-1, theta.shape[-1])[0])
+    problem = as_problem(key, model, times, observations, where, num_steps, step_size)
+    unknowns = problem.unknowns
+    log_prior = as_log_prior(prior, unknowns, problem.theta)
+    root = _first_root(covariance, prior, unknowns, problem.theta)
+    theta, state = starting_points(problem, init, num_chains, constraint, PMMHState)
     pilot_key, run_key = jax.random.split(key)
-    parts = []
-    groups = step_groups(intervals.duration, num_steps, step_size)
-    for part_key, group in zip(jax.random.split(pilot_key, len(groups)), groups, strict=True):
-        mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
-        chosen = as_proposal(
-            proposal, pilot_model, like, num_counts, None, max_trials, for_density=True
-        )
-        chosen.check(pilot_model, mine)
-        check_for_density(chosen, pilot_model)
-        chosen = settled(chosen, part_key, pilot_model, mine, group.num_steps)
-        chosen = chosen.prepared(part_key, pilot_model, mine, group.num_steps)
-        parts.append(_Part(mine, chosen, group.num_steps))
-    setting = _Setting(unknowns, tuple(parts), log_prior, constraint, num_proposals)
+    arguments = (problem.intervals, problem.groups, proposal, (num_counts, None, max_trials))
+    parts = make_parts(pilot_key, problem.pilot_model(theta), *arguments, for_density=True)
+    setting = _Setting(unknowns, parts, log_prior, constraint, num_proposals)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     if state is None:
-        root = jnp.broadcast_to(root, (*chains, *root.shape))
+        root = jnp.broadcast_to(root, (*theta.shape[:-1], *root.shape))
         state = _start(run_key, setting, theta, root)
     return _run(run_key, setting, state, num_warmup, num_iterations, thin, meter)
-
-
-class _Part(eqx.Module):
-    """Intervals with one number of steps."""
-
-    intervals: Intervals
-    proposal: AbstractWeightedProposal
-    num_steps: int = eqx.field(static=True)
 
 
 class _Setting(eqx.Module):
     """What does not change from iteration to iteration."""
 
     unknowns: Unknowns
-    parts: tuple[_Part, ...]
+    parts: tuple[Part, ...]
     log_prior: NormalDensity | GivenDensity
     constraint: Constraint | None = eqx.field(static=True)
     num_proposals: int = eqx.field(static=True)
 
-    def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Float[Array, ""]:
-        """log of an unbiased estimate of the likelihood; -inf where there is none."""
-        model, log_likelihood = self.unknowns.at(theta).prepared(), jnp.zeros((), theta.dtype)
+    def estimate(
+        self, key: Key[Array, ""], theta: Float[Array, " p"]
+    ) -> tuple[Float[Array, ""], Int[Array, ""]]:
+        """log of an unbiased estimate of the likelihood, -inf where there is none; and how many
+        of its weights were cut off."""
+        model = self.unknowns.at(theta).prepared()
+        log_likelihood, num_truncated = jnp.zeros((), theta.dtype), jnp.int32(0)
         for part_key, part in zip(jax.random.split(key, len(self.parts)), self.parts, strict=True):
-            log_likelihood += jnp.sum(
-                estimate_log_density(
-                    part_key,
-                    model,
-                    part.proposal,
-                    part.intervals,
-                    self.num_proposals,
-                    part.num_steps,
-                ).value
-            )
-        return jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood)
+            size = (self.num_proposals, part.num_steps)
+            made = estimate_log_density(part_key, model, part.proposal, part.intervals, *size)
+            log_likelihood += jnp.sum(made.value)
+            num_truncated += jnp.sum(made.num_truncated, dtype=jnp.int32)
+        return jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood), num_truncated
 
 
 def _first_root(
@@ -233,7 +199,7 @@ def _start(key, setting: _Setting, theta, root) -> PMMHState:
     key = jax.random.fold_in(key, 0)
 
     def estimate(key, theta):
-        return setting.estimate(key, theta)
+        return setting.estimate(key, theta)[0]
 
     if theta.ndim == 1:
         return PMMHState(theta, estimate(key, theta), root)
@@ -241,15 +207,24 @@ def _start(key, setting: _Setting, theta, root) -> PMMHState:
     return PMMHState(theta, jax.vmap(estimate)(keys, theta), root)
 
 
+class _Told(NamedTuple):
+    """Of one step: whether it was accepted, was refused because no estimate was to be had, and
+    how many weights of the estimate were cut off."""
+
+    accepted: Bool[Array, "*chains"]
+    unknown: Int[Array, "*chains"]
+    num_truncated: Int[Array, "*chains"]
+
+
 def _iterate(key, setting: _Setting, state: PMMHState, gain: Float[Array, ""]):
-    """One step, and whether it was accepted and an estimate was to be had; S moves by `gain`."""
+    """One step, and what is told of it; S moves by `gain`."""
     walk_key, estimate_key, accept_key = jax.random.split(key, 3)
     noise = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
     proposed = state.theta + state.root @ noise
     inside = allowed(setting.constraint, setting.unknowns, proposed)
     # Outside the constraint the model may not be simulated: θ stands in, and is refused.
     proposed = jnp.where(inside, proposed, state.theta)
-    estimated = setting.estimate(estimate_key, proposed)
+    estimated, num_truncated = setting.estimate(estimate_key, proposed)
     new = jnp.where(inside, estimated + setting.log_prior(proposed), -jnp.inf)
     rate = acceptance_rate(state.log_likelihood + setting.log_prior(state.theta), new)
     accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
@@ -264,7 +239,7 @@ def _iterate(key, setting: _Setting, state: PMMHState, gain: Float[Array, ""]):
         jnp.where(accepted, estimated, state.log_likelihood),
         root,
     )
-    return state, (accepted, unknown)
+    return state, _Told(accepted, unknown.astype(jnp.int32), num_truncated)
 
 
 @eqx.filter_jit
@@ -298,22 +273,27 @@ def _run(
 
     def kept(carry, i):
         steps = num_warmup + i * thin + jnp.arange(thin)
-        carry, (accepted, unknown) = lax.scan(iterate, carry, steps)
+        carry, told = lax.scan(iterate, carry, steps)
         state, _ = carry
-        made = state.theta, state.log_likelihood, jnp.any(accepted, axis=0)
-        return carry, (*made, jnp.sum(unknown, axis=0, dtype=jnp.int32))
+        told = _add_up(told)._replace(accepted=jnp.any(told.accepted, axis=0))
+        return carry, (state.theta, state.log_likelihood, told)
 
     carry = (state, progress_meter.init())
-    carry, (_, lost) = lax.scan(iterate, carry, jnp.arange(num_warmup))
-    (state, meter), (theta, log_likelihood, accepted, unknown) = lax.scan(
+    carry, lost = lax.scan(iterate, carry, jnp.arange(num_warmup))
+    (state, meter), (theta, log_likelihood, told) = lax.scan(
         kept, carry, jnp.arange(num_iterations)
     )
     progress_meter.close(meter)
-    num_unknown = jnp.sum(lost, axis=0, dtype=jnp.int32) + jnp.sum(unknown, axis=0, dtype=jnp.int32)
+    sums, accepted = jax.tree.map(jnp.add, _add_up(lost), _add_up(told)), told.accepted
     if theta.ndim == 3:
         theta, log_likelihood, accepted = jax.tree.map(
             lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, log_likelihood, accepted)
         )
     as_params = jax.vmap(setting.unknowns.all)
     params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
-    return PMMHPosterior(params, theta, log_likelihood, accepted, num_unknown, state)
+    counts = sums.unknown, sums.num_truncated
+    return PMMHPosterior(params, theta, log_likelihood, accepted, *counts, state)
+
+
+def _add_up(told: _Told) -> _Told:
+    return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0, dtype=jnp.int32), told)

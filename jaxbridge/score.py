@@ -15,19 +15,16 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from .arrays import Numbers, nondifferentiable
-from .bridges import check_key
-from .choice import as_proposal, settled
-from .diffusion import Diffusion, check_diffusion
-from .intervals import Intervals, check_count
+from .diffusion import Diffusion
+from .intervals import check_count
 from .likelihood import forms_of, log_likelihoods
-from .observations import as_observations, step_groups
-from .unknowns import Unknowns, as_unknowns, check_sigma_known
-from .weighted import AbstractWeightedProposal
+from .parts import Part, make_parts
+from .problem import as_problem
+from .unknowns import Unknowns
 
 # Bridges of all intervals that are made at a time.
 _PATHS = 8_192
@@ -93,35 +90,30 @@ def score(
         estimate.value, estimate.standard_error
         ```
     """
-    check_key(key)
-    check_diffusion(model)
     num_bridges = check_count("num_bridges", num_bridges, 2)
-    intervals = as_observations(model, times, observations)
-    like = intervals.start[0]
-    unknowns, theta = as_unknowns(model, where, like)
-    check_sigma_known(
-        unknowns,
-        theta,
-        like,
+    problem = as_problem(
+        key,
+        model,
+        times,
+        observations,
+        where,
+        num_steps,
+        step_size,
         "differentiate `transition_log_density` with a proposal that is pulled to the end point, "
         "or pick the others with `where=`.",
     )
-    moments, sizes, order = [], [], []
-    groups = step_groups(intervals.duration, num_steps, step_size)
-    for group_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
-        mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
-        chosen = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
-        chosen.check(model, mine)
-        chosen = settled(chosen, group_key, model, mine, group.num_steps)
-        fractions = jnp.asarray(np.diff(chosen.fractions(group.num_steps)), like.dtype)
-        made, size = _interval_moments(
-            group_key, unknowns, theta, chosen, mine, fractions, num_bridges, progress_meter
-        )
-        moments.append(made)
-        sizes.append(size)
-        order.append(group.which)
+    unknowns, theta = problem.unknowns, problem.theta
+    bounds = (num_counts, max_proposals, max_trials)
+    parts = make_parts(key, model, problem.intervals, problem.groups, proposal, bounds)
+    keys = jax.random.split(key, len(parts))
+    made = [
+        _interval_moments(part_key, unknowns, theta, part, num_bridges, progress_meter)
+        for part_key, part in zip(keys, parts, strict=True)
+    ]
+    moments, sizes = zip(*made, strict=True)
     gradient, covariance, information = jax.tree.map(lambda *parts: sum(parts), *moments)
-    size = jnp.concatenate(sizes)[np.argsort(np.concatenate(order))]
+    order = jnp.concatenate([part.index for part in parts])
+    size = jnp.concatenate(sizes)[jnp.argsort(order)]
     error = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
     return Score(
         unknowns.pick(gradient),
@@ -139,28 +131,24 @@ def _interval_moments(
     key: Key[Array, ""],
     unknowns: Unknowns,
     theta: Float[Array, " p"],
-    proposal: AbstractWeightedProposal,
-    intervals: Intervals,
-    fractions: Float[Array, " N"],
+    part: Part,
     num_bridges: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> tuple[tuple[Array, Array, Array], Float[Array, " I"]]:
     """Σ over intervals of the score, of the covariance of its error, and of the information; and
     the effective number of bridges of each."""
-    unknowns, intervals = nondifferentiable((unknowns, intervals))
+    unknowns, intervals = nondifferentiable((unknowns, part.intervals))
     model = unknowns.at(theta).prepared()
-    num_intervals, num_steps = intervals.start.shape[0], fractions.shape[0]
-    proposal = proposal.prepared(key, model, intervals, num_steps)
+    num_intervals, num_steps = intervals.start.shape[0], part.num_steps
     form = forms_of(model, intervals.start[0])[0]
-    steps = fractions[:, None] * intervals.duration
     at_once = min(num_bridges, max(1, _PATHS // num_intervals))
     num_batches = -(-num_bridges // at_once)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    steps = jnp.repeat(steps, at_once, axis=1)
+    steps = jnp.repeat(part.steps, at_once, axis=1)
 
     def batch(state, i):
         keys = jax.random.split(jax.random.fold_in(key, i), (num_intervals, at_once))
-        drawn = proposal.draw(keys, model, intervals, num_steps, None, False)
+        drawn = part.proposal.draw(keys, model, intervals, num_steps, None, False)
         start = intervals.start[:, None, None]
         paths = jnp.where(drawn.found[..., None, None], drawn.paths, start)
         paths = paths.reshape(-1, *paths.shape[2:])
