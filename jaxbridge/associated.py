@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from .coupling import AbstractCoupling, rotate_back, rotation_between
+from .coupling import AbstractCoupling, rotate_back, rotation_between, see
 from .diffusion import Diffusion
 from .lanes import over_lanes
 from .linalg import all_finite
-from .meeting import PairStep, frame
+from .meeting import PairStep
 from .noise import noisy_scan
 from .proposals import pair_noise, realise
 from .schemes import fitted_in_lanes
@@ -64,7 +64,7 @@ def run_associated(
         dt, root_dt, scheme = lane
         normal, uniform = noise
         sigma, driven_sigma = forward.sigma(y), forward.sigma(z)
-        seen = frame(driven_sigma, y, z)
+        seen = see(coupling, scheme, forward, y, z, dt)
         du = None if normal is None else root_dt * normal
         dw = coupling.driving_noise(seen, scheme.noise(forward, z, z_next, dt), du)
         dw = rotate_back(rotation_between(coupling, sigma, driven_sigma), dw)

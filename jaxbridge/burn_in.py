@@ -21,11 +21,11 @@ from jaxtyping import Array, Float, Key
 
 from .arrays import Numbers, is_traced
 from .bridges import check_key
-from .coupling import AbstractCoupling, Coupling, rotate, rotation_between
+from .coupling import AbstractCoupling, Coupling, rotate, rotation_between, see
 from .diffusion import Diffusion, check_diffusion
 from .intervals import as_intervals, check_count, check_model
 from .lanes import over_lanes
-from .meeting import PairStep, frame
+from .meeting import PairStep
 from .noise import noisy_scan
 from .schemes import fitted_in_lanes
 from .search import key_for
@@ -122,7 +122,7 @@ def _measure(
     @over_lanes(-1, -1, -1, -1, -1, -1, -1, -1)
     def step_pair(x, driven, met, dw, uniform, dt, root_dt, scheme):
         sigma, driven_sigma = dynamics.sigma(x), dynamics.sigma(driven)
-        seen = frame(driven_sigma, x, driven)
+        seen = see(reflection, scheme, dynamics, x, driven, dt)
         dw = root_dt * dw
         turned = rotate(rotation_between(reflection, sigma, driven_sigma), dw)
         x_next = scheme.step(dynamics, x, dt, dw)

@@ -25,6 +25,7 @@ from jaxtyping import Array, ArrayLike, Float, Key
 
 from . import decisions
 from .arrays import as_floating, is_traced
+from .diffusion import Dynamics
 from .linalg import dot, matmul, matvec, polar_factor
 from .meeting import (
     AbstractMeeting,
@@ -32,6 +33,7 @@ from .meeting import (
     Frame,
     ReflectionPlane,
     SignTest,
+    frame,
 )
 from .schemes import AbstractScheme, Euler, Heun
 from .sigma import AbstractSigma, Full
@@ -122,6 +124,21 @@ class AbstractCoupling(eqx.Module):
     def realise(self, keys: Key[Array, " lanes"]) -> "AbstractCoupling":
         """The coupling of each of many proposals: arrays drawn at random get a trailing axis
         of lanes. A coupling without randomness of its own returns itself."""
+
+
+def see(
+    coupling: AbstractCoupling,
+    scheme: AbstractScheme,
+    dynamics: Dynamics,
+    x: Float[Array, " d"],
+    driven: Float[Array, " d"],
+    dt: Float[Array, ""],
+) -> Frame:
+    """How the pair lies at the beginning of a step, as the meeting rule wants it seen; `scheme` is
+    the coupling's, fitted to the step."""
+    if coupling.meeting.looks_ahead:
+        return scheme.frame(dynamics, x, driven, dt)
+    return frame(dynamics.sigma(driven), x, driven)
 
 
 class Coupling(AbstractCoupling):

@@ -50,7 +50,7 @@ def _one_block(
     paths[0] = z
     for i in range(num_steps):
         dw = x[i + 1] - step @ x[i]
-        difference = x[i] - z
+        difference = step @ (x[i] - z) if crossing else x[i] - z  # after the drift, or before
         gap = np.sqrt((difference * difference).sum(0))
         u = difference / np.where(gap > 0, gap, 1)
         along = np.float32(gamma - 1) * (u * dw).sum(0)

@@ -18,11 +18,11 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from . import decisions
 from .arrays import cast_floats
-from .coupling import AbstractCoupling, rotate, rotation_between
+from .coupling import AbstractCoupling, rotate, rotation_between, see
 from .diffusion import Diffusion
 from .lanes import over_lanes
 from .linalg import all_finite
-from .meeting import PairStep, frame
+from .meeting import PairStep
 from .noise import Store, noisy_scan
 from .schemes import fitted_in_lanes
 
@@ -88,7 +88,7 @@ def propose(
         dt, root_dt, fixed_rho, scheme = lane
         normal, uniform = noise
         sigma, driven_sigma = forward.sigma(x), forward.sigma(z)
-        seen = frame(driven_sigma, x, z)
+        seen = see(coupling, scheme, forward, x, z, dt)
         du = None if normal is None else root_dt * normal
         dw = scheme.noise(forward, x, x_next, dt)
         dw = rotate(rotation_between(coupling, sigma, driven_sigma), dw)

@@ -20,7 +20,8 @@ from . import decisions
 from .diffusion import Dynamics, is_linear, ito_correction
 from .linalg import cholesky, inverse, matmul, matvec, solve
 from .linear import linear_transition
-from .sigma import Diagonal
+from .meeting import Frame, frame, frame_of
+from .sigma import Constant, Diagonal
 
 
 class AbstractScheme(eqx.Module):
@@ -58,6 +59,16 @@ class AbstractScheme(eqx.Module):
     ) -> Float[Array, " d"]:
         """The noise increment that takes `x` to `x_next` in `dt`: the inverse of `step`."""
 
+    @abstractmethod
+    def frame(
+        self,
+        dynamics: Dynamics,
+        x: Float[Array, " d"],
+        driven: Float[Array, " d"],
+        dt: Float[Array, ""],
+    ) -> Frame:
+        """How a pair lies for the noise of the step, once the drift of it is done (`meeting`)."""
+
 
 class Euler(AbstractScheme):
     """Euler–Maruyama, `x + α(x)δ + σ(x)ΔW`, as in the paper. Its inverse is exact.
@@ -75,6 +86,9 @@ class Euler(AbstractScheme):
 
     def noise(self, dynamics, x, x_next, dt):
         return dynamics.sigma(x).solve(x_next - x - dynamics.drift(x) * dt)
+
+    def frame(self, dynamics, x, driven, dt):
+        return _frame_after_drift(dynamics, x, driven, dt)
 
 
 class Milstein(AbstractScheme):
@@ -110,6 +124,9 @@ class Milstein(AbstractScheme):
         # Past the fold, where no increment explains the step, take the fold itself.
         discriminant = jnp.maximum(1 + 2 * slope * increment, jnp.finfo(x.dtype).eps)
         return 2 * increment / (1 + jnp.sqrt(discriminant))
+
+    def frame(self, dynamics, x, driven, dt):
+        return _frame_after_drift(dynamics, x, driven, dt)
 
     @staticmethod
     def _slope(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
@@ -157,6 +174,16 @@ class Heun(AbstractScheme):
         sigma = dynamics.sigma(x).average(dynamics.sigma(x_next))
         return sigma.solve(x_next - x - drift * dt / 2)
 
+    def frame(self, dynamics, x, driven, dt):
+        """For constant σ the noise of the step is σ (I + ½ ∇α δ) ΔW, so the gap at its end lies
+        along (I + ½ ∇α δ) u if u is taken after half the drift. The length stays that at the
+        beginning, since D_{i+1} is measured at the end: it is their product that counts."""
+        now = frame(dynamics.sigma(driven), x, driven)
+        if dynamics.sigma_varies:
+            return now
+        half = _frame_after_drift(dynamics, x, driven, dt / 2)
+        return now._replace(u=half.u)
+
     def _stratonovich_drift(self, dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
         drift = dynamics.drift(x)
         corrected = decisions.stratonovich(self.stratonovich, dynamics.sigma_varies).simulated
@@ -169,8 +196,8 @@ class GaussianTransition(AbstractScheme):
         x + M_δ α(x) + R ΔW,    M_δ = ∫_0^δ e^{sA} ds,   R Rᵀ δ = Γ_δ,
 
     with the root R = σ L, L lower triangular, that tends to σ as δ → 0. Paths of the diffusion
-    and of its time reversal have no step error at all; whether two of them met between grid
-    points is still decided by the meeting rule.
+    and of its time reversal have no step error at all, nor have bridges made of them if the
+    meeting rule is `BrownianCrossing`: at its grid points one step is as good as many.
 
     **Raises:** `ValueError` for a drift that is not linear, or σ that depends on the state.
     """
@@ -188,7 +215,7 @@ class GaussianTransition(AbstractScheme):
         moments = linear_transition(jax.jacfwd(dynamics.drift)(like), matmul(sigma, sigma.T), dt)
         whitened = solve(sigma, solve(sigma, moments.covariance / dt).T)
         root = matmul(sigma, cholesky(whitened))
-        return _FittedTransition(moments.integral, root, inverse(root))
+        return _FittedTransition(moments.integral, Constant(root, inverse(root)))
 
     def step(self, dynamics, x, dt, dw):
         return self.fitted(dynamics, x, dt).step(dynamics, x, dt, dw)
@@ -196,23 +223,37 @@ class GaussianTransition(AbstractScheme):
     def noise(self, dynamics, x, x_next, dt):
         return self.fitted(dynamics, x, dt).noise(dynamics, x, x_next, dt)
 
+    def frame(self, dynamics, x, driven, dt):
+        return self.fitted(dynamics, x, dt).frame(dynamics, x, driven, dt)
+
 
 class _FittedTransition(AbstractScheme):
     """The same for one equation and one step size."""
 
     integral: Float[Array, "d d"]
-    root: Float[Array, "d d"]
-    inverse_root: Float[Array, "d d"]
+    root: Constant
     stratonovich: ClassVar[bool] = False
 
     def fitted(self, dynamics, like, dt):
         return self
 
     def step(self, dynamics, x, dt, dw):
-        return x + matvec(self.integral, dynamics.drift(x)) + matvec(self.root, dw)
+        return x + matvec(self.integral, dynamics.drift(x)) + self.root.mv(dw)
 
     def noise(self, dynamics, x, x_next, dt):
-        return matvec(self.inverse_root, x_next - x - matvec(self.integral, dynamics.drift(x)))
+        return self.root.solve(x_next - x - matvec(self.integral, dynamics.drift(x)))
+
+    def frame(self, dynamics, x, driven, dt):
+        drift = dynamics.drift(x) - dynamics.drift(driven)
+        return frame_of(self.root, x - driven + matvec(self.integral, drift))
+
+
+def _frame_after_drift(
+    dynamics: Dynamics, x: Float[Array, " d"], driven: Float[Array, " d"], dt: Float[Array, ""]
+) -> Frame:
+    """The gap when each has gone α δ."""
+    drift = dynamics.drift(x) - dynamics.drift(driven)
+    return frame_of(dynamics.sigma(driven), x - driven + drift * dt)
 
 
 def fitted_in_lanes(

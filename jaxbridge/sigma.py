@@ -70,9 +70,9 @@ class Constant(AbstractSigma):
     matrix: Float[Array, "d d"]
     inverse: Float[Array, "d d"]
 
-    def __init__(self, matrix: Float[Array, "d d"]):
+    def __init__(self, matrix: Float[Array, "d d"], inverse: Float[Array, "d d"] | None = None):
         self.matrix = matrix
-        self.inverse = any_inverse(matrix)
+        self.inverse = any_inverse(matrix) if inverse is None else inverse
 
     def mv(self, noise):
         return matvec(self.matrix, noise)

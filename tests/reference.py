@@ -15,7 +15,7 @@ def hitting_frequency(rng, B, path, dt, gamma, starts):
     hit = np.zeros(len(y), bool)
     for z, z_next in itertools.pairwise(path):
         dw = z_next - z + B @ z * dt
-        difference = y - z
+        difference = y - z - (y - z) @ B.T * dt  # after the drift of the step
         gap = np.linalg.norm(difference, axis=1)
         u = difference / np.where(gap > 0, gap, 1)[:, None]
         du = np.sqrt(dt) * rng.normal(size=len(y))

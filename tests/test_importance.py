@@ -46,6 +46,23 @@ def test_weighted_midpoints_have_the_exact_law(name):
     assert size > 800 and not weighted.truncated.any()
 
 
+def test_two_exact_transitions_are_as_good_as_many():
+    """The law half way, from two steps of length ½."""
+    case = exact_case(paper_model(), *PAPER_CASES["unlikely"], 1.0, 0.5)
+    weighted = jb.sample_weighted_bridges(
+        jax.random.key(0),
+        case.model,
+        case.start,
+        case.end,
+        1.0,
+        num_bridges=30_000,
+        num_steps=2,
+        proposal=jb.Coupling(0.5, scheme=jb.GaussianTransition()),
+    )
+    middle = np.asarray(weighted.paths[:, 1])
+    assert assert_weighted_moments(middle, weighted.weights, case.mean, case.covariance) > 6_000
+
+
 @pytest.mark.slow
 def test_unweighted_and_published_midpoints_fail_the_same_test():
     case = exact_case(paper_model(), *PAPER_CASES["very unlikely"], 1.0, 0.5)

@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import assert_moments
 from scipy.stats import norm
 
 import jaxbridge as jb
+from jaxbridge.coupling import see
 from jaxbridge.meeting import PairStep, frame
 
 NUM = 200_000
@@ -80,3 +82,63 @@ def test_frame_is_finite_and_differentiable_at_meeting():
     assert seen.gap == 0 and (seen.u == 0).all()
     derivative = jax.jacrev(lambda x: frame(sigma, x, jnp.ones(2)).u)(jnp.ones(2))
     assert jnp.isfinite(derivative).all()
+
+
+class CrossingSeenBefore(jb.AbstractMeeting):
+    """The crossing of the gap as it is before the drift of the step."""
+
+    draws_uniform = True
+    looks_ahead = False
+
+    def met(self, step, forward, uniform):
+        return jb.BrownianCrossing().met(step, forward, uniform)
+
+
+TURNING = jb.ornstein_uhlenbeck([[1.0, 1.5], [-1.0, 0.5]], sigma=[[1.0, 0.4], [-0.2, 0.7]])
+
+
+def joined_steps(meeting, scheme, gamma, dt=0.5, num=200_000):
+    """Points after one long step of a pair, joined if they met; and how many were."""
+    x, driven, dt = jnp.array([0.5, 0.1]), jnp.array([-0.1, -0.4]), jnp.asarray(dt)
+    dynamics, coupling = TURNING.forward(x), jb.Coupling(gamma, meeting=meeting, scheme=scheme)
+    fitted = scheme.fitted(dynamics, x, dt)
+
+    @jax.jit
+    @jax.vmap
+    def joined(key):
+        keys = jax.random.split(key, 3)
+        dw = jnp.sqrt(dt) * jax.random.normal(keys[0], (2,))
+        du = jnp.sqrt(dt) * jax.random.normal(keys[1]) if coupling.independent_noise else None
+        x_next = fitted.step(dynamics, x, dt, dw)
+        seen = see(coupling, fitted, dynamics, x, driven, dt)
+        driven_next = fitted.step(dynamics, driven, dt, coupling.driven_noise(seen, dw, du))
+        pair = PairStep(seen, x, x_next, driven, driven_next, dt, coupling.gap_variance(seen))
+        met = meeting.met(pair, dynamics, jax.random.uniform(keys[2]))
+        return jnp.where(met, x_next, driven_next), met
+
+    points, met = joined(jax.random.split(jax.random.key(0), num))
+    return driven, np.asarray(points, float), float(met.mean())
+
+
+def assert_is_euler_step(driven, points, dt=0.5):
+    B, sigma = np.asarray(TURNING.params.B), np.asarray(TURNING.params.sigma)
+    assert_moments(points, driven - B @ driven * dt, sigma @ sigma.T * dt)
+
+
+@pytest.mark.parametrize("gamma", [-1.0, 0.0, 0.7])
+def test_joined_steps_are_steps_of_the_scheme(gamma):
+    """However long they are: a meeting has no error of its own where σ is constant."""
+    driven, points, share = joined_steps(jb.BrownianCrossing(), jb.Euler(), gamma)
+    assert 0.05 < share < 0.95
+    assert_is_euler_step(driven, points)
+    driven, points, share = joined_steps(jb.BrownianCrossing(), jb.GaussianTransition(), gamma)
+    assert 0.05 < share < 0.95
+    law = jb.ou_transition(TURNING, driven, 0.5)
+    assert_moments(points, law.mean, law.covariance)
+
+
+@pytest.mark.parametrize("meeting", [CrossingSeenBefore(), jb.SignTest()])
+def test_joined_steps_of_a_pair_seen_before_its_drift_are_not(meeting):
+    driven, points, _ = joined_steps(meeting, jb.Euler(), 0.0)
+    with pytest.raises(AssertionError):
+        assert_is_euler_step(driven, points)

@@ -33,6 +33,35 @@ def test_density_is_that_of_the_closed_form(name):
     print(f"{name}: {np.exp(float(estimate.value) - case.log_density):.4f} +- {error:.4f}")
 
 
+@pytest.mark.parametrize(
+    ("num_steps", "gamma", "reversible"),
+    [
+        (1, 0.5, False),
+        pytest.param(1, -1.0, True, marks=pytest.mark.slow),
+        pytest.param(2, 0.5, True, marks=pytest.mark.slow),
+        pytest.param(2, 0.0, False, marks=pytest.mark.slow),
+    ],
+)
+def test_exact_transitions_leave_no_step_error(num_steps, gamma, reversible):
+    """One step is as good as many, with no allowance."""
+    model, (start, end) = paper_model(), PAPER_CASES["unlikely"]
+    if not reversible:
+        model = jb.ornstein_uhlenbeck([[1.0, 1.5], [-1.0, 0.5]], sigma=[[1.0, 0.4], [-0.2, 0.7]])
+    estimate = jb.transition_log_density(
+        jax.random.key(1),
+        model,
+        start,
+        end,
+        1.0,
+        num_proposals=200_000,
+        num_steps=num_steps,
+        proposal=jb.Coupling(gamma, scheme=jb.GaussianTransition()),
+    )
+    exact = jb.ou_transition(model, jnp.asarray(start), 1.0).log_density(jnp.asarray(end))
+    assert estimate.standard_error < 0.008
+    assert abs(float(estimate.value - exact)) < 5 * float(estimate.standard_error)
+
+
 @pytest.mark.slow
 def test_published_start_law_fails():
     """Theorem 1 as printed starts the associated diffusion from p*_T(b, ·), which finds the
