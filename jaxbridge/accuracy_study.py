@@ -1,9 +1,10 @@
 """What accuracy costs in time: the paper's setting beside better ones, and what effects cost.
 
 The paper's unlikely bridge, by Euler's scheme with the sign test in a radius, as published, and
-then with another meeting rule and other schemes. With exact Gaussian transitions the meeting rule is
-the only error of discretisation, and none is left with the Brownian crossing. The same for a process with a full σ(x), whose bridges
-are known because it is an Ornstein–Uhlenbeck process in other coordinates.
+then with another meeting rule and other schemes. With exact Gaussian transitions the meeting rule
+is the only error of discretisation, and none is left with the Brownian crossing. The same for a
+process with a full σ(x), whose bridges are known because it is an Ornstein–Uhlenbeck process in
+other coordinates.
 """
 
 from collections.abc import Callable, Sequence
