@@ -14,7 +14,8 @@ on top. The likelihood of a path (`likelihood`) and what is not known (`unknowns
 follow from complete paths (`parameter_steps`), in turn (`gibbs`), or from densities (`pmmh`), or
 as maximum likelihood estimates (`score`, `maximum_likelihood`); `expectation` has derivatives
 that are right. What a program simulates is decided in one table (`decisions`, `scene`), and its
-loops run over many lanes of small points (`lanes`, `noise`). Exact laws stand beside (`gaussian`,
+loops run over many lanes of small points (`lanes`, `noise`). `transform` is for state spaces with
+a boundary. Exact laws stand beside (`gaussian`,
 `linear`), what accuracy costs above (`work_precision`), and the studies above all (`study`,
 `exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`, `benchmark`, `plot`). References
 to equations and sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion
@@ -100,6 +101,7 @@ from .schemes import (
     GaussianTransition as GaussianTransition,
     Heun as Heun,
     Milstein as Milstein,
+    SemiImplicit as SemiImplicit,
 )
 from .score import Score as Score, score as score
 from .simulate import simulate as simulate
@@ -113,6 +115,7 @@ from .step_density import (
     EulerDensity as EulerDensity,
     TrapezoidDensity as TrapezoidDensity,
 )
+from .transform import Transformed as Transformed, transform as transform
 from .transition import (
     TransitionLogDensity as TransitionLogDensity,
     transition_log_density as transition_log_density,

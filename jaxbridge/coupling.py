@@ -154,7 +154,8 @@ class Coupling(AbstractCoupling):
     - `gamma`: γ in [-1, 1); or a law, a function `key -> γ`, from which each proposal draws
         its own.
     - `meeting`: `BrownianCrossing()`, `SignTest(radius)` or, for γ = -1, `ReflectionPlane()`.
-    - `scheme`: `Heun()`, `Euler()` or `Milstein()`.
+    - `scheme`: `Heun()`, `Euler()`, `Milstein()`, for stiff or superlinear drift
+        `SemiImplicit()`, for linear drift `GaussianTransition()`.
     - `rotation`: O(x, x') from the matrices σ(x), σ(x'); `None` is `polar_rotation` where σ is
         a full matrix that depends on the state, and nothing elsewhere.
     - `start_law`: μ, where the associated diffusion starts, which only what corrects bridges to

@@ -63,6 +63,9 @@ class Diffusion(eqx.Module):
         `reversibility_residual` for a check.
     - `normalised`: declare that `log_stationary` is the logarithm of a density, not only up to a
         constant. Transition densities by couplings from the stationary law rest on it.
+    - `domain`: the state space, where it is not all of R^d: a function `(x, params)` to whether x
+        is inside. A path that leaves it is a miss, and counted among `num_nonfinite`. Where paths
+        come near the boundary, `transform` loses none of them.
     - `prepare`: maps `params` to what the functions above receive in their place, for
         quantities that depend on the parameters but not on the point. It runs once per call,
         outside every loop.
@@ -84,6 +87,7 @@ class Diffusion(eqx.Module):
     _reverse_drift: Callable | None = eqx.field(static=True)
     _sample_stationary: Callable | None = eqx.field(static=True)
     _prepare: Callable | None = eqx.field(static=True)
+    _domain: Callable | None = eqx.field(static=True)
     _constant_sigma: Inexact[Array, "..."] | None
     params: PyTree
     reversible: bool = eqx.field(static=True)
@@ -100,6 +104,7 @@ class Diffusion(eqx.Module):
         sample_stationary: Callable | None = None,
         reversible: bool = False,
         normalised: bool = False,
+        domain: Callable | None = None,
         prepare: Callable | None = None,
     ):
         for name, function in [
@@ -107,6 +112,7 @@ class Diffusion(eqx.Module):
             ("log_stationary", log_stationary),
             ("reverse_drift", reverse_drift),
             ("sample_stationary", sample_stationary),
+            ("domain", domain),
             ("prepare", prepare),
         ]:
             if not (callable(function) or (function is None and name != "drift")):
@@ -116,6 +122,7 @@ class Diffusion(eqx.Module):
         self._reverse_drift = reverse_drift
         self._sample_stationary = sample_stationary
         self._prepare = prepare
+        self._domain = domain
         if diffusion is None or callable(diffusion):
             self._diffusion, self._constant_sigma = diffusion, None
         else:
@@ -196,7 +203,37 @@ class Diffusion(eqx.Module):
             sample_stationary=self._sample_stationary,
             reversible=self.reversible,
             normalised=self.normalised,
+            domain=self._domain,
         )
+
+    def unbound(self) -> "Diffusion":
+        """The functions alone, for `with_params` of what `preparation` makes of the parameters. It
+        has no arrays, and can be compared and hashed.
+
+        **Raises:** `ValueError` for a constant σ that is traced.
+        """
+        sigma = self._constant_sigma
+        if is_traced(sigma):
+            raise ValueError(
+                "this model has a constant σ that is traced: let `diffusion` be a function "
+                "`(x, params)` that finds it in `params`."
+            )
+        return Diffusion(
+            self._drift,
+            self._diffusion if sigma is None else _constant_function(_as_tuples(sigma)),
+            self._log_stationary,
+            None,
+            reverse_drift=self._reverse_drift,
+            sample_stationary=self._sample_stationary,
+            reversible=self.reversible,
+            normalised=self.normalised,
+            domain=self._domain,
+        )
+
+    @property
+    def preparation(self) -> Callable | None:
+        """`prepare`, as it was given."""
+        return self._prepare
 
     @property
     def has_reversal(self) -> bool:
@@ -223,9 +260,7 @@ class Diffusion(eqx.Module):
         """The coefficients α and σ at points like this one (only its shape and dtype count),
         with everything done that does not depend on the point."""
         params = self._prepared_params()
-
-        def drift(x):
-            return check_value("drift", self._drift(x, params), x.shape, x)
+        drift = self._inside("drift", self._drift, params)
 
         if self._diffusion is not None:
             diffusion = self._diffusion
@@ -249,18 +284,38 @@ class Diffusion(eqx.Module):
         derived = self.reverse_drift_effect
         params, reverse_drift = self._prepared_params(), self._reverse_drift
         if reverse_drift is not None and not derived.simulated:
-
-            def drift(x):
-                return check_value("reverse_drift", reverse_drift(x, params), x.shape, x)
-
+            drift = self._inside("reverse_drift", reverse_drift, params)
         else:
             log_nu = self._log_stationary_function()
             divergence = decisions.divergence(derived, forward.sigma_varies).simulated
 
-            def drift(x):
+            def derived_drift(x):
                 return -forward.drift(x) + _stationary_flux(forward, log_nu, x, divergence)
 
+            drift = derived_drift
+
         return forward._replace(drift=drift)
+
+    def _inside(
+        self, name: str, function: Callable, params: PyTree
+    ) -> Callable[[Float[Array, " d"]], Float[Array, " d"]]:
+        """A drift, NaN outside the state space: a path that steps out is lost with the next step,
+        and no bridge ends there."""
+        domain = self._domain
+
+        def drift(x):
+            value = check_value(name, function(x, params), x.shape, x)
+            if domain is None:
+                return value
+            inside = jnp.asarray(domain(x, params))
+            if inside.shape != () or inside.dtype != bool:
+                raise ValueError(
+                    "`domain` must return one truth value, such as `jnp.all(x > 0)`; it returned "
+                    f"shape {inside.shape} and dtype {inside.dtype}."
+                )
+            return jnp.where(inside, value, jnp.nan)
+
+        return drift
 
     def _prepared_params(self) -> PyTree:
         return self.params if self._prepare is None else self._prepare(self.params)
@@ -369,6 +424,16 @@ def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) 
             f"it returned {value.shape}."
         )
     return value.astype(x.dtype)
+
+
+@functools.lru_cache(maxsize=256)
+def _constant_function(values: tuple) -> Callable:
+    """σ as a function of a point, the same one for the same numbers."""
+    return lambda x, params: jnp.asarray(np.array(values), x.dtype)
+
+
+def _as_tuples(sigma: Array) -> tuple:
+    return tuple(tuple(row) if isinstance(row, list) else row for row in sigma.tolist())
 
 
 def _check_constant_sigma(sigma: Numbers) -> Array:

@@ -1,0 +1,166 @@
+"""A diffusion in other coordinates, by Itô's formula.
+
+For a smooth bijection f with inverse g, Y = f(X) solves an equation with
+
+    α_Y(y) = ∇f α + ½ Σ_k ∂²f[σ_k, σ_k],    σ_Y(y) = ∇f σ,    at x = g(y),
+
+σ_k the columns of σ, and has the stationary density ν(g(y)) |det ∇g(y)|. A state space with a
+boundary becomes all of R^d, in which no step leads out of it; bridges are simulated and weighted
+there, and their paths mapped back.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .arrays import Numbers, as_floating
+from .diffusion import Diffusion, check_diffusion, check_value
+from .linalg import log_abs_det
+
+Map = Callable[[Array], Any]
+_Result = TypeVar("_Result")
+
+
+class Transformed(eqx.Module):
+    """A model in other coordinates, and the way there and back.
+
+    - `model`: of Y = f(X), with the parameters of the given model.
+    - `forward`, `inverse`: f and its inverse, of one point of shape (d,).
+
+    !!! example
+
+        ```python
+        logarithm = jb.transform(model, jnp.log, jnp.exp)
+        a, b = logarithm.forward(start), logarithm.forward(end)
+        bridges = logarithm.back(
+            jb.sample_exact_bridges(key, logarithm.model, a, b, 1.0, num_bridges=1000)
+        )
+        ```
+    """
+
+    model: Diffusion
+    forward: Map = eqx.field(static=True)
+    inverse: Map = eqx.field(static=True)
+
+    def back(self, bridges: _Result) -> _Result:
+        """What `sample_bridges`, `sample_weighted_bridges`, `weigh_bridges` or
+        `sample_exact_bridges` returned, with paths in the coordinates of X. Weigh before: the
+        result is no longer of this model."""
+        paths = getattr(bridges, "paths", None)
+        if paths is None:
+            raise TypeError(
+                "`bridges` must be what `sample_bridges`, `sample_weighted_bridges` or "
+                f"`sample_exact_bridges` returned; got {type(bridges).__name__}."
+            )
+        points = paths.reshape(-1, paths.shape[-1])
+        mapped = jax.vmap(lambda y: check_value("inverse", self.inverse(y), y.shape, y))(points)
+        return eqx.tree_at(lambda result: result.paths, bridges, mapped.reshape(paths.shape))
+
+    def log_jacobian(self, x: Numbers) -> Float[Array, ""]:
+        """log |det ∇f(x)|: add it to a transition density of Y at f(x), and it is that of X."""
+        x = as_floating("x", x)
+        return log_abs_det(jax.jacfwd(self.forward)(x))
+
+
+def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
+    """The model of Y = f(X): drift, σ, stationary density and sampler, by automatic
+    differentiation.
+
+    **Arguments:**
+
+    - `model`: the model of X. A constant σ that it was given as an array must be known.
+    - `forward`: f, a smooth bijection of the state space onto R^d, a function of one point (d,);
+        for instance `jnp.log`, or `jax.scipy.special.logit`.
+    - `inverse`: its inverse, for instance `jnp.exp` or `jax.nn.sigmoid`.
+
+    **Returns:** `Transformed`. Calls with the same functions compile once.
+
+    **Raises:** `TypeError` for what is no model or no function.
+
+    !!! example
+
+        ```python
+        rate, mean, noise = 1.0, 0.5, 0.3  # Cox, Ingersoll & Ross (1985)
+        cir = jb.Diffusion(
+            lambda x, p: p[0] * (p[1] - x),
+            lambda x, p: p[2] * jnp.sqrt(x),
+            lambda x, p: jnp.sum((2 * p[0] * p[1] / p[2]**2 - 1) * jnp.log(x)
+                                 - 2 * p[0] * x / p[2]**2),
+            (rate, mean, noise),
+        )
+        logarithm = jb.transform(cir, jnp.log, jnp.exp)
+        ```
+    """
+    check_diffusion(model)
+    for name, function in [("forward", forward), ("inverse", inverse)]:
+        if not callable(function):
+            raise TypeError(f"`{name}` must be a function of a point; got {function!r}.")
+    functions = _functions(model.unbound(), forward, inverse)
+    moved = Diffusion(
+        functions.drift,
+        functions.diffusion,
+        functions.log_stationary if model.has_density else None,
+        model.params,
+        sample_stationary=functions.sample_stationary if model.has_sampler else None,
+        reversible=model.reversible,
+        normalised=model.normalised,
+        prepare=model.preparation,
+    )
+    return Transformed(moved, forward, inverse)
+
+
+class _Functions(NamedTuple):
+    """Those of the model of Y, of one point and the parameters."""
+
+    drift: Callable
+    diffusion: Callable
+    log_stationary: Callable
+    sample_stationary: Callable
+
+
+@functools.lru_cache(maxsize=256)
+def _functions(unbound: Diffusion, forward: Map, inverse: Map) -> _Functions:
+    """The same functions for the same arguments, so that they compile once."""
+
+    def at(y, params):
+        x = check_value("inverse", inverse(y), y.shape, y)
+        return x, unbound.with_params(params).forward(x)
+
+    def f(x):
+        return check_value("forward", forward(x), x.shape, x)
+
+    def along(x, direction):
+        """∇f v."""
+        return jax.jvp(f, (x,), (direction,))[1]
+
+    def columns(x, dynamics):
+        sigma, units = dynamics.sigma(x), np.eye(x.shape[0])
+        return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in units]
+
+    def drift(y, params):
+        x, dynamics = at(y, params)
+        moved = along(x, dynamics.drift(x))
+        for column in columns(x, dynamics):
+            moved += jax.jvp(lambda x, v=column: along(x, v), (x,), (column,))[1] / 2
+        return moved
+
+    def diffusion(y, params):
+        x, dynamics = at(y, params)
+        moved = [along(x, column) for column in columns(x, dynamics)]
+        # In one dimension a matrix is its diagonal.
+        return moved[0] if len(moved) == 1 else jnp.stack(moved, axis=1)
+
+    def log_stationary(y, params):
+        x, _ = at(y, params)
+        return unbound.with_params(params).log_stationary(x) + log_abs_det(jax.jacfwd(inverse)(y))
+
+    def sample_stationary(key, params):
+        return f(unbound.with_params(params).sample_stationary(key))
+
+    return _Functions(drift, diffusion, log_stationary, sample_stationary)

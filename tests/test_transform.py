@@ -1,0 +1,211 @@
+"""Other coordinates, against diffusions on a half line and an interval with known transitions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import count_compilations, swirl, unswirl, warped_model
+from jax.scipy.special import logit
+from scipy.stats import ncx2
+
+import jaxbridge as jb
+
+RATE, MEAN, NOISE = 1.0, 0.5, 0.6
+
+
+def cir_log_stationary(x, p):
+    """The Gamma density of the stationary law, normalised."""
+    rate, mean, noise = p
+    shape, scale = 2 * rate * mean / noise**2, noise**2 / (2 * rate)
+    log_density = (shape - 1) * jnp.log(x) - x / scale
+    return jnp.sum(log_density - jax.scipy.special.gammaln(shape) - shape * jnp.log(scale))
+
+
+def cir_drift(x, p):
+    return p[0] * (p[1] - x)
+
+
+def cir_sigma(x, p):
+    return p[2] * jnp.sqrt(x)
+
+
+def cir_sampler(key, p):
+    rate, mean, noise = p
+    draw = jax.random.gamma(key, 2 * rate * mean / noise**2, (1,))
+    return draw * noise**2 / (2 * rate)
+
+
+def positive(x, p):
+    return jnp.all(x > 0)
+
+
+def cir(**options):
+    """dX = (0.5 - X) dt + 0.6 √X dW (Cox, Ingersoll & Ross 1985)."""
+    options = dict(reversible=True, normalised=True, sample_stationary=cir_sampler) | options
+    return jb.Diffusion(cir_drift, cir_sigma, cir_log_stationary, (RATE, MEAN, NOISE), **options)
+
+
+def cir_density(x, y, t):
+    """p_t(x, y) by the non-central χ² law."""
+    c = 2 * RATE / (NOISE**2 * (1 - np.exp(-RATE * t)))
+    freedom = 4 * RATE * MEAN / NOISE**2
+    return 2 * c * ncx2.pdf(2 * c * y, freedom, 2 * c * x * np.exp(-RATE * t))
+
+
+def test_coefficients_follow_from_itos_formula(x64):
+    logarithm = jb.transform(cir(), jnp.log, jnp.exp).model
+    for y in (-1.3, 0.2):
+        x = np.exp(y)
+        drift = (RATE * (MEAN - x) - NOISE**2 / 2) / x
+        np.testing.assert_allclose(logarithm.drift([y]), [drift], rtol=1e-10)
+        np.testing.assert_allclose(logarithm.diffusion([y]), [[NOISE / np.sqrt(x)]], rtol=1e-10)
+    residual = logarithm.reversibility_residual(np.array([[-1.0], [0.3]]))
+    np.testing.assert_allclose(residual, 0, atol=1e-9)
+    grid = jnp.linspace(-12, 3, 4001)[:, None]
+    density = np.exp(np.asarray(jax.vmap(logarithm.log_stationary)(grid)))
+    assert density.sum() * 15 / 4000 == pytest.approx(1, abs=1e-6)
+
+
+def test_a_planar_model_is_that_of_the_closed_form(x64):
+    ou = jb.ornstein_uhlenbeck([[1.0, 1.5], [-1.0, 0.5]], sigma=[[1.0, 0.4], [-0.2, 0.7]])
+    ours, theirs = jb.transform(ou, swirl, unswirl).model, warped_model(ou, swirl, unswirl)
+    x = jnp.array([0.4, -0.9])
+    np.testing.assert_allclose(ours.drift(x), theirs.drift(x), rtol=1e-8)
+    np.testing.assert_allclose(ours.diffusion(x), theirs.diffusion(x), rtol=1e-8)
+    np.testing.assert_allclose(ours.reverse_drift(x), theirs.reverse_drift(x), rtol=1e-7)
+    key = jax.random.key(0)
+    np.testing.assert_allclose(ours.sample_stationary(key), swirl(ou.sample_stationary(key)))
+
+
+def test_a_constant_sigma_that_was_given_as_an_array_comes_along(x64):
+    model = jb.Diffusion(lambda x, p: -x, 0.5 * np.eye(2), lambda x, p: -4 * x @ x)
+    scaled = jb.transform(model, lambda x: 2 * x, lambda y: y / 2).model
+    np.testing.assert_allclose(scaled.diffusion([1.0, 2.0]), np.eye(2))
+    assert not jb.effects(scaled).solves.simulated
+    with pytest.raises(ValueError, match="constant σ that is traced"):
+        jax.jit(
+            lambda s: jb.transform(
+                jb.Diffusion(lambda x, p: -x, s * jnp.eye(2)), jnp.sinh, jnp.arcsinh
+            ).model.drift(jnp.ones(2))
+        )(0.5)
+
+
+@pytest.mark.parametrize(
+    "proposal",
+    [jb.Coupling(0.0), jb.ModifiedDiffusionBridge()],
+    ids=["coupling", "modified diffusion bridge"],
+)
+def test_bridges_of_cir_have_the_exact_law(proposal):
+    """Transition density and the law half way, near the boundary, from paths in log x."""
+    start, end, duration = 0.15, 0.3, 1.0
+    logarithm = jb.transform(cir(), jnp.log, jnp.exp)
+    points = jnp.log(jnp.array([start])), jnp.log(jnp.array([end]))
+    options = dict(num_steps=80, proposal=proposal)
+    estimate = jb.transition_log_density(
+        jax.random.key(0), logarithm.model, *points, duration, num_proposals=40_000, **options
+    )
+    value = float(estimate.value + logarithm.log_jacobian([end]))
+    exact = np.log(cir_density(start, end, duration))
+    assert estimate.standard_error < 0.02
+    assert abs(value - exact) < 5 * float(estimate.standard_error) + 0.02  # the step error
+    weighted = logarithm.back(
+        jb.sample_weighted_bridges(
+            jax.random.key(1), logarithm.model, *points, duration, num_bridges=10_000, **options
+        )
+    )
+    met = np.asarray(weighted.met)  # Euler steps may overflow next to the boundary
+    paths, weights = np.asarray(weighted.paths)[met, :, 0], np.asarray(weighted.weights)[met]
+    assert met.mean() > 0.99 and (paths > 0).all()
+    np.testing.assert_allclose(paths[:, -1], end, rtol=1e-5)
+    grid = np.linspace(1e-4, 5, 20_000)
+    density = cir_density(start, grid, duration / 2) * cir_density(grid, end, duration / 2)
+    mean = (density * grid).sum() / density.sum()
+    sd = np.sqrt((density * (grid - mean) ** 2).sum() / density.sum())
+    found = (weights * paths[:, 40]).sum() / weights.sum()
+    size = weights.sum() ** 2 / (weights**2).sum()
+    assert abs(found - mean) / sd < 5 / np.sqrt(size) + 0.02
+
+
+def jacobi():
+    """dX = (½ - X) dt + 0.4 √(X(1-X)) dW on the unit interval, with a Beta law."""
+    return jb.Diffusion(
+        lambda x, p: 0.5 - x,
+        lambda x, p: 0.4 * jnp.sqrt(x * (1 - x)),
+        lambda x, p: jnp.sum((1 / 0.4**2 - 1) * jnp.log(x * (1 - x))),
+        reversible=True,
+    )
+
+
+def test_an_interval_becomes_a_line(x64):
+    line = jb.transform(jacobi(), logit, jax.nn.sigmoid).model
+    np.testing.assert_allclose(
+        line.reversibility_residual(np.array([[-2.0], [0.3], [4.0]])), 0, atol=1e-8
+    )
+
+
+def test_paths_that_leave_the_state_space_are_misses_and_counted():
+    """In the original coordinates, near the boundary: what is left are bridges inside."""
+    options = dict(num_bridges=500, num_steps=20, coupling=jb.Coupling(0.0, scheme=jb.Euler()))
+    model = cir(domain=positive)
+    bridges = jb.sample_bridges(jax.random.key(0), model, [0.02], [0.05], 1.0, **options)
+    assert bridges.met.all() and bridges.num_nonfinite > 10
+    assert (np.asarray(bridges.paths) > 0).all()
+    guided = jb.transition_log_density(
+        jax.random.key(0),
+        model,
+        [0.02],
+        [0.05],
+        1.0,
+        num_proposals=2000,
+        num_steps=20,
+        proposal=jb.ModifiedDiffusionBridge(),
+    )
+    assert guided.num_nonfinite > 10 and np.isfinite(guided.value)
+
+
+def test_a_domain_is_told_from_no_domain():
+    """An Ornstein–Uhlenbeck process knows no boundary, unless it is told so."""
+    options = dict(num_bridges=200, num_steps=20)
+    inside = jb.Diffusion(
+        lambda x, p: -x, None, lambda x, p: -x @ x, reversible=True, domain=positive
+    )
+    ends = ([0.1], [0.1], 1.0)
+    held = jb.sample_bridges(jax.random.key(0), inside, *ends, **options)
+    free = jb.sample_bridges(jax.random.key(0), jb.ornstein_uhlenbeck([[1.0]]), *ends, **options)
+    assert (np.asarray(held.paths)[np.asarray(held.met)] > 0).all()
+    assert (np.asarray(free.paths) < 0).any() and free.num_nonfinite == 0
+
+
+def test_end_points_outside_are_refused(unchecked):
+    with pytest.raises(ValueError, match="not finite at `end`"):
+        jb.sample_bridges(
+            jax.random.key(0), cir(domain=positive), [0.5], [-0.5], 1.0, num_bridges=1
+        )
+    other = cir(domain=lambda x, p: x > 0)
+    with pytest.raises(ValueError, match="`domain` must return one truth value"):
+        other.drift(jnp.ones(2))
+
+
+def test_the_same_functions_compile_once():
+    def run(mean):
+        model = cir().with_params((RATE, mean, NOISE))
+        logarithm = jb.transform(model, jnp.log, jnp.exp)
+        return jb.sample_bridges(
+            jax.random.key(0), logarithm.model, [-0.5], [-0.4], 1.0, num_bridges=10, num_steps=5
+        )
+
+    run(0.5)
+    with count_compilations() as compiled:
+        run(0.6)
+    assert not compiled
+
+
+def test_bad_arguments_are_refused(unchecked):
+    with pytest.raises(TypeError, match="`forward` must be a function"):
+        jb.transform(cir(), 3.0, jnp.exp)
+    with pytest.raises(TypeError, match="`model` must be"):
+        jb.transform(jnp.ones(2), jnp.log, jnp.exp)
+    with pytest.raises(ValueError, match="`forward` must return shape"):
+        jb.transform(cir(), jnp.sum, jnp.exp).model.drift(jnp.ones(1))
+    with pytest.raises(TypeError, match="`bridges` must be"):
+        jb.transform(cir(), jnp.log, jnp.exp).back(3.0)
