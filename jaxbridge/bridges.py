@@ -28,6 +28,7 @@ from .search import (
     numbered_keys,
     search,
 )
+from .throwing import throw_where_incomplete
 
 
 class Bridges(eqx.Module):
@@ -97,7 +98,8 @@ def sample_bridges(
         rounding only. By default no more than are useful, and as many as fit in 16 MiB, or 256
         if these fit in 512 MiB.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where a bridge was not found.
+    - `throw`: raise an error at run time where a bridge was not found, or parameters are not
+        finite.
 
     **Returns:** `Bridges`.
 
@@ -150,14 +152,7 @@ def sample_bridges(
         batched,
         several_durations,
     )
-    if throw:
-        message = (
-            "some bridges were not found within `max_proposals` proposals: allow more, lengthen "
-            "the duration or choose a smaller `gamma`."
-        )
-        paths = eqx.error_if(bridges.paths, ~bridges.met, message)
-        bridges = eqx.tree_at(lambda b: b.paths, bridges, paths)
-    return bridges
+    return throw_where_incomplete(bridges, "paths", model, ~bridges.met) if throw else bridges
 
 
 class Inputs(NamedTuple):

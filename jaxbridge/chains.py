@@ -23,6 +23,7 @@ from .intervals import as_intervals, check_count
 from .kernels import Chain
 from .pseudo_marginal_chain import run_pseudo_marginal
 from .renewal_chain import as_pairs, run_renewal
+from .throwing import throw_where_incomplete
 
 
 def sample_exact_bridges(
@@ -42,6 +43,7 @@ def sample_exact_bridges(
     step_size: Numbers | None = None,
     save_at: Numbers | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = False,
 ) -> Chain:
     """A Markov chain of bridges with the exact law: section 2.3 of the paper.
 
@@ -73,6 +75,8 @@ def sample_exact_bridges(
         count. See `Chain.truncated`.
     - `step_size`: β in (0, 1] of "crank_nicolson", by default 0.5; see `crank_nicolson`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, or
+        parameters are not finite.
 
     **Returns:** `Chain`. Not differentiable.
 
@@ -113,5 +117,9 @@ def sample_exact_bridges(
     arguments = (key, model, proposal, intervals, stored, num_bridges, num_steps, batched)
     arguments = (*arguments, several_durations, progress_meter)
     if method == "crank_nicolson":
-        return run_crank_nicolson(*arguments, check_step_size(step_size))
-    return (run_renewal if method == "renewal" else run_pseudo_marginal)(*arguments)
+        chain = run_crank_nicolson(*arguments, check_step_size(step_size))
+    else:
+        chain = (run_renewal if method == "renewal" else run_pseudo_marginal)(*arguments)
+    if not throw:
+        return chain
+    return throw_where_incomplete(chain, "paths", model, ~chain.met, chain.truncated)

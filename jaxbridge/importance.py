@@ -24,6 +24,7 @@ from .hitting import check_max_trials, counts_of, coupling_of
 from .intervals import Intervals, as_intervals, check_count
 from .search import key_for
 from .start_laws import AnyStartLaw
+from .throwing import throw_where_incomplete
 from .weighted import AbstractWeightedProposal
 
 
@@ -139,6 +140,7 @@ def weigh_bridges(
     max_trials: int | None = None,
     batch_size: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = False,
 ) -> WeightedBridges:
     """Weights that correct approximate bridges to the exact law: importance sampling.
 
@@ -154,6 +156,8 @@ def weigh_bridges(
         `WeightedBridges.truncated`.
     - `batch_size`: trials simulated side by side; changes results by rounding only.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, or
+        parameters are not finite.
 
     **Returns:** `WeightedBridges`. Not differentiable.
 
@@ -182,7 +186,13 @@ def weigh_bridges(
     budget = (num_counts, bound, batch_size, progress_meter)
     like = bridges.paths[..., 0, :].reshape(-1, bridges.paths.shape[-1])[0]
     pairs = as_proposal(coupling, model, like, num_counts, None, max_trials)
-    return _weigh_bridges(key_for("weights", key), model, pairs, bridges, budget)
+    weighted = _weigh_bridges(key_for("weights", key), model, pairs, bridges, budget)
+    return _or_throw(weighted, model) if throw else weighted
+
+
+def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
+    missing, truncated = ~weighted.met, weighted.truncated
+    return throw_where_incomplete(weighted, "log_weights", model, missing, truncated)
 
 
 @eqx.filter_jit
@@ -227,6 +237,7 @@ def sample_weighted_bridges(
     max_trials: int | None = None,
     save_at: Numbers | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = False,
 ) -> WeightedBridges:
     """Independent weighted bridges from any proposal: importance sampling.
 
@@ -236,6 +247,8 @@ def sample_weighted_bridges(
     - `num_bridges`: n, for each interval.
     - `proposal`, `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, or
+        parameters are not finite.
 
     **Returns:** `WeightedBridges`.
 
@@ -267,7 +280,8 @@ def sample_weighted_bridges(
     fractions = proposal.fractions(num_steps)
     stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
     sizes = (num_bridges, num_steps, batched, several_durations, progress_meter)
-    return _sample_weighted(key, model, proposal, intervals, stored, *sizes)
+    weighted = _sample_weighted(key, model, proposal, intervals, stored, *sizes)
+    return _or_throw(weighted, model) if throw else weighted
 
 
 @eqx.filter_jit

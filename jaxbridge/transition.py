@@ -23,6 +23,7 @@ from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count
 from .kernels import sum_by_interval
 from .start_laws import Reversed, Stationary
+from .throwing import throw_where_incomplete
 from .weighted import AbstractWeightedProposal
 
 
@@ -64,6 +65,7 @@ def transition_log_density(
     num_counts: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = False,
 ) -> TransitionLogDensity:
     """An estimate of log p_T(a, b) with its standard error, for one pair or thousands.
 
@@ -81,6 +83,8 @@ def transition_log_density(
     - `num_counts`: N hitting counts for each proposal, by default one.
     - `max_trials`: bounds the trials of each proposal; by default 10,000 for each count.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time where no proposal became a bridge, a weight was cut off,
+        or parameters are not finite.
 
     **Returns:** `TransitionLogDensity`. With proposals that are pulled to the end point `value` is
     differentiable, forward and reverse: an estimate of the score. With couplings, and with a
@@ -109,7 +113,11 @@ def transition_log_density(
     check_for_density(proposal, model)
     proposal = settled(proposal, key, model, intervals, num_steps)
     size = (num_proposals, num_steps, batched, progress_meter)
-    return estimate_log_density(key, model, proposal, intervals, *size)
+    estimate = estimate_log_density(key, model, proposal, intervals, *size)
+    if not throw:
+        return estimate
+    missing, truncated = estimate.num_met == 0, estimate.num_truncated > 0
+    return throw_where_incomplete(estimate, "value", model, missing, truncated)
 
 
 def check_for_density(proposal: AbstractWeightedProposal, model: Diffusion) -> None:

@@ -135,6 +135,11 @@ def test_joined_steps_are_steps_of_the_scheme(gamma):
     assert 0.05 < share < 0.95
     law = jb.ou_transition(TURNING, driven, 0.5)
     assert_moments(points, law.mean, law.covariance)
+    driven, points, share = joined_steps(jb.BrownianCrossing(), jb.SemiImplicit(), gamma)
+    B, sigma = np.asarray(TURNING.params.B), np.asarray(TURNING.params.sigma)
+    implicit = np.linalg.inv(np.eye(2) + 0.25 * B)
+    root = implicit @ sigma
+    assert_moments(points, driven - implicit @ B @ driven * 0.5, root @ root.T * 0.5)
 
 
 @pytest.mark.parametrize("meeting", [CrossingSeenBefore(), jb.SignTest()])

@@ -1,0 +1,46 @@
+"""Errors at run time, for those who ask for them by `throw=True`.
+
+Inside compiled code what is missing is data: `met`, `truncated`, `num_nonfinite`. Here it is
+turned into one error at the end, with a sentence that says what to change.
+"""
+
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, PyTree
+
+_Result = TypeVar("_Result")
+
+_PARAMETERS = "some parameters of the model are not finite: nothing can be simulated with them."
+_MISSING = (
+    "some bridges were not found within `max_proposals` proposals: allow more, lengthen the "
+    "duration or choose a smaller `gamma`; on intervals much shorter than the relaxation time "
+    "pairs hardly ever meet: use `ModifiedDiffusionBridge()` or `Guided()` there."
+)
+_TRUNCATED = (
+    "some weights were cut off by `max_trials`, and what they weigh is hardly ever hit: allow more "
+    "trials, or fit a start law by `fit_start_law`."
+)
+
+
+def throw_where_incomplete(
+    result: _Result,
+    field: str,
+    model: PyTree,
+    missing: Bool[Array, "..."],
+    truncated: Bool[Array, "..."] | None = None,
+) -> _Result:
+    """The result, whose `field` raises `RuntimeError` if anything is missing or cut off."""
+    leaves = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
+    broken = [jnp.any(~jnp.isfinite(leaf)) for leaf in leaves]
+    value = getattr(result, field)
+    for bad, message in [
+        (jnp.any(jnp.stack(broken)) if broken else None, _PARAMETERS),
+        (jnp.any(missing), _MISSING),
+        (None if truncated is None else jnp.any(truncated), _TRUNCATED),
+    ]:
+        if bad is not None:
+            value = eqx.error_if(value, bad, message)
+    return eqx.tree_at(lambda tree: getattr(tree, field), result, value)

@@ -1,0 +1,594 @@
+"""Hard cases stay numerically stable, each against an oracle or an invariant.
+
+`hard` keeps what the README's table says of a case beside the test that shows it.
+"""
+
+import pathlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from helpers import PAPER_B, paper_model, run_program
+
+import jaxbridge as jb
+from jaxbridge.proposals import propose
+
+README = pathlib.Path(__file__).parent.parent / "README.md"
+ROWS: list[tuple[str, str, str, str]] = []
+
+
+def hard(case, plain, here):
+    """A row of the table: the case, what goes wrong in a plain implementation, what happens here."""
+
+    def keep(test):
+        ROWS.append((case, plain, here, test.__name__))
+        return test
+
+    return keep
+
+
+def table():
+    lines = ["| case | plain implementation | here | test |", "|---|---|---|---|"]
+    lines += [f"| {case} | {plain} | {here} | `{test}` |" for case, plain, here, test in ROWS]
+    return "\n".join(lines)
+
+
+def test_readme_has_the_table():
+    assert table() in README.read_text(encoding="utf-8")
+
+
+def all_finite(*trees):
+    leaves = [leaf for leaf in jax.tree.leaves(trees) if jnp.issubdtype(leaf.dtype, jnp.inexact)]
+    return all(bool(jnp.isfinite(leaf).all()) for leaf in leaves)
+
+
+def density_on_grid(drift, grid, start, duration):
+    """p_T(start, ·) of dX = α(X) dt + dW on a grid, by the exponential of a generator of jumps
+    between neighbours (Scharfetter–Gummel rates)."""
+    h = grid[1] - grid[0]
+    middle = (grid[1:] + grid[:-1]) / 2
+    exponent = np.clip(2 * drift(middle) * h, -500, 500)
+    bernoulli = np.where(np.abs(exponent) < 1e-8, 1.0, exponent / np.expm1(exponent))
+    down, up = bernoulli / (2 * h**2), bernoulli * np.exp(exponent) / (2 * h**2)
+    rates = np.diag(up, 1) + np.diag(down, -1)
+    rates -= np.diag(rates.sum(1))
+    row = scipy.linalg.expm(duration * rates)[np.abs(grid - start).argmin()]
+    return row / h
+
+
+# Meetings
+
+
+@hard(
+    "start equals end; start within 1e-7 of the reversed path; met at step 0",
+    "0/0 in u = v/|v|, and in its derivative",
+    "u is zero there, with derivative zero; index 0 counts as a meeting",
+)
+def test_pairs_that_have_met_before_they_start(precision):
+    model, dtype = paper_model(), jnp.dtype(precision)
+    coupling = jb.Coupling(0.5)
+    end = jnp.zeros((2, 1), dtype)
+    keys, dt = jax.random.split(jax.random.key(0), 1), jnp.full(1, 0.05, dtype)
+    first = propose(model, coupling, keys, end, end, dt, 20)
+    for away in (0.0, 1e-7):
+        again = propose(model, coupling, keys, first.reverse_start + away, end, dt, 20)
+        assert int(again.meeting_step[0]) == 1 and all_finite(again)
+
+    def total(scale, start):
+        scaled = model.with_params(jax.tree.map(lambda leaf: leaf * scale, model.params))
+        bridges = jb.sample_bridges(
+            jax.random.key(1), scaled, start, jnp.zeros(2, dtype), 1.0, num_bridges=50
+        )
+        return jnp.sum(bridges.paths)
+
+    assert all_finite(jax.grad(total, argnums=(0, 1))(jnp.ones((), dtype), jnp.zeros(2, dtype)))
+    bridges = jb.sample_bridges(
+        jax.random.key(1), model, jnp.zeros(2, dtype), jnp.zeros(2, dtype), 1.0, num_bridges=200
+    )
+    weighted = jb.weigh_bridges(jax.random.key(2), model, bridges)
+    assert bridges.met.all() and all_finite(bridges.paths, weighted.log_weights)
+
+
+@hard(
+    "γ = -1; γ = 1 - 1e-3; γ = 1 - 1e-6; γ = 1",
+    "√(1-γ²) of a negative number, division by 1-γ = 0; a search without end",
+    "finite for every γ < 1, and fewer meetings as it grows, within the bound; γ = 1 is refused",
+)
+def test_gamma_at_both_ends(precision, unchecked):
+    dtype, acceptance = jnp.dtype(precision), []
+    start, end = jnp.array([0.3, 0.3], dtype), jnp.array([0.4, 0.2], dtype)
+    for gamma in (-1.0, 0.5, 1 - 1e-3, 1 - 1e-6):
+        bridges = jb.sample_bridges(
+            jax.random.key(0),
+            paper_model(),
+            start,
+            end,
+            1.0,
+            num_bridges=20,
+            coupling=jb.Coupling(gamma),
+            max_proposals=20_000,
+        )
+        assert all_finite(bridges.paths[bridges.met]) and bridges.num_proposals <= 30_000
+        assert bridges.num_nonfinite == 0
+        acceptance.append(float(bridges.met.sum() / bridges.num_proposals))
+    assert acceptance[0] > 0.5 and (np.diff(acceptance[1:]) < 0).all()
+    with pytest.raises(ValueError, match="gamma"):
+        jb.Coupling(1.0)
+
+
+# Unlikely bridges
+
+
+@hard(
+    "bridges 5 standard deviations out, (5, -5) → (6, -6), and 40, (10, 10) → (-10, -10)",
+    "a search for ever; weights that under- or overflow",
+    "the right density from a fitted start law, or `met` is false within the bound; log weights "
+    "are kept as logarithms",
+)
+def test_very_unlikely_bridges():
+    model = paper_model()
+    exact = lambda a, b: float(jb.ou_transition(model, jnp.array(a), 1.0).log_density(jnp.array(b)))
+    start, end = [5.0, -5.0], [6.0, -6.0]
+    law = jb.fit_start_law(jax.random.key(0), model, start, end, 1.0, coupling=jb.Coupling(0.5))
+    options = dict(num_proposals=20_000, num_steps=50)
+    estimate = jb.transition_log_density(
+        jax.random.key(1),
+        model,
+        start,
+        end,
+        1.0,
+        proposal=jb.Coupling(0.5, start_law=law),
+        **options,
+    )
+    error = float(estimate.standard_error)
+    assert estimate.num_met > 0 and error < 0.2
+    assert abs(float(estimate.value) - exact(start, end)) < 5 * error + 0.03
+    # No pair crosses 28 standard deviations: that is said, not hidden.
+    far = ([10.0, 10.0], [-10.0, -10.0])
+    bridges = jb.sample_bridges(
+        jax.random.key(0), model, *far, 1.0, num_bridges=5, max_proposals=5_000
+    )
+    assert not bridges.met.any() and np.isnan(bridges.paths).all()
+    assert bridges.num_proposals <= 10_000
+    missed = jb.transition_log_density(jax.random.key(1), model, *far, 1.0, **options)
+    assert missed.value == -np.inf and missed.standard_error == np.inf and missed.num_met == 0
+    # A linear guide knows the way: a log density of some -800.
+    guided = jb.transition_log_density(
+        jax.random.key(1),
+        model,
+        *far,
+        1.0,
+        num_proposals=500,
+        num_steps=400,
+        proposal=jb.Guided(density=jb.TrapezoidDensity()),
+    )
+    assert exact(*far) < -500
+    assert abs(float(guided.value) / exact(*far) - 1) < 1e-3
+
+
+@hard(
+    "T = 1000 in 50,000 steps",
+    "sums of δ in float32 are off by several steps at the end; memory for every step",
+    "times are i δ, computed from i; only the times asked for are kept",
+)
+def test_long_intervals():
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        jb.hyperbolic(0.8, 2),
+        [0.0, 0.0],
+        [1.0, 0.0],
+        1000.0,
+        num_bridges=4,
+        num_steps=50_000,
+        save_at=jnp.linspace(0, 1000, 11),
+    )
+    assert bridges.met.all() and all_finite(bridges.paths)
+    np.testing.assert_array_equal(bridges.times, np.linspace(0, 1000, 11, dtype=np.float32))
+    np.testing.assert_array_equal(bridges.paths[:, -1], np.tile([1.0, 0.0], (4, 1)))
+    assert (bridges.meeting_step < 5_000).all()
+
+
+@hard(
+    "T = 0.001",
+    "pairs do not meet unless the ends are close: a search for ever",
+    "`met` is false within the bound, and `throw=True` says what to do instead",
+)
+def test_short_intervals():
+    options = dict(num_bridges=2, num_steps=10, max_proposals=2_000)
+    ends = ([0.0, 0.0], [1.0, 1.0], 1e-3)
+    bridges = jb.sample_bridges(jax.random.key(0), paper_model(), *ends, **options)
+    assert not bridges.met.any() and bridges.num_proposals <= 4_000
+    with pytest.raises(RuntimeError, match="ModifiedDiffusionBridge"):
+        jb.sample_bridges(jax.random.key(0), paper_model(), *ends, throw=True, **options)
+
+
+# Stiff and superlinear drift
+
+
+@hard(
+    "stiff drift: eigenvalues 0.5 and 500 at δ = 0.02",
+    "explicit steps explode",
+    "counted in `num_nonfinite` with an explicit scheme; `SemiImplicit` and, for linear drift, "
+    "`GaussianTransition` stay stable and give the right density",
+)
+def test_stiff_drift():
+    model = jb.ornstein_uhlenbeck([[0.5, 0.0], [0.0, 500.0]])
+    start, end = [0.3, 0.02], [0.8, -0.03]
+    exact = jb.ou_transition(model, jnp.array(start), 1.0).log_density(jnp.array(end))
+    explicit = jb.sample_bridges(
+        jax.random.key(0), model, start, end, 1.0, num_bridges=5, max_proposals=500
+    )
+    assert not explicit.met.any() and explicit.num_nonfinite > 0
+    for scheme in (jb.SemiImplicit(), jb.GaussianTransition()):
+        estimate = jb.transition_log_density(
+            jax.random.key(1),
+            model,
+            start,
+            end,
+            1.0,
+            num_proposals=20_000,
+            num_steps=50,
+            proposal=jb.Coupling(0.0, scheme=scheme),
+        )
+        error = float(estimate.standard_error)
+        assert error < 0.1 and estimate.num_nonfinite == 0
+        assert abs(float(estimate.value - exact)) < 5 * error + 0.01
+
+
+def well_drift(x, p):
+    return x - x**3
+
+
+def log_well(x, p):
+    return jnp.sum(x**2 - x**4 / 2)
+
+
+@hard(
+    "superlinear drift: dX = (X - X³) dt + dW from 8, δ = 0.05",
+    "explicit steps overflow from the first on",
+    "counted in `num_nonfinite`; `SemiImplicit` gives the density of the Fokker–Planck equation",
+)
+def test_superlinear_drift():
+    grid = np.linspace(-4, 9, 1301)
+    density = density_on_grid(lambda x: x - x**3, grid, 8.0, 1.0)
+    exact = np.log(np.interp(0.5, grid, density))
+    mass = np.exp(grid**2 - grid**4 / 2).sum() * (grid[1] - grid[0])
+    model = jb.Diffusion(
+        well_drift,
+        None,
+        lambda x, p: log_well(x, p) - np.log(mass),
+        reversible=True,
+        normalised=True,
+    )
+    ends = ([8.0], [0.5], 1.0)
+    options = dict(num_proposals=50_000, num_steps=20)
+    law = jb.GaussianLaw([0.0], [[1.0]])
+
+    def estimate(scheme):
+        proposal = jb.Coupling(0.0, scheme=scheme, start_law=law)
+        return jb.transition_log_density(
+            jax.random.key(0), model, *ends, proposal=proposal, **options
+        )
+
+    explicit, implicit = estimate(jb.Euler()), estimate(jb.SemiImplicit())
+    assert explicit.num_nonfinite > 0.9 * options["num_proposals"]
+    assert implicit.num_nonfinite == 0 and implicit.standard_error < 0.02
+    assert abs(float(implicit.value) - exact) < 5 * float(implicit.standard_error) + 0.1
+
+
+@hard(
+    "a metastable double well over T = 50",
+    "a pair in different wells is called unreachable",
+    "the share of bridges in either well half way is that of the Fokker–Planck equation",
+)
+def test_metastable_double_well():
+    barrier = 1.5
+    slope = lambda x: 4 * barrier * x * (1 - x**2) / 2
+    grid = np.linspace(-2.5, 2.5, 501)
+    one, other = (density_on_grid(slope, grid, a, 25.0) for a in (-1.0, 1.0))
+    nu = np.exp(-barrier * (grid**2 - 1) ** 2)
+    # p(a, x) p(x, b), the latter by reversibility.
+    middle = one * other * nu.max() / nu * (nu > 1e-12)
+    right = middle[grid > 0].sum() / middle.sum()
+    model = jb.Diffusion(
+        lambda x, p: 2 * barrier * x * (1 - x**2),
+        None,
+        lambda x, p: -jnp.sum(barrier * (x**2 - 1) ** 2),
+        reversible=True,
+    )
+    weighted = jb.sample_weighted_bridges(
+        jax.random.key(0),
+        model,
+        [-1.0],
+        [1.0],
+        50.0,
+        num_bridges=4_000,
+        num_steps=1_000,
+        save_at=[25.0],
+        proposal=jb.Coupling(0.0, scheme=jb.SemiImplicit()),
+    )
+    share = weighted.mean(lambda path: (path[0, 0] > 0).astype(path.dtype))
+    error = 0.5 / np.sqrt(float(weighted.effective_sample_size))
+    assert abs(float(share) - right) < 5 * error + 0.01
+
+
+# σ
+
+
+@hard(
+    "nearly singular σ: condition number 1e6, and correlation 0.9999",
+    "V = σσᵀ squares the condition number, beyond float32",
+    "only σ is solved with; densities agree with the closed form",
+)
+@pytest.mark.parametrize(
+    "mixing",
+    [np.diag([1.0, 1e-6]), np.array([[1.0, 0.0], [0.9999, 0.014]])],
+    ids=["scales", "correlation"],
+)
+def test_nearly_singular_sigma(mixing):
+    """The paper's process in other linear coordinates."""
+    B = mixing @ PAPER_B @ np.linalg.inv(mixing)
+    model = jb.ornstein_uhlenbeck(jnp.asarray(B, jnp.float32), sigma=mixing)
+    ends = [mixing @ np.array(point) for point in ([0.3, -0.2], [0.5, 0.4])]
+    exact = jb.ou_transition(paper_model(), jnp.array([0.3, -0.2]), 1.0).log_density(
+        jnp.array([0.5, 0.4])
+    ) - np.log(np.linalg.det(mixing))
+    for proposal in (jb.Coupling(0.5), jb.ModifiedDiffusionBridge(jb.TrapezoidDensity())):
+        estimate = jb.transition_log_density(
+            jax.random.key(0), model, *ends, 1.0, num_proposals=20_000, proposal=proposal
+        )
+        error = float(estimate.standard_error)
+        assert error < 0.03
+        assert abs(float(estimate.value - exact)) < 5 * error + 0.01
+
+
+@hard(
+    "σ(x) a rotation through full turns: repeated singular values",
+    "the polar factor by singular vectors jumps, with infinite derivatives",
+    "O is σ(x')ᵀσ(x) itself, and bridges have the Ornstein–Uhlenbeck law",
+)
+def test_rotating_sigma():
+    def turn(x, p):
+        angle = 2 * np.pi * x[0]
+        return jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
+
+    model = jb.Diffusion(
+        lambda x, p: -x / 2,
+        turn,
+        lambda x, p: -x @ x / 2 - jnp.log(2 * np.pi),
+        reversible=True,
+        normalised=True,
+    )
+    start, end = jnp.array([0.3, -0.2]), jnp.array([-0.5, 0.4])
+    exact = jb.ou_transition(jb.ornstein_uhlenbeck(0.5 * np.eye(2)), start, 2.0).log_density(end)
+    for scheme in (jb.Euler(), jb.Heun()):
+        estimate = jb.transition_log_density(
+            jax.random.key(0),
+            model,
+            start,
+            end,
+            2.0,
+            num_proposals=10_000,
+            num_steps=100,
+            proposal=jb.Coupling(0.5, scheme=scheme),
+        )
+        error = float(estimate.standard_error)
+        assert error < 0.05
+        assert abs(float(estimate.value - exact)) < 5 * error + 0.03
+
+
+# Stationary densities
+
+
+def uniform(x, p):
+    return jnp.zeros((), x.dtype)
+
+
+def student(x, p):
+    return -2.5 * jnp.log1p(x @ x / 3)
+
+
+def laplace(x, p):
+    return -jnp.sum(jnp.abs(x))
+
+
+def half_plane(x, p):
+    return jnp.where(x[0] > -3, -x @ x, -jnp.inf)
+
+
+@hard(
+    "log ν flat, with heavy tails, with a kink, -∞ outside, and at 10⁴ standard deviations",
+    "ν underflows, ∇ν/ν is 0/0",
+    "only ∇log ν is used; a path that comes to where it is not finite is a miss",
+)
+@pytest.mark.parametrize("log_density", [uniform, student, laplace, half_plane])
+def test_unusual_stationary_densities(log_density, precision):
+    dtype = jnp.dtype(precision)
+    model = jb.langevin(log_density)
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        model,
+        jnp.zeros(2, dtype),
+        jnp.array([0.5, -0.5], dtype),
+        2.0,
+        num_bridges=100,
+        max_proposals=20_000,
+    )
+    assert all_finite(bridges.paths[bridges.met])
+    assert log_density is uniform or bridges.met.all()
+    far = jnp.full(2, 1e4, dtype)
+    assert all_finite(jb.langevin(lambda x, p: -x @ x / 2).reverse_drift(far))
+
+
+# Dimensions
+
+
+@hard(
+    "d = 1, 2, 10, 50",
+    "costs and memory of d³ matrices where none is called for",
+    "with σ = I a step is d numbers; laws agree with the closed form",
+)
+@pytest.mark.parametrize("d", [1, 2, 10, 50])
+def test_dimensions(d):
+    model = jb.ornstein_uhlenbeck(jnp.eye(d))
+    start, end = jnp.full(d, 0.2), jnp.full(d, -0.1)
+    weighted = jb.sample_weighted_bridges(
+        jax.random.key(0),
+        model,
+        start,
+        end,
+        3.0,
+        num_bridges=2_000,
+        num_steps=60,
+        proposal=jb.Coupling(-1.0, scheme=jb.Heun()),
+        save_at=[1.5],
+    )
+    exact = jb.gaussian_bridge(model, start, end, 3.0, times=[1.5])
+    size = float(weighted.effective_sample_size)
+    assert size > 100 and not weighted.truncated.any()
+    bias = (weighted.mean()[0] - exact.mean[0]) / jnp.sqrt(jnp.diagonal(exact.covariance[0]))
+    assert float(jnp.abs(bias).max()) < 5 / np.sqrt(size)
+
+
+@hard(
+    "a drift that is mostly rotation, eigenvalues 0.1 ± 20i",
+    "the path turns once in 15 steps: symmetric formulas for the reversal fail",
+    "α* from log ν turns the other way; the density is that of the closed form",
+)
+def test_rotation_dominated_drift():
+    model = jb.ornstein_uhlenbeck([[0.1, 20.0], [-20.0, 0.1]])
+    start, end = jnp.array([1.0, 0.5]), jnp.array([-0.5, 1.5])
+    estimate = jb.transition_log_density(
+        jax.random.key(0),
+        model,
+        start,
+        end,
+        2.0,
+        num_proposals=20_000,
+        num_steps=100,
+        proposal=jb.Coupling(0.0, scheme=jb.GaussianTransition()),
+    )
+    exact = jb.ou_transition(model, start, 2.0).log_density(end)
+    assert estimate.standard_error < 0.05
+    assert abs(float(estimate.value - exact)) < 5 * float(estimate.standard_error)
+
+
+# Counts, parameters, determinism
+
+
+@hard(
+    "hitting probabilities near 1e-6; all proposals missed; one accepted",
+    "a geometric count that never ends; division by no hits",
+    "`max_trials` bounds the work, `truncated` says where, weights stay finite",
+)
+def test_extreme_counts():
+    model = paper_model()
+    bridges = jb.sample_bridges(
+        jax.random.key(0), model, [2.0, -2.0], [3.0, -3.0], 1.0, num_bridges=3
+    )
+    weighted = jb.weigh_bridges(jax.random.key(1), model, bridges, max_trials=5)
+    assert weighted.truncated.any() and all_finite(weighted.log_weights, weighted.mean())
+    with pytest.raises(RuntimeError, match="max_trials"):
+        jb.weigh_bridges(jax.random.key(1), model, bridges, max_trials=5, throw=True)
+    nothing = jb.sample_bridges(
+        jax.random.key(0), model, [9.0, 9.0], [-9.0, -9.0], 0.1, num_bridges=3, max_proposals=50
+    )
+    empty = jb.weigh_bridges(jax.random.key(1), model, nothing)
+    assert not empty.met.any() and empty.effective_sample_size == 0
+    assert all_finite(empty.weights) and (empty.log_weights == -np.inf).all()
+    single = jb.sample_bridges(jax.random.key(0), model, [0.0, 0.0], [0.1, 0.0], 1.0, num_bridges=1)
+    one = jb.weigh_bridges(jax.random.key(1), model, single)
+    assert one.weights[0] == 1 and one.effective_sample_size == 1
+
+
+@hard(
+    "parameters that are not finite, inside `jit`",
+    "NaN paths that look like results",
+    "nothing is met, all proposals are counted in `num_nonfinite`; `throw=True` raises",
+)
+def test_parameters_that_are_not_finite():
+    def run(alpha, throw):
+        return jb.sample_bridges(
+            jax.random.key(0),
+            jb.hyperbolic(alpha, 2),
+            [0.0, 0.0],
+            [1.0, 0.0],
+            1.0,
+            num_bridges=3,
+            max_proposals=100,
+            throw=throw,
+        )
+
+    bridges = jax.jit(lambda alpha: run(alpha, False))(jnp.nan)
+    assert not bridges.met.any() and bridges.num_nonfinite == bridges.num_proposals
+    with pytest.raises(RuntimeError, match="parameters of the model are not finite"):
+        jax.block_until_ready(jax.jit(lambda alpha: run(alpha, True))(jnp.nan))
+    density = jax.jit(
+        lambda alpha: jb.transition_log_density(
+            jax.random.key(0), jb.hyperbolic(alpha, 2), [0.0, 0.0], [1.0, 0.0], 1.0
+        )
+    )(jnp.nan)
+    assert density.value == -np.inf and density.num_met == 0
+
+
+@hard(
+    "the same key under `jit` and without, in other batches, on several devices",
+    "other numbers",
+    "the same numbers up to rounding: each path has a key of its own",
+)
+def test_the_same_key_gives_the_same_numbers():
+    def run(batch_size=None):
+        return jb.sample_bridges(
+            jax.random.key(0),
+            paper_model(),
+            [0.0, 0.0],
+            [1.0, 0.0],
+            1.0,
+            num_bridges=50,
+            batch_size=batch_size,
+        ).paths
+
+    plain = run()
+    np.testing.assert_allclose(jax.jit(run)(), plain, atol=1e-5)
+    for batch_size in (7, 64):
+        np.testing.assert_allclose(run(batch_size), plain, atol=1e-5)
+
+
+@hard(
+    "60,000 lanes with a full σ(x), d = 2, 5, 12",
+    "batched LAPACK calls inside a scan deadlock XLA's thread pool on CPU",
+    "no LAPACK call in any loop: elimination and polar iterations written out",
+)
+@pytest.mark.slow
+@pytest.mark.parametrize("d", [2, 5, 12])
+def test_no_deadlock(d):
+    """Sampler, counts, weights and Gibbs in a process of their own, with a deadline."""
+    run_program(
+        f"""
+        import jax, jax.numpy as jnp, jaxbridge as jb
+        d, n = {d}, 60_000
+        mix = lambda x: jnp.eye(d) + 0.1 * jnp.sin(x)[:, None] * jnp.cos(x)
+        model = jb.Diffusion(
+            lambda x, p: -p * x, lambda x, p: mix(x), lambda x, p: -x @ x, 1.0, reversible=True
+        )
+        zero = jnp.zeros(d)
+        coupling = jb.Coupling(0.0, scheme=jb.Euler())
+        bridges = jb.sample_bridges(
+            jax.random.key(0), model, zero, zero, 1.0, num_bridges=n, num_steps=2,
+            batch_size=n, coupling=coupling, max_proposals=2 * n,
+        )
+        weighted = jb.weigh_bridges(
+            jax.random.key(1), model, bridges, max_trials=2, batch_size=n
+        )
+        times = jnp.linspace(0, 6, 7)
+        path = jax.random.normal(jax.random.key(2), (7, d)) / 2
+        posterior = jb.gibbs(
+            jax.random.key(3), model, times, path, prior=jb.NormalPrior(1.0, 1.0),
+            proposal=coupling, num_iterations=3, num_steps=2,
+        )
+        jax.block_until_ready((weighted, posterior))
+        """,
+        deadline=580,
+    )
