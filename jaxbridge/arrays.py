@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, PyTree
 
 # Anything `jnp.asarray` takes: an array, a number, a (nested) list of numbers.
@@ -68,3 +69,25 @@ def _refuse(primals, tangents):
         "likelihood of their paths. (Of a choice between proposals: make it before, with "
         "`choose_proposal`, between those that are pulled to the end point.)"
     )
+
+
+def time_steps(name: str, times: Numbers) -> tuple[Array, Array]:
+    """Times as an array, and the differences of successive ones, in the last axis. Where times are
+    known these are taken before they are rounded to the array's precision.
+
+    **Raises:** `ValueError` where they are so large that rounding has spoilt the differences.
+    """
+    array = as_floating(name, times)
+    if is_traced(times):
+        return array, jnp.diff(array)
+    known = np.asarray(times)
+    known = known if np.issubdtype(known.dtype, np.floating) else known.astype(float)
+    steps = np.diff(known.astype(float))
+    smallest = np.min(np.abs(steps[steps != 0]), initial=np.inf)
+    if np.finfo(known.dtype).eps * np.max(np.abs(known), initial=0) > 1e-3 * smallest:
+        raise ValueError(
+            f"`{name}` are too large for their differences to be known in {known.dtype}: count "
+            "them from a later zero, or pass them as a NumPy array of float64."
+        )
+    with jax.ensure_compile_time_eval():
+        return array, jnp.asarray(steps, array.dtype)

@@ -17,8 +17,10 @@ from typing import Any, Literal, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from .arrays import is_traced
 from .coupled_pairs import CoupledPairs
 from .diffusion import Diffusion
 from .guided import ModifiedDiffusionBridge
@@ -132,6 +134,26 @@ class Completion(eqx.Module):
     def num_intervals(self) -> int:
         return sum(len(part.index) for part in self.parts)
 
+    def check_paths(self, paths: Paths, chains: tuple[int, ...]) -> None:
+        """Raise `ValueError` where these are no paths between the observations."""
+        wanted = [
+            (*chains, len(part.index), part.num_steps + 1, part.intervals.start.shape[1])
+            for part in self.parts
+        ]
+        shapes = [mine.shape for mine in paths]
+        if shapes != wanted:
+            raise ValueError(
+                f"`init` is a state with paths of shapes {shapes}, but these observations and "
+                f"numbers of steps call for {wanted}."
+            )
+        for part, mine in zip(self.parts, paths, strict=True):
+            ends = (part.intervals.start, part.intervals.end)
+            for end, found in zip(ends, (mine[..., 0, :], mine[..., -1, :]), strict=True):
+                if not is_traced(end, found) and not np.allclose(found, end, atol=1e-6, rtol=1e-4):
+                    raise ValueError(
+                        "`init` is a state whose paths do not join these observations."
+                    )
+
     def first(self, key: Key[Array, ""], model: Diffusion) -> Paths:
         """Paths to start from. Where the proposal finds none, whatever its weight, a modified
         diffusion bridge serves, or a straight line: a chain may start anywhere."""
@@ -220,7 +242,9 @@ def complete(
     if proposal is None and bridges == "exact" and method is None:
         given = "auto"
     only_couplings = bridges == "approximate" or method == "renewal"
-    parts = make_parts(key, model, intervals, groups, given, bounds, only_couplings=only_couplings)
+    exact = bridges == "exact"
+    couplings = {"only_couplings": only_couplings, "weighted": exact}
+    parts = make_parts(key, model, intervals, groups, given, bounds, **couplings)
     return Completion(parts, tuple(_kernel(part.proposal, bridges, method) for part in parts))
 
 

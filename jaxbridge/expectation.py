@@ -14,7 +14,6 @@ derivative of the paths themselves is not. Higher derivatives are right, too.
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -74,7 +73,6 @@ def expectation(
     # Missing bridges are NaN and weigh nothing: another path takes their place.
     some = jnp.take_along_axis(paths, jnp.argmax(met, axis=1)[:, None, None, None], axis=1)
     paths = jnp.where(met[..., None, None], paths, some)
-    _known_sigma(model.diffusion(paths[0, 0, 0]))
     log_weights = jnp.where(met, 0.0, -jnp.inf).astype(paths.dtype)
     if isinstance(bridges, WeightedBridges):
         log_weights = lax.stop_gradient(bridges.log_weights).reshape(met.shape)
@@ -90,17 +88,3 @@ def expectation(
         return total if batched else total[0]
 
     return jax.tree.map(mean, jax.vmap(jax.vmap(fn))(paths))
-
-
-@eqx.filter_custom_jvp
-def _known_sigma(sigma: Array) -> Array:
-    """σ, of which no derivative may be taken."""
-    return sigma
-
-
-@_known_sigma.def_jvp
-def _refuse(primals, tangents):
-    raise TypeError(
-        "σ depends on parameters in which a derivative is taken, and paths have no density that "
-        "depends on σ: differentiate in the parameters of the drift only."
-    )

@@ -20,14 +20,16 @@ from .arrays import Numbers, nondifferentiable
 from .completion import Completion, Paths, complete
 from .diffusion import Diffusion
 from .intervals import check_count
-from .likelihood import Form, forms_of
+from .likelihood import Form
 from .parameter_steps import (
     AbstractParameterKernel,
     CompleteData,
     NormalDraw,
+    check_kernel,
     choose_kernel,
     quadratic_form,
 )
+from .parts import target_forms
 from .posterior import AbstractPosterior
 from .problem import as_problem, first_chain, starting_points
 from .unknowns import (
@@ -114,6 +116,8 @@ def gibbs(
     - `num_iterations`: draws that are kept; between two of them are `thin` iterations.
     - `num_steps`: N for each interval, by default 50; or `step_size`, the longest step, from
         which each interval gets its own number of steps.
+    - `prior`, `constraint`, `where` and `parameter_kernel` are compared by identity: define them
+        once to compile once.
     - `proposal`: a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, `Guided()`, or
         "auto", the default, which finds the best for each interval by a pilot run; or, for
         approximate bridges, a `Coupling`, by default `Coupling(gamma=0.0)`.
@@ -160,19 +164,23 @@ def gibbs(
         "use `pmmh`, which needs no path, or pick the others with `where=`.",
     )
     unknowns, like = problem.unknowns, problem.like
+    check_kernel(parameter_kernel)
     log_prior = as_log_prior(prior, unknowns, problem.theta)
-    theta, state = starting_points(problem, init, num_chains, constraint, GibbsState)
+    theta, state = starting_points(problem, init, num_chains, constraint, log_prior, GibbsState)
     complete_key, run_key = jax.random.split(key)
     bounds = (num_counts, max_proposals, max_trials)
     arguments = (problem.intervals, problem.groups, proposal, bridges, method, bounds)
     completion = complete(complete_key, problem.pilot_model(theta), *arguments)
-    form = quadratic_form(unknowns, first_chain(theta), like)
+    forms = target_forms(completion.parts, model)
+    form = quadratic_form(unknowns, first_chain(theta), like, forms)
     kernel = choose_kernel(parameter_kernel, form is not None, log_prior)
-    form = forms_of(model, like)[0] if form is None else form
+    form = forms[0] if form is None else form
     setting = _Setting(unknowns, completion, log_prior, constraint, kernel, form)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     if state is None:
         state = _start(run_key, setting, theta)
+    else:
+        completion.check_paths(state.paths, theta.shape[:-1])
     return _run(run_key, setting, state, num_iterations, thin, meter)
 
 

@@ -31,7 +31,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .arrays import Numbers, as_floating, is_traced
+from .arrays import Numbers, as_floating, is_traced, time_steps
 from .diffusion import Diffusion, Dynamics, check_diffusion
 from .lanes import over_lanes
 from .linalg import dot, total
@@ -43,7 +43,7 @@ Form = Literal["girsanov", "trapezoid", "ito", "euler"]
 def path_log_likelihood(
     model: Diffusion, times: Numbers, path: Numbers, *, form: Form | None = None
 ) -> Float[Array, "*batch"]:
-    """The log likelihood of paths, differentiable in `model.params`.
+    """The log likelihood of paths, differentiable in the parameters of the drift.
 
     **Arguments:**
 
@@ -59,7 +59,8 @@ def path_log_likelihood(
     to Lebesgue's measure.
 
     **Raises:** `ValueError` for shapes that do not fit, times that do not increase, or a form
-    that the model does not have.
+    that the model does not have; `TypeError` where a derivative is taken in parameters of σ,
+    except as "euler".
 
     !!! example
 
@@ -71,7 +72,7 @@ def path_log_likelihood(
         ```
     """
     check_diffusion(model)
-    times, path = as_floating("times", times), as_floating("path", path)
+    (times, steps), path = time_steps("times", times), as_floating("path", path)
     if path.ndim < 2 or path.shape[-2] < 2:
         raise ValueError(
             "`path` must hold two or more points in the axis before the last, shape (..., K, d); "
@@ -87,14 +88,31 @@ def path_log_likelihood(
             f"{num_times}) for paths of shape (I, ..., {num_times}, d); got {times.shape} for "
             f"paths of shape {path.shape}."
         )
-    steps = jnp.diff(times.astype(path.dtype))
-    if not is_traced(times) and not np.all(np.diff(np.asarray(times)) > 0):
+    steps = steps.astype(path.dtype)
+    if not is_traced(steps) and not np.all(np.asarray(steps) > 0):
         raise ValueError("`times` must be finite and increase.")
     if steps.ndim == 2:
         steps = steps.reshape(len(steps), *[1] * (len(batch) - 1), num_times - 1)
     steps = jnp.broadcast_to(steps, (*batch, num_times - 1)).reshape(-1, num_times - 1)
-    values = _compiled(model, steps.T, path.reshape(-1, num_times, d), form)
-    return values.reshape(batch)
+    paths = path.reshape(-1, num_times, d)
+    if form != "euler":
+        known_sigma(model.diffusion(paths[0, 0]))
+    return _compiled(model, steps.T, paths, form).reshape(batch)
+
+
+@eqx.filter_custom_jvp
+def known_sigma(sigma: Array) -> Array:
+    """σ, of which no derivative may be taken."""
+    return sigma
+
+
+@known_sigma.def_jvp
+def _refuse(primals, tangents):
+    raise TypeError(
+        "σ depends on parameters in which a derivative is taken, and paths have no density that "
+        "depends on σ: differentiate in the parameters of the drift only, or, for the density of "
+        'the Euler scheme at the points of the path, choose `form="euler"`.'
+    )
 
 
 def log_likelihoods(

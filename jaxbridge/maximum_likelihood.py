@@ -22,15 +22,16 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from .arrays import Numbers, nondifferentiable
 from .completion import Completion, Paths, complete
 from .diffusion import Diffusion
 from .intervals import check_count
-from .likelihood import Form, forms_of
+from .likelihood import Form
 from .linalg import any_solve
 from .parameter_steps import CompleteData, quadratic_form
+from .parts import target_forms
 from .problem import as_problem
 from .score import Score, score
 from .unknowns import (
@@ -39,6 +40,9 @@ from .unknowns import (
     allowed,
     check_allowed,
 )
+
+# Made once, for optimisers are compared by identity.
+_ADAM = optax.adam(1e-2)
 
 
 class MaximumLikelihood(eqx.Module):
@@ -53,8 +57,13 @@ class MaximumLikelihood(eqx.Module):
     - `iterates`: of the stochastic approximation, shape (n, p).
     - `score`: at the average of the iterates, before the last step.
     - `num_missing`: iterations' bridges that were not found, in all.
-    - `newton`: whether the last step was made; not so if the information was not positive
-        definite, or the step led out of the constraint: then more iterations are needed.
+    - `num_truncated`: weights that `max_trials` cut off.
+    - `num_refused`: iterations whose step led out of the constraint, or to what is not finite, and
+        was not made.
+    - `newton`: whether the last step was made. Not so if the information was not positive definite,
+        or the step longer than about a standard error, or out of the constraint: then the average
+        of the iterates is returned, which is not the maximum, and more iterations are needed, or
+        longer steps.
     """
 
     params: PyTree
@@ -65,6 +74,8 @@ class MaximumLikelihood(eqx.Module):
     iterates: Float[Array, "n p"]
     score: Score
     num_missing: Int[Array, ""]
+    num_truncated: Int[Array, ""]
+    num_refused: Int[Array, ""]
     newton: Bool[Array, ""]
 
 
@@ -96,7 +107,7 @@ def maximum_likelihood(
     - `model`: its `params` are where the search starts.
     - `times`, `observations`, `num_steps`, `step_size`, `proposal`, `where`, `constraint`: as in
         `gibbs`. A step that would leave the constraint is not made.
-    - `optimizer`: any of optax's, by default `optax.adam(0.01)`; it is given the gradient of minus
+    - `optimizer`: any of optax's, compared by identity (make it once to compile once), by default `optax.adam(0.01)`; it is given the gradient of minus
         the mean log likelihood per interval, in the unknown parameters as a vector.
     - `method`: "gradient", or "em", which takes no optimiser and needs fewer iterations.
     - `num_iterations`: of the stochastic approximation.
@@ -120,6 +131,10 @@ def maximum_likelihood(
     num_iterations = check_count("num_iterations", num_iterations, 2)
     if method not in ("gradient", "em"):
         raise ValueError(f'`method` must be "gradient" or "em"; got {method!r}.')
+    if not (optimizer is None or isinstance(optimizer, optax.GradientTransformation)):
+        raise TypeError(
+            f"`optimizer` must be one of optax's, such as `optax.adam(1e-2)`; got {optimizer!r}."
+        )
     if method == "em" and optimizer is not None:
         raise ValueError('`method="em"` takes no `optimizer`.')
     problem = as_problem(
@@ -136,14 +151,16 @@ def maximum_likelihood(
     unknowns, theta = problem.unknowns, problem.theta
     check_allowed(constraint, unknowns, theta)
     complete_key, run_key, score_key = jax.random.split(key, 3)
+    proposal = "auto" if proposal is None else proposal
     bounds = (num_counts, max_proposals, max_trials)
     arguments = (problem.intervals, problem.groups, proposal, "exact", None, bounds)
     completion = complete(complete_key, model, *arguments)
-    form = quadratic_form(unknowns, theta, problem.like) or forms_of(model, problem.like)[0]
-    rule = _EM() if method == "em" else _Gradient(optimizer or optax.adam(1e-2))
+    forms = target_forms(completion.parts, model)
+    form = quadratic_form(unknowns, theta, problem.like, forms) or forms[0]
+    rule = _EM() if method == "em" else _Gradient(_ADAM if optimizer is None else optimizer)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     setting = _Setting(unknowns, completion, constraint, rule, form)
-    iterates, num_missing = _approximate(run_key, setting, theta, num_iterations, meter)
+    iterates, lost = _approximate(run_key, setting, theta, num_iterations, meter)
     rough = iterates[-1] if method == "em" else jnp.mean(iterates[num_iterations // 2 :], axis=0)
     at_rough = score(
         score_key,
@@ -160,9 +177,12 @@ def maximum_likelihood(
         max_trials=max_trials,
     )
     covariance = jnp.linalg.inv(at_rough.information)
-    newton = rough + covariance @ at_rough.gradient
+    step = covariance @ at_rough.gradient
     definite = jnp.all(jnp.linalg.eigvalsh(at_rough.information) > 0)
-    ok = definite & allowed(constraint, unknowns, newton)
+    # Further off the likelihood need not be near its quadratic approximation.
+    near = at_rough.gradient @ step < theta.shape[0]
+    newton = rough + step
+    ok = definite & near & allowed(constraint, unknowns, newton)
     estimate = jnp.where(ok, newton, rough)
     left = covariance @ at_rough.covariance @ covariance
     standard, monte_carlo = (
@@ -176,7 +196,9 @@ def maximum_likelihood(
         covariance,
         iterates,
         at_rough,
-        num_missing,
+        lost.missing,
+        lost.truncated + at_rough.num_truncated,
+        lost.refused,
         ok,
     )
 
@@ -222,6 +244,14 @@ class _Setting(eqx.Module):
     form: Form = eqx.field(static=True)
 
 
+class _Lost(NamedTuple):
+    """Bridges that were not found, weights that were cut off, and steps that were not made."""
+
+    missing: Shaped[Array, "..."]
+    truncated: Shaped[Array, "..."]
+    refused: Shaped[Array, "..."]
+
+
 class _State(NamedTuple):
     theta: Float[Array, " p"]
     paths: Paths
@@ -236,8 +266,8 @@ def _approximate(
     theta: Float[Array, " p"],
     num_iterations: int,
     meter: diffrax.AbstractProgressMeter,
-) -> tuple[Float[Array, "n p"], Int[Array, ""]]:
-    """The iterates, and how many bridges were missing."""
+) -> tuple[Float[Array, "n p"], _Lost]:
+    """The iterates, and what was lost on the way."""
     setting = nondifferentiable(setting)
     unknowns, completion = setting.unknowns, setting.completion
     first_key, run_key = jax.random.split(key)
@@ -251,13 +281,24 @@ def _approximate(
             unknowns, completion, paths, jnp.zeros_like, setting.constraint, setting.form
         )
         moved, rule = setting.rule.update(i, state.theta, state.rule, data, num_intervals)
-        inside = allowed(setting.constraint, unknowns, moved)
-        theta = jnp.where(inside, moved, state.theta)
+        finite = all_finite_leaves(rule)
+        ok = allowed(setting.constraint, unknowns, moved) & finite
+        theta = jnp.where(ok, moved, state.theta)
+        # What an optimiser remembers must not be spoilt for all steps to come.
+        rule = jax.tree.map(lambda new, old: jnp.where(finite, new, old), rule, state.rule)
         progress = meter.step(state.meter, (i + 1).astype(jnp.float32) / num_iterations)
-        return _State(theta, paths, rule, progress), (theta, jnp.sum(renewed.missing))
+        lost = _Lost(renewed.missing, renewed.truncated, ~ok)
+        lost = jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)
+        return _State(theta, paths, rule, progress), (theta, lost)
 
     first = completion.first(first_key, unknowns.at(theta))
     state = _State(theta, first, setting.rule.init(theta), meter.init())
-    state, (iterates, missing) = lax.scan(iterate, state, jnp.arange(num_iterations))
+    state, (iterates, lost) = lax.scan(iterate, state, jnp.arange(num_iterations))
     meter.close(state.meter)
-    return iterates, jnp.sum(missing, dtype=jnp.int32)
+    return iterates, jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)
+
+
+def all_finite_leaves(tree: PyTree) -> Bool[Array, ""]:
+    """Whether all numbers in the tree are finite."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves] or [True]))

@@ -10,15 +10,16 @@ a meeting is a visit of that Brownian motion, from D_i to D_{i+1}, to zero.
 
 During a step the drift turns the gap, so with u from its beginning the two pass each other at a
 distance of O(δ^{3/2}), which is the error of what is joined there. Where σ is constant, schemes
-take u, and D_i, from the gap as it is after the drift of their step (`AbstractScheme.frame`): the
-noise then moves it straight through zero. For a scheme x + m(x) + R ΔW, with constant R,
+take u from the gap as it is when the noise of their step sets in (`AbstractScheme.frame`), which
+then moves it straight through zero. For a scheme x + m(x) + R ΔW, with constant R, that is after
+the drift,
 
     D_i u = R⁻¹[x_i + m(x_i) - x'_i - m(x'_i)],    D_{i+1} = D_i + uᵀ(ΔW - ΔW'),
 
 and the joint law of (ΔW, ΔW') given what is orthogonal to uᵀ(ΔW - ΔW') stays the same if x_{i+1}
 and x'_{i+1} change places, but for the factor exp(-2 D_i D_{i+1} / (s δ)) in its density. That is
-the probability of a crossing, so the joined path has exactly the transition probabilities of
-the scheme: meetings have no error of their own at any δ. (With γ = -1 this is the maximal coupling
+the probability of a crossing, so, if X has the transition probabilities of the scheme, the joined
+path has exactly these: meetings have no error of their own at any δ. (With γ = -1 this is the maximal coupling
 of two normal laws by reflection; Bou-Rabee, Eberle & Zimmer 2020.)
 """
 
@@ -38,8 +39,9 @@ class Frame(NamedTuple):
     """How the pair (x, x') lies, seen from the driven process x'.
 
     `sigma` is σ(x'), or the root R of the scheme's noise; `u`, shape (d,), the unit vector along
-    `σ(x')⁻¹(x - x')`, now or after the drift of a step, zero where the two are equal; `gap` the
-    length of that vector, in square roots of a unit of time.
+    `σ(x')⁻¹(x - x')`, zero where the two are equal; `gap` the length of that vector, in square
+    roots of a unit of time. Schemes may look at the pair after the drift of their step; `Heun`
+    takes u after half of it, and the gap before.
     """
 
     sigma: AbstractSigma
@@ -63,7 +65,7 @@ class PairStep(NamedTuple):
     """One time step of the pair: everything a meeting rule may look at.
 
     `x`, `x_next` are the states of X and `driven`, `driven_next` those of X', shape (d,);
-    `frame` is taken at the beginning of the step, of length `dt`; `gap_variance` is the
+    `frame` is what the noise of the step, of length `dt`, was coupled in; `gap_variance` is the
     variance per unit of time of the gap along `frame.u`.
     """
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
-from .arrays import Numbers, as_floating, is_traced
+from .arrays import Numbers, as_floating, is_traced, time_steps
 from .diffusion import Diffusion
 from .intervals import Intervals, as_intervals, check_count
 
@@ -28,7 +28,7 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
 
     **Raises:** `ValueError` that says what is wrong with which time or observation.
     """
-    times = as_floating("times", times)
+    times, duration = time_steps("times", times)
     observations = as_floating("observations", observations)
     if times.ndim != 1:
         raise ValueError(f"`times` must have shape (n + 1,); got {times.shape}.")
@@ -44,7 +44,7 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
         missing = np.flatnonzero(~np.isfinite(known))
         if missing.size:
             raise ValueError(f"`times[{missing[0]}]` = {known[missing[0]]} is missing.")
-        back = np.flatnonzero(np.diff(known) <= 0)
+        back = np.flatnonzero(np.asarray(duration) <= 0)
         if back.size:
             i = back[0]
             raise ValueError(
@@ -60,7 +60,6 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
                 "observations that are missing, with their times."
             )
         _check_state_space(model, observations)
-    duration = jnp.diff(times)
     intervals, _, _ = as_intervals(observations[:-1], observations[1:], duration)
     return intervals
 

@@ -17,7 +17,7 @@ With τ = 1 and constant G this is the draw above, always accepted.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Key
 from .completion import Completion, Paths
 from .diffusion import uses_argument
 from .lanes import over_lanes
-from .likelihood import Form, forms_of, log_likelihoods
+from .likelihood import Form, log_likelihoods
 from .linalg import any_cholesky, any_solve, dot, matvec
 from .unknowns import Constraint, NormalDensity, Unknowns, allowed
 
@@ -89,11 +89,14 @@ class CompleteData(NamedTuple):
 
 
 def quadratic_form(
-    unknowns: Unknowns, theta: Float[Array, " p"], like: Float[Array, " d"]
+    unknowns: Unknowns,
+    theta: Float[Array, " p"],
+    like: Float[Array, " d"],
+    forms: Sequence[Form],
 ) -> Form | None:
-    """The most accurate form in which the log likelihood is quadratic in θ, if there is one."""
+    """The first of these forms in which the log likelihood is quadratic in θ, if there is one."""
     steps, paths = jnp.ones((1, 1), like.dtype), jnp.stack([like, like])[None]
-    for form in forms_of(unknowns.model, like):
+    for form in forms:
 
         def log_likelihood(theta, form: Form = form):
             return log_likelihoods(unknowns.at(theta), steps, paths, form)[0]
@@ -117,8 +120,15 @@ class NormalDraw(AbstractParameterKernel):
     """θ from its normal law given the paths."""
 
     def step(self, key, theta, data):
-        gradient, hessian = _derivatives(data.log_posterior_inside, theta)
-        root = any_cholesky(-hessian)
+        gradient, root = _gradient_and_root(data, theta)
+        if data.form == "trapezoid":
+            # Its part from Lévy's area is positive, and where nearly nothing is observed the rest
+            # may not outweigh it.
+            gradient, root = lax.cond(
+                jnp.all(jnp.isfinite(root)),
+                lambda: (gradient, root),
+                lambda: _gradient_and_root(data._replace(form="girsanov"), theta),
+            )
         mean = theta + _solve_root(root, gradient)
 
         def draw(carry):
@@ -184,16 +194,20 @@ class GivenKernel(AbstractParameterKernel):
         return ParameterStep(moved, jnp.any(moved != theta))
 
 
+def check_kernel(kernel: Any) -> None:
+    """Raise `TypeError` for anything but a function, or `None`."""
+    if kernel is not None and not callable(kernel):
+        raise TypeError(
+            "`parameter_kernel` must be a function that makes a kernel from a log density, for "
+            f"instance `lambda f: blackjax.mala(f, 0.1)`; got {kernel!r}."
+        )
+
+
 def choose_kernel(
     kernel: Callable[[Callable], Any] | None, is_quadratic: bool, log_prior: Callable
 ) -> AbstractParameterKernel:
     """The user's, if there is one; else the exact draw where it is to be had."""
     if kernel is not None:
-        if not callable(kernel):
-            raise TypeError(
-                "`parameter_kernel` must be a function that makes a kernel from a log density, for "
-                f"instance `lambda f: blackjax.mala(f, 0.1)`; got {kernel!r}."
-            )
         return GivenKernel(kernel)
     exact = is_quadratic and isinstance(log_prior, NormalDensity)
     return NormalDraw() if exact else NewtonStep()
@@ -205,6 +219,14 @@ def _derivatives(
     """Gradient and Hessian; forward over reverse where there are many parameters."""
     gradient = jax.jacfwd(function) if theta.shape[0] < 3 else jax.grad(function)
     return gradient(theta), jax.jacfwd(gradient)(theta)
+
+
+def _gradient_and_root(
+    data: CompleteData, theta: Float[Array, " p"]
+) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
+    """g, and the root of P."""
+    gradient, hessian = _derivatives(data.log_posterior_inside, theta)
+    return gradient, any_cholesky(-hessian)
 
 
 def _solve_root(root: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:

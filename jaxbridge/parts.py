@@ -8,11 +8,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from .choice import as_proposal, settled
+from .choice import as_proposal, default_candidates, settled, singles, undecided_between
+from .coupled_pairs import CoupledPairs
+from .coupling import AbstractCoupling
 from .diffusion import Diffusion
 from .intervals import Intervals
+from .likelihood import Form, forms_of
 from .observations import Group
 from .renewal_chain import as_pairs
+from .start_laws import Reversed, Stationary, needs_burn_in
+from .step_density import AbstractStepDensity, EulerDensity
 from .transition import check_for_density
 from .weighted import AbstractWeightedProposal
 
@@ -48,12 +53,20 @@ def make_parts(
     *,
     for_density: bool = False,
     only_couplings: bool = False,
+    moving: bool = True,
+    weighted: bool = True,
 ) -> tuple[Part, ...]:
     """The proposal that the user gave, checked, and settled and prepared for each part at this
-    model.
+    model: parameters that are `moving` leave from there.
 
     **Raises:** `ValueError` and `TypeError` for a proposal that does not fit.
     """
+    like = intervals.start[0]
+    if moving and weighted and proposal == "auto" and needs_burn_in(Stationary(), model):
+        candidates = default_candidates(model, like, for_density)
+        candidates = [each for each in candidates if not isinstance(each, AbstractCoupling)]
+        proposal = undecided_between(candidates, model, like, None, *bounds)
+        bounds = (None, None, None)
     parts = []
     for part_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
         mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
@@ -61,6 +74,8 @@ def make_parts(
         chosen.check(model, mine)
         if for_density:
             check_for_density(chosen, model)
+        if moving and weighted:
+            _check_for_moving(chosen, model, for_density)
         if only_couplings:
             chosen = as_pairs(chosen)
         chosen = settled(chosen, part_key, model, mine, group.num_steps)
@@ -68,3 +83,40 @@ def make_parts(
         fractions = jnp.asarray(np.diff(chosen.fractions(group.num_steps)), mine.duration.dtype)
         parts.append(Part(mine, jnp.asarray(group.which), fractions, chosen))
     return tuple(parts)
+
+
+def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
+    """The forms of the path likelihood that go with the target of the bridges, the most accurate
+    first: weights that are exact for the Euler scheme call for its own likelihood, for otherwise
+    paths and parameters would be drawn from conditionals of two laws."""
+    are_densities = lambda leaf: isinstance(leaf, AbstractStepDensity)
+    densities = jax.tree.leaves([part.proposal for part in parts], is_leaf=are_densities)
+    if any(isinstance(density, EulerDensity) for density in densities):
+        return ("girsanov",)
+    return forms_of(model, parts[0].intervals.start[0])
+
+
+def _check_for_moving(
+    proposal: AbstractWeightedProposal, model: Diffusion, for_density: bool
+) -> None:
+    """Raise `ValueError` where something is known at the first parameters only."""
+    laws = [
+        single.coupling.start_law
+        for single in singles(proposal)
+        if isinstance(single, CoupledPairs)
+    ]
+    if any(needs_burn_in(law, model) for law in laws):
+        raise ValueError(
+            "this model has no sampler of its stationary law, and how long a run takes that replaces "
+            "it depends on the parameters: pass `sample_stationary=` to `Diffusion`, give the "
+            "coupling `Stationary(burn_in=...)` that is long enough for all parameters to come, or "
+            "choose proposals that are pulled to the end point."
+        )
+    stationary = any(isinstance(law, Stationary | Reversed) for law in laws)
+    if for_density and stationary and not model.normalised:
+        raise ValueError(
+            "densities by this coupling are in proportion to `log_stationary`, whose constant "
+            "depends on the parameters: normalise it and declare that by `Diffusion(..., "
+            "normalised=True)`, give the coupling a start law with a density, or choose proposals "
+            "that are pulled to the end point."
+        )

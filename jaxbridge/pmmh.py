@@ -17,14 +17,15 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from .arrays import Numbers, as_floating, nondifferentiable
+from .arrays import Numbers, as_floating, is_traced, nondifferentiable
 from .diffusion import Diffusion
 from .intervals import check_count
 from .kernels import acceptance_rate
-from .linalg import any_cholesky
+from .linalg import any_cholesky, any_inverse
 from .parts import Part, make_parts
 from .posterior import AbstractPosterior
 from .problem import as_problem, starting_points
@@ -61,7 +62,7 @@ class PMMHPosterior(AbstractPosterior):
     - `theta`: the unknown ones as vectors, shape (*chains, n, p).
     - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
     - `accepted`: shape (*chains, n).
-    - `num_unknown`: iterations, with those of the warm-up, in which the proposed parameters
+    - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed parameters
         were refused because no estimate was to be had, shape (*chains,).
     - `num_truncated`: weights that `max_trials` cut off, in all these iterations, shape
         (*chains,): where there are many the law is not exact.
@@ -72,7 +73,7 @@ class PMMHPosterior(AbstractPosterior):
     theta: Float[Array, "*chains n p"]
     log_likelihood: Float[Array, "*chains n"]
     accepted: Bool[Array, "*chains n"]
-    num_unknown: Int[Array, "*chains"]
+    num_without_estimate: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
     state: PMMHState
 
@@ -113,7 +114,8 @@ def pmmh(
     - `num_proposals`: weighted paths for each interval in each estimate. The variance of the
         estimated log likelihood should be about one: with n intervals that takes in
         proportion to n.
-    - `proposal`: as in `transition_log_density`.
+    - `proposal`: as in `transition_log_density`. Densities by a coupling from the stationary law
+        rest on a normalised `log_stationary`, whose constant depends on the parameters.
     - `covariance`: of the first proposals, shape (p,) for a diagonal or (p, p); by default a tenth
         of the prior's standard deviations, or a tenth of θ where the prior is not normal.
     - `init`: unknown parameters to start from, or the `state` of earlier draws.
@@ -141,7 +143,9 @@ def pmmh(
     unknowns = problem.unknowns
     log_prior = as_log_prior(prior, unknowns, problem.theta)
     root = _first_root(covariance, prior, unknowns, problem.theta)
-    theta, state = starting_points(problem, init, num_chains, constraint, PMMHState)
+    theta, state = starting_points(problem, init, num_chains, constraint, log_prior, PMMHState)
+    if state is not None and covariance is not None:
+        raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
     pilot_key, run_key = jax.random.split(key)
     arguments = (problem.intervals, problem.groups, proposal, (num_counts, None, max_trials))
     parts = make_parts(pilot_key, problem.pilot_model(theta), *arguments, for_density=True)
@@ -187,10 +191,18 @@ def _first_root(
             raise ValueError(
                 f"`covariance` must have shape ({p},) or ({p}, {p}); got {matrix.shape}."
             )
-        return jnp.diag(jnp.sqrt(matrix)) if matrix.ndim == 1 else any_cholesky(matrix)
+        matrix = jnp.diag(matrix) if matrix.ndim == 1 else matrix
+        if not is_traced(matrix):
+            known = np.asarray(matrix, float)
+            symmetric = np.allclose(known, known.T, rtol=1e-5)
+            if not (np.all(np.isfinite(known)) and symmetric and np.linalg.eigvalsh(known)[0] > 0):
+                raise ValueError(
+                    f"`covariance` must be finite, symmetric and positive definite; got {covariance}."
+                )
+        return any_cholesky(matrix)
     if isinstance(prior, NormalPrior):
-        precision = as_normal(prior, unknowns, theta).precision
-        return 0.1 * jnp.diag(1 / jnp.sqrt(jnp.diagonal(precision)))
+        variance = any_inverse(as_normal(prior, unknowns, theta).precision)
+        return 0.1 * jnp.diag(jnp.sqrt(jnp.diagonal(variance)))
     return 0.1 * jnp.diag(jnp.maximum(jnp.abs(theta), 0.1))
 
 

@@ -22,7 +22,8 @@ class AbstractPosterior(eqx.Module):
 
     @property
     def effective_sample_size(self) -> Float[Array, " p"]:
-        """Of each unknown parameter, over all chains."""
+        """Of each unknown parameter, summed over the chains: to be trusted where `r_hat` says that
+        they agree."""
         return jnp.sum(jax.vmap(effective_sample_size)(self._chains), axis=0)
 
     @property

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
-from .arrays import Numbers
+from .arrays import Numbers, is_traced
 from .bridges import check_key
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, check_count
@@ -70,6 +70,7 @@ def starting_points(
     init: PyTree,
     num_chains: int | None,
     constraint: Constraint | None,
+    log_prior: Callable[[Array], Array],
     state_type: type,
 ) -> tuple[Float[Array, "*chains p"], Any]:
     """θ of each chain, and the state to go on from, if `init` is one."""
@@ -92,6 +93,12 @@ def starting_points(
     if theta.ndim == 1:
         theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
     check_allowed(constraint, problem.unknowns, theta)
+    for row in theta.reshape(-1, theta.shape[-1]):
+        if not is_traced(value := log_prior(row)) and not jnp.isfinite(value):
+            raise ValueError(
+                f"`prior` is {value} at the parameters to start from, "
+                f"{problem.unknowns.pick(row)}: start where its density is positive, by `init=`."
+            )
     return theta, state
 
 

@@ -21,8 +21,8 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from .arrays import Numbers, nondifferentiable
 from .diffusion import Diffusion
 from .intervals import check_count
-from .likelihood import forms_of, log_likelihoods
-from .parts import Part, make_parts
+from .likelihood import Form, log_likelihoods
+from .parts import Part, make_parts, target_forms
 from .problem import as_problem
 from .unknowns import Unknowns
 
@@ -40,6 +40,7 @@ class Score(eqx.Module):
     - `effective_sample_size`: of the bridges of each interval, shape (I,). Errors can be trusted
         where it is large.
     - `num_missing`: intervals without any bridge. They are left out.
+    - `num_truncated`: weights that `max_trials` cut off.
     """
 
     value: PyTree
@@ -49,6 +50,7 @@ class Score(eqx.Module):
     information: Float[Array, "p p"]
     effective_sample_size: Float[Array, " I"]
     num_missing: Int[Array, ""]
+    num_truncated: Int[Array, ""]
 
 
 def score(
@@ -104,13 +106,15 @@ def score(
     )
     unknowns, theta = problem.unknowns, problem.theta
     bounds = (num_counts, max_proposals, max_trials)
-    parts = make_parts(key, model, problem.intervals, problem.groups, proposal, bounds)
+    arguments = (problem.intervals, problem.groups, proposal, bounds)
+    parts = make_parts(key, model, *arguments, moving=False)
+    form = target_forms(parts, model)[0]
     keys = jax.random.split(key, len(parts))
     made = [
-        _interval_moments(part_key, unknowns, theta, part, num_bridges, progress_meter)
+        _interval_moments(part_key, unknowns, theta, part, form, num_bridges, progress_meter)
         for part_key, part in zip(keys, parts, strict=True)
     ]
-    moments, sizes = zip(*made, strict=True)
+    moments, sizes, truncated = zip(*made, strict=True)
     gradient, covariance, information = jax.tree.map(lambda *parts: sum(parts), *moments)
     order = jnp.concatenate([part.index for part in parts])
     size = jnp.concatenate(sizes)[jnp.argsort(order)]
@@ -123,6 +127,7 @@ def score(
         information,
         size,
         jnp.sum(size == 0, dtype=jnp.int32),
+        jnp.sum(jnp.stack(truncated), dtype=jnp.int32),
     )
 
 
@@ -132,15 +137,15 @@ def _interval_moments(
     unknowns: Unknowns,
     theta: Float[Array, " p"],
     part: Part,
+    form: Form,
     num_bridges: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
-) -> tuple[tuple[Array, Array, Array], Float[Array, " I"]]:
-    """Σ over intervals of the score, of the covariance of its error, and of the information; and
-    the effective number of bridges of each."""
+) -> tuple[tuple[Array, Array, Array], Float[Array, " I"], Int[Array, ""]]:
+    """Σ over intervals of the score, of the covariance of its error, and of the information; the
+    effective number of bridges of each; and how many weights were cut off."""
     unknowns, intervals = nondifferentiable((unknowns, part.intervals))
     model = unknowns.at(theta).prepared()
     num_intervals, num_steps = intervals.start.shape[0], part.num_steps
-    form = forms_of(model, intervals.start[0])[0]
     at_once = min(num_bridges, max(1, _PATHS // num_intervals))
     num_batches = -(-num_bridges // at_once)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
@@ -162,7 +167,7 @@ def _interval_moments(
             for derivative in (gradient(theta), jax.jacfwd(gradient)(theta))
         )
         state = meter.step(state, (i + 1).astype(jnp.float32) / num_batches)
-        return state, (drawn.log_weights, g, H)
+        return state, (drawn.log_weights, g, H, drawn.truncated)
 
     state, made = lax.scan(batch, meter.init(), jnp.arange(num_batches))
     meter.close(state)
@@ -172,7 +177,7 @@ def _interval_moments(
         leaf = leaf.reshape(num_intervals, -1, *leaf.shape[3:])
         return leaf[:, :num_bridges]
 
-    log_weights, g, H = map(join, made)
+    log_weights, g, H, truncated = map(join, made)
     largest = jnp.max(log_weights, axis=1, keepdims=True)
     weights = jnp.exp(log_weights - jnp.where(jnp.isfinite(largest), largest, 0))
     total = jnp.sum(weights, axis=1, keepdims=True)
@@ -187,4 +192,6 @@ def _interval_moments(
     covariance = jnp.sum(weights[..., None, None] ** 2 * products, axis=1)
     information = -jnp.sum(weights[..., None, None] * H, axis=1) - spread
     size = jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1), 0)
-    return (mean.sum(axis=0), covariance.sum(axis=0), information.sum(axis=0)), size
+    num_truncated = jnp.sum(truncated, dtype=jnp.int32)
+    moments = (mean.sum(axis=0), covariance.sum(axis=0), information.sum(axis=0))
+    return moments, size, num_truncated

@@ -139,9 +139,11 @@ def as_normal(prior: NormalPrior, unknowns: Unknowns, theta: Float[Array, " p"])
     p = theta.shape[0]
 
     def as_vector(name, value):
-        structure = jax.tree.structure(unknowns.params)
-        if jax.tree.structure(value) == structure and not hasattr(value, "ndim"):
-            like = jax.tree.leaves(unknowns.params)
+        structure, like = jax.tree.structure(unknowns.params), jax.tree.leaves(unknowns.params)
+        is_array = hasattr(value, "ndim")
+        if is_array and len(like) == 1 and value.shape == like[0].shape and name == "mean":
+            value = jnp.ravel(value)
+        if jax.tree.structure(value) == structure and not is_array:
             leaves = [as_floating(f"prior.{name}", leaf) for leaf in jax.tree.leaves(value)]
             for leaf, known in zip(leaves, like, strict=True):
                 if leaf.shape not in ((), known.shape):
@@ -222,9 +224,8 @@ def check_allowed(
     for row in theta.reshape(-1, theta.shape[-1]):
         ok = allowed(constraint, unknowns, row)
         if not is_traced(ok) and not bool(ok):
-            raise ValueError(
-                f"the parameters to start from, {unknowns.pick(row)}, do not satisfy `constraint`."
-            )
+            why = "are not finite" if constraint is None else "do not satisfy `constraint`"
+            raise ValueError(f"the parameters to start from, {unknowns.pick(row)}, {why}.")
 
 
 def init_vectors(
@@ -232,7 +233,7 @@ def init_vectors(
 ) -> Float[Array, "*chains p"]:
     """θ of the unknown parameters that the user wants to start from, for each chain its own if
     they have such an axis."""
-    init = jax.tree.map(jnp.asarray, init)
+    init = jax.tree.map(lambda leaf: as_floating("init", leaf), init)
     known = unknowns.params
     if jax.tree.structure(init) != jax.tree.structure(known):
         raise ValueError(
@@ -249,5 +250,6 @@ def init_vectors(
         return jax.vmap(unknowns.vector)(init)
     raise ValueError(
         f"`init` must have leaves of the shapes of the unknown parameters, {[s for _, s in shapes]}"
-        f", with a leading axis of chains if they differ; got {[s for s, _ in shapes]}."
+        f", with a leading axis of {chains[0] if chains else 'no'} chains if they differ; got "
+        f"{[s for s, _ in shapes]}."
     )
