@@ -107,8 +107,9 @@ def maximum_likelihood(
     - `model`: its `params` are where the search starts.
     - `times`, `observations`, `num_steps`, `step_size`, `proposal`, `where`, `constraint`: as in
         `gibbs`. A step that would leave the constraint is not made.
-    - `optimizer`: any of optax's, compared by identity (make it once to compile once), by default `optax.adam(0.01)`; it is given the gradient of minus
-        the mean log likelihood per interval, in the unknown parameters as a vector.
+    - `optimizer`: any of optax's, by default `optax.adam(0.01)`; it is given the gradient of minus
+        the mean log likelihood per interval, in the unknown parameters as a vector. Optimisers are
+        compared by identity: make one once to compile once.
     - `method`: "gradient", or "em", which takes no optimiser and needs fewer iterations.
     - `num_iterations`: of the stochastic approximation.
     - `num_bridges`: weighted bridges of each interval for the last step and the errors.

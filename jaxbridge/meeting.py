@@ -19,8 +19,8 @@ the drift,
 and the joint law of (ΔW, ΔW') given what is orthogonal to uᵀ(ΔW - ΔW') stays the same if x_{i+1}
 and x'_{i+1} change places, but for the factor exp(-2 D_i D_{i+1} / (s δ)) in its density. That is
 the probability of a crossing, so, if X has the transition probabilities of the scheme, the joined
-path has exactly these: meetings have no error of their own at any δ. (With γ = -1 this is the maximal coupling
-of two normal laws by reflection; Bou-Rabee, Eberle & Zimmer 2020.)
+path has exactly these: meetings have no error of their own at any δ. (With γ = -1 this is the
+maximal coupling of two normal laws by reflection; Bou-Rabee, Eberle & Zimmer 2020.)
 """
 
 from abc import abstractmethod

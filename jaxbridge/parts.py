@@ -107,10 +107,10 @@ def _check_for_moving(
     ]
     if any(needs_burn_in(law, model) for law in laws):
         raise ValueError(
-            "this model has no sampler of its stationary law, and how long a run takes that replaces "
-            "it depends on the parameters: pass `sample_stationary=` to `Diffusion`, give the "
-            "coupling `Stationary(burn_in=...)` that is long enough for all parameters to come, or "
-            "choose proposals that are pulled to the end point."
+            "this model has no sampler of its stationary law, and how long a run takes that "
+            "replaces it depends on the parameters: pass `sample_stationary=` to `Diffusion`, give "
+            "the coupling `Stationary(burn_in=...)` that is long enough for all parameters to come, "
+            "or choose proposals that are pulled to the end point."
         )
     stationary = any(isinstance(law, Stationary | Reversed) for law in laws)
     if for_density and stationary and not model.normalised:

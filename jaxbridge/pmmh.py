@@ -62,8 +62,8 @@ class PMMHPosterior(AbstractPosterior):
     - `theta`: the unknown ones as vectors, shape (*chains, n, p).
     - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
     - `accepted`: shape (*chains, n).
-    - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed parameters
-        were refused because no estimate was to be had, shape (*chains,).
+    - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
+        parameters were refused because no estimate was to be had, shape (*chains,).
     - `num_truncated`: weights that `max_trials` cut off, in all these iterations, shape
         (*chains,): where there are many the law is not exact.
     - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
@@ -197,7 +197,8 @@ def _first_root(
             symmetric = np.allclose(known, known.T, rtol=1e-5)
             if not (np.all(np.isfinite(known)) and symmetric and np.linalg.eigvalsh(known)[0] > 0):
                 raise ValueError(
-                    f"`covariance` must be finite, symmetric and positive definite; got {covariance}."
+                    "`covariance` must be finite, symmetric and positive definite; got "
+                    f"{covariance}."
                 )
         return any_cholesky(matrix)
     if isinstance(prior, NormalPrior):

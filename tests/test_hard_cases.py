@@ -20,7 +20,8 @@ ROWS: list[tuple[str, str, str, str]] = []
 
 
 def hard(case, plain, here):
-    """A row of the table: the case, what goes wrong in a plain implementation, what happens here."""
+    """A row of the table: the case, what goes wrong in a plain implementation, and what happens
+    here."""
 
     def keep(test):
         ROWS.append((case, plain, here, test.__name__))
