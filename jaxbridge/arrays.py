@@ -84,7 +84,7 @@ def time_steps(name: str, times: Numbers) -> tuple[Array, Array]:
     known = known if np.issubdtype(known.dtype, np.floating) else known.astype(float)
     steps = np.diff(known.astype(float))
     smallest = np.min(np.abs(steps[steps != 0]), initial=np.inf)
-    if np.finfo(known.dtype).eps * np.max(np.abs(known), initial=0) > 1e-3 * smallest:
+    if np.finfo(known.dtype).eps * np.max(np.abs(known), initial=0) > 0.05 * smallest:
         raise ValueError(
             f"`{name}` are too large for their differences to be known in {known.dtype}: count "
             "them from a later zero, or pass them as a NumPy array of float64."

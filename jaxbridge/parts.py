@@ -109,8 +109,8 @@ def _check_for_moving(
         raise ValueError(
             "this model has no sampler of its stationary law, and how long a run takes that "
             "replaces it depends on the parameters: pass `sample_stationary=` to `Diffusion`, give "
-            "the coupling `Stationary(burn_in=...)` that is long enough for all parameters to come, "
-            "or choose proposals that are pulled to the end point."
+            "the coupling `Stationary(burn_in=...)` that is long enough for all parameters to "
+            "come, or choose proposals that are pulled to the end point."
         )
     stationary = any(isinstance(law, Stationary | Reversed) for law in laws)
     if for_density and stationary and not model.normalised:

@@ -228,6 +228,8 @@ def test_arviz_takes_the_draws():
         (dict(step_size=-1.0), "`step_size` must be"),
         (dict(init=jnp.zeros(3)), "`init` must have"),
         (dict(num_iterations=0), "`num_iterations`"),
+        (dict(init=0, constraint=None, prior=lambda rate: jnp.log(rate)), "`prior` is -inf"),
+        (dict(times=np.float32([7e4, 70_000.01, 70_000.02])), "`times` are too large"),
     ],
 )
 def test_bad_input_is_refused_with_a_sentence(change, message, unchecked):
@@ -243,6 +245,92 @@ def test_observations_outside_the_state_space_are_named(unchecked):
     )
     with pytest.raises(ValueError, match=r"`observations\[2\]`.*outside the state space"):
         jb.gibbs(jax.random.key(0), root, [0.0, 1.0, 2.0], [[1.0], [0.5], [-0.1]], prior=PRIOR)
+
+
+def test_parameters_in_which_the_drift_is_not_linear():
+    """Rate e^θ: the information at θ is not that at θ', and Metropolis–Hastings must know."""
+    model = jb.Diffusion(
+        lambda x, p: -jnp.exp(p) * x,
+        None,
+        lambda x, p: -jnp.exp(p) * jnp.sum(x * x),
+        0.0,
+        reversible=True,
+    )
+    made = jb.gibbs(
+        jax.random.key(0),
+        model,
+        TIMES[:9],
+        DATA[:9],
+        prior=jb.NormalPrior(0.0, 1.0),
+        num_iterations=6_000,
+        num_steps=15,
+        proposal=jb.ModifiedDiffusionBridge(TRAPEZOID),
+    )
+    grid = np.linspace(-5, 4, 4_000)
+    log_density = ou_log_likelihood(TIMES[:9], DATA[:9], np.exp(grid), 1.0) - grid**2 / 2
+    assert not made.exact_parameters and 0.3 < made.parameters_moved.mean() < 1
+    assert_posterior(made.params[100:], *grid_moments(grid, log_density))
+
+
+def test_the_likelihood_is_that_of_the_target_of_the_bridges():
+    """With weights that are exact for the Euler scheme on a coarse grid, the posterior is that of
+    the Euler scheme, not a mixture of two."""
+    times = np.arange(0.0, 40.0)
+    data, steps = ou_data(2, times), 3
+    made = jb.gibbs(
+        jax.random.key(0),
+        ou_1d(),
+        times,
+        data,
+        num_iterations=6_000,
+        num_steps=steps,
+        proposal=jb.ModifiedDiffusionBridge(),
+        **OPTIONS,
+    )
+    grid = np.linspace(0.01, 2.9, 3_000)
+    decay = 1 - grid[:, None] / steps  # of one Euler step
+    variance = sum(decay ** (2 * i) for i in range(steps)) / steps
+    residual = data[1:, 0] - decay**steps * data[:-1, 0]
+    log_density = -(residual**2 / variance + np.log(variance)).sum(1) / 2 - (grid - 1) ** 2 / 2
+    assert_posterior(made.params[0][100:], *grid_moments(grid, log_density), allowance=0)
+
+
+def test_what_is_cut_off_is_counted():
+    made = jb.gibbs(
+        jax.random.key(0),
+        ou_1d(),
+        TIMES,
+        DATA,
+        num_iterations=5,
+        num_steps=5,
+        proposal=jb.Coupling(0.0),
+        method="pseudo_marginal",
+        max_trials=1,
+        **OPTIONS,
+    )
+    assert made.num_truncated.shape == (5,) and made.num_truncated.sum() > 0
+
+
+def test_a_state_must_fit_the_observations(unchecked):
+    options = dict(OPTIONS, num_iterations=2, proposal=jb.ModifiedDiffusionBridge())
+    key = jax.random.key(0)
+    state = jb.gibbs(key, ou_1d(), TIMES[:5], DATA[:5], num_steps=4, **options).state
+    for times, data, num_steps, message in [
+        (TIMES[:5], DATA[:5], 5, "paths of shapes"),
+        (TIMES[:6], DATA[:6], 4, "paths of shapes"),
+        (TIMES[:5], DATA[1:6], 4, "do not join"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            jb.gibbs(key, ou_1d(), times, data, num_steps=num_steps, init=state, **options)
+
+
+def test_a_run_that_replaces_a_sampler_would_depend_on_the_parameters(unchecked):
+    model = jb.Diffusion(lambda x, p: -p * x, None, lambda x, p: -p * x @ x, 1.0, reversible=True)
+    arguments = (jax.random.key(0), model, TIMES[:4], DATA[:4])
+    with pytest.raises(ValueError, match="burn_in"):
+        jb.gibbs(*arguments, prior=PRIOR, proposal=jb.Coupling(0.0))
+    made = jb.gibbs(*arguments, prior=PRIOR, num_iterations=2, num_steps=4)  # "auto" does without
+    assert made.theta.shape == (2, 1)
 
 
 def test_other_types_are_refused(unchecked):

@@ -128,10 +128,37 @@ def test_batches_are_single_paths():
     np.testing.assert_allclose(
         jb.path_log_likelihood(model, times[1], paths[1]), together[1], rtol=1e-4
     )
-    scores = jax.jacfwd(lambda p: jb.path_log_likelihood(model.with_params(p), times, paths))(
-        model.params
-    )
-    assert scores.B.shape == (3, 4, 2, 2) and jnp.isfinite(scores.B).all()
+
+    def of_drift(B, form=None):
+        moved = model.with_params(model.params._replace(B=B))
+        return jb.path_log_likelihood(moved, times, paths, form=form)
+
+    scores = jax.jacfwd(of_drift)(model.params.B)
+    assert scores.shape == (3, 4, 2, 2) and jnp.isfinite(scores).all()
+
+
+def test_sigma_has_a_derivative_in_the_euler_form_only():
+    """Given a path σ is known; relative to the law of σW the likelihood says nothing of it."""
+    times, path = jnp.linspace(0, 1, 11), jax.random.normal(jax.random.key(0), (11, 1))
+
+    def of_sigma(sigma, form):
+        model = jb.Diffusion(lambda x, p: -x, lambda x, p: p * jnp.ones(1), params=sigma)
+        return jb.path_log_likelihood(model, times, path, form=form)
+
+    assert jnp.isfinite(jax.grad(of_sigma)(1.0, "euler"))
+    for form in (None, "girsanov", "trapezoid"):
+        with pytest.raises(TypeError, match="σ depends on parameters"):
+            jax.grad(of_sigma)(1.0, form)
+
+
+def test_long_ago_is_no_zero_of_time(unchecked):
+    """Days since 1970: steps of 0.01 are lost in float32, not in NumPy's float64."""
+    days = 20_000 + 0.01 * np.arange(6)
+    path = np.random.default_rng(0).normal(size=(6, 2))
+    expected = jb.path_log_likelihood(rotating(), days - 20_000, path)
+    np.testing.assert_allclose(jb.path_log_likelihood(rotating(), days, path), expected, rtol=1e-3)
+    with pytest.raises(ValueError, match="`times` are too large"):
+        jb.path_log_likelihood(rotating(), days.astype(np.float32), path)
 
 
 def test_most_accurate_form_is_the_default():

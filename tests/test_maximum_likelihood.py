@@ -5,7 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from inference import multivariate_ou, ou_transitions_log_density
+from inference import (
+    multivariate_ou,
+    ou_1d,
+    ou_data,
+    ou_log_likelihood,
+    ou_transitions_log_density,
+)
 
 import jaxbridge as jb
 
@@ -33,7 +39,32 @@ def exact_maximum():
     return b, jnp.linalg.inv(-hessian)
 
 
-@pytest.mark.parametrize("method", ["em", pytest.param("gradient", marks=pytest.mark.slow)])
+def test_one_unknown_rate():
+    """The maximum, or, where the search has only begun, no claim to have found it."""
+    times = np.arange(0.0, 30.0)
+    data = ou_data(1, times)
+    grid = np.linspace(0.05, 4, 4_000)
+    log_likelihood = ou_log_likelihood(times, data, grid, 1.0)
+    exact = grid[log_likelihood.argmax()]
+    options = dict(
+        where=lambda params: params[0],
+        constraint=lambda rate: rate > 0,
+        num_steps=15,
+        num_bridges=500,
+        proposal=jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+    )
+    arguments = (jax.random.key(0), ou_1d(), times, data)
+    made = jb.maximum_likelihood(*arguments, method="em", num_iterations=60, **options)
+    error, sd = float(made.monte_carlo_errors), float(made.standard_errors)
+    assert made.newton and made.num_missing == 0 and made.num_truncated == 0
+    assert abs(float(made.theta[0]) - exact) < 5 * error + 0.03 * sd and error < 0.1 * sd
+    begun = jb.maximum_likelihood(
+        jax.random.key(0), ou_1d(5.0), times, data, num_iterations=20, **options
+    )
+    assert not begun.newton and 4 < begun.theta[0] < 5
+
+
+@pytest.mark.parametrize("method", ["em", "gradient"])
 @pytest.mark.slow
 def test_finds_the_maximum(method):
     model, times, observations = multivariate_ou()
