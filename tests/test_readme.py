@@ -11,7 +11,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), 
 
 
 def test_readme_code_runs():
-    assert len(BLOCKS) == 11
+    assert len(BLOCKS) == 12
     namespace = {}
     for block in BLOCKS:
         exec(block, namespace)
@@ -28,6 +28,8 @@ def test_readme_code_runs():
     assert namespace["costs"].cheapest() is not None
     assert 0.2 < namespace["posterior"].params.mean() < 2
     assert namespace["sensitivity"] < 0
+    assert namespace["positive"].paths.shape == (1000, 51, 1)
+    assert bool((namespace["positive"].paths > 0).all())
     assert namespace["densities"].value.shape == (500,)
     assert (namespace["densities"].standard_error < 0.5).mean() > 0.95
 
