@@ -8,7 +8,8 @@ and read in the other direction, for the associated diffusion, equation (stjerne
 
     dW = Oᵀ [{I - (1-γ)Π} dW' + √(1-γ²) u dU'].
 
-u is built with σ(x') in both directions, x' being the state of X'. The rotation O(x, x')
+u is built with σ(x') in both directions, x' being the state of X', and in discrete time from the
+gap when the noise of the step sets in (`meeting`, `see`). The rotation O(x, x')
 belongs to the pair, not to the coupling's geometry: a coupling sees the noise of X after O
 has turned it, so one O serves both directions.
 """

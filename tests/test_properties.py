@@ -1,0 +1,123 @@
+"""What holds for every stable Ornstein–Uhlenbeck process, and for every malformed argument."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import paper_model
+from hypothesis import assume, given, settings, strategies as st
+
+import jaxbridge as jb
+
+
+def number(low, high):
+    return st.floats(low, high, allow_nan=False, width=32)
+
+
+RATES = st.tuples(number(0.5, 2.0), number(0.5, 2.0), number(-2.0, 2.0))
+POINTS = st.tuples(number(-1.0, 1.0), number(-1.0, 1.0))
+SCENE = dict(
+    rates=RATES,
+    start=POINTS,
+    end=POINTS,
+    duration=number(0.5, 3.0),
+    gamma=number(-0.875, 0.875),
+)
+
+
+def process(rates):
+    """B = ((p, r), (-r, q)), whose eigenvalues have positive real parts: only numbers change."""
+    p, q, r = rates
+    return jb.ornstein_uhlenbeck(jnp.array([[p, r], [-r, q]], jnp.float32))
+
+
+def arguments(start, end, duration):
+    return jnp.array(start, jnp.float32), jnp.array(end, jnp.float32), jnp.float32(duration)
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(**SCENE)
+def test_bridges_join_their_ends(rates, start, end, duration, gamma):
+    ends = arguments(start, end, duration)
+    bridges = jb.sample_bridges(
+        jax.random.key(0),
+        process(rates),
+        *ends,
+        num_bridges=20,
+        num_steps=15,
+        coupling=jb.Coupling(gamma),
+        max_proposals=5_000,
+    )
+    paths = np.asarray(bridges.paths)[np.asarray(bridges.met)]
+    assert np.isfinite(paths).all() and bridges.num_nonfinite == 0
+    assert (paths[:, 0] == np.asarray(ends[0])).all() and (
+        paths[:, -1] == np.asarray(ends[1])
+    ).all()
+    assert np.isnan(np.asarray(bridges.paths)[~np.asarray(bridges.met)]).all()
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(**SCENE)
+def test_densities_and_means_are_those_of_the_closed_form(rates, start, end, duration, gamma):
+    """Exact transitions leave no step error: six standard errors, and nothing else."""
+    ends, model = arguments(start, end, duration), process(rates)
+    proposal = jb.Coupling(gamma, scheme=jb.GaussianTransition())
+    estimate = jb.transition_log_density(
+        jax.random.key(0), model, *ends, num_proposals=6_000, num_steps=4, proposal=proposal
+    )
+    assume(float(estimate.effective_sample_size) > 300)
+    exact = jb.ou_transition(model, ends[0], ends[2]).log_density(ends[1])
+    error = float(estimate.standard_error)
+    assert abs(np.expm1(float(estimate.value - exact))) < 6 * error
+    weighted = jb.sample_weighted_bridges(
+        jax.random.key(1), model, *ends, num_bridges=3_000, num_steps=4, proposal=proposal
+    )
+    size = float(weighted.effective_sample_size)
+    assume(size > 300)
+    # Half way, in standard deviations.
+    law = jb.gaussian_bridge(model, *ends, times=[0.5 * duration])
+    bias = (weighted.mean()[2] - law.mean[0]) / jnp.sqrt(jnp.diagonal(law.covariance[0]))
+    assert float(jnp.abs(bias).max()) < 6 / np.sqrt(size)
+
+
+KEY, A, B = jax.random.key(0), [0.0, 0.0], [1.0, 0.0]
+
+
+def calls():
+    """Each public function of a model and an interval."""
+    law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
+    return {
+        "sample_bridges": lambda *a: jb.sample_bridges(*a),
+        "sample_weighted_bridges": lambda *a: jb.sample_weighted_bridges(*a),
+        "sample_exact_bridges": lambda *a: jb.sample_exact_bridges(*a),
+        "transition_log_density": lambda *a: jb.transition_log_density(
+            *a, proposal=jb.Coupling(start_law=law)
+        ),
+        "gaussian_bridge": lambda key, *a: jb.gaussian_bridge(*a, times=[0.5]),
+        "work_precision": lambda *a: jb.work_precision(*a),
+        "fit_start_law": lambda *a: jb.fit_start_law(*a),
+        "tune_coupling": lambda *a: jb.tune_coupling(*a),
+        "choose_proposal": lambda *a: jb.choose_proposal(*a),
+    }
+
+
+MALFORMED = {
+    "a point of another dimension": (KEY, paper_model, [0.0], B, 1.0),
+    "points in a cube": (KEY, paper_model, [[[0.0, 0.0]]], B, 1.0),
+    "a point that is missing": (KEY, paper_model, [np.nan, 0.0], B, 1.0),
+    "a point in words": (KEY, paper_model, "here", B, 1.0),
+    "complex numbers": (KEY, paper_model, [1j, 0.0], B, 1.0),
+    "no time at all": (KEY, paper_model, A, B, 0.0),
+    "time that runs backwards": (KEY, paper_model, A, B, -1.0),
+    "a model that is none": (KEY, lambda: 3.0, A, B, 1.0),
+}
+
+
+@pytest.mark.parametrize("malformed", MALFORMED)
+@pytest.mark.parametrize("name", calls())
+def test_malformed_arguments_are_refused_before_anything_is_compiled(name, malformed, unchecked):
+    key, model, *rest = MALFORMED[malformed]
+    with pytest.raises((ValueError, TypeError)) as caught:
+        calls()[name](key, model(), *rest)
+    assert "`" in str(caught.value)  # the argument is named
+    assert "Tracer" not in str(caught.value)
