@@ -134,7 +134,7 @@ class Completion(eqx.Module):
     def num_intervals(self) -> int:
         return sum(len(part.index) for part in self.parts)
 
-    def check_paths(self, paths: Paths, chains: tuple[int, ...]) -> None:
+    def check_paths(self, paths: tuple[Float[Array, "..."], ...], chains: tuple[int, ...]) -> None:
         """Raise `ValueError` where these are no paths between the observations."""
         wanted = [
             (*chains, len(part.index), part.num_steps + 1, part.intervals.start.shape[1])

@@ -82,10 +82,10 @@ for mesh in meshes():
     with jax.set_mesh(mesh):
         assert lanes(paths, starts) == {40 // mesh.size}
 text = lambda starts: jax.jit(draws).lower(starts).as_text()
-assert "<10x2x8x5xf32>" in text(starts) and "<10x2x1x40xf32>" in text(starts[:1])
+assert "<10x40xf32>" in text(starts) and "<10x40xf32>" in text(starts[:1])
 with jax.set_mesh(mesh):
-    assert "<10x2x1x5xf32>" in text(starts) and "<10x2x8x5xf32>" not in text(starts)
-    assert "<10x2x1x5xf32>" in text(starts[:1]) and "<10x2x1x40xf32>" not in text(starts[:1])
+    assert "<10x5xf32>" in text(starts) and "<10x40xf32>" not in text(starts)
+    assert "<10x5xf32>" in text(starts[:1]) and "<10x40xf32>" not in text(starts[:1])
 by_hand = jax.shard_map(
     paths, mesh=mesh, in_specs=P(("x", "y")), out_specs=P(("x", "y")), check_vma=False
 )

@@ -117,6 +117,7 @@ def test_newton_steps_are_exact_draws_where_these_exist():
     assert_posterior(made.params[0][100:], *exact_moments())
 
 
+@pytest.mark.slow
 def test_chains_start_where_they_are_told_and_go_on():
     options = dict(OPTIONS, num_steps=10, proposal=jb.ModifiedDiffusionBridge(), num_chains=3)
     starts = jnp.array([0.3, 1.0, 3.0])
@@ -282,7 +283,7 @@ def test_the_likelihood_is_that_of_the_target_of_the_bridges():
         ou_1d(),
         times,
         data,
-        num_iterations=6_000,
+        num_iterations=12_000,
         num_steps=steps,
         proposal=jb.ModifiedDiffusionBridge(),
         **OPTIONS,

@@ -67,6 +67,7 @@ def density_on_grid(drift, grid, start, duration):
     "0/0 in u = v/|v|, and in its derivative",
     "u is zero there, with derivative zero; index 0 counts as a meeting",
 )
+@pytest.mark.slow
 def test_pairs_that_have_met_before_they_start(precision):
     model, dtype = paper_model(), jnp.dtype(precision)
     coupling = jb.Coupling(0.5)
@@ -468,6 +469,7 @@ def test_dimensions(d):
     "the path turns once in 15 steps: symmetric formulas for the reversal fail",
     "α* from log ν turns the other way; the density is that of the closed form",
 )
+@pytest.mark.slow
 def test_rotation_dominated_drift():
     model = jb.ornstein_uhlenbeck([[0.1, 20.0], [-20.0, 0.1]])
     start, end = jnp.array([1.0, 0.5]), jnp.array([-0.5, 1.5])
@@ -494,6 +496,7 @@ def test_rotation_dominated_drift():
     "a geometric count that never ends; division by no hits",
     "`max_trials` bounds the work, `truncated` says where, weights stay finite",
 )
+@pytest.mark.slow
 def test_extreme_counts():
     model = paper_model()
     bridges = jb.sample_bridges(
@@ -519,6 +522,7 @@ def test_extreme_counts():
     "NaN paths that look like results",
     "nothing is met, all proposals are counted in `num_nonfinite`; `throw=True` raises",
 )
+@pytest.mark.slow
 def test_parameters_that_are_not_finite():
     def run(alpha, throw):
         return jb.sample_bridges(

@@ -25,7 +25,9 @@ def some_bridges(num_bridges=3, num_steps=30, coupling=None, ends=PAPER_CASES["u
     )
 
 
-@pytest.mark.parametrize("law", [jb.Stationary(), LAW], ids=["nu", "mu"])
+@pytest.mark.parametrize(
+    "law", [pytest.param(jb.Stationary(), marks=pytest.mark.slow), LAW], ids=["nu", "mu"]
+)
 def test_probabilities_are_those_of_an_independent_simulation(law):
     """Against NumPy, path by path; the paths differ a lot in how often they are hit."""
     model, bridges = paper_model(), some_bridges(6)

@@ -46,6 +46,7 @@ def test_weighted_midpoints_have_the_exact_law(name):
     assert size > 800 and not weighted.truncated.any()
 
 
+@pytest.mark.slow
 def test_two_exact_transitions_are_as_good_as_many():
     """The law half way, from two steps of length ½."""
     case = exact_case(paper_model(), *PAPER_CASES["unlikely"], 1.0, 0.5)

@@ -25,10 +25,11 @@ def exact_derivatives():
     "proposal",
     [
         jb.Guided(density=jb.TrapezoidDensity()),
-        pytest.param(jb.Coupling(0.0), marks=pytest.mark.slow),
+        jb.Coupling(0.0),
     ],
     ids=["guided", "coupling"],
 )
+@pytest.mark.slow
 def test_score_and_information_are_derivatives_of_the_closed_form(proposal):
     gradient, information = exact_derivatives()
     made = jb.score(

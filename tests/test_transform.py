@@ -66,6 +66,7 @@ def test_coefficients_follow_from_itos_formula(x64):
     assert density.sum() * 15 / 4000 == pytest.approx(1, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_planar_model_is_that_of_the_closed_form(x64):
     ou = jb.ornstein_uhlenbeck([[1.0, 1.5], [-1.0, 0.5]], sigma=[[1.0, 0.4], [-0.2, 0.7]])
     ours, theirs = jb.transform(ou, swirl, unswirl).model, warped_model(ou, swirl, unswirl)
@@ -92,7 +93,7 @@ def test_a_constant_sigma_that_was_given_as_an_array_comes_along(x64):
 
 @pytest.mark.parametrize(
     "proposal",
-    [jb.Coupling(0.0), jb.ModifiedDiffusionBridge()],
+    [pytest.param(jb.Coupling(0.0), marks=pytest.mark.slow), jb.ModifiedDiffusionBridge()],
     ids=["coupling", "modified diffusion bridge"],
 )
 def test_bridges_of_cir_have_the_exact_law(proposal):
@@ -136,6 +137,7 @@ def jacobi():
     )
 
 
+@pytest.mark.slow
 def test_an_interval_becomes_a_line(x64):
     line = jb.transform(jacobi(), logit, jax.nn.sigmoid).model
     np.testing.assert_allclose(
