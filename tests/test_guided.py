@@ -132,7 +132,14 @@ def test_linear_drift_is_guided_without_error(x64, linearisation, refinement):
 
 
 @pytest.mark.parametrize("duration, num_steps", [(0.01, 10), (0.1, 50), (1.0, 800)])
-@pytest.mark.parametrize("name", ["modified diffusion bridge", "residual bridge", "guided"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("modified diffusion bridge", marks=pytest.mark.slow),
+        pytest.param("residual bridge", marks=pytest.mark.slow),
+        "guided",
+    ],
+)
 def test_density_is_that_of_the_closed_form(name, duration, num_steps):
     model = paper_model()
     start = jnp.array([0.785, 0.785])
@@ -210,8 +217,8 @@ def two_wells_in_numpy(barrier):
     "name, duration, num_steps",
     [
         ("modified diffusion bridge", 0.25, 200),
-        ("modified diffusion bridge", 1.0, 800),
-        ("guided", 1.0, 800),
+        pytest.param("modified diffusion bridge", 1.0, 800, marks=pytest.mark.slow),
+        pytest.param("guided", 1.0, 800, marks=pytest.mark.slow),
     ],
 )
 def test_double_well_agrees_with_brownian_bridge_monte_carlo(name, duration, num_steps):

@@ -217,6 +217,7 @@ def test_short_intervals():
     "counted in `num_nonfinite` with an explicit scheme; `SemiImplicit` and, for linear drift, "
     "`GaussianTransition` stay stable and give the right density",
 )
+@pytest.mark.slow
 def test_stiff_drift():
     model = jb.ornstein_uhlenbeck([[0.5, 0.0], [0.0, 500.0]])
     start, end = [0.3, 0.02], [0.8, -0.03]
