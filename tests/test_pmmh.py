@@ -40,7 +40,7 @@ def test_posterior_is_exact(proposal):
         ou_1d(0.8, 0.7),
         TIMES,
         DATA,
-        num_iterations=6_000,
+        num_iterations=12_000,
         num_proposals=20,
         num_chains=2,
         proposal=proposal,
