@@ -124,7 +124,7 @@ def test_gamma_at_both_ends(precision, unchecked):
 
 
 @hard(
-    "bridges 5 standard deviations out, (5, -5) → (6, -6), and 40, (10, 10) → (-10, -10)",
+    "bridges 7 standard deviations out, (5, -5) → (6, -6), and 30, (10, 10) → (-10, -10)",
     "a search for ever; weights that under- or overflow",
     "the right density from a fitted start law, or `met` is false within the bound; log weights "
     "are kept as logarithms",
@@ -493,7 +493,7 @@ def test_rotation_dominated_drift():
 
 
 @hard(
-    "hitting probabilities near 1e-6; all proposals missed; one accepted",
+    "bridges that are hardly ever hit, with five trials; all proposals missed; one accepted",
     "a geometric count that never ends; division by no hits",
     "`max_trials` bounds the work, `truncated` says where, weights stay finite",
 )
@@ -550,7 +550,7 @@ def test_parameters_that_are_not_finite():
 
 
 @hard(
-    "the same key under `jit` and without, in other batches, on several devices",
+    "the same key under `jit` and without, in other batches",
     "other numbers",
     "the same numbers up to rounding: each path has a key of its own",
 )
