@@ -18,8 +18,8 @@ program simulates is decided in one table (`decisions`, `scene`), and its loops 
 lanes of small points (`lanes`, `noise`). `transform` is for state spaces with a boundary. Exact
 laws stand beside (`gaussian`, `linear`), what accuracy costs above (`work_precision`), and the
 studies above all (`study`, `exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`,
-`benchmark`, `plot`). References to equations and sections are to Bladt, Finch & Sørensen,
-*Simulation of multivariate diffusion bridges*.
+`benchmark`), with their pictures (`plot`, `study_figures`). References to equations and sections
+are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*.
 """
 
 from .bridges import Bridges as Bridges, sample_bridges as sample_bridges

@@ -332,11 +332,11 @@ def write_accuracy_figures(
     """
     from matplotlib.figure import Figure
 
-    from . import plot
+    from . import study_figures
 
     paths = [directory / "accuracy.png", directory / "effects.png"]
-    plot.accuracy(results).savefig(paths[0], dpi=150)
+    study_figures.accuracy(results).savefig(paths[0], dpi=150)
     figure = Figure(figsize=(7, 4), layout="constrained")
-    plot.effect_costs(costs, figure.subplots())
+    study_figures.effect_costs(costs, figure.subplots())
     figure.savefig(paths[1], dpi=150)
     return paths

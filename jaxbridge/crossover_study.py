@@ -236,8 +236,8 @@ def write_crossover_figure(rates: Sequence[Rate], directory: Path) -> list[Path]
 
     **Raises:** `ImportError` without matplotlib.
     """
-    from . import plot
+    from . import study_figures
 
     path = directory / "crossover.png"
-    plot.crossover(rates).savefig(path, dpi=150)
+    study_figures.crossover(rates).savefig(path, dpi=150)
     return [path]

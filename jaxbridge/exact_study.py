@@ -341,7 +341,7 @@ def write_exact_figures(
 
     **Raises:** `ImportError` without matplotlib.
     """
-    from . import plot
+    from . import study_figures
 
     paths = []
 
@@ -353,10 +353,10 @@ def write_exact_figures(
         samples = {r.method: r.samples for r in group}
         title = f"{bridge.replace('->', '→')} in time 1, at time ½: exact methods, γ = {_GAMMA:g}"
         name = "very_unlikely" if group[0].bridge == _words(VERY_UNLIKELY) else "unlikely"
-        figure = plot.margins_and_copula(samples, group[0].law, title.replace("-", "−"))
+        figure = study_figures.margins_and_copula(samples, group[0].law, title.replace("-", "−"))
         save(figure, f"exact_{name}.png")
-    save(plot.variation(variation), "variation.png")
-    save(plot.cost(costs, slope(costs)), "cost.png")
+    save(study_figures.variation(variation), "variation.png")
+    save(study_figures.cost(costs, slope(costs)), "cost.png")
     return paths
 
 

@@ -212,16 +212,16 @@ def write_figures(key: Key[Array, ""], results: Sequence[Result], directory: Pat
 
     **Raises:** `ImportError` without matplotlib.
     """
-    from . import plot
+    from . import study_figures
 
     paths = [directory / "bridges.png"]
-    plot.bridges_overview(*_whole_bridges(key)).savefig(paths[0], dpi=110)
+    study_figures.bridges_overview(*_whole_bridges(key)).savefig(paths[0], dpi=110)
     for case, by_method in itertools.groupby(results, key=lambda result: result.case):
         group = list(by_method)
         samples = {result.method: result.samples for result in group}
         title = f"{case.bridge.replace('->', '→')} in time 1, at time ½,  γ = {case.gamma:g}"
         title = title.replace("-", "−")
-        figure = plot.margins_and_copula(samples, group[0].law, title)
+        figure = study_figures.margins_and_copula(samples, group[0].law, title)
         paths.append(directory / f"{case.name.replace(' ', '-')}_gamma_{case.gamma:g}.png")
         figure.savefig(paths[-1], dpi=150)
     return paths

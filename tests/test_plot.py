@@ -5,13 +5,14 @@ import matplotlib
 matplotlib.use("Agg")
 
 import jax
+import matplotlib.pyplot
 import numpy as np
 import pytest
 import scipy.stats
 from helpers import paper_model
 
 import jaxbridge as jb
-from jaxbridge import plot
+from jaxbridge import plot, study_figures
 
 
 @pytest.mark.parametrize("correlation", [-0.8, 0.0, 0.6])
@@ -52,19 +53,64 @@ def test_posteriors_and_traces_show_every_sampler():
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), draws["one"])
 
 
+def test_paths_in_space_go_up_from_start_to_end():
+    times, paths = np.linspace(0, 2, 5), np.random.default_rng(0).normal(size=(4, 5, 2))
+    paths[0] = np.nan  # not found
+    ax = plot.paths_in_space(times, paths, num_paths=2)
+    lines = [np.stack(line.get_data_3d(), -1) for line in ax.lines]
+    for line, path in zip(lines[:2], paths[1:3], strict=True):
+        np.testing.assert_array_equal(line, np.column_stack([path, times]))
+    np.testing.assert_array_equal(lines[2], [[*paths[1, 0], 0.0]])
+    np.testing.assert_array_equal(lines[3], [[*paths[1, -1], 2.0]])
+
+
+def test_bands_are_quantiles_of_the_bridges_that_were_found():
+    times, values = np.linspace(0, 1, 3), np.random.default_rng(0).normal(size=(101, 3, 2))
+    values[5] = np.nan
+    ax = plot.bridge_fan(times, values, coordinate=1, num_paths=0)
+    expected = np.quantile(np.delete(values, 5, axis=0)[..., 1], 0.5, axis=0)
+    median = next(line for line in ax.lines if line.get_label() == "median")
+    np.testing.assert_allclose(median.get_ydata(), expected)
+    assert {text.get_text() for text in ax.get_legend().get_texts()} == {"90 %", "50 %", "median"}
+
+
+def test_axes_that_are_given_are_used_and_returned():
+    _, ax = matplotlib.pyplot.subplots()
+    draws = np.random.default_rng(0).normal(size=(50, 2))
+    assert plot.qq({"draws": draws[:, 0]}, 0.0, 1.0, ax) is ax
+    assert plot.copula_levels({"draws": draws}, np.eye(2), ax=ax) is ax
+    assert plot.trace({"draws": draws[:, 0]}, ax=ax) is ax
+    assert plot.posterior({"draws": draws[:, 0]}, np.ones(2), {}, ax=ax) is ax
+    assert plot.bridge_fan(np.arange(2.0), draws[:, :, None], ax) is ax
+
+
+def test_what_cannot_be_drawn_is_refused(unchecked):
+    nothing = np.full((3, 2, 2), np.nan)
+    with pytest.raises(ValueError, match="`paths` must have a bridge to draw"):
+        plot.bridge_fan(np.arange(2.0), nothing)
+    with pytest.raises(ValueError, match="`paths` must have shape"):
+        plot.bridge_fan(np.arange(2.0), np.ones(2))
+    with pytest.raises(ValueError, match="two coordinates"):
+        plot.paths_in_space(np.arange(2.0), np.ones((1, 2, 3)))
+    with pytest.raises(TypeError, match="`ax` must be made with"):
+        plot.paths_in_space(np.arange(2.0), np.ones((1, 2, 2)), matplotlib.pyplot.subplots()[1])
+
+
 @pytest.mark.slow
 def test_figures_render(tmp_path):
     model, ends = paper_model(), ([0.0, 0.0], [1.0, 1.0])
     bridges = jb.sample_bridges(jax.random.key(0), model, *ends, 2.0, num_bridges=200)
     exact = jb.gaussian_bridge(model, *ends, 2.0, bridges.times)
-    overview = plot.bridges_overview(bridges, exact)
+    overview = study_figures.bridges_overview(bridges, exact)
     # In both coordinates the dashed exact median starts and ends where the bridges do.
     for coordinate, ax in enumerate(overview.axes[1:]):
         median = next(line for line in ax.lines if line.get_label() == "exact").get_ydata()
         np.testing.assert_allclose(median[[0, -1]], [0.0, 1.0], atol=1e-5)
         assert ax.get_ylabel() == f"$Z^{{({coordinate + 1})}}_t$"
     law = jb.GaussianLaw(exact.mean[25], exact.covariance[25])
-    panels = plot.margins_and_copula({"bridges": np.asarray(bridges.paths[:, 25])}, law, "title")
+    panels = study_figures.margins_and_copula(
+        {"bridges": np.asarray(bridges.paths[:, 25])}, law, "title"
+    )
     for name, figure in [("overview", overview), ("panels", panels)]:
         figure.savefig(tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000

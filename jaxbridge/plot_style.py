@@ -1,0 +1,48 @@
+"""How pictures look: colours, markers, axes. Needs the extra `plot`."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+try:
+    import matplotlib.pyplot as plt
+    from matplotlib.axes import Axes as Axes
+    from matplotlib.figure import Figure as Figure
+    from matplotlib.lines import Line2D as Line2D
+    from mpl_toolkits.mplot3d import Axes3D as Axes3D
+except ImportError as error:
+    raise ImportError(
+        'pictures are drawn by matplotlib; install it with `pip install "jaxbridge[plot]"`.'
+    ) from error
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9")  # Okabe & Ito
+EXACT = "0.15"
+MARKERS = ("o", "^", "s", "D")
+DASHES = ((0, (6, 3)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
+
+# Margins and samples come as arrays of either kind.
+Reals = Array | np.ndarray
+
+
+def axes_or_new(ax: Axes | None, **axes: Any) -> Axes:
+    if ax is not None:
+        return ax
+    return plt.subplots(layout="constrained", subplot_kw=axes)[1]
+
+
+def finish(ax: Axes, **legend: Any) -> Axes:
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.legend(frameon=False, fontsize="small", **legend)
+    return ax
+
+
+def found(paths: Float[Reals, "n K d"]) -> Float[np.ndarray, "m K d"]:
+    """Those of the bridges that there are: the others are NaN."""
+    values = np.asarray(paths, float)
+    if values.ndim != 3:
+        raise ValueError(f"`paths` must have shape (n, K, d); got shape {values.shape}.")
+    values = values[np.all(np.isfinite(values), axis=(1, 2))]
+    if len(values) == 0:
+        raise ValueError("`paths` must have a bridge to draw: none of these was found.")
+    return values
