@@ -15,7 +15,8 @@ observations (`parts`, `completion`), and parameters follow from complete paths
 (`parameter_steps`), in turn (`gibbs`), or from densities (`pmmh`), or as maximum likelihood
 estimates (`score`, `maximum_likelihood`); `expectation` has derivatives that are right. What a
 program simulates is decided in one table (`decisions`, `scene`), and its loops run over many
-lanes of small points (`lanes`, `noise`). `transform` is for state spaces with a boundary. Exact
+lanes of small points (`lanes`, `noise`). Other coordinates are for state spaces with a boundary
+(`transform`), or for a σ of one (`lamperti`). Exact
 laws stand beside (`gaussian`, `linear`), what accuracy costs above (`work_precision`), and the
 studies above all (`study`, `exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`,
 `benchmark`), with their pictures (`plot`, `study_figures`). References to equations and sections
@@ -72,6 +73,7 @@ from .importance import (
     weigh_bridges as weigh_bridges,
 )
 from .kernels import Chain as Chain, Kernel as Kernel
+from .lamperti import lamperti as lamperti
 from .likelihood import path_log_likelihood as path_log_likelihood
 from .maximum_likelihood import (
     MaximumLikelihood as MaximumLikelihood,

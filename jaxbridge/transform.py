@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from .arrays import Numbers, as_floating
@@ -45,8 +46,8 @@ class Transformed(eqx.Module):
     """
 
     model: Diffusion
-    forward: Map = eqx.field(static=True)
-    inverse: Map = eqx.field(static=True)
+    forward: Partial
+    inverse: Partial
 
     def back(self, bridges: _Result) -> _Result:
         """What `sample_bridges`, `sample_weighted_bridges`, `weigh_bridges` or
@@ -112,7 +113,7 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
         normalised=model.normalised,
         prepare=model.preparation,
     )
-    return Transformed(moved, forward, inverse)
+    return Transformed(moved, Partial(forward), Partial(inverse))
 
 
 class _Functions(NamedTuple):

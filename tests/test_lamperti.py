@@ -1,0 +1,126 @@
+"""Coordinates in which σ is one, against closed forms of the Cox–Ingersoll–Ross process."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import count_compilations
+from test_transform import MEAN, NOISE, RATE, cir, cir_density
+
+import jaxbridge as jb
+
+AT = 0.5
+
+
+def root(x, noise=NOISE):
+    return 2 * (np.sqrt(x) - np.sqrt(AT)) / noise
+
+
+def test_coordinates_are_those_of_the_closed_form(precision):
+    dtype = jnp.dtype(precision)
+    tolerance = 1e-7 if dtype == "float64" else 2e-6
+    moved = jb.lamperti(cir(), at=AT, reach=8.0)
+    for x in (0.002, 0.05, 0.5, 0.6, 4.0):
+        point = jnp.array([x], dtype)
+        y = moved.forward(point)
+        np.testing.assert_allclose(y, [root(x)], atol=tolerance)
+        np.testing.assert_allclose(moved.inverse(y), point, rtol=10 * tolerance)
+        drift = RATE * (MEAN - x) / (NOISE * np.sqrt(x)) - NOISE / (4 * np.sqrt(x))
+        np.testing.assert_allclose(moved.model.drift(y), [drift], rtol=30 * tolerance, atol=1e-6)
+        expected = -np.log(NOISE * np.sqrt(x))
+        np.testing.assert_allclose(moved.log_jacobian(point), expected, rtol=1e-5)
+    assert not np.isfinite(moved.forward(jnp.array([-0.1], dtype))).any()
+    assert not np.isfinite(moved.model.drift(jnp.array([root(0.0) - 0.1], dtype))).any()
+    assert not np.isfinite(moved.model.drift(jnp.array([8.1], dtype))).any()
+
+
+def test_the_reversal_follows_from_the_density(x64):
+    """α* = ∇log ν_Y - α is the drift itself, through the derivative of the table."""
+    moved = jb.lamperti(cir(), at=AT, reach=8.0).model
+    residual = moved.reversibility_residual(jnp.linspace(-1.8, 4, 30)[:, None])
+    np.testing.assert_allclose(residual, 0, atol=1e-4)
+    draws = jax.vmap(moved.sample_stationary)(jax.random.split(jax.random.key(0), 4000))
+    values = jb.lamperti(cir(), at=AT, reach=8.0).inverse
+    mean = float(jnp.mean(jax.vmap(values)(draws)))
+    assert abs(mean - MEAN) < 5 * NOISE * np.sqrt(MEAN / (2 * RATE) / 4000)
+
+
+@pytest.mark.parametrize(
+    "proposal",
+    [
+        pytest.param(jb.Coupling(0.0, scheme=jb.Heun()), marks=pytest.mark.slow),
+        jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+    ],
+    ids=["coupling", "modified diffusion bridge"],
+)
+def test_densities_are_those_of_cir(proposal):
+    """What needs a constant σ serves: the trapezoid density, Heun of second order."""
+    start, end = 0.15, 0.3
+    moved = jb.lamperti(cir(), at=AT, reach=8.0)
+    assert not jb.effects(moved.model).solves.simulated  # σ is the identity
+    estimate = jb.transition_log_density(
+        jax.random.key(0),
+        moved.model,
+        moved.forward(jnp.array([start])),
+        moved.forward(jnp.array([end])),
+        1.0,
+        num_proposals=40_000,
+        num_steps=40,
+        proposal=proposal,
+    )
+    value, error = float(estimate.value + moved.log_jacobian([end])), estimate.standard_error
+    assert error < 0.02 and estimate.num_nonfinite < 400
+    assert abs(value - np.log(cir_density(start, end, 1.0))) < 5 * float(error) + 0.005
+    # In the coordinates of X again.
+    bridges = jb.sample_weighted_bridges(
+        jax.random.key(1),
+        moved.model,
+        moved.forward(jnp.array([start])),
+        moved.forward(jnp.array([end])),
+        1.0,
+        num_bridges=100,
+        num_steps=40,
+        proposal=proposal,
+    )
+    paths = np.asarray(moved.back(bridges).paths)[np.asarray(bridges.met)]
+    np.testing.assert_allclose(paths[:, [0, -1], 0], np.tile([start, end], (len(paths), 1)), 1e-5)
+
+
+def test_parameters_of_sigma_may_change_and_have_derivatives(x64):
+    moved = jb.lamperti(cir(), at=AT, reach=8.0).model
+
+    def drift(noise):
+        return moved.with_params((RATE, MEAN, noise)).drift(jnp.array([0.3]))[0]
+
+    def exact(noise):
+        x = (jnp.sqrt(AT) + 0.15 * noise) ** 2
+        return RATE * (MEAN - x) / (noise * jnp.sqrt(x)) - noise / (4 * jnp.sqrt(x))
+
+    jitted = jax.jit(drift)
+    np.testing.assert_allclose(jitted(0.6), exact(0.6), rtol=1e-6)
+    with count_compilations() as compiled:
+        np.testing.assert_allclose(jitted(0.9), exact(0.9), rtol=1e-6)
+        jb.lamperti(cir().with_params((RATE, 0.4, 0.7)), at=AT, reach=8.0)
+    assert not compiled
+    slope = jax.grad(exact)(0.6)
+    np.testing.assert_allclose(jax.grad(drift)(0.6), slope, rtol=1e-5)
+    np.testing.assert_allclose(jax.jvp(drift, (0.6,), (1.0,))[1], slope, rtol=1e-5)
+
+
+def test_bad_arguments_are_refused(unchecked):
+    with pytest.raises(TypeError, match="`model` must be"):
+        jb.lamperti(3.0, at=AT, reach=8.0)
+    with pytest.raises(ValueError, match="`at` must be a number"):
+        jb.lamperti(cir(), at=[0.5, 0.5], reach=8.0)
+    with pytest.raises(ValueError, match="`at` must be a point inside"):
+        jb.lamperti(cir(), at=-1.0, reach=8.0)
+    with pytest.raises(ValueError, match="`reach` must be positive"):
+        jb.lamperti(cir(), at=AT, reach=0.0)
+    with pytest.raises(ValueError, match="`reach` must be finite"):
+        jb.lamperti(cir(), at=AT, reach=np.inf)
+    with pytest.raises(ValueError, match="`num_nodes`"):
+        jb.lamperti(cir(), at=AT, reach=8.0, num_nodes=0)
+    with pytest.raises(TypeError, match="`at` must be a known number"):
+        jax.jit(lambda at: jb.lamperti(cir(), at=at, reach=8.0).model.params)(AT)
+    with pytest.raises(ValueError, match="one-dimensional"):
+        jb.lamperti(jb.hyperbolic(0.8, 2), at=AT, reach=8.0).model.drift([0.0, 0.0])
