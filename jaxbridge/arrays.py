@@ -8,7 +8,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, PyTree
+from jaxtyping import Array, ArrayLike, Bool, PyTree
 
 # Anything `jnp.asarray` takes: an array, a number, a (nested) list of numbers.
 Numbers = ArrayLike | Sequence[Any]
@@ -52,6 +52,12 @@ def cast_floats(tree: PyTree, dtype) -> PyTree:
     return jax.tree.map(
         lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, tree
     )
+
+
+def all_finite_leaves(tree: PyTree) -> Bool[Array, ""]:
+    """Whether all numbers in the tree are finite."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves] or [True]))
 
 
 @eqx.filter_custom_jvp

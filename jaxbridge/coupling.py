@@ -164,7 +164,7 @@ class Coupling(AbstractCoupling):
         object with `sample(key, model)` and a normalised `log_density(x)`; see `fit_start_law`.
 
     **Raises:** `ValueError` for γ outside [-1, 1) or `ReflectionPlane` with γ ≠ -1; `TypeError`
-    for a start law that is none.
+    for a meeting rule, a scheme or a start law that is none.
 
     !!! example
 
@@ -195,6 +195,12 @@ class Coupling(AbstractCoupling):
         self.meeting = BrownianCrossing() if meeting is None else meeting
         self.scheme = Heun() if scheme is None else scheme
         self.start_law = as_start_law(Stationary() if start_law is None else start_law)
+        for name, given, kind in [
+            ("meeting", self.meeting, AbstractMeeting),
+            ("scheme", self.scheme, AbstractScheme),
+        ]:
+            if not isinstance(given, kind):
+                raise TypeError(f"`{name}` must be a `{kind.__name__}`; got {given!r}.")
         self.rotation = rotation
         self._gamma_law = law
         reflection = False

@@ -121,7 +121,8 @@ class WeightedBridges(eqx.Module):
         each = jax.vmap(fn) if self.log_weights.ndim == 1 else jax.vmap(jax.vmap(fn))
         # Missing bridges are NaN and weigh nothing.
         paths = jnp.where(self.met[..., None, None], self.paths, 0)
-        return each(paths)
+        # Truth values and counts have means as well.
+        return jax.tree.map(lambda value: value.astype(paths.dtype), each(paths))
 
 
 def _weighted_sum(weights: Float[Array, "*I n"], values: Array) -> Array:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Diffusion, check_diffusion
+from .intervals import check_count
 from .transform import Transformed
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
@@ -61,8 +62,7 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
     origin, reach = _number("at", at), _number("reach", reach)
     if not reach > 0:
         raise ValueError(f"`reach` must be positive; got {reach}.")
-    if num_nodes < 1:
-        raise ValueError(f"`num_nodes` must be a positive number; got {num_nodes}.")
+    check_count("num_nodes", num_nodes)
     functions = _functions(model.unbound(), model.preparation, origin, reach, num_nodes)
     table = functions.prepare(model.params)
     slope = table.sigma[num_nodes]

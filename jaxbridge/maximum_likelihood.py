@@ -24,7 +24,7 @@ import optax
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
-from .arrays import Numbers, nondifferentiable
+from .arrays import Numbers, all_finite_leaves, nondifferentiable
 from .completion import Completion, Paths, complete
 from .diffusion import Diffusion
 from .intervals import check_count
@@ -130,6 +130,7 @@ def maximum_likelihood(
         ```
     """
     num_iterations = check_count("num_iterations", num_iterations, 2)
+    num_bridges = check_count("num_bridges", num_bridges, 2)
     if method not in ("gradient", "em"):
         raise ValueError(f'`method` must be "gradient" or "em"; got {method!r}.')
     if not (optimizer is None or isinstance(optimizer, optax.GradientTransformation)):
@@ -297,9 +298,3 @@ def _approximate(
     state, (iterates, lost) = lax.scan(iterate, state, jnp.arange(num_iterations))
     meter.close(state.meter)
     return iterates, jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)
-
-
-def all_finite_leaves(tree: PyTree) -> Bool[Array, ""]:
-    """Whether all numbers in the tree are finite."""
-    leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves] or [True]))

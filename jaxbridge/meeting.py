@@ -30,6 +30,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from .arrays import as_floating, is_traced
 from .diffusion import Dynamics
 from .linalg import dot, safe_norm
 from .sigma import AbstractSigma
@@ -116,7 +117,9 @@ class SignTest(AbstractMeeting):
     looks_ahead: ClassVar[bool] = False
 
     def __init__(self, radius: float | Float[Array, ""] | None = None):
-        self.radius = None if radius is None else jnp.asarray(radius)
+        self.radius = None if radius is None else as_floating("radius", radius)
+        if self.radius is not None and not is_traced(self.radius) and not self.radius > 0:
+            raise ValueError(f"`radius` must be positive; got {radius}.")
 
     def met(self, step, forward, uniform):
         crossed = step.frame.gap * step.gap_next() < 0

@@ -38,7 +38,7 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
             f"{observations.shape}."
         )
     if times.shape[0] < 2:
-        raise ValueError(f"there must be two observations or more; got {times.shape[0]}.")
+        raise ValueError(f"`observations` must be two or more; got {times.shape[0]}.")
     if not is_traced(times):
         known = np.asarray(times)
         missing = np.flatnonzero(~np.isfinite(known))

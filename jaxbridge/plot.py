@@ -17,6 +17,7 @@ from .plot_style import (
     Axes,
     Axes3D,
     Line2D,
+    Number,
     Reals,
     axes_or_new,
     finish,
@@ -59,7 +60,7 @@ def paths_in_space(
     space = axes_or_new(ax, projection="3d")
     if not isinstance(space, Axes3D):
         raise TypeError('`ax` must be made with `projection="3d"`; got flat axes.')
-    times, paths = np.asarray(times, float), found(paths)
+    times, (paths, _) = np.asarray(times, float), found(paths)
     if paths.shape[-1] != 2:
         raise ValueError(f"`paths` must have two coordinates; got shape {paths.shape}.")
     for i, path in enumerate(paths[:num_paths]):
@@ -82,10 +83,12 @@ def bridge_fan(
     coordinate: int = 0,
     num_paths: int = 5,
     exact: GaussianBridge | None = None,
+    weights: Float[Reals, " n"] | None = None,
 ) -> Axes:
     """One coordinate of many bridges: median, 50 % and 90 % bands, and the first few paths.
 
-    `times` and `paths` as `sample_bridges` returns them; bridges not found are left out. The same
+    `times` and `paths` as `sample_bridges` returns them; bridges not found are left out. `weights`
+    are those of weighted bridges, and then the paths drawn are resampled by them. The same
     quantiles of an `exact` law, a result of `gaussian_bridge` at these times, are dashed.
 
     !!! example
@@ -95,20 +98,26 @@ def bridge_fan(
         ```
     """
     ax = axes_or_new(ax)
-    times, values = np.asarray(times, float), found(paths)[..., coordinate]
-    low, lower, median, upper, high = np.quantile(values, LEVELS, axis=0)
+    times, (kept, index) = np.asarray(times, float), found(paths)
+    values = kept[..., coordinate]
+    if weights is None:
+        shown, curves = values[:num_paths], np.quantile(values, LEVELS, axis=0)
+    else:
+        mass = np.asarray(weights, float)[index]
+        places = (np.arange(num_paths) + 0.5) / max(num_paths, 1) * mass.sum()
+        shown = values[np.searchsorted(np.cumsum(mass), places)]
+        curves = np.quantile(values, LEVELS, axis=0, weights=mass, method="inverted_cdf")
+    low, lower, median, upper, high = curves
     colour = COLOURS[0]
     band = {"color": colour, "linewidth": 0}
     ax.fill_between(times, low, high, alpha=0.15, label="90 %", **band)
     ax.fill_between(times, lower, upper, alpha=0.3, label="50 %", **band)
-    ax.plot(times, values[:num_paths].T, color=EXACT, linewidth=0.6, alpha=0.7)
+    ax.plot(times, shown.T, color=EXACT, linewidth=0.6, alpha=0.7)
     ax.plot(times, median, color=colour, linewidth=1.6, label="median")
     if exact is not None:
         mean = np.asarray(exact.mean, float)[:, coordinate]
         variance = np.asarray(exact.covariance, float)[:, coordinate, coordinate]
-        curves = mean[:, None] + np.sqrt(np.maximum(variance, 0))[:, None] * np.asarray(
-            ndtri(LEVELS), float
-        )
+        curves = mean[:, None] + np.sqrt(np.maximum(variance, 0))[:, None] * SCORES
         lines = ax.plot(times, curves, color=EXACT, linewidth=0.9, linestyle=DASHES[0])
         lines[2].set_label("exact")
     ax.set(xlabel="time", ylabel=f"$Z^{{({coordinate + 1})}}_t$", xlim=(times[0], times[-1]))
@@ -117,8 +126,8 @@ def bridge_fan(
 
 def qq(
     samples: Mapping[str, Float[Reals, " n"]],
-    mean: float,
-    sd: float,
+    mean: Number,
+    sd: Number,
     ax: Axes | None = None,
 ) -> Axes:
     """Q-Q plot of one margin against N(mean, sd²), each method in its own colour.
@@ -127,7 +136,7 @@ def qq(
     evenly spaced on the normal scale, out to the most extreme draws; on the diagonal the two
     laws agree.
     """
-    ax = axes_or_new(ax)
+    ax, mean, sd = axes_or_new(ax), float(mean), float(sd)
     largest = max(np.size(values) for values in samples.values())
     reach = mean + sd * np.array([-1, 1]) * _scores(largest)[-1]
     ax.plot(reach, reach, color=EXACT, linewidth=0.8, label="exact")

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 try:
     import matplotlib.pyplot as plt
@@ -23,6 +23,7 @@ DASHES = ((0, (6, 3)), (0, (1.5, 1.5)), (0, (6, 2, 1.5, 2)))
 
 # Margins and samples come as arrays of either kind.
 Reals = Array | np.ndarray
+Number = float | np.floating | Float[Reals, ""]
 
 
 def axes_or_new(ax: Axes | None, **axes: Any) -> Axes:
@@ -37,12 +38,14 @@ def finish(ax: Axes, **legend: Any) -> Axes:
     return ax
 
 
-def found(paths: Float[Reals, "n K d"]) -> Float[np.ndarray, "m K d"]:
-    """Those of the bridges that there are: the others are NaN."""
+def found(
+    paths: Float[Reals, "n K d"],
+) -> tuple[Float[np.ndarray, "m K d"], Int[np.ndarray, " m"]]:
+    """Those of the bridges that there are, and which they are: the others are NaN."""
     values = np.asarray(paths, float)
     if values.ndim != 3:
         raise ValueError(f"`paths` must have shape (n, K, d); got shape {values.shape}.")
-    values = values[np.all(np.isfinite(values), axis=(1, 2))]
-    if len(values) == 0:
+    (index,) = np.nonzero(np.all(np.isfinite(values), axis=(1, 2)))
+    if len(index) == 0:
         raise ValueError("`paths` must have a bridge to draw: none of these was found.")
-    return values
+    return values[index], index

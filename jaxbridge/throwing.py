@@ -7,9 +7,10 @@ turned into one error at the end, with a sentence that says what to change.
 from typing import TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
+
+from .arrays import all_finite_leaves
 
 _Result = TypeVar("_Result")
 
@@ -33,11 +34,9 @@ def throw_where_incomplete(
     truncated: Bool[Array, "..."] | None = None,
 ) -> _Result:
     """The result, whose `field` raises `RuntimeError` if anything is missing or cut off."""
-    leaves = [leaf for leaf in jax.tree.leaves(model) if eqx.is_inexact_array(leaf)]
-    broken = [jnp.any(~jnp.isfinite(leaf)) for leaf in leaves]
     value = getattr(result, field)
     for bad, message in [
-        (jnp.any(jnp.stack(broken)) if broken else None, _PARAMETERS),
+        (~all_finite_leaves(model), _PARAMETERS),
         (jnp.any(missing), _MISSING),
         (None if truncated is None else jnp.any(truncated), _TRUNCATED),
     ]:

@@ -59,14 +59,21 @@ class Transformed(eqx.Module):
                 "`bridges` must be what `sample_bridges`, `sample_weighted_bridges` or "
                 f"`sample_exact_bridges` returned; got {type(bridges).__name__}."
             )
-        points = paths.reshape(-1, paths.shape[-1])
-        mapped = jax.vmap(lambda y: check_value("inverse", self.inverse(y), y.shape, y))(points)
+        mapped = jax.vmap(lambda y: check_value("inverse", self.inverse(y), y.shape, y))(
+            _rows(paths)
+        )
         return eqx.tree_at(lambda result: result.paths, bridges, mapped.reshape(paths.shape))
 
-    def log_jacobian(self, x: Numbers) -> Float[Array, ""]:
-        """log |det ∇f(x)|: add it to a transition density of Y at f(x), and it is that of X."""
+    def log_jacobian(self, x: Numbers) -> Float[Array, "*batch"]:
+        """log |det ∇f(x)| at points of shape (d,) or (..., d): add it to a transition density of Y
+        at f(x), and it is that of X."""
         x = as_floating("x", x)
-        return log_abs_det(jax.jacfwd(self.forward)(x))
+        values = jax.vmap(lambda x: log_abs_det(jax.jacfwd(self.forward)(x)))(_rows(x))
+        return values.reshape(x.shape[:-1])
+
+
+def _rows(points: Float[Array, "... d"]) -> Float[Array, "n d"]:
+    return points.reshape(-1, points.shape[-1])
 
 
 def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:

@@ -214,7 +214,7 @@ def test_arviz_takes_the_draws():
         (dict(times=[0.0, 2.0, 1.0]), r"`times\[1\]`.*sort them"),
         (dict(times=[0.0, np.nan, 1.0]), r"`times\[1\]` = nan is missing"),
         (dict(times=[0.0, 1.0]), "`observations` must have shape"),
-        (dict(times=[0.0], data=[[1.0]]), "two observations or more"),
+        (dict(times=[0.0], data=[[1.0]]), "must be two or more"),
         (dict(data=[[0.0], [np.nan], [1.0]]), r"`observations\[1\]`.*leave out"),
         (dict(data=[0.0, 1.0, 2.0]), "`observations` must have shape"),
         (dict(prior=jb.NormalPrior(jnp.zeros(3), 1.0)), "`prior.mean` must be"),

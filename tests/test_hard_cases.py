@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.stats
 from helpers import PAPER_B, paper_model, run_program
 
 import jaxbridge as jb
@@ -130,10 +131,10 @@ def test_gamma_at_both_ends(precision, unchecked):
     "are kept as logarithms",
 )
 @pytest.mark.slow
-def test_very_unlikely_bridges():
-    model = paper_model()
-    exact = lambda a, b: float(jb.ou_transition(model, jnp.array(a), 1.0).log_density(jnp.array(b)))
-    start, end = [5.0, -5.0], [6.0, -6.0]
+def test_very_unlikely_bridges(precision):
+    model, dtype = paper_model(), jnp.dtype(precision)
+    exact = lambda a, b: float(jb.ou_transition(model, a, 1.0).log_density(b))
+    start, end = jnp.array([5.0, -5.0], dtype), jnp.array([6.0, -6.0], dtype)
     law = jb.fit_start_law(jax.random.key(0), model, start, end, 1.0, coupling=jb.Coupling(0.5))
     options = dict(num_proposals=20_000, num_steps=50)
     estimate = jb.transition_log_density(
@@ -149,7 +150,7 @@ def test_very_unlikely_bridges():
     assert estimate.num_met > 0 and error < 0.2
     assert abs(float(estimate.value) - exact(start, end)) < 5 * error + 0.03
     # No pair crosses 28 standard deviations: that is said, not hidden.
-    far = ([10.0, 10.0], [-10.0, -10.0])
+    far = (jnp.array([10.0, 10.0], dtype), jnp.array([-10.0, -10.0], dtype))
     bridges = jb.sample_bridges(
         jax.random.key(0), model, *far, 1.0, num_bridges=5, max_proposals=5_000
     )
@@ -199,9 +200,10 @@ def test_long_intervals():
     "pairs do not meet unless the ends are close: a search for ever",
     "`met` is false within the bound, and `throw=True` says what to do instead",
 )
-def test_short_intervals():
+def test_short_intervals(precision):
+    dtype = jnp.dtype(precision)
     options = dict(num_bridges=2, num_steps=10, max_proposals=2_000)
-    ends = ([0.0, 0.0], [1.0, 1.0], 1e-3)
+    ends = (jnp.zeros(2, dtype), jnp.ones(2, dtype), 1e-3)
     bridges = jb.sample_bridges(jax.random.key(0), paper_model(), *ends, **options)
     assert not bridges.met.any() and bridges.num_proposals <= 4_000
     with pytest.raises(RuntimeError, match="ModifiedDiffusionBridge"):
@@ -218,10 +220,11 @@ def test_short_intervals():
     "`GaussianTransition` stay stable and give the right density",
 )
 @pytest.mark.slow
-def test_stiff_drift():
+def test_stiff_drift(precision):
+    dtype = jnp.dtype(precision)
     model = jb.ornstein_uhlenbeck([[0.5, 0.0], [0.0, 500.0]])
-    start, end = [0.3, 0.02], [0.8, -0.03]
-    exact = jb.ou_transition(model, jnp.array(start), 1.0).log_density(jnp.array(end))
+    start, end = jnp.array([0.3, 0.02], dtype), jnp.array([0.8, -0.03], dtype)
+    exact = jb.ou_transition(model, start, 1.0).log_density(end)
     explicit = jb.sample_bridges(
         jax.random.key(0), model, start, end, 1.0, num_bridges=5, max_proposals=500
     )
@@ -242,45 +245,60 @@ def test_stiff_drift():
         assert abs(float(estimate.value - exact)) < 5 * error + 0.01
 
 
-def well_drift(x, p):
-    return x - x**3
+TURN = np.array([[0.8, -0.6], [0.6, 0.8]])
 
 
-def log_well(x, p):
-    return jnp.sum(x**2 - x**4 / 2)
+def in_wells(x):
+    """The coordinates in which a point moves in a double well for each, independently: a turn of
+    the given ones if there are two."""
+    return x if x.shape[0] == 1 else jnp.asarray(TURN, x.dtype) @ x
+
+
+def wells_drift(x, p):
+    y = in_wells(x)
+    force = y - y**3
+    return force if x.shape[0] == 1 else jnp.asarray(TURN.T, x.dtype) @ force
+
+
+def log_wells(x, p):
+    y = in_wells(x)
+    return jnp.sum(y**2 - y**4 / 2 - jnp.asarray(p, x.dtype))
 
 
 @hard(
-    "superlinear drift: dX = (X - X³) dt + dW from 8, δ = 0.05",
+    "superlinear drift: a double well, dX = (X - X³) dt + dW from 8, δ = 0.05, and a quartic well "
+    "in the plane, turned",
     "explicit steps overflow from the first on",
     "counted in `num_nonfinite`; `SemiImplicit` gives the density of the Fokker–Planck equation",
 )
 @pytest.mark.slow
-def test_superlinear_drift():
+@pytest.mark.parametrize("wells", [[8.0, 0.5], [[8.0, 0.5], [-0.8, -0.4]]], ids=["line", "plane"])
+def test_superlinear_drift(wells, precision):
+    """`wells` are start and end in coordinates where the density is a product."""
+    wells = np.atleast_2d(wells)
+    d, dtype = len(wells), jnp.dtype(precision)
     grid = np.linspace(-4, 9, 1301)
-    density = density_on_grid(lambda x: x - x**3, grid, 8.0, 1.0)
-    exact = np.log(np.interp(0.5, grid, density))
-    log_mass = float(np.log(np.exp(grid**2 - grid**4 / 2).sum() * (grid[1] - grid[0])))
-    model = jb.Diffusion(
-        well_drift,
-        None,
-        lambda x, p: log_well(x, p) - log_mass,
-        reversible=True,
-        normalised=True,
+    densities = [density_on_grid(lambda x: x - x**3, grid, start, 1.0) for start, _ in wells]
+    exact = sum(
+        np.log(np.interp(end, grid, density))
+        for density, (_, end) in zip(densities, wells, strict=True)
     )
-    ends = ([8.0], [0.5], 1.0)
+    log_mass = float(np.log(np.exp(grid**2 - grid**4 / 2).sum() * (grid[1] - grid[0])))
+    model = jb.Diffusion(wells_drift, None, log_wells, log_mass, reversible=True, normalised=True)
+    back = np.eye(1) if d == 1 else TURN.T
+    start, end = (jnp.asarray(back @ point, dtype) for point in wells.T)
     options = dict(num_proposals=50_000, num_steps=20)
-    law = jb.GaussianLaw([0.0], [[1.0]])
+    law = jb.GaussianLaw(np.zeros(d), np.eye(d))
 
     def estimate(scheme):
         proposal = jb.Coupling(0.0, scheme=scheme, start_law=law)
         return jb.transition_log_density(
-            jax.random.key(0), model, *ends, proposal=proposal, **options
+            jax.random.key(0), model, start, end, 1.0, proposal=proposal, **options
         )
 
     explicit, implicit = estimate(jb.Euler()), estimate(jb.SemiImplicit())
-    assert explicit.num_nonfinite > 0.9 * options["num_proposals"]
-    assert implicit.num_nonfinite == 0 and implicit.standard_error < 0.06
+    assert int(explicit.num_nonfinite) > 0.9 * options["num_proposals"]
+    assert implicit.num_nonfinite == 0 and implicit.standard_error < 0.1
     assert abs(float(implicit.value) - exact) < 5 * float(implicit.standard_error) + 0.1
 
 
@@ -335,11 +353,12 @@ def test_metastable_double_well():
     [np.diag([1.0, 1e-6]), np.array([[1.0, 0.0], [0.9999, 0.014]])],
     ids=["scales", "correlation"],
 )
-def test_nearly_singular_sigma(mixing):
+def test_nearly_singular_sigma(mixing, precision):
     """The paper's process in other linear coordinates."""
+    dtype = jnp.dtype(precision)
     B = mixing @ PAPER_B @ np.linalg.inv(mixing)
-    model = jb.ornstein_uhlenbeck(jnp.asarray(B, jnp.float32), sigma=mixing)
-    ends = [mixing @ np.array(point) for point in ([0.3, -0.2], [0.5, 0.4])]
+    model = jb.ornstein_uhlenbeck(jnp.asarray(B, dtype), sigma=mixing)
+    ends = [jnp.asarray(mixing @ np.array(x), dtype) for x in ([0.3, -0.2], [0.5, 0.4])]
     exact = jb.ou_transition(paper_model(), jnp.array([0.3, -0.2]), 1.0).log_density(
         jnp.array([0.5, 0.4])
     ) - np.log(np.linalg.det(mixing))
@@ -358,7 +377,9 @@ def test_nearly_singular_sigma(mixing):
     "O is σ(x')ᵀσ(x) itself, and bridges have the Ornstein–Uhlenbeck law",
 )
 @pytest.mark.slow
-def test_rotating_sigma():
+def test_rotating_sigma(precision):
+    dtype = jnp.dtype(precision)
+
     def turn(x, p):
         angle = 2 * x[0]  # a full turn within the law's reach
         return jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
@@ -370,8 +391,9 @@ def test_rotating_sigma():
         reversible=True,
         normalised=True,
     )
-    start, end = jnp.array([0.3, -0.2]), jnp.array([-0.5, 0.4])
-    exact = jb.ou_transition(jb.ornstein_uhlenbeck(0.5 * np.eye(2)), start, 2.0).log_density(end)
+    start, end = jnp.array([0.3, -0.2], dtype), jnp.array([-0.5, 0.4], dtype)
+    plain = jb.ornstein_uhlenbeck(0.5 * jnp.eye(2))
+    exact = jb.ou_transition(plain, start, 2.0).log_density(end)
     for scheme in (jb.Euler(), jb.Heun()):
         estimate = jb.transition_log_density(
             jax.random.key(0),
@@ -440,13 +462,16 @@ def test_unusual_stationary_densities(log_density, precision):
 @hard(
     "d = 1, 2, 10, 50",
     "costs and memory of d³ matrices where none is called for",
-    "with σ = I a step is d numbers; laws agree with the closed form",
+    "with σ = I a step is d numbers, in time and memory; laws, and the share of pairs that meet, "
+    "are those of the closed form",
 )
 @pytest.mark.slow
 @pytest.mark.parametrize("d", [1, 2, 10, 50])
-def test_dimensions(d):
-    model = jb.ornstein_uhlenbeck(jnp.eye(d))
-    start, end = jnp.full(d, 0.2), jnp.full(d, -0.1)
+def test_dimensions(d, precision):
+    model, dtype = jb.ornstein_uhlenbeck(jnp.eye(d)), jnp.dtype(precision)
+    check_meetings(model, d, dtype)
+    check_memory(model, d, dtype)
+    start, end = jnp.full(d, 0.2, dtype), jnp.full(d, -0.1, dtype)
     weighted = jb.sample_weighted_bridges(
         jax.random.key(0),
         model,
@@ -465,15 +490,57 @@ def test_dimensions(d):
     assert float(jnp.abs(bias).max()) < 5 / np.sqrt(size)
 
 
+def check_meetings(model, d, dtype):
+    """Ends drawn from ν make the reversed path a stationary one, whose distance from the driven
+    path, started at zero, is for γ = -1 an Ornstein–Uhlenbeck process dR = -R dt + 2 dW: it comes
+    to zero by time T with probability 2Φ(-R_0 / √(2(e^{2T} - 1)))."""
+    n, duration = 20_000, 2.0
+    key, keys = jax.random.key(3), jax.random.split(jax.random.key(4), n)
+    end = jax.random.normal(key, (d, n), dtype) * 0.5**0.5
+    num_steps = 8
+    dt = jnp.full(n, duration / num_steps, dtype)
+    coupling = jb.Coupling(-1.0, scheme=jb.GaussianTransition())
+    found = propose(model, coupling, keys, jnp.zeros((d, n), dtype), end, dt, num_steps)
+    distance = scipy.stats.chi(d, scale=0.5**0.5)
+    exact = distance.expect(
+        lambda r: 2 * scipy.stats.norm.cdf(-r / np.sqrt(2 * np.expm1(2 * duration)))
+    )
+    share = float(jnp.mean(found.meeting_step <= num_steps))
+    assert abs(share - exact) < 5 * np.sqrt(exact * (1 - exact) / n)
+
+
+def check_memory(model, d, dtype):
+    """What a compiled search takes beside its result: some numbers for each coordinate, step and
+    proposal of a batch."""
+    n, num_steps = 1_000, 50
+
+    def run(end):
+        return jb.sample_bridges(
+            jax.random.key(0),
+            model,
+            jnp.zeros(d, dtype),
+            end,
+            2.0,
+            num_bridges=n,
+            num_steps=num_steps,
+            batch_size=n,
+        ).paths
+
+    memory = jax.jit(run).lower(jnp.zeros(d, dtype)).compile().memory_analysis()
+    paths = n * (num_steps + 1) * d * dtype.itemsize
+    assert memory.temp_size_in_bytes < 8 * paths + 2**20
+
+
 @hard(
     "a drift that is mostly rotation, eigenvalues 0.1 ± 20i",
     "the path turns once in 15 steps: symmetric formulas for the reversal fail",
     "α* from log ν turns the other way; the density is that of the closed form",
 )
 @pytest.mark.slow
-def test_rotation_dominated_drift():
+def test_rotation_dominated_drift(precision):
+    dtype = jnp.dtype(precision)
     model = jb.ornstein_uhlenbeck([[0.1, 20.0], [-20.0, 0.1]])
-    start, end = jnp.array([1.0, 0.5]), jnp.array([-0.5, 1.5])
+    start, end = jnp.array([1.0, 0.5], dtype), jnp.array([-0.5, 1.5], dtype)
     estimate = jb.transition_log_density(
         jax.random.key(0),
         model,
@@ -493,20 +560,31 @@ def test_rotation_dominated_drift():
 
 
 @hard(
-    "bridges that are hardly ever hit, with five trials; all proposals missed; one accepted",
+    "bridges that are hit once in a million times or less; all proposals missed; one accepted",
     "a geometric count that never ends; division by no hits",
-    "`max_trials` bounds the work, `truncated` says where, weights stay finite",
+    "`max_trials` bounds the work, `truncated` says where, weights stay finite; a fitted start law "
+    "hits them",
 )
 @pytest.mark.slow
 def test_extreme_counts():
-    model = paper_model()
+    model, ends = paper_model(), ([3.6, -3.6], [4.0, -4.0], 1.0)
     bridges = jb.sample_bridges(
-        jax.random.key(0), model, [2.0, -2.0], [3.0, -3.0], 1.0, num_bridges=3
+        jax.random.key(0), model, *ends, num_bridges=3, coupling=jb.Coupling(0.5)
     )
-    weighted = jb.weigh_bridges(jax.random.key(1), model, bridges, max_trials=5)
-    assert weighted.truncated.any() and all_finite(weighted.log_weights, weighted.mean())
+    assert bridges.met.all()
+    weighted = jb.weigh_bridges(jax.random.key(1), model, bridges, max_trials=100_000)
+    assert weighted.truncated.all() and all_finite(weighted.log_weights, weighted.mean())
     with pytest.raises(RuntimeError, match="max_trials"):
         jb.weigh_bridges(jax.random.key(1), model, bridges, max_trials=5, throw=True)
+    # A start law that reaches them gives the right density, and cuts nothing off.
+    law = jb.fit_start_law(jax.random.key(2), model, *ends, coupling=jb.Coupling(0.5))
+    estimate = jb.transition_log_density(
+        jax.random.key(3), model, *ends, proposal=jb.Coupling(0.5, start_law=law)
+    )
+    exact = jb.ou_transition(model, jnp.array(ends[0]), 1.0).log_density(jnp.array(ends[1]))
+    assert abs(float(estimate.value - exact)) < 5 * float(estimate.standard_error) + 0.02
+    reached = jb.weigh_bridges(jax.random.key(1), model, bridges, start_law=law)
+    assert not reached.truncated.any()
     nothing = jb.sample_bridges(
         jax.random.key(0), model, [9.0, 9.0], [-9.0, -9.0], 0.1, num_bridges=3, max_proposals=50
     )

@@ -74,6 +74,17 @@ def test_bands_are_quantiles_of_the_bridges_that_were_found():
     assert {text.get_text() for text in ax.get_legend().get_texts()} == {"90 %", "50 %", "median"}
 
 
+def test_bands_of_weighted_bridges():
+    times, values = np.linspace(0, 1, 3), np.arange(101.0).repeat(3).reshape(101, 3, 1)
+    weights = np.zeros(101)
+    weights[40:51] = 1 / 11
+    ax = plot.bridge_fan(times, values, weights=weights, num_paths=2)
+    median = next(line for line in ax.lines if line.get_label() == "median")
+    np.testing.assert_allclose(median.get_ydata(), 45)
+    drawn = [line.get_ydata()[0] for line in ax.lines if line is not median]
+    assert all(40 <= value <= 50 for value in drawn) and len(drawn) == 2
+
+
 def test_axes_that_are_given_are_used_and_returned():
     _, ax = matplotlib.pyplot.subplots()
     draws = np.random.default_rng(0).normal(size=(50, 2))

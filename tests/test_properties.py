@@ -1,10 +1,8 @@
-"""What holds for every stable Ornstein–Uhlenbeck process, and for every malformed argument."""
+"""What holds for every stable Ornstein–Uhlenbeck process."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
-from helpers import paper_model
 from hypothesis import assume, given, settings, strategies as st
 
 import jaxbridge as jb
@@ -78,46 +76,3 @@ def test_densities_and_means_are_those_of_the_closed_form(rates, start, end, dur
     law = jb.gaussian_bridge(model, *ends, times=[0.5 * duration])
     bias = (weighted.mean()[2] - law.mean[0]) / jnp.sqrt(jnp.diagonal(law.covariance[0]))
     assert float(jnp.abs(bias).max()) < 6 / np.sqrt(size)
-
-
-KEY, A, B = jax.random.key(0), [0.0, 0.0], [1.0, 0.0]
-
-
-def calls():
-    """Each public function of a model and an interval."""
-    law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
-    return {
-        "sample_bridges": lambda *a: jb.sample_bridges(*a),
-        "sample_weighted_bridges": lambda *a: jb.sample_weighted_bridges(*a),
-        "sample_exact_bridges": lambda *a: jb.sample_exact_bridges(*a),
-        "transition_log_density": lambda *a: jb.transition_log_density(
-            *a, proposal=jb.Coupling(start_law=law)
-        ),
-        "gaussian_bridge": lambda key, *a: jb.gaussian_bridge(*a, times=[0.5]),
-        "work_precision": lambda *a: jb.work_precision(*a),
-        "fit_start_law": lambda *a: jb.fit_start_law(*a),
-        "tune_coupling": lambda *a: jb.tune_coupling(*a),
-        "choose_proposal": lambda *a: jb.choose_proposal(*a),
-    }
-
-
-MALFORMED = {
-    "a point of another dimension": (KEY, paper_model, [0.0], B, 1.0),
-    "points in a cube": (KEY, paper_model, [[[0.0, 0.0]]], B, 1.0),
-    "a point that is missing": (KEY, paper_model, [np.nan, 0.0], B, 1.0),
-    "a point in words": (KEY, paper_model, "here", B, 1.0),
-    "complex numbers": (KEY, paper_model, [1j, 0.0], B, 1.0),
-    "no time at all": (KEY, paper_model, A, B, 0.0),
-    "time that runs backwards": (KEY, paper_model, A, B, -1.0),
-    "a model that is none": (KEY, lambda: 3.0, A, B, 1.0),
-}
-
-
-@pytest.mark.parametrize("malformed", MALFORMED)
-@pytest.mark.parametrize("name", calls())
-def test_malformed_arguments_are_refused_before_anything_is_compiled(name, malformed, unchecked):
-    key, model, *rest = MALFORMED[malformed]
-    with pytest.raises((ValueError, TypeError)) as caught:
-        calls()[name](key, model(), *rest)
-    assert "`" in str(caught.value)  # the argument is named
-    assert "Tracer" not in str(caught.value)

@@ -137,6 +137,13 @@ def jacobi():
     )
 
 
+def test_jacobians_at_one_point_and_many():
+    logarithm = jb.transform(cir(), jnp.log, jnp.exp)
+    points = np.array([[[0.5], [2.0]], [[1.0], [4.0]]], np.float32)
+    np.testing.assert_allclose(logarithm.log_jacobian(points), -np.log(points[..., 0]), rtol=1e-6)
+    np.testing.assert_allclose(logarithm.log_jacobian([0.5]), np.log(2), rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_an_interval_becomes_a_line(x64):
     line = jb.transform(jacobi(), logit, jax.nn.sigmoid).model
