@@ -166,12 +166,12 @@ class Coupling(AbstractCoupling):
     **Raises:** `ValueError` for γ outside [-1, 1) or `ReflectionPlane` with γ ≠ -1; `TypeError`
     for a start law that is none.
 
-    !!! example
+    **Example:**
 
-        ```python
-        coupling = jb.Coupling(0.5)
-        bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000, coupling=coupling)
-        ```
+    ```python
+    coupling = jb.Coupling(0.5)
+    bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000, coupling=coupling)
+    ```
     """
 
     gamma: Float[Array, "..."]

@@ -77,12 +77,12 @@ def hitting_variation(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        weighted = jb.weigh_bridges(key, model, bridges)
-        jb.hitting_variation(key, model, weighted, num_counts=(10, 20, 40)).ratio
-        ```
+    ```python
+    weighted = jb.weigh_bridges(key, model, bridges)
+    jb.hitting_variation(key, model, weighted, num_counts=(10, 20, 40)).ratio
+    ```
     """
     check_key(key)
     sizes = [check_count("num_counts", n) for n in num_counts]
@@ -150,11 +150,11 @@ def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
 
     `draws`: one chain, shape (n, ...), for instance `chain.paths[:, 25]`.
 
-    !!! example
+    **Example:**
 
-        ```python
-        jb.effective_sample_size(chain.paths[:, 25])  # shape (d,)
-        ```
+    ```python
+    jb.effective_sample_size(chain.paths[:, 25])  # shape (d,)
+    ```
     """
     draws = as_floating("draws", draws)
     if draws.ndim == 0 or draws.shape[0] < 4:
@@ -182,11 +182,11 @@ def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
 
     `draws`: shape (chains, n, ...).
 
-    !!! example
+    **Example:**
 
-        ```python
-        jb.potential_scale_reduction(posterior.theta)  # shape (p,)
-        ```
+    ```python
+    jb.potential_scale_reduction(posterior.theta)  # shape (p,)
+    ```
     """
     draws = as_floating("draws", draws)
     if draws.ndim < 2 or draws.shape[1] < 4:

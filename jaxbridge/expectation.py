@@ -43,16 +43,16 @@ def expectation(
 
     **Raises:** `TypeError` for other bridges; `ValueError` where they were not kept whole.
 
-    !!! example
+    **Example:**
 
-        ```python
-        bridges = jb.sample_weighted_bridges(key, model, a, b, 1.0, num_bridges=10_000)
+    ```python
+    bridges = jb.sample_weighted_bridges(key, model, a, b, 1.0, num_bridges=10_000)
 
-        def middle(theta):
-            return jb.expectation(lambda path: path[25], bridges, model.with_params(theta))
+    def middle(theta):
+        return jb.expectation(lambda path: path[25], bridges, model.with_params(theta))
 
-        jax.jacfwd(middle)(model.params)
-        ```
+    jax.jacfwd(middle)(model.params)
+    ```
     """
     check_diffusion(model)
     if not isinstance(bridges, WeightedBridges | Chain):

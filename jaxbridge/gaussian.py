@@ -110,12 +110,12 @@ def ornstein_uhlenbeck(
     **Raises:** `ValueError` where B has an eigenvalue whose real part is not positive, so
     that the process is not ergodic; for a singular σ; for shapes that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        model = jb.ornstein_uhlenbeck(jnp.array([[1.5, 1.0], [1.0, 1.5]]))
-        model.reverse_drift(jnp.array([1.0, 0.0]))  # Array([-1.5, -1. ], dtype=float32)
-        ```
+    ```python
+    model = jb.ornstein_uhlenbeck(jnp.array([[1.5, 1.0], [1.0, 1.5]]))
+    model.reverse_drift(jnp.array([1.0, 0.0]))  # Array([-1.5, -1. ], dtype=float32)
+    ```
     """
     B = as_floating("B", B)
     if B.ndim != 2 or B.shape[0] != B.shape[1]:
@@ -163,12 +163,12 @@ def ou_transition(model: Diffusion, start: Float[Array, " d"], duration: Numbers
 
     **Raises:** `TypeError` for any other model.
 
-    !!! example
+    **Example:**
 
-        ```python
-        law = jb.ou_transition(model, jnp.zeros(2), 1.0)
-        law.log_density(jnp.ones(2))
-        ```
+    ```python
+    law = jb.ou_transition(model, jnp.zeros(2), 1.0)
+    law.log_density(jnp.ones(2))
+    ```
     """
     params = _ou_params(model)
     start, _, duration = _one_interval(params, start, start, duration)
@@ -229,12 +229,12 @@ def gaussian_bridge(
 
     **Raises:** `TypeError` for any other model, `ValueError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        exact = jb.gaussian_bridge(model, [0.0, 0.0], [1.0, 0.0], 1.0, times=[0.25, 0.5])
-        exact.mean[1], exact.covariance[1], exact.sample(jax.random.key(0), 1000)
-        ```
+    ```python
+    exact = jb.gaussian_bridge(model, [0.0, 0.0], [1.0, 0.0], 1.0, times=[0.25, 0.5])
+    exact.mean[1], exact.covariance[1], exact.sample(jax.random.key(0), 1000)
+    ```
     """
     params = _ou_params(model)
     a, b, total = _one_interval(params, start, end, duration)

@@ -142,15 +142,15 @@ def gibbs(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        posterior = jb.gibbs(
-            jax.random.key(0), jb.hyperbolic(0.8, 2), times, observations,
-            prior=jb.NormalPrior(1.0, 1.0), constraint=lambda alpha: alpha > 0,
-        )
-        posterior.params.mean(), posterior.effective_sample_size
-        ```
+    ```python
+    posterior = jb.gibbs(
+        jax.random.key(0), jb.hyperbolic(0.8, 2), times, observations,
+        prior=jb.NormalPrior(1.0, 1.0), constraint=lambda alpha: alpha > 0,
+    )
+    posterior.params.mean(), posterior.effective_sample_size
+    ```
     """
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
     problem = as_problem(

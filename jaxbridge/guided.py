@@ -181,12 +181,12 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
-    !!! example
+    **Example:**
 
-        ```python
-        proposal = jb.ModifiedDiffusionBridge()
-        chain = jb.sample_exact_bridges(key, model, a, b, 0.1, num_bridges=1000, proposal=proposal)
-        ```
+    ```python
+    proposal = jb.ModifiedDiffusionBridge()
+    chain = jb.sample_exact_bridges(key, model, a, b, 0.1, num_bridges=1000, proposal=proposal)
+    ```
     """
 
     density: AbstractStepDensity
@@ -219,12 +219,12 @@ class ResidualBridge(AbstractGuidedProposal):
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
-    !!! example
+    **Example:**
 
-        ```python
-        proposal = jb.ResidualBridge()
-        chain = jb.sample_exact_bridges(key, model, a, b, 0.5, num_bridges=1000, proposal=proposal)
-        ```
+    ```python
+    proposal = jb.ResidualBridge()
+    chain = jb.sample_exact_bridges(key, model, a, b, 0.5, num_bridges=1000, proposal=proposal)
+    ```
     """
 
     density: AbstractStepDensity
@@ -272,12 +272,12 @@ class Guided(AbstractGuidedProposal):
 
     **Raises:** `ValueError` and `TypeError` for anything else.
 
-    !!! example
+    **Example:**
 
-        ```python
-        proposal = jb.Guided()
-        chain = jb.sample_exact_bridges(key, model, a, b, 2.0, num_bridges=1000, proposal=proposal)
-        ```
+    ```python
+    proposal = jb.Guided()
+    chain = jb.sample_exact_bridges(key, model, a, b, 2.0, num_bridges=1000, proposal=proposal)
+    ```
     """
 
     density: AbstractStepDensity

@@ -132,12 +132,12 @@ def hitting_counts(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        counts = jb.hitting_counts(key, model, bridges, num_counts=100)
-        counts.probability, counts.standard_error
-        ```
+    ```python
+    counts = jb.hitting_counts(key, model, bridges, num_counts=100)
+    counts.probability, counts.standard_error
+    ```
     """
     check_key(key)
     check_diffusion(model)

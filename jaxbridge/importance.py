@@ -163,13 +163,13 @@ def weigh_bridges(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000)
-        weighted = jb.weigh_bridges(jax.random.key(1), model, bridges)
-        weighted.mean(lambda path: path[25]), weighted.effective_sample_size
-        ```
+    ```python
+    bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000)
+    weighted = jb.weigh_bridges(jax.random.key(1), model, bridges)
+    weighted.mean(lambda path: path[25]), weighted.effective_sample_size
+    ```
     """
     check_key(key)
     check_diffusion(model)
@@ -260,13 +260,13 @@ def sample_weighted_bridges(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        proposal = jb.ModifiedDiffusionBridge()
-        weighted = jb.sample_weighted_bridges(key, model, a, b, 0.1, proposal=proposal)
-        weighted.mean(lambda path: path[25]), weighted.effective_sample_size
-        ```
+    ```python
+    proposal = jb.ModifiedDiffusionBridge()
+    weighted = jb.sample_weighted_bridges(key, model, a, b, 0.1, proposal=proposal)
+    weighted.mean(lambda path: path[25]), weighted.effective_sample_size
+    ```
     """
     check_key(key)
     check_diffusion(model)

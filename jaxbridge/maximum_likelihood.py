@@ -120,14 +120,14 @@ def maximum_likelihood(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        estimate = jb.maximum_likelihood(
-            jax.random.key(0), jb.hyperbolic(1.0, 2), times, observations, optax.adam(1e-2)
-        )
-        estimate.params, estimate.standard_errors
-        ```
+    ```python
+    estimate = jb.maximum_likelihood(
+        jax.random.key(0), jb.hyperbolic(1.0, 2), times, observations, optax.adam(1e-2)
+    )
+    estimate.params, estimate.standard_errors
+    ```
     """
     num_iterations = check_count("num_iterations", num_iterations, 2)
     if method not in ("gradient", "em"):

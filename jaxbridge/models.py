@@ -40,12 +40,12 @@ def stationary_diffusion(
 
     **Raises:** `TypeError` for arguments that are not functions.
 
-    !!! example
+    **Example:**
 
-        ```python
-        swirl = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
-        model = jb.stationary_diffusion(lambda x, p: -x @ x / 2, Q=lambda x, p: swirl)
-        ```
+    ```python
+    swirl = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
+    model = jb.stationary_diffusion(lambda x, p: -x @ x / 2, Q=lambda x, p: swirl)
+    ```
     """
     for name, function in [("log_density", log_density), ("V", V), ("Q", Q)]:
         if not (callable(function) or (function is None and name != "log_density")):
@@ -65,11 +65,11 @@ def langevin(log_density: Callable, params: PyTree = None) -> Diffusion:
 
     `log_density`, `(x, params) -> ()`, is log ν up to a constant.
 
-    !!! example
+    **Example:**
 
-        ```python
-        double_well = jb.langevin(lambda x, p: -p * (x @ x - 1) ** 2, params=1.0)
-        ```
+    ```python
+    double_well = jb.langevin(lambda x, p: -p * (x @ x - 1) ** 2, params=1.0)
+    ```
     """
     return stationary_diffusion(log_density, params=params)
 
@@ -81,12 +81,12 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
 
     **Raises:** `ValueError` for α ≤ 0 or dim < 1.
 
-    !!! example
+    **Example:**
 
-        ```python
-        model = jb.hyperbolic(0.8, dim=2)
-        model.sample_stationary(jax.random.key(0))
-        ```
+    ```python
+    model = jb.hyperbolic(0.8, dim=2)
+    model.sample_stationary(jax.random.key(0))
+    ```
     """
     dim = check_count("dim", dim)
     alpha = as_floating("alpha", alpha)

@@ -25,13 +25,13 @@ from .plot_style import (
 from .work_precision import WorkPrecision
 
 __all__ = [
-    "bridge_fan",
-    "copula_levels",
     "paths_in_space",
-    "posterior",
+    "bridge_fan",
     "qq",
-    "trace",
+    "copula_levels",
     "work_precision",
+    "posterior",
+    "trace",
 ]
 
 LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
@@ -49,12 +49,12 @@ def paths_in_space(
     `times` and `paths` as `sample_bridges` returns them; bridges not found are left out. `ax`, if
     it is given, must be made with `projection="3d"`.
 
-    !!! example
+    **Example:**
 
-        ```python
-        ax = plot.paths_in_space(bridges.times, bridges.paths)
-        ax.figure.savefig("bridges.png")
-        ```
+    ```python
+    ax = plot.paths_in_space(bridges.times, bridges.paths)
+    ax.figure.savefig("bridges.png")
+    ```
     """
     space = axes_or_new(ax, projection="3d")
     if not isinstance(space, Axes3D):
@@ -88,11 +88,11 @@ def bridge_fan(
     `times` and `paths` as `sample_bridges` returns them; bridges not found are left out. The same
     quantiles of an `exact` law, a result of `gaussian_bridge` at these times, are dashed.
 
-    !!! example
+    **Example:**
 
-        ```python
-        plot.bridge_fan(bridges.times, bridges.paths, coordinate=1)
-        ```
+    ```python
+    plot.bridge_fan(bridges.times, bridges.paths, coordinate=1)
+    ```
     """
     ax = axes_or_new(ax)
     times, values = np.asarray(times, float), found(paths)[..., coordinate]

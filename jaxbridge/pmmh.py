@@ -126,15 +126,15 @@ def pmmh(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        posterior = jb.pmmh(
-            jax.random.key(0), jb.ornstein_uhlenbeck([[1.0]], sigma=[[0.5]]), times, observations,
-            where=lambda params: (params.B, params.sigma), prior=jb.NormalPrior(1.0, 1.0),
-            constraint=lambda unknown: (unknown[0][0, 0] > 0) & (unknown[1][0, 0] > 0),
-        )
-        ```
+    ```python
+    posterior = jb.pmmh(
+        jax.random.key(0), jb.ornstein_uhlenbeck([[1.0]], sigma=[[0.5]]), times, observations,
+        where=lambda params: (params.B, params.sigma), prior=jb.NormalPrior(1.0, 1.0),
+        constraint=lambda unknown: (unknown[0][0, 0] > 0) & (unknown[1][0, 0] > 0),
+    )
+    ```
     """
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
     num_warmup = check_count("num_warmup", num_warmup, 0)

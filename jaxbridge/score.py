@@ -85,12 +85,12 @@ def score(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        estimate = jb.score(jax.random.key(0), jb.hyperbolic(0.8, 2), times, observations)
-        estimate.value, estimate.standard_error
-        ```
+    ```python
+    estimate = jb.score(jax.random.key(0), jb.hyperbolic(0.8, 2), times, observations)
+    estimate.value, estimate.standard_error
+    ```
     """
     num_bridges = check_count("num_bridges", num_bridges, 2)
     problem = as_problem(

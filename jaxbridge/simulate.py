@@ -42,12 +42,12 @@ def simulate(
 
     **Raises:** `ValueError` for shapes that do not fit or times that do not increase.
 
-    !!! example
+    **Example:**
 
-        ```python
-        times = jnp.linspace(0, 10, 101)
-        paths = jb.simulate(jax.random.key(0), model, [0.0, 0.0], times, num_paths=8)
-        ```
+    ```python
+    times = jnp.linspace(0, 10, 101)
+    paths = jb.simulate(jax.random.key(0), model, [0.0, 0.0], times, num_paths=8)
+    ```
     """
     check_key(key)
     check_diffusion(model)

@@ -92,15 +92,15 @@ def transition_log_density(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
-        estimate = jb.transition_log_density(
-            jax.random.key(0), model, a, b, 1.0, proposal=jb.Coupling(0.5, start_law=law)
-        )
-        estimate.value, estimate.standard_error
-        ```
+    ```python
+    law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
+    estimate = jb.transition_log_density(
+        jax.random.key(0), model, a, b, 1.0, proposal=jb.Coupling(0.5, start_law=law)
+    )
+    estimate.value, estimate.standard_error
+    ```
     """
     check_key(key)
     check_diffusion(model)

@@ -101,12 +101,12 @@ def fit_start_law(
     **Raises:** `ValueError` where too few pilot bridges are found, or for arguments that do not
     fit; `TypeError` inside `jit`.
 
-    !!! example
+    **Example:**
 
-        ```python
-        law = jb.fit_start_law(jax.random.key(0), model, a, b, 1.0, coupling=jb.Coupling(0.5))
-        coupling = jb.Coupling(0.5, start_law=law)
-        ```
+    ```python
+    law = jb.fit_start_law(jax.random.key(0), model, a, b, 1.0, coupling=jb.Coupling(0.5))
+    coupling = jb.Coupling(0.5, start_law=law)
+    ```
     """
     coupling = Coupling() if coupling is None else coupling
     pilots = _pilots(key, model, start, end, duration, num_steps, coupling, num_pilot)
@@ -136,13 +136,13 @@ def tune_coupling(
 
     **Raises:** as `fit_start_law`.
 
-    !!! example
+    **Example:**
 
-        ```python
-        tuning = jb.tune_coupling(jax.random.key(0), model, a, b, 1.0)
-        print(tuning)
-        chain = jb.sample_exact_bridges(key, model, a, b, 1.0, proposal=tuning.coupling)
-        ```
+    ```python
+    tuning = jb.tune_coupling(jax.random.key(0), model, a, b, 1.0)
+    print(tuning)
+    chain = jb.sample_exact_bridges(key, model, a, b, 1.0, proposal=tuning.coupling)
+    ```
     """
     if couplings is None:
         couplings = [Coupling(gamma) for gamma in (-1.0, 0.0, 0.5, 0.9)]
@@ -190,13 +190,13 @@ def choose_proposal(
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit; `TypeError` inside
     `jit`.
 
-    !!! example
+    **Example:**
 
-        ```python
-        choice = jb.choose_proposal(jax.random.key(0), model, a, b, 1.0)
-        print(choice)
-        chain = jb.sample_exact_bridges(key, model, a, b, 1.0, proposal=choice)
-        ```
+    ```python
+    choice = jb.choose_proposal(jax.random.key(0), model, a, b, 1.0)
+    print(choice)
+    chain = jb.sample_exact_bridges(key, model, a, b, 1.0, proposal=choice)
+    ```
     """
     check_key(key)
     check_diffusion(model)

@@ -256,12 +256,12 @@ def work_precision(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        result = jb.work_precision(key, model, a, b, 1.0, target=0.01)
-        print(result), result.cheapest(), jaxbridge.plot.work_precision(result)
-        ```
+    ```python
+    result = jb.work_precision(key, model, a, b, 1.0, target=0.01)
+    print(result), result.cheapest(), jaxbridge.plot.work_precision(result)
+    ```
     """
     check_key(key)
     check_diffusion(model)
