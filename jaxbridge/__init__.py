@@ -19,7 +19,24 @@ lanes of small points (`lanes`, `noise`). `transform` is for state spaces with a
 laws stand beside (`gaussian`, `linear`), what accuracy costs above (`work_precision`), and the
 studies above all (`study`, `exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`,
 `benchmark`), with their pictures (`plot`, `study_figures`). References to equations and sections
-are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*.
+are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*; equations go by
+their labels in its source.
+
+What examples take for granted:
+
+```python
+import jax
+import jax.numpy as jnp
+import jaxbridge as jb
+
+key = jax.random.key(0)
+model = jb.ornstein_uhlenbeck(jnp.array([[1.5, 1.0], [1.0, 1.5]]))
+start, end = jnp.array([0.0, 0.0]), jnp.array([1.0, 0.0])
+bridges = jb.sample_bridges(key, model, start, end, 1.0, num_bridges=100)
+
+times = jnp.array([0.0, 0.5, 1.5, 2.0])
+observations = jnp.array([[0.0, 0.0], [0.5, -0.3], [0.2, 0.4], [-0.3, 0.6]])
+```
 """
 
 from .bridges import Bridges, sample_bridges

@@ -77,7 +77,7 @@ def measure_burn_in(
     **Example:**
 
     ```python
-    burn_in = jb.measure_burn_in(jax.random.key(0), model, b, 1.0)
+    burn_in = jb.measure_burn_in(key, model, end, 1.0)
     coupling = jb.Coupling(0.5, start_law=jb.Stationary(burn_in))
     ```
     """

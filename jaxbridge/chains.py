@@ -85,10 +85,8 @@ def sample_exact_bridges(
     **Example:**
 
     ```python
-    chain = jb.sample_exact_bridges(
-        jax.random.key(0), model, [0.0, 0.0], [1.0, 0.0], 1.0, num_bridges=10_000
-    )
-    chain.paths, chain.acceptance_rate
+    chain = jb.sample_exact_bridges(key, model, start, end, 1.0, num_bridges=1000)
+    chain.paths.shape, chain.acceptance_rate  # (1000, 51, 2)
     ```
     """
     check_key(key)

@@ -81,7 +81,7 @@ def crank_nicolson(
     **Example:**
 
     ```python
-    kernel = jb.crank_nicolson(model, a, b, 10.0, num_steps=500, step_size=0.3)
+    kernel = jb.crank_nicolson(model, start, end, 10.0, num_steps=500, step_size=0.3)
     state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
     ```
     """

@@ -58,7 +58,9 @@ _SHORTEST_STEP = 1e-10
 
 
 class NoiseLaw(NamedTuple):
-    """N(m, L Lᵀ), the law of one step's standardised noise; L is a number or a triangle."""
+    """N(m, L Lᵀ), the law of one step's standardised noise, which `noise_law` of an
+    `AbstractGuidedProposal` returns: `mean` is m, shape (d,), and `root` L, a number, shape (), or
+    a lower triangle, (d, d)."""
 
     mean: Float[Array, " d"]
     root: Float[Array, "..."]
@@ -82,7 +84,13 @@ class NoiseLaw(NamedTuple):
 
 
 class Step(NamedTuple):
-    """One step of one interval: what the proposal worked out for it, δ_i, T - t_i, and b."""
+    """One step of one interval, as `noise_law` of an `AbstractGuidedProposal` sees it.
+
+    - `guide`: what the proposal worked out for the step.
+    - `dt`: its length δ_i, in units of time.
+    - `remaining`: T - t_i, the time from its beginning to the end.
+    - `end`: b, shape (d,).
+    """
 
     guide: PyTree
     dt: Float[Array, "*lanes"]
@@ -185,7 +193,7 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
 
     ```python
     proposal = jb.ModifiedDiffusionBridge()
-    chain = jb.sample_exact_bridges(key, model, a, b, 0.1, num_bridges=1000, proposal=proposal)
+    chain = jb.sample_exact_bridges(key, model, start, end, 0.1, num_bridges=100, proposal=proposal)
     ```
     """
 
@@ -223,7 +231,7 @@ class ResidualBridge(AbstractGuidedProposal):
 
     ```python
     proposal = jb.ResidualBridge()
-    chain = jb.sample_exact_bridges(key, model, a, b, 0.5, num_bridges=1000, proposal=proposal)
+    chain = jb.sample_exact_bridges(key, model, start, end, 0.5, num_bridges=100, proposal=proposal)
     ```
     """
 
@@ -276,7 +284,7 @@ class Guided(AbstractGuidedProposal):
 
     ```python
     proposal = jb.Guided()
-    chain = jb.sample_exact_bridges(key, model, a, b, 2.0, num_bridges=1000, proposal=proposal)
+    chain = jb.sample_exact_bridges(key, model, start, end, 2.0, num_bridges=100, proposal=proposal)
     ```
     """
 

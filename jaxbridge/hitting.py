@@ -45,7 +45,7 @@ class BridgePaths(Protocol):
 
 
 class HittingCounts(eqx.Module):
-    """Counts of n bridges, or of I × n with a leading axis I.
+    """What `hitting_counts` returns: counts of n bridges, or of I × n with a leading axis I.
 
     - `counts`: N independent counts for each bridge, shape (n, N); -1 where the trials ran out
         before the count was complete, and for a bridge that is missing.
@@ -135,7 +135,7 @@ def hitting_counts(
     **Example:**
 
     ```python
-    counts = jb.hitting_counts(key, model, bridges, num_counts=100)
+    counts = jb.hitting_counts(key, model, bridges, num_counts=10)
     counts.probability, counts.standard_error
     ```
     """

@@ -29,7 +29,8 @@ from .weighted import AbstractWeightedProposal
 
 
 class WeightedBridges(eqx.Module):
-    """Bridges whose weights make them exact; with I intervals arrays have a leading axis I.
+    """Bridges whose weights make them exact, from `weigh_bridges` or `sample_weighted_bridges`;
+    with I intervals arrays have a leading axis I.
 
     - `times`, `paths`: as in `Bridges`, shapes (K,) and (n, K, d).
     - `log_weights`: shape (n,), up to a common constant; -inf for a bridge that is missing.
@@ -166,7 +167,6 @@ def weigh_bridges(
     **Example:**
 
     ```python
-    bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000)
     weighted = jb.weigh_bridges(jax.random.key(1), model, bridges)
     weighted.mean(lambda path: path[25]), weighted.effective_sample_size
     ```
@@ -264,7 +264,7 @@ def sample_weighted_bridges(
 
     ```python
     proposal = jb.ModifiedDiffusionBridge()
-    weighted = jb.sample_weighted_bridges(key, model, a, b, 0.1, proposal=proposal)
+    weighted = jb.sample_weighted_bridges(key, model, start, end, 0.1, proposal=proposal)
     weighted.mean(lambda path: path[25]), weighted.effective_sample_size
     ```
     """

@@ -46,7 +46,7 @@ _ADAM = optax.adam(1e-2)
 
 
 class MaximumLikelihood(eqx.Module):
-    """The maximum likelihood estimate.
+    """The maximum likelihood estimate, from `maximum_likelihood`.
 
     - `params`: all parameters of the model, the unknown ones estimated.
     - `standard_errors`: a pytree like the unknown parameters, from the observed information.
@@ -124,7 +124,7 @@ def maximum_likelihood(
 
     ```python
     estimate = jb.maximum_likelihood(
-        jax.random.key(0), jb.hyperbolic(1.0, 2), times, observations, optax.adam(1e-2)
+        key, jb.hyperbolic(1.0, 2), times, observations, num_iterations=200, num_steps=20
     )
     estimate.params, estimate.standard_errors
     ```

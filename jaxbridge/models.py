@@ -36,7 +36,7 @@ def stationary_diffusion(
 
     **Arguments:** functions `(x, params)` of one point `x` of shape (d,): `log_density`, log ν
     up to a constant; `V`, positive definite, shape (d, d), or (d,) for a diagonal, by default
-    the identity; `Q`, shape (d, d), by default zero.
+    the identity; `Q`, shape (d, d), by default zero. `params`, any pytree, is what they receive.
 
     **Raises:** `TypeError` for arguments that are not functions.
 
@@ -63,7 +63,8 @@ def stationary_diffusion(
 def langevin(log_density: Callable, params: PyTree = None) -> Diffusion:
     """The Langevin diffusion `dX = ½ ∇log ν(X) dt + dW`: reversible, with stationary density ν.
 
-    `log_density`, `(x, params) -> ()`, is log ν up to a constant.
+    **Arguments:** `log_density`, `(x, params) -> ()`, is log ν up to a constant; `params`, any
+    pytree, is what it receives.
 
     **Example:**
 
@@ -77,7 +78,9 @@ def langevin(log_density: Callable, params: PyTree = None) -> Diffusion:
 def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     """The hyperbolic diffusion `dX = -α X / √(1+|X|²) dt + dW` in R^dim: equation
     (hyperbolicsde). Reversible; its log stationary density is the normalised one of equation
-    (hypdensity), and its stationary sampler is exact. `params` is α, per unit of time.
+    (hypdensity), and its stationary sampler is exact. `params` is α.
+
+    **Arguments:** `alpha`, α > 0, per unit of time; `dim`, the dimension d.
 
     **Raises:** `ValueError` for α ≤ 0 or dim < 1.
 
@@ -85,7 +88,7 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
 
     ```python
     model = jb.hyperbolic(0.8, dim=2)
-    model.sample_stationary(jax.random.key(0))
+    model.drift(jnp.ones(2))
     ```
     """
     dim = check_count("dim", dim)

@@ -76,7 +76,7 @@ def pseudo_marginal(
     **Example:**
 
     ```python
-    kernel = jb.pseudo_marginal(model, a, b, 1.0, num_steps=50, proposal=jb.Coupling(0.5))
+    kernel = jb.pseudo_marginal(model, start, end, 1.0, proposal=jb.Coupling(0.5))
     state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
     ```
     """

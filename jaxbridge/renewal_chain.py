@@ -71,7 +71,7 @@ def renewal(
     **Example:**
 
     ```python
-    kernel = jb.renewal(model, a, b, 1.0, num_steps=50, proposal=jb.Coupling(0.5))
+    kernel = jb.renewal(model, start, end, 1.0, proposal=jb.Coupling(0.5))
     state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
     ```
     """

@@ -44,7 +44,7 @@ def effects(
 
     ```python
     print(jb.effects(jb.hyperbolic(0.8, 2), jb.Coupling(-1.0)))
-    jb.effects(model).reverse_drift.simulated
+    jb.effects(model).reverse_drift.why
     ```
     """
     check_diffusion(model)

@@ -36,10 +36,10 @@ class Transformed(eqx.Module):
     **Example:**
 
     ```python
-    logarithm = jb.transform(model, jnp.log, jnp.exp)
-    a, b = logarithm.forward(start), logarithm.forward(end)
-    bridges = logarithm.back(
-        jb.sample_exact_bridges(key, logarithm.model, a, b, 1.0, num_bridges=1000)
+    stretched = jb.transform(model, jnp.sinh, jnp.arcsinh)
+    a, b = stretched.forward(start), stretched.forward(end)
+    bridges = stretched.back(
+        jb.sample_bridges(key, stretched.model, a, b, 1.0, num_bridges=100)
     )
     ```
     """

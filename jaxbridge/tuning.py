@@ -49,9 +49,16 @@ _PILOT_TRIALS = 1_000
 
 
 class Pilot(NamedTuple):
-    """One pilot run: γ; λ, the share of the Gaussian fit in the start law; the share of proposals
-    that met; trials for a hitting count; effective samples per simulated path, NaN where counts
-    took too long or too few pairs met; and the coupling."""
+    """One pilot run of `tune_coupling`.
+
+    - `gamma`: γ.
+    - `fit_share`: λ, the share of the Gaussian fit in the start law.
+    - `acceptance`: the share of proposals that met.
+    - `trials_per_count`: trials for a hitting count.
+    - `efficiency`: effective samples per simulated path, NaN where counts took too long or too few
+        pairs met.
+    - `coupling`: with this γ and start law.
+    """
 
     gamma: float
     fit_share: float
@@ -62,7 +69,8 @@ class Pilot(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """The `coupling` with most effective samples per simulated path, and all `pilots`."""
+    """What `tune_coupling` returns: the `coupling` with most effective samples per simulated path,
+    and all `pilots`. Printed, it is a table."""
 
     coupling: Coupling
     pilots: list[Pilot]
@@ -104,7 +112,7 @@ def fit_start_law(
     **Example:**
 
     ```python
-    law = jb.fit_start_law(jax.random.key(0), model, a, b, 1.0, coupling=jb.Coupling(0.5))
+    law = jb.fit_start_law(key, model, start, end, 1.0, coupling=jb.Coupling(0.5))
     coupling = jb.Coupling(0.5, start_law=law)
     ```
     """
@@ -139,9 +147,10 @@ def tune_coupling(
     **Example:**
 
     ```python
-    tuning = jb.tune_coupling(jax.random.key(0), model, a, b, 1.0)
+    couplings = [jb.Coupling(-1.0), jb.Coupling(0.5)]
+    tuning = jb.tune_coupling(key, model, start, end, 1.0, couplings=couplings, num_pilot=500)
     print(tuning)
-    chain = jb.sample_exact_bridges(key, model, a, b, 1.0, proposal=tuning.coupling)
+    chain = jb.sample_exact_bridges(key, model, start, end, 1.0, proposal=tuning.coupling)
     ```
     """
     if couplings is None:
@@ -193,9 +202,10 @@ def choose_proposal(
     **Example:**
 
     ```python
-    choice = jb.choose_proposal(jax.random.key(0), model, a, b, 1.0)
+    candidates = [jb.Coupling(0.5), jb.Guided()]
+    choice = jb.choose_proposal(key, model, start, end, 1.0, candidates=candidates)
     print(choice)
-    chain = jb.sample_exact_bridges(key, model, a, b, 1.0, proposal=choice)
+    chain = jb.sample_exact_bridges(key, model, start, end, 1.0, proposal=choice)
     ```
     """
     check_key(key)
