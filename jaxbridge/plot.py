@@ -212,7 +212,7 @@ def work_precision(result: WorkPrecision, ax: Axes | None = None) -> Axes:
 
     ```python
     result = jb.work_precision(
-        key, model, start, end, 1.0, proposals=[jb.Coupling()], num_steps=(5, 10), target=0.05
+        key, model, start, end, 1.0, proposals=[jb.Coupling()], num_steps=(4, 8), target=0.05
     )
     plot.work_precision(result)
     ```

@@ -260,7 +260,7 @@ def work_precision(
 
     ```python
     result = jb.work_precision(
-        key, model, start, end, 1.0, proposals=[jb.Coupling()], num_steps=(5, 10), target=0.05
+        key, model, start, end, 1.0, proposals=[jb.Coupling()], num_steps=(4, 8), target=0.05
     )
     print(result)
     result.cheapest()  # or `plot.work_precision(result)`
