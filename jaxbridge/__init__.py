@@ -20,119 +20,242 @@ lanes of small points (`lanes`, `noise`). Other coordinates are for state spaces
 laws stand beside (`gaussian`, `linear`), what accuracy costs above (`work_precision`), and the
 studies above all (`study`, `exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`,
 `benchmark`), with their pictures (`plot`, `study_figures`). References to equations and sections
-are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*.
+are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*; equations go by
+their labels in its source.
+
+What examples take for granted:
+
+```python
+import jax
+import jax.numpy as jnp
+import jaxbridge as jb
+
+key = jax.random.key(0)
+model = jb.ornstein_uhlenbeck(jnp.array([[1.5, 1.0], [1.0, 1.5]]))
+start, end = jnp.array([0.0, 0.0]), jnp.array([1.0, 0.0])
+bridges = jb.sample_bridges(key, model, start, end, 1.0, num_bridges=100)
+
+times = jnp.array([0.0, 0.5, 1.5, 2.0])
+observations = jnp.array([[0.0, 0.0], [0.5, -0.3], [0.2, 0.4], [-0.3, 0.6]])
+```
 """
 
-from .bridges import Bridges as Bridges, sample_bridges as sample_bridges
-from .burn_in import measure_burn_in as measure_burn_in
-from .chains import sample_exact_bridges as sample_exact_bridges
-from .choice import Choice as Choice
-from .coupled_pairs import CoupledPairs as CoupledPairs
+from .bridges import Bridges, sample_bridges
+from .burn_in import measure_burn_in
+from .chains import sample_exact_bridges
+from .choice import Choice
+from .coupled_pairs import CoupledPairs
 from .coupling import (
-    AbstractCoupling as AbstractCoupling,
-    Coupling as Coupling,
-    no_rotation as no_rotation,
-    polar_rotation as polar_rotation,
-    published_rotation as published_rotation,
+    AbstractCoupling,
+    Coupling,
+    no_rotation,
+    polar_rotation,
+    published_rotation,
 )
-from .crank_nicolson_chain import crank_nicolson as crank_nicolson
+from .crank_nicolson_chain import crank_nicolson
 from .diagnostics import (
-    HittingVariation as HittingVariation,
-    effective_sample_size as effective_sample_size,
-    hitting_variation as hitting_variation,
-    potential_scale_reduction as potential_scale_reduction,
+    HittingVariation,
+    effective_sample_size,
+    hitting_variation,
+    potential_scale_reduction,
 )
-from .diffusion import Diffusion as Diffusion
-from .expectation import expectation as expectation
+from .diffusion import Diffusion
+from .expectation import expectation
 from .gaussian import (
-    GaussianBridge as GaussianBridge,
-    GaussianLaw as GaussianLaw,
-    OrnsteinUhlenbeckParams as OrnsteinUhlenbeckParams,
-    gaussian_bridge as gaussian_bridge,
-    ornstein_uhlenbeck as ornstein_uhlenbeck,
-    ou_stationary as ou_stationary,
-    ou_transition as ou_transition,
+    GaussianBridge,
+    GaussianLaw,
+    OrnsteinUhlenbeckParams,
+    gaussian_bridge,
+    ornstein_uhlenbeck,
+    ou_stationary,
+    ou_transition,
 )
 from .gibbs import (
-    GibbsPosterior as GibbsPosterior,
-    GibbsState as GibbsState,
-    gibbs as gibbs,
+    GibbsPosterior,
+    GibbsState,
+    gibbs,
 )
 from .guided import (
-    AbstractGuidedProposal as AbstractGuidedProposal,
-    Guided as Guided,
-    ModifiedDiffusionBridge as ModifiedDiffusionBridge,
-    NoiseLaw as NoiseLaw,
-    ResidualBridge as ResidualBridge,
-    Step as Step,
+    AbstractGuidedProposal,
+    Guided,
+    ModifiedDiffusionBridge,
+    NoiseLaw,
+    ResidualBridge,
+    Step,
 )
-from .hitting import HittingCounts as HittingCounts, hitting_counts as hitting_counts
+from .hitting import HittingCounts, hitting_counts
 from .importance import (
-    WeightedBridges as WeightedBridges,
-    sample_weighted_bridges as sample_weighted_bridges,
-    weigh_bridges as weigh_bridges,
+    WeightedBridges,
+    sample_weighted_bridges,
+    weigh_bridges,
 )
-from .kernels import Chain as Chain, Kernel as Kernel
-from .lamperti import lamperti as lamperti
-from .likelihood import path_log_likelihood as path_log_likelihood
+from .kernels import Chain, Kernel
+from .lamperti import lamperti
+from .likelihood import path_log_likelihood
 from .maximum_likelihood import (
-    MaximumLikelihood as MaximumLikelihood,
-    maximum_likelihood as maximum_likelihood,
+    MaximumLikelihood,
+    maximum_likelihood,
 )
 from .meeting import (
-    AbstractMeeting as AbstractMeeting,
-    BrownianCrossing as BrownianCrossing,
-    Frame as Frame,
-    PairStep as PairStep,
-    ReflectionPlane as ReflectionPlane,
-    SignTest as SignTest,
+    AbstractMeeting,
+    BrownianCrossing,
+    Frame,
+    PairStep,
+    ReflectionPlane,
+    SignTest,
 )
 from .models import (
-    hyperbolic as hyperbolic,
-    langevin as langevin,
-    stationary_diffusion as stationary_diffusion,
+    hyperbolic,
+    langevin,
+    stationary_diffusion,
 )
-from .pmmh import PMMHPosterior as PMMHPosterior, PMMHState as PMMHState, pmmh as pmmh
-from .posterior import AbstractPosterior as AbstractPosterior
-from .pseudo_marginal_chain import pseudo_marginal as pseudo_marginal
-from .renewal_chain import renewal as renewal
-from .scene import effects as effects
+from .pmmh import PMMHPosterior, PMMHState, pmmh
+from .posterior import AbstractPosterior
+from .pseudo_marginal_chain import pseudo_marginal
+from .renewal_chain import renewal
+from .scene import effects
 from .schemes import (
-    AbstractScheme as AbstractScheme,
-    Euler as Euler,
-    GaussianTransition as GaussianTransition,
-    Heun as Heun,
-    Milstein as Milstein,
-    SemiImplicit as SemiImplicit,
+    AbstractScheme,
+    Euler,
+    GaussianTransition,
+    Heun,
+    Milstein,
+    SemiImplicit,
 )
-from .score import Score as Score, score as score
-from .simulate import simulate as simulate
+from .score import Score, score
+from .simulate import simulate
 from .start_laws import (
-    Reversed as Reversed,
-    StartLaw as StartLaw,
-    Stationary as Stationary,
+    Reversed,
+    StartLaw,
+    Stationary,
 )
 from .step_density import (
-    AbstractStepDensity as AbstractStepDensity,
-    EulerDensity as EulerDensity,
-    TrapezoidDensity as TrapezoidDensity,
+    AbstractStepDensity,
+    EulerDensity,
+    TrapezoidDensity,
 )
-from .transform import Transformed as Transformed, transform as transform
+from .transform import Transformed, transform
 from .transition import (
-    TransitionLogDensity as TransitionLogDensity,
-    transition_log_density as transition_log_density,
+    TransitionLogDensity,
+    transition_log_density,
 )
 from .tuning import (
-    Pilot as Pilot,
-    Tuning as Tuning,
-    choose_proposal as choose_proposal,
-    fit_start_law as fit_start_law,
-    tune_coupling as tune_coupling,
+    Pilot,
+    Tuning,
+    choose_proposal,
+    fit_start_law,
+    tune_coupling,
 )
-from .unknowns import NormalPrior as NormalPrior
-from .weighted import AbstractWeightedProposal as AbstractWeightedProposal
+from .unknowns import NormalPrior
+from .weighted import AbstractWeightedProposal
 from .work_precision import (
-    Setting as Setting,
-    WorkPrecision as WorkPrecision,
-    work_precision as work_precision,
+    Setting,
+    WorkPrecision,
+    work_precision,
 )
+
+__all__ = [
+    # A model, and its paths.
+    "Diffusion",
+    "ornstein_uhlenbeck",
+    "OrnsteinUhlenbeckParams",
+    "hyperbolic",
+    "langevin",
+    "stationary_diffusion",
+    "transform",
+    "lamperti",
+    "Transformed",
+    "simulate",
+    # Bridges by coupling.
+    "sample_bridges",
+    "Bridges",
+    "Coupling",
+    # How a pair is stepped, joined and turned.
+    "Heun",
+    "Euler",
+    "Milstein",
+    "SemiImplicit",
+    "GaussianTransition",
+    "BrownianCrossing",
+    "SignTest",
+    "ReflectionPlane",
+    "polar_rotation",
+    "no_rotation",
+    "published_rotation",
+    # Proposals that are pulled to the end point.
+    "ModifiedDiffusionBridge",
+    "Guided",
+    "ResidualBridge",
+    "EulerDensity",
+    "TrapezoidDensity",
+    # Exact bridges, by Markov chains or weights.
+    "sample_exact_bridges",
+    "Chain",
+    "sample_weighted_bridges",
+    "weigh_bridges",
+    "WeightedBridges",
+    "expectation",
+    # The same chains as kernels.
+    "pseudo_marginal",
+    "renewal",
+    "crank_nicolson",
+    "Kernel",
+    # Transition densities.
+    "transition_log_density",
+    "TransitionLogDensity",
+    # Where the associated diffusion starts.
+    "Stationary",
+    "GaussianLaw",
+    "Reversed",
+    "StartLaw",
+    "fit_start_law",
+    "measure_burn_in",
+    # Choices by pilot runs.
+    "choose_proposal",
+    "Choice",
+    "tune_coupling",
+    "Tuning",
+    "Pilot",
+    # Inference from discrete observations.
+    "gibbs",
+    "GibbsPosterior",
+    "GibbsState",
+    "pmmh",
+    "PMMHPosterior",
+    "PMMHState",
+    "maximum_likelihood",
+    "MaximumLikelihood",
+    "score",
+    "Score",
+    "NormalPrior",
+    "path_log_likelihood",
+    # What to trust, what it costs, and what is simulated.
+    "hitting_counts",
+    "HittingCounts",
+    "hitting_variation",
+    "HittingVariation",
+    "effective_sample_size",
+    "potential_scale_reduction",
+    "work_precision",
+    "WorkPrecision",
+    "Setting",
+    "effects",
+    # The exact laws of Ornstein–Uhlenbeck processes.
+    "gaussian_bridge",
+    "GaussianBridge",
+    "ou_stationary",
+    "ou_transition",
+    # What to subclass, and what such classes are given.
+    "AbstractCoupling",
+    "Frame",
+    "AbstractMeeting",
+    "PairStep",
+    "AbstractScheme",
+    "AbstractStepDensity",
+    "AbstractGuidedProposal",
+    "Step",
+    "NoiseLaw",
+    "AbstractWeightedProposal",
+    "CoupledPairs",
+    "AbstractPosterior",
+]

@@ -112,14 +112,12 @@ def sample_bridges(
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit, as far as their
     values are visible before tracing.
 
-    !!! example
+    **Example:**
 
-        ```python
-        model = jb.ornstein_uhlenbeck(jnp.array([[1.5, 1.0], [1.0, 1.5]]))
-        bridges = jb.sample_bridges(
-            jax.random.key(0), model, [0.0, 0.0], [1.0, 0.0], 1.0, num_bridges=1000
-        )
-        ```
+    ```python
+    bridges = jb.sample_bridges(key, model, [0.0, 0.0], [1.0, 0.0], 1.0, num_bridges=100)
+    bridges.paths.shape, 100 / bridges.num_proposals  # (100, 51, 2) and the acceptance rate
+    ```
     """
     coupling = Coupling() if coupling is None else coupling
     check_coupling(coupling)

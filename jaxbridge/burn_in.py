@@ -74,12 +74,12 @@ def measure_burn_in(
     **Raises:** `ValueError` where the diffusion has not forgotten its start after 2¹⁷ steps
     (inside `jit` the time is then infinite), or for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        burn_in = jb.measure_burn_in(jax.random.key(0), model, b, 1.0)
-        coupling = jb.Coupling(0.5, start_law=jb.Stationary(burn_in))
-        ```
+    ```python
+    burn_in = jb.measure_burn_in(key, model, end, 1.0)
+    coupling = jb.Coupling(0.5, start_law=jb.Stationary(burn_in))
+    ```
     """
     check_key(key)
     check_diffusion(model)

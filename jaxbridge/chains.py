@@ -82,14 +82,12 @@ def sample_exact_bridges(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        chain = jb.sample_exact_bridges(
-            jax.random.key(0), model, [0.0, 0.0], [1.0, 0.0], 1.0, num_bridges=10_000
-        )
-        chain.paths, chain.acceptance_rate
-        ```
+    ```python
+    chain = jb.sample_exact_bridges(key, model, start, end, 1.0, num_bridges=1000)
+    chain.paths.shape, chain.acceptance_rate  # (1000, 51, 2)
+    ```
     """
     check_key(key)
     check_diffusion(model)

@@ -53,8 +53,8 @@ _CONTENDS = 3.0
 
 
 class Choice(AbstractWeightedProposal):
-    """A proposal for each interval, and why: what `proposal="auto"` comes to. Printed, it is a
-    table.
+    """A proposal for each interval, and why: what `proposal="auto"` comes to, and what
+    `choose_proposal` returns. Printed, it is a table.
 
     - `candidates`: C proposals.
     - `seconds`: per simulated path, shape (C, I): by rule relative to those of a modified
@@ -62,6 +62,7 @@ class Choice(AbstractWeightedProposal):
     - `efficiency`: effective samples per simulated path in the pilot run, extrapolated to
         a larger one, shape (C, I); NaN where none was needed because the candidate could not win.
     - `chosen`: the number of each interval's candidate, shape (I,).
+    - `num_pilot`: pilot paths of each candidate for each interval, or `None` for the default.
     - `used`: the numbers of those that were chosen for any interval; inside `jit`, where that is
         not known, of all. Only they are compiled, so that another set compiles again.
     """

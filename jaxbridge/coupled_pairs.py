@@ -27,7 +27,14 @@ _BLOCK_BYTES = 2**28
 
 
 class CoupledPairs(AbstractWeightedProposal):
-    """The proposals of a coupling, weighted by `num_counts` hitting counts each."""
+    """The proposals of a coupling, weighted by hitting counts: `proposal` of what
+    `sample_exact_bridges` and others return where they were given a `Coupling`.
+
+    - `coupling`: with its start law.
+    - `max_proposals`: bounds the tries for a pair that meets.
+    - `max_trials`: bounds the trials for the counts of each path.
+    - `num_counts`: N, hitting counts for each path.
+    """
 
     coupling: AbstractCoupling
     max_proposals: Int[Array, ""]

@@ -44,18 +44,46 @@ Rotation = Callable[[Float[Array, "d d"], Float[Array, "d d"]], Float[Array, "d 
 
 
 def polar_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
-    """O(x, x'), the orthogonal matrix closest to σ(x')ᵀσ(x), so that σ(x')O ≈ σ(x)."""
+    """O(x, x'), the orthogonal matrix closest to σ(x')ᵀσ(x), so that σ(x')O ≈ σ(x).
+
+    `sigma` is σ(x), `driven_sigma` σ(x'), shape (d, d). The paper prints its transpose,
+    `published_rotation`.
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, rotation=jb.polar_rotation)
+    ```
+    """
     return polar_factor(matmul(driven_sigma.T, sigma))
 
 
 def no_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
-    """O = I: as exact as any other rotation, but σ(x) and σ(x') may point elsewhere."""
+    """O = I: as exact as any other rotation, but σ(x) and σ(x') may point elsewhere.
+
+    `sigma` is σ(x), `driven_sigma` σ(x'), shape (d, d).
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, rotation=jb.no_rotation)
+    ```
+    """
     return None
 
 
 def published_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
     """The orthogonal factor of σ(x)ᵀσ(x') as printed in the paper: the transpose of the
-    rotation that aligns the two, so it turns the wrong way. For comparisons."""
+    rotation that aligns the two, so it turns the wrong way. For comparisons.
+
+    `sigma` is σ(x), `driven_sigma` σ(x'), shape (d, d).
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, rotation=jb.published_rotation)
+    ```
+    """
     return polar_factor(matmul(sigma.T, driven_sigma))
 
 
@@ -166,12 +194,12 @@ class Coupling(AbstractCoupling):
     **Raises:** `ValueError` for γ outside [-1, 1) or `ReflectionPlane` with γ ≠ -1; `TypeError`
     for a meeting rule, a scheme or a start law that is none.
 
-    !!! example
+    **Example:**
 
-        ```python
-        coupling = jb.Coupling(0.5)
-        bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000, coupling=coupling)
-        ```
+    ```python
+    coupling = jb.Coupling(0.5, scheme=jb.Euler())
+    bridges = jb.sample_bridges(key, model, start, end, 1.0, num_bridges=100, coupling=coupling)
+    ```
     """
 
     gamma: Float[Array, "..."]

@@ -78,12 +78,12 @@ def crank_nicolson(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        kernel = jb.crank_nicolson(model, a, b, 10.0, num_steps=500, step_size=0.3)
-        state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
-        ```
+    ```python
+    kernel = jb.crank_nicolson(model, start, end, 10.0, num_steps=500, step_size=0.3)
+    state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
+    ```
     """
     check_diffusion(model)
     intervals = one_interval(start, end, duration)

@@ -30,14 +30,16 @@ from .start_laws import AnyStartLaw
 
 
 class HittingVariation(NamedTuple):
-    """The regression of V(ρ̂_N) on 1/N; standard errors by bootstrap over the bridges.
+    """What `hitting_variation` returns: the regression of V(ρ̂_N) on 1/N, with standard errors by
+    bootstrap over the bridges.
 
     - `num_counts`, `variances`: N and V(ρ̂_N), shape (K,).
-    - `intercept`: an estimate of V(1/π_T(B)), which chance can make negative, and its error.
+    - `intercept`, `intercept_error`: an estimate of V(1/π_T(B)), which chance can make negative,
+        and its error.
     - `slope`: an estimate of E[(1-π)/π²].
     - `mean`: of ρ̂, an estimate of E[1/π_T(B)].
-    - `ratio`: √intercept / mean, zero for a negative intercept: the variation of 1/π_T(B), and
-        its error. Zero for a proposal that is exact as it is.
+    - `ratio`, `ratio_error`: √intercept / mean, zero for a negative intercept: the variation of
+        1/π_T(B), and its error. Zero for a proposal that is exact as it is.
     - `num_truncated`: bridges left out because their counts were cut off by `max_trials`.
     """
 
@@ -77,12 +79,12 @@ def hitting_variation(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        weighted = jb.weigh_bridges(key, model, bridges)
-        jb.hitting_variation(key, model, weighted, num_counts=(10, 20, 40)).ratio
-        ```
+    ```python
+    weighted = jb.weigh_bridges(key, model, bridges)
+    jb.hitting_variation(key, model, weighted, num_counts=(10, 20, 40)).ratio
+    ```
     """
     check_key(key)
     sizes = [check_count("num_counts", n) for n in num_counts]
@@ -150,11 +152,12 @@ def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
 
     `draws`: one chain, shape (n, ...), for instance `chain.paths[:, 25]`.
 
-    !!! example
+    **Example:**
 
-        ```python
-        jb.effective_sample_size(chain.paths[:, 25])  # shape (d,)
-        ```
+    ```python
+    draws = jax.random.normal(key, (1000, 2))  # as, of a chain, `chain.paths[:, 25]`
+    jb.effective_sample_size(draws)  # shape (2,)
+    ```
     """
     draws = as_floating("draws", draws)
     if draws.ndim == 0 or draws.shape[0] < 4:
@@ -182,11 +185,12 @@ def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
 
     `draws`: shape (chains, n, ...).
 
-    !!! example
+    **Example:**
 
-        ```python
-        jb.potential_scale_reduction(posterior.theta)  # shape (p,)
-        ```
+    ```python
+    draws = jax.random.normal(key, (4, 1000, 2))  # as `theta` of a posterior of four chains
+    jb.potential_scale_reduction(draws)  # shape (2,)
+    ```
     """
     draws = as_floating("draws", draws)
     if draws.ndim < 2 or draws.shape[1] < 4:

@@ -73,12 +73,12 @@ class Diffusion(eqx.Module):
     **Raises:** `TypeError` where a function is not callable; `ValueError` for a constant σ of
     a wrong shape, or singular.
 
-    !!! example
+    **Example:**
 
-        ```python
-        model = jb.Diffusion(lambda x, p: -p * x, None, lambda x, p: -p * x @ x, params=1.0)
-        model.reverse_drift(jnp.ones(2))  # Array([-1., -1.], dtype=float32)
-        ```
+    ```python
+    model = jb.Diffusion(lambda x, p: -p * x, None, lambda x, p: -p * x @ x, params=1.0)
+    model.reverse_drift(jnp.ones(2))  # Array([-1., -1.], dtype=float32)
+    ```
     """
 
     _drift: Callable = eqx.field(static=True)

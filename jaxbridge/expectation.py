@@ -43,16 +43,16 @@ def expectation(
 
     **Raises:** `TypeError` for other bridges; `ValueError` where they were not kept whole.
 
-    !!! example
+    **Example:**
 
-        ```python
-        bridges = jb.sample_weighted_bridges(key, model, a, b, 1.0, num_bridges=10_000)
+    ```python
+    weighted = jb.weigh_bridges(key, model, bridges)
 
-        def middle(theta):
-            return jb.expectation(lambda path: path[25], bridges, model.with_params(theta))
+    def middle(params):
+        return jb.expectation(lambda path: path[25], weighted, model.with_params(params))
 
-        jax.jacfwd(middle)(model.params)
-        ```
+    jax.jacfwd(middle)(model.params).mean  # shape (2, 2)
+    ```
     """
     check_diffusion(model)
     if not isinstance(bridges, WeightedBridges | Chain):

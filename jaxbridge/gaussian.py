@@ -31,10 +31,19 @@ from .linear import linear_transition
 
 
 class GaussianLaw(eqx.Module):
-    """The normal distribution N(mean, covariance), with shapes (d,) and (d, d).
+    """The normal distribution N(mean, covariance).
+
+    **Arguments:** `mean`, shape (d,); `covariance`, shape (d, d).
 
     **Raises:** `ValueError` for shapes that do not fit, or a covariance that is visibly not
     symmetric and positive definite.
+
+    **Example:**
+
+    ```python
+    law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
+    coupling = jb.Coupling(0.5, start_law=law)
+    ```
     """
 
     mean: Float[Array, " d"]
@@ -76,7 +85,15 @@ class GaussianLaw(eqx.Module):
 
 
 class OrnsteinUhlenbeckParams(NamedTuple):
-    """B, shape (d, d); the mean, (d,); σ, (d, d), (d,) for a diagonal, or `None` for I."""
+    """The parameters of an Ornstein–Uhlenbeck model, `params` of `ornstein_uhlenbeck`: `B`, shape
+    (d, d), per unit of time; `mean`, (d,); `sigma`, (d, d), (d,) for a diagonal, or `None` for I.
+
+    **Example:**
+
+    ```python
+    moved = model.with_params(model.params._replace(mean=jnp.ones(2)))
+    ```
+    """
 
     B: Float[Array, "d d"]
     mean: Float[Array, " d"]
@@ -110,12 +127,12 @@ def ornstein_uhlenbeck(
     **Raises:** `ValueError` where B has an eigenvalue whose real part is not positive, so
     that the process is not ergodic; for a singular σ; for shapes that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        model = jb.ornstein_uhlenbeck(jnp.array([[1.5, 1.0], [1.0, 1.5]]))
-        model.reverse_drift(jnp.array([1.0, 0.0]))  # Array([-1.5, -1. ], dtype=float32)
-        ```
+    ```python
+    model = jb.ornstein_uhlenbeck(jnp.array([[1.5, 1.0], [1.0, 1.5]]))
+    model.reverse_drift(jnp.array([1.0, 0.0]))  # Array([-1.5, -1. ], dtype=float32)
+    ```
     """
     B = as_floating("B", B)
     if B.ndim != 2 or B.shape[0] != B.shape[1]:
@@ -153,22 +170,33 @@ def ornstein_uhlenbeck(
 
 
 def ou_stationary(model: Diffusion) -> GaussianLaw:
-    """The stationary law N(m, Γ) of an Ornstein–Uhlenbeck model."""
+    """The stationary law N(m, Γ) of `model`, an Ornstein–Uhlenbeck model, with Γ the solution of
+    B Γ + Γ Bᵀ = σ σᵀ.
+
+    **Raises:** `TypeError` for any other model.
+
+    **Example:**
+
+    ```python
+    jb.ou_stationary(model).covariance  # shape (2, 2)
+    ```
+    """
     prepared = _prepare(_ou_params(model))
     return GaussianLaw(prepared.mean, prepared.covariance)
 
 
 def ou_transition(model: Diffusion, start: Float[Array, " d"], duration: Numbers) -> GaussianLaw:
-    """The law of X_t given X_0 = `start`, for t = `duration`, of an Ornstein–Uhlenbeck model.
+    """The law of X_t given X_0 = `start`, shape (d,), for t = `duration`, of `model`, an
+    Ornstein–Uhlenbeck model.
 
     **Raises:** `TypeError` for any other model.
 
-    !!! example
+    **Example:**
 
-        ```python
-        law = jb.ou_transition(model, jnp.zeros(2), 1.0)
-        law.log_density(jnp.ones(2))
-        ```
+    ```python
+    law = jb.ou_transition(model, start, 1.0)
+    law.log_density(end)
+    ```
     """
     params = _ou_params(model)
     start, _, duration = _one_interval(params, start, start, duration)
@@ -177,7 +205,7 @@ def ou_transition(model: Diffusion, start: Float[Array, " d"], duration: Numbers
 
 
 class GaussianBridge(eqx.Module):
-    """The exact law of an Ornstein–Uhlenbeck bridge at K times.
+    """The exact law of an Ornstein–Uhlenbeck bridge at K times, from `gaussian_bridge`.
 
     `times` (K,), `mean` (K, d) and `covariance` (K, d, d), the covariance at each time;
     `sample` draws whole paths.
@@ -224,17 +252,26 @@ def gaussian_bridge(
     duration: Numbers,
     times: Numbers,
 ) -> GaussianBridge:
-    """The exact law of the (start, end, duration)-bridge of an Ornstein–Uhlenbeck model at
-    `times`, increasing, shape (K,), in [0, duration]; B need not be reversible.
+    """The exact law of the (start, end, duration)-bridge of an Ornstein–Uhlenbeck model: the
+    paper's lemma on the bridge, for any B.
+
+    **Arguments:**
+
+    - `model`: from `ornstein_uhlenbeck`. It need not be reversible.
+    - `start`, `end`: points, shape (d,).
+    - `duration`: in units of time, shape ().
+    - `times`: increasing, shape (K,), in [0, duration].
+
+    **Returns:** `GaussianBridge`.
 
     **Raises:** `TypeError` for any other model, `ValueError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        exact = jb.gaussian_bridge(model, [0.0, 0.0], [1.0, 0.0], 1.0, times=[0.25, 0.5])
-        exact.mean[1], exact.covariance[1], exact.sample(jax.random.key(0), 1000)
-        ```
+    ```python
+    exact = jb.gaussian_bridge(model, start, end, 1.0, times=[0.25, 0.5])
+    exact.mean[1], exact.covariance[1], exact.sample(key, num_paths=1000)
+    ```
     """
     params = _ou_params(model)
     a, b, total = _one_interval(params, start, end, duration)

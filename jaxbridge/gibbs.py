@@ -43,15 +43,19 @@ from .unknowns import (
 
 
 class GibbsState(NamedTuple):
-    """Where a chain is: θ, shape (p,), and the paths of all intervals, in parts of one number of
-    steps; with chains in a leading axis if there are several."""
+    """Where a chain of `gibbs` is, with chains in a leading axis if there are several.
+
+    - `theta`: θ, shape (p,).
+    - `paths`: those of all intervals, in parts of one number of steps.
+    """
 
     theta: Float[Array, "*chains p"]
     paths: tuple[Float[Array, "..."], ...]
 
 
 class GibbsPosterior(AbstractPosterior):
-    """Draws of the unknown parameters; arrays have a leading axis of chains if there are several.
+    """What `gibbs` returns: draws of the unknown parameters. Arrays have a leading axis of chains
+    if there are several.
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
     - `theta`: the unknown ones as vectors, shape (*chains, n, p).
@@ -116,8 +120,6 @@ def gibbs(
     - `num_iterations`: draws that are kept; between two of them are `thin` iterations.
     - `num_steps`: N for each interval, by default 50; or `step_size`, the longest step, from
         which each interval gets its own number of steps.
-    - `prior`, `constraint`, `where` and `parameter_kernel` are compared by identity: define them
-        once to compile once.
     - `proposal`: a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, `Guided()`, or
         "auto", the default, which finds the best for each interval by a pilot run; or, for
         approximate bridges, a `Coupling`, by default `Coupling(gamma=0.0)`.
@@ -138,19 +140,21 @@ def gibbs(
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
+    The functions among these are compared by identity: define them once to compile once.
+
     **Returns:** `GibbsPosterior`. Not differentiable.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        posterior = jb.gibbs(
-            jax.random.key(0), jb.hyperbolic(0.8, 2), times, observations,
-            prior=jb.NormalPrior(1.0, 1.0), constraint=lambda alpha: alpha > 0,
-        )
-        posterior.params.mean(), posterior.effective_sample_size
-        ```
+    ```python
+    posterior = jb.gibbs(
+        key, jb.hyperbolic(0.8, 2), times, observations, num_iterations=500, num_steps=20,
+        prior=jb.NormalPrior(1.0, 1.0), constraint=lambda alpha: alpha > 0,
+    )
+    posterior.params.mean(), posterior.effective_sample_size
+    ```
     """
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
     problem = as_problem(

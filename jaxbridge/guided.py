@@ -58,7 +58,9 @@ _SHORTEST_STEP = 1e-10
 
 
 class NoiseLaw(NamedTuple):
-    """N(m, L Lᵀ), the law of one step's standardised noise; L is a number or a triangle."""
+    """N(m, L Lᵀ), the law of one step's standardised noise, which `noise_law` of an
+    `AbstractGuidedProposal` returns: `mean` is m, shape (d,), and `root` L, a number, shape (), or
+    a lower triangle, (d, d)."""
 
     mean: Float[Array, " d"]
     root: Float[Array, "..."]
@@ -82,7 +84,13 @@ class NoiseLaw(NamedTuple):
 
 
 class Step(NamedTuple):
-    """One step of one interval: what the proposal worked out for it, δ_i, T - t_i, and b."""
+    """One step of one interval, as `noise_law` of an `AbstractGuidedProposal` sees it.
+
+    - `guide`: what the proposal worked out for the step.
+    - `dt`: its length δ_i, in units of time.
+    - `remaining`: T - t_i, the time from its beginning to the end.
+    - `end`: b, shape (d,).
+    """
 
     guide: PyTree
     dt: Float[Array, "*lanes"]
@@ -181,12 +189,12 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
-    !!! example
+    **Example:**
 
-        ```python
-        proposal = jb.ModifiedDiffusionBridge()
-        chain = jb.sample_exact_bridges(key, model, a, b, 0.1, num_bridges=1000, proposal=proposal)
-        ```
+    ```python
+    proposal = jb.ModifiedDiffusionBridge()
+    chain = jb.sample_exact_bridges(key, model, start, end, 0.1, num_bridges=100, proposal=proposal)
+    ```
     """
 
     density: AbstractStepDensity
@@ -219,12 +227,12 @@ class ResidualBridge(AbstractGuidedProposal):
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
-    !!! example
+    **Example:**
 
-        ```python
-        proposal = jb.ResidualBridge()
-        chain = jb.sample_exact_bridges(key, model, a, b, 0.5, num_bridges=1000, proposal=proposal)
-        ```
+    ```python
+    proposal = jb.ResidualBridge()
+    chain = jb.sample_exact_bridges(key, model, start, end, 0.5, num_bridges=100, proposal=proposal)
+    ```
     """
 
     density: AbstractStepDensity
@@ -272,12 +280,12 @@ class Guided(AbstractGuidedProposal):
 
     **Raises:** `ValueError` and `TypeError` for anything else.
 
-    !!! example
+    **Example:**
 
-        ```python
-        proposal = jb.Guided()
-        chain = jb.sample_exact_bridges(key, model, a, b, 2.0, num_bridges=1000, proposal=proposal)
-        ```
+    ```python
+    proposal = jb.Guided()
+    chain = jb.sample_exact_bridges(key, model, start, end, 2.0, num_bridges=100, proposal=proposal)
+    ```
     """
 
     density: AbstractStepDensity

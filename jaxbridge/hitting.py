@@ -45,7 +45,7 @@ class BridgePaths(Protocol):
 
 
 class HittingCounts(eqx.Module):
-    """Counts of n bridges, or of I × n with a leading axis I.
+    """What `hitting_counts` returns: counts of n bridges, or of I × n with a leading axis I.
 
     - `counts`: N independent counts for each bridge, shape (n, N); -1 where the trials ran out
         before the count was complete, and for a bridge that is missing.
@@ -132,12 +132,12 @@ def hitting_counts(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        counts = jb.hitting_counts(key, model, bridges, num_counts=100)
-        counts.probability, counts.standard_error
-        ```
+    ```python
+    counts = jb.hitting_counts(key, model, bridges, num_counts=10)
+    counts.probability, counts.standard_error
+    ```
     """
     check_key(key)
     check_diffusion(model)

@@ -29,7 +29,8 @@ from .weighted import AbstractWeightedProposal
 
 
 class WeightedBridges(eqx.Module):
-    """Bridges whose weights make them exact; with I intervals arrays have a leading axis I.
+    """Bridges whose weights make them exact, from `weigh_bridges` or `sample_weighted_bridges`;
+    with I intervals arrays have a leading axis I.
 
     - `times`, `paths`: as in `Bridges`, shapes (K,) and (n, K, d).
     - `log_weights`: shape (n,), up to a common constant; -inf for a bridge that is missing.
@@ -164,13 +165,12 @@ def weigh_bridges(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        bridges = jb.sample_bridges(key, model, a, b, 1.0, num_bridges=1000)
-        weighted = jb.weigh_bridges(jax.random.key(1), model, bridges)
-        weighted.mean(lambda path: path[25]), weighted.effective_sample_size
-        ```
+    ```python
+    weighted = jb.weigh_bridges(jax.random.key(1), model, bridges)
+    weighted.mean(lambda path: path[25]), weighted.effective_sample_size
+    ```
     """
     check_key(key)
     check_diffusion(model)
@@ -261,13 +261,13 @@ def sample_weighted_bridges(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        proposal = jb.ModifiedDiffusionBridge()
-        weighted = jb.sample_weighted_bridges(key, model, a, b, 0.1, proposal=proposal)
-        weighted.mean(lambda path: path[25]), weighted.effective_sample_size
-        ```
+    ```python
+    proposal = jb.ModifiedDiffusionBridge()
+    weighted = jb.sample_weighted_bridges(key, model, start, end, 0.1, proposal=proposal)
+    weighted.mean(lambda path: path[25]), weighted.effective_sample_size
+    ```
     """
     check_key(key)
     check_diffusion(model)

@@ -18,15 +18,20 @@ from .weighted import AbstractWeightedProposal
 
 
 class Kernel(NamedTuple):
-    """A Markov kernel: `init(position, rng_key) -> state` and `step(rng_key, state) -> (state,
-    info)`. Runners that look for these two functions, such as BlackJAX's, take it as it is."""
+    """A Markov kernel on bridges, from `pseudo_marginal`, `renewal` or `crank_nicolson`. Runners
+    that look for its two functions, such as BlackJAX's, take it as it is.
+
+    - `init`: a function `(position, rng_key) -> state`.
+    - `step`: a function `(rng_key, state) -> (state, info)`.
+    """
 
     init: Callable
     step: Callable
 
 
 class Chain(eqx.Module):
-    """States of a chain; with I intervals arrays have a leading axis I.
+    """What `sample_exact_bridges` returns: the states of a chain. With I intervals arrays have a
+    leading axis I.
 
     - `times`: the K stored times, shape (K,); (I, K) for I durations.
     - `paths`: the states of the chain after each step, shape (n, K, d); NaN until a first path

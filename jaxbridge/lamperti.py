@@ -46,17 +46,17 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
     **Raises:** `ValueError` for numbers that are out of range and for a σ(a) that is not a
     positive number; `TypeError` for what is no model, or no number.
 
-    !!! example
+    **Example:**
 
-        ```python
-        cir = jb.Diffusion(
-            lambda x, p: 0.5 - x,
-            lambda x, p: 0.6 * jnp.sqrt(x),
-            lambda x, p: jnp.sum((1 / 0.6**2 - 1) * jnp.log(x) - 2 * x / 0.6**2),
-        )
-        root = jb.lamperti(cir, at=0.5, reach=8.0)
-        root.forward(jnp.array([0.6]))  # 2 (√0.6 - √0.5) / 0.6
-        ```
+    ```python
+    cir = jb.Diffusion(
+        lambda x, p: 0.5 - x,
+        lambda x, p: 0.6 * jnp.sqrt(x),
+        lambda x, p: jnp.sum((1 / 0.6**2 - 1) * jnp.log(x) - 2 * x / 0.6**2),
+    )
+    root = jb.lamperti(cir, at=0.5, reach=8.0)
+    root.forward(jnp.array([0.6]))  # 2 (√0.6 - √0.5) / 0.6
+    ```
     """
     check_diffusion(model)
     origin, reach = _number("at", at), _number("reach", reach)

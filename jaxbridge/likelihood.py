@@ -62,14 +62,14 @@ def path_log_likelihood(
     that the model does not have; `TypeError` where a derivative is taken in parameters of σ,
     except as "euler".
 
-    !!! example
+    **Example:**
 
-        ```python
-        def log_likelihood(alpha):
-            return jb.path_log_likelihood(model.with_params(alpha), bridges.times, bridges.paths)
+    ```python
+    def log_likelihood(params):
+        return jb.path_log_likelihood(model.with_params(params), bridges.times, bridges.paths)
 
-        jax.jacfwd(log_likelihood)(0.8)  # the score of each path
-        ```
+    jax.jacfwd(log_likelihood)(model.params).B  # the score of each path, shape (100, 2, 2)
+    ```
     """
     check_diffusion(model)
     (times, steps), path = time_steps("times", times), as_floating("path", path)

@@ -46,7 +46,7 @@ _ADAM = optax.adam(1e-2)
 
 
 class MaximumLikelihood(eqx.Module):
-    """The maximum likelihood estimate.
+    """The maximum likelihood estimate, from `maximum_likelihood`.
 
     - `params`: all parameters of the model, the unknown ones estimated.
     - `standard_errors`: a pytree like the unknown parameters, from the observed information.
@@ -120,14 +120,14 @@ def maximum_likelihood(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        estimate = jb.maximum_likelihood(
-            jax.random.key(0), jb.hyperbolic(1.0, 2), times, observations, optax.adam(1e-2)
-        )
-        estimate.params, estimate.standard_errors
-        ```
+    ```python
+    estimate = jb.maximum_likelihood(
+        key, jb.hyperbolic(1.0, 2), times, observations, num_iterations=200, num_steps=20
+    )
+    estimate.params, estimate.standard_errors
+    ```
     """
     num_iterations = check_count("num_iterations", num_iterations, 2)
     num_bridges = check_count("num_bridges", num_bridges, 2)

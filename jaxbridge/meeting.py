@@ -110,6 +110,12 @@ class SignTest(AbstractMeeting):
 
     Sees about half of the meetings, so what it decides is off by O(√δ). With a `radius`, in
     units of space, `|x_i - x'_i| ≤ radius` is asked too; the paper uses 0.05.
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, meeting=jb.SignTest(radius=0.05))
+    ```
     """
 
     radius: Float[Array, ""] | None = None
@@ -135,6 +141,12 @@ class ReflectionPlane(AbstractMeeting):
         uᵀσ⁻¹ (x_{i+1} - x_i - α(x_i) δ) ≤ -½ D_i.
 
     The same test as `SignTest()` where the two share their drift, and off by O(√δ) as well.
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(-1.0, meeting=jb.ReflectionPlane())
+    ```
     """
 
     draws_uniform: ClassVar[bool] = False
@@ -153,6 +165,12 @@ class BrownianCrossing(AbstractMeeting):
     with s the variance of the gap per unit of time, 2(1-γ) for the γ-coupling. For constant σ
     without error of its own with `Euler` and `GaussianTransition`, and off by O(δ²) with `Heun`;
     off by O(δ) where σ depends on the state.
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, meeting=jb.BrownianCrossing())  # the default
+    ```
     """
 
     draws_uniform: ClassVar[bool] = True

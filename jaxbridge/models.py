@@ -36,16 +36,16 @@ def stationary_diffusion(
 
     **Arguments:** functions `(x, params)` of one point `x` of shape (d,): `log_density`, log ν
     up to a constant; `V`, positive definite, shape (d, d), or (d,) for a diagonal, by default
-    the identity; `Q`, shape (d, d), by default zero.
+    the identity; `Q`, shape (d, d), by default zero. `params`, any pytree, is what they receive.
 
     **Raises:** `TypeError` for arguments that are not functions.
 
-    !!! example
+    **Example:**
 
-        ```python
-        swirl = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
-        model = jb.stationary_diffusion(lambda x, p: -x @ x / 2, Q=lambda x, p: swirl)
-        ```
+    ```python
+    swirl = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
+    model = jb.stationary_diffusion(lambda x, p: -x @ x / 2, Q=lambda x, p: swirl)
+    ```
     """
     for name, function in [("log_density", log_density), ("V", V), ("Q", Q)]:
         if not (callable(function) or (function is None and name != "log_density")):
@@ -63,13 +63,14 @@ def stationary_diffusion(
 def langevin(log_density: Callable, params: PyTree = None) -> Diffusion:
     """The Langevin diffusion `dX = ½ ∇log ν(X) dt + dW`: reversible, with stationary density ν.
 
-    `log_density`, `(x, params) -> ()`, is log ν up to a constant.
+    **Arguments:** `log_density`, `(x, params) -> ()`, is log ν up to a constant; `params`, any
+    pytree, is what it receives.
 
-    !!! example
+    **Example:**
 
-        ```python
-        double_well = jb.langevin(lambda x, p: -p * (x @ x - 1) ** 2, params=1.0)
-        ```
+    ```python
+    double_well = jb.langevin(lambda x, p: -p * (x @ x - 1) ** 2, params=1.0)
+    ```
     """
     return stationary_diffusion(log_density, params=params)
 
@@ -77,16 +78,18 @@ def langevin(log_density: Callable, params: PyTree = None) -> Diffusion:
 def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     """The hyperbolic diffusion `dX = -α X / √(1+|X|²) dt + dW` in R^dim: equation
     (hyperbolicsde). Reversible; its log stationary density is the normalised one of equation
-    (hypdensity), and its stationary sampler is exact. `params` is α, per unit of time.
+    (hypdensity), and its stationary sampler is exact. `params` is α.
+
+    **Arguments:** `alpha`, α > 0, per unit of time; `dim`, the dimension d.
 
     **Raises:** `ValueError` for α ≤ 0 or dim < 1.
 
-    !!! example
+    **Example:**
 
-        ```python
-        model = jb.hyperbolic(0.8, dim=2)
-        model.sample_stationary(jax.random.key(0))
-        ```
+    ```python
+    model = jb.hyperbolic(0.8, dim=2)
+    model.drift(jnp.ones(2))
+    ```
     """
     dim = check_count("dim", dim)
     alpha = as_floating("alpha", alpha)

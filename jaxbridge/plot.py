@@ -1,5 +1,10 @@
 """Pictures of bridges, of their law beside an exact one, and of what is inferred by them. Each
-function takes the axes to draw in, or makes them, and returns them. Needs the extra `plot`."""
+function takes the axes to draw in, `ax`, or makes them, and returns them. Needs the extra `plot`.
+
+```python
+from jaxbridge import plot
+```
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -26,13 +31,13 @@ from .plot_style import (
 from .work_precision import WorkPrecision
 
 __all__ = [
-    "bridge_fan",
-    "copula_levels",
     "paths_in_space",
-    "posterior",
+    "bridge_fan",
     "qq",
-    "trace",
+    "copula_levels",
     "work_precision",
+    "posterior",
+    "trace",
 ]
 
 LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
@@ -47,15 +52,17 @@ def paths_in_space(
 ) -> Axes:
     """The first few two-dimensional bridges with time upwards, as in the paper's first figure.
 
-    `times` and `paths` as `sample_bridges` returns them; bridges not found are left out. `ax`, if
-    it is given, must be made with `projection="3d"`.
+    `times`, shape (K,), and `paths`, (n, K, 2), as `sample_bridges` returns them; bridges not found
+    are left out, and of the others `num_paths` are drawn. `ax`, if it is given, must be made with
+    `projection="3d"`.
 
-    !!! example
+    **Raises:** `ValueError` for paths that do not have two coordinates; `TypeError` for flat axes.
 
-        ```python
-        ax = plot.paths_in_space(bridges.times, bridges.paths)
-        ax.figure.savefig("bridges.png")
-        ```
+    **Example:**
+
+    ```python
+    plot.paths_in_space(bridges.times, bridges.paths)
+    ```
     """
     space = axes_or_new(ax, projection="3d")
     if not isinstance(space, Axes3D):
@@ -87,15 +94,17 @@ def bridge_fan(
 ) -> Axes:
     """One coordinate of many bridges: median, 50 % and 90 % bands, and the first few paths.
 
-    `times` and `paths` as `sample_bridges` returns them; bridges not found are left out. `weights`
-    are those of weighted bridges, and then the paths drawn are resampled by them. The same
-    quantiles of an `exact` law, a result of `gaussian_bridge` at these times, are dashed.
+    `times`, shape (K,), and `paths`, (n, K, d), as `sample_bridges` returns them; bridges not found
+    are left out. `coordinate` counts from zero; `num_paths` are drawn. `weights`, shape (n,), are
+    those of weighted bridges, by which the paths that are drawn are chosen too. The same quantiles
+    of an `exact` law, a result of `gaussian_bridge` at these times, are dashed. `ax` is where to
+    draw.
 
-    !!! example
+    **Example:**
 
-        ```python
-        plot.bridge_fan(bridges.times, bridges.paths, coordinate=1)
-        ```
+    ```python
+    plot.bridge_fan(bridges.times, bridges.paths, coordinate=1)
+    ```
     """
     ax = axes_or_new(ax)
     times, (kept, index) = np.asarray(times, float), found(paths)
@@ -132,9 +141,17 @@ def qq(
 ) -> Axes:
     """Q-Q plot of one margin against N(mean, sd²), each method in its own colour.
 
-    `samples` are the draws of each method by its name. Quantiles are shown at levels that are
-    evenly spaced on the normal scale, out to the most extreme draws; on the diagonal the two
-    laws agree.
+    `samples` are the draws of each method by its name, shape (n,); `mean` and `sd` those of the
+    exact law. Quantiles are shown at levels that are evenly spaced on the normal scale, out to the
+    most extreme draws; on the diagonal the two laws agree. `ax` is where to draw.
+
+    **Example:**
+
+    ```python
+    exact = jb.gaussian_bridge(model, start, end, 1.0, times=[0.5])
+    mean, sd = exact.mean[0, 0], jnp.sqrt(exact.covariance[0, 0, 0])
+    plot.qq({"approximate": bridges.paths[:, 25, 0]}, mean, sd)
+    ```
     """
     ax, mean, sd = axes_or_new(ax), float(mean), float(sd)
     largest = max(np.size(values) for values in samples.values())
@@ -159,8 +176,16 @@ def copula_levels(
 ) -> Axes:
     """Level curves of the copula: exact (full drawn) and of each method's draws (dashed).
 
-    `samples` are the draws of each method by its name; `covariance` is that of the exact,
-    Gaussian law.
+    `samples` are the draws of each method by its name, shape (n, 2); `covariance`, (2, 2), is that
+    of the exact, Gaussian law; `levels` are those of the curves, between 0 and 1. `ax` is where to
+    draw.
+
+    **Example:**
+
+    ```python
+    exact = jb.gaussian_bridge(model, start, end, 1.0, times=[0.5])
+    plot.copula_levels({"approximate": bridges.paths[:, 25]}, exact.covariance[0])
+    ```
     """
     ax = axes_or_new(ax)
     variance = np.diag(covariance)
@@ -186,10 +211,20 @@ def copula_levels(
 
 def work_precision(result: WorkPrecision, ax: Axes | None = None) -> Axes:
     """Error against time, a curve for each proposal and method, its points labelled with their
-    numbers of steps: a result of `work_precision`.
+    numbers of steps.
 
-    The error is that which stays however many bridges are made, ± its uncertainty; the time is
-    that of 1,000 effective samples. The dotted line is the Monte Carlo error of so many.
+    `result` is what `jaxbridge.work_precision` returned. The error is that which stays however many
+    bridges are made, ± its uncertainty; the time is that of 1,000 effective samples. The dotted
+    line is the Monte Carlo error of so many. `ax` is where to draw.
+
+    **Example:**
+
+    ```python
+    result = jb.work_precision(
+        key, model, start, end, 1.0, proposals=[jb.Coupling()], num_steps=(4, 8), target=0.05
+    )
+    plot.work_precision(result)
+    ```
     """
     ax = axes_or_new(ax)
     for i, (curve, group) in enumerate(result.curves()):
@@ -222,7 +257,16 @@ def posterior(
 ) -> Axes:
     """Histograms of each sampler's draws of one parameter, over densities that are known.
 
-    `draws` are those of each sampler by its name, `curves` densities on the `grid`, likewise.
+    `draws` are those of each sampler by its name, shape (n,); `curves` densities on the `grid`,
+    both of shape (m,), likewise. `label` names the parameter. `ax` is where to draw.
+
+    **Example:**
+
+    ```python
+    draws = jax.random.normal(key, (1000,))  # as `theta[:, 0]` of a posterior
+    grid = jnp.linspace(-4, 4, 100)
+    plot.posterior({"Gibbs": draws}, grid, {"exact": jax.scipy.stats.norm.pdf(grid)})
+    ```
     """
     ax = axes_or_new(ax)
     everything = np.concatenate([np.asarray(values, float) for values in draws.values()])
@@ -253,7 +297,18 @@ def trace(
     label: str = "parameter",
     ax: Axes | None = None,
 ) -> Axes:
-    """The draws of one parameter in the order in which they were made, by each sampler."""
+    """The draws of one parameter in the order in which they were made, by each sampler.
+
+    `draws` are those of each sampler by its name, shape (n,). A line is drawn at `level`, where it
+    is given, for instance at the true value. `label` names the parameter. `ax` is where to draw.
+
+    **Example:**
+
+    ```python
+    draws = jax.random.normal(key, (1000,))  # as `theta[:, 0]` of a posterior
+    plot.trace({"Gibbs": draws}, level=0.0)
+    ```
+    """
     ax = axes_or_new(ax)
     for i, (name, values) in enumerate(draws.items()):
         colour = COLOURS[i % len(COLOURS)]

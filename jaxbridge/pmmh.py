@@ -47,8 +47,12 @@ _TARGET = 0.2
 
 
 class PMMHState(NamedTuple):
-    """Where a chain is: θ, the estimate of its log likelihood, and the root S of the covariance of
-    proposals; with chains in a leading axis if there are several."""
+    """Where a chain of `pmmh` is, with chains in a leading axis if there are several.
+
+    - `theta`: θ, shape (p,).
+    - `log_likelihood`: the estimate that the chain holds, shape ().
+    - `root`: S of the covariance S Sᵀ of proposals, shape (p, p).
+    """
 
     theta: Float[Array, "*chains p"]
     log_likelihood: Float[Array, "*chains"]
@@ -56,7 +60,8 @@ class PMMHState(NamedTuple):
 
 
 class PMMHPosterior(AbstractPosterior):
-    """Draws of the unknown parameters; arrays have a leading axis of chains if there are several.
+    """What `pmmh` returns: draws of the unknown parameters. Arrays have a leading axis of chains
+    if there are several.
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
     - `theta`: the unknown ones as vectors, shape (*chains, n, p).
@@ -126,15 +131,17 @@ def pmmh(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        posterior = jb.pmmh(
-            jax.random.key(0), jb.ornstein_uhlenbeck([[1.0]], sigma=[[0.5]]), times, observations,
-            where=lambda params: (params.B, params.sigma), prior=jb.NormalPrior(1.0, 1.0),
-            constraint=lambda unknown: (unknown[0][0, 0] > 0) & (unknown[1][0, 0] > 0),
-        )
-        ```
+    ```python
+    posterior = jb.pmmh(
+        key, jb.ornstein_uhlenbeck([[1.0]], sigma=[[0.5]]), times, observations[:, :1],
+        where=lambda params: (params.B, params.sigma), prior=jb.NormalPrior(1.0, 1.0),
+        constraint=lambda unknown: (unknown[0][0, 0] > 0) & (unknown[1][0, 0] > 0),
+        num_iterations=200, num_warmup=100,
+    )
+    posterior.theta.mean(0), posterior.accepted.mean()
+    ```
     """
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
     num_warmup = check_count("num_warmup", num_warmup, 0)

@@ -73,12 +73,12 @@ def pseudo_marginal(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        kernel = jb.pseudo_marginal(model, a, b, 1.0, num_steps=50, proposal=jb.Coupling(0.5))
-        state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
-        ```
+    ```python
+    kernel = jb.pseudo_marginal(model, start, end, 1.0, proposal=jb.Coupling(0.5))
+    state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
+    ```
     """
     check_diffusion(model)
     intervals = one_interval(start, end, duration)

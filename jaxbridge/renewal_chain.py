@@ -68,12 +68,12 @@ def renewal(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        kernel = jb.renewal(model, a, b, 1.0, num_steps=50, proposal=jb.Coupling(0.5))
-        state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
-        ```
+    ```python
+    kernel = jb.renewal(model, start, end, 1.0, proposal=jb.Coupling(0.5))
+    state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
+    ```
     """
     check_diffusion(model)
     intervals = one_interval(start, end, duration)

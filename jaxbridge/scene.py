@@ -40,12 +40,12 @@ def effects(
     **Raises:** `ValueError` where no dimension fits, or the time reversal is unknown; `TypeError`
     for anything but a model and a coupling.
 
-    !!! example
+    **Example:**
 
-        ```python
-        print(jb.effects(jb.hyperbolic(0.8, 2), jb.Coupling(-1.0)))
-        jb.effects(model).reverse_drift.simulated
-        ```
+    ```python
+    print(jb.effects(jb.hyperbolic(0.8, 2), jb.Coupling(-1.0)))
+    jb.effects(model).reverse_drift.why
+    ```
     """
     check_diffusion(model)
     coupling = Coupling() if coupling is None else coupling

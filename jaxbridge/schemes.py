@@ -75,6 +75,12 @@ class Euler(AbstractScheme):
     """Euler–Maruyama, `x + α(x)δ + σ(x)ΔW`, as in the paper. Its inverse is exact.
 
     Strong order ½ (1 for constant σ), weak order 1.
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, scheme=jb.Euler())
+    ```
     """
 
     stratonovich: ClassVar[bool] = False
@@ -101,7 +107,17 @@ class Milstein(AbstractScheme):
     noise as ∂σ → 0; it is exact as long as `1 + ∂_iσ_i ΔW_i > 0`, which fails with a
     probability that vanishes faster than any power of δ. For constant σ this is Euler.
 
-    **Raises:** `ValueError` for a σ that is a full, state-dependent matrix.
+    **Raises:** `ValueError`, when it is used, for a σ that is a full, state-dependent matrix.
+
+    **Example:**
+
+    ```python
+    model = jb.Diffusion(  # its stationary law is a Student's t
+        lambda x, p: -x, lambda x, p: jnp.sqrt(1 + x**2), lambda x, p: -2 * jnp.log1p(x @ x)
+    )
+    coupling = jb.Coupling(0.5, scheme=jb.Milstein())
+    bridges = jb.sample_bridges(key, model, [0.0], [1.0], 2.0, num_bridges=100, coupling=coupling)
+    ```
     """
 
     stratonovich: ClassVar[bool] = False
@@ -157,6 +173,12 @@ class Heun(AbstractScheme):
     The inverse is that of the trapezoid rule along the path,
     `½ [σ(x) + σ(x⁺)] ξ = x⁺ - x - ½ [α_S(x) + α_S(x⁺)] δ`; after a predictor–corrector step it
     returns the noise up to O(δ^{3/2}), for constant σ up to O(δ^{5/2}).
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, scheme=jb.Heun())  # the default
+    ```
     """
 
     stratonovich: ClassVar[bool] = True
@@ -203,6 +225,14 @@ class SemiImplicit(AbstractScheme):
 
     Steps must be short beside the inverse of the positive eigenvalues of ½∇α, at which L is
     singular: those of the barrier in a double well.
+
+    **Example:**
+
+    ```python
+    quartic = jb.langevin(lambda x, p: -(x @ x) ** 2 / 2)
+    coupling = jb.Coupling(0.5, scheme=jb.SemiImplicit())
+    bridges = jb.sample_bridges(key, quartic, [0.0], [1.0], 2.0, num_bridges=100, coupling=coupling)
+    ```
     """
 
     stratonovich: ClassVar[bool] = False
@@ -244,7 +274,15 @@ class GaussianTransition(AbstractScheme):
     and of its time reversal have no step error at all, nor have bridges made of them if the
     meeting rule is `BrownianCrossing`: at its grid points one step is as good as many.
 
-    **Raises:** `ValueError` for a drift that is not linear, or σ that depends on the state.
+    **Raises:** `ValueError`, when it is used, for a drift that is not linear, or σ that depends on
+    the state.
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, scheme=jb.GaussianTransition())
+    bridges = jb.sample_bridges(key, model, start, end, 1.0, num_bridges=100, coupling=coupling)
+    ```
     """
 
     stratonovich: ClassVar[bool] = False

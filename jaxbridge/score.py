@@ -31,7 +31,8 @@ _PATHS = 8_192
 
 
 class Score(eqx.Module):
-    """The gradient of the log likelihood at the model's parameters, with Monte Carlo errors.
+    """What `score` returns: the gradient of the log likelihood at the model's parameters, with
+    Monte Carlo errors.
 
     - `value`, `standard_error`: pytrees like the unknown parameters.
     - `gradient`, `covariance`: the same as a vector of shape (p,) with the covariance of its
@@ -85,12 +86,12 @@ def score(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        estimate = jb.score(jax.random.key(0), jb.hyperbolic(0.8, 2), times, observations)
-        estimate.value, estimate.standard_error
-        ```
+    ```python
+    estimate = jb.score(key, jb.hyperbolic(0.8, 2), times, observations, num_steps=20)
+    estimate.value, estimate.standard_error
+    ```
     """
     num_bridges = check_count("num_bridges", num_bridges, 2)
     problem = as_problem(

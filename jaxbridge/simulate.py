@@ -29,9 +29,12 @@ def simulate(
 
     **Arguments:**
 
+    - `key`: a typed key.
+    - `model`: the diffusion. Neither its reversal nor its stationary law is called for.
     - `x0`: the start, shape (d,), or one for each path, (num_paths, d), or `None` to draw from
         the stationary law by the model's sampler.
     - `times`: increasing, shape (K,), in units of time.
+    - `num_paths`: how many paths.
     - `num_steps`: solver steps between one time and the next.
     - `solver`: a diffrax solver that takes fixed steps; by default `diffrax.Heun()`. A solver
         for Stratonovich equations is given the drift in that form, and one that asks for a
@@ -42,12 +45,12 @@ def simulate(
 
     **Raises:** `ValueError` for shapes that do not fit or times that do not increase.
 
-    !!! example
+    **Example:**
 
-        ```python
-        times = jnp.linspace(0, 10, 101)
-        paths = jb.simulate(jax.random.key(0), model, [0.0, 0.0], times, num_paths=8)
-        ```
+    ```python
+    paths = jb.simulate(key, model, start, jnp.linspace(0, 10, 101), num_paths=8)
+    paths.shape  # (8, 101, 2)
+    ```
     """
     check_key(key)
     check_diffusion(model)

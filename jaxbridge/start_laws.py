@@ -60,6 +60,14 @@ class Stationary(eqx.Module):
     starts at b and is taken after `burn_in` units of time, afresh for every draw. By default
     that time is measured, as `measure_burn_in` does, and the results that used it say what it
     was: infinite where none was found, and then bridges are not exact.
+
+    **Raises:** `ValueError` for a `burn_in` that is not a positive time, shape ().
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, start_law=jb.Stationary(burn_in=20.0))
+    ```
     """
 
     burn_in: Float[Array, ""] | None = None
@@ -75,7 +83,14 @@ class Stationary(eqx.Module):
 
 class Reversed(eqx.Module):
     """p*_T(b, ·), the law of the time-reversed diffusion from b after the whole duration, as
-    the paper prints it. It does **not** give the exact law: for comparisons only."""
+    the paper prints it. It does **not** give the exact law: for comparisons only.
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, start_law=jb.Reversed())
+    ```
+    """
 
 
 class _Identity:

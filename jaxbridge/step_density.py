@@ -49,7 +49,14 @@ class AbstractStepDensity(eqx.Module):
 
 
 class EulerDensity(AbstractStepDensity):
-    """The transition density of the Euler scheme itself, for any σ: O(δ) along a path."""
+    """The transition density of the Euler scheme itself, for any σ: O(δ) along a path.
+
+    **Example:**
+
+    ```python
+    proposal = jb.ModifiedDiffusionBridge(density=jb.EulerDensity())  # the default
+    ```
+    """
 
     def look(self, dynamics, x):
         return None
@@ -71,7 +78,13 @@ class TrapezoidDensity(AbstractStepDensity):
 
     It calls for the drift's derivatives at each point, by autodiff.
 
-    **Raises:** `ValueError` for a σ that depends on the state.
+    **Raises:** `ValueError`, when it is used, for a σ that depends on the state.
+
+    **Example:**
+
+    ```python
+    proposal = jb.Guided(density=jb.TrapezoidDensity())
+    ```
     """
 
     def look(self, dynamics, x):

@@ -34,15 +34,15 @@ class Transformed(eqx.Module):
     - `model`: of Y = f(X), with the parameters of the given model.
     - `forward`, `inverse`: f and its inverse, of one point of shape (d,).
 
-    !!! example
+    **Example:**
 
-        ```python
-        logarithm = jb.transform(model, jnp.log, jnp.exp)
-        a, b = logarithm.forward(start), logarithm.forward(end)
-        bridges = logarithm.back(
-            jb.sample_exact_bridges(key, logarithm.model, a, b, 1.0, num_bridges=1000)
-        )
-        ```
+    ```python
+    stretched = jb.transform(model, jnp.sinh, jnp.arcsinh)
+    a, b = stretched.forward(start), stretched.forward(end)
+    bridges = stretched.back(
+        jb.sample_bridges(key, stretched.model, a, b, 1.0, num_bridges=100)
+    )
+    ```
     """
 
     model: Diffusion
@@ -91,19 +91,19 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
 
     **Raises:** `TypeError` for what is no model or no function.
 
-    !!! example
+    **Example:**
 
-        ```python
-        rate, mean, noise = 1.0, 0.5, 0.3  # Cox, Ingersoll & Ross (1985)
-        cir = jb.Diffusion(
-            lambda x, p: p[0] * (p[1] - x),
-            lambda x, p: p[2] * jnp.sqrt(x),
-            lambda x, p: jnp.sum((2 * p[0] * p[1] / p[2]**2 - 1) * jnp.log(x)
-                                 - 2 * p[0] * x / p[2]**2),
-            (rate, mean, noise),
-        )
-        logarithm = jb.transform(cir, jnp.log, jnp.exp)
-        ```
+    ```python
+    rate, mean, noise = 1.0, 0.5, 0.3  # Cox, Ingersoll & Ross (1985)
+    cir = jb.Diffusion(
+        lambda x, p: p[0] * (p[1] - x),
+        lambda x, p: p[2] * jnp.sqrt(x),
+        lambda x, p: jnp.sum((2 * p[0] * p[1] / p[2]**2 - 1) * jnp.log(x)
+                             - 2 * p[0] * x / p[2]**2),
+        (rate, mean, noise),
+    )
+    logarithm = jb.transform(cir, jnp.log, jnp.exp)
+    ```
     """
     check_diffusion(model)
     for name, function in [("forward", forward), ("inverse", inverse)]:

@@ -28,7 +28,8 @@ from .weighted import AbstractWeightedProposal
 
 
 class TransitionLogDensity(eqx.Module):
-    """Estimates for one pair of points, shape (), or for I of them.
+    """What `transition_log_density` returns: estimates for one pair of points, shape (), or for I
+    of them.
 
     - `value`: log p̂_T(a, b); `exp(value)` is unbiased. -inf where no proposal became a bridge.
     - `standard_error`: that of `value`, by the delta method; infinite where nothing is known.
@@ -92,15 +93,14 @@ def transition_log_density(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
-        estimate = jb.transition_log_density(
-            jax.random.key(0), model, a, b, 1.0, proposal=jb.Coupling(0.5, start_law=law)
-        )
-        estimate.value, estimate.standard_error
-        ```
+    ```python
+    law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
+    coupling = jb.Coupling(0.5, start_law=law)
+    estimate = jb.transition_log_density(key, model, start, end, 1.0, proposal=coupling)
+    estimate.value, estimate.standard_error
+    ```
     """
     check_key(key)
     check_diffusion(model)

@@ -49,9 +49,16 @@ _PILOT_TRIALS = 1_000
 
 
 class Pilot(NamedTuple):
-    """One pilot run: γ; λ, the share of the Gaussian fit in the start law; the share of proposals
-    that met; trials for a hitting count; effective samples per simulated path, NaN where counts
-    took too long or too few pairs met; and the coupling."""
+    """One pilot run of `tune_coupling`.
+
+    - `gamma`: γ.
+    - `fit_share`: λ, the share of the Gaussian fit in the start law.
+    - `acceptance`: the share of proposals that met.
+    - `trials_per_count`: trials for a hitting count.
+    - `efficiency`: effective samples per simulated path, NaN where counts took too long or too few
+        pairs met.
+    - `coupling`: with this γ and start law.
+    """
 
     gamma: float
     fit_share: float
@@ -62,7 +69,8 @@ class Pilot(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """The `coupling` with most effective samples per simulated path, and all `pilots`."""
+    """What `tune_coupling` returns: the `coupling` with most effective samples per simulated path
+    (up to a tenth), and all `pilots`. Printed, it is a table."""
 
     coupling: Coupling
     pilots: list[Pilot]
@@ -90,7 +98,8 @@ def fit_start_law(
     num_pilot: int = 2000,
 ) -> AnyStartLaw:
     """The start law μ with most effective samples per simulated path, between ν and a Gaussian
-    fit to the reversed paths' starts.
+    fit to the reversed paths' starts. Of laws that come within a tenth of the most, the one closest
+    to ν is taken, whose weights are bounded more safely.
 
     A choice made outside `jit`, of one interval: it looks at numbers.
 
@@ -101,12 +110,12 @@ def fit_start_law(
     **Raises:** `ValueError` where too few pilot bridges are found, or for arguments that do not
     fit; `TypeError` inside `jit`.
 
-    !!! example
+    **Example:**
 
-        ```python
-        law = jb.fit_start_law(jax.random.key(0), model, a, b, 1.0, coupling=jb.Coupling(0.5))
-        coupling = jb.Coupling(0.5, start_law=law)
-        ```
+    ```python
+    law = jb.fit_start_law(key, model, start, end, 1.0, coupling=jb.Coupling(0.5))
+    coupling = jb.Coupling(0.5, start_law=law)
+    ```
     """
     coupling = Coupling() if coupling is None else coupling
     pilots = _pilots(key, model, start, end, duration, num_steps, coupling, num_pilot)
@@ -124,7 +133,8 @@ def tune_coupling(
     couplings: Sequence[Coupling] | None = None,
     num_pilot: int = 2000,
 ) -> Tuning:
-    """The γ and the start law with most effective samples per simulated path.
+    """The γ and the start law with most effective samples per simulated path; within a tenth of the
+    most, the law closest to ν, as in `fit_start_law`.
 
     A choice made outside `jit`, of one interval: it looks at numbers.
 
@@ -136,13 +146,14 @@ def tune_coupling(
 
     **Raises:** as `fit_start_law`.
 
-    !!! example
+    **Example:**
 
-        ```python
-        tuning = jb.tune_coupling(jax.random.key(0), model, a, b, 1.0)
-        print(tuning)
-        chain = jb.sample_exact_bridges(key, model, a, b, 1.0, proposal=tuning.coupling)
-        ```
+    ```python
+    couplings = [jb.Coupling(-1.0), jb.Coupling(0.5)]
+    tuning = jb.tune_coupling(key, model, start, end, 1.0, couplings=couplings, num_pilot=500)
+    print(tuning)
+    chain = jb.sample_exact_bridges(key, model, start, end, 1.0, proposal=tuning.coupling)
+    ```
     """
     if couplings is None:
         couplings = [Coupling(gamma) for gamma in (-1.0, 0.0, 0.5, 0.9)]
@@ -190,13 +201,14 @@ def choose_proposal(
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit; `TypeError` inside
     `jit`.
 
-    !!! example
+    **Example:**
 
-        ```python
-        choice = jb.choose_proposal(jax.random.key(0), model, a, b, 1.0)
-        print(choice)
-        chain = jb.sample_exact_bridges(key, model, a, b, 1.0, proposal=choice)
-        ```
+    ```python
+    candidates = [jb.Coupling(0.5), jb.Guided()]
+    choice = jb.choose_proposal(key, model, start, end, 1.0, candidates=candidates)
+    print(choice)
+    chain = jb.sample_exact_bridges(key, model, start, end, 1.0, proposal=choice)
+    ```
     """
     check_key(key)
     check_diffusion(model)

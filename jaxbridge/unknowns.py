@@ -64,12 +64,12 @@ class NormalPrior(eqx.Module):
 
     **Raises:** `ValueError`, by the function it is passed to, if shapes do not fit the parameters.
 
-    !!! example
+    **Example:**
 
-        ```python
-        jb.NormalPrior(1.0, 1.0)
-        jb.NormalPrior(jnp.zeros(4), 0.5 * jnp.eye(4))
-        ```
+    ```python
+    jb.NormalPrior(1.0, 1.0)
+    jb.NormalPrior(jnp.zeros(4), 0.5 * jnp.eye(4))
+    ```
     """
 
     mean: PyTree

@@ -50,7 +50,7 @@ _FOR_COUPLINGS, _FOR_GUIDED = ("approximate", "renewal"), ("crank_nicolson",)
 
 
 class Setting(NamedTuple):
-    """One setting and what it came to.
+    """One setting of `work_precision`, and what it came to.
 
     - `method`, `proposal`, `scheme`, `meeting`, `gamma`, `dtype`, `num_steps`: the setting;
         `scheme` is the target density of proposals that are pulled to the end point, and `gamma`
@@ -256,12 +256,15 @@ def work_precision(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
-    !!! example
+    **Example:**
 
-        ```python
-        result = jb.work_precision(key, model, a, b, 1.0, target=0.01)
-        print(result), result.cheapest(), jaxbridge.plot.work_precision(result)
-        ```
+    ```python
+    result = jb.work_precision(
+        key, model, start, end, 1.0, proposals=[jb.Coupling()], num_steps=(4, 8), target=0.05
+    )
+    print(result)
+    result.cheapest()  # or `plot.work_precision(result)`
+    ```
     """
     check_key(key)
     check_diffusion(model)
