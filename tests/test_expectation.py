@@ -57,6 +57,7 @@ def test_derivative_is_that_of_the_expectation(bridges):
     np.testing.assert_allclose(of_drift(bridges, middle)(B), bridges.mean(middle), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_derivative_of_the_paths_is_not():
     """The pathwise derivative of accepted bridges leaves out that other bridges are accepted."""
     model = multivariate_ou()[0]

@@ -41,7 +41,7 @@ PROPOSALS = {
 
 
 @pytest.mark.parametrize(
-    "name", ["bridge", "renewal", *(pytest.param(n, marks=SLOW) for n in ("counts", "auto"))]
+    "name", ["bridge", *(pytest.param(n, marks=SLOW) for n in ("renewal", "counts", "auto"))]
 )
 def test_posterior_is_exact(name):
     proposal, method = PROPOSALS[name]
@@ -296,6 +296,7 @@ def test_the_likelihood_is_that_of_the_target_of_the_bridges():
     assert_posterior(made.params[0][100:], *grid_moments(grid, log_density), allowance=0)
 
 
+@pytest.mark.slow
 def test_what_is_cut_off_is_counted():
     made = jb.gibbs(
         jax.random.key(0),

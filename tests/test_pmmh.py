@@ -94,6 +94,7 @@ def test_bad_input_is_refused(unchecked):
         jb.pmmh(arguments[0], rough, TIMES, DATA, proposal=jb.Coupling(), **options)
 
 
+@pytest.mark.slow
 def test_what_is_cut_off_is_counted():
     made = jb.pmmh(
         jax.random.key(0),

@@ -3,6 +3,8 @@
 import pathlib
 import re
 
+import pytest
+
 from jaxbridge.benchmark import load, markdown
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -10,6 +12,15 @@ README = ROOT / "README.md"
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
 
 
+def test_quickstart_runs():
+    namespace = {}
+    for block in BLOCKS[:3]:
+        exec(block, namespace)
+    assert bool(namespace["bridges"].met.all()) and bool(namespace["many"].met.all())
+    assert namespace["closer"].paths.shape == (1000, 51, 2)
+
+
+@pytest.mark.slow
 def test_readme_code_runs():
     assert len(BLOCKS) == 12
     namespace = {}

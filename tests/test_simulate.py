@@ -87,10 +87,10 @@ def assert_sinh_law(paths, start):
     "solver, num_steps",
     [
         (None, 40),
-        (diffrax.ItoMilstein(), 200),
-        (diffrax.StratonovichMilstein(), 200),
+        pytest.param(diffrax.ItoMilstein(), 200, marks=pytest.mark.slow),
+        pytest.param(diffrax.StratonovichMilstein(), 200, marks=pytest.mark.slow),
         (diffrax.EulerHeun(), 200),
-        (diffrax.Euler(), 200),
+        pytest.param(diffrax.Euler(), 200, marks=pytest.mark.slow),
     ],
     ids=["default", "ItoMilstein", "StratonovichMilstein", "EulerHeun", "Euler"],
 )
@@ -152,6 +152,7 @@ def test_numbers_may_change_without_a_new_compilation():
     np.testing.assert_array_equal(first, run(0, 1.0, 0.0, 1.0))
 
 
+@pytest.mark.slow
 def test_simulation_inside_jit_equals_that_outside():
     simulate = lambda key, model, times: jb.simulate(key, model, START, times, num_steps=4)
     arguments = jax.random.key(0), process(), jnp.asarray(TIMES)

@@ -32,6 +32,7 @@ def without_sampler(model):
     )
 
 
+@pytest.mark.slow
 def test_reversed_is_the_law_of_the_reversed_diffusion():
     """For a process that is not reversible, whose reversal is known in closed form."""
     model, end = jb.ornstein_uhlenbeck(NON_REVERSIBLE), jnp.array([1.0, -0.5])

@@ -37,6 +37,7 @@ def test_trapezoid_density_is_of_second_order(reversible, x64):
     assert abs(loglog_slope(1 / sizes, np.abs(errors)) - 2) < 0.3
 
 
+@pytest.mark.slow
 def test_curl_is_called_for():
     """Without the term of Lévy's area the error is of first order."""
     model = jb.ornstein_uhlenbeck([[0.5, 3.0], [-3.0, 0.5]])

@@ -93,9 +93,10 @@ def test_a_constant_sigma_that_was_given_as_an_array_comes_along(x64):
 
 @pytest.mark.parametrize(
     "proposal",
-    [pytest.param(jb.Coupling(0.0), marks=pytest.mark.slow), jb.ModifiedDiffusionBridge()],
+    [jb.Coupling(0.0), jb.ModifiedDiffusionBridge()],
     ids=["coupling", "modified diffusion bridge"],
 )
+@pytest.mark.slow
 def test_bridges_of_cir_have_the_exact_law(proposal):
     """Transition density and the law half way, near the boundary, from paths in log x."""
     start, end, duration = 0.15, 0.3, 1.0
@@ -172,6 +173,7 @@ def test_paths_that_leave_the_state_space_are_misses_and_counted():
     assert guided.num_nonfinite > 10 and np.isfinite(guided.value)
 
 
+@pytest.mark.slow
 def test_a_domain_is_told_from_no_domain():
     """An Ornstein–Uhlenbeck process knows no boundary, unless it is told so."""
     options = dict(num_bridges=200, num_steps=20)

@@ -188,6 +188,7 @@ def test_errors_say_what_to_change(changes, message, unchecked):
         jb.work_precision(KEY, paper_model(), **arguments)
 
 
+@pytest.mark.slow
 def test_bridges_that_are_not_found_are_counted():
     """Ends that no pair joins in so short a time."""
     (setting,) = jb.work_precision(
