@@ -22,7 +22,7 @@ def test_quickstart_runs():
 
 @pytest.mark.slow
 def test_readme_code_runs():
-    assert len(BLOCKS) == 12
+    assert len(BLOCKS) == 13
     namespace = {}
     for block in BLOCKS:
         exec(block, namespace)
