@@ -178,10 +178,11 @@ def test_very_unlikely_bridges(precision):
     "times are i δ, computed from i; only the times asked for are kept",
 )
 @pytest.mark.slow
-def test_long_intervals():
+@pytest.mark.parametrize("model", [paper_model(), jb.hyperbolic(0.8, 2)], ids=["OU", "hyperbolic"])
+def test_long_intervals(model):
     bridges = jb.sample_bridges(
         jax.random.key(0),
-        jb.hyperbolic(0.8, 2),
+        model,
         [0.0, 0.0],
         [1.0, 0.0],
         1000.0,

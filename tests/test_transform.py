@@ -145,12 +145,26 @@ def test_jacobians_at_one_point_and_many():
     np.testing.assert_allclose(logarithm.log_jacobian([0.5]), np.log(2), rtol=1e-6)
 
 
-@pytest.mark.slow
-def test_an_interval_becomes_a_line(x64):
-    line = jb.transform(jacobi(), logit, jax.nn.sigmoid).model
-    np.testing.assert_allclose(
-        line.reversibility_residual(np.array([[-2.0], [0.3], [4.0]])), 0, atol=1e-8
+def growth():
+    """dX = X(1 - X) dt + 0.7 X dW, of geometric type, with a Gamma law."""
+    return jb.Diffusion(
+        lambda x, p: x * (1 - x),
+        lambda x, p: 0.7 * x,
+        lambda x, p: jnp.sum((2 / 0.7**2 - 2) * jnp.log(x) - 2 * x / 0.7**2),
+        reversible=True,
     )
+
+
+@pytest.mark.slow
+def test_intervals_and_half_lines_become_lines(x64):
+    points = np.array([[-2.0], [0.3], [4.0]])
+    for model, forward, inverse in [
+        (jacobi(), logit, jax.nn.sigmoid),
+        (growth(), jnp.log, jnp.exp),
+    ]:
+        line = jb.transform(model, forward, inverse).model
+        np.testing.assert_allclose(line.reversibility_residual(points), 0, atol=1e-8)
+    np.testing.assert_allclose(line.diffusion([0.3]), [[0.7]])
 
 
 def test_paths_that_leave_the_state_space_are_misses_and_counted():
