@@ -6,7 +6,7 @@ import numpy as np
 from test_work_precision import made_up, table
 
 import jaxbridge as jb
-from jaxbridge import plot
+from jaxbridge import study_figures
 from jaxbridge.accuracy_study import (
     EffectCost,
     curves,
@@ -51,7 +51,7 @@ def test_tables_and_figures_render(tmp_path):
     costs = [EffectCost("one", 10.0), EffectCost("two", 25.0)]
     assert "25" in format_effects(costs) and "2.5" in format_sigmas([(2, 10.0, 25.0)])
     assert all(path.exists() for path in write_accuracy_figures(results, costs, tmp_path))
-    assert len(plot.effect_costs(costs).patches) == 2
+    assert len(study_figures.effect_costs(costs).patches) == 2
 
 
 def test_a_step_takes_some_time():
