@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from test_work_precision import made_up, table
 
 import jaxbridge as jb
@@ -20,6 +21,7 @@ from jaxbridge.accuracy_study import (
 from jaxbridge.study import study_model
 
 
+@pytest.mark.slow
 def test_the_process_in_other_coordinates_is_reversible_too(x64):
     """α = ½(V ∇log ν + div V) holds drift, σ and ν to one another."""
     model, *_ = sinh_model()

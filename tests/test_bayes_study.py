@@ -43,6 +43,7 @@ def test_brownian_bridges_give_the_likelihood_of_the_trapezoid_rule():
     assert exact.error < 0.1 * exact.sd
 
 
+@pytest.mark.slow
 def test_distant_observations_are_draws_from_the_stationary_law():
     data = hyperbolic_data(jax.random.key(0), 200, 20.0)
     exact = stationary_posterior(data)

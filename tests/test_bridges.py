@@ -50,6 +50,7 @@ def mid_points(case, gamma, coupling=None, num_bridges=50_000, seed=0):
 # The law
 
 
+@pytest.mark.slow
 def test_likely_bridges_by_reflection_have_the_exact_law():
     start, end = PAPER_CASES["likely"]
     exact = jb.gaussian_bridge(paper_model(), start, end, 1.0, [0.5]).covariance[0]
@@ -109,6 +110,7 @@ def test_same_law_as_an_independent_implementation(gamma, meeting, crossing):
             assert (np.abs(a.mean(0) - b.mean(0)) < 5 * error).all()
 
 
+@pytest.mark.slow
 def test_non_reversible_process_on_a_long_interval():
     """Nearly every pair meets, so the approximate bridge is exact up to Monte Carlo error."""
     model = jb.ornstein_uhlenbeck(NON_REVERSIBLE, mean=[0.2, -0.1], sigma=[[1.0, 0.3], [0.0, 0.8]])

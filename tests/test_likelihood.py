@@ -117,6 +117,7 @@ def test_euler_density_is_a_product_of_normal_densities(x64):
     np.testing.assert_allclose(without_drift(model.params), value, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_batches_are_single_paths():
     model = rotating()
     paths = jax.random.normal(jax.random.key(0), (3, 4, 6, 2))

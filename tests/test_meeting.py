@@ -144,7 +144,9 @@ def assert_is_euler_step(driven, points, dt=0.5):
     assert_moments(points, driven - B @ driven * dt, sigma @ sigma.T * dt)
 
 
-@pytest.mark.parametrize("gamma", [-1.0, 0.0, 0.7])
+@pytest.mark.parametrize(
+    "gamma", [0.0, *(pytest.param(g, marks=pytest.mark.slow) for g in (-1.0, 0.7))]
+)
 def test_joined_steps_are_steps_of_the_scheme(gamma):
     """However long they are: a meeting has no error of its own where σ is constant."""
     driven, points, share = joined_steps(jb.BrownianCrossing(), jb.Euler(), gamma)

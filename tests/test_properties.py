@@ -54,7 +54,7 @@ def test_bridges_join_their_ends(rates, start, end, duration, gamma):
     assert np.isnan(np.asarray(bridges.paths)[~np.asarray(bridges.met)]).all()
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
+@settings(max_examples=8, deadline=None, derandomize=True)
 @given(**SCENE)
 def test_densities_and_means_are_those_of_the_closed_form(rates, start, end, duration, gamma):
     """Exact transitions leave no step error: six standard errors, and nothing else."""

@@ -37,8 +37,8 @@ def joint_law(first, second):
     "solver, num_steps",
     [
         (None, 20),
-        (diffrax.Euler(), 200),
-        (diffrax.SEA(), 200),
+        pytest.param(diffrax.Euler(), 200, marks=pytest.mark.slow),
+        pytest.param(diffrax.SEA(), 200, marks=pytest.mark.slow),
         (diffrax.ShARK(), 20),
     ],
     ids=["default", "Euler", "SEA", "ShARK"],

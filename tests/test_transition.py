@@ -35,7 +35,7 @@ def test_density_is_that_of_the_closed_form(name):
 @pytest.mark.parametrize(
     ("num_steps", "gamma", "reversible"),
     [
-        (1, 0.5, False),
+        pytest.param(1, 0.5, False, marks=pytest.mark.slow),
         pytest.param(1, -1.0, True, marks=pytest.mark.slow),
         pytest.param(2, 0.5, True, marks=pytest.mark.slow),
         pytest.param(2, 0.0, False, marks=pytest.mark.slow),
