@@ -32,14 +32,10 @@ def test_density_is_that_of_the_closed_form(name):
     print(f"{name}: {np.exp(float(estimate.value) - case.log_density):.4f} +- {error:.4f}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("num_steps", "gamma", "reversible"),
-    [
-        pytest.param(1, 0.5, False, marks=pytest.mark.slow),
-        pytest.param(1, -1.0, True, marks=pytest.mark.slow),
-        pytest.param(2, 0.5, True, marks=pytest.mark.slow),
-        pytest.param(2, 0.0, False, marks=pytest.mark.slow),
-    ],
+    [(1, 0.5, False), (1, -1.0, True), (2, 0.5, True), (2, 0.0, False)],
 )
 def test_exact_transitions_leave_no_step_error(num_steps, gamma, reversible):
     """One step is as good as many, with no allowance."""
