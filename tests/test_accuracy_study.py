@@ -30,6 +30,7 @@ def test_the_process_in_other_coordinates_is_reversible_too(x64):
     assert jb.effects(model).solves.simulated
 
 
+@pytest.mark.slow
 def test_its_bridge_is_that_of_the_gaussian_one():
     _, start, end, (mean, sd) = sinh_model()
     ends = ([0.785, 0.785], [1.091, 1.091])
@@ -56,6 +57,7 @@ def test_tables_and_figures_render(tmp_path):
     assert len(study_figures.effect_costs(costs).patches) == 2
 
 
+@pytest.mark.slow
 def test_a_step_takes_some_time():
     model = jb.hyperbolic(0.8, 2)
     assert 0 < time_of_step(jax.random.key(0), model, jb.Coupling(-1.0), 100, 2, False) < 1e6

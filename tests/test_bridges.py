@@ -59,6 +59,7 @@ def test_likely_bridges_by_reflection_have_the_exact_law():
     assert_moments(z, np.zeros(2), exact / np.outer(scale, scale))
 
 
+@pytest.mark.slow
 def test_unlikely_bridges_show_the_error_of_the_method():
     """Conditioning on being hit pulls the bridge towards the stationary law. The error is the
     same in both coordinates up to sign, by symmetry, and shrinks as γ → 1, as the paper saw."""
@@ -72,7 +73,10 @@ def test_unlikely_bridges_show_the_error_of_the_method():
 
 @pytest.mark.parametrize(
     ("gamma", "meeting", "crossing"),
-    [(-1.0, jb.SignTest(), False), (0.5, jb.BrownianCrossing(), True)],
+    [
+        pytest.param(-1.0, jb.SignTest(), False, marks=pytest.mark.slow),
+        (0.5, jb.BrownianCrossing(), True),
+    ],
 )
 def test_same_law_as_an_independent_implementation(gamma, meeting, crossing):
     """Mid-points, meeting and acceptance against NumPy, same scheme and same step."""
@@ -377,6 +381,7 @@ def test_a_caller_who_asks_for_no_gradient_pays_for_none(monkeypatch):
     assert calls[-1][8] is not None  # the fixed meeting step of a replay
 
 
+@pytest.mark.slow
 def test_gradients_stay_finite_where_no_bridge_was_found():
     """Some rows have no bridge because every proposal overflowed; masked, they count nothing,
     in reverse mode too."""

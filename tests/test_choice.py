@@ -94,6 +94,7 @@ def test_auto_takes_what_theory_says_is_best(duration, model, winners):
     assert chain.met.all() and chain.acceptance_rate > 0.3
 
 
+@pytest.mark.slow
 def test_a_candidate_that_cannot_win_makes_no_pilot_run():
     """Of a coupling's simulated paths at most one in two is an effective sample."""
     choice = jb.choose_proposal(

@@ -95,6 +95,7 @@ def test_chain_is_that_of_the_kernel_and_runs_in_blackjax():
     assert states.position.shape == (20, 9, 2)
 
 
+@pytest.mark.slow
 def test_a_path_that_enters_is_the_state():
     """`init` finds the noise of a path, so a step of size β moves it by no more than that."""
     weighted = jb.sample_weighted_bridges(
@@ -124,6 +125,7 @@ def test_several_intervals_have_chains_of_their_own():
     assert (chains.acceptance_rate > 0.99).all()
 
 
+@pytest.mark.slow
 def test_progress_is_shown(capfd):
     jb.sample_exact_bridges(
         jax.random.key(0), *HARD, num_bridges=20, num_steps=5,

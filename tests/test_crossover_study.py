@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy import integrate, stats
 
 from jaxbridge import study_figures
@@ -15,6 +16,7 @@ from jaxbridge.crossover_study import (
 )
 
 
+@pytest.mark.slow
 def test_double_well_is_normalised_reversible_and_sampled():
     model = double_well(1.7)
 

@@ -175,6 +175,7 @@ def reversal_of(model):
     )
 
 
+@pytest.mark.slow
 def test_the_reversed_ou_process_retraces_stationary_paths():
     covariance = stationary_covariance(SWIRLING_B, SWIRLING_SIGMA)
     lagged = covariance @ scipy.linalg.expm(-LAG_TIMES[1] * SWIRLING_B).T  # Cov(X_0, X_t)

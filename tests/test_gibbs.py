@@ -273,6 +273,7 @@ def test_parameters_in_which_the_drift_is_not_linear():
     assert_posterior(made.params[100:], *grid_moments(grid, log_density))
 
 
+@pytest.mark.slow
 def test_the_likelihood_is_that_of_the_target_of_the_bridges():
     """With weights that are exact for the Euler scheme on a coarse grid, the posterior is that of
     the Euler scheme, not a mixture of two."""

@@ -99,6 +99,7 @@ def test_pairs_that_have_met_before_they_start(precision):
     "√(1-γ²) of a negative number, division by 1-γ = 0; a search without end",
     "finite for every γ < 1, and fewer meetings as it grows, within the bound; γ = 1 is refused",
 )
+@pytest.mark.slow
 def test_gamma_at_both_ends(precision, unchecked):
     dtype, acceptance = jnp.dtype(precision), []
     start, end = jnp.array([0.3, 0.3], dtype), jnp.array([0.4, 0.2], dtype)

@@ -74,7 +74,9 @@ def test_derivatives_are_the_papers_H_and_B(precision):
         np.testing.assert_allclose(jax.hessian(log_likelihood)(0.7), -integral_B, rtol=tolerance)
 
 
-@pytest.mark.parametrize("form", ["girsanov", "trapezoid", "ito"])
+@pytest.mark.parametrize(
+    "form", [pytest.param("girsanov", marks=pytest.mark.slow), "trapezoid", "ito"]
+)
 def test_forms_converge_to_the_density_of_the_points(x64, form):
     """Root mean square errors: √δ for left points; δ² and δ^{3/2} for the others, whose mean error
     is of order δ²."""
