@@ -26,7 +26,7 @@ from jaxtyping import Array, Float, Key
 from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Diffusion, check_invertible
 from .intervals import as_intervals
-from .linalg import any_cholesky, any_inverse, dot, matvec, solve
+from .linalg import any_cholesky, any_inverse, any_solve, dot, matvec, solve
 from .linear import linear_transition
 
 
@@ -229,7 +229,7 @@ class GaussianBridge(eqx.Module):
         decay, covariance = jax.vmap(lambda t: _decay_and_covariance(params, t))(steps)
         still = (steps <= 0)[:, None, None]  # two equal times: no noise between them
         identity = jnp.eye(len(self._start), dtype=grid.dtype)
-        root = jnp.linalg.cholesky(jnp.where(still, identity, covariance))
+        root = jax.vmap(any_cholesky)(jnp.where(still, identity, covariance))
         root = jnp.where(still, 0, root)
         noise = jax.random.normal(key, (len(steps), num_paths, len(self._start)), grid.dtype)
 
@@ -288,7 +288,7 @@ def gaussian_bridge(
     def moments(t):
         decay, covariance = _decay_and_covariance(params, t)
         remaining, _ = _decay_and_covariance(params, total - t)
-        gain = jnp.linalg.solve(covariance_T, remaining @ covariance).T
+        gain = any_solve(covariance_T, remaining @ covariance).T
         mean = params.mean + decay @ (a - params.mean) + gain @ miss
         return mean, covariance - gain @ remaining @ covariance, gain
 

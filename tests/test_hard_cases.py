@@ -499,16 +499,16 @@ def check_meetings(model, d, dtype):
     n, duration = 20_000, 2.0
     key, keys = jax.random.key(3), jax.random.split(jax.random.key(4), n)
     end = jax.random.normal(key, (d, n), dtype) * 0.5**0.5
-    num_steps = 8
+    num_steps = 40
     dt = jnp.full(n, duration / num_steps, dtype)
-    coupling = jb.Coupling(-1.0, scheme=jb.GaussianTransition())
+    coupling = jb.Coupling(-1.0, scheme=jb.Heun())
     found = propose(model, coupling, keys, jnp.zeros((d, n), dtype), end, dt, num_steps)
     distance = scipy.stats.chi(d, scale=0.5**0.5)
     exact = distance.expect(
         lambda r: 2 * scipy.stats.norm.cdf(-r / np.sqrt(2 * np.expm1(2 * duration)))
     )
     share = float(jnp.mean(found.meeting_step <= num_steps))
-    assert abs(share - exact) < 5 * np.sqrt(exact * (1 - exact) / n)
+    assert abs(share - exact) < 5 * np.sqrt(exact * (1 - exact) / n) + 0.002  # the step error
 
 
 def check_memory(model, d, dtype):
