@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Key
 from .coupling import AbstractCoupling, rotate_back, rotation_between, see
 from .diffusion import Diffusion
 from .lanes import over_lanes
-from .linalg import all_finite
+from .linalg import all_finite, is_finite
 from .meeting import PairStep
 from .noise import noisy_scan
 from .proposals import pair_noise, realise
@@ -86,5 +86,5 @@ def run_associated(
         num_steps,
         over=lambda carry: carry[1],
     )
-    finite = jnp.all(jnp.isfinite(y_end), axis=0) | hit
+    finite = jnp.all(is_finite(y_end), axis=0) | hit
     return Associated(hit, start, finite)

@@ -20,9 +20,19 @@ def dot(left: Float[Array, " d"], right: Float[Array, " d"]) -> Float[Array, ""]
     return _sum([left[i] * right[i] for i in range(left.shape[0])])
 
 
+# Squares of larger numbers overflow in float32. A path that is further out has exploded, and it
+# shall have in float64 as well.
+_EXPLODED = 1e18
+
+
+def is_finite(values: Float[Array, "*shape"]) -> Bool[Array, "*shape"]:
+    """Whether numbers are such as a path that did not explode can have."""
+    return jnp.abs(values) < _EXPLODED
+
+
 def all_finite(vector: Float[Array, " d"]) -> Bool[Array, ""]:
-    """Whether every coordinate is finite (up to overflow of their sum)."""
-    return jnp.isfinite(_sum(list(vector)))
+    """Whether all are, of one point."""
+    return is_finite(_sum([jnp.abs(x) for x in vector]))
 
 
 def total(vector: Float[Array, " d"]) -> Float[Array, ""]:

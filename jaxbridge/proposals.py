@@ -21,7 +21,7 @@ from .arrays import cast_floats
 from .coupling import AbstractCoupling, rotate, rotation_between, see
 from .diffusion import Diffusion
 from .lanes import over_lanes
-from .linalg import all_finite
+from .linalg import all_finite, is_finite
 from .meeting import PairStep
 from .noise import Store, noisy_scan
 from .schemes import fitted_in_lanes
@@ -96,7 +96,8 @@ def propose(
         if fixed_rho is None:
             variance = coupling.gap_variance(seen)
             pair = PairStep(seen, x, x_next, z, driven_next, dt, variance)
-            met = rule.met(pair, forward, uniform) & all_finite(driven_next)
+            met = rule.met(pair, forward, uniform)
+            met &= all_finite(driven_next) & all_finite(x_next)
             # The first meeting: a minimum over the steps, masked by whether they saw one.
             rho = jnp.where(met, jnp.minimum(rho, i + 1), rho)
         return jnp.where(i + 1 >= rho, x_next, driven_next), rho
@@ -128,8 +129,8 @@ def propose(
         z_path = jnp.concatenate([start[None], z_path])
     else:
         z_path = z_path[:-1]
-    # Non-finite numbers stay non-finite from step to step, so the last states tell.
-    finite = jnp.all(jnp.isfinite(x_start) & jnp.isfinite(z_end), axis=0) | (rho <= num_steps)
+    # What has exploded does not come back, so the last states tell.
+    finite = jnp.all(is_finite(x_start) & is_finite(z_end), axis=0) | (rho <= num_steps)
     return Proposals(z_path, x_start, rho, finite)
 
 
