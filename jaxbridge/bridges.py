@@ -43,7 +43,8 @@ class Bridges(eqx.Module):
     - `reverse_start`: the reversed path at time 0, shape (n, d); NaN where no bridge was found.
     - `num_proposals`: proposals made until the last bridge was found, or until the bound.
         `n / num_proposals` estimates the acceptance probability.
-    - `num_nonfinite`: how many of them left the finite numbers and were rejected for it.
+    - `num_nonfinite`: how many of them left the finite numbers, or came further out than 1e18, and
+        were rejected for it.
     - `coupling`, `num_steps`: those they were made with.
     """
 
