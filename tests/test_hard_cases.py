@@ -671,7 +671,8 @@ def test_no_deadlock(d):
             lambda x, p: -p * x, lambda x, p: mix(x), lambda x, p: -x @ x, 1.0, reversible=True
         )
         zero = jnp.zeros(d)
-        coupling = jb.Coupling(0.0, scheme=jb.Euler())
+        law = jb.Stationary(burn_in=3.0)
+        coupling = jb.Coupling(0.0, scheme=jb.Euler(), start_law=law)
         bridges = jb.sample_bridges(
             jax.random.key(0), model, zero, zero, 1.0, num_bridges=n, num_steps=2,
             batch_size=n, coupling=coupling, max_proposals=2 * n,
