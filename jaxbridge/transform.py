@@ -59,9 +59,8 @@ class Transformed(eqx.Module):
                 "`bridges` must be what `sample_bridges`, `sample_weighted_bridges` or "
                 f"`sample_exact_bridges` returned; got {type(bridges).__name__}."
             )
-        mapped = jax.vmap(lambda y: check_value("inverse", self.inverse(y), y.shape, y))(
-            _rows(paths)
-        )
+        inverse = lambda y: check_value("inverse", self.inverse(y), y.shape, y)
+        mapped = jax.vmap(inverse)(_rows(paths))
         return eqx.tree_at(lambda result: result.paths, bridges, mapped.reshape(paths.shape))
 
     def log_jacobian(self, x: Numbers) -> Float[Array, "*batch"]:

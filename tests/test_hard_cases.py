@@ -300,7 +300,7 @@ def test_superlinear_drift(wells, precision):
 
     explicit, implicit = estimate(jb.Euler()), estimate(jb.SemiImplicit())
     assert int(explicit.num_nonfinite) > 0.9 * options["num_proposals"]
-    assert implicit.num_nonfinite == 0 and implicit.standard_error < 0.1
+    assert implicit.num_nonfinite == 0 and implicit.standard_error < (0.06 if d == 1 else 0.1)
     assert abs(float(implicit.value) - exact) < 5 * float(implicit.standard_error) + 0.1
 
 
@@ -464,7 +464,7 @@ def test_unusual_stationary_densities(log_density, precision):
 @hard(
     "d = 1, 2, 10, 50",
     "costs and memory of d³ matrices where none is called for",
-    "with σ = I a step is d numbers, in time and memory; laws, and the share of pairs that meet, "
+    "with σ = I memory grows as d; laws, and the share of pairs that meet, "
     "are those of the closed form",
 )
 @pytest.mark.slow
@@ -562,7 +562,7 @@ def test_rotation_dominated_drift(precision):
 
 
 @hard(
-    "bridges that are hit once in a million times or less; all proposals missed; one accepted",
+    "bridges that 100,000 trials do not hit; all proposals missed; one accepted",
     "a geometric count that never ends; division by no hits",
     "`max_trials` bounds the work, `truncated` says where, weights stay finite; a fitted start law "
     "hits them",
