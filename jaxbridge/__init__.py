@@ -8,8 +8,9 @@ steps; a coupling (`coupling`) with a meeting rule (`meeting`) makes pairs of pa
 Proposals that are pulled to the end point (`guided`) have a weight made of the densities of their
 steps (`step_density`), and pilot runs choose (`choice`, `tuning`). On weighted proposals
 (`weighted`) are built importance sampling (`importance`), transition densities (`transition`) and
-Markov chains (`chains`, one method a module), with `diagnostics` on top; what was not found
-raises an error where that is asked for (`throwing`). The likelihood of a path (`likelihood`) and
+Markov chains (`chains`, one method a module), with their `averages` and `diagnostics`, and what
+makes them hard (`hitting_variation`); what was not found raises an error where that is asked for
+(`throwing`). The likelihood of a path (`likelihood`) and
 what is not known (`unknowns`, `observations`, `problem`) make inference: bridges complete the
 observations (`parts`, `completion`), and parameters follow from complete paths
 (`parameter_steps`), in turn (`gibbs`), or from densities (`pmmh`), or as maximum likelihood
@@ -53,12 +54,7 @@ from .coupling import (
     published_rotation,
 )
 from .crank_nicolson_chain import crank_nicolson
-from .diagnostics import (
-    HittingVariation,
-    effective_sample_size,
-    hitting_variation,
-    potential_scale_reduction,
-)
+from .diagnostics import effective_sample_size, potential_scale_reduction
 from .diffusion import Diffusion
 from .expectation import expectation
 from .gaussian import (
@@ -84,6 +80,7 @@ from .guided import (
     Step,
 )
 from .hitting import HittingCounts, hitting_counts
+from .hitting_variation import HittingVariation, hitting_variation
 from .importance import (
     WeightedBridges,
     sample_weighted_bridges,

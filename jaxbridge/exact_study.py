@@ -19,8 +19,9 @@ from jaxtyping import Array, Float, Key
 from .bridges import sample_bridges
 from .chains import sample_exact_bridges
 from .coupling import Coupling
-from .diagnostics import HittingVariation, effective_sample_size, hitting_variation
+from .diagnostics import effective_sample_size
 from .gaussian import GaussianLaw, gaussian_bridge
+from .hitting_variation import HittingVariation, hitting_variation
 from .importance import weigh_bridges
 from .start_laws import AnyStartLaw, Reversed, Stationary
 from .study import CASES, Fit, Point, compare, study_model

@@ -12,22 +12,19 @@ that of the expectation: which bridge is proposed, met and accepted depends on Î
 derivative of the paths themselves is not. Higher derivatives are right, too.
 """
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
+from .averages import PathFunction, filled, values_of, weighted_mean
 from .diffusion import Diffusion, check_diffusion
 from .importance import WeightedBridges
 from .kernels import Chain
 from .likelihood import path_log_likelihood
 
 
-def expectation(
-    fn: Callable[[Array], PyTree], bridges: WeightedBridges | Chain, model: Diffusion
-) -> PyTree:
+def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffusion) -> PyTree:
     """The mean of `fn(path)` over exact bridges, differentiable in the parameters of `model`.
 
     **Arguments:**
@@ -66,25 +63,12 @@ def expectation(
             f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points: make them without "
             "`save_at`."
         )
-    paths = lax.stop_gradient(bridges.paths)
-    batched = bridges.met.ndim == 2
-    paths = paths if batched else paths[None]
-    met = bridges.met if batched else bridges.met[None]
-    # Missing bridges are NaN and weigh nothing: another path takes their place.
-    some = jnp.take_along_axis(paths, jnp.argmax(met, axis=1)[:, None, None, None], axis=1)
-    paths = jnp.where(met[..., None, None], paths, some)
-    log_weights = jnp.where(met, 0.0, -jnp.inf).astype(paths.dtype)
+    paths = lax.stop_gradient(filled(bridges.paths, bridges.met))
+    log_weights = jnp.where(bridges.met, 0.0, -jnp.inf).astype(paths.dtype)
     if isinstance(bridges, WeightedBridges):
-        log_weights = lax.stop_gradient(bridges.log_weights).reshape(met.shape)
-    times = lax.stop_gradient(bridges.times)
-    log_f = path_log_likelihood(model, times, paths)
-    largest = jnp.max(log_weights, axis=1, keepdims=True)
+        log_weights = lax.stop_gradient(bridges.log_weights)
+    log_f = path_log_likelihood(model, lax.stop_gradient(bridges.times), paths)
+    largest = jnp.max(log_weights, axis=-1, keepdims=True)
     ratios = jnp.exp(log_weights - largest + log_f - lax.stop_gradient(log_f))
-    weights = ratios / jnp.sum(ratios, axis=1, keepdims=True)
-
-    def mean(values):
-        each = weights.reshape(*weights.shape, *[1] * (values.ndim - 2))
-        total = jnp.sum(jnp.where(each > 0, each * values, 0), axis=1)
-        return total if batched else total[0]
-
-    return jax.tree.map(mean, jax.vmap(jax.vmap(fn))(paths))
+    weights = ratios / jnp.sum(ratios, axis=-1, keepdims=True)
+    return jax.tree.map(lambda value: weighted_mean(weights, value), values_of(fn, paths))

@@ -185,7 +185,7 @@ def ou_stationary(model: Diffusion) -> GaussianLaw:
     return GaussianLaw(prepared.mean, prepared.covariance)
 
 
-def ou_transition(model: Diffusion, start: Float[Array, " d"], duration: Numbers) -> GaussianLaw:
+def ou_transition(model: Diffusion, start: Numbers, duration: Numbers) -> GaussianLaw:
     """The law of X_t given X_0 = `start`, shape (d,), for t = `duration`, of `model`, an
     Ornstein–Uhlenbeck model.
 

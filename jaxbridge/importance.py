@@ -5,7 +5,6 @@
 by weighing approximate bridges, or from any weighted proposal.
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -15,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers
+from .averages import PathFunction, expanded, filled, values_of, weighted_mean
 from .bridges import Bridges, check_key, grid_times, stored_steps
 from .choice import as_proposal, settled
 from .coupled_pairs import CoupledPairs, check_density, pair_log_weights, usable
@@ -80,22 +80,22 @@ class WeightedBridges(eqx.Module):
         size = self.effective_sample_size
         return size / jnp.maximum(self.num_simulated, 1).astype(size.dtype)
 
-    def mean(self, fn: Callable[[Array], PyTree] = lambda path: path) -> PyTree:
+    def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
         """The weighted mean of `fn(path)`, a function of one path of shape (K, d), by default
-        the path itself: an estimate of its expectation over exact bridges."""
-        values, weights = self._values(fn), self.weights
-        return jax.tree.map(lambda value: _weighted_sum(weights, value), values)
+        the path itself: an estimate of its expectation over exact bridges. NaN where there are
+        none."""
+        values = values_of(fn, filled(self.paths, self.met))
+        return jax.tree.map(lambda value: weighted_mean(self.weights, value), values)
 
-    def standard_error(self, fn: Callable[[Array], PyTree] = lambda path: path) -> PyTree:
+    def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """That of `mean(fn)`, by the delta method, entry by entry."""
-        values, weights = self._values(fn), self.weights
+        weights, axis = self.weights, self.log_weights.ndim - 1
 
         def error(value):
-            mean = _weighted_sum(weights, value)
-            deviation = value - jnp.expand_dims(mean, weights.ndim - 1)
-            return jnp.sqrt(_weighted_sum(weights**2, deviation**2))
+            deviation = value - jnp.expand_dims(weighted_mean(weights, value), axis)
+            return jnp.sqrt(jnp.sum((expanded(weights, value) * deviation) ** 2, axis))
 
-        return jax.tree.map(error, values)
+        return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
 
     def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:
         """Equally weighted paths by systematic resampling, shape (m, K, d): many effective ones
@@ -117,19 +117,6 @@ class WeightedBridges(eqx.Module):
             return one_interval(key, self.weights, self.paths)
         keys = jax.random.split(key, len(self.log_weights))
         return jax.vmap(one_interval)(keys, self.weights, self.paths)
-
-    def _values(self, fn: Callable[[Array], PyTree]) -> PyTree:
-        each = jax.vmap(fn) if self.log_weights.ndim == 1 else jax.vmap(jax.vmap(fn))
-        # Missing bridges are NaN and weigh nothing.
-        paths = jnp.where(self.met[..., None, None], self.paths, 0)
-        # Truth values and counts have means as well.
-        return jax.tree.map(lambda value: value.astype(paths.dtype), each(paths))
-
-
-def _weighted_sum(weights: Float[Array, "*I n"], values: Array) -> Array:
-    axis = weights.ndim - 1
-    weights = weights.reshape(*weights.shape, *[1] * (values.ndim - weights.ndim))
-    return jnp.sum(jnp.where(weights > 0, weights * values, 0), axis=axis)
 
 
 def weigh_bridges(

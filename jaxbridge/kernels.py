@@ -8,11 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from .arrays import Numbers, as_floating, is_traced
+from .averages import PathFunction, filled, values_of, weighted_mean
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling
+from .diagnostics import effective_sample_size
 from .intervals import Intervals, as_intervals
 from .weighted import AbstractWeightedProposal
 
@@ -69,6 +71,33 @@ class Chain(eqx.Module):
     def acceptance_rate(self) -> Float[Array, "*I"]:
         """The share of steps that took a new path."""
         return jnp.mean(self.accepted, axis=-1)
+
+    def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """The mean of `fn(path)`, a function of one path of shape (K, d), by default the path
+        itself: an estimate of its expectation over exact bridges. NaN where there are none."""
+        weights = self._weights
+        return jax.tree.map(lambda value: weighted_mean(weights, value), self._values(fn))
+
+    def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """That of `mean(fn)`, from the effective sample size of the chain, entry by entry."""
+        weights, axis = self._weights, self.met.ndim - 1
+        size = effective_sample_size
+        for _ in range(axis):
+            size = jax.vmap(size)
+
+        def error(value):
+            deviation = value - jnp.expand_dims(weighted_mean(weights, value), axis)
+            return jnp.sqrt(weighted_mean(weights, deviation**2) / size(value))
+
+        return jax.tree.map(error, self._values(fn))
+
+    @property
+    def _weights(self) -> Float[Array, "*I n"]:
+        met = self.met.astype(self.paths.dtype)
+        return met / jnp.maximum(jnp.sum(met, axis=-1, keepdims=True), 1)
+
+    def _values(self, fn: PathFunction) -> PyTree:
+        return values_of(fn, filled(self.paths, self.met))
 
 
 def acceptance_rate(

@@ -249,16 +249,18 @@ def work_precision(result: WorkPrecision, ax: Axes | None = None) -> Axes:
 
 
 def posterior(
-    draws: Mapping[str, Float[Reals, " n"]],
+    draws: Mapping[str, Float[Reals, "*chains n"]],
     grid: Float[Reals, " m"],
     curves: Mapping[str, Float[Reals, " m"]],
     label: str = "parameter",
     ax: Axes | None = None,
+    bins: int = 60,
 ) -> Axes:
     """Histograms of each sampler's draws of one parameter, over densities that are known.
 
-    `draws` are those of each sampler by its name, shape (n,); `curves` densities on the `grid`,
-    both of shape (m,), likewise. `label` names the parameter. `ax` is where to draw.
+    `draws` are those of each sampler by its name, shape (n,), or (chains, n), taken together;
+    `curves` densities on the `grid`, both of shape (m,), likewise. `label` names the parameter.
+    `ax` is where to draw, `bins` how many bins there are over the range of all draws.
 
     **Example:**
 
@@ -269,13 +271,14 @@ def posterior(
     ```
     """
     ax = axes_or_new(ax)
-    everything = np.concatenate([np.asarray(values, float) for values in draws.values()])
-    bins = np.linspace(everything.min(), everything.max(), 60)
-    for i, (name, values) in enumerate(draws.items()):
+    flat = {name: np.ravel(np.asarray(values, float)) for name, values in draws.items()}
+    everything = np.concatenate(list(flat.values()))
+    edges = np.linspace(everything.min(), everything.max(), bins + 1)
+    for i, (name, values) in enumerate(flat.items()):
         colour = COLOURS[i % len(COLOURS)]
         ax.hist(
-            np.asarray(values, float),
-            bins,
+            values,
+            edges,
             density=True,
             histtype="step",
             color=colour,
@@ -292,15 +295,16 @@ def posterior(
 
 
 def trace(
-    draws: Mapping[str, Float[Reals, " n"]],
+    draws: Mapping[str, Float[Reals, "*chains n"]],
     level: float | None = None,
     label: str = "parameter",
     ax: Axes | None = None,
 ) -> Axes:
     """The draws of one parameter in the order in which they were made, by each sampler.
 
-    `draws` are those of each sampler by its name, shape (n,). A line is drawn at `level`, where it
-    is given, for instance at the true value. `label` names the parameter. `ax` is where to draw.
+    `draws` are those of each sampler by its name, shape (n,), or (chains, n), drawn over each
+    other. A line is drawn at `level`, where it is given, for instance at the true value. `label`
+    names the parameter. `ax` is where to draw.
 
     **Example:**
 
@@ -311,8 +315,9 @@ def trace(
     """
     ax = axes_or_new(ax)
     for i, (name, values) in enumerate(draws.items()):
-        colour = COLOURS[i % len(COLOURS)]
-        ax.plot(np.asarray(values, float), color=colour, linewidth=0.4, label=name)
+        style: dict[str, Any] = {"color": COLOURS[i % len(COLOURS)], "linewidth": 0.4}
+        for j, chain in enumerate(np.atleast_2d(np.asarray(values, float))):
+            ax.plot(chain, **style, label=name if j == 0 else None)
     if level is not None:
         ax.axhline(level, color=EXACT, linewidth=0.8)
     ax.set(xlabel="iteration", ylabel=label)

@@ -293,6 +293,11 @@ def work_precision(
         raise ValueError('`proposals` must be single ones; "auto" chooses between several.')
     if save_at is None:
         save_at = [float(intervals.duration[0]) / 2]
+        if any(n % 2 for n in steps):
+            raise ValueError(
+                "`num_steps` must be even where `save_at` is left to its default, half the "
+                f"duration; got {tuple(steps)}."
+            )
     for candidate, n in itertools.product(candidates, steps):
         stored_steps(save_at, duration, candidate.fractions(n))
     scene = _Scene(

@@ -53,6 +53,17 @@ def test_posteriors_and_traces_show_every_sampler():
     np.testing.assert_array_equal(ax.lines[0].get_ydata(), draws["one"])
 
 
+def test_several_chains_are_one_sampler():
+    chains = {"one": np.random.default_rng(0).normal(size=(2, 100)), "two": np.ones(50)}
+    ax = plot.trace(chains)
+    for line, values in zip(ax.lines, [*chains["one"], chains["two"]], strict=True):
+        np.testing.assert_array_equal(line.get_ydata(), values)
+    assert len(ax.get_legend().get_texts()) == 2
+    histogram = plot.posterior(chains, np.ones(2), {}, bins=7).patches[0].get_xy()
+    area = np.trapezoid(histogram[:, 1], histogram[:, 0])
+    assert len(np.unique(histogram[:, 0])) == 8 and abs(area - 1) < 1e-6
+
+
 def test_paths_in_space_go_up_from_start_to_end():
     times, paths = np.linspace(0, 2, 5), np.random.default_rng(0).normal(size=(4, 5, 2))
     paths[0] = np.nan  # not found

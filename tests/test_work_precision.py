@@ -179,7 +179,7 @@ def test_the_table_reads_well_and_exports():
         (dict(num_bridges=0), "`num_bridges` must be at least 1"),
         (dict(start=[[0.0, 0.0]] * 2), "one interval"),
         (dict(proposals=["auto"]), "must be single ones"),
-        (dict(num_steps=(5,)), "must lie on the grid"),
+        (dict(num_steps=(5,)), "`num_steps` must be even"),
     ],
 )
 def test_errors_say_what_to_change(changes, message, unchecked):

@@ -1,0 +1,40 @@
+"""Means over bridges: Σ w h(path) of functions h of one path, shape (K, d)."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+# A function of one path; its values may be truth values and counts.
+PathFunction = Callable[[Array], PyTree]
+
+
+def filled(paths: Float[Array, "*I n K d"], met: Bool[Array, "*I n"]) -> Float[Array, "*I n K d"]:
+    """The first bridge that was found in place of those that were not, which are NaN."""
+    first = jnp.argmax(met, axis=-1)[..., None, None, None]
+    return jnp.where(met[..., None, None], paths, jnp.take_along_axis(paths, first, axis=-3))
+
+
+def values_of(fn: PathFunction, paths: Float[Array, "*I n K d"]) -> PyTree:
+    """`fn` of every path, as floating point numbers with leading axes (*I, n)."""
+    each = jax.vmap(fn)
+    for _ in paths.shape[:-3]:
+        each = jax.vmap(each)
+    return jax.tree.map(lambda value: value.astype(paths.dtype), each(paths))
+
+
+def weighted_mean(
+    weights: Float[Array, "*I n"], values: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Σ w h, for weights that sum to one and values of shape (*I, n, ...); NaN where nothing has
+    weight."""
+    axis = weights.ndim - 1
+    each = expanded(weights, values)
+    total = jnp.sum(jnp.where(each > 0, each * values, 0), axis)
+    return jnp.where(jnp.sum(each, axis) > 0, total, jnp.nan)
+
+
+def expanded(weights: Float[Array, "*I n"], values: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The weights with as many axes as the values."""
+    return weights.reshape(*weights.shape, *[1] * (values.ndim - weights.ndim))
