@@ -1,28 +1,27 @@
 """Diffusion bridges by coupling, in JAX.
 
-Data flows one way: a model (`diffusion`, `models`, `gaussian`) and a scheme (`schemes`) make
-steps; a coupling (`coupling`) with a meeting rule (`meeting`) makes pairs of paths and joins them
+Data flows one way: a model (`diffusion`, `models`, `gaussian`) and a scheme (`schemes`) make steps;
+a coupling (`coupling`) with a meeting rule (`meeting`) makes pairs of paths and joins them
 (`proposals`); a search (`search`), on one device or several (`devices`), keeps the pairs that met
-(`bridges`). The diffusion associated with a bridge (`associated`), started from some law
-(`start_laws`, `burn_in`), hits it or not (`hitting`), which makes a weight (`coupled_pairs`).
-Proposals that are pulled to the end point (`guided`) have a weight made of the densities of their
-steps (`step_density`), and pilot runs choose (`choice`, `tuning`). On weighted proposals
-(`weighted`) are built importance sampling (`importance`), transition densities (`transition`) and
-Markov chains (`chains`, one method a module), with their `averages` and `diagnostics`, and what
-makes them hard (`hitting_variation`); what was not found raises an error where that is asked for
-(`throwing`). The likelihood of a path (`likelihood`) and
-what is not known (`unknowns`, `observations`, `problem`) make inference: bridges complete the
-observations (`parts`, `completion`), and parameters follow from complete paths
-(`parameter_steps`), in turn (`gibbs`), or from densities (`pmmh`), or as maximum likelihood
-estimates (`score`, `maximum_likelihood`); `expectation` has derivatives that are right. What a
-program simulates is decided in one table (`decisions`, `scene`), and its loops run over many
-lanes of small points (`lanes`, `noise`). Other coordinates are for state spaces with a boundary
-(`transform`), or for a σ of one (`lamperti`). Exact
-laws stand beside (`gaussian`, `linear`), what accuracy costs above (`work_precision`), and the
-studies above all (`study`, `exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`,
-`benchmark`), with their pictures (`plot`, `study_figures`). References to equations and sections
-are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*; equations go by
-their labels in its source.
+(`bridges`), on a `grid` of times. The diffusion associated with a bridge (`associated`), started
+from some law (`start_laws`, `burn_in`), hits it or not (`hitting`), which makes a weight
+(`coupled_pairs`). Proposals that are pulled to the end point (`guided`) have a weight made of the
+densities of their steps (`step_density`), and pilot runs choose (`choice`, `tuning`). On weighted
+proposals (`weighted`) are built importance sampling (`importance`), transition densities
+(`transition`) and Markov chains (`chains`, one method a module), with their `averages` and
+`diagnostics`, and what makes them hard (`hitting_variation`); what was not found raises an error
+where that is asked for (`throwing`). The likelihood of a path (`likelihood`) and what is not known
+(`unknowns`, `observations`, `problem`) make inference: bridges complete the observations (`parts`,
+`completion`), and parameters follow from complete paths (`parameter_steps`), in turn (`gibbs`), or
+from densities (`pmmh`), or as maximum likelihood estimates (`score`, `maximum_likelihood`);
+`expectation` has derivatives that are right. What a program simulates is decided in one table
+(`decisions`, `scene`), and its loops run over many lanes of small points (`lanes`, `noise`). Other
+coordinates are for state spaces with a boundary (`transform`), or for a σ of one (`lamperti`).
+Exact laws stand beside (`gaussian`, `linear`), what accuracy costs above (`work_precision`), and
+the studies above all (`study`, `exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`,
+`benchmark`), with their pictures (`plot`, `copula`, `study_figures`). References to equations and
+sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*; equations
+go by their labels in its source.
 
 What examples take for granted:
 

@@ -10,6 +10,20 @@ from jaxtyping import Array, Bool, Float, PyTree
 PathFunction = Callable[[Array], PyTree]
 
 
+def normalised(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I n"]:
+    """The weights, normalised to sum to one; all zero where nothing has weight."""
+    largest = jnp.max(log_weights, axis=-1, keepdims=True)
+    weights = jnp.exp(log_weights - jnp.where(jnp.isfinite(largest), largest, 0))
+    total = jnp.sum(weights, axis=-1, keepdims=True)
+    return weights / jnp.where(total > 0, total, 1)
+
+
+def effective_size(weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:
+    """1/Σw², for weights that sum to one: between 0, where nothing has weight, and n."""
+    squares = jnp.sum(weights**2, axis=-1)
+    return jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1), 0)
+
+
 def filled(paths: Float[Array, "*I n K d"], met: Bool[Array, "*I n"]) -> Float[Array, "*I n K d"]:
     """The first bridge that was found in place of those that were not, which are NaN."""
     first = jnp.argmax(met, axis=-1)[..., None, None, None]

@@ -10,15 +10,15 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, Shaped
 
-from .arrays import Numbers, as_floating, is_traced
+from .arrays import Numbers
 from .coupling import AbstractCoupling, Coupling, check_coupling
 from .devices import over_devices
 from .diffusion import Diffusion, check_diffusion
-from .intervals import Intervals, as_intervals, check_count, check_model
+from .grid import grid_times, stored_steps, uniform_fractions
+from .intervals import Intervals, as_intervals, check_count, check_key, check_model
 from .proposals import Proposals, propose
 from .search import (
     Found,
@@ -265,18 +265,6 @@ def unflatten_rows(rows: Shaped[Array, "rows ..."], num_intervals: int, batched:
     return rows.reshape(num_intervals, -1, *rows.shape[1:]) if batched else rows
 
 
-def grid_times(
-    intervals: Intervals,
-    stored: Int[Array, " K"] | None,
-    fractions: Float[np.ndarray, " points"],
-    several_durations: bool,
-) -> Float[Array, "*durations K"]:
-    """The times of the stored steps, for each interval where durations differ."""
-    duration = intervals.duration[:, None] if several_durations else intervals.duration[0]
-    kept = jnp.asarray(fractions, duration.dtype)
-    return (kept if stored is None else kept[stored]) * duration
-
-
 def _propose_numbered(
     inputs: Inputs,
     keys: Key[Array, " I"],
@@ -337,47 +325,3 @@ def _replayed_paths(
 ) -> Float[Array, "rows K d"]:
     made = _propose_numbered(inputs, keys, interval, number, num_steps, stored, rho, time_scale)
     return jnp.moveaxis(made.paths, -1, 0)
-
-
-def check_key(key) -> None:
-    """Raise `TypeError` for anything but one typed key."""
-    if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
-        raise TypeError(f"`key` must be a typed key, `jax.random.key(seed)`; got {key!r}.")
-    if key.shape != ():
-        raise ValueError(f"`key` must be a single key; got an array of keys, {key.shape}.")
-
-
-def uniform_fractions(num_steps: int) -> Float[np.ndarray, " points"]:
-    """t_i / T on the grid of equal steps."""
-    return np.arange(num_steps + 1) / num_steps
-
-
-def stored_steps(
-    save_at: Numbers | None, duration: Numbers, fractions: Float[np.ndarray, " points"]
-) -> Int[Array, " K"] | None:
-    """The grid points, t_i = T × fraction, at which paths are kept."""
-    if save_at is None:
-        return None
-    save_at = as_floating("save_at", save_at)
-    if save_at.ndim != 1 or save_at.shape[0] == 0:
-        raise ValueError(f"`save_at` must be times in an array of shape (K,); got {save_at.shape}.")
-    between = (fractions[1:] + fractions[:-1]) / 2
-    if is_traced(save_at, duration):
-        wanted = save_at / jnp.asarray(duration)
-        middle = jnp.asarray(between, wanted.dtype)
-        return jnp.searchsorted(middle, wanted).astype(jnp.int32)
-    length = float(np.asarray(duration, float))
-    wanted = np.asarray(save_at, float) / length
-    nearest = np.searchsorted(between, wanted)
-    # A thousandth of a step, and what rounding makes of times.
-    tolerance = 1e-3 * np.diff(fractions).min() + float(jnp.finfo(save_at.dtype).eps)
-    if np.any(wanted < -tolerance) or np.any(wanted > 1 + tolerance):
-        raise ValueError(f"`save_at` must lie in [0, {duration}]; got {save_at}.")
-    if np.any(np.abs(fractions[nearest] - wanted) > tolerance):
-        raise ValueError(
-            "`save_at` must lie on the grid of `num_steps` steps: the times nearest to "
-            f"those given are {fractions[nearest] * length}."
-        )
-    if np.any(np.diff(nearest) <= 0):
-        raise ValueError(f"`save_at` must increase from one grid point on; got {save_at}.")
-    return jnp.asarray(nearest, jnp.int32)

@@ -20,11 +20,11 @@ from jax import lax
 from jaxtyping import Array, Float, Key
 
 from .arrays import Numbers, is_traced
-from .bridges import check_key
 from .coupling import AbstractCoupling, Coupling, rotate, rotation_between, see
 from .diffusion import Diffusion, check_diffusion
-from .intervals import as_intervals, check_count, check_model
+from .intervals import as_intervals, check_count, check_key, check_model
 from .lanes import over_lanes
+from .linalg import all_finite
 from .meeting import PairStep
 from .noise import noisy_scan
 from .schemes import fitted_in_lanes
@@ -88,7 +88,9 @@ def measure_burn_in(
     coupling = Coupling() if coupling is None else coupling
     check_model(model, intervals, coupling.scheme)
     model.check_reversal()
-    time = _measure_compiled(key_for("burn-in", key), model, coupling, intervals, num_steps)
+    pairs = jnp.arange(_NUM_PAIRS) * len(intervals.end) // _NUM_PAIRS
+    end, dt = intervals.end[pairs].T, intervals.duration[pairs] / num_steps
+    time = _measure(key_for("burn-in", key), model, coupling, end, dt, num_steps)
     if not is_traced(time) and not np.isfinite(time):
         raise ValueError(
             "two copies of the reversed diffusion have not all met after 2¹⁷ steps, so it has "
@@ -99,12 +101,6 @@ def measure_burn_in(
 
 
 @eqx.filter_jit
-def _measure_compiled(key, model, coupling, intervals, num_steps):
-    pairs = jnp.arange(_NUM_PAIRS) * len(intervals.end) // _NUM_PAIRS
-    end, dt = intervals.end[pairs].T, intervals.duration[pairs] / num_steps
-    return _measure(key, model.prepared(), coupling, end, dt, num_steps)
-
-
 def _measure(
     key: Key[Array, ""],
     model: Diffusion,
@@ -114,7 +110,7 @@ def _measure(
     num_steps: int,
 ) -> Float[Array, ""]:
     """2s for the first s = 1, 2, 4, ... times `num_steps` steps within which all pairs meet."""
-    dynamics, scheme = model.backward(end[:, 0]), coupling.scheme
+    dynamics, scheme = model.prepared().backward(end[:, 0]), coupling.scheme
     fitted = fitted_in_lanes(scheme, dynamics, end[:, 0], dt)
     reflection = Coupling(-1.0, scheme=scheme, rotation=coupling.rotation)
     rule, root_dt = reflection.meeting, jnp.sqrt(dt)
@@ -129,7 +125,7 @@ def _measure(
         driven_next = scheme.step(dynamics, driven, dt, reflection.driven_noise(seen, turned, None))
         variance = reflection.gap_variance(seen).astype(x.dtype)
         pair = PairStep(seen, x, x_next, driven, driven_next, dt, variance)
-        met |= rule.met(pair, dynamics, uniform)
+        met |= rule.met(pair, dynamics, uniform) & all_finite(x_next) & all_finite(driven_next)
         return x_next, jnp.where(met, x_next, driven_next), met
 
     def step_pairs(pairs, inputs):

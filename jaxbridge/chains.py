@@ -14,12 +14,12 @@ import diffrax
 from jaxtyping import Array, Key
 
 from .arrays import Numbers
-from .bridges import check_key, stored_steps
-from .choice import as_proposal, settled
+from .choice import as_proposal, settled, uses_couplings
 from .crank_nicolson_chain import as_guided, check_step_size, run_crank_nicolson
 from .diffusion import Diffusion, check_diffusion
+from .grid import stored_steps
 from .guided import Guided
-from .intervals import as_intervals, check_count
+from .intervals import as_intervals, check_count, check_key
 from .kernels import Chain
 from .pseudo_marginal_chain import run_pseudo_marginal
 from .renewal_chain import as_pairs, run_renewal
@@ -72,7 +72,7 @@ def sample_exact_bridges(
         one.
     - `max_proposals`: bounds the tries for each new path; by default 10,000.
     - `max_trials`: bounds the trials for the counts of each path; by default 10,000 for each
-        count. See `Chain.truncated`.
+        count. See `Chain.truncated`. It and `num_counts` are not for the renewal chain.
     - `step_size`: β in (0, 1] of "crank_nicolson", by default 0.5; see `crank_nicolson`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, or
@@ -105,6 +105,11 @@ def sample_exact_bridges(
         proposal = as_guided(proposal)
     elif method == "renewal":
         proposal = as_pairs(proposal)
+        if not (num_counts is None and max_trials is None):
+            raise ValueError(
+                "`num_counts` and `max_trials` are for the pseudo-marginal chain: the renewal "
+                "chain counts nothing."
+            )
     elif method != "pseudo_marginal":
         raise ValueError(
             f'`method` must be "pseudo_marginal", "renewal" or "crank_nicolson"; got {method!r}.'
@@ -120,4 +125,7 @@ def sample_exact_bridges(
         chain = (run_renewal if method == "renewal" else run_pseudo_marginal)(*arguments)
     if not throw:
         return chain
-    return throw_where_incomplete(chain, "paths", model, ~chain.met, chain.truncated)
+    missing, truncated = ~chain.met, chain.truncated
+    return throw_where_incomplete(
+        chain, "paths", model, missing, truncated, coupled=uses_couplings(proposal)
+    )

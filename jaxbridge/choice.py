@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from .arrays import is_traced, nondifferentiable
+from .averages import effective_size, normalised
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling, Coupling
 from .diffusion import Diffusion
@@ -73,6 +74,12 @@ class Choice(AbstractWeightedProposal):
     chosen: Int[Array, " I"] | None
     num_pilot: int | None = eqx.field(static=True)
     used: tuple[int, ...] = eqx.field(static=True)
+
+    def of(self, which: Int[np.ndarray, " J"]) -> "Choice":
+        """The choice for some of the intervals."""
+        made = (self.seconds, self.efficiency, self.chosen)
+        seconds, efficiency, chosen = jax.tree.map(lambda leaf: leaf[..., which], made)
+        return Choice(self.candidates, seconds, efficiency, chosen, self.num_pilot, self.used)
 
     def check(self, model, intervals):
         for candidate in self.candidates:
@@ -226,19 +233,11 @@ def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
     """
     num_intervals, n = log_weights.shape
     eighth = max(n // 8, 1)
-    share = _effective_size(log_weights) / n
+    share = effective_size(normalised(log_weights)) / n
     parts = log_weights[:, : n // eighth * eighth].reshape(num_intervals, -1, eighth)
-    share_of_part = jnp.mean(_effective_size(parts), axis=1) / eighth
+    share_of_part = jnp.mean(effective_size(normalised(parts)), axis=1) / eighth
     fall = jnp.minimum(share / jnp.where(share_of_part > 0, share_of_part, 1), 1)
     return n * share * fall**2
-
-
-def _effective_size(log_weights: Float[Array, "*rows n"]) -> Float[Array, "*rows"]:
-    """(Σw)²/Σw²."""
-    largest = jnp.max(log_weights, axis=-1, keepdims=True)
-    weights = jnp.exp(log_weights - jnp.where(largest > -jnp.inf, largest, 0))
-    squares = jnp.sum(weights**2, axis=-1)
-    return jnp.sum(weights, axis=-1) ** 2 / jnp.where(squares > 0, squares, 1)
 
 
 def as_proposal(
@@ -283,6 +282,11 @@ def singles(proposal: AbstractWeightedProposal) -> tuple[AbstractWeightedProposa
     if not isinstance(proposal, Choice):
         return (proposal,)
     return tuple(proposal.candidates[i] for i in proposal.used)
+
+
+def uses_couplings(proposal: AbstractWeightedProposal) -> bool:
+    """Whether any interval may have a coupling."""
+    return any(isinstance(single, CoupledPairs) for single in singles(proposal))
 
 
 def guided_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[AbstractWeightedProposal]:

@@ -74,7 +74,7 @@ class ByRenewal(AbstractBridgeKernel):
     pairs: CoupledPairs
 
     def first(self, keys, model, intervals, num_steps):
-        return first_paths(keys, model, self.pairs, intervals, num_steps)
+        return first_paths(keys, model, self.pairs, intervals, num_steps)[0]
 
     def renew(self, keys, model, intervals, paths):
         everything = jnp.ones(len(keys), bool)
@@ -113,7 +113,7 @@ class Unweighted(AbstractBridgeKernel):
     pairs: CoupledPairs
 
     def first(self, keys, model, intervals, num_steps):
-        return first_paths(keys, model, self.pairs, intervals, num_steps)
+        return first_paths(keys, model, self.pairs, intervals, num_steps)[0]
 
     def renew(self, keys, model, intervals, paths):
         num_steps = paths.shape[1] - 1

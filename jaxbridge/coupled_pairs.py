@@ -12,10 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from .arrays import nondifferentiable
-from .bridges import Inputs, find_bridges, uniform_fractions
+from .bridges import Inputs, find_bridges
 from .burn_in import with_burn_in
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion
+from .grid import uniform_fractions
 from .hitting import HittingCounts, count_hits
 from .intervals import check_model
 from .search import default_num_lanes

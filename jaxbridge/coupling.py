@@ -232,12 +232,14 @@ class Coupling(AbstractCoupling):
         self.rotation = rotation
         self._gamma_law = law
         reflection = False
-        if law is None and not is_traced(self.gamma):
-            if self.gamma.ndim != 0:
-                raise ValueError(
-                    f"`gamma` must be a scalar, got shape {self.gamma.shape}; use `jax.vmap` "
-                    "for several values, or pass a function `key -> gamma`."
-                )
+        if self.gamma.ndim != 0:
+            raise ValueError(
+                f"`gamma` must be a scalar, got shape {self.gamma.shape}; use `jax.vmap` "
+                "for several values, or pass a function `key -> gamma`."
+            )
+        if is_traced(self.gamma):
+            self.gamma = _in_range(self.gamma)
+        elif law is None:
             if not -1 <= np.asarray(self.gamma) < 1:
                 raise ValueError(f"`gamma` must be in [-1, 1), got {gamma}.")
             reflection = bool(np.asarray(self.gamma) == -1)
@@ -267,7 +269,7 @@ class Coupling(AbstractCoupling):
         if self._gamma_law is None:
             return self
         gamma = jax.vmap(self._gamma_law)(keys)
-        return eqx.tree_at(lambda c: c.gamma, self, gamma.astype(self.gamma.dtype))
+        return eqx.tree_at(lambda c: c.gamma, self, _in_range(gamma.astype(self.gamma.dtype)))
 
     def _turn(self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None):
         """{I - (1-γ)Π} w + √(1-γ²) u ΔU: symmetric, so it serves both directions."""
@@ -277,6 +279,11 @@ class Coupling(AbstractCoupling):
             positive = own > 0  # at a traced γ = -1 the root has no derivative
             along += jnp.where(positive, jnp.sqrt(jnp.where(positive, own, 1)), 0) * du
         return dw + frame.u * along
+
+
+def _in_range(gamma: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """NaN where γ is not in [-1, 1): such pairs never meet, and are counted as not finite."""
+    return jnp.where((gamma >= -1) & (gamma < 1), gamma, jnp.nan)
 
 
 def rotation_between(

@@ -22,11 +22,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from .arrays import Numbers, as_floating, is_traced, nondifferentiable
-from .bridges import check_key, grid_times
 from .choice import as_proposal
 from .diffusion import Diffusion, check_diffusion
+from .grid import grid_times
 from .guided import AbstractGuidedProposal, Guided, noise_of, path_of
-from .intervals import Intervals, check_count
+from .intervals import Intervals, check_count, check_key
 from .kernels import (
     Chain,
     Kernel,

@@ -173,6 +173,11 @@ class Diffusion(eqx.Module):
         """Whether the model knows its stationary density."""
         return self._log_stationary is not None
 
+    @property
+    def has_reverse_drift(self) -> bool:
+        """Whether the drift of the reversed diffusion was given, and need not be derived."""
+        return self._reverse_drift is not None
+
     def reversibility_residual(self, points: Numbers) -> Float[Array, "n d"]:
         """α - ½ (V ∇log ν + div V) at each of the points, shape (n, d).
 

@@ -14,6 +14,7 @@ derivative of the paths themselves is not. Higher derivatives are right, too.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import PyTree
 
@@ -21,7 +22,7 @@ from .averages import PathFunction, filled, values_of, weighted_mean
 from .diffusion import Diffusion, check_diffusion
 from .importance import WeightedBridges
 from .kernels import Chain
-from .likelihood import path_log_likelihood
+from .likelihood import forms_of_target, log_likelihood_of_steps
 
 
 def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffusion) -> PyTree:
@@ -67,7 +68,12 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
     log_weights = jnp.where(bridges.met, 0.0, -jnp.inf).astype(paths.dtype)
     if isinstance(bridges, WeightedBridges):
         log_weights = lax.stop_gradient(bridges.log_weights)
-    log_f = path_log_likelihood(model, lax.stop_gradient(bridges.times), paths)
+    # Of the grid, for differences of rounded times would not do where its steps are unequal.
+    fractions = np.diff(bridges.proposal.fractions(bridges.num_steps))
+    duration = lax.stop_gradient(bridges.times)[..., -1:]
+    steps = jnp.asarray(fractions, duration.dtype) * duration
+    form = forms_of_target(bridges.proposal, model, paths.reshape(-1, paths.shape[-1])[0])[0]
+    log_f = log_likelihood_of_steps(model, steps, paths, form)
     largest = jnp.max(log_weights, axis=-1, keepdims=True)
     ratios = jnp.exp(log_weights - largest + log_f - lax.stop_gradient(log_f))
     weights = ratios / jnp.sum(ratios, axis=-1, keepdims=True)

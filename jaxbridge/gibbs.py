@@ -122,7 +122,8 @@ def gibbs(
         which each interval gets its own number of steps.
     - `proposal`: a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, `Guided()`, or
         "auto", the default, which finds the best for each interval by a pilot run; or, for
-        approximate bridges, a `Coupling`, by default `Coupling(gamma=0.0)`.
+        approximate bridges or where a `method` is given, a `Coupling`, by default
+        `Coupling(gamma=0.0)`.
     - `bridges`: "exact", or "approximate" as in the paper.
     - `method`: of exact bridges by a coupling, "renewal" (the default if `proposal` is one) or
         "pseudo_marginal".

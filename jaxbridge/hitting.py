@@ -17,11 +17,10 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from .arrays import nondifferentiable
 from .associated import run_associated
-from .bridges import check_key
 from .burn_in import with_burn_in
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
-from .intervals import check_count
+from .intervals import check_count, check_key
 from .search import Trials, check_bound, default_num_lanes, key_for, numbered_keys, search
 from .start_laws import AnyStartLaw, as_start_law
 

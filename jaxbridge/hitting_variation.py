@@ -18,11 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from .bridges import check_key
-from .chains import Chain
+from .diffusion import Diffusion
 from .hitting import hitting_counts
 from .importance import WeightedBridges
-from .intervals import check_count
+from .intervals import check_count, check_key
+from .kernels import Chain
 from .search import key_for
 from .start_laws import AnyStartLaw
 
@@ -54,7 +54,7 @@ class HittingVariation(NamedTuple):
 
 def hitting_variation(
     key: Key[Array, ""],
-    model,
+    model: Diffusion,
     bridges: WeightedBridges | Chain,
     num_counts: Sequence[int] = (50, 100, 150, 200, 300),
     *,
@@ -65,13 +65,13 @@ def hitting_variation(
 
     **Arguments:**
 
+    - `key`, `model`, `max_trials`: as in `hitting_counts`.
     - `bridges`: exact ones, of one interval, with whole paths: from `sample_exact_bridges`
         (thin the chain: states that repeat cost counts but say little) or `weigh_bridges`,
         whose weights are taken into account.
     - `num_counts`: increasing, at least two. The largest is what is simulated for each bridge.
     - `start_law`: where the associated diffusion starts, by default as the bridges' coupling has
         it.
-    - `key`, `model`, `max_trials`: as in `hitting_counts`.
 
     **Returns:** `HittingVariation`.
 
@@ -93,8 +93,11 @@ def hitting_variation(
             "`bridges` must have the exact law: pass what `weigh_bridges` or "
             f"`sample_exact_bridges` returned; got {type(bridges).__name__}."
         )
-    if bridges.paths.ndim != 3:
-        raise ValueError("`bridges` must be those of one interval, paths of shape (n, N+1, d).")
+    if bridges.paths.ndim != 3 or len(bridges.paths) < 2:
+        raise ValueError(
+            "`bridges` must be two or more of one interval, paths of shape (n, N+1, d); got "
+            f"{bridges.paths.shape}."
+        )
     counted = hitting_counts(
         key_for("variation", key),
         model,

@@ -14,14 +14,23 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from .arrays import Numbers
-from .averages import PathFunction, expanded, filled, values_of, weighted_mean
-from .bridges import Bridges, check_key, grid_times, stored_steps
-from .choice import as_proposal, settled
+from .averages import (
+    PathFunction,
+    effective_size,
+    expanded,
+    filled,
+    normalised,
+    values_of,
+    weighted_mean,
+)
+from .bridges import Bridges
+from .choice import as_proposal, settled, uses_couplings
 from .coupled_pairs import CoupledPairs, check_density, pair_log_weights, usable
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
+from .grid import grid_times, stored_steps
 from .hitting import check_max_trials, counts_of, coupling_of
-from .intervals import Intervals, as_intervals, check_count
+from .intervals import Intervals, as_intervals, check_count, check_key
 from .search import key_for
 from .start_laws import AnyStartLaw
 from .throwing import throw_where_incomplete
@@ -62,17 +71,12 @@ class WeightedBridges(eqx.Module):
     @property
     def weights(self) -> Float[Array, "*I n"]:
         """The weights, normalised to sum to one; all zero where no bridge was found."""
-        largest = jnp.max(self.log_weights, axis=-1, keepdims=True)
-        weights = jnp.exp(self.log_weights - jnp.where(jnp.isfinite(largest), largest, 0))
-        total = jnp.sum(weights, axis=-1, keepdims=True)
-        return weights / jnp.where(total > 0, total, 1)
+        return normalised(self.log_weights)
 
     @property
     def effective_sample_size(self) -> Float[Array, "*I"]:
         """(Σw)²/Σw²: how many exact bridges these are worth, between 0 and n."""
-        squares = jnp.sum(self.weights**2, axis=-1)
-        positive = squares > 0
-        return jnp.where(positive, 1 / jnp.where(positive, squares, 1), 0)
+        return effective_size(self.weights)
 
     @property
     def efficiency(self) -> Float[Array, "*I"]:
@@ -172,15 +176,19 @@ def weigh_bridges(
     check_density(coupling.start_law, model)
     batch_size = None if batch_size is None else check_count("batch_size", batch_size)
     budget = (num_counts, bound, batch_size, progress_meter)
-    like = bridges.paths[..., 0, :].reshape(-1, bridges.paths.shape[-1])[0]
+    like = bridges.reverse_start.reshape(-1, bridges.paths.shape[-1])[0]
     pairs = as_proposal(coupling, model, like, num_counts, None, max_trials)
     weighted = _weigh_bridges(key_for("weights", key), model, pairs, bridges, budget)
-    return _or_throw(weighted, model) if throw else weighted
+    return _or_throw(weighted, model, pairs) if throw else weighted
 
 
-def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
+def _or_throw(
+    weighted: WeightedBridges, model: Diffusion, proposal: AbstractWeightedProposal
+) -> WeightedBridges:
     missing, truncated = ~weighted.met, weighted.truncated
-    return throw_where_incomplete(weighted, "log_weights", model, missing, truncated)
+    return throw_where_incomplete(
+        weighted, "log_weights", model, missing, truncated, coupled=uses_couplings(proposal)
+    )
 
 
 @eqx.filter_jit
@@ -269,7 +277,7 @@ def sample_weighted_bridges(
     stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
     sizes = (num_bridges, num_steps, batched, several_durations, progress_meter)
     weighted = _sample_weighted(key, model, proposal, intervals, stored, *sizes)
-    return _or_throw(weighted, model) if throw else weighted
+    return _or_throw(weighted, model, proposal) if throw else weighted
 
 
 @eqx.filter_jit

@@ -71,6 +71,14 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
     return intervals, bool(lengths), duration.ndim == 1
 
 
+def check_key(key) -> None:
+    """Raise `TypeError` for anything but one typed key."""
+    if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+        raise TypeError(f"`key` must be a typed key, `jax.random.key(seed)`; got {key!r}.")
+    if key.shape != ():
+        raise ValueError(f"`key` must be a single key; got an array of keys, {key.shape}.")
+
+
 def check_count(name: str, value, minimum: int = 1) -> int:
     """A static whole number of at least `minimum`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):

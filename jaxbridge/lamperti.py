@@ -78,7 +78,7 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
         model.params,
         sample_stationary=functions.sample_stationary if model.has_sampler else None,
         # In one dimension every stationary diffusion is reversible.
-        reversible=model.reversible or model.has_density,
+        reversible=model.has_reversal,
         normalised=model.normalised,
         prepare=functions.prepare,
     )

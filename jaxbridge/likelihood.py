@@ -29,13 +29,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from .arrays import Numbers, as_floating, is_traced, time_steps
 from .diffusion import Diffusion, Dynamics, check_diffusion
 from .lanes import over_lanes
 from .linalg import dot, total
-from .step_density import TrapezoidDensity
+from .step_density import AbstractStepDensity, EulerDensity, TrapezoidDensity
 
 Form = Literal["girsanov", "trapezoid", "ito", "euler"]
 
@@ -78,7 +78,7 @@ def path_log_likelihood(
             "`path` must hold two or more points in the axis before the last, shape (..., K, d); "
             f"got {path.shape}."
         )
-    batch, (num_times, d) = path.shape[:-2], path.shape[-2:]
+    num_times = path.shape[-2]
     fits = times.shape == (num_times,) or (
         path.ndim > 2 and times.shape == (path.shape[0], num_times)
     )
@@ -88,13 +88,24 @@ def path_log_likelihood(
             f"{num_times}) for paths of shape (I, ..., {num_times}, d); got {times.shape} for "
             f"paths of shape {path.shape}."
         )
-    steps = steps.astype(path.dtype)
     if not is_traced(steps) and not np.all(np.asarray(steps) > 0):
         raise ValueError("`times` must be finite and increase.")
+    return log_likelihood_of_steps(model, steps.astype(path.dtype), path, form)
+
+
+def log_likelihood_of_steps(
+    model: Diffusion,
+    steps: Float[Array, "*I K"],
+    path: Float[Array, "*batch points d"],
+    form: Form | None = None,
+) -> Float[Array, "*batch"]:
+    """`path_log_likelihood`, given the steps of the grid: one for all paths, or one for each
+    interval."""
+    batch, (num_points, d) = path.shape[:-2], path.shape[-2:]
     if steps.ndim == 2:
-        steps = steps.reshape(len(steps), *[1] * (len(batch) - 1), num_times - 1)
-    steps = jnp.broadcast_to(steps, (*batch, num_times - 1)).reshape(-1, num_times - 1)
-    paths = path.reshape(-1, num_times, d)
+        steps = steps.reshape(len(steps), *[1] * (len(batch) - 1), num_points - 1)
+    steps = jnp.broadcast_to(steps, (*batch, num_points - 1)).reshape(-1, num_points - 1)
+    paths = path.reshape(-1, num_points, d)
     if form != "euler":
         known_sigma(model.diffusion(paths[0, 0]))
     return _compiled(model, steps.T, paths, form).reshape(batch)
@@ -194,6 +205,19 @@ def forms_of(model: Diffusion, like: Float[Array, " d"]) -> tuple[Form, ...]:
         return ("girsanov",)
     gradient = model.reversible and model.has_density
     return ("ito", "trapezoid", "girsanov") if gradient else ("trapezoid", "girsanov")
+
+
+def forms_of_target(
+    proposals: PyTree, model: Diffusion, like: Float[Array, " d"]
+) -> tuple[Form, ...]:
+    """The forms that go with the target of the bridges of these proposals, the most accurate
+    first: weights that are exact for the Euler scheme call for its own likelihood, for otherwise
+    paths and parameters would belong to two laws."""
+    are_densities = lambda leaf: isinstance(leaf, AbstractStepDensity)
+    densities = jax.tree.leaves(proposals, is_leaf=are_densities)
+    if any(isinstance(density, EulerDensity) for density in densities):
+        return ("girsanov",)
+    return forms_of(model, like)
 
 
 def _form(model: Diffusion, like: Float[Array, " d"], form: Form | None) -> Form:

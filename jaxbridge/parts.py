@@ -8,16 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from .choice import as_proposal, default_candidates, settled, singles, undecided_between
+from .choice import Choice, as_proposal, default_candidates, settled, singles, undecided_between
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion
 from .intervals import Intervals
-from .likelihood import Form, forms_of
+from .likelihood import Form, forms_of_target
 from .observations import Group
 from .renewal_chain import as_pairs
 from .start_laws import Reversed, Stationary, needs_burn_in
-from .step_density import AbstractStepDensity, EulerDensity
 from .transition import check_for_density
 from .weighted import AbstractWeightedProposal
 
@@ -71,29 +70,31 @@ def make_parts(
     for part_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
         mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
         chosen = as_proposal(proposal, model, mine.start[0], *bounds, for_density=for_density)
+        if isinstance(chosen, Choice) and _is_for(chosen, intervals):
+            chosen = chosen.of(group.which)
         chosen.check(model, mine)
         if for_density:
             check_for_density(chosen, model)
         if moving and weighted:
             _check_for_moving(chosen, model, for_density)
         if only_couplings:
-            chosen = as_pairs(chosen)
+            chosen = as_pairs(chosen, 'bridges="approximate"' if not weighted else "renewal")
         chosen = settled(chosen, part_key, model, mine, group.num_steps)
-        chosen = chosen.prepared(part_key, model, mine, group.num_steps)
+        if weighted:
+            chosen = chosen.prepared(part_key, model, mine, group.num_steps)
         fractions = jnp.asarray(np.diff(chosen.fractions(group.num_steps)), mine.duration.dtype)
         parts.append(Part(mine, jnp.asarray(group.which), fractions, chosen))
     return tuple(parts)
 
 
 def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
-    """The forms of the path likelihood that go with the target of the bridges, the most accurate
-    first: weights that are exact for the Euler scheme call for its own likelihood, for otherwise
-    paths and parameters would be drawn from conditionals of two laws."""
-    are_densities = lambda leaf: isinstance(leaf, AbstractStepDensity)
-    densities = jax.tree.leaves([part.proposal for part in parts], is_leaf=are_densities)
-    if any(isinstance(density, EulerDensity) for density in densities):
-        return ("girsanov",)
-    return forms_of(model, parts[0].intervals.start[0])
+    """Those of the path likelihood that go with the bridges of all parts."""
+    return forms_of_target([part.proposal for part in parts], model, parts[0].intervals.start[0])
+
+
+def _is_for(choice: Choice, intervals: Intervals) -> bool:
+    """Whether the choice has been made, for all these intervals."""
+    return choice.chosen is not None and choice.chosen.shape == intervals.duration.shape
 
 
 def _check_for_moving(

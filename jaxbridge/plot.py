@@ -13,6 +13,7 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Float
 
+from .copula import empirical_copula, gaussian_copula
 from .gaussian import GaussianBridge
 from .plot_style import (
     COLOURS,
@@ -27,6 +28,7 @@ from .plot_style import (
     axes_or_new,
     finish,
     found,
+    there,
 )
 from .work_precision import WorkPrecision
 
@@ -141,9 +143,10 @@ def qq(
 ) -> Axes:
     """Q-Q plot of one margin against N(mean, sd²), each method in its own colour.
 
-    `samples` are the draws of each method by its name, shape (n,); `mean` and `sd` those of the
-    exact law. Quantiles are shown at levels that are evenly spaced on the normal scale, out to the
-    most extreme draws; on the diagonal the two laws agree. `ax` is where to draw.
+    `samples` are the draws of each method by its name, shape (n,), of which those that are NaN, of
+    bridges not found, are left out; `mean` and `sd` those of the exact law. Quantiles are shown at
+    levels that are evenly spaced on the normal scale, out to the most extreme draws; on the
+    diagonal the two laws agree. `ax` is where to draw.
 
     **Example:**
 
@@ -154,13 +157,14 @@ def qq(
     ```
     """
     ax, mean, sd = axes_or_new(ax), float(mean), float(sd)
-    largest = max(np.size(values) for values in samples.values())
+    kept = {name: there(name, values) for name, values in samples.items()}
+    largest = max(len(values) for values in kept.values())
     reach = mean + sd * np.array([-1, 1]) * _scores(largest)[-1]
     ax.plot(reach, reach, color=EXACT, linewidth=0.8, label="exact")
-    for i, (name, values) in enumerate(samples.items()):
-        scores = _scores(np.size(values))
+    for i, (name, values) in enumerate(kept.items()):
+        scores = _scores(len(values))
         levels = np.asarray(ndtr(scores), float)
-        quantiles = np.quantile(np.asarray(values, float), levels, method="hazen")
+        quantiles = np.quantile(values, levels, method="hazen")
         colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
         style = {"color": colour, "markersize": 3.5, "markeredgewidth": 0.8, "fillstyle": "none"}
         ax.plot(mean + sd * scores, quantiles, marker, label=name, **style)
@@ -176,7 +180,8 @@ def copula_levels(
 ) -> Axes:
     """Level curves of the copula: exact (full drawn) and of each method's draws (dashed).
 
-    `samples` are the draws of each method by its name, shape (n, 2); `covariance`, (2, 2), is that
+    `samples` are the draws of each method by its name, shape (n, 2), of which those that are NaN,
+    of bridges not found, are left out; `covariance`, (2, 2), is that
     of the exact, Gaussian law; `levels` are those of the curves, between 0 and 1. `ax` is where to
     draw.
 
@@ -201,7 +206,7 @@ def copula_levels(
     handles = [Line2D([], [], color=EXACT, linewidth=0.8, label="exact")]
     for i, (name, values) in enumerate(samples.items()):
         colour, dashes = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]
-        copula = empirical_copula(values, resolution)
+        copula = empirical_copula(there(name, values), resolution)
         draw(copula, colors=colour, linewidths=1.4, linestyles=[dashes])
         handles.append(Line2D([], [], color=colour, linewidth=1.4, linestyle=dashes, label=name))
     # No labels on the curves: C(1, v) = v, so each ends on the right at its own level.
@@ -322,35 +327,6 @@ def trace(
         ax.axhline(level, color=EXACT, linewidth=0.8)
     ax.set(xlabel="iteration", ylabel=label)
     return finish(ax)
-
-
-def gaussian_copula(
-    u: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."], correlation: float
-) -> Float[np.ndarray, "..."]:
-    """The Gaussian copula C(u, v), for u, v in [0, 1] and -1 < correlation < 1.
-
-    By Plackett's identity ∂C/∂r = φ₂(x, y; r), integrated from independence with r = sin θ.
-    """
-    # Away from the edges, where the scores are infinite, by less than a picture can show.
-    x, y = (np.asarray(ndtri(np.clip(p, 1e-6, 1 - 1e-6)), float)[..., None] for p in (u, v))
-    nodes, weights = np.polynomial.legendre.leggauss(48)
-    half = np.arcsin(correlation) / 2
-    angle = half * (1 + nodes)
-    exponent = (x**2 + y**2 - 2 * x * y * np.sin(angle)) / (2 * np.cos(angle) ** 2)
-    return u * v + half * np.exp(-exponent) @ weights / (2 * np.pi)
-
-
-def empirical_copula(
-    samples: Float[Reals, "n 2"], resolution: int
-) -> Float[np.ndarray, "{resolution}+1 {resolution}+1"]:
-    """C_n(u, v), the share of draws with ranks at most nu and nv, at u, v = 0, 1/m, ..., 1,
-    m being the `resolution`."""
-    n = len(samples)
-    ranks = np.argsort(np.argsort(np.asarray(samples), axis=0), axis=0) + 1
-    cell = (ranks * resolution - 1) // n  # rank/n lies in (cell/m, (cell + 1)/m]
-    counts = np.zeros((resolution + 1, resolution + 1))
-    np.add.at(counts, tuple(cell.T + 1), 1)
-    return counts.cumsum(0).cumsum(1) / n
 
 
 def _scores(n: int, num_points: int = 61) -> Float[np.ndarray, " num_points"]:

@@ -49,3 +49,12 @@ def found(
     if len(index) == 0:
         raise ValueError("`paths` must have a bridge to draw: none of these was found.")
     return values[index], index
+
+
+def there(name: str, draws: Float[Reals, "n ..."]) -> Float[np.ndarray, "m ..."]:
+    """The draws that are numbers: those of bridges that were found."""
+    draws = np.asarray(draws, float)
+    kept = draws[np.isfinite(draws).reshape(len(draws), -1).all(axis=1)]
+    if len(kept) == 0:
+        raise ValueError(f"the sample {name!r} must have draws that are numbers; all are NaN.")
+    return kept

@@ -119,8 +119,9 @@ def pmmh(
     - `num_proposals`: weighted paths for each interval in each estimate. The variance of the
         estimated log likelihood should be about one: with n intervals that takes in
         proportion to n.
-    - `proposal`: as in `transition_log_density`. Densities by a coupling from the stationary law
-        rest on a normalised `log_stationary`, whose constant depends on the parameters.
+    - `proposal`: as in `transition_log_density`, but "auto" by default. Densities by a
+        coupling from the stationary law rest on a normalised `log_stationary`, whose constant
+        depends on the parameters.
     - `covariance`: of the first proposals, shape (p,) for a diagonal or (p, p); by default a tenth
         of the prior's standard deviations, or a tenth of θ where the prior is not normal.
     - `init`: unknown parameters to start from, or the `state` of earlier draws.

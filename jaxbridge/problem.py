@@ -7,9 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from .arrays import Numbers, is_traced
-from .bridges import check_key
 from .diffusion import Diffusion, check_diffusion
-from .intervals import Intervals, check_count
+from .intervals import Intervals, check_count, check_key
 from .observations import Group, as_observations, step_groups
 from .unknowns import (
     Constraint,

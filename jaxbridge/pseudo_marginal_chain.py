@@ -15,10 +15,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from .arrays import Numbers, nondifferentiable
-from .bridges import check_key, grid_times
 from .choice import as_proposal
 from .diffusion import Diffusion, check_diffusion
-from .intervals import Intervals, check_count
+from .grid import grid_times
+from .intervals import Intervals, check_count, check_key
 from .kernels import (
     Chain,
     Kernel,

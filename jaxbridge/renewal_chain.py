@@ -20,12 +20,13 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from .arrays import Numbers, nondifferentiable
 from .associated import run_associated
-from .bridges import Inputs, Joined, check_key, find_bridges, grid_times
+from .bridges import Inputs, Joined, find_bridges
 from .choice import as_proposal
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
-from .intervals import Intervals, check_count
+from .grid import grid_times
+from .intervals import Intervals, check_count, check_key
 from .kernels import Chain, Kernel, chain_keys, check_path, one_interval, sum_by_interval
 from .search import Found, default_num_lanes, most_lanes
 from .start_laws import log_ratio
@@ -88,7 +89,7 @@ def renewal(
     def init(position, rng_key):
         check_key(rng_key)
         if position is None:
-            return RenewalState(first_paths(rng_key[None], *setting, num_steps)[0])
+            return RenewalState(first_paths(rng_key[None], *setting, num_steps)[0][0])
         return RenewalState(check_path(position, intervals, num_steps))
 
     def step(rng_key, state):
@@ -148,7 +149,7 @@ def run_renewal(
     num_intervals = intervals.start.shape[0]
     pairs = pairs.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, num_intervals, num_bridges, batched)
-    first = first_paths(init_keys, model, pairs, intervals, num_steps)
+    first, proposed = first_paths(init_keys, model, pairs, intervals, num_steps)
     most_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
     num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, most_segments))
     length = -(-num_bridges // num_segments)
@@ -231,8 +232,8 @@ def run_renewal(
         None,
         jnp.all(jnp.isfinite(paths), axis=(-2, -1)),
         None,
-        total(segments.num_simulated),
-        total(segments.num_nonfinite),
+        total(segments.num_simulated) + total(proposed.num_trials),
+        total(segments.num_nonfinite) + total(proposed.num_nonfinite),
         total(jnp.zeros(num, jnp.int32)),
         pairs,
         num_steps,
@@ -300,16 +301,16 @@ def first_paths(
     pairs: CoupledPairs,
     intervals: Intervals,
     num_steps: int,
-) -> Float[Array, "I points d"]:
-    """A bridge by proposal for each interval, NaN where none was found."""
+) -> tuple[Float[Array, "I points d"], Found]:
+    """A bridge by proposal for each interval, NaN where none was found; and the search for it."""
     proposed = propose_paths(keys, model.prepared(), pairs, intervals, None, num_steps)
     joined: Joined = proposed.outputs
-    return jnp.where((proposed.num_found > 0)[:, None, None], joined.paths, jnp.nan)
+    return jnp.where((proposed.num_found > 0)[:, None, None], joined.paths, jnp.nan), proposed
 
 
-def as_pairs(proposal: AbstractWeightedProposal) -> CoupledPairs:
+def as_pairs(proposal: AbstractWeightedProposal, method: str = "renewal") -> CoupledPairs:
+    """The proposal, which must be a coupling's for this method."""
     if not isinstance(proposal, CoupledPairs):
-        raise TypeError(
-            'renewal is for couplings: pass a `Coupling`, or choose method="pseudo_marginal".'
-        )
+        other = {"renewal": 'method="pseudo_marginal"'}.get(method, 'bridges="exact"')
+        raise TypeError(f"{method} is for couplings: pass a `Coupling`, or choose {other}.")
     return proposal

@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from .arrays import Numbers, nondifferentiable
+from .averages import effective_size, normalised
 from .diffusion import Diffusion
 from .intervals import check_count
 from .likelihood import Form, log_likelihoods
@@ -78,7 +79,7 @@ def score(
     - `model`, `times`, `observations`, `num_steps`, `step_size`, `where`: as in `gibbs`.
     - `num_bridges`: weighted bridges for each interval. Means over them have a bias of the order
         of one over their effective number, beside the Monte Carlo error.
-    - `proposal`: anything that `sample_weighted_bridges` takes.
+    - `proposal`: anything that `sample_weighted_bridges` takes; by default "auto".
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_weighted_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
@@ -179,10 +180,7 @@ def _interval_moments(
         return leaf[:, :num_bridges]
 
     log_weights, g, H, truncated = map(join, made)
-    largest = jnp.max(log_weights, axis=1, keepdims=True)
-    weights = jnp.exp(log_weights - jnp.where(jnp.isfinite(largest), largest, 0))
-    total = jnp.sum(weights, axis=1, keepdims=True)
-    weights = weights / jnp.where(total > 0, total, 1)
+    weights = normalised(log_weights)
     mean = jnp.sum(weights[..., None] * g, axis=1)
     deviation = g - mean[:, None]
     products = deviation[..., :, None] * deviation[..., None, :]
@@ -192,7 +190,6 @@ def _interval_moments(
     spread = jnp.sum(weights[..., None, None] * products, axis=1) / less
     covariance = jnp.sum(weights[..., None, None] ** 2 * products, axis=1)
     information = -jnp.sum(weights[..., None, None] * H, axis=1) - spread
-    size = jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1), 0)
     num_truncated = jnp.sum(truncated, dtype=jnp.int32)
     moments = (mean.sum(axis=0), covariance.sum(axis=0), information.sum(axis=0))
-    return moments, size, num_truncated
+    return moments, effective_size(weights), num_truncated

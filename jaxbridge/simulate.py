@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from .arrays import Numbers, as_floating, is_traced
-from .bridges import check_key
 from .diffusion import Diffusion, Dynamics, check_diffusion, ito_correction
-from .intervals import check_count
+from .intervals import check_count, check_key
 from .sigma import AbstractSigma, Diagonal
 
 

@@ -20,6 +20,11 @@ _MISSING = (
     "duration or choose a smaller `gamma`; on intervals much shorter than the relaxation time "
     "pairs hardly ever meet: use `ModifiedDiffusionBridge()` or `Guided()` there."
 )
+_FAILED = (
+    "some paths left the finite numbers or the state space, or ended where they have no density, "
+    "so that intervals are without bridges: take more steps, transform the coordinates, or check "
+    "that the end points lie in the state space."
+)
 _TRUNCATED = (
     "some weights were cut off by `max_trials`, and what they weigh is hardly ever hit: allow more "
     "trials, or fit a start law by `fit_start_law`."
@@ -32,12 +37,15 @@ def throw_where_incomplete(
     model: PyTree,
     missing: Bool[Array, "..."],
     truncated: Bool[Array, "..."] | None = None,
+    *,
+    coupled: bool = True,
 ) -> _Result:
-    """The result, whose `field` raises `RuntimeError` if anything is missing or cut off."""
+    """The result, whose `field` raises `RuntimeError` if anything is missing or cut off. What is
+    missing has not met if pairs were `coupled`."""
     value = getattr(result, field)
     for bad, message in [
         (~all_finite_leaves(model), _PARAMETERS),
-        (jnp.any(missing), _MISSING),
+        (jnp.any(missing), _MISSING if coupled else _FAILED),
         (None if truncated is None else jnp.any(truncated), _TRUNCATED),
     ]:
         if bad is not None:

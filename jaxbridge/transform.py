@@ -114,6 +114,7 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
         functions.diffusion,
         functions.log_stationary if model.has_density else None,
         model.params,
+        reverse_drift=functions.reverse_drift if model.has_reverse_drift else None,
         sample_stationary=functions.sample_stationary if model.has_sampler else None,
         reversible=model.reversible,
         normalised=model.normalised,
@@ -127,6 +128,7 @@ class _Functions(NamedTuple):
 
     drift: Callable
     diffusion: Callable
+    reverse_drift: Callable
     log_stationary: Callable
     sample_stationary: Callable
 
@@ -151,7 +153,14 @@ def _functions(unbound: Diffusion, forward: Map, inverse: Map) -> _Functions:
         return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in units]
 
     def drift(y, params):
-        x, dynamics = at(y, params)
+        return moved_drift(*at(y, params))
+
+    def reverse_drift(y, params):
+        x, _ = at(y, params)
+        return moved_drift(x, unbound.with_params(params).backward(x))
+
+    def moved_drift(x, dynamics):
+        """Itô's formula: ∇f α + ½ Σ_k ∂²f(σ_k, σ_k), with the columns σ_k of σ."""
         moved = along(x, dynamics.drift(x))
         for column in columns(x, dynamics):
             moved += jax.jvp(lambda x, v=column: along(x, v), (x,), (column,))[1] / 2
@@ -170,4 +179,4 @@ def _functions(unbound: Diffusion, forward: Map, inverse: Map) -> _Functions:
     def sample_stationary(key, params):
         return f(unbound.with_params(params).sample_stationary(key))
 
-    return _Functions(drift, diffusion, log_stationary, sample_stationary)
+    return _Functions(drift, diffusion, reverse_drift, log_stationary, sample_stationary)

@@ -16,11 +16,10 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Int, Key
 
 from .arrays import Numbers
-from .bridges import check_key
-from .choice import as_proposal, settled, singles
+from .choice import Choice, as_proposal, settled, singles, uses_couplings
 from .coupled_pairs import CoupledPairs
 from .diffusion import Diffusion, check_diffusion
-from .intervals import Intervals, as_intervals, check_count
+from .intervals import Intervals, as_intervals, check_count, check_key
 from .kernels import sum_by_interval
 from .start_laws import Reversed, Stationary
 from .throwing import throw_where_incomplete
@@ -75,10 +74,10 @@ def transition_log_density(
     - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`. The
         density is with respect to `end`, in units of space to the power -d.
     - `num_proposals`: for each interval. One that does not meet counts as zero.
-    - `proposal`: a `Coupling`, with its start law; by default `Coupling(gamma=0.0)`. With
-        `Stationary()` the model's `log_stationary` must be normalised (those of
-        `ornstein_uhlenbeck` and `hyperbolic` are); with a start law that has a density it
-        need not be, for its constant cancels. Or `ModifiedDiffusionBridge()`,
+    - `proposal`: a `Coupling`, with its start law; by default `Coupling(gamma=0.0)` if the model
+        is declared `normalised`. With `Stationary()` the model's `log_stationary` must be
+        normalised (those of `ornstein_uhlenbeck` and `hyperbolic` are); with a start law that has
+        a density it need not be, for its constant cancels. Or `ModifiedDiffusionBridge()`,
         `ResidualBridge()` or `Guided()`, which need no stationary law; or "auto", which tries
         couplings only if the model is declared `normalised`; or what `choose_proposal` returns.
     - `num_counts`: N hitting counts for each proposal, by default one.
@@ -108,6 +107,14 @@ def transition_log_density(
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, _ = as_intervals(start, end, duration)
     like = intervals.start[0]
+    if proposal is None and not model.normalised:
+        raise ValueError(
+            "the default proposal, a coupling from the stationary law, gives the density in "
+            "proportion to `log_stationary`: where that is normalised, declare it by "
+            "`Diffusion(..., normalised=True)`; otherwise choose a `proposal`, for instance "
+            '"auto", `ModifiedDiffusionBridge()`, or a `Coupling` with a start law that has a '
+            "density (`fit_start_law`)."
+        )
     proposal = as_proposal(proposal, model, like, num_counts, None, max_trials, for_density=True)
     proposal.check(model, intervals)
     check_for_density(proposal, model)
@@ -117,7 +124,9 @@ def transition_log_density(
     if not throw:
         return estimate
     missing, truncated = estimate.num_met == 0, estimate.num_truncated > 0
-    return throw_where_incomplete(estimate, "value", model, missing, truncated)
+    return throw_where_incomplete(
+        estimate, "value", model, missing, truncated, coupled=uses_couplings(proposal)
+    )
 
 
 def check_for_density(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
@@ -130,10 +139,10 @@ def check_for_density(proposal: AbstractWeightedProposal, model: Diffusion) -> N
             "proposal that does not need it, such as `ModifiedDiffusionBridge()` or `Guided()`."
         )
     stationary = [isinstance(pair.coupling.start_law, Stationary | Reversed) for pair in pairs]
-    if any(stationary) and len(singles(proposal)) > 1 and not model.normalised:
+    if any(stationary) and isinstance(proposal, Choice) and not model.normalised:
         raise ValueError(
-            "this choice uses a coupling from the stationary law beside other proposals, and their "
-            "densities agree only if `log_stationary` is normalised: declare that by "
+            "this choice may use a coupling from the stationary law, whose densities agree with "
+            "those of other proposals only if `log_stationary` is normalised: declare that by "
             "`Diffusion(..., normalised=True)`, or choose between other proposals."
         )
 

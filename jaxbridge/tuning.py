@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from .arrays import Numbers, is_traced
-from .bridges import check_key, sample_bridges
+from .bridges import sample_bridges
 from .burn_in import measure_burn_in
 from .choice import (
     Choice,
@@ -32,7 +32,7 @@ from .coupling import Coupling
 from .diffusion import Diffusion, check_diffusion
 from .gaussian import GaussianLaw
 from .importance import weigh_bridges
-from .intervals import Intervals, as_intervals, check_count
+from .intervals import Intervals, as_intervals, check_count, check_key
 from .search import key_for, most_lanes
 from .start_laws import AnyStartLaw, Stationary, draw_starts, needs_burn_in
 

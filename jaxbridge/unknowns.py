@@ -141,7 +141,8 @@ def as_normal(prior: NormalPrior, unknowns: Unknowns, theta: Float[Array, " p"])
     def as_vector(name, value):
         structure, like = jax.tree.structure(unknowns.params), jax.tree.leaves(unknowns.params)
         is_array = hasattr(value, "ndim")
-        if is_array and len(like) == 1 and value.shape == like[0].shape and name == "mean":
+        alike = is_array and len(like) == 1 and value.shape == like[0].shape
+        if alike and (name == "mean" or value.shape != (p, p)):
             value = jnp.ravel(value)
         if jax.tree.structure(value) == structure and not is_array:
             leaves = [as_floating(f"prior.{name}", leaf) for leaf in jax.tree.leaves(value)]

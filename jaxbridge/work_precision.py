@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from .arrays import Numbers, cast_floats
-from .bridges import check_key, sample_bridges, stored_steps
+from .bridges import sample_bridges
 from .chains import sample_exact_bridges
 from .choice import as_proposal, describe, singles
 from .coupled_pairs import CoupledPairs
@@ -35,9 +35,10 @@ from .coupling import AbstractCoupling, Coupling
 from .diagnostics import effective_sample_size
 from .diffusion import Diffusion, check_diffusion, is_linear
 from .gaussian import OrnsteinUhlenbeckParams, gaussian_bridge, ou_transition
+from .grid import stored_steps
 from .guided import AbstractGuidedProposal
 from .importance import sample_weighted_bridges
-from .intervals import as_intervals, check_count
+from .intervals import as_intervals, check_count, check_key
 from .meeting import AbstractMeeting, BrownianCrossing
 from .schemes import AbstractScheme, Euler, GaussianTransition, Heun
 from .search import key_for

@@ -237,6 +237,7 @@ def test_chain_without_a_bridge_is_nan_and_said():
         )
         assert not chain.met.any() and not chain.accepted.any()
         assert np.isnan(chain.paths).all()
+        assert chain.num_simulated >= 21 * 9  # in each step, and for the first path
         kernel = getattr(jb, method)(*arguments, max_proposals=9)
         state = kernel.init(None, jax.random.key(0))
         state, info = kernel.step(jax.random.key(1), state)
@@ -306,6 +307,8 @@ def test_errors_say_what_to_change(unchecked):
         jb.pseudo_marginal(blind, *interval)
     with pytest.raises(TypeError, match="`proposal` must be"):
         jb.sample_exact_bridges(key, model, *interval, proposal=0.5)
+    with pytest.raises(ValueError, match="counts nothing"):
+        jb.sample_exact_bridges(key, model, *interval, method="renewal", num_counts=2)
 
 
 @pytest.mark.slow

@@ -165,3 +165,21 @@ def test_bad_couplings():
         jb.Coupling(jnp.zeros(3))
     with pytest.raises(ValueError, match="reflection coupling only"):
         jb.Coupling(0.5, jb.ReflectionPlane())
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1.5, -1.1])
+def test_gamma_out_of_its_range_where_it_cannot_be_seen(gamma):
+    """From a law, or traced: then no pair meets, and all are counted."""
+    model = paper_model()
+
+    def run(coupling):
+        return jb.sample_bridges(
+            jax.random.key(0), model, [0.0, 0.0], [0.3, 0.1], 1.0,
+            num_steps=10, coupling=coupling, max_proposals=20,
+        )  # fmt: skip
+
+    for bridges in (
+        run(jb.Coupling(lambda key: jnp.asarray(gamma))),
+        jax.jit(lambda gamma: run(jb.Coupling(gamma)))(gamma),
+    ):
+        assert not bridges.met.any() and bridges.num_nonfinite == bridges.num_proposals

@@ -7,6 +7,7 @@ import pytest
 from inference import grid_moments, multivariate_ou, ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
+from jaxbridge.unknowns import as_normal, as_unknowns
 
 TIMES = np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 20, 1.0)])
 DATA = ou_data(3, TIMES)
@@ -342,8 +343,37 @@ def test_other_types_are_refused(unchecked):
         jb.gibbs(*arguments, prior=3.0, where=RATE)
     with pytest.raises(TypeError, match="renewal is for couplings"):
         jb.gibbs(*arguments, prior=PRIOR, where=RATE, proposal=jb.Guided(), method="renewal")
+    with pytest.raises(TypeError, match='bridges="approximate" is for couplings'):
+        guided = dict(proposal=jb.Guided(), bridges="approximate")
+        jb.gibbs(*arguments, prior=PRIOR, where=RATE, **guided)
     with pytest.raises(TypeError, match="`constraint` must be"):
         jb.gibbs(*arguments, prior=PRIOR, where=RATE, constraint=3.0)
+
+
+def test_a_prior_may_have_the_shape_of_the_parameters():
+    model = multivariate_ou()[0]
+    unknowns, theta = as_unknowns(model, lambda p: p.B, jnp.zeros(2))
+    variance = jnp.array([[1.0, 2.0], [3.0, 4.0]])
+    prior = as_normal(jb.NormalPrior(jnp.eye(2), variance), unknowns, theta)
+    np.testing.assert_allclose(prior.mean, [1, 0, 0, 1])
+    np.testing.assert_allclose(prior.precision @ np.diag([1.0, 2.0, 3.0, 4.0]), np.eye(4))
+
+
+@pytest.mark.slow
+def test_a_choice_made_before_serves_for_intervals_of_other_lengths():
+    intervals = (DATA[:-1], DATA[1:], np.diff(TIMES))
+    choice = jb.choose_proposal(jax.random.key(0), ou_1d(), *intervals, num_steps=8)
+    made = jb.gibbs(
+        jax.random.key(1),
+        ou_1d(),
+        TIMES,
+        DATA,
+        proposal=choice,
+        step_size=0.1,
+        num_iterations=2,
+        **OPTIONS,
+    )
+    assert np.isfinite(made.theta).all() and made.num_missing.sum() == 0
 
 
 @pytest.mark.slow

@@ -15,25 +15,6 @@ import jaxbridge as jb
 from jaxbridge import plot, study_figures
 
 
-@pytest.mark.parametrize("correlation", [-0.8, 0.0, 0.6])
-def test_gaussian_copula(correlation):
-    u, v = np.meshgrid([0.1, 0.5, 0.9], [0.2, 0.5, 0.7])
-    law = scipy.stats.multivariate_normal(cov=[[1, correlation], [correlation, 1]])
-    expected = law.cdf(np.stack([scipy.stats.norm.ppf(u), scipy.stats.norm.ppf(v)], -1))
-    np.testing.assert_allclose(plot.gaussian_copula(u, v, correlation), expected, atol=1e-5)
-
-
-def test_empirical_copula_counts_ranks():
-    samples = np.random.default_rng(0).normal(size=(97, 2))
-    grid = np.linspace(0, 1, 11)
-    ranks = scipy.stats.rankdata(samples, axis=0)
-    expected = [
-        [np.mean((ranks[:, 0] <= 97 * u + 1e-9) & (ranks[:, 1] <= 97 * v + 1e-9)) for v in grid]
-        for u in grid
-    ]
-    np.testing.assert_allclose(plot.empirical_copula(samples, 10), expected)
-
-
 def test_qq_of_the_exact_law_lies_on_the_diagonal():
     quantiles = 2 + 3 * scipy.stats.norm.ppf((np.arange(20_000) + 0.5) / 20_000)
     ax = plot.qq({"exact draws": quantiles}, 2.0, 3.0)
@@ -94,6 +75,24 @@ def test_bands_of_weighted_bridges():
     np.testing.assert_allclose(median.get_ydata(), 45)
     drawn = [line.get_ydata()[0] for line in ax.lines if line is not median]
     assert all(40 <= value <= 50 for value in drawn) and len(drawn) == 2
+
+
+def test_bridges_not_found_are_left_out():
+    rng = np.random.default_rng(0)
+    draws = rng.normal(size=(400, 2))
+    half = np.concatenate([draws, np.full((400, 2), np.nan)])
+    for draw in (
+        lambda sample: plot.qq({"sample": sample[:, 0]}, 0.0, 1.0),
+        lambda sample: plot.copula_levels({"sample": sample}, np.eye(2)),
+    ):
+        with_missing, without = draw(half), draw(draws)
+        for one, other in zip(with_missing.lines, without.lines, strict=True):
+            np.testing.assert_array_equal(one.get_data(), other.get_data())
+        for one, other in zip(with_missing.collections, without.collections, strict=True):
+            paths = (one.get_paths(), other.get_paths())
+            assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(*paths, strict=True))
+    with pytest.raises(ValueError, match="all are NaN"):
+        plot.qq({"none": np.full(3, np.nan)}, 0.0, 1.0)
 
 
 def test_axes_that_are_given_are_used_and_returned():

@@ -138,6 +138,13 @@ def test_gaussian_law_is_normalised_and_sampled():
     np.testing.assert_allclose(jax.vmap(law.log_density)(draws[:50]), expected, atol=1e-4)
 
 
+def test_pairs_that_explode_have_not_met():
+    """Explicit steps of a quartic well that are far too long: nothing stays finite."""
+    quartic = jb.Diffusion(lambda x, p: -2 * x**3, None, lambda x, p: -jnp.sum(x**4))
+    with pytest.raises(ValueError, match="have not all met"):
+        jb.measure_burn_in(jax.random.key(0), quartic, [3.0], 20.0, num_steps=10)
+
+
 def test_errors_say_what_to_change(unchecked):
     with pytest.raises(TypeError, match="`start_law` must be"):
         as_start_law(3.0)

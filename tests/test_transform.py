@@ -78,6 +78,19 @@ def test_a_planar_model_is_that_of_the_closed_form(x64):
     np.testing.assert_allclose(ours.sample_stationary(key), swirl(ou.sample_stationary(key)))
 
 
+def test_a_reversal_that_was_given_comes_along(x64):
+    """dX = -(I + J) X dt + dW turns, and backwards the other way: known by its two drifts alone,
+    it has the reversal that the stationary density of the transformed process gives."""
+    turn = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    drifts = [lambda x, p, s=sign: -x + s * turn @ x for sign in (-1, 1)]
+    known = jb.Diffusion(drifts[0], reverse_drift=drifts[1])
+    by_density = jb.Diffusion(drifts[0], None, lambda x, p: -x @ x)
+    x = jnp.array([0.4, -0.9])
+    ours, theirs = (jb.transform(m, swirl, unswirl).model for m in (known, by_density))
+    np.testing.assert_allclose(ours.reverse_drift(x), theirs.reverse_drift(x), rtol=1e-8)
+    assert abs(ours.reverse_drift(x) - ours.drift(x)).max() > 0.5
+
+
 def test_a_constant_sigma_that_was_given_as_an_array_comes_along(x64):
     model = jb.Diffusion(lambda x, p: -x, 0.5 * np.eye(2), lambda x, p: -4 * x @ x)
     scaled = jb.transform(model, lambda x: 2 * x, lambda y: y / 2).model

@@ -182,3 +182,16 @@ def test_errors_say_what_to_change(unchecked):
         jb.transition_log_density(
             jax.random.key(0), paper_model(), [0.0, 0.0], [1.0, 0.0], 1.0, proposal="coupling"
         )
+
+
+def test_a_constant_that_is_not_known_is_refused(unchecked):
+    """The default coupling's density has the constant of `log_stationary`."""
+    model = jb.langevin(lambda x, p: -x @ x)
+    ends = ([0.0], [0.5], 1.0)
+    with pytest.raises(ValueError, match="in proportion to `log_stationary`"):
+        jb.transition_log_density(jax.random.key(0), model, *ends)
+    choice = jb.choose_proposal(
+        jax.random.key(0), model, *ends, candidates=[jb.Coupling(0.5)], num_pilot=8
+    )
+    with pytest.raises(ValueError, match="normalised=True"):
+        jb.transition_log_density(jax.random.key(0), model, *ends, proposal=choice)
