@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Inexact, PyTree, Shaped
 
 # A function of one path; its values may be truth values and counts.
 PathFunction = Callable[[Array], PyTree]
@@ -31,16 +31,21 @@ def filled(paths: Float[Array, "*I n K d"], met: Bool[Array, "*I n"]) -> Float[A
 
 
 def values_of(fn: PathFunction, paths: Float[Array, "*I n K d"]) -> PyTree:
-    """`fn` of every path, as floating point numbers with leading axes (*I, n)."""
+    """`fn` of every path, with leading axes (*I, n); truth values and counts as numbers."""
     each = jax.vmap(fn)
     for _ in paths.shape[:-3]:
         each = jax.vmap(each)
-    return jax.tree.map(lambda value: value.astype(paths.dtype), each(paths))
+
+    def number(value):
+        inexact = jnp.issubdtype(value.dtype, jnp.inexact)
+        return value if inexact else value.astype(paths.dtype)
+
+    return jax.tree.map(number, each(paths))
 
 
 def weighted_mean(
-    weights: Float[Array, "*I n"], values: Float[Array, "..."]
-) -> Float[Array, "..."]:
+    weights: Float[Array, "*I n"], values: Inexact[Array, "..."]
+) -> Inexact[Array, "..."]:
     """Σ w h, for weights that sum to one and values of shape (*I, n, ...); NaN where nothing has
     weight."""
     axis = weights.ndim - 1
@@ -49,6 +54,6 @@ def weighted_mean(
     return jnp.where(jnp.sum(each, axis) > 0, total, jnp.nan)
 
 
-def expanded(weights: Float[Array, "*I n"], values: Float[Array, "..."]) -> Float[Array, "..."]:
+def expanded(weights: Shaped[Array, "*I n"], values: Inexact[Array, "..."]) -> Shaped[Array, "..."]:
     """The weights with as many axes as the values."""
     return weights.reshape(*weights.shape, *[1] * (values.ndim - weights.ndim))

@@ -24,7 +24,7 @@ from .coupling import AbstractCoupling, Coupling, rotate, rotation_between, see
 from .diffusion import Diffusion, check_diffusion
 from .intervals import as_intervals, check_count, check_key, check_model
 from .lanes import over_lanes
-from .linalg import all_finite
+from .linalg import all_finite, is_finite
 from .meeting import PairStep
 from .noise import noisy_scan
 from .schemes import fitted_in_lanes
@@ -32,6 +32,8 @@ from .search import key_for
 from .start_laws import MOST_STEPS, Stationary, needs_burn_in, run_for
 
 _NUM_PAIRS = 512
+# Pairs that explode are left out, as they are from bridges; but not if so many do.
+_MOST_EXPLODED = 0.5
 
 
 def with_burn_in(
@@ -71,8 +73,8 @@ def measure_burn_in(
 
     **Arguments:** as in `sample_bridges`; only the scheme and the step matter.
 
-    **Raises:** `ValueError` where the diffusion has not forgotten its start after 2¹⁷ steps
-    (inside `jit` the time is then infinite), or for arguments that do not fit.
+    **Raises:** `ValueError` where the diffusion has not forgotten its start after 2¹⁷ steps, or
+    most paths explode (inside `jit` the time is then infinite), or for arguments that do not fit.
 
     **Example:**
 
@@ -95,7 +97,8 @@ def measure_burn_in(
         raise ValueError(
             "two copies of the reversed diffusion have not all met after 2¹⁷ steps, so it has "
             "not forgotten its start: take longer steps (a longer `duration` or fewer "
-            "`num_steps`), or give `Diffusion` a sampler of its stationary law."
+            "`num_steps`), or give `Diffusion` a sampler of its stationary law. Or most paths left "
+            "the finite numbers: then take shorter steps, or `SemiImplicit()` as the scheme."
         )
     return time
 
@@ -157,19 +160,22 @@ def _measure(
             )[0]
 
         pairs = (end, driven, jnp.zeros(_NUM_PAIRS, bool))
-        return jnp.all(lax.fori_loop(0, repeats, once, pairs)[2])
+        x, driven, met = lax.fori_loop(0, repeats, once, pairs)
+        exploded = ~met & ~jnp.all(is_finite(x) & is_finite(driven), axis=0)
+        too_many = jnp.mean(exploded) > _MOST_EXPLODED
+        return jnp.all(met | exploded) & ~too_many, too_many
 
     most = max(0, (MOST_STEPS // 2 // num_steps).bit_length() - 1)
 
     def going_on(state):
-        doublings, all_met = state
-        return ~all_met & (doublings < most)
+        doublings, (all_met, too_many) = state
+        return ~all_met & ~too_many & (doublings < most)
 
     def double(state):
         doublings, _ = state
         return doublings + 1, attempt(doublings + 1)
 
     init = (jnp.int32(0), attempt(jnp.int32(0)))
-    doublings, all_met = lax.while_loop(going_on, double, init)
+    doublings, (all_met, _) = lax.while_loop(going_on, double, init)
     time = 2 * num_steps * jnp.max(dt) * (2**doublings).astype(dt.dtype)
     return jnp.where(all_met, time, jnp.inf)

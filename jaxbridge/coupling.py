@@ -181,7 +181,8 @@ class Coupling(AbstractCoupling):
     **Arguments:**
 
     - `gamma`: γ in [-1, 1); or a law, a function `key -> γ`, from which each proposal draws
-        its own.
+        its own. Pairs whose γ is out of that range, which only a law or a traced value can be,
+        never meet, and are counted in `num_nonfinite`.
     - `meeting`: `BrownianCrossing()`, `SignTest(radius)` or, for γ = -1, `ReflectionPlane()`.
     - `scheme`: `Heun()`, `Euler()`, `Milstein()`, for stiff or superlinear drift
         `SemiImplicit()`, for linear drift `GaussianTransition()`.

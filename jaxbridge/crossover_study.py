@@ -239,5 +239,5 @@ def write_crossover_figure(rates: Sequence[Rate], directory: Path) -> list[Path]
     from . import study_figures
 
     path = directory / "crossover.png"
-    study_figures.crossover(rates).savefig(path, dpi=150)
+    study_figures.crossover(rates, _LONG).savefig(path, dpi=150)
     return [path]

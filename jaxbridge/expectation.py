@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import PyTree
 
 from .averages import PathFunction, filled, values_of, weighted_mean
+from .choice import singles
 from .diffusion import Diffusion, check_diffusion
 from .importance import WeightedBridges
 from .kernels import Chain
@@ -72,7 +73,8 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
     fractions = np.diff(bridges.proposal.fractions(bridges.num_steps))
     duration = lax.stop_gradient(bridges.times)[..., -1:]
     steps = jnp.asarray(fractions, duration.dtype) * duration
-    form = forms_of_target(bridges.proposal, model, paths.reshape(-1, paths.shape[-1])[0])[0]
+    like = paths.reshape(-1, paths.shape[-1])[0]
+    form = forms_of_target(singles(bridges.proposal), model, like)[0]
     log_f = log_likelihood_of_steps(model, steps, paths, form)
     largest = jnp.max(log_weights, axis=-1, keepdims=True)
     ratios = jnp.exp(log_weights - largest + log_f - lax.stop_gradient(log_f))

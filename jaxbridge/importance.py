@@ -96,8 +96,10 @@ class WeightedBridges(eqx.Module):
         weights, axis = self.weights, self.log_weights.ndim - 1
 
         def error(value):
-            deviation = value - jnp.expand_dims(weighted_mean(weights, value), axis)
-            return jnp.sqrt(jnp.sum((expanded(weights, value) * deviation) ** 2, axis))
+            mean, each = weighted_mean(weights, value), expanded(weights, value)
+            deviation = value - jnp.expand_dims(mean, axis)
+            squares = jnp.where(each > 0, (each * deviation) ** 2, 0)
+            return jnp.where(jnp.isnan(mean), jnp.nan, jnp.sqrt(jnp.sum(squares, axis)))
 
         return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from .arrays import Numbers, as_floating, is_traced
-from .averages import PathFunction, filled, values_of, weighted_mean
+from .averages import PathFunction, expanded, filled, values_of, weighted_mean
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling
 from .diagnostics import effective_sample_size
@@ -79,7 +79,8 @@ class Chain(eqx.Module):
         return jax.tree.map(lambda value: weighted_mean(weights, value), self._values(fn))
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """That of `mean(fn)`, from the effective sample size of the chain, entry by entry."""
+        """That of `mean(fn)`, from the effective sample size of the chain, of at least four states,
+        entry by entry."""
         weights, axis = self._weights, self.met.ndim - 1
         size = effective_sample_size
         for _ in range(axis):
@@ -87,7 +88,10 @@ class Chain(eqx.Module):
 
         def error(value):
             deviation = value - jnp.expand_dims(weighted_mean(weights, value), axis)
-            return jnp.sqrt(weighted_mean(weights, deviation**2) / size(value))
+            there = expanded(self.met, value)
+            share = jnp.mean(there, axis=axis, dtype=value.dtype)
+            many = size(jnp.where(there, deviation, 0)) * share
+            return jnp.sqrt(weighted_mean(weights, deviation**2) / many)
 
         return jax.tree.map(error, self._values(fn))
 

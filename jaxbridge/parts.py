@@ -20,6 +20,8 @@ from .start_laws import Reversed, Stationary, needs_burn_in
 from .transition import check_for_density
 from .weighted import AbstractWeightedProposal
 
+_FOR_APPROXIMATE = ('bridges="approximate"', 'bridges="exact"')
+
 # num_counts, max_proposals, max_trials
 Bounds = tuple[int | None, int | None, int | None]
 
@@ -70,7 +72,8 @@ def make_parts(
     for part_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
         mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
         chosen = as_proposal(proposal, model, mine.start[0], *bounds, for_density=for_density)
-        if isinstance(chosen, Choice) and _is_for(chosen, intervals):
+        if isinstance(chosen, Choice) and chosen.chosen is not None:
+            chosen.check(model, intervals)
             chosen = chosen.of(group.which)
         chosen.check(model, mine)
         if for_density:
@@ -78,7 +81,7 @@ def make_parts(
         if moving and weighted:
             _check_for_moving(chosen, model, for_density)
         if only_couplings:
-            chosen = as_pairs(chosen, 'bridges="approximate"' if not weighted else "renewal")
+            chosen = as_pairs(chosen) if weighted else as_pairs(chosen, *_FOR_APPROXIMATE)
         chosen = settled(chosen, part_key, model, mine, group.num_steps)
         if weighted:
             chosen = chosen.prepared(part_key, model, mine, group.num_steps)
@@ -89,12 +92,8 @@ def make_parts(
 
 def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
     """Those of the path likelihood that go with the bridges of all parts."""
-    return forms_of_target([part.proposal for part in parts], model, parts[0].intervals.start[0])
-
-
-def _is_for(choice: Choice, intervals: Intervals) -> bool:
-    """Whether the choice has been made, for all these intervals."""
-    return choice.chosen is not None and choice.chosen.shape == intervals.duration.shape
+    proposals = [singles(part.proposal) for part in parts]
+    return forms_of_target(proposals, model, parts[0].intervals.start[0])
 
 
 def _check_for_moving(

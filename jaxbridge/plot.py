@@ -276,7 +276,7 @@ def posterior(
     ```
     """
     ax = axes_or_new(ax)
-    flat = {name: np.ravel(np.asarray(values, float)) for name, values in draws.items()}
+    flat = {name: there(name, np.ravel(values)) for name, values in draws.items()}
     everything = np.concatenate(list(flat.values()))
     edges = np.linspace(everything.min(), everything.max(), bins + 1)
     for i, (name, values) in enumerate(flat.items()):

@@ -56,5 +56,5 @@ def there(name: str, draws: Float[Reals, "n ..."]) -> Float[np.ndarray, "m ..."]
     draws = np.asarray(draws, float)
     kept = draws[np.isfinite(draws).reshape(len(draws), -1).all(axis=1)]
     if len(kept) == 0:
-        raise ValueError(f"the sample {name!r} must have draws that are numbers; all are NaN.")
+        raise ValueError(f"the sample {name!r} must have draws that are finite; none is.")
     return kept

@@ -149,7 +149,7 @@ def run_renewal(
     num_intervals = intervals.start.shape[0]
     pairs = pairs.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, num_intervals, num_bridges, batched)
-    first, proposed = first_paths(init_keys, model, pairs, intervals, num_steps)
+    first, num_tried, num_failed = first_paths(init_keys, model, pairs, intervals, num_steps)
     most_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
     num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, most_segments))
     length = -(-num_bridges // num_segments)
@@ -232,8 +232,8 @@ def run_renewal(
         None,
         jnp.all(jnp.isfinite(paths), axis=(-2, -1)),
         None,
-        total(segments.num_simulated) + total(proposed.num_trials),
-        total(segments.num_nonfinite) + total(proposed.num_nonfinite),
+        total(segments.num_simulated) + total(num_tried),
+        total(segments.num_nonfinite) + total(num_failed),
         total(jnp.zeros(num, jnp.int32)),
         pairs,
         num_steps,
@@ -301,16 +301,21 @@ def first_paths(
     pairs: CoupledPairs,
     intervals: Intervals,
     num_steps: int,
-) -> tuple[Float[Array, "I points d"], Found]:
-    """A bridge by proposal for each interval, NaN where none was found; and the search for it."""
+) -> tuple[Float[Array, "I points d"], Int[Array, " I"], Int[Array, " I"]]:
+    """A bridge by proposal for each interval, NaN where none was found; how many proposals that
+    took, and how many of them left the finite numbers."""
     proposed = propose_paths(keys, model.prepared(), pairs, intervals, None, num_steps)
     joined: Joined = proposed.outputs
-    return jnp.where((proposed.num_found > 0)[:, None, None], joined.paths, jnp.nan), proposed
+    paths = jnp.where((proposed.num_found > 0)[:, None, None], joined.paths, jnp.nan)
+    return paths, proposed.num_trials, proposed.num_nonfinite
 
 
-def as_pairs(proposal: AbstractWeightedProposal, method: str = "renewal") -> CoupledPairs:
+def as_pairs(
+    proposal: AbstractWeightedProposal,
+    method: str = "renewal",
+    instead: str = 'method="pseudo_marginal"',
+) -> CoupledPairs:
     """The proposal, which must be a coupling's for this method."""
     if not isinstance(proposal, CoupledPairs):
-        other = {"renewal": 'method="pseudo_marginal"'}.get(method, 'bridges="exact"')
-        raise TypeError(f"{method} is for couplings: pass a `Coupling`, or choose {other}.")
+        raise TypeError(f"{method} is for couplings: pass a `Coupling`, or choose {instead}.")
     return proposal

@@ -85,9 +85,9 @@ def cost(costs: Sequence[Any], slope: float) -> Figure:
     return figure
 
 
-def crossover(rates: Sequence[Any]) -> Figure:
+def crossover(rates: Sequence[Any], long: float) -> Figure:
     """Effective samples per second against the duration, a panel for each process: results of
-    `crossover_study.run_crossover`."""
+    `crossover_study.run_crossover`. Durations from `long` on, with more steps, are shaded."""
     names = list(dict.fromkeys(rate.process for rate in rates))
     figure = Figure(figsize=(4.1 * len(names), 3.8), layout="constrained")
     panels = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
@@ -103,6 +103,10 @@ def crossover(rates: Sequence[Any]) -> Figure:
                 style |= {"markersize": 4, "linewidth": 1.2}
             ax.loglog(duration, np.maximum(value, 1e-1), label=proposal, **style)
         ax.set(xlabel="duration T", title=name.replace("-", "–"))
+        longest = max(rate.duration for rate in group)
+        if longest >= long:
+            ax.axvspan(long / 2, 2 * longest, color="0.95", zorder=0)
+        ax.margins(x=0)
         ax.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("effective samples per second")
     panels[0].set_ylim(bottom=3)

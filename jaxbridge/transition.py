@@ -141,8 +141,8 @@ def check_for_density(proposal: AbstractWeightedProposal, model: Diffusion) -> N
     stationary = [isinstance(pair.coupling.start_law, Stationary | Reversed) for pair in pairs]
     if any(stationary) and isinstance(proposal, Choice) and not model.normalised:
         raise ValueError(
-            "this choice may use a coupling from the stationary law, whose densities agree with "
-            "those of other proposals only if `log_stationary` is normalised: declare that by "
+            "this choice may use a coupling from the stationary law, whose densities are known "
+            "only in proportion, unless `log_stationary` is normalised: declare that by "
             "`Diffusion(..., normalised=True)`, or choose between other proposals."
         )
 

@@ -59,6 +59,31 @@ def test_a_chain_before_its_first_path():
     np.testing.assert_allclose(share[0], np.mean(paths[0, 7:, 1, 0] > 0), atol=1e-6)
 
 
+def test_standard_error_of_a_late_chain_is_that_of_its_states():
+    paths = np.random.default_rng(0).normal(size=(5_000, 1, 1)).astype(np.float32)
+    paths[:4_500] = np.nan
+    np.testing.assert_allclose(chain_of(jnp.asarray(paths)).standard_error(), 500**-0.5, rtol=0.2)
+
+
+def test_values_without_weight_may_be_anything():
+    paths = jnp.array([1.0, 2.0, -1.0])[:, None, None]
+    weighted = jb.WeightedBridges(
+        times=jnp.zeros(1),
+        paths=paths,
+        log_weights=jnp.log(jnp.array([0.5, 0.5, 0.0])),
+        met=jnp.ones(3, bool),
+        truncated=jnp.zeros(3, bool),
+        num_simulated=jnp.int32(3),
+        num_nonfinite=jnp.int32(0),
+        proposal=jb.ModifiedDiffusionBridge(),
+        num_steps=1,
+    )
+    log = lambda path: jnp.log(path[0, 0])  # NaN for the last
+    np.testing.assert_allclose(weighted.mean(log), np.log(2) / 2, rtol=1e-6)
+    # √Σ w² (h - mean)² = √(2 · ¼ · (½ log 2)²)
+    np.testing.assert_allclose(weighted.standard_error(log), np.log(2) / np.sqrt(8), rtol=1e-6)
+
+
 def test_missing_bridges_have_no_weight():
     paths = np.arange(12.0, dtype=np.float32).reshape(3, 2, 2)
     paths[1] = np.nan

@@ -59,6 +59,6 @@ def test_table_and_figure_show_the_share_of_the_best():
     assert share_of_best(rates(), 0.05) == 0.75 and share_of_best(rates(), 20.0) == 0.8
     table = format_crossover(rates())
     assert "0.75" in table and "0.80" in table and "c(0)" in table and "T = 20" in table
-    (ax,) = study_figures.crossover(rates()).axes
+    (ax,) = study_figures.crossover(rates(), 5.0).axes
     assert ax.get_title() == "double well" and len(ax.get_lines()) == 3
     assert len({process.name for process in processes()}) == 3

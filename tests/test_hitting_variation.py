@@ -57,3 +57,6 @@ def test_errors_say_what_to_change(unchecked):
     weighted = jb.weigh_bridges(key, model, bridges)
     with pytest.raises(ValueError, match="two or more increasing"):
         jb.hitting_variation(key, model, weighted, num_counts=(5, 5))
+    with pytest.raises(ValueError, match="must be two or more"):
+        one = jb.sample_exact_bridges(key, model, [0.0, 0.0], [0.5, 0.0], 1.0, num_bridges=1)
+        jb.hitting_variation(key, model, one)

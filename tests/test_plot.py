@@ -91,7 +91,7 @@ def test_bridges_not_found_are_left_out():
         for one, other in zip(with_missing.collections, without.collections, strict=True):
             paths = (one.get_paths(), other.get_paths())
             assert all(np.array_equal(a.vertices, b.vertices) for a, b in zip(*paths, strict=True))
-    with pytest.raises(ValueError, match="all are NaN"):
+    with pytest.raises(ValueError, match="finite; none is"):
         plot.qq({"none": np.full(3, np.nan)}, 0.0, 1.0)
 
 
