@@ -133,7 +133,9 @@ def hitting_variation(
     )
 
 
-def _regress(rho: Float[Array, "n K"], weights: Float[Array, " n"], sizes: Int[np.ndarray, " K"]):
+def _regress(
+    rho: Float[Array, "n K"], weights: Float[Array, " n"], sizes: Int[Array | np.ndarray, " K"]
+):
     """V(ρ̂_N), then intercept and slope of its regression on 1/N, the mean and the ratio."""
     weights = weights / jnp.sum(weights)
     mean = weights @ rho

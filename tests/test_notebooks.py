@@ -3,7 +3,7 @@
 import json
 import pathlib
 
-import matplotlib
+import matplotlib.pyplot
 import pytest
 
 NOTEBOOKS = sorted((pathlib.Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
@@ -18,6 +18,7 @@ def test_notebook_runs(path, monkeypatch):
     for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
         if cell["cell_type"] == "code":
             exec("".join(cell["source"]), namespace)
+    matplotlib.pyplot.close("all")
 
 
 def test_there_are_notebooks():
