@@ -106,7 +106,7 @@ def crossover(rates: Sequence[Any], long: float) -> Figure:
         longest = max(rate.duration for rate in group)
         if longest >= long:
             ax.axvspan(long / 2, 2 * longest, color="0.95", zorder=0)
-        ax.margins(x=0)
+        ax.set_xlim(0.7 * min(rate.duration for rate in group), 1.4 * longest)
         ax.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("effective samples per second")
     panels[0].set_ylim(bottom=3)
