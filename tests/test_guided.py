@@ -478,16 +478,18 @@ def test_what_cannot_be_a_bridge_is_refused_or_flagged(unchecked, proposal):
         assert 1 <= float(estimate.effective_sample_size) <= 4.001
 
 
-def test_explosions_are_counted_and_never_returned():
+@pytest.mark.parametrize(("start", "found"), [(6.0, 0), (1.0, 200)])
+def test_explosions_are_counted_and_never_returned(start, found):
+    """The drift alone explodes in steps of one where |x| > √2."""
     cubic = jb.Diffusion(lambda x, p: -(x**3))
     weighted = jb.sample_weighted_bridges(
-        jax.random.key(0), cubic, [6.0], [0.0], 20.0, num_bridges=200, num_steps=20,
+        jax.random.key(0), cubic, [start], [0.0], 20.0, num_bridges=200, num_steps=20,
         proposal=jb.ResidualBridge(),
     )  # fmt: skip
-    assert int(weighted.num_nonfinite) == int((~weighted.met).sum()) > 0
+    assert int(weighted.met.sum()) == 200 - int(weighted.num_nonfinite) == found
     assert np.isnan(weighted.paths[~weighted.met]).all()
     assert np.isfinite(weighted.paths[weighted.met]).all()
-    assert np.isfinite(weighted.mean()).all()
+    assert (np.isfinite(weighted.mean()) == (found > 0)).all()  # of none there is no mean
 
 
 def test_errors_say_what_to_change(unchecked):
