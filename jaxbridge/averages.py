@@ -54,6 +54,17 @@ def weighted_mean(
     return jnp.where(jnp.sum(each, axis) > 0, total, jnp.nan)
 
 
+def mean_over_paths(
+    fn: PathFunction,
+    weights: Float[Array, "*I n"],
+    paths: Float[Array, "*I n K d"],
+    met: Bool[Array, "*I n"],
+) -> PyTree:
+    """The weighted mean of `fn` over the paths that there are."""
+    values = values_of(fn, filled(paths, met))
+    return jax.tree.map(lambda value: weighted_mean(weights, value), values)
+
+
 def expanded(weights: Shaped[Array, "*I n"], values: Inexact[Array, "..."]) -> Shaped[Array, "..."]:
     """The weights with as many axes as the values."""
     return weights.reshape(*weights.shape, *[1] * (values.ndim - weights.ndim))

@@ -19,6 +19,7 @@ from .averages import (
     effective_size,
     expanded,
     filled,
+    mean_over_paths,
     normalised,
     values_of,
     weighted_mean,
@@ -88,8 +89,7 @@ class WeightedBridges(eqx.Module):
         """The weighted mean of `fn(path)`, a function of one path of shape (K, d), by default
         the path itself: an estimate of its expectation over exact bridges. NaN where there are
         none."""
-        values = values_of(fn, filled(self.paths, self.met))
-        return jax.tree.map(lambda value: weighted_mean(self.weights, value), values)
+        return mean_over_paths(fn, self.weights, self.paths, self.met)
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """That of `mean(fn)`, by the delta method, entry by entry."""

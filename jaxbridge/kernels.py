@@ -11,7 +11,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from .arrays import Numbers, as_floating, is_traced
-from .averages import PathFunction, expanded, filled, values_of, weighted_mean
+from .averages import (
+    PathFunction,
+    expanded,
+    filled,
+    mean_over_paths,
+    values_of,
+    weighted_mean,
+)
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling
 from .diagnostics import effective_sample_size
@@ -75,8 +82,7 @@ class Chain(eqx.Module):
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
         """The mean of `fn(path)`, a function of one path of shape (K, d), by default the path
         itself: an estimate of its expectation over exact bridges. NaN where there are none."""
-        weights = self._weights
-        return jax.tree.map(lambda value: weighted_mean(weights, value), self._values(fn))
+        return mean_over_paths(fn, self._weights, self.paths, self.met)
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """That of `mean(fn)`, from the effective sample size of the chain, of at least four states,
@@ -93,15 +99,12 @@ class Chain(eqx.Module):
             many = size(jnp.where(there, deviation, 0)) * share
             return jnp.sqrt(weighted_mean(weights, deviation**2) / many)
 
-        return jax.tree.map(error, self._values(fn))
+        return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
 
     @property
     def _weights(self) -> Float[Array, "*I n"]:
         met = self.met.astype(self.paths.dtype)
         return met / jnp.maximum(jnp.sum(met, axis=-1, keepdims=True), 1)
-
-    def _values(self, fn: PathFunction) -> PyTree:
-        return values_of(fn, filled(self.paths, self.met))
 
 
 def acceptance_rate(

@@ -68,20 +68,20 @@ def make_parts(
         candidates = [each for each in candidates if not isinstance(each, AbstractCoupling)]
         proposal = undecided_between(candidates, model, like, None, *bounds)
         bounds = (None, None, None)
+    given = as_proposal(proposal, model, like, *bounds, for_density=for_density)
+    given.check(model, intervals)
+    if for_density:
+        check_for_density(given, model)
+    if moving and weighted:
+        _check_for_moving(given, model, for_density)
+    if only_couplings:
+        given = as_pairs(given) if weighted else as_pairs(given, *_FOR_APPROXIMATE)
     parts = []
     for part_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
         mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
-        chosen = as_proposal(proposal, model, mine.start[0], *bounds, for_density=for_density)
-        if isinstance(chosen, Choice) and chosen.chosen is not None:
-            chosen.check(model, intervals)
-            chosen = chosen.of(group.which)
-        chosen.check(model, mine)
-        if for_density:
-            check_for_density(chosen, model)
-        if moving and weighted:
-            _check_for_moving(chosen, model, for_density)
-        if only_couplings:
-            chosen = as_pairs(chosen) if weighted else as_pairs(chosen, *_FOR_APPROXIMATE)
+        chosen = given
+        if isinstance(given, Choice) and given.chosen is not None:
+            chosen = given.of(group.which)
         chosen = settled(chosen, part_key, model, mine, group.num_steps)
         if weighted:
             chosen = chosen.prepared(part_key, model, mine, group.num_steps)

@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 try:
     import matplotlib.pyplot as plt
@@ -45,7 +45,7 @@ def found(
     values = np.asarray(paths, float)
     if values.ndim != 3:
         raise ValueError(f"`paths` must have shape (n, K, d); got shape {values.shape}.")
-    (index,) = np.nonzero(np.all(np.isfinite(values), axis=(1, 2)))
+    (index,) = np.nonzero(_finite(values))
     if len(index) == 0:
         raise ValueError("`paths` must have a bridge to draw: none of these was found.")
     return values[index], index
@@ -54,7 +54,12 @@ def found(
 def there(name: str, draws: Float[Reals, "n ..."]) -> Float[np.ndarray, "m ..."]:
     """The draws that are numbers: those of bridges that were found."""
     draws = np.asarray(draws, float)
-    kept = draws[np.isfinite(draws).reshape(len(draws), -1).all(axis=1)]
+    kept = draws[_finite(draws)]
     if len(kept) == 0:
         raise ValueError(f"the sample {name!r} must have draws that are finite; none is.")
     return kept
+
+
+def _finite(rows: Float[np.ndarray, "n ..."]) -> Bool[np.ndarray, " n"]:
+    """Which rows have finite numbers only."""
+    return np.asarray(np.isfinite(rows).reshape(len(rows), -1).all(axis=1))

@@ -68,7 +68,8 @@ class PMMHPosterior(AbstractPosterior):
     - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
     - `accepted`: shape (*chains, n).
     - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
-        parameters were refused because no estimate was to be had, shape (*chains,).
+        parameters were refused because no estimate was to be had, shape (*chains,). With couplings
+        also where no pair met, which is an estimate of zero and leaves the law exact.
     - `num_truncated`: weights that `max_trials` cut off, in all these iterations, shape
         (*chains,): where there are many the law is not exact.
     - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.

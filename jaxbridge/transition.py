@@ -107,7 +107,7 @@ def transition_log_density(
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, _ = as_intervals(start, end, duration)
     like = intervals.start[0]
-    if proposal is None and not model.normalised:
+    if proposal is None and model.has_density and not model.normalised:
         raise ValueError(
             "the default proposal, a coupling from the stationary law, gives the density in "
             "proportion to `log_stationary`: where that is normalised, declare it by "
