@@ -74,7 +74,6 @@ from .guided import (
     AbstractGuidedProposal,
     Guided,
     ModifiedDiffusionBridge,
-    NoiseLaw,
     ResidualBridge,
     Step,
 )
@@ -128,7 +127,7 @@ from .start_laws import (
 from .step_density import (
     AbstractStepDensity,
     EulerDensity,
-    TrapezoidDensity,
+    ItoTaylorDensity,
 )
 from .transform import Transformed, transform
 from .transition import (
@@ -183,7 +182,7 @@ __all__ = [
     "Guided",
     "ResidualBridge",
     "EulerDensity",
-    "TrapezoidDensity",
+    "ItoTaylorDensity",
     # Exact bridges, by Markov chains or weights.
     "sample_exact_bridges",
     "Chain",
@@ -250,7 +249,6 @@ __all__ = [
     "AbstractStepDensity",
     "AbstractGuidedProposal",
     "Step",
-    "NoiseLaw",
     "AbstractWeightedProposal",
     "CoupledPairs",
     "AbstractPosterior",

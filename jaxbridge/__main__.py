@@ -78,7 +78,7 @@ posterior of 50."""
 _WHAT_TO_SEE_CROSSOVER = """\
 Thousands of effective samples per second, compile time left out, of a run of 200,000 proposals in
 50 steps (T up to 1) or 20,000 in 1,000 (from T = 5 on); fewer for couplings alone. The step error
-is of second order for all: Heun for couplings, the trapezoid density for the others. "auto"
+is of second order for all: Heun for couplings, the Itô–Taylor density for the others. "auto"
 includes its pilot runs."""
 
 

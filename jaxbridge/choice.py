@@ -36,7 +36,7 @@ from .hitting import check_max_trials
 from .intervals import Intervals, check_count
 from .search import check_bound, key_for
 from .start_laws import Stationary
-from .step_density import EulerDensity, TrapezoidDensity
+from .step_density import EulerDensity, ItoTaylorDensity
 from .weighted import AbstractWeightedProposal, WeightedPaths
 
 # Bounds the tries for one bridge, unless the user says otherwise.
@@ -291,7 +291,7 @@ def uses_couplings(proposal: AbstractWeightedProposal) -> bool:
 
 def guided_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[AbstractWeightedProposal]:
     """With the same order of step error as couplings, where that is to be had."""
-    density = EulerDensity() if model.forward(like).sigma_varies else TrapezoidDensity()
+    density = EulerDensity() if model.forward(like).sigma_varies else ItoTaylorDensity()
     guided = [Guided(along, density) for along in ("end", "path")]
     return [ModifiedDiffusionBridge(density), *guided]
 

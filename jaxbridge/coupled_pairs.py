@@ -107,6 +107,7 @@ class CoupledPairs(AbstractWeightedProposal):
                 counts.truncated | unusable,
                 proposed.num_trials + counts.num_trials,
                 proposed.num_nonfinite + counts.num_nonfinite,
+                jnp.full_like(log_weights, jnp.nan),
             )
             return jax.tree.map(
                 lambda leaf: leaf.reshape(num_intervals, num_draws, *leaf.shape[1:]), made
@@ -138,6 +139,7 @@ class CoupledPairs(AbstractWeightedProposal):
             counts.truncated | unusable,
             counts.num_trials,
             counts.num_nonfinite,
+            jnp.full_like(log_weights, jnp.nan),
         )
         return jax.tree.map(lambda leaf: leaf[:, None], made)
 

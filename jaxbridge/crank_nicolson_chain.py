@@ -40,12 +40,14 @@ from .weighted import AbstractWeightedProposal
 
 
 class CrankNicolsonState(NamedTuple):
-    """`position`, the path, shape (N+1, d); the `noise` it is made from, (N-1, d); and its
-    `log_weight`, -inf for a path that left the finite numbers."""
+    """`position`, the path, shape (N+1, d); the `noise` it is made from, (N-1, d); its
+    `log_weight`, -inf for a path that left the finite numbers; and its `log_halving`, the log of
+    the factor by which half as many steps would change that (`halving`)."""
 
     position: Float[Array, "*I points d"]
     noise: Float[Array, "*I steps d"]
     log_weight: Float[Array, "*I"]
+    log_halving: Float[Array, "*I"]
 
 
 class CrankNicolsonInfo(NamedTuple):
@@ -120,11 +122,11 @@ def _init(
     dynamics = model.forward(intervals.start[0])
     if paths is None:
         noise = _normal(keys, num_steps, intervals)
-        paths, log_weights = path_of(proposal, dynamics, intervals, noise)
+        paths, log_weights, log_halving = path_of(proposal, dynamics, intervals, noise)
     else:
-        noise, log_weights = noise_of(proposal, dynamics, intervals, paths)
+        noise, log_weights, log_halving = noise_of(proposal, dynamics, intervals, paths)
         noise = jnp.where(jnp.isfinite(noise), noise, 0)  # a path outside the state space is left
-    return CrankNicolsonState(paths, noise, _finite(log_weights))
+    return CrankNicolsonState(paths, noise, _finite(log_weights), log_halving)
 
 
 @eqx.filter_jit
@@ -150,8 +152,8 @@ def _move(
     beta = beta.astype(dtype)
     fresh = _normal(noise_keys, state.noise.shape[1] + 1, intervals)
     noise = jnp.sqrt((1 - beta) * (1 + beta)) * state.noise + beta * fresh
-    paths, log_weights = path_of(proposal, dynamics, intervals, noise)
-    candidate = CrankNicolsonState(paths, noise, _finite(log_weights))
+    paths, log_weights, log_halving = path_of(proposal, dynamics, intervals, noise)
+    candidate = CrankNicolsonState(paths, noise, _finite(log_weights), log_halving)
     rate = acceptance_rate(state.log_weight, candidate.log_weight)
     uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=dtype))(accept_keys)
     accepted = uniform < rate

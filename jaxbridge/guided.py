@@ -1,23 +1,23 @@
-"""Proposals that are pulled to the end point: the Euler scheme with bent noise.
+"""Proposals that are pulled to the end point: a chain of normal steps with bent noise.
 
-On a grid 0 = t_0 < ... < t_N = T with steps δ_i the Euler scheme is
+On a grid 0 = t_0 < ... < t_N = T with steps δ_i the target is a chain (`step_density`) of steps
 
-    x_{i+1} = μ_i + √δ_i σ(x_i) y_i,    μ_i = x_i + α(x_i) δ_i,    y_i ~ N(0, I).
+    x_{i+1} = μ_i + √δ_i R_i y_i,    R_i = σ(x_i) L(x_i),    y_i ~ N(0, I);
 
-A proposal goes the same steps with y_i ~ N(m_i, C_i), which may depend on x_i, and x_N = b. Its
-weight is the Euler density of the path over that of the proposal,
+the Euler scheme has μ_i = x_i + α(x_i) δ_i and L = I. A proposal goes the same steps with
+y_i ~ N(m_i, C_i), which may depend on x_i, and x_N = b. Its weight is the density of the path under
+the target over that under the proposal,
 
-    w = N(b; μ_{N-1}, V(x_{N-1}) δ_{N-1}) Π_{i<N-1} N(y_i; 0, I) / N(y_i; m_i, C_i),
+    w = N(b; μ_{N-1}, R Rᵀ δ_{N-1}) Π_{i<N-1} N(y_i; 0, I) / N(y_i; m_i, C_i),
 
-so E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b] for the Euler scheme without any further error, and
-for the diffusion up to its step error, O(δ). With the densities of another discretisation in
-the place of Euler's (`step_density`) that is the target: for constant σ O(δ²) is to be had. No
-stationary law is called for.
+so E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b] for the target without any further error, and for the
+diffusion up to the target's step error, O(δ), or O(δ²) by `ItoTaylorDensity`. No stationary law is
+called for.
 
 m and C follow from a guess h_{i+1}(x) of the density of b seen from x at t_{i+1}. Where log h
 is quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting N(0, I) by h gives
 
-    C = (I + δ σᵀ H̃ σ)⁻¹,    m = √δ C σᵀ r̃
+    C = (I + δ Rᵀ H̃ R)⁻¹,    m = √δ C Rᵀ r̃
 
 (r̃ and H̃ as in Schauer, van der Meulen & van Zanten 2017; the discrete form as in Whitaker,
 Golightly, Boys & Sherlock 2017). With the true density in the place of h this is Doob's
@@ -37,14 +37,23 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from .arrays import Numbers, as_floating, is_traced
 from .devices import num_devices
 from .diffusion import Diffusion, Dynamics
+from .halving import (
+    Opened,
+    Pairing,
+    close_pair,
+    log_of_step,
+    of_all_steps,
+    open_pair,
+    pair_up,
+)
 from .intervals import Intervals, check_model
 from .lanes import join_rows, over_lanes, split_rows
-from .linalg import all_finite, cholesky, dot, inverse, matmul, matvec, solve, total
+from .linalg import all_finite, cholesky, inverse, matmul, matvec
 from .noise import Store, noisy_scan
 from .schemes import Euler
 from .search import most_lanes
 from .sigma import AbstractSigma
-from .step_density import AbstractStepDensity, EulerDensity
+from .step_density import AbstractStepDensity, EulerDensity, StepLaw
 from .weighted import (
     AbstractWeightedProposal,
     WeightedPaths,
@@ -53,38 +62,14 @@ from .weighted import (
     masked,
 )
 
+# For constant σ D of `halving` is worked out for one in so many paths, but for so many at least.
+_LOOKED_SHARE, _FEWEST_LOOKED = 8, 32
 # Of the duration: shorter steps are lost in the rounding of points.
 _SHORTEST_STEP = 1e-10
 
 
-class NoiseLaw(NamedTuple):
-    """N(m, L Lᵀ), the law of one step's standardised noise, which `noise_law` of an
-    `AbstractGuidedProposal` returns: `mean` is m, shape (d,), and `root` L, a number, shape (), or
-    a lower triangle, (d, d)."""
-
-    mean: Float[Array, " d"]
-    root: Float[Array, "..."]
-
-    def bend(self, xi: Float[Array, " d"]) -> Float[Array, " d"]:
-        """y = m + L ξ."""
-        return self.mean + (self.root * xi if self.root.ndim == 0 else matvec(self.root, xi))
-
-    def unbend(self, y: Float[Array, " d"]) -> Float[Array, " d"]:
-        """ξ = L⁻¹ (y - m)."""
-        centred = y - self.mean
-        return centred / self.root if self.root.ndim == 0 else solve(self.root, centred)
-
-    def log_weight(self, xi: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
-        """log [N(y; 0, I) / N(y; m, L Lᵀ)]."""
-        if self.root.ndim == 0:
-            log_det = xi.shape[0] * jnp.log(self.root)
-        else:
-            log_det = total(jnp.log(jnp.diagonal(self.root)))
-        return (dot(xi, xi) - dot(y, y)) / 2 + log_det
-
-
 class Step(NamedTuple):
-    """One step of one interval, as `noise_law` of an `AbstractGuidedProposal` sees it.
+    """One step of one interval, as `step_law` of an `AbstractGuidedProposal` sees it.
 
     - `guide`: what the proposal worked out for the step.
     - `dt`: its length δ_i, in units of time.
@@ -99,10 +84,10 @@ class Step(NamedTuple):
 
 
 class AbstractGuidedProposal(AbstractWeightedProposal):
-    """Euler paths whose noise is bent so that they end in b.
+    """Paths in steps as the target's, but pulled so that they end in b.
 
-    A proposal is a law of the noise, `noise_law`, and what can be worked out for it before any
-    path is simulated, `guide`. `density` is that of the target's steps, and `refinement` is ρ
+    A proposal is another law of each step, `step_law`, and what can be worked out for it before
+    any path is simulated, `guide`. `density` is that of the target's steps, and `refinement` is ρ
     in t_i = T [1 - (1 - i/N)^ρ].
     """
 
@@ -117,17 +102,11 @@ class AbstractGuidedProposal(AbstractWeightedProposal):
         end: Float[Array, " d"],
         dt: Float[Array, " N"],
     ) -> PyTree:
-        """Anything with leading axis N - 1, of which `noise_law` sees one entry per step."""
+        """Anything with leading axis N - 1, of which `step_law` sees one entry per step."""
 
     @abstractmethod
-    def noise_law(
-        self,
-        step: Step,
-        x: Float[Array, " d"],
-        drift: Float[Array, " d"],
-        sigma: AbstractSigma,
-    ) -> NoiseLaw:
-        """N(m_i, C_i) at x_i = x, given α(x) and σ(x)."""
+    def step_law(self, step: Step, x: Float[Array, " d"], target: StepLaw) -> StepLaw:
+        """The law of the proposal's step from x_i = x, with the same σ, given the target's."""
 
     def check(self, model, intervals):
         check_model(model, intervals, Euler())
@@ -167,9 +146,8 @@ class AbstractGuidedProposal(AbstractWeightedProposal):
 
     def reweigh(self, keys, model, intervals, paths, active=None):
         dynamics = model.forward(intervals.start[0])
-        _, log_weights = noise_of(self, dynamics, intervals, paths)
-        kept = paths[:, None]
-        made = _weighted(kept, log_weights[:, None])
+        _, log_weights, log_halving = noise_of(self, dynamics, intervals, paths)
+        made = _weighted(paths[:, None], log_weights[:, None], log_halving[:, None])
         return made if active is None else masked(made, active)
 
 
@@ -185,7 +163,7 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
     **Arguments:**
 
     - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
-        `TrapezoidDensity()` is far closer to the diffusion.
+        `ItoTaylorDensity()` is far closer to the diffusion.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
@@ -207,8 +185,8 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
     def guide(self, dynamics, start, end, dt):
         return None
 
-    def noise_law(self, step, x, drift, sigma):
-        return _bridge_law(step, sigma, (step.end - x) / step.remaining - drift)
+    def step_law(self, step, x, target):
+        return _bridge_law(step, target, x + (step.end - x) * (step.dt / step.remaining))
 
 
 class ResidualBridge(AbstractGuidedProposal):
@@ -223,7 +201,7 @@ class ResidualBridge(AbstractGuidedProposal):
     **Arguments:**
 
     - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
-        `TrapezoidDensity()` is far closer to the diffusion.
+        `ItoTaylorDensity()` is far closer to the diffusion.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
@@ -243,13 +221,13 @@ class ResidualBridge(AbstractGuidedProposal):
         self.refinement = _check_refinement(refinement)
 
     def guide(self, dynamics, start, end, dt):
-        xi, xi_end = deterministic_path(dynamics, start, dt)
-        slope = jax.vmap(dynamics.drift)(xi)
-        return slope[:-1], (xi + end - xi_end)[:-1]
+        xi, xi_end = deterministic_path(self.density, dynamics, start, dt)
+        moved = jnp.concatenate([xi[1:], xi_end[None]]) - xi
+        return moved[:-1], (xi + end - xi_end)[:-1]
 
-    def noise_law(self, step, x, drift, sigma):
-        slope, target = step.guide
-        return _bridge_law(step, sigma, slope - drift + (target - x) / step.remaining)
+    def step_law(self, step, x, target):
+        moved, aim = step.guide
+        return _bridge_law(step, target, x + moved + (aim - x) * (step.dt / step.remaining))
 
 
 class _GaussianGuess(NamedTuple):
@@ -265,8 +243,7 @@ class Guided(AbstractGuidedProposal):
 
         dX̃ = [α̃ + F (X̃ - b)] dt + σ̃ dW,
 
-    on the same Euler grid, so that for an Ornstein–Uhlenbeck process and `EulerDensity` all
-    weights are equal.
+    in steps as the target's, so that for an Ornstein–Uhlenbeck process all weights are equal.
 
     **Arguments:**
 
@@ -274,7 +251,7 @@ class Guided(AbstractGuidedProposal):
         of them linearised along the deterministic path dξ = α(ξ) dt from the start, bent so that
         it ends in b; or a matrix F of shape (d, d), with α(b) and σ(b).
     - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
-        `TrapezoidDensity()` is far closer to the diffusion.
+        `ItoTaylorDensity()` is far closer to the diffusion.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
@@ -330,7 +307,7 @@ class Guided(AbstractGuidedProposal):
             )
         points = end[None]
         if self._along == "path":
-            xi, xi_end = deterministic_path(dynamics, start, dt)
+            xi, xi_end = deterministic_path(self.density, dynamics, start, dt)
             done = jnp.concatenate([jnp.zeros_like(dt[:1]), jnp.cumsum(dt)[:-1]]) / jnp.sum(dt)
             points = xi + done[:, None] * (end - xi_end)
         coefficients = jax.vmap(lambda x: self._linear(dynamics, x, end))(points)
@@ -339,16 +316,17 @@ class Guided(AbstractGuidedProposal):
             """h_i from h_{i+1}, by one step of the linear process."""
             (F, drift, V), dt = inputs
             shift, H = guess
-            step = jnp.eye(d, dtype=end.dtype) + F * dt
-            gain = inverse(jnp.eye(d, dtype=end.dtype) + matmul(H, V) * dt)
-            shift = matvec(step.T, matvec(gain, shift - matvec(H, drift) * dt))
-            H = matmul(step.T, matmul(matmul(gain, H), step))
+            step = self.density.linear_step(F, V, dt)
+            gain = inverse(jnp.eye(d, dtype=end.dtype) + matmul(H, step.covariance))
+            shift = shift - matvec(H, matvec(step.integral, drift))
+            shift = matvec(step.decay.T, matvec(gain, shift))
+            H = matmul(step.decay.T, matmul(matmul(gain, H), step.decay))
             return _GaussianGuess(shift, (H + H.T) / 2), guess
 
         F, drift, V = jax.tree.map(lambda leaf: leaf[-1], coefficients)
-        step = jnp.eye(d, dtype=end.dtype) + F * dt[-1]
-        pull = matmul(step.T, inverse(V))  # of the last step, from t_{N-1} to b itself
-        last = _GaussianGuess(-matvec(pull, drift), matmul(pull, step) / dt[-1])
+        step = self.density.linear_step(F, V, dt[-1])
+        pull = matmul(step.decay.T, inverse(step.covariance))  # from t_{N-1} to b itself
+        last = _GaussianGuess(-matvec(pull, matvec(step.integral, drift)), matmul(pull, step.decay))
         num_steps = dt.shape[0]
         each = jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (num_steps, *leaf.shape[1:]))[:-1], coefficients
@@ -356,14 +334,14 @@ class Guided(AbstractGuidedProposal):
         _, guesses = lax.scan(back, last, (each, dt[:-1]), reverse=True)
         return guesses
 
-    def noise_law(self, step, x, drift, sigma):
+    def step_law(self, step, x, target):
         shift, H = step.guide
-        d, root_dt = x.shape[0], jnp.sqrt(step.dt)
-        r = shift - matvec(H, x + drift * step.dt - step.end)
-        curvature = _congruence(H, sigma, d)
-        C = inverse(jnp.eye(d, dtype=x.dtype) + step.dt * curvature)
-        C = (C + C.T) / 2
-        return NoiseLaw(root_dt * matvec(C, sigma.mv_transpose(r)), cholesky(C))
+        r = shift - matvec(H, target.mean - step.end)
+        columns = jax.vmap(target.pulled_back, in_axes=1, out_axes=1)(H)
+        C = inverse(jnp.eye(x.shape[0], dtype=x.dtype) + jax.vmap(target.pulled_back)(columns))
+        root, bend = cholesky((C + C.T) / 2), matvec(C, target.pulled_back(r))
+        root = target.root * root if target.root.ndim == 0 else matmul(target.root, root)
+        return target._replace(mean=target.point(bend), root=root)
 
     def _linear(self, dynamics: Dynamics, x: Float[Array, " d"], end: Float[Array, " d"]):
         """F, the linear drift at b, and Ṽ, when the diffusion is linearised at x."""
@@ -374,19 +352,23 @@ class Guided(AbstractGuidedProposal):
 
 
 class _Steps(NamedTuple):
-    """The fields of `Step` that change from step to step, for a scan."""
+    """What changes from step to step, for a scan: the fields of `Step`, and the pairs of
+    `halving`."""
 
     guide: PyTree
     dt: Float[Array, "*steps I"]
     remaining: Float[Array, "*steps I"]
+    pairing: Pairing
 
 
 class _State(NamedTuple):
-    """The point where a path is, its log weight so far, and what was seen at that point."""
+    """The point where a path is and its log weight so far; for some of the paths D of `halving`
+    so far, with the step before, which may have opened a pair."""
 
     x: Float[Array, "d *lanes"]
     log_weight: Float[Array, "*lanes"]
-    seen: PyTree
+    log_halving: Float[Array, "*looked"]
+    opened: Opened
 
 
 class _Lanes:
@@ -408,10 +390,13 @@ class _Lanes:
         guide = jax.vmap(proposal.guide, in_axes=(None, 0, 0, 1), out_axes=-1)(
             dynamics, start, end, dt
         )
-        self._num_draws = num_draws
+        self._num_draws, self._num_steps = num_draws, num_steps
+        self._num_looked = _num_looked(num_draws, dynamics.sigma_varies)
         self._of_lane = None if start.shape[0] == 1 else -1
-        self.start, self.end, self._last_dt = start.T, end.T, dt[-1]
-        self.steps = _Steps(guide, dt[:-1], remaining[:-1])
+        self.start, self.end = start.T, end.T
+        each = (dt, remaining, pair_up(dt))
+        self.steps = _Steps(guide, *jax.tree.map(lambda leaf: leaf[:-1], each))
+        self._last = _Steps(None, *jax.tree.map(lambda leaf: leaf[-1], each))
         self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.density
 
     def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
@@ -421,19 +406,27 @@ class _Lanes:
     def begin(self) -> _State:
         """Paths at their start, with weight one."""
         start = self.spread(self.start)
-        look = over_lanes(-1)(lambda x: self._density.look(self._dynamics, x))
-        return _State(start, jnp.zeros_like(start[0]), look(start))
+
+        def open_none(x):  # as a pair that is never closed
+            zero = jnp.zeros((), x.dtype)
+            law = self._density.steps_from(self._dynamics, x)(zero)
+            return zero, open_pair(self._dynamics, x, law, zero)
+
+        log_halving, opened = over_lanes(-1)(open_none)(self._looked(start))
+        return _State(start, jnp.zeros_like(start[0]), log_halving, opened)
 
     def advance(self, state: _State, xi: Float[Array, "d lanes"], steps: _Steps) -> _State:
         """One step with the noise ξ, and the weight with its factor."""
 
         def one(state, xi, step):
-            law, mu, sigma = _step_law(self._proposal, self._dynamics, step, state.x)
-            y = law.bend(xi)
-            x_next = mu + jnp.sqrt(step.dt) * sigma.mv(y)
-            return self._weighed(state, x_next, law.log_weight(xi, y), step.dt)
+            steps = self._density.steps_from(self._dynamics, state.x)
+            law = self._proposal.step_law(step, state.x, steps(step.dt))
+            x_next = law.point(xi)
+            return x_next, self._log_weight(steps(step.dt), law, x_next, xi)
 
-        return over_lanes(-1, -1, self._of_lane)(one)(state, xi, self._step(steps))
+        each = (-1, -1, self._of_lane)
+        x_next, log_weight = over_lanes(*each)(one)(state, xi, self._of_each(self._step(steps)))
+        return self._moved(state, x_next, log_weight, steps)
 
     def retrace(
         self, state: _State, x_next: Float[Array, "d lanes"], steps: _Steps
@@ -441,61 +434,74 @@ class _Lanes:
         """The step to these points, and the noise ξ that it takes."""
 
         def one(state, x_next, step):
-            law, mu, sigma = _step_law(self._proposal, self._dynamics, step, state.x)
-            y = sigma.solve(x_next - mu) / jnp.sqrt(step.dt)
-            xi = law.unbend(y)
-            return self._weighed(state, x_next, law.log_weight(xi, y), step.dt), xi
+            steps = self._density.steps_from(self._dynamics, state.x)
+            law = self._proposal.step_law(step, state.x, steps(step.dt))
+            xi = law.noise(x_next)
+            return xi, self._log_weight(steps(step.dt), law, x_next, xi)
 
-        return over_lanes(-1, -1, self._of_lane)(one)(state, x_next, self._step(steps))
+        each = (-1, -1, self._of_lane)
+        xi, log_weight = over_lanes(*each)(one)(state, x_next, self._of_each(self._step(steps)))
+        return self._moved(state, x_next, log_weight, steps), xi
 
-    def finish(self, state: _State) -> Float[Array, " lanes"]:
-        """The log weights with that of the last step, to b."""
+    def finish(self, state: _State) -> tuple[Float[Array, " lanes"], Float[Array, "I m"]]:
+        """The log weights with that of the last step, to b, and D of the paths that are looked
+        at."""
 
-        def one(state, last):
+        def one(x, last):
+            # Steps may lead out of the state space, where no bridge ends.
             end, dt = last
-            # Euler steps may lead out of the state space, where no bridge ends.
             inside = all_finite(self._dynamics.drift(end))
             inside &= jnp.isfinite(self._dynamics.sigma(end).log_abs_det())
-            density = _log_euler_density(self._dynamics, state.x, end, dt)
-            weighed = self._weighed(state, end, density, dt)
-            return jnp.where(inside, weighed.log_weight, jnp.nan)
+            log_density = self._density.steps_from(self._dynamics, x)(dt).log_density(end)
+            return jnp.where(inside, log_density, jnp.nan)
 
-        last = self._for_lanes((self.end, self._last_dt))
-        return over_lanes(-1, self._of_lane)(one)(state, last)
+        last = self._of_each((self.end, self._last.dt))
+        log_weight = over_lanes(-1, self._of_lane)(one)(state.x, last)
+        end = self.spread(self.end)
+        state = self._moved(state, end, log_weight, self._last)
+        log_halving = of_all_steps(state.log_halving, self._num_steps)
+        return state.log_weight, log_halving.reshape(-1, self._num_looked)
 
     def _step(self, steps: _Steps) -> Step:
-        return Step(*self._for_lanes((*steps, self.end)))
+        return Step(steps.guide, steps.dt, steps.remaining, self.end)
 
-    def _for_lanes(self, of_intervals: PyTree) -> PyTree:
-        """Without an axis for a single interval, which all lanes share."""
+    def _of_each(self, of_intervals: PyTree) -> PyTree:
+        """For each lane; without an axis for a single interval, which all lanes share."""
         if self._of_lane is None:
             return jax.tree.map(lambda leaf: leaf[..., 0], of_intervals)
         return jax.tree.map(self.spread, of_intervals)
 
-    def _weighed(self, state: _State, x_next, log_weight, dt) -> _State:
-        """The state at x_next, given the weight of the Euler step."""
-        seen = self._density.look(self._dynamics, x_next)
-        both = (state.x, x_next, state.seen, seen)
-        log_weight += self._density.log_ratio(self._dynamics, *both, dt)
-        return _State(x_next, state.log_weight + log_weight, seen)
+    def _looked(self, leaf: Float[Array, "*shape lanes"]) -> Float[Array, "*shape looked"]:
+        """The first paths of each interval, of which D is worked out."""
+        leaf = leaf.reshape(*leaf.shape[:-1], -1, self._num_draws)[..., : self._num_looked]
+        return leaf.reshape(*leaf.shape[:-2], -1)
 
+    @staticmethod
+    def _log_weight(target: StepLaw, law: StepLaw, point, xi) -> Float[Array, ""]:
+        return target.log_relative(target.noise(point)) - law.log_relative(xi)
 
-def _step_law(
-    proposal: AbstractGuidedProposal, dynamics: Dynamics, step: Step, x: Float[Array, " d"]
-) -> tuple[NoiseLaw, Float[Array, " d"], AbstractSigma]:
-    """N(m_i, C_i), μ_i and σ at x."""
-    drift, sigma = dynamics.drift(x), dynamics.sigma(x)
-    return proposal.noise_law(step, x, drift, sigma), x + drift * step.dt, sigma
+    def _moved(self, state: _State, x_next, log_weight, steps: _Steps) -> _State:
+        """The state at x_next, given the weight of the step."""
+        density, dynamics = self._density, self._dynamics
 
+        def one(opened, x, x_next, dt, pairing):
+            laws = density.steps_from(dynamics, x)
+            log_density = log_of_step(dynamics, laws(dt), laws(dt).noise(x_next))
+            change = close_pair(dynamics, opened, x, x_next, (pairing.before, dt), log_density)
+            change = jnp.where(pairing.ends, change, 0)
+            return change, open_pair(dynamics, x, laws(dt + pairing.after), log_density)
 
-def _log_euler_density(
-    dynamics: Dynamics, x: Float[Array, " d"], x_next: Float[Array, " d"], dt: Float[Array, ""]
-) -> Float[Array, ""]:
-    """log N(x_next; x + α(x) δ, V(x) δ)."""
-    sigma = dynamics.sigma(x)
-    white = sigma.solve(x_next - x - dynamics.drift(x) * dt)
-    log_det = x.shape[0] * jnp.log(2 * np.pi * dt) / 2 + sigma.log_abs_det()
-    return -dot(white, white) / dt / 2 - log_det
+        of_intervals = (steps.dt, steps.pairing)
+        if self._of_lane is None:
+            of_intervals = self._of_each(of_intervals)
+        else:
+            repeat = lambda leaf: jnp.repeat(leaf, self._num_looked, axis=-1)
+            of_intervals = jax.tree.map(repeat, of_intervals)
+        points = (self._looked(state.x), self._looked(x_next))
+        change, opened = over_lanes(-1, -1, -1, self._of_lane, self._of_lane)(one)(
+            state.opened, *points, *of_intervals
+        )
+        return _State(x_next, state.log_weight + log_weight, state.log_halving + change, opened)
 
 
 def noise_of(
@@ -503,9 +509,9 @@ def noise_of(
     dynamics: Dynamics,
     intervals: Intervals,
     paths: Float[Array, "I points d"],
-) -> tuple[Float[Array, "I steps d"], Float[Array, " I"]]:
+) -> tuple[Float[Array, "I steps d"], Float[Array, " I"], Float[Array, " I"]]:
     """The noise ξ_0, ..., ξ_{N-2} from which the proposal makes these paths, one for each
-    interval, and their log weights."""
+    interval, their log weights, and D."""
     lanes = _Lanes(proposal, dynamics, intervals, paths.shape[1] - 1)
 
     def each(state, inputs):
@@ -515,7 +521,7 @@ def noise_of(
 
     inputs = split_rows((jnp.moveaxis(paths, 0, -1)[1:-1], lanes.steps), axis=1)
     state, xi = lax.scan(each, split_rows(lanes.begin()), inputs)
-    return jnp.moveaxis(join_rows(xi, axis=1), -1, 0), lanes.finish(join_rows(state))
+    return jnp.moveaxis(join_rows(xi, axis=1), -1, 0), *_flat(lanes.finish(join_rows(state)))
 
 
 def path_of(
@@ -523,8 +529,8 @@ def path_of(
     dynamics: Dynamics,
     intervals: Intervals,
     xi: Float[Array, "I steps d"],
-) -> tuple[Float[Array, "I points d"], Float[Array, " I"]]:
-    """The paths that the proposal makes from this noise, and their log weights: the inverse of
+) -> tuple[Float[Array, "I points d"], Float[Array, " I"], Float[Array, " I"]]:
+    """The paths that the proposal makes from this noise, their log weights, and D: the inverse of
     `noise_of`."""
     lanes = _Lanes(proposal, dynamics, intervals, xi.shape[1] + 1)
 
@@ -535,10 +541,20 @@ def path_of(
     inputs = split_rows((jnp.moveaxis(xi, 0, -1), lanes.steps), axis=1)
     state, path = lax.scan(each, split_rows(lanes.begin()), inputs)
     path = jnp.concatenate([lanes.start[None], join_rows(path, axis=1), lanes.end[None]])
-    return jnp.moveaxis(path, -1, 0), lanes.finish(join_rows(state))
+    return jnp.moveaxis(path, -1, 0), *_flat(lanes.finish(join_rows(state)))
 
 
-def _weighted(paths: Float[Array, "I n K d"], log_weights: Float[Array, "I n"]) -> WeightedPaths:
+def _flat(finished: tuple[Array, Array]) -> tuple[Float[Array, " I"], Float[Array, " I"]]:
+    """Of one path for each interval."""
+    log_weights, log_halving = finished
+    return log_weights, log_halving[:, 0]
+
+
+def _weighted(
+    paths: Float[Array, "I n K d"],
+    log_weights: Float[Array, "I n"],
+    log_halving: Float[Array, "I n"],
+) -> WeightedPaths:
     """One simulated path each; those that left the finite numbers are not found."""
     found = jnp.isfinite(log_weights)
     return WeightedPaths(
@@ -548,6 +564,7 @@ def _weighted(paths: Float[Array, "I n K d"], log_weights: Float[Array, "I n"]) 
         jnp.zeros_like(found),
         jnp.ones(found.shape, jnp.int32),
         (~found).astype(jnp.int32),
+        log_halving,
     )
 
 
@@ -574,8 +591,8 @@ def _draw_block(
 @eqx.filter_custom_jvp
 def _draw(
     inputs: _Inputs, keys: Key[Array, "I n"], stored: Int[Array, " K"] | None, num_steps: int
-) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"]]:
-    """One path for each key, and its log weight."""
+) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"], Float[Array, "I n"]]:
+    """One path for each key, its log weight, and D, which has no derivatives."""
     return _simulate(inputs, keys, stored, num_steps, None)
 
 
@@ -588,10 +605,11 @@ def _draw_tangents(primals, tangents):
     found = jnp.isfinite(drawn[1])
 
     def again(inputs):
-        paths, log_weights = _simulate(inputs, keys, stored, num_steps, found)
+        paths, log_weights, _ = _simulate(inputs, keys, stored, num_steps, found)
         return jnp.where(found[..., None, None], paths, 0), jnp.where(found, log_weights, 0)
 
-    return drawn, eqx.filter_jvp(again, (inputs,), (tangents[0],))[1]
+    _, along = eqx.filter_jvp(again, (inputs,), (tangents[0],))
+    return drawn, (*along, jnp.zeros_like(drawn[2]))
 
 
 def _simulate(
@@ -600,8 +618,8 @@ def _simulate(
     stored: Int[Array, " K"] | None,
     num_steps: int,
     noisy: Bool[Array, "I n"] | None,
-) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"]]:
-    """Paths and log weights; without noise where `noisy` is given and false."""
+) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"], Float[Array, "I n"]]:
+    """Paths, log weights and D; without noise where `noisy` is given and false."""
     proposal, model, intervals = inputs
     dynamics = model.forward(intervals.start[0])
     (num_intervals, num_draws), (_, d) = keys.shape, intervals.start.shape
@@ -635,33 +653,44 @@ def _simulate(
         )
     elif store is not None:
         path = store.rows
-    log_weights = lanes.finish(state).reshape(keys.shape)
+    log_weights, some = lanes.finish(state)
+    log_weights = log_weights.reshape(keys.shape)
+    unseen = jnp.full((num_intervals, num_draws - some.shape[1]), jnp.nan, dtype)
+    log_halving = jnp.concatenate([some, unseen], axis=1)
     if slots is None:
         path = jnp.concatenate([start[None], path, end[None]])
     else:
         path = path.at[slots[-1]].set(end)[:-1]
     path = path.reshape(-1, d, num_intervals, num_draws)
-    return jnp.moveaxis(path, (2, 3), (0, 1)), log_weights
+    return jnp.moveaxis(path, (2, 3), (0, 1)), log_weights, log_halving
 
 
 def deterministic_path(
-    dynamics: Dynamics, start: Float[Array, " d"], dt: Float[Array, " N"]
+    density: AbstractStepDensity,
+    dynamics: Dynamics,
+    start: Float[Array, " d"],
+    dt: Float[Array, " N"],
 ) -> tuple[Float[Array, "N d"], Float[Array, " d"]]:
-    """ξ_0, ..., ξ_{N-1} and ξ_N of dξ = α(ξ) dt from the start, by Euler's rule."""
-    end, path = lax.scan(lambda xi, dt: (xi + dynamics.drift(xi) * dt, xi), start, dt)
+    """ξ_0, ..., ξ_{N-1} and ξ_N of the target's steps from the start, without noise."""
+
+    def step(xi, dt):
+        return density.steps_from(dynamics, xi)(dt).mean, xi
+
+    end, path = lax.scan(step, start, dt)
     return path, end
 
 
-def _bridge_law(step: Step, sigma: AbstractSigma, velocity: Float[Array, " d"]) -> NoiseLaw:
-    """m = √δ σ⁻¹ v and C = (T - t_{i+1})/(T - t_i) I."""
-    mean = jnp.sqrt(step.dt) * sigma.solve(velocity)
-    return NoiseLaw(mean, jnp.sqrt((step.remaining - step.dt) / step.remaining))
+def _bridge_law(step: Step, target: StepLaw, mean: Float[Array, " d"]) -> StepLaw:
+    """With this mean and the covariance V δ (T - t_{i+1})/(T - t_i)."""
+    root = jnp.sqrt((step.remaining - step.dt) / step.remaining)
+    return target._replace(mean=mean, root=root)
 
 
-def _congruence(matrix: Float[Array, "d d"], sigma: AbstractSigma, d: int) -> Float[Array, "d d"]:
-    """σᵀ M σ."""
-    columns = jax.vmap(sigma.mv_transpose, in_axes=1, out_axes=1)(matrix)
-    return jax.vmap(sigma.mv_transpose)(columns)
+def _num_looked(num_draws: int, sigma_varies: bool) -> int:
+    """Of how many paths of an interval D is worked out. A few are enough where σ is constant."""
+    if sigma_varies:
+        return num_draws
+    return min(num_draws, max(_FEWEST_LOOKED, num_draws // _LOOKED_SHARE))
 
 
 def _congruence_of_root(sigma: AbstractSigma, x: Float[Array, " d"]) -> Float[Array, "d d"]:
@@ -674,7 +703,7 @@ def _check_density(density: AbstractStepDensity | None) -> AbstractStepDensity:
     density = EulerDensity() if density is None else density
     if not isinstance(density, AbstractStepDensity):
         raise TypeError(
-            f"`density` must be `EulerDensity()` or `TrapezoidDensity()`; got {density!r}."
+            f"`density` must be `EulerDensity()` or `ItoTaylorDensity()`; got {density!r}."
         )
     return density
 

@@ -23,7 +23,7 @@ from jaxtyping import Array, PyTree
 from .lane_forms import AbstractForm, Coordinates, LanesLast, aval, is_short
 
 # Beyond these, what is written out in coordinates takes long to compile.
-_MOST_NUMBERS = 512
+_MOST_NUMBERS = 1024
 _MOST_ROWS = 4
 
 

@@ -40,6 +40,16 @@ def total(vector: Float[Array, " d"]) -> Float[Array, ""]:
     return _sum([vector[i] for i in range(vector.shape[0])])
 
 
+def log_product(numbers: Float[Array, " d"]) -> Float[Array, ""]:
+    """The log of the product of positive numbers, by few logarithms."""
+    groups = [numbers[i : i + _FACTORS] for i in range(0, numbers.shape[0], _FACTORS)]
+    return _sum([jnp.log(functools.reduce(operator.mul, list(group))) for group in groups])
+
+
+# Of so many the product of numbers near one does not overflow.
+_FACTORS = 4
+
+
 def matvec(matrix: Float[Array, "n m"], vector: Float[Array, " m"]) -> Float[Array, " n"]:
     """`matrix @ vector`, column by column."""
     return _sum([matrix[:, j] * vector[j] for j in range(matrix.shape[1])])
@@ -98,10 +108,19 @@ def cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """The lower triangular L with `L Lᵀ = matrix`, column by column; NaN where there is none."""
     d, rest, columns = matrix.shape[0], matrix, []
     for k in range(d):
-        column = jnp.where(np.arange(d) < k, 0, rest[:, k] / jnp.sqrt(rest[k, k]))
+        column = jnp.where(np.arange(d) < k, 0, rest[:, k] * lax.rsqrt(rest[k, k]))
         columns.append(column)
         rest = rest - column[:, None] * column
     return jnp.stack(columns, axis=1)
+
+
+def solve_lower(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float[Array, " d"]:
+    """`L⁻¹ right` for a lower triangular L, by forward substitution."""
+    solved = []
+    for i in range(matrix.shape[0]):
+        known = [matrix[i, j] * solved[j] for j in range(i)]
+        solved.append((right[i] - _sum(known) if known else right[i]) / matrix[i, i])
+    return jnp.stack(solved)
 
 
 # Beyond this, writing the elimination out costs too much compilation.

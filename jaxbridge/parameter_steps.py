@@ -121,14 +121,6 @@ class NormalDraw(AbstractParameterKernel):
 
     def step(self, key, theta, data):
         gradient, root = _gradient_and_root(data, theta)
-        if data.form == "trapezoid":
-            # Its part from Lévy's area is positive, and where nearly nothing is observed the rest
-            # may not outweigh it.
-            gradient, root = lax.cond(
-                jnp.all(jnp.isfinite(root)),
-                lambda: (gradient, root),
-                lambda: _gradient_and_root(data._replace(form="girsanov"), theta),
-            )
         mean = theta + _solve_root(root, gradient)
 
         def draw(carry):

@@ -1,55 +1,110 @@
-"""The density of one step, from x to x' in δ: what a path's weight is made of.
+"""The law of one step, from x in a time δ: what a path's weight is made of.
 
-The Euler scheme's is N(x'; x + α(x) δ, V(x) δ), with an error that adds up to O(δ) along a path.
-For constant σ more is known. In the coordinates of the noise, β = σ⁻¹α and Δw = σ⁻¹(x' - x), the
-step's density relative to that of σW is, by Girsanov's theorem in Stratonovich form, the mean
-over Brownian bridges from x to x' of
+The target of a weighted path is a Markov chain on its grid, whose steps are normal,
 
-    exp[∫ β · ∘dw - ½ ∫ (|β|² + div β) dt].
+    x' = μ(x) + √δ σ(x) L(x) ξ,    ξ ~ N(0, I),    L lower triangular.
 
-The trapezoid rule for ∫ β · ∘dw is too large by β''[Δw, Δw, Δw]/12, in the mean over steps by
-δ/4 times the increment of div β, which with the trapezoid rule for the other integral leaves
-½ div β(x') δ. Further, ∫ β · ∘dw has a part that the end points do not determine unless β is a
-gradient: by Lévy's area formula, with Ω the antisymmetric part of ∇β, its exponential has a mean
-of exp[δ²|Ω|²/12 + δ|ΩΔw|²/6] to leading order. What is left adds up to O(δ²). This is a density
-up to terms of higher order only.
+Each step has a probability density, so the weights have the chain's own transition density as
+their mean: finite, whatever the model. How near that is to p_T is the step error.
+
+`EulerDensity`, μ = x + αδ and L = I, is O(δ) away, for any σ. For constant σ more is known. In the
+coordinates of the noise, with β = σ⁻¹α and A = ∇β, the first terms of Itô's and Taylor's expansion
+(Kloeden & Platen 1992, section 14.2) are normal as well, `ItoTaylorDensity`,
+
+    x + βδ + ½δ² (Aβ + ½Δβ) + ∫_0^δ [I + (δ-s) A] dW_s,
+
+with L Lᵀ = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ ≥ ¼ I or so however long the step, and O(δ²) away from p_T.
 """
 
 from abc import abstractmethod
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from .diffusion import Dynamics
-from .linalg import dot, matvec, total
+from .linalg import cholesky, dot, log_product, matmul, matvec, solve_lower, total
+from .sigma import AbstractSigma
+
+
+class StepLaw(NamedTuple):
+    """N(μ, δ σ L Lᵀ σᵀ), the law of a step from one point in a time δ.
+
+    - `mean`: μ, shape (d,).
+    - `sigma`: σ at the point.
+    - `root`: L, a lower triangle, shape (d, d), or a number, shape ().
+    - `dt`: δ.
+    """
+
+    mean: Float[Array, "d *lanes"]
+    sigma: AbstractSigma | None
+    root: Float[Array, "..."]
+    dt: Float[Array, "*lanes"]
+
+    def point(self, xi: Float[Array, " d"]) -> Float[Array, " d"]:
+        """μ + √δ σ L ξ."""
+        noise = self.root * xi if self.root.ndim == 0 else matvec(self.root, xi)
+        return self.mean + jnp.sqrt(self.dt) * self.sigma.mv(noise)
+
+    def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
+        """ξ of the step to this point."""
+        scaled = self.sigma.solve(point - self.mean) / jnp.sqrt(self.dt)
+        return scaled / self.root if self.root.ndim == 0 else solve_lower(self.root, scaled)
+
+    def pulled_back(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
+        """√δ (σ L)ᵀ v."""
+        vector = jnp.sqrt(self.dt) * self.sigma.mv_transpose(vector)
+        return self.root * vector if self.root.ndim == 0 else matvec(self.root.T, vector)
+
+    def log_relative(self, xi: Float[Array, " d"]) -> Float[Array, ""]:
+        """log of the density at the point of this noise, but for factors that all laws with this
+        σ and δ share: -½ |ξ|² - log det L."""
+        if self.root.ndim == 0:
+            log_det = xi.shape[0] * jnp.log(self.root)
+        else:
+            log_det = log_product(jnp.diagonal(self.root))
+        return -dot(xi, xi) / 2 - log_det
+
+    def log_density(self, point: Float[Array, " d"]) -> Float[Array, ""]:
+        """Of the step to this point, in units of space to the power -d."""
+        scale = self.sigma.log_abs_det() + point.shape[0] * jnp.log(2 * np.pi * self.dt) / 2
+        return self.log_relative(self.noise(point)) - scale
+
+
+class LinearStep(NamedTuple):
+    """A step of dX = [c + F X] dt + σ dW: x' ~ N(decay x + integral c, covariance)."""
+
+    decay: Float[Array, "d d"]
+    integral: Float[Array, "d d"]
+    covariance: Float[Array, "d d"]
+
+
+StepsFrom = Callable[[Float[Array, ""]], StepLaw]
 
 
 class AbstractStepDensity(eqx.Module):
-    """The density of a step, relative to that of the Euler scheme."""
+    """The normal law of a step. `order` is p of the error O(δ^p) that it adds up to along a path,
+    in the mean over paths."""
+
+    order: ClassVar[int]
 
     @abstractmethod
-    def look(self, dynamics: Dynamics, x: Float[Array, " d"]) -> PyTree:
-        """What must be known at each point of a path, once."""
+    def steps_from(self, dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
+        """The law of a step from x, a function of its length δ."""
 
     @abstractmethod
-    def log_ratio(
-        self,
-        dynamics: Dynamics,
-        x: Float[Array, " d"],
-        x_next: Float[Array, " d"],
-        seen: PyTree,
-        seen_next: PyTree,
-        dt: Float[Array, ""],
-    ) -> Float[Array, ""]:
-        """log [p(x'|x) / N(x'; x + α(x) δ, V(x) δ)], with what was seen at both points."""
+    def linear_step(
+        self, F: Float[Array, "d d"], V: Float[Array, "d d"], dt: Float[Array, ""]
+    ) -> LinearStep:
+        """The same of a linear process with V = σσᵀ, of which it is a closed form."""
 
 
 class EulerDensity(AbstractStepDensity):
-    """The transition density of the Euler scheme itself, for any σ: O(δ) along a path.
+    """The Euler scheme, N(x + α(x) δ, V(x) δ), for any σ: O(δ) along a path.
 
     **Example:**
 
@@ -58,63 +113,67 @@ class EulerDensity(AbstractStepDensity):
     ```
     """
 
-    def look(self, dynamics, x):
-        return None
+    order: ClassVar[int] = 1
 
-    def log_ratio(self, dynamics, x, x_next, seen, seen_next, dt):
-        return jnp.zeros((), x.dtype)
+    def steps_from(self, dynamics, x):
+        drift, sigma = dynamics.drift(x), dynamics.sigma(x)
+        return lambda dt: StepLaw(x + drift * dt, sigma, jnp.ones((), x.dtype), dt)
 
-
-class _Field(NamedTuple):
-    """β, its divergence, and Ω, at one point; no Ω in one dimension."""
-
-    beta: Float[Array, " d"]
-    divergence: Float[Array, ""]
-    curl: Float[Array, "d d"] | None
+    def linear_step(self, F, V, dt):
+        identity = jnp.eye(F.shape[0], dtype=F.dtype)
+        return LinearStep(identity + F * dt, identity * dt, V * dt)
 
 
-class TrapezoidDensity(AbstractStepDensity):
-    """The trapezoid rule in Girsanov's theorem, for constant σ: O(δ²) along a path.
+class ItoTaylorDensity(AbstractStepDensity):
+    """Itô's and Taylor's expansion of weak order 2, for constant σ: O(δ²) along a path.
 
-    It calls for the drift's derivatives at each point, by autodiff.
+    It calls for the first and second derivatives of the drift along the columns of σ, by autodiff.
 
     **Raises:** `ValueError`, when it is used, for a σ that depends on the state.
 
     **Example:**
 
     ```python
-    proposal = jb.Guided(density=jb.TrapezoidDensity())
+    proposal = jb.Guided(density=jb.ItoTaylorDensity())
     ```
     """
 
-    def look(self, dynamics, x):
+    order: ClassVar[int] = 2
+
+    def steps_from(self, dynamics, x):
         if dynamics.sigma_varies:
             raise ValueError(
-                "`TrapezoidDensity` is for constant σ, but this one depends on the state: choose "
+                "`ItoTaylorDensity` is for constant σ, but this one depends on the state: choose "
                 "`EulerDensity()`."
             )
         sigma, d = dynamics.sigma(x), x.shape[0]
+        columns = [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(d)]
+        slopes, bends = zip(*(_along(dynamics.drift, x, column) for column in columns), strict=True)
+        drift = dynamics.drift(x)
+        beta = sigma.solve(drift)
+        # σ (Aβ + ½ Δβ), and A with columns σ⁻¹ (∇α σ_k).
+        bent = total(jnp.stack([slopes[k] * beta[k] + bends[k] / 2 for k in range(d)]))
+        A = jnp.stack([sigma.solve(slope) for slope in slopes], axis=1)
+        twice, square, identity = A + A.T, matmul(A, A.T), jnp.eye(d, dtype=x.dtype)
 
-        def beta(y):
-            return sigma.solve(dynamics.drift(y))
+        def law(dt):
+            root = cholesky(identity + dt / 2 * twice + dt**2 / 3 * square)
+            return StepLaw(x + dt * drift + dt**2 / 2 * bent, sigma, root, dt)
 
-        # Derivatives in the coordinates of the noise: columns of ∇β σ.
-        along = [sigma.mv(jnp.asarray(direction, x.dtype)) for direction in np.eye(d)]
-        value, slope = jax.linearize(beta, x)
-        columns = [slope(direction) for direction in along]
-        divergence = total(jnp.stack([columns[i][i] for i in range(d)]))
-        curl = None
-        if d > 1:
-            jacobian = jnp.stack(columns, axis=1)
-            curl = (jacobian - jacobian.T) / 2
-        return _Field(value, divergence, curl)
+        return law
 
-    def log_ratio(self, dynamics, x, x_next, seen, seen_next, dt):
-        change = seen_next.beta - seen.beta
-        dw = dynamics.sigma(x).solve(x_next - x)
-        noise = dw - dt * (seen.beta + seen_next.beta) / 2
-        ratio = dot(change, noise) / 2 - dt * seen_next.divergence / 2
-        if seen.curl is not None:
-            turned, square = matvec(seen.curl, dw), total((seen.curl**2).ravel())
-            ratio += dt**2 * square / 12 + dt * dot(turned, turned) / 6
-        return ratio
+    def linear_step(self, F, V, dt):
+        identity = jnp.eye(F.shape[0], dtype=F.dtype)
+        integral = dt * identity + dt**2 / 2 * F
+        flow = matmul(F, V)
+        covariance = dt * V + dt**2 / 2 * (flow + flow.T) + dt**3 / 3 * matmul(flow, F.T)
+        return LinearStep(identity + matmul(F, integral), integral, covariance)
+
+
+def _along(field, x: Float[Array, " d"], direction: Float[Array, " d"]):
+    """∂f[v] and ∂²f[v, v]."""
+
+    def first(y):
+        return jax.jvp(field, (y,), (direction,))[1]
+
+    return jax.jvp(first, (x,), (direction,))

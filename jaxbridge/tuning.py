@@ -189,7 +189,7 @@ def choose_proposal(
 
     - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`.
     - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge`,
-        `Guided("end")` and `Guided("path")`, with `TrapezoidDensity()` for constant σ, and so
+        `Guided("end")` and `Guided("path")`, with `ItoTaylorDensity()` for constant σ, and so
         with the same order of step error as couplings; where the time reversal of the model is
         known `Coupling(0.0)` and `Coupling(0.5)`; and for a single interval for which one of them
         comes near the best, one with its start law tuned.

@@ -29,7 +29,8 @@ class WeightedPaths(NamedTuple):
 
     `log_weights` are -inf and `paths` NaN where none was `found`; `truncated` says where a
     weight is not exact because a bound on the work was reached; `num_simulated` counts the
-    simulated paths, and `num_nonfinite` those that left the finite numbers.
+    simulated paths, and `num_nonfinite` those that left the finite numbers. `log_halving` is D of
+    `halving`, NaN where none was worked out.
     """
 
     paths: Float[Array, "I n K d"]
@@ -38,6 +39,7 @@ class WeightedPaths(NamedTuple):
     truncated: Bool[Array, "I n"]
     num_simulated: Int[Array, "I n"]
     num_nonfinite: Int[Array, "I n"]
+    log_halving: Float[Array, "I n"]
 
 
 class AbstractWeightedProposal(eqx.Module):
@@ -193,6 +195,7 @@ def masked(made: WeightedPaths, active: Bool[Array, " I"]) -> WeightedPaths:
         keep(made.truncated, False),
         keep(made.num_simulated, 0),
         keep(made.num_nonfinite, 0),
+        keep(made.log_halving, jnp.nan),
     )
 
 

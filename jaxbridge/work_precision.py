@@ -43,7 +43,7 @@ from .meeting import AbstractMeeting, BrownianCrossing
 from .schemes import AbstractScheme, Euler, GaussianTransition, Heun
 from .search import key_for
 from .start_laws import Reversed, Stationary
-from .step_density import AbstractStepDensity, TrapezoidDensity
+from .step_density import AbstractStepDensity, ItoTaylorDensity
 from .transition import transition_log_density
 
 METHODS = ("approximate", "weights", "pseudo_marginal", "renewal", "crank_nicolson", "density")
@@ -529,7 +529,7 @@ def _at_its_best(candidate: Any, scene: _Scene) -> Any:
         )
     if scene.model.forward(jnp.asarray(scene.start)).sigma_varies:
         return candidate
-    return eqx.tree_at(lambda p: p.density, candidate, TrapezoidDensity(), is_leaf=is_leaf)
+    return eqx.tree_at(lambda p: p.density, candidate, ItoTaylorDensity(), is_leaf=is_leaf)
 
 
 def _measure(
