@@ -21,8 +21,10 @@ from .grid import stored_steps
 from .guided import Guided
 from .intervals import as_intervals, check_count, check_key
 from .kernels import Chain
+from .pareto import is_reliable
 from .pseudo_marginal_chain import run_pseudo_marginal
 from .renewal_chain import as_pairs, run_renewal
+from .step_error import is_gross
 from .throwing import throw_where_incomplete
 
 
@@ -75,8 +77,8 @@ def sample_exact_bridges(
         count. See `Chain.truncated`. It and `num_counts` are not for the renewal chain.
     - `step_size`: β in (0, 1] of "crank_nicolson", by default 0.5; see `crank_nicolson`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, or
-        parameters are not finite.
+    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, k̂ is
+        above 0.7, the step error is above 0.1 standard deviations, or parameters are not finite.
 
     **Returns:** `Chain`. Not differentiable.
 
@@ -125,7 +127,13 @@ def sample_exact_bridges(
         chain = (run_renewal if method == "renewal" else run_pseudo_marginal)(*arguments)
     if not throw:
         return chain
-    missing, truncated = ~chain.met, chain.truncated
     return throw_where_incomplete(
-        chain, "paths", model, missing, truncated, coupled=uses_couplings(proposal)
+        chain,
+        "paths",
+        model,
+        ~chain.met,
+        chain.truncated,
+        coupled=uses_couplings(proposal),
+        heavy=None if chain.pareto_k is None else ~is_reliable(chain.pareto_k),
+        gross=is_gross(chain.step_error_in_sds()),
     )

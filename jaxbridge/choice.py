@@ -108,6 +108,11 @@ class Choice(AbstractWeightedProposal):
     def fractions(self, num_steps):
         return self.candidates[0].fractions(num_steps)
 
+    def step_share(self, model, intervals):
+        assert self.chosen is not None
+        shares = jnp.stack([each.step_share(model, intervals) for each in self.candidates])
+        return jnp.take_along_axis(shares, self.chosen[None], axis=0)[0]
+
     def draw(
         self,
         keys,

@@ -15,12 +15,16 @@ from .arrays import nondifferentiable
 from .bridges import Inputs, find_bridges
 from .burn_in import with_burn_in
 from .coupling import AbstractCoupling
-from .diffusion import Diffusion
+from .diffusion import Diffusion, Dynamics
 from .grid import uniform_fractions
+from .halving import log_halving_of_paths, num_looked
 from .hitting import HittingCounts, count_hits
-from .intervals import check_model
+from .intervals import Intervals, check_model
+from .schemes import AbstractScheme, Euler, GaussianTransition, Milstein
 from .search import default_num_lanes
 from .start_laws import AnyStartLaw, Reversed, Stationary, log_ratio, needs_burn_in
+from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
+from .step_error import share_of_order
 from .weighted import AbstractWeightedProposal, WeightedPaths, in_blocks
 
 # Whole paths are kept only until they are weighed: at most this many bytes of them at a time.
@@ -64,6 +68,10 @@ class CoupledPairs(AbstractWeightedProposal):
     def fractions(self, num_steps):
         return uniform_fractions(num_steps)
 
+    def step_share(self, model, intervals):
+        _, share = step_law_of(self.coupling.scheme, model.forward(intervals.start[0]))
+        return jnp.full_like(intervals.duration, share)
+
     def draw(
         self,
         keys,
@@ -99,6 +107,7 @@ class CoupledPairs(AbstractWeightedProposal):
             law = self.coupling.start_law
             log_weights = pair_log_weights(law, model, intervals.end, reverse_start, counts.mean)
             log_weights, unusable = usable(log_weights, found)
+            log_halving = self.log_halving(model, intervals, paths, num_draws)
             kept = paths if stored is None else paths[:, stored]
             made = WeightedPaths(
                 jnp.where(found[:, None, None], kept, jnp.nan),
@@ -107,7 +116,7 @@ class CoupledPairs(AbstractWeightedProposal):
                 counts.truncated | unusable,
                 proposed.num_trials + counts.num_trials,
                 proposed.num_nonfinite + counts.num_nonfinite,
-                jnp.full_like(log_weights, jnp.nan),
+                log_halving,
             )
             return jax.tree.map(
                 lambda leaf: leaf.reshape(num_intervals, num_draws, *leaf.shape[1:]), made
@@ -139,9 +148,22 @@ class CoupledPairs(AbstractWeightedProposal):
             counts.truncated | unusable,
             counts.num_trials,
             counts.num_nonfinite,
-            jnp.full_like(log_weights, jnp.nan),
+            self.log_halving(model, intervals, paths, 1),
         )
         return jax.tree.map(lambda leaf: leaf[:, None], made)
+
+    def log_halving(
+        self, model: Diffusion, intervals: Intervals, paths: Float[Array, "P points d"], n: int
+    ) -> Float[Array, " P"]:
+        """D of the first of n paths of each interval, NaN of the others."""
+        dynamics = model.forward(intervals.start[0])
+        density, _ = step_law_of(self.coupling.scheme, dynamics)
+        some = jnp.arange(len(paths)).reshape(-1, n)[:, : num_looked(n, dynamics.sigma_varies)]
+        some = some.reshape(-1)
+        num_steps = paths.shape[1] - 1
+        dt = jnp.broadcast_to(intervals.duration[some] / num_steps, (num_steps, len(some)))
+        log_halving = log_halving_of_paths(density, dynamics, dt, paths[some])
+        return jnp.full(len(paths), jnp.nan, paths.dtype).at[some].set(log_halving)
 
     def _counts(
         self, keys, model, intervals, paths, found, num_counts, progress_meter=None
@@ -157,6 +179,19 @@ class CoupledPairs(AbstractWeightedProposal):
             self.max_trials,
             progress_meter=progress_meter,
         )
+
+
+def step_law_of(scheme: AbstractScheme, dynamics: Dynamics) -> tuple[AbstractStepDensity, float]:
+    """The normal law of a step that comes nearest to that of the scheme, and the step error of the
+    scheme as a share of what half as many steps change with that law."""
+    if isinstance(scheme, GaussianTransition):
+        return EulerDensity(), 0.0  # there is no step error
+    if isinstance(scheme, Euler | Milstein):
+        return EulerDensity(), share_of_order(EulerDensity.order)
+    if dynamics.sigma_varies:
+        # Of first order like Euler's, and two to four times as large where it was measured.
+        return EulerDensity(), 3 * share_of_order(EulerDensity.order)
+    return ItoTaylorDensity(), share_of_order(ItoTaylorDensity.order)
 
 
 def pair_log_weights(

@@ -196,7 +196,8 @@ def run_crank_nicolson(
         path = jnp.where(met[:, None, None], state.position, jnp.nan)
         path = path if stored is None else path[:, stored]
         lost = info.log_weight == -jnp.inf
-        return (state, meter_state), (path, info.is_accepted, state.log_weight, met, lost)
+        made = (path, info.is_accepted, state.log_weight, met, state.log_halving, lost)
+        return (state, meter_state), made
 
     (_, meter_state), made = lax.scan(
         step, (first, meter.init()), (jnp.arange(num_bridges), step_keys.T)
@@ -205,22 +206,26 @@ def run_crank_nicolson(
     made = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), made)
     *_, lost = made
     lost = jnp.concatenate([(first.log_weight == -jnp.inf)[:, None], lost], axis=1)
-    path, accepted, log_weight, met, _ = jax.tree.map(
+    path, accepted, log_weight, met, log_halving, _ = jax.tree.map(
         lambda leaf: leaf if batched else leaf[0], made
     )
     ones = jnp.ones((num_intervals, num_bridges + 1), jnp.int32)
+    share = proposal.step_share(model, intervals)
     return Chain(
-        grid_times(intervals, stored, proposal.fractions(num_steps), several_durations),
-        path,
-        accepted,
-        log_weight,
-        met,
-        jnp.zeros_like(met),
-        sum_by_interval(ones, num_intervals, batched),
-        sum_by_interval(lost.astype(jnp.int32), num_intervals, batched),
-        sum_by_interval(jnp.zeros_like(ones), num_intervals, batched),
-        proposal,
-        num_steps,
+        times=grid_times(intervals, stored, proposal.fractions(num_steps), several_durations),
+        paths=path,
+        accepted=accepted,
+        log_weights=log_weight,
+        met=met,
+        truncated=jnp.zeros_like(met),
+        num_simulated=sum_by_interval(ones, num_intervals, batched),
+        num_nonfinite=sum_by_interval(lost.astype(jnp.int32), num_intervals, batched),
+        num_truncated=sum_by_interval(jnp.zeros_like(ones), num_intervals, batched),
+        proposal=proposal,
+        pareto_k=None,
+        log_halving=log_halving,
+        step_share=share if batched else share[0],
+        num_steps=num_steps,
     )
 
 

@@ -41,7 +41,7 @@ from .halving import (
     Opened,
     Pairing,
     close_pair,
-    log_of_step,
+    num_looked,
     of_all_steps,
     open_pair,
     pair_up,
@@ -54,6 +54,7 @@ from .schemes import Euler
 from .search import most_lanes
 from .sigma import AbstractSigma
 from .step_density import AbstractStepDensity, EulerDensity, StepLaw
+from .step_error import share_of_order
 from .weighted import (
     AbstractWeightedProposal,
     WeightedPaths,
@@ -62,8 +63,6 @@ from .weighted import (
     masked,
 )
 
-# For constant σ D of `halving` is worked out for one in so many paths, but for so many at least.
-_LOOKED_SHARE, _FEWEST_LOOKED = 8, 32
 # Of the duration: shorter steps are lost in the rounding of points.
 _SHORTEST_STEP = 1e-10
 
@@ -119,6 +118,9 @@ class AbstractGuidedProposal(AbstractWeightedProposal):
 
     def fractions(self, num_steps):
         return 1 - self.remaining(num_steps)
+
+    def step_share(self, model, intervals):
+        return jnp.full_like(intervals.duration, share_of_order(self.density.order))
 
     def remaining(self, num_steps: int) -> Float[np.ndarray, " points"]:
         """(T - t_i) / T, down to zero."""
@@ -391,7 +393,7 @@ class _Lanes:
             dynamics, start, end, dt
         )
         self._num_draws, self._num_steps = num_draws, num_steps
-        self._num_looked = _num_looked(num_draws, dynamics.sigma_varies)
+        self._num_looked = num_looked(num_draws, dynamics.sigma_varies)
         self._of_lane = None if start.shape[0] == 1 else -1
         self.start, self.end = start.T, end.T
         each = (dt, remaining, pair_up(dt))
@@ -409,8 +411,8 @@ class _Lanes:
 
         def open_none(x):  # as a pair that is never closed
             zero = jnp.zeros((), x.dtype)
-            law = self._density.steps_from(self._dynamics, x)(zero)
-            return zero, open_pair(self._dynamics, x, law, zero)
+            steps, one = self._density.steps_from(self._dynamics, x), jnp.ones((), x.dtype)
+            return zero, open_pair(self._dynamics, x, steps, one, one)
 
         log_halving, opened = over_lanes(-1)(open_none)(self._looked(start))
         return _State(start, jnp.zeros_like(start[0]), log_halving, opened)
@@ -420,9 +422,10 @@ class _Lanes:
 
         def one(state, xi, step):
             steps = self._density.steps_from(self._dynamics, state.x)
-            law = self._proposal.step_law(step, state.x, steps(step.dt))
+            target = steps.law(step.dt)
+            law = self._proposal.step_law(step, state.x, target)
             x_next = law.point(xi)
-            return x_next, self._log_weight(steps(step.dt), law, x_next, xi)
+            return x_next, self._log_weight(target, law, x_next, xi)
 
         each = (-1, -1, self._of_lane)
         x_next, log_weight = over_lanes(*each)(one)(state, xi, self._of_each(self._step(steps)))
@@ -435,9 +438,10 @@ class _Lanes:
 
         def one(state, x_next, step):
             steps = self._density.steps_from(self._dynamics, state.x)
-            law = self._proposal.step_law(step, state.x, steps(step.dt))
+            target = steps.law(step.dt)
+            law = self._proposal.step_law(step, state.x, target)
             xi = law.noise(x_next)
-            return xi, self._log_weight(steps(step.dt), law, x_next, xi)
+            return xi, self._log_weight(target, law, x_next, xi)
 
         each = (-1, -1, self._of_lane)
         xi, log_weight = over_lanes(*each)(one)(state, x_next, self._of_each(self._step(steps)))
@@ -452,7 +456,7 @@ class _Lanes:
             end, dt = last
             inside = all_finite(self._dynamics.drift(end))
             inside &= jnp.isfinite(self._dynamics.sigma(end).log_abs_det())
-            log_density = self._density.steps_from(self._dynamics, x)(dt).log_density(end)
+            log_density = self._density.steps_from(self._dynamics, x).law(dt).log_density(end)
             return jnp.where(inside, log_density, jnp.nan)
 
         last = self._of_each((self.end, self._last.dt))
@@ -485,11 +489,10 @@ class _Lanes:
         density, dynamics = self._density, self._dynamics
 
         def one(opened, x, x_next, dt, pairing):
-            laws = density.steps_from(dynamics, x)
-            log_density = log_of_step(dynamics, laws(dt), laws(dt).noise(x_next))
-            change = close_pair(dynamics, opened, x, x_next, (pairing.before, dt), log_density)
+            steps, both = density.steps_from(dynamics, x), (pairing.before, dt)
+            change = close_pair(dynamics, opened, x, x_next, both, steps.law(dt))
             change = jnp.where(pairing.ends, change, 0)
-            return change, open_pair(dynamics, x, laws(dt + pairing.after), log_density)
+            return change, open_pair(dynamics, x, steps, dt, pairing.after)
 
         of_intervals = (steps.dt, steps.pairing)
         if self._of_lane is None:
@@ -674,7 +677,7 @@ def deterministic_path(
     """ξ_0, ..., ξ_{N-1} and ξ_N of the target's steps from the start, without noise."""
 
     def step(xi, dt):
-        return density.steps_from(dynamics, xi)(dt).mean, xi
+        return density.steps_from(dynamics, xi).law(dt).mean, xi
 
     end, path = lax.scan(step, start, dt)
     return path, end
@@ -684,13 +687,6 @@ def _bridge_law(step: Step, target: StepLaw, mean: Float[Array, " d"]) -> StepLa
     """With this mean and the covariance V δ (T - t_{i+1})/(T - t_i)."""
     root = jnp.sqrt((step.remaining - step.dt) / step.remaining)
     return target._replace(mean=mean, root=root)
-
-
-def _num_looked(num_draws: int, sigma_varies: bool) -> int:
-    """Of how many paths of an interval D is worked out. A few are enough where σ is constant."""
-    if sigma_varies:
-        return num_draws
-    return min(num_draws, max(_FEWEST_LOOKED, num_draws // _LOOKED_SHARE))
 
 
 def _congruence_of_root(sigma: AbstractSigma, x: Float[Array, " d"]) -> Float[Array, "d d"]:

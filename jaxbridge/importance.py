@@ -19,26 +19,29 @@ from .averages import (
     effective_size,
     expanded,
     filled,
-    mean_over_paths,
     normalised,
     values_of,
     weighted_mean,
 )
 from .bridges import Bridges
 from .choice import as_proposal, settled, uses_couplings
-from .coupled_pairs import CoupledPairs, check_density, pair_log_weights, usable
+from .coupled_pairs import CoupledPairs, check_density, pair_log_weights, step_law_of, usable
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
+from .exact_bridges import AbstractExactBridges
 from .grid import grid_times, stored_steps
-from .hitting import check_max_trials, counts_of, coupling_of
+from .halving import log_halving_of_paths
+from .hitting import check_max_trials, counts_of, coupling_of, durations_of
 from .intervals import Intervals, as_intervals, check_count, check_key
+from .pareto import is_reliable, pareto_k
 from .search import key_for
 from .start_laws import AnyStartLaw
+from .step_error import is_gross
 from .throwing import throw_where_incomplete
 from .weighted import AbstractWeightedProposal
 
 
-class WeightedBridges(eqx.Module):
+class WeightedBridges(AbstractExactBridges):
     """Bridges whose weights make them exact, from `weigh_bridges` or `sample_weighted_bridges`;
     with I intervals arrays have a leading axis I.
 
@@ -52,6 +55,8 @@ class WeightedBridges(eqx.Module):
     - `num_nonfinite`: how many of them left the finite numbers.
     - `proposal`, `num_steps`: those they were made with. The coupling of a proposal has the
         start law of the weights; a `Stationary` that had to be run has its `burn_in` in it.
+    - `log_halving`: log of the factor by which half as many steps would change a weight, NaN where
+        none was worked out; and `step_share`, the step error as a share of what that changes.
     """
 
     times: Float[Array, "*durations K"]
@@ -62,6 +67,8 @@ class WeightedBridges(eqx.Module):
     num_simulated: Int[Array, "*I"]
     num_nonfinite: Int[Array, "*I"]
     proposal: AbstractWeightedProposal
+    log_halving: Float[Array, "*I n"]
+    step_share: Float[Array, "*I"]
     num_steps: int = eqx.field(static=True)
 
     @property
@@ -85,11 +92,10 @@ class WeightedBridges(eqx.Module):
         size = self.effective_sample_size
         return size / jnp.maximum(self.num_simulated, 1).astype(size.dtype)
 
-    def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """The weighted mean of `fn(path)`, a function of one path of shape (K, d), by default
-        the path itself: an estimate of its expectation over exact bridges. NaN where there are
-        none."""
-        return mean_over_paths(fn, self.weights, self.paths, self.met)
+    @property
+    def log_mean_weights(self) -> Float[Array, "*I n"]:
+        """Those of the bridges."""
+        return self.log_weights
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """That of `mean(fn)`, by the delta method, entry by entry."""
@@ -102,6 +108,11 @@ class WeightedBridges(eqx.Module):
             return jnp.where(jnp.isnan(mean), jnp.nan, jnp.sqrt(jnp.sum(squares, axis)))
 
         return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
+
+    @property
+    def pareto_k(self) -> Float[Array, "*I"]:
+        """k̂ of the weights. Above 0.7 neither means nor their standard errors can be trusted."""
+        return pareto_k(self.log_weights)
 
     def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:
         """Equally weighted paths by systematic resampling, shape (m, K, d): many effective ones
@@ -151,8 +162,8 @@ def weigh_bridges(
         `WeightedBridges.truncated`.
     - `batch_size`: trials simulated side by side; changes results by rounding only.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, or
-        parameters are not finite.
+    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, k̂ is
+        above 0.7, the step error is above 0.1 standard deviations, or parameters are not finite.
 
     **Returns:** `WeightedBridges`. Not differentiable.
 
@@ -187,9 +198,15 @@ def weigh_bridges(
 def _or_throw(
     weighted: WeightedBridges, model: Diffusion, proposal: AbstractWeightedProposal
 ) -> WeightedBridges:
-    missing, truncated = ~weighted.met, weighted.truncated
     return throw_where_incomplete(
-        weighted, "log_weights", model, missing, truncated, coupled=uses_couplings(proposal)
+        weighted,
+        "log_weights",
+        model,
+        ~weighted.met,
+        weighted.truncated,
+        coupled=uses_couplings(proposal),
+        heavy=~is_reliable(weighted.pareto_k),
+        gross=is_gross(weighted.step_error_in_sds()),
     )
 
 
@@ -205,19 +222,36 @@ def _weigh_bridges(key, model, pairs, bridges, budget):
         counts.mean.reshape(-1),
     ).reshape(shape)
     log_weights, unusable = usable(log_weights, bridges.met)
+    log_halving, share = _halving_of_bridges(model, coupling, bridges)
     num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)
     num_nonfinite = jnp.sum(counts.num_nonfinite, axis=-1, dtype=jnp.int32)
     return WeightedBridges(
-        bridges.times,
-        bridges.paths,
-        log_weights,
-        bridges.met,
-        counts.truncated | unusable,
-        bridges.num_proposals + num_trials,
-        bridges.num_nonfinite + num_nonfinite,
-        eqx.tree_at(lambda p: p.coupling, pairs, coupling),
-        bridges.num_steps,
+        times=bridges.times,
+        paths=bridges.paths,
+        log_weights=log_weights,
+        met=bridges.met,
+        truncated=counts.truncated | unusable,
+        num_simulated=bridges.num_proposals + num_trials,
+        num_nonfinite=bridges.num_nonfinite + num_nonfinite,
+        proposal=eqx.tree_at(lambda p: p.coupling, pairs, coupling),
+        log_halving=log_halving,
+        step_share=share,
+        num_steps=bridges.num_steps,
     )
+
+
+def _halving_of_bridges(
+    model: Diffusion, coupling: AbstractCoupling, bridges: Bridges
+) -> tuple[Float[Array, "*I n"], Float[Array, "*I"]]:
+    """D of all bridges, and the share of the step error."""
+    model = model.prepared()
+    shape, paths = bridges.met.shape, bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
+    dynamics = model.forward(paths[0, 0])
+    density, share = step_law_of(coupling.scheme, dynamics)
+    steps = durations_of(bridges) / bridges.num_steps
+    dt = jnp.broadcast_to(steps, (bridges.num_steps, len(paths)))
+    log_halving = log_halving_of_paths(density, dynamics, dt, paths).reshape(shape)
+    return log_halving, jnp.full(shape[:-1], share, paths.dtype)
 
 
 def sample_weighted_bridges(
@@ -245,8 +279,8 @@ def sample_weighted_bridges(
     - `num_bridges`: n, for each interval.
     - `proposal`, `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, or
-        parameters are not finite.
+    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, k̂ is
+        above 0.7, the step error is above 0.1 standard deviations, or parameters are not finite.
 
     **Returns:** `WeightedBridges`.
 
@@ -307,16 +341,19 @@ def _sample_weighted(
         num_nonfinite=jnp.sum(drawn.num_nonfinite, axis=1, dtype=jnp.int32),
     )
     times = grid_times(intervals, stored, proposal.fractions(num_steps), several_durations)
+    share = proposal.step_share(model, intervals)
     if not batched:
         drawn = jax.tree.map(lambda leaf: leaf[0], drawn)
     return WeightedBridges(
-        times,
-        drawn.paths,
-        drawn.log_weights,
-        drawn.found,
-        drawn.truncated,
-        drawn.num_simulated,
-        drawn.num_nonfinite,
-        proposal,
-        num_steps,
+        times=times,
+        paths=drawn.paths,
+        log_weights=drawn.log_weights,
+        met=drawn.found,
+        truncated=drawn.truncated,
+        num_simulated=drawn.num_simulated,
+        num_nonfinite=drawn.num_nonfinite,
+        proposal=proposal,
+        log_halving=drawn.log_halving,
+        step_share=share if batched else share[0],
+        num_steps=num_steps,
     )

@@ -15,13 +15,14 @@ from .averages import (
     PathFunction,
     expanded,
     filled,
-    mean_over_paths,
+    normalised,
     values_of,
     weighted_mean,
 )
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling
 from .diagnostics import effective_sample_size
+from .exact_bridges import AbstractExactBridges
 from .intervals import Intervals, as_intervals
 from .weighted import AbstractWeightedProposal
 
@@ -38,7 +39,7 @@ class Kernel(NamedTuple):
     step: Callable
 
 
-class Chain(eqx.Module):
+class Chain(AbstractExactBridges):
     """What `sample_exact_bridges` returns: the states of a chain. With I intervals arrays have a
     leading axis I.
 
@@ -54,6 +55,12 @@ class Chain(eqx.Module):
     - `num_nonfinite`: how many of them left the finite numbers.
     - `num_truncated`: how many proposals, accepted or not, had counts cut off.
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
+    - `pareto_k`: k̂ of the weights of all proposals: above 0.7 states with large weights stay too
+        long for any error to be trusted. `None` where no new weights are proposed, as by renewal
+        and Crank–Nicolson moves.
+    - `log_halving`: log of the factor by which half as many steps would change the weight of a
+        state, NaN where none was worked out; and `step_share`, the step error as a share of what
+        that changes.
     - `num_steps`: N.
     """
 
@@ -67,6 +74,9 @@ class Chain(eqx.Module):
     num_nonfinite: Int[Array, "*I"]
     num_truncated: Int[Array, "*I"]
     proposal: AbstractWeightedProposal
+    pareto_k: Float[Array, "*I"] | None
+    log_halving: Float[Array, "*I n"]
+    step_share: Float[Array, "*I"]
     num_steps: int = eqx.field(static=True)
 
     @property
@@ -79,15 +89,15 @@ class Chain(eqx.Module):
         """The share of steps that took a new path."""
         return jnp.mean(self.accepted, axis=-1)
 
-    def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """The mean of `fn(path)`, a function of one path of shape (K, d), by default the path
-        itself: an estimate of its expectation over exact bridges. NaN where there are none."""
-        return mean_over_paths(fn, self._weights, self.paths, self.met)
+    @property
+    def log_mean_weights(self) -> Float[Array, "*I n"]:
+        """All states count alike."""
+        return jnp.where(self.met, 0.0, -jnp.inf).astype(self.paths.dtype)
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """That of `mean(fn)`, from the effective sample size of the chain, of at least four states,
         entry by entry."""
-        weights, axis = self._weights, self.met.ndim - 1
+        weights, axis = normalised(self.log_mean_weights), self.met.ndim - 1
         size = effective_sample_size
         for _ in range(axis):
             size = jax.vmap(size)
@@ -100,11 +110,6 @@ class Chain(eqx.Module):
             return jnp.sqrt(weighted_mean(weights, deviation**2) / many)
 
         return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
-
-    @property
-    def _weights(self) -> Float[Array, "*I n"]:
-        met = self.met.astype(self.paths.dtype)
-        return met / jnp.maximum(jnp.sum(met, axis=-1, keepdims=True), 1)
 
 
 def acceptance_rate(

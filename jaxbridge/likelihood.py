@@ -189,7 +189,7 @@ def _girsanov(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
 
 def _ito_taylor(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
     """log of the density of the step, relative to N(x'; x, V δ)."""
-    law = ItoTaylorDensity().steps_from(dynamics, x)(dt)
+    law = ItoTaylorDensity().steps_from(dynamics, x).law(dt)
     dw = dynamics.sigma(x).solve(x_next - x)
     return law.log_relative(law.noise(x_next)) + dot(dw, dw) / (2 * dt)
 

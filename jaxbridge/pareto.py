@@ -12,7 +12,7 @@ import math
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 # A fit to fewer weights means nothing.
 _FEWEST = 5
@@ -23,6 +23,15 @@ _EQUAL = 1e-3
 
 # The prior of the shape counts as so many weights, and has this mean.
 _PRIOR_COUNT, _PRIOR_SHAPE = 10, 0.5
+
+
+# Above, the error of a mean falls too slowly with the number of weights, and is not seen in them.
+_MOST_RELIABLE = 0.7
+
+
+def is_reliable(k: Float[Array, "*I"]) -> Bool[Array, "*I"]:
+    """Whether a mean of weights of this shape is to be trusted."""
+    return k < _MOST_RELIABLE
 
 
 def pareto_k(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:

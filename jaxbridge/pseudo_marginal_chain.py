@@ -28,6 +28,7 @@ from .kernels import (
     one_interval,
     sum_by_interval,
 )
+from .pareto import pareto_k
 from .weighted import AbstractWeightedProposal, WeightedPaths
 
 
@@ -177,15 +178,18 @@ def run_pseudo_marginal(
         return sum_by_interval(leaf, num_intervals, batched)
 
     return Chain(
-        grid_times(intervals, stored, proposal.fractions(num_steps), several_durations),
-        of_states(drawn.paths),
-        of_interval(accepted.T),
-        of_interval(log_weights.T),
-        of_states(drawn.found),
-        of_states(drawn.truncated),
-        total(drawn.num_simulated),
-        total(drawn.num_nonfinite),
-        total(drawn.truncated),
-        proposal,
-        num_steps,
+        times=grid_times(intervals, stored, proposal.fractions(num_steps), several_durations),
+        paths=of_states(drawn.paths),
+        accepted=of_interval(accepted.T),
+        log_weights=of_interval(log_weights.T),
+        met=of_states(drawn.found),
+        truncated=of_states(drawn.truncated),
+        num_simulated=total(drawn.num_simulated),
+        num_nonfinite=total(drawn.num_nonfinite),
+        num_truncated=total(drawn.truncated),
+        proposal=proposal,
+        pareto_k=of_interval(pareto_k(drawn.log_weights)),
+        log_halving=of_states(drawn.log_halving),
+        step_share=of_interval(proposal.step_share(model, intervals)),
+        num_steps=num_steps,
     )

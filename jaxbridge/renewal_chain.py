@@ -221,22 +221,32 @@ def run_renewal(
         return leaf if batched else leaf[0]
 
     paths = of_steps(segments.paths)
+    # D of the states in which segments end, all but the last, which may be too long.
+    log_halving = pairs.log_halving(model, each, segments.ends, 1)
+    last = jnp.arange(num_segments * length) % length == length - 1
+    last = (last & (jnp.arange(num_segments * length) < num_bridges)).reshape(num_segments, -1)
+    log_halving = jnp.where(last, log_halving.reshape(num_intervals, -1, 1), jnp.nan)
+    log_halving = log_halving.reshape(num_intervals, -1)[:, :num_bridges]
+    share = pairs.step_share(model, intervals)
 
     def total(leaf):
         return sum_by_interval(leaf, num_intervals, batched)
 
     return Chain(
-        grid_times(intervals, stored, pairs.fractions(num_steps), several_durations),
-        paths,
-        of_steps(segments.moved),
-        None,
-        jnp.all(jnp.isfinite(paths), axis=(-2, -1)),
-        None,
-        total(segments.num_simulated) + total(num_tried),
-        total(segments.num_nonfinite) + total(num_failed),
-        total(jnp.zeros(num, jnp.int32)),
-        pairs,
-        num_steps,
+        times=grid_times(intervals, stored, pairs.fractions(num_steps), several_durations),
+        paths=paths,
+        accepted=of_steps(segments.moved),
+        log_weights=None,
+        met=jnp.all(jnp.isfinite(paths), axis=(-2, -1)),
+        truncated=None,
+        num_simulated=total(segments.num_simulated) + total(num_tried),
+        num_nonfinite=total(segments.num_nonfinite) + total(num_failed),
+        num_truncated=total(jnp.zeros(num, jnp.int32)),
+        proposal=pairs,
+        pareto_k=None,
+        log_halving=log_halving if batched else log_halving[0],
+        step_share=share if batched else share[0],
+        num_steps=num_steps,
     )
 
 

@@ -41,7 +41,7 @@ class StepLaw(NamedTuple):
     """
 
     mean: Float[Array, "d *lanes"]
-    sigma: AbstractSigma | None
+    sigma: AbstractSigma
     root: Float[Array, "..."]
     dt: Float[Array, "*lanes"]
 
@@ -83,7 +83,15 @@ class LinearStep(NamedTuple):
     covariance: Float[Array, "d d"]
 
 
-StepsFrom = Callable[[Float[Array, ""]], StepLaw]
+class StepsFrom(NamedTuple):
+    """Steps from one point, as functions of their length δ.
+
+    - `law`: the law of the step.
+    - `decay`: the derivative of the mean of σ⁻¹x' in σ⁻¹x, shape (d, d), where the drift is linear.
+    """
+
+    law: Callable[[Float[Array, ""]], StepLaw]
+    decay: Callable[[Float[Array, ""]], Float[Array, "d d"]]
 
 
 class AbstractStepDensity(eqx.Module):
@@ -94,7 +102,7 @@ class AbstractStepDensity(eqx.Module):
 
     @abstractmethod
     def steps_from(self, dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
-        """The law of a step from x, a function of its length δ."""
+        """The law of a step from x."""
 
     @abstractmethod
     def linear_step(
@@ -116,8 +124,18 @@ class EulerDensity(AbstractStepDensity):
     order: ClassVar[int] = 1
 
     def steps_from(self, dynamics, x):
-        drift, sigma = dynamics.drift(x), dynamics.sigma(x)
-        return lambda dt: StepLaw(x + drift * dt, sigma, jnp.ones((), x.dtype), dt)
+        drift, sigma, d = dynamics.drift(x), dynamics.sigma(x), x.shape[0]
+
+        def law(dt):
+            return StepLaw(x + drift * dt, sigma, jnp.ones((), x.dtype), dt)
+
+        def decay(dt):
+            columns = _columns(sigma, x)
+            slopes = [jax.jvp(dynamics.drift, (x,), (column,))[1] for column in columns]
+            A = jnp.stack([sigma.solve(slope) for slope in slopes], axis=1)
+            return jnp.eye(d, dtype=x.dtype) + dt * A
+
+        return StepsFrom(law, decay)
 
     def linear_step(self, F, V, dt):
         identity = jnp.eye(F.shape[0], dtype=F.dtype)
@@ -147,8 +165,8 @@ class ItoTaylorDensity(AbstractStepDensity):
                 "`EulerDensity()`."
             )
         sigma, d = dynamics.sigma(x), x.shape[0]
-        columns = [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(d)]
-        slopes, bends = zip(*(_along(dynamics.drift, x, column) for column in columns), strict=True)
+        along = [_along(dynamics.drift, x, column) for column in _columns(sigma, x)]
+        slopes, bends = zip(*along, strict=True)
         drift = dynamics.drift(x)
         beta = sigma.solve(drift)
         # σ (Aβ + ½ Δβ), and A with columns σ⁻¹ (∇α σ_k).
@@ -160,7 +178,10 @@ class ItoTaylorDensity(AbstractStepDensity):
             root = cholesky(identity + dt / 2 * twice + dt**2 / 3 * square)
             return StepLaw(x + dt * drift + dt**2 / 2 * bent, sigma, root, dt)
 
-        return law
+        def decay(dt):
+            return identity + dt * A + dt**2 / 2 * matmul(A, A)
+
+        return StepsFrom(law, decay)
 
     def linear_step(self, F, V, dt):
         identity = jnp.eye(F.shape[0], dtype=F.dtype)
@@ -168,6 +189,11 @@ class ItoTaylorDensity(AbstractStepDensity):
         flow = matmul(F, V)
         covariance = dt * V + dt**2 / 2 * (flow + flow.T) + dt**3 / 3 * matmul(flow, F.T)
         return LinearStep(identity + matmul(F, integral), integral, covariance)
+
+
+def _columns(sigma: AbstractSigma, x: Float[Array, " d"]) -> list[Float[Array, " d"]]:
+    """Those of σ."""
+    return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(x.shape[0])]
 
 
 def _along(field, x: Float[Array, " d"], direction: Float[Array, " d"]):

@@ -29,6 +29,15 @@ _TRUNCATED = (
     "some weights were cut off by `max_trials`, and what they weigh is hardly ever hit: allow more "
     "trials, or fit a start law by `fit_start_law`."
 )
+_HEAVY = (
+    "some weights have tails so heavy (a Pareto shape k̂ above 0.7) that their mean and its error "
+    "cannot be trusted: choose another proposal, take shorter intervals, or use "
+    '`method="crank_nicolson"`.'
+)
+_GROSS = (
+    "some step errors are beyond 0.1 and the standard error: take more steps, or for stiff drift "
+    "the scheme `SemiImplicit()`."
+)
 
 
 def throw_where_incomplete(
@@ -39,15 +48,20 @@ def throw_where_incomplete(
     truncated: Bool[Array, "..."] | None = None,
     *,
     coupled: bool = True,
+    heavy: Bool[Array, "..."] | None = None,
+    gross: Bool[Array, "..."] | None = None,
 ) -> _Result:
-    """The result, whose `field` raises `RuntimeError` if anything is missing or cut off. What is
-    missing has not met if pairs were `coupled`."""
+    """The result, whose `field` raises `RuntimeError` if anything is missing or cut off, if weights
+    have `heavy` tails or the step error is `gross`. What is missing has not met if pairs were
+    `coupled`."""
     value = getattr(result, field)
     for bad, message in [
         (~all_finite_leaves(model), _PARAMETERS),
         (jnp.any(missing), _MISSING if coupled else _FAILED),
-        (None if truncated is None else jnp.any(truncated), _TRUNCATED),
+        (truncated, _TRUNCATED),
+        (heavy, _HEAVY),
+        (gross, _GROSS),
     ]:
         if bad is not None:
-            value = eqx.error_if(value, bad, message)
+            value = eqx.error_if(value, jnp.any(bad), message)
     return eqx.tree_at(lambda tree: getattr(tree, field), result, value)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import logsumexp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from .arrays import Numbers
 from .choice import Choice, as_proposal, settled, singles, uses_couplings
@@ -21,7 +21,9 @@ from .coupled_pairs import CoupledPairs
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count, check_key
 from .kernels import sum_by_interval
+from .pareto import is_reliable, pareto_k
 from .start_laws import Reversed, Stationary
+from .step_error import StepError, dominates, is_gross, of_log_mean
 from .throwing import throw_where_incomplete
 from .weighted import AbstractWeightedProposal
 
@@ -40,6 +42,9 @@ class TransitionLogDensity(eqx.Module):
     - `num_simulated`: paths simulated in all.
     - `num_nonfinite`: how many of them left the finite numbers.
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
+    - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` can be trusted.
+    - `step_error`: an estimate of what `value` is too large by for the length of the steps, with
+        a standard error of it, `step_uncertainty`. NaN where it is not known, as of one step.
     """
 
     value: Float[Array, "*I"]
@@ -50,6 +55,23 @@ class TransitionLogDensity(eqx.Module):
     num_simulated: Int[Array, "*I"]
     num_nonfinite: Int[Array, "*I"]
     proposal: AbstractWeightedProposal
+    pareto_k: Float[Array, "*I"]
+    step_error: Float[Array, "*I"]
+    step_uncertainty: Float[Array, "*I"]
+
+    @property
+    def step_error_dominates(self) -> Bool[Array, "*I"]:
+        """Whether the step error is beyond the standard error, or not known well enough to say:
+        then more steps help, and more proposals do not."""
+        error = StepError(self.step_error, self.step_uncertainty)
+        return dominates(error, self.standard_error)
+
+    @property
+    def trustworthy(self) -> Bool[Array, "*I"]:
+        """Whether `value` and `standard_error` are to be trusted: a mean that large weights do not
+        decide, no weight cut off, and a step error that does not dominate."""
+        trusted = is_reliable(self.pareto_k) & (self.num_truncated == 0)
+        return trusted & ~self.step_error_dominates & (self.num_met > 0)
 
 
 def transition_log_density(
@@ -84,7 +106,8 @@ def transition_log_density(
     - `max_trials`: bounds the trials of each proposal; by default 10,000 for each count.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time where no proposal became a bridge, a weight was cut off,
-        or parameters are not finite.
+        k̂ is above 0.7, the step error is above the standard error and 0.1, or parameters are not
+        finite.
 
     **Returns:** `TransitionLogDensity`. With proposals that are pulled to the end point `value` is
     differentiable, forward and reverse: an estimate of the score. With couplings, and with a
@@ -123,9 +146,16 @@ def transition_log_density(
     estimate = estimate_log_density(key, model, proposal, intervals, *size)
     if not throw:
         return estimate
-    missing, truncated = estimate.num_met == 0, estimate.num_truncated > 0
+    error = StepError(estimate.step_error, estimate.step_uncertainty)
     return throw_where_incomplete(
-        estimate, "value", model, missing, truncated, coupled=uses_couplings(proposal)
+        estimate,
+        "value",
+        model,
+        estimate.num_met == 0,
+        estimate.num_truncated > 0,
+        coupled=uses_couplings(proposal),
+        heavy=~is_reliable(estimate.pareto_k),
+        gross=estimate.step_error_dominates & is_gross(error),
     )
 
 
@@ -179,6 +209,10 @@ def estimate_log_density(
     variance *= num_proposals / max(num_proposals - 1, 1)
     error = jnp.sqrt(variance) if num_proposals > 1 else jnp.full_like(variance, jnp.inf)
 
+    step_error = of_log_mean(
+        drawn.log_weights, drawn.log_halving, proposal.step_share(model, intervals)
+    )
+
     def of_interval(leaf):
         return leaf if batched else leaf[0]
 
@@ -194,4 +228,6 @@ def estimate_log_density(
         total(drawn.num_simulated),
         total(drawn.num_nonfinite),
         proposal,
+        of_interval(pareto_k(drawn.log_weights)),
+        *map(of_interval, lax.stop_gradient(step_error)),
     )

@@ -67,6 +67,10 @@ class AbstractWeightedProposal(eqx.Module):
         """The grid, t_i / T, from 0 to 1."""
 
     @abstractmethod
+    def step_share(self, model: Diffusion, intervals: Intervals) -> Float[Array, " I"]:
+        """The step error as a share of what half as many steps change (`step_error`)."""
+
+    @abstractmethod
     def draw(
         self,
         keys: Key[Array, "I n"],
