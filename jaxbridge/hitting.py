@@ -90,10 +90,13 @@ class HittingCounts(eqx.Module):
 
     @property
     def standard_error(self) -> Float[Array, "*I n"]:
-        """That of `probability`, about π √((1-π)/N); infinite for fewer than three counts, of
-        which nothing is known."""
-        variance = self.probability**2 * (1 - self.probability)
-        hits = self._num_hits
+        """That of `probability`, about π √((1-π)/N), and about 1/N where no trial missed: N hits
+        in N trials tell π from 1 no better than that. Infinite for fewer than three counts, of
+        which nothing is known, as where the trials ran out without a hit."""
+        hits, trials, probability = self._num_hits, self.num_trials, self.probability
+        # The smallest share of misses that the trials tell from none is one of them.
+        resolution = 1 / jnp.maximum(trials, 1).astype(probability.dtype)
+        variance = probability**2 * jnp.maximum(1 - probability, resolution)
         error = jnp.sqrt(variance / jnp.maximum(hits - 2, 1).astype(variance.dtype))
         return jnp.where(hits > 2, error, jnp.inf)
 
