@@ -157,6 +157,12 @@ class Completion(eqx.Module):
     def first(self, key: Key[Array, ""], model: Diffusion) -> Paths:
         """Paths to start from. Where the proposal finds none, whatever its weight, a modified
         diffusion bridge serves, or a straight line: a chain may start anywhere."""
+        return self.first_and_found(key, model)[0]
+
+    def first_and_found(
+        self, key: Key[Array, ""], model: Diffusion
+    ) -> tuple[Paths, Bool[Array, " I"]]:
+        """The same, and which of them the proposal itself has found, in the order of the parts."""
         model = model.prepared()
 
         def of_part(part, kernel, keys):
@@ -171,9 +177,10 @@ class Completion(eqx.Module):
             path = start + done[:, None] * (end - start)
             for better in (other.paths[:, 0], found):
                 path = jnp.where(is_there(better)[:, None, None], better, path)
-            return path
+            return path, is_there(found)
 
-        return tuple(map(of_part, self.parts, self.kernels, self._keys(key)))
+        made = list(map(of_part, self.parts, self.kernels, self._keys(key)))
+        return tuple(path for path, _ in made), jnp.concatenate([found for _, found in made])
 
     def renew(self, key: Key[Array, ""], model: Diffusion, paths: Paths) -> tuple[Paths, Renewed]:
         """One step of every bridge, at the parameters of this model."""
