@@ -125,7 +125,9 @@ def sample_exact_bridges(
         chain = (run_renewal if method == "renewal" else run_pseudo_marginal)(*arguments)
     if not throw:
         return chain
-    missing, truncated = ~chain.met, chain.truncated
+    # The renewal chain keeps no weights that could be cut off, but its trials may start wrongly.
+    truncated = chain.num_truncated > 0 if chain.truncated is None else chain.truncated
+    missing = ~chain.met
     return throw_where_incomplete(
         chain, "paths", model, missing, truncated, coupled=uses_couplings(proposal)
     )

@@ -30,6 +30,7 @@ from .likelihood import Form, log_likelihoods
 from .observations import Group
 from .parts import Bounds, Part, make_parts
 from .renewal_chain import as_pairs, first_paths, propose_paths, renew
+from .start_laws import run_is_cut
 from .weighted import AbstractWeightedProposal
 
 # One array of shape (I, N+1, d) for each part.
@@ -40,7 +41,8 @@ class Renewed(NamedTuple):
     """Of one step on all intervals: whether the path of each was replaced; how many paths were
     simulated, or weighed, for it; whether no proposal was found though one was called for. Then
     the path stays, which leaves the exact law invariant, for whether one is found does not
-    depend on the path. Last, whether a weight was cut off by a bound on its trials."""
+    depend on the path. Last, whether a weight was cut off by a bound on its trials, or the run
+    that replaces a sampler of the stationary law by one on its steps."""
 
     moved: Bool[Array, " I"]
     num_simulated: Int[Array, " I"]
@@ -79,8 +81,10 @@ class ByRenewal(AbstractBridgeKernel):
     def renew(self, keys, model, intervals, paths):
         everything = jnp.ones(len(keys), bool)
         paths, info = renew(keys, model, self.pairs, intervals, paths, everything)
-        whole = jnp.zeros_like(everything)
-        return paths, Renewed(info.is_accepted, info.num_simulated, info.is_missing, whole)
+        num_steps = paths.shape[1] - 1
+        law, dt = self.pairs.coupling.start_law, intervals.duration / num_steps
+        cut = run_is_cut(law, model, dt, num_steps)
+        return paths, Renewed(info.is_accepted, info.num_simulated, info.is_missing, cut)
 
 
 class ByWeights(AbstractBridgeKernel):

@@ -22,7 +22,7 @@ from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
 from .intervals import check_count, check_key
 from .search import Trials, check_bound, default_num_lanes, key_for, numbered_keys, search
-from .start_laws import AnyStartLaw, as_start_law
+from .start_laws import AnyStartLaw, as_start_law, run_is_cut
 
 # A count that takes longer than this is cut off, unless the user says otherwise.
 _MAX_TRIALS_PER_COUNT = 10_000
@@ -48,7 +48,8 @@ class HittingCounts(eqx.Module):
 
     - `counts`: N independent counts for each bridge, shape (n, N); -1 where the trials ran out
         before the count was complete, and for a bridge that is missing.
-    - `truncated`: whether the trials ran out, shape (n,).
+    - `truncated`: whether the trials ran out, shape (n,). Also where they did not start from ν,
+        because the run that replaces a sampler of it was cut off: see `Stationary`.
     - `num_trials`: how many there were in all, shape (n,).
     - `num_nonfinite`: how many of them left the finite numbers, which is no hit.
     - `start`: where the last trial that hit had started, shape (n, d).
@@ -78,7 +79,7 @@ class HittingCounts(eqx.Module):
         missing."""
         hits, trials = self._num_hits, self.num_trials
         # Trials that ran out are a binomial sample, estimated by hits / trials.
-        less = jnp.where(self.truncated, 0, 1)
+        less = jnp.where(hits < self.counts.shape[-1], 0, 1)
         numerator, denominator = hits - less, trials - less
         certain = denominator <= 0  # one trial, one hit
         numerator, denominator = (
@@ -213,9 +214,10 @@ def count_hits(
     before = jnp.concatenate([jnp.full_like(number[:, :1], -1), number[:, :-1]], axis=1)
     last = jnp.maximum(found.num_found - 1, 0)
     starts = found.outputs.reshape(*number.shape, -1)
+    cut = run_is_cut(coupling.start_law, model, duration / num_steps, num_steps)
     return HittingCounts(
         jnp.where(number >= 0, number - before, -1),
-        active & (found.num_found < num_counts),
+        active & ((found.num_found < num_counts) | cut),
         found.num_trials,
         found.num_nonfinite,
         starts[jnp.arange(len(number)), last],
