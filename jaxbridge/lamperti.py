@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, PyTree
 from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Diffusion, check_diffusion
 from .intervals import check_count
-from .transform import Transformed
+from .transform import Transformed, of_points
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
@@ -82,7 +82,10 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
         normalised=model.normalised,
         prepare=functions.prepare,
     )
-    return Transformed(moved, Partial(functions.forward, table), Partial(functions.inverse, table))
+    forward, inverse = (
+        of_points(Partial(function, table)) for function in (functions.forward, functions.inverse)
+    )
+    return Transformed(moved, forward, inverse)
 
 
 def _number(name: str, value: Numbers) -> float:

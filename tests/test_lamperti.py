@@ -109,6 +109,15 @@ def test_parameters_of_sigma_may_change_and_have_derivatives(x64):
     np.testing.assert_allclose(jax.grad(drift)(0.6), slope, rtol=1e-5)
 
 
+def test_maps_take_many_points():
+    moved = jb.lamperti(cir(), at=AT, reach=8.0)
+    points = np.linspace(0.05, 2, 12).reshape(3, 4, 1).astype(np.float32)
+    mapped = moved.forward(points)
+    np.testing.assert_allclose(mapped, root(points), atol=2e-6)
+    np.testing.assert_allclose(moved.inverse(mapped), points, rtol=2e-5)
+    np.testing.assert_allclose(moved.forward(points[0, 0]), root(points[0, 0]), atol=2e-6)
+
+
 def test_bad_arguments_are_refused(unchecked):
     with pytest.raises(TypeError, match="`model` must be"):
         jb.lamperti(3.0, at=AT, reach=8.0)
