@@ -133,6 +133,7 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
         reversible=model.reversible,
         normalised=model.normalised,
         prepare=model.preparation,
+        _coordinates=model.coordinates,
     )
     return Transformed(moved, of_points(forward), of_points(inverse))
 
