@@ -5,11 +5,16 @@ coupled by reflection, start from b and from where another run from b has come i
 the coupling inequality the total variation distance between their laws after t is at most
 P(τ > t), τ the time when they meet. s is doubled until all of 512 pairs meet within s, that
 is, until what s can spread s can join again; pairs at distance √s do not all meet within s
-before that, however small s is. Twice that s is the burn-in: meeting times have exponential
-tails, so the distance left is of the order of 512⁻².
+before that, however small s is. Twice that s is the burn-in.
 
-A diffusion with wells that it leaves only after very many relaxation times can deceive this, as
-any look at a finite run: give `Stationary(burn_in=...)`, or a start law with a density.
+That all of 512 pairs have met says that P(τ > s) is about 1/512 or less, and no more. Where
+meeting times have exponential tails, as for a drift that pulls back in proportion to the distance
+or with a force that does not vanish far out, P(τ > 2s) is of the order of its square, and so
+the distance left is about 512⁻² ≈ 4·10⁻⁶. Where the drift fades far out, as for heavy-tailed
+stationary laws, they have polynomial tails, and to double s gains a factor only: 2·10⁻³ has been
+measured. And a diffusion with wells that it leaves only after very many relaxation times can
+deceive this, as any look at a finite run. In both cases give `Stationary(burn_in=...)` a longer
+time, or choose a start law with a density.
 """
 
 import equinox as eqx
@@ -44,7 +49,8 @@ def with_burn_in(
     duration: Float[Array, " P"],
     num_steps: int,
 ) -> AbstractCoupling:
-    """The coupling, whose start law knows its burn-in where it needs one."""
+    """The coupling, whose start law knows its burn-in where it needs one: infinite where none was
+    found, by which `run_is_cut` knows it."""
     if not needs_burn_in(coupling.start_law, model):
         return coupling
     key = key_for("burn-in", key)
@@ -65,16 +71,22 @@ def measure_burn_in(
     num_steps: int = 50,
     coupling: AbstractCoupling | None = None,
 ) -> Float[Array, ""]:
-    """A time after which the reversed diffusion from `end` is stationary to about 1e-5 in total
-    variation, for `Stationary(burn_in=...)`: a multiple of `duration`, found by coupling.
+    """A time after which the reversed diffusion from `end` is stationary, for
+    `Stationary(burn_in=...)`: twice one within which all of 512 coupled pairs meet, a multiple of
+    `duration`.
 
-    It sees wells only if they are left within the run: where a diffusion stays in one well for
-    very many relaxation times of it, give a longer time yourself.
+    In total variation what is left of the start is about 1e-5 where the diffusion forgets it
+    exponentially fast, as where the drift pulls back however far out. Where the drift fades far
+    out, as for heavy-tailed stationary laws, it is forgotten by a power of the time, and 2e-3 may
+    be left: give a multiple of this time. It sees wells only if they are left within the run:
+    where a diffusion stays in one well for very many relaxation times of it, give a longer time
+    yourself.
 
     **Arguments:** as in `sample_bridges`; only the scheme and the step matter.
 
     **Raises:** `ValueError` where the diffusion has not forgotten its start after 2¹⁷ steps, or
-    most paths explode (inside `jit` the time is then infinite), or for arguments that do not fit.
+    most paths explode, or for arguments that do not fit. Inside `jit`, and where a result measures
+    its burn-in itself, the time is then infinite, and what rests on it marked as `truncated`.
 
     **Example:**
 
@@ -96,9 +108,10 @@ def measure_burn_in(
     if not is_traced(time) and not np.isfinite(time):
         raise ValueError(
             "two copies of the reversed diffusion have not all met after 2¹⁷ steps, so it has "
-            "not forgotten its start: take longer steps (a longer `duration` or fewer "
-            "`num_steps`), or give `Diffusion` a sampler of its stationary law. Or most paths left "
-            "the finite numbers: then take shorter steps, or `SemiImplicit()` as the scheme."
+            "not forgotten its start, or most paths left the finite numbers: give `Diffusion` a "
+            "sampler of its stationary law, the coupling a start law with a density, or, if you "
+            "know it, a `Stationary(burn_in=...)`. For a stiff drift, which calls for short steps "
+            "of an explicit scheme, take `SemiImplicit()`: its steps may be longer."
         )
     return time
 

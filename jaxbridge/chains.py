@@ -127,12 +127,14 @@ def sample_exact_bridges(
         chain = (run_renewal if method == "renewal" else run_pseudo_marginal)(*arguments)
     if not throw:
         return chain
+    # The renewal chain keeps no weights that could be cut off, but its trials may start wrongly.
+    truncated = chain.num_truncated > 0 if chain.truncated is None else chain.truncated
     return throw_where_incomplete(
         chain,
         "paths",
         model,
         ~chain.met,
-        chain.truncated,
+        truncated,
         coupled=uses_couplings(proposal),
         heavy=None if chain.pareto_k is None else ~is_reliable(chain.pareto_k),
         gross=is_gross(chain.step_error_in_sds()),

@@ -30,6 +30,7 @@ from .likelihood import Form, log_likelihoods
 from .observations import Group
 from .parts import Bounds, Part, make_parts
 from .renewal_chain import as_pairs, first_paths, propose_paths, renew
+from .start_laws import run_is_cut
 from .weighted import AbstractWeightedProposal
 
 # One array of shape (I, N+1, d) for each part.
@@ -40,7 +41,8 @@ class Renewed(NamedTuple):
     """Of one step on all intervals: whether the path of each was replaced; how many paths were
     simulated, or weighed, for it; whether no proposal was found though one was called for. Then
     the path stays, which leaves the exact law invariant, for whether one is found does not
-    depend on the path. Last, whether a weight was cut off by a bound on its trials."""
+    depend on the path. Last, whether a weight was cut off by a bound on its trials, or the run
+    that replaces a sampler of the stationary law by one on its steps."""
 
     moved: Bool[Array, " I"]
     num_simulated: Int[Array, " I"]
@@ -79,8 +81,10 @@ class ByRenewal(AbstractBridgeKernel):
     def renew(self, keys, model, intervals, paths):
         everything = jnp.ones(len(keys), bool)
         paths, info = renew(keys, model, self.pairs, intervals, paths, everything)
-        whole = jnp.zeros_like(everything)
-        return paths, Renewed(info.is_accepted, info.num_simulated, info.is_missing, whole)
+        num_steps = paths.shape[1] - 1
+        law, dt = self.pairs.coupling.start_law, intervals.duration / num_steps
+        cut = run_is_cut(law, model, dt, num_steps)
+        return paths, Renewed(info.is_accepted, info.num_simulated, info.is_missing, cut)
 
 
 class ByWeights(AbstractBridgeKernel):
@@ -157,6 +161,12 @@ class Completion(eqx.Module):
     def first(self, key: Key[Array, ""], model: Diffusion) -> Paths:
         """Paths to start from. Where the proposal finds none, whatever its weight, a modified
         diffusion bridge serves, or a straight line: a chain may start anywhere."""
+        return self.first_and_found(key, model)[0]
+
+    def first_and_found(
+        self, key: Key[Array, ""], model: Diffusion
+    ) -> tuple[Paths, Bool[Array, " I"]]:
+        """The same, and which of them the proposal itself has found, in the order of the parts."""
         model = model.prepared()
 
         def of_part(part, kernel, keys):
@@ -171,9 +181,10 @@ class Completion(eqx.Module):
             path = start + done[:, None] * (end - start)
             for better in (other.paths[:, 0], found):
                 path = jnp.where(is_there(better)[:, None, None], better, path)
-            return path
+            return path, is_there(found)
 
-        return tuple(map(of_part, self.parts, self.kernels, self._keys(key)))
+        made = list(map(of_part, self.parts, self.kernels, self._keys(key)))
+        return tuple(path for path, _ in made), jnp.concatenate([found for _, found in made])
 
     def renew(self, key: Key[Array, ""], model: Diffusion, paths: Paths) -> tuple[Paths, Renewed]:
         """One step of every bridge, at the parameters of this model."""

@@ -88,6 +88,7 @@ class Diffusion(eqx.Module):
     _sample_stationary: Callable | None = eqx.field(static=True)
     _prepare: Callable | None = eqx.field(static=True)
     _domain: Callable | None = eqx.field(static=True)
+    _coordinates: Callable | None = eqx.field(static=True)
     _constant_sigma: Inexact[Array, "..."] | None
     params: PyTree
     reversible: bool = eqx.field(static=True)
@@ -106,6 +107,7 @@ class Diffusion(eqx.Module):
         normalised: bool = False,
         domain: Callable | None = None,
         prepare: Callable | None = None,
+        _coordinates: Callable | None = None,
     ):
         for name, function in [
             ("drift", drift),
@@ -123,6 +125,7 @@ class Diffusion(eqx.Module):
         self._sample_stationary = sample_stationary
         self._prepare = prepare
         self._domain = domain
+        self._coordinates = _coordinates
         if diffusion is None or callable(diffusion):
             self._diffusion, self._constant_sigma = diffusion, None
         else:
@@ -209,6 +212,7 @@ class Diffusion(eqx.Module):
             reversible=self.reversible,
             normalised=self.normalised,
             domain=self._domain,
+            _coordinates=self._coordinates,
         )
 
     def unbound(self) -> "Diffusion":
@@ -233,12 +237,23 @@ class Diffusion(eqx.Module):
             reversible=self.reversible,
             normalised=self.normalised,
             domain=self._domain,
+            _coordinates=self._coordinates,
         )
 
     @property
     def preparation(self) -> Callable | None:
         """`prepare`, as it was given."""
         return self._prepare
+
+    @property
+    def coordinates(self) -> Callable[[PyTree], PyTree] | None:
+        """Where the coordinates of the model depend on its parameters, as those of `lamperti` do:
+        a function of the prepared parameters, to values that depend on the same of them."""
+        return self._coordinates
+
+    def coordinate_values(self) -> PyTree:
+        """The values of that function, none where the coordinates are fixed."""
+        return () if self._coordinates is None else self._coordinates(self._prepared_params())
 
     @property
     def has_reversal(self) -> bool:

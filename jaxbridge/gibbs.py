@@ -47,10 +47,13 @@ class GibbsState(NamedTuple):
 
     - `theta`: θ, shape (p,).
     - `paths`: those of all intervals, in parts of one number of steps.
+    - `found`: which of them the proposal has found, shape (I,), in the same order. The others are
+        stand-ins, for a chain must start somewhere.
     """
 
     theta: Float[Array, "*chains p"]
     paths: tuple[Float[Array, "..."], ...]
+    found: Bool[Array, "*chains I"]
 
 
 class GibbsPosterior(AbstractPosterior):
@@ -63,7 +66,10 @@ class GibbsPosterior(AbstractPosterior):
     - `bridges_moved`: the share of bridges that were replaced, shape (*chains, n).
     - `num_simulated`: paths simulated or weighed, shape (*chains, n).
     - `num_missing`: bridges that were not found, though called for, within `max_proposals`, shape
-        (*chains, n). They stayed as they were: the law is right, but the chain moves less.
+        (*chains, n). They stayed as they were: the law is right, but the chain moves less. Also,
+        in every iteration, those whose first path is a stand-in that nothing has replaced yet: a
+        stand-in that is hardly ever hit calls for no proposal, and the posterior is then given
+        that path. Where this does not go to zero choose another proposal for such intervals.
     - `num_truncated`: weights that `max_trials` cut off, shape (*chains, n): where there are many
         the law is not exact.
     - `state`: where it ended; pass it as `init` to go on.
@@ -219,12 +225,12 @@ class _Sweep(NamedTuple):
 def _start(key: Key[Array, ""], setting: _Setting, theta: Float[Array, "*chains p"]) -> GibbsState:
     def first(key, theta):
         model = nondifferentiable(setting.unknowns.at(theta))
-        return setting.completion.first(key, model)
+        return setting.completion.first_and_found(key, model)
 
     key = jax.random.fold_in(key, 0)
     if theta.ndim == 1:
-        return GibbsState(theta, first(key, theta))
-    return GibbsState(theta, jax.vmap(first)(jax.random.split(key, len(theta)), theta))
+        return GibbsState(theta, *first(key, theta))
+    return GibbsState(theta, *jax.vmap(first)(jax.random.split(key, len(theta)), theta))
 
 
 def _iterate(
@@ -234,15 +240,16 @@ def _iterate(
     bridge_key, parameter_key = jax.random.split(key)
     model = setting.unknowns.at(state.theta)
     paths, renewed = setting.completion.renew(bridge_key, model, state.paths)
+    found = state.found | renewed.moved
     step = setting.kernel.step(parameter_key, state.theta, setting.data(paths))
     sweep = _Sweep(
         step.accepted,
         jnp.mean(renewed.moved.astype(state.theta.dtype)),
         jnp.sum(renewed.num_simulated, dtype=jnp.int32),
-        jnp.sum(renewed.missing, dtype=jnp.int32),
+        jnp.sum(renewed.missing | ~found, dtype=jnp.int32),
         jnp.sum(renewed.truncated, dtype=jnp.int32),
     )
-    return GibbsState(step.theta, paths), sweep
+    return GibbsState(step.theta, paths, found), sweep
 
 
 @eqx.filter_jit

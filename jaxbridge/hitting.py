@@ -22,7 +22,7 @@ from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
 from .intervals import check_count, check_key
 from .search import Trials, check_bound, default_num_lanes, key_for, numbered_keys, search
-from .start_laws import AnyStartLaw, as_start_law
+from .start_laws import AnyStartLaw, as_start_law, run_is_cut
 
 # A count that takes longer than this is cut off, unless the user says otherwise.
 _MAX_TRIALS_PER_COUNT = 10_000
@@ -48,7 +48,8 @@ class HittingCounts(eqx.Module):
 
     - `counts`: N independent counts for each bridge, shape (n, N); -1 where the trials ran out
         before the count was complete, and for a bridge that is missing.
-    - `truncated`: whether the trials ran out, shape (n,).
+    - `truncated`: whether the trials ran out, shape (n,). Also where they did not start from ν,
+        because the run that replaces a sampler of it was cut off: see `Stationary`.
     - `num_trials`: how many there were in all, shape (n,).
     - `num_nonfinite`: how many of them left the finite numbers, which is no hit.
     - `start`: where the last trial that hit had started, shape (n, d).
@@ -78,7 +79,7 @@ class HittingCounts(eqx.Module):
         missing."""
         hits, trials = self._num_hits, self.num_trials
         # Trials that ran out are a binomial sample, estimated by hits / trials.
-        less = jnp.where(self.truncated, 0, 1)
+        less = jnp.where(hits < self.counts.shape[-1], 0, 1)
         numerator, denominator = hits - less, trials - less
         certain = denominator <= 0  # one trial, one hit
         numerator, denominator = (
@@ -90,10 +91,13 @@ class HittingCounts(eqx.Module):
 
     @property
     def standard_error(self) -> Float[Array, "*I n"]:
-        """That of `probability`, about π √((1-π)/N); infinite for fewer than three counts, of
-        which nothing is known."""
-        variance = self.probability**2 * (1 - self.probability)
-        hits = self._num_hits
+        """That of `probability`, about π √((1-π)/N), and about 1/N where no trial missed: N hits
+        in N trials tell π from 1 no better than that. Infinite for fewer than three counts, of
+        which nothing is known, as where the trials ran out without a hit."""
+        hits, trials, probability = self._num_hits, self.num_trials, self.probability
+        # The smallest share of misses that the trials tell from none is one of them.
+        resolution = 1 / jnp.maximum(trials, 1).astype(probability.dtype)
+        variance = probability**2 * jnp.maximum(1 - probability, resolution)
         error = jnp.sqrt(variance / jnp.maximum(hits - 2, 1).astype(variance.dtype))
         return jnp.where(hits > 2, error, jnp.inf)
 
@@ -210,9 +214,10 @@ def count_hits(
     before = jnp.concatenate([jnp.full_like(number[:, :1], -1), number[:, :-1]], axis=1)
     last = jnp.maximum(found.num_found - 1, 0)
     starts = found.outputs.reshape(*number.shape, -1)
+    cut = run_is_cut(coupling.start_law, model, duration / num_steps, num_steps)
     return HittingCounts(
         jnp.where(number >= 0, number - before, -1),
-        active & (found.num_found < num_counts),
+        active & ((found.num_found < num_counts) | cut),
         found.num_trials,
         found.num_nonfinite,
         starts[jnp.arange(len(number)), last],

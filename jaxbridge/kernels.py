@@ -53,7 +53,8 @@ class Chain(AbstractExactBridges):
         little weight, and the chain's law is not exact. Shape (n,), or `None` as `log_weights`.
     - `num_simulated`: paths simulated in all, shape ().
     - `num_nonfinite`: how many of them left the finite numbers.
-    - `num_truncated`: how many proposals, accepted or not, had counts cut off.
+    - `num_truncated`: how many proposals, accepted or not, had counts cut off; for the renewal
+        chain all its steps where the run that replaces a sampler of ν was (see `Stationary`).
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
     - `pareto_k`: k̂ of the weights of all proposals: above 0.7 states with large weights stay too
         long for any error to be trusted. `None` where no new weights are proposed, as by renewal

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, PyTree
 from .arrays import Numbers, as_floating, is_traced
 from .diffusion import Diffusion, check_diffusion
 from .intervals import check_count
-from .transform import Transformed
+from .transform import Transformed, of_points
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
@@ -41,7 +41,8 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
 
     **Returns:** `Transformed`. Its `model` takes other parameters, also those of σ, by
     `with_params`, and compiles once; `forward`, `inverse` and `back` are for the parameters that
-    `model` has.
+    `model` has. So parameters of σ cannot be inferred from observations in these coordinates,
+    which would move with them: `gibbs`, `pmmh`, `score` and `maximum_likelihood` refuse it.
 
     **Raises:** `ValueError` for numbers that are out of range and for a σ(a) that is not a
     positive number; `TypeError` for what is no model, or no number.
@@ -81,8 +82,12 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
         reversible=model.has_reversal,
         normalised=model.normalised,
         prepare=functions.prepare,
+        _coordinates=functions.coordinates,
     )
-    return Transformed(moved, Partial(functions.forward, table), Partial(functions.inverse, table))
+    forward, inverse = (
+        of_points(Partial(function, table)) for function in (functions.forward, functions.inverse)
+    )
+    return Transformed(moved, forward, inverse)
 
 
 def _number(name: str, value: Numbers) -> float:
@@ -115,6 +120,7 @@ class _Functions(NamedTuple):
     sample_stationary: Callable
     forward: Callable
     inverse: Callable
+    coordinates: Callable
 
 
 @functools.lru_cache(maxsize=256)
@@ -200,4 +206,11 @@ def _functions(
     def sample_stationary(key, table):
         return forward(table, unbound.with_params(table.params).sample_stationary(key))
 
-    return _Functions(prepare, drift, log_stationary, sample_stationary, forward, inverse)
+    def coordinates(table):
+        """Y depends on the parameters that σ depends on, at any point, and on those of the
+        coordinates that it is made from."""
+        within = () if unbound.coordinates is None else unbound.coordinates(table.params)
+        return sigma(jnp.asarray(origin, float), table.params), within
+
+    moments = (log_stationary, sample_stationary)
+    return _Functions(prepare, drift, *moments, forward, inverse, coordinates)

@@ -28,8 +28,8 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
 
     **Raises:** `ValueError` that says what is wrong with which time or observation.
     """
-    times, duration = time_steps("times", times)
-    observations = as_floating("observations", observations)
+    times, duration = time_steps("times", _unmasked("times", times))
+    observations = as_floating("observations", _unmasked("observations", observations))
     if times.ndim != 1:
         raise ValueError(f"`times` must have shape (n + 1,); got {times.shape}.")
     if observations.ndim != 2 or observations.shape[0] != times.shape[0]:
@@ -55,13 +55,39 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
         missing = np.flatnonzero(~np.all(np.isfinite(observations), axis=1))
         if missing.size:
             i = missing[0]
+            row = np.asarray(observations[i])
+            lacking = np.flatnonzero(~np.isfinite(row))
+            if lacking.size < row.size:
+                which = ", ".join(map(str, lacking))
+                raise ValueError(
+                    f"`observations[{i}]` = {row} has no finite number for coordinate {which}, but "
+                    "observations must be complete, all coordinates at a time: leave out this row, "
+                    "with its time."
+                )
             raise ValueError(
-                f"`observations[{i}]` = {np.asarray(observations[i])} is not finite: leave out "
-                "observations that are missing, with their times."
+                f"`observations[{i}]` = {row} is not finite: leave out observations that are "
+                "missing, with their times."
             )
         _check_state_space(model, observations)
     intervals, _, _ = as_intervals(observations[:-1], observations[1:], duration)
     return intervals
+
+
+def _unmasked(name: str, values: Numbers) -> Numbers:
+    """What a masked array of NumPy holds, if nothing in it is masked."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    mask = np.ma.getmaskarray(values)
+    if mask.any():
+        place = np.argwhere(mask)[0]
+        which = f"`{name}[{place[0]}]`" if place.size else f"`{name}`"
+        whole = place.size < 2 or mask[place[0]].all()
+        coordinate = "" if whole else f", in coordinate {place[1]},"
+        raise ValueError(
+            f"{which} is masked{coordinate} but observations must be complete: leave out what is "
+            "masked, the whole row with its time."
+        )
+    return values.data
 
 
 def _check_state_space(model: Diffusion, observations: Array) -> None:

@@ -15,6 +15,7 @@ from .unknowns import (
     Unknowns,
     as_unknowns,
     check_allowed,
+    check_coordinates_known,
     check_sigma_known,
     init_vectors,
 )
@@ -58,6 +59,7 @@ def as_problem(
     check_diffusion(model)
     intervals = as_observations(model, times, observations)
     unknowns, theta = as_unknowns(model, where, intervals.start[0])
+    check_coordinates_known(unknowns, theta)
     if sigma_unknown is not None:
         check_sigma_known(unknowns, theta, intervals.start[0], sigma_unknown)
     groups = step_groups(intervals.duration, num_steps, step_size)

@@ -29,7 +29,7 @@ from .grid import grid_times
 from .intervals import Intervals, check_count, check_key
 from .kernels import Chain, Kernel, chain_keys, check_path, one_interval, sum_by_interval
 from .search import Found, default_num_lanes, most_lanes
-from .start_laws import log_ratio
+from .start_laws import log_ratio, run_is_cut
 from .weighted import AbstractWeightedProposal
 
 
@@ -232,6 +232,9 @@ def run_renewal(
     def total(leaf):
         return sum_by_interval(leaf, num_intervals, batched)
 
+    # Nothing is counted, but no hit is what it should be if its trial did not start from μ.
+    cut = run_is_cut(pairs.coupling.start_law, model, intervals.duration / num_steps, num_steps)
+
     return Chain(
         times=grid_times(intervals, stored, pairs.fractions(num_steps), several_durations),
         paths=paths,
@@ -241,7 +244,7 @@ def run_renewal(
         truncated=None,
         num_simulated=total(segments.num_simulated) + total(num_tried),
         num_nonfinite=total(segments.num_nonfinite) + total(num_failed),
-        num_truncated=total(jnp.zeros(num, jnp.int32)),
+        num_truncated=total(jnp.where(cut, num_bridges, 0)),
         proposal=pairs,
         pareto_k=None,
         log_halving=log_halving if batched else log_halving[0],

@@ -105,7 +105,8 @@ class Milstein(AbstractScheme):
 
     Strong order 1. The inverse solves the quadratic for the root that tends to the Euler
     noise as ∂σ → 0; it is exact as long as `1 + ∂_iσ_i ΔW_i > 0`, which fails with a
-    probability that vanishes faster than any power of δ. For constant σ this is Euler.
+    probability that vanishes faster than any power of δ. Of a step that no increment explains it
+    is the fold, ΔW_i = -1/∂_iσ_i, whose step comes nearest. For constant σ this is Euler.
 
     **Raises:** `ValueError`, when it is used, for a σ that is a full, state-dependent matrix.
 
@@ -138,9 +139,11 @@ class Milstein(AbstractScheme):
             return euler
         slope = self._slope(dynamics, x)
         increment = euler + slope * dt / 2  # = ΔW + ½ ∂σ ΔW²
-        # Past the fold, where no increment explains the step, take the fold itself.
-        discriminant = jnp.maximum(1 + 2 * slope * increment, jnp.finfo(x.dtype).eps)
-        return 2 * increment / (1 + jnp.sqrt(discriminant))
+        discriminant = 1 + 2 * slope * increment
+        # At the fold ΔW = -1/∂σ, and no increment explains a step past it.
+        past = discriminant <= 0
+        increment = jnp.where(past, -0.5 / jnp.where(past, slope, 1), increment)
+        return 2 * increment / (1 + _root(discriminant))
 
     def frame(self, dynamics, x, driven, dt):
         return _frame_after_drift(dynamics, x, driven, dt)
@@ -271,8 +274,11 @@ class GaussianTransition(AbstractScheme):
         x + M_δ α(x) + R ΔW,    M_δ = ∫_0^δ e^{sA} ds,   R Rᵀ δ = Γ_δ,
 
     with the root R = σ L, L lower triangular, that tends to σ as δ → 0. Paths of the diffusion
-    and of its time reversal have no step error at all, nor have bridges made of them if the
-    meeting rule is `BrownianCrossing`: at its grid points one step is as good as many.
+    and of its time reversal have no step error at all, nor have bridges made of them, and
+    transition densities by these, if the meeting rule is `BrownianCrossing`: at its grid points
+    one step is as good as many. That is so for given parameters only. Where parameters are
+    inferred from the paths (`gibbs`, `score`, `maximum_likelihood`) the likelihood of a path has a
+    step error of its own, whatever the scheme, so there `num_steps` still counts.
 
     **Raises:** `ValueError`, when it is used, for a drift that is not linear, or σ that depends on
     the state.
@@ -329,6 +335,12 @@ class _FittedTransition(AbstractScheme):
     def frame(self, dynamics, x, driven, dt):
         drift = dynamics.drift(x) - dynamics.drift(driven)
         return frame_of(self.root, x - driven + matvec(self.integral, drift))
+
+
+def _root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """√x, zero below zero; within rounding of zero a chord, whose slope is finite."""
+    eps = jnp.finfo(x.dtype).eps
+    return jnp.where(x > eps, jnp.sqrt(jnp.maximum(x, eps)), jnp.maximum(x, 0) / eps**0.5)
 
 
 def _frame_after_drift(

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from .arrays import Numbers, as_floating, cast_floats, is_traced
 from .diffusion import Diffusion, Dynamics, check_value
@@ -59,7 +59,10 @@ class Stationary(eqx.Module):
     Draws come from the model's sampler. A model without one is run: the reversed diffusion
     starts at b and is taken after `burn_in` units of time, afresh for every draw. By default
     that time is measured, as `measure_burn_in` does, and the results that used it say what it
-    was: infinite where none was found, and then bridges are not exact.
+    was: infinite where none was found. A run takes no more than 2¹⁸ steps; where it should have
+    taken more bridges are not exact, and what was counted or weighed is marked as `truncated`.
+    What the start weighs after the run is less than 1e-5 for a diffusion that forgets
+    exponentially fast, but may be 2e-3 for one with heavy tails: see `measure_burn_in`.
 
     **Raises:** `ValueError` for a `burn_in` that is not a positive time, shape ().
 
@@ -155,6 +158,17 @@ def log_ratio(law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]) -> Floa
 def needs_burn_in(law: AnyStartLaw, model: Diffusion) -> bool:
     """Whether ν must be sampled by a run whose length is not known."""
     return isinstance(law, Stationary) and law.burn_in is None and not model.has_sampler
+
+
+def run_is_cut(
+    law: AnyStartLaw, model: Diffusion, dt: Float[Array, " lanes"], num_steps: int
+) -> Bool[Array, " lanes"]:
+    """Where the run that replaces a sampler of ν would have to be longer than it may be, so that
+    its end does not have the law ν: always if the burn-in is infinite, for it is not known."""
+    if not isinstance(law, Stationary) or law.burn_in is None or model.has_sampler:
+        return jnp.zeros(dt.shape, bool)
+    longest = (MOST_STEPS // num_steps) * num_steps * dt
+    return ~(law.burn_in.astype(dt.dtype) <= longest * (1 + 1e-4))  # of rounding
 
 
 def draw_starts(

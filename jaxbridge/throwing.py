@@ -27,7 +27,11 @@ _FAILED = (
 )
 _TRUNCATED = (
     "some weights were cut off by `max_trials`, and what they weigh is hardly ever hit: allow more "
-    "trials, or fit a start law by `fit_start_law`."
+    "trials, or fit a start law by `fit_start_law`. Or the run that replaces a sampler of the "
+    "stationary law was cut off, for its burn-in is unknown (infinite in the result, as where "
+    "`measure_burn_in` finds none) or longer than 2¹⁸ steps: give `Diffusion` a "
+    "`sample_stationary`, or the coupling a `Stationary(burn_in=...)` that is shorter or a start "
+    "law with a density."
 )
 _HEAVY = (
     "some weights have tails so heavy (a Pareto shape k̂ above 0.7) that their mean and its error "

@@ -32,7 +32,8 @@ class Transformed(eqx.Module):
     """A model in other coordinates, and the way there and back.
 
     - `model`: of Y = f(X), with the parameters of the given model.
-    - `forward`, `inverse`: f and its inverse, of one point of shape (d,).
+    - `forward`, `inverse`: f and its inverse, of points of shape (d,) or (..., d), such as
+        observations.
 
     **Example:**
 
@@ -73,6 +74,19 @@ class Transformed(eqx.Module):
 
 def _rows(points: Float[Array, "... d"]) -> Float[Array, "n d"]:
     return points.reshape(-1, points.shape[-1])
+
+
+def of_points(function: Map) -> Partial:
+    """A function of one point as one of points of shape (d,) or (..., d)."""
+    return Partial(_of_points, Partial(function))
+
+
+def _of_points(function: Map, points: Numbers) -> Array:
+    points = as_floating("points", points)
+    if points.ndim < 2:
+        return function(points)
+    values = jax.vmap(function)(_rows(points))
+    return values.reshape(*points.shape[:-1], *values.shape[1:])
 
 
 def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
@@ -119,8 +133,9 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
         reversible=model.reversible,
         normalised=model.normalised,
         prepare=model.preparation,
+        _coordinates=model.coordinates,
     )
-    return Transformed(moved, Partial(forward), Partial(inverse))
+    return Transformed(moved, of_points(forward), of_points(inverse))
 
 
 class _Functions(NamedTuple):

@@ -134,6 +134,18 @@ def check_sigma_known(
         )
 
 
+def check_coordinates_known(unknowns: Unknowns, theta: Float[Array, " p"]) -> None:
+    """Raise `ValueError` where the coordinates of the model depend on the unknown parameters."""
+    if uses_argument(lambda theta: unknowns.at(theta).coordinate_values(), theta):
+        raise ValueError(
+            "the coordinates of `lamperti` depend on the unknown parameters, those of σ, but the "
+            "observations were mapped to them at fixed ones: infer in the original coordinates, "
+            "or in those of `jb.transform(model, jnp.log, jnp.exp)`, which depend on no "
+            "parameters, by `pmmh` or `maximum_likelihood`; or hold the parameters of σ fixed by "
+            "`where=`."
+        )
+
+
 def as_normal(prior: NormalPrior, unknowns: Unknowns, theta: Float[Array, " p"]) -> NormalDensity:
     """The prior of θ, with its shapes checked."""
     p = theta.shape[0]

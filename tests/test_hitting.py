@@ -75,8 +75,31 @@ def test_estimates_from_counts_are_unbiased(probability, num_counts):
         values = np.asarray(estimate, float)
         assert abs(values.mean() - exact) <= 5 * values.std() / np.sqrt(n) + 1e-6
     if num_counts == 50:
-        stated = float(jnp.mean(counts.standard_error))
-        assert stated == pytest.approx(float(jnp.std(counts.probability)), rel=0.1, abs=1e-6)
+        stated, spread = float(jnp.mean(counts.standard_error)), jnp.std(counts.probability)
+        assert stated == pytest.approx(1 / 50 if probability == 1 else float(spread), rel=0.1)
+
+
+@pytest.mark.parametrize("probability", [0.99, 0.999])
+def test_counts_that_are_all_one_have_an_error(probability):
+    """Where hardly any trial misses, the estimate is still as far off as the error says."""
+    drawn = np.random.default_rng(0).geometric(probability, size=(20_000, 20))
+    counts = synthetic(drawn)
+    all_one = (drawn == 1).all(1)
+    assert 0.5 < all_one.mean() < 1
+    error = np.asarray(counts.standard_error)
+    np.testing.assert_allclose(error[all_one], 1 / 20, rtol=0.1)
+    assert (abs(np.asarray(counts.probability) - probability) < 5 * error).mean() > 0.9999
+
+
+def test_trials_that_ran_out_without_a_hit_tell_nothing():
+    counts = jb.HittingCounts(
+        jnp.array([[-1, -1, -1], [1, 1, -1], [-1, -1, -1]]),
+        jnp.array([True, True, False]),
+        jnp.array([64, 64, 0]),  # the last bridge is missing
+        jnp.zeros(3, int),
+        jnp.zeros((3, 2)),
+    )
+    np.testing.assert_array_equal(counts.standard_error, np.inf)
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ from helpers import count_compilations
 from test_transform import MEAN, NOISE, RATE, cir, cir_density
 
 import jaxbridge as jb
+from jaxbridge.problem import as_problem
 
 AT = 0.5
 
@@ -107,6 +108,98 @@ def test_parameters_of_sigma_may_change_and_have_derivatives(x64):
     slope = jax.grad(exact)(0.6)
     np.testing.assert_allclose(jax.jvp(drift, (0.6,), (1.0,))[1], slope, rtol=1e-5)
     np.testing.assert_allclose(jax.grad(drift)(0.6), slope, rtol=1e-5)
+
+
+def test_maps_take_many_points():
+    moved = jb.lamperti(cir(), at=AT, reach=8.0)
+    points = np.linspace(0.05, 2, 12).reshape(3, 4, 1).astype(np.float32)
+    mapped = moved.forward(points)
+    np.testing.assert_allclose(mapped, root(points), atol=2e-6)
+    np.testing.assert_allclose(moved.inverse(mapped), points, rtol=2e-5)
+    np.testing.assert_allclose(moved.forward(points[0, 0]), root(points[0, 0]), atol=2e-6)
+
+
+TIMES = np.arange(4.0)
+OBSERVATIONS = np.array([[0.3], [0.5], [0.4], [0.6]], np.float32)
+PRIOR = jb.NormalPrior(1.0, 1.0)
+INFERENCE = {
+    "gibbs": lambda *a, **o: jb.gibbs(*a, prior=PRIOR, num_iterations=2, **o),
+    "pmmh": lambda *a, **o: jb.pmmh(*a, prior=PRIOR, num_iterations=2, **o),
+    "score": jb.score,
+    "maximum_likelihood": lambda *a, **o: jb.maximum_likelihood(*a, num_iterations=2, **o),
+}
+
+
+def shifted(model):
+    """Other coordinates than those that depend on parameters, which then do so as well."""
+    moved = jb.transform(model, lambda y: 1 + y, lambda z: z - 1)
+    return moved.model, moved.forward
+
+
+@pytest.mark.parametrize("name", INFERENCE)
+@pytest.mark.parametrize("where", [None, lambda p: p[2]], ids=["all", "noise"])
+def test_unknown_parameters_of_sigma_are_refused(name, where):
+    """The coordinates would move with them, and the observations would not."""
+    moved = jb.lamperti(cir(), at=AT, reach=8.0)
+    points = moved.forward(OBSERVATIONS)
+    further, forward = shifted(moved.model)
+    twice = jb.lamperti(moved.model, at=0.0, reach=6.0)
+    for model, data in [
+        (moved.model, points),
+        (moved.model.with_params((1.0, 0.6, 0.5)), points),
+        (further, forward(points)),
+        (twice.model, points),
+    ]:
+        with pytest.raises(ValueError, match=r"coordinates of `lamperti` depend.*`where="):
+            INFERENCE[name](jax.random.key(0), model, TIMES, data, where=where, num_steps=4)
+
+
+def test_unknown_parameters_of_the_drift_are_not_refused():
+    moved = jb.lamperti(cir(), at=AT, reach=8.0)
+    points = moved.forward(OBSERVATIONS)
+    further, forward = shifted(moved.model)
+    prepared = jb.Diffusion(  # the parameters of σ reach it by `prepare`
+        lambda x, p: p["rate"] * (0.5 - x),
+        lambda x, p: p["noise"] * jnp.sqrt(x),
+        params=(1.0, 0.36),
+        prepare=lambda p: dict(rate=p[0], noise=jnp.sqrt(p[1])),
+    )
+    prepared = jb.lamperti(prepared, at=AT, reach=8.0)
+    for model, data in [
+        (moved.model, points),
+        (further, forward(points)),
+        (prepared.model, prepared.forward(OBSERVATIONS)),
+    ]:
+        arguments = (jax.random.key(0), model, TIMES, data)
+        problem = as_problem(*arguments, lambda p: p[0], 4, None, "")
+        assert problem.theta.shape == (1,)
+        with pytest.raises(ValueError, match="coordinates of `lamperti` depend"):
+            as_problem(*arguments, lambda p: p[1:], 4, None, "")
+
+
+@pytest.mark.slow
+def test_the_rate_is_inferred_as_in_other_fixed_coordinates():
+    """The score of the rate, whose coordinates do not matter where they are known."""
+    values = []
+    for moved in (
+        jb.lamperti(cir(), at=AT, reach=8.0),
+        jb.transform(cir(), jnp.log, jnp.exp),
+    ):
+        values.append(
+            jb.score(
+                jax.random.key(0),
+                moved.model,
+                TIMES,
+                moved.forward(OBSERVATIONS),
+                where=lambda p: p[0],
+                num_steps=40,
+                num_bridges=4_000,
+                proposal=jb.ModifiedDiffusionBridge(),
+            )
+        )
+    error = np.hypot(*(float(each.standard_error) for each in values))
+    assert error < 0.05
+    assert abs(values[0].value - values[1].value) < 5 * error + 0.02  # the step errors
 
 
 def test_bad_arguments_are_refused(unchecked):

@@ -8,6 +8,7 @@ import pytest
 from helpers import paper_model
 
 import jaxbridge as jb
+from jaxbridge.observations import as_observations
 
 KEY, A, B = jax.random.key(0), [0.0, 0.0], [1.0, 0.0]
 LAW = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
@@ -92,6 +93,47 @@ def test_observations(name, malformed, unchecked):
     if (name, malformed) == ("path_log_likelihood", "a point that is missing"):
         pytest.skip("a likelihood of NaN is data: bridges that were not found are NaN")
     refused(OF_OBSERVATIONS[name], *OBSERVATIONS[malformed])
+
+
+@pytest.mark.parametrize(
+    ("times", "points", "sentence"),
+    [
+        (
+            TIMES,
+            np.ma.masked_invalid([[0.0, 0.0], [np.nan, np.nan], [0.1, 0.3]]),
+            r"`observations\[1\]` is masked but .* the whole row with its time",
+        ),
+        (
+            TIMES,
+            np.ma.masked_invalid([[0.0, 0.0], [0.5, 0.2], [0.1, np.nan]]),
+            r"`observations\[2\]` is masked, in coordinate 1, but .* the whole row",
+        ),
+        (
+            np.ma.masked_equal(TIMES, 1.0),
+            POINTS,
+            r"`times\[1\]` is masked but observations must be complete",
+        ),
+        (
+            TIMES,
+            [[0.0, 0.0], [0.5, np.nan], [0.1, 0.3]],
+            r"`observations\[1\]` = .* for coordinate 1, but .* leave out this row, with its time",
+        ),
+        (
+            TIMES,
+            [[0.0, 0.0], [0.5, 0.2], [np.nan, np.nan]],
+            r"`observations\[2\]` = .* is not finite: leave out observations that are missing",
+        ),
+    ],
+)
+def test_what_is_missing_is_named(times, points, sentence, unchecked):
+    with pytest.raises(ValueError, match=sentence):
+        as_observations(MODEL, times, points)
+
+
+def test_masked_arrays_without_anything_masked_are_arrays():
+    masked = as_observations(MODEL, np.ma.masked_less(TIMES, -1), np.ma.masked_invalid(POINTS))
+    plain = as_observations(MODEL, TIMES, POINTS)
+    jax.tree.map(np.testing.assert_array_equal, masked, plain)
 
 
 # Counts, and functions of what others return.

@@ -60,11 +60,49 @@ def test_heun_inverse_order(make_model, order, x64):
     assert loglog_slope(steps, errors) == pytest.approx(order, abs=0.15)
 
 
-def test_milstein_past_the_fold_is_finite():
-    dynamics = jb.Diffusion(lambda x, p: -x, lambda x, p: jnp.exp(x)).forward(jnp.zeros(1))
-    far_below = jnp.array([-5.0])  # no increment takes 0 there in one step
-    noise = jb.Milstein().noise(dynamics, jnp.zeros(1), far_below, jnp.asarray(0.01))
-    assert jnp.isfinite(noise).all()
+def milstein_noise(x_next, slope, dt=0.01, dtype=None):
+    """Of the step from 0 to `x_next`, without drift, with σ = 1 + slope · x."""
+    model = jb.Diffusion(lambda x, p: jnp.zeros_like(x), lambda x, p: 1 + p * x, params=slope)
+    x = jnp.zeros(1, dtype)
+    noise = jb.Milstein().noise(model.forward(x), x, x_next[None], jnp.asarray(dt, dtype))
+    return noise[0]
+
+
+@pytest.mark.parametrize("slope", [3.0, -0.5, 1e-3, 1e-12])
+def test_milstein_past_the_fold_is_the_fold(slope, precision):
+    """The increment whose step comes nearest, found by search; it does not depend on how far
+    past the fold the point is, and has derivatives."""
+    dtype, dt = jnp.dtype(precision), 0.01
+    fold = (-1 / slope - slope * dt) / 2  # the point that ΔW = -1/∂σ leads to
+    for distance in (1.001, 1.5, 40.0):
+        point = jnp.asarray(distance * (fold if abs(slope) < 1 else fold - 1 / slope), dtype)
+        noise = milstein_noise(point, slope, dt, dtype)
+        trial = np.linspace(-3, 3, 60_001) / abs(slope)
+        misses = abs(trial + slope * (trial**2 - dt) / 2 - float(point))
+        np.testing.assert_allclose(noise, trial[np.argmin(misses)], rtol=1e-3)
+        np.testing.assert_allclose(noise, -1 / slope, rtol=1e-6)
+        slopes = jax.grad(milstein_noise, (0, 1, 2))(point, jnp.asarray(slope, dtype), dt, dtype)
+        np.testing.assert_allclose(slopes, [0, 1 / slope**2, 0], rtol=1e-5)
+
+
+def test_milstein_is_continuous_at_the_fold(precision):
+    dtype, slope, dt = jnp.dtype(precision), 3.0, 0.01
+    fold = (-1 / slope - slope * dt) / 2
+    points = jnp.asarray(fold, dtype) + jnp.linspace(-1, 1, 2001).astype(dtype) * 1e-5
+    noise = jax.vmap(lambda x: milstein_noise(x, slope, dt, dtype))(points)
+    assert (jnp.diff(noise) >= -1e-6).all()  # it does not jump back, and rises like a root
+    expected = (-1 + np.sqrt(np.maximum(2 * slope * (np.asarray(points, float) - fold), 0))) / slope
+    np.testing.assert_allclose(noise, expected, atol=1e-3 if dtype == "float32" else 1e-8)
+    slopes = jax.vmap(jax.grad(lambda x: milstein_noise(x, slope, dt, dtype)))(points)
+    assert jnp.isfinite(slopes).all()
+
+
+@pytest.mark.parametrize("slope", [0.0, 1e-30, -1e-20])
+def test_milstein_noise_of_a_tiny_slope_is_that_of_euler(slope):
+    """Branches that are not taken leave no trace in derivatives."""
+    value, slopes = jax.value_and_grad(milstein_noise, (0, 1))(jnp.array(0.3), jnp.array(slope))
+    np.testing.assert_allclose(value, 0.3, rtol=1e-6)
+    np.testing.assert_allclose(slopes, [1, (0.01 - 0.3**2) / 2], rtol=1e-5)
 
 
 def strong_errors(scheme, model, exact, step_counts, num_paths=2000, finest=1024):

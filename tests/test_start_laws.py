@@ -5,9 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import NON_REVERSIBLE, assert_moments, paper_model
+from helpers import NON_REVERSIBLE, assert_moments, paper_model, slow_cases
 
 import jaxbridge as jb
+from jaxbridge import burn_in, start_laws
 from jaxbridge.start_laws import as_start_law, draw_starts
 
 
@@ -48,11 +49,11 @@ def test_a_run_replaces_the_sampler_from_far_away():
     model = jb.ornstein_uhlenbeck(NON_REVERSIBLE)
     end = jnp.array([6.0, -6.0])
     blind = without_sampler(model)
-    burn_in = jb.measure_burn_in(jax.random.key(1), blind, end, 1.0, num_steps=40)
+    measured = jb.measure_burn_in(jax.random.key(1), blind, end, 1.0, num_steps=40)
     # The slowest rate is 3/4: the start, ten standard deviations out, must be forgotten.
-    assert 8 <= burn_in <= 100
+    assert 8 <= measured <= 100
     exact = jb.ou_stationary(model)
-    drawn = starts(jb.Stationary(burn_in), blind, end)
+    drawn = starts(jb.Stationary(measured), blind, end)
     assert_moments(drawn, exact.mean, exact.covariance, mean_allowance=0.002)
     with pytest.raises(AssertionError):  # one unit of time is not enough
         assert_moments(starts(jb.Stationary(1.0), blind, end), exact.mean, exact.covariance)
@@ -141,11 +142,83 @@ def test_gaussian_law_is_normalised_and_sampled():
 def test_pairs_that_explode_have_not_met():
     """Explicit steps of a quartic well that are far too long: nothing stays finite."""
     quartic = jb.Diffusion(lambda x, p: -2 * x**3, None, lambda x, p: -jnp.sum(x**4))
-    with pytest.raises(ValueError, match="have not all met"):
+    with pytest.raises(ValueError, match=r"have not all met.*`SemiImplicit\(\)`"):
         jb.measure_burn_in(jax.random.key(0), quartic, [3.0], 20.0, num_steps=10)
     # In steps of a third some pairs explode, and are left out of those that must meet.
     seldom = jb.measure_burn_in(jax.random.key(0), quartic, [0.5], 20.0, num_steps=60)
     assert 20.0 < seldom < 200.0
+
+
+@pytest.fixture
+def short_runs(monkeypatch):
+    """Runs of 256 steps at most, so that a test need not wait for a run that is too short."""
+    for module in (start_laws, burn_in):
+        monkeypatch.setattr(module, "MOST_STEPS", 2**8)
+
+
+def slow_model():
+    """An Ornstein–Uhlenbeck process that takes hundreds of units of time to forget, known by its
+    density only: N(0, 50)."""
+    return jb.Diffusion(
+        lambda x, p: -0.01 * x,
+        None,
+        lambda x, p: jnp.sum(-0.01 * x**2 - jnp.log(100 * jnp.pi) / 2),
+        reversible=True,
+        normalised=True,
+    )
+
+
+LAWS = {
+    "unknown": (jb.Stationary(), False),
+    "too long": (jb.Stationary(1e4), False),
+    "known": (jb.Stationary(32.0), True),  # the longest run
+}
+
+
+@pytest.mark.parametrize("name", slow_cases(LAWS, ["unknown"]))
+def test_counts_and_weights_from_a_run_that_was_cut_are_marked(name, short_runs):
+    """Whether it was measured in vain or given too long, 32 units of time are not enough."""
+    law, trusted = LAWS[name]
+    key, model, ends = jax.random.key(0), slow_model(), ([0.0], [0.3], 1.0)
+    coupling = jb.Coupling(0.0, start_law=law)
+    bridges = jb.sample_bridges(key, model, *ends, num_bridges=4, num_steps=8, coupling=coupling)
+    assert bridges.met.all()
+    weighted = jb.weigh_bridges(key, model, bridges)
+    assert (weighted.truncated != trusted).all() and np.isfinite(weighted.log_weights).all()
+    assert bool(np.isinf(weighted.coupling.start_law.burn_in)) == (law.burn_in is None)
+    counts = jb.hitting_counts(key, model, bridges, 3)
+    assert (counts.counts > 0).all() and (counts.truncated != trusted).all()
+    trials = np.asarray(counts.num_trials)  # as many hits as were wanted, marked or not
+    np.testing.assert_allclose(counts.probability, 2 / (trials - 1), rtol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LAWS)
+def test_densities_and_chains_from_a_run_that_was_cut_are_marked(name, short_runs):
+    law, trusted = LAWS[name]
+    key, model, ends = jax.random.key(0), slow_model(), ([0.0], [0.3], 1.0)
+    options = dict(num_steps=8, proposal=jb.Coupling(0.0, start_law=law))
+    density = jb.transition_log_density(key, model, *ends, num_proposals=20, **options)
+    assert density.num_truncated == (0 if trusted else density.num_met)
+    for method in ("renewal", "pseudo_marginal"):
+        chain = jb.sample_exact_bridges(key, model, *ends, num_bridges=4, method=method, **options)
+        assert (chain.num_truncated == 0) == trusted
+
+
+@pytest.mark.slow
+def test_a_burn_in_that_is_unknown_raises_for_those_who_ask(short_runs):
+    key, model, ends = jax.random.key(0), slow_model(), ([0.0], [0.3], 1.0)
+    options = dict(num_bridges=4, num_steps=8, throw=True)
+    coupling = jb.Coupling(0.0)
+    bridges = jb.sample_bridges(key, model, *ends, coupling=coupling, **options)
+    with pytest.raises(RuntimeError, match="burn-in is unknown"):
+        jb.weigh_bridges(key, model, bridges, throw=True)
+    for method in ("renewal", "pseudo_marginal"):
+        with pytest.raises(RuntimeError, match="burn-in is unknown"):
+            jb.sample_exact_bridges(key, model, *ends, proposal=coupling, method=method, **options)
+    options = dict(num_steps=8, proposal=coupling, throw=True)
+    with pytest.raises(RuntimeError, match="burn-in is unknown"):
+        jb.transition_log_density(key, model, *ends, num_proposals=20, **options)
 
 
 def test_errors_say_what_to_change(unchecked):

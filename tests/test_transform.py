@@ -158,6 +158,31 @@ def test_jacobians_at_one_point_and_many():
     np.testing.assert_allclose(logarithm.log_jacobian([0.5]), np.log(2), rtol=1e-6)
 
 
+def test_maps_take_one_point_and_many():
+    """Of a map that mixes coordinates, batches of any shape are the points one by one."""
+    ou = jb.ornstein_uhlenbeck(np.eye(2))
+    turned = jb.transform(ou, swirl, unswirl)
+    points = jax.random.normal(jax.random.key(0), (3, 4, 2))
+    for function, alone in [(turned.forward, swirl), (turned.inverse, unswirl)]:
+        expected = np.array([[alone(x) for x in row] for row in points])
+        np.testing.assert_allclose(function(points), expected, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(function(points[0]), expected[0], rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(function(points[0, 0]), expected[0, 0], rtol=1e-5, atol=1e-6)
+        assert function(points[:0]).shape == (0, 4, 2)
+    np.testing.assert_allclose(turned.inverse(turned.forward(points)), points, atol=1e-5)
+    logarithm = jb.transform(cir(), jnp.log, jnp.exp)
+    np.testing.assert_allclose(logarithm.forward([[0.5], [2]]), np.log([[0.5], [2]]), rtol=1e-6)
+
+
+def test_maps_are_pytrees_that_compile_once():
+    run = jax.jit(lambda moved, x: moved.forward(x))
+    points = jnp.ones((5, 1))
+    run(jb.transform(cir(), jnp.log, jnp.exp), points)
+    with count_compilations() as compiled:
+        run(jb.transform(cir().with_params((1.0, 0.4, 0.5)), jnp.log, jnp.exp), points)
+    assert not compiled
+
+
 def growth():
     """dX = X(1 - X) dt + 0.7 X dW, of geometric type, with a Gamma law."""
     return jb.Diffusion(
