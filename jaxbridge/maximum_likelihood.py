@@ -78,8 +78,10 @@ class MaximumLikelihood(eqx.Module):
     - `newton`: whether the last step was made. Not so if the information was not positive definite,
         or the step longer than about a standard error, or out of the constraint: then the average
         of the iterates is returned, which is not the maximum, and more iterations are needed, or
-        longer steps. Where σ is unknown: whether the maximum was found; if not, `params` are the
-        best that were seen.
+        longer steps. Where σ is unknown: whether a maximum was found, and no Monte Carlo error,
+        in any direction, is more than half a standard error. If not, `params` are those of the
+        largest simulated likelihood that was seen, which may be a maximum of the noise alone: more
+        bridges are needed, or a better proposal, unless the maximum lies out of the constraint.
     """
 
     params: PyTree

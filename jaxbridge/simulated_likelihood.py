@@ -26,7 +26,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jax import lax
-from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from .arrays import all_finite_leaves, is_traced, nondifferentiable
@@ -39,10 +38,13 @@ from .unknowns import Constraint, Unknowns, allowed
 
 # Paths of each interval for a noisy gradient.
 _FEW = 8
-# Newton's method has arrived where another step would raise ℓ̂ by less: the step is then shorter
-# than a hundredth of a standard error.
+# Newton's method has arrived where the square of the next step, in standard errors, is less.
 _GAIN = 1e-5
-# Points that are tried, and the shortest fraction of a step.
+# A Monte Carlo error of more, in standard errors, is too much for a maximum.
+_NOISE = 0.5
+# The longest step, in standard errors.
+_LONGEST = 2.0
+# Points that are tried, and the shortest fraction of a step so bounded.
 _MOST_POINTS = 60
 _SHORTEST = 1e-4
 
@@ -157,14 +159,17 @@ def _log_densities(
 ) -> Float[Array, " I"]:
     """log p̂ of each interval with half the relative variance of p̂ added; zero where no path was
     found."""
-    n = log_weights.shape[1]
-    some = jnp.any(found, axis=1)
-    # A lost path has no weight; where all are lost any number will do.
-    used = found | ~some[:, None]
-    log_sum = logsumexp(log_weights, axis=1, where=used)
-    log_squares = logsumexp(2 * log_weights, axis=1, where=used)
-    variance = (jnp.exp(log_squares - 2 * log_sum) - 1 / n) * (n / (n - 1))
-    return jnp.where(some, log_sum - np.log(n) + variance / 2, 0)
+    n, some = log_weights.shape[1], jnp.any(found, axis=1)
+    largest = jnp.max(log_weights, axis=1, initial=-jnp.inf, where=found)
+    largest = lax.stop_gradient(jnp.where(some, largest, 0))
+    # What is lost has no weight, and is not raised to a power: in reverse mode a masked 0 · ∞
+    # would be NaN.
+    weights = jnp.exp(jnp.where(found, log_weights - largest[:, None], 0))
+    weights = jnp.where(found, weights, 0)
+    sums, squares = jnp.sum(weights, axis=1), jnp.sum(weights**2, axis=1)
+    sums = jnp.where(some, sums, 1)
+    variance = (squares / sums**2 - 1 / n) * (n / (n - 1))
+    return jnp.where(some, jnp.log(sums) + largest - np.log(n) + variance / 2, 0)
 
 
 def simulated(
@@ -276,31 +281,35 @@ def climb(
         made, old = at(jnp.where(inside, tried, starts[0])), state.simulated
         expected = jnp.where(starting, 0, 1e-4 * state.fraction * (old.gradient @ state.step))
         higher = made.value >= old.value + expected - jnp.where(starting, 0, old.rounding)
-        fewer, as_many = (
-            made.num_missing < old.num_missing,
-            made.num_missing == old.num_missing,
-        )
+        fewer, as_many = made.num_missing < old.num_missing, made.num_missing == old.num_missing
         better = inside & all_finite_leaves(made) & (fewer | (as_many & higher))
         theta, made = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (tried, made), (state.theta, old)
         )
         step = ascent(made.gradient, made.information)
-        fraction = jnp.where(better | starting, 1, state.fraction / 3).astype(theta.dtype)
+        gain = made.gradient @ step
+        # A leap could end where weights are so uneven that ℓ̂ has maxima of its own.
+        longest = _LONGEST / jnp.sqrt(jnp.maximum(gain, _LONGEST**2))
+        fraction = jnp.where(better | starting, longest, state.fraction / 3).astype(theta.dtype)
         # The last point that was tried is better, or no shorter step would do.
-        done = (state.i + 1 >= at_start) & ((made.gradient @ step < _GAIN) | (fraction < _SHORTEST))
+        done = (state.i + 1 >= at_start) & ((gain < _GAIN) | (fraction < _SHORTEST * longest))
         return _Climb(state.i + 1, theta, made, step, fraction, done)
 
     nowhere = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(at, starts[0])
     )
-    worst = jnp.int32(jnp.iinfo(jnp.int32).max)
-    nowhere = nowhere._replace(value=-jnp.inf * jnp.ones_like(starts[0, 0]), num_missing=worst)
+    num_intervals = jnp.int32(nowhere.effective_sample_size.shape[0])
+    nowhere = nowhere._replace(
+        value=jnp.full_like(nowhere.value, -jnp.inf), num_missing=num_intervals
+    )
     one, no = jnp.ones_like(starts[0, 0]), jnp.array(False)
     first = _Climb(jnp.int32(0), starts[0], nowhere, jnp.zeros_like(starts[0]), one, no)
     last = lax.while_loop(lambda state: ~state.done & (state.i < _MOST_POINTS), next_point, first)
     made = last.simulated
-    definite = jnp.all(jnp.linalg.eigvalsh(made.information) > 0)
-    found = definite & (made.gradient @ last.step < _GAIN)
+    # Positive definite, and by far: where weights are very uneven ℓ̂ has maxima of its own.
+    clear = jnp.all(jnp.linalg.eigvalsh(_NOISE**2 * made.information - made.covariance) > 0)
+    # By rounding a step may seem to lead down that does not.
+    found = clear & (made.gradient @ last.step < 100 * _GAIN)
     return Maximum(last.theta, made, found)
 
 
