@@ -144,9 +144,10 @@ def maximum_likelihood(
     paths of each interval with fixed noise, a smooth function of θ. Half the estimated relative
     variance of each density is added to its logarithm, whose mean is too small by that; what is
     left of the bias falls with the square of `num_bridges`, and is small beside a standard error
-    where the number of intervals is small beside the square of `effective_sample_size`. For a σ
-    that varies with the state the density's step error is of first order: `num_steps` matters.
-    Only σ σᵀ is in the law of the data: of a matrix, leave unknown what that determines.
+    where the root of the number of intervals is small beside the square of
+    `effective_sample_size`. For a σ that varies with the state the density's step error is of first
+    order: `num_steps` matters. Only σ σᵀ is in the law of the data: of a matrix, leave unknown
+    what that determines.
 
     **Returns:** `MaximumLikelihood`. Not differentiable.
 

@@ -104,8 +104,8 @@ def test_monte_carlo_errors_and_bias():
     ]
     said = np.sqrt(np.diagonal(np.mean(covariances, axis=0))) / sd
     np.testing.assert_allclose(errors.std(axis=0), said, rtol=0.3)
-    # Without the correction it is 0.3 of a standard error.
-    assert (np.abs(errors.mean(axis=0)) < 4 * said / np.sqrt(60) + 0.02).all()
+    # Without the correction the rate is a tenth of a standard error too small.
+    assert (np.abs(errors.mean(axis=0)) < 2.5 * said / np.sqrt(60) + 0.01).all()
 
 
 def few(times, data, num_steps, model):
@@ -148,7 +148,7 @@ def test_noise_that_varies_with_the_state():
 
 def test_derivatives_are_those_of_the_value(x64):
     times, data, *_ = ou_problem()
-    unknowns, parts, theta = few(times[:5], data[:5], 5, ou_1d())
+    unknowns, parts, theta = few(times[:5], data[:5], 5, ou_1d(4.0))
 
     @jax.jit
     def at(theta):
@@ -161,7 +161,7 @@ def test_derivatives_are_those_of_the_value(x64):
     made = at(theta)
     np.testing.assert_allclose(made.gradient, jnp.stack(gradient), rtol=1e-6)
     np.testing.assert_allclose(made.information, jnp.stack(information), rtol=1e-6)
-    assert (made.effective_sample_size < 3.99).all()
+    assert made.effective_sample_size.min() < 3.95  # so that the correction counts
 
 
 def test_lost_paths_have_no_weight_and_no_derivative():
