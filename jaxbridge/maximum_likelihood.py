@@ -1,7 +1,7 @@
-"""Maximum likelihood by stochastic approximation over bridges.
+"""Maximum likelihood: by stochastic approximation over bridges, or of a simulated likelihood.
 
-Bridges are moved by their exact kernel at the current θ, once an iteration (Gu & Kong 1998), and
-θ by what the completed path says:
+Where σ is known, bridges are moved by their exact kernel at the current θ, once an iteration
+(Gu & Kong 1998), and θ by what the completed path says:
 
 * "gradient": a step of an optimiser along ∇ log f_θ(Z), whose mean over bridges is the score;
   the estimate is the average of the second half of the iterates.
@@ -11,6 +11,9 @@ Bridges are moved by their exact kernel at the current θ, once an iteration (Gu
 
 Then, at the estimate, `score` with independent bridges gives the observed information I, one step
 of Newton's method, θ + I⁻¹ ∇ log L(θ), and the Monte Carlo error that is left.
+
+Where σ depends on the unknown parameters paths are of no use, and the maximum is that of the
+likelihood by simulation (`simulated_likelihood`).
 """
 
 from collections.abc import Callable
@@ -22,9 +25,9 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from .arrays import Numbers, all_finite_leaves, nondifferentiable
+from .arrays import Numbers, nondifferentiable
 from .completion import Completion, Paths, complete
 from .diffusion import Diffusion
 from .intervals import check_count
@@ -32,8 +35,17 @@ from .likelihood import Form
 from .linalg import any_solve
 from .parameter_steps import CompleteData, quadratic_form
 from .parts import target_forms
-from .problem import as_problem
+from .problem import Problem, as_problem
 from .score import Score, score
+from .simulated_likelihood import (
+    Lost,
+    as_pulled,
+    climb,
+    guarded,
+    pulled_parts,
+    sigma_is_unknown,
+    wander,
+)
 from .unknowns import (
     Constraint,
     Unknowns,
@@ -55,7 +67,10 @@ class MaximumLikelihood(eqx.Module):
     - `theta`, `covariance`: the unknown parameters as a vector, shape (p,), and the inverse of
         the observed information, shape (p, p).
     - `iterates`: of the stochastic approximation, shape (n, p).
-    - `score`: at the average of the iterates, before the last step.
+    - `score`: at the average of the iterates, before the last step; where σ is unknown, at the
+        estimate, so that its gradient is about zero, and the covariance of that by the noise of
+        the bridges is what matters. Errors can be trusted where its `effective_sample_size` is
+        large in all intervals.
     - `num_missing`: iterations' bridges that were not found, in all.
     - `num_truncated`: weights that `max_trials` cut off.
     - `num_refused`: iterations whose step led out of the constraint, or to what is not finite, and
@@ -63,7 +78,10 @@ class MaximumLikelihood(eqx.Module):
     - `newton`: whether the last step was made. Not so if the information was not positive definite,
         or the step longer than about a standard error, or out of the constraint: then the average
         of the iterates is returned, which is not the maximum, and more iterations are needed, or
-        longer steps.
+        longer steps. Where σ is unknown: whether a maximum was found, and no Monte Carlo error,
+        in any direction, is more than half a standard error. If not, `params` are those of the
+        largest simulated likelihood that was seen, which may be a maximum of the noise alone: more
+        bridges are needed, or a better proposal, unless the maximum lies out of the constraint.
     """
 
     params: PyTree
@@ -104,17 +122,32 @@ def maximum_likelihood(
     **Arguments:**
 
     - `key`: a typed key.
-    - `model`: its `params` are where the search starts.
+    - `model`: its `params` are where the search starts. σ may depend on the unknown parameters:
+        then the maximum is that of the likelihood by simulation, as below.
     - `times`, `observations`, `num_steps`, `step_size`, `proposal`, `where`, `constraint`: as in
         `gibbs`. A step that would leave the constraint is not made.
     - `optimizer`: any of optax's, by default `optax.adam(0.01)`; it is given the gradient of minus
         the mean log likelihood per interval, in the unknown parameters as a vector. Optimisers are
         compared by identity: make one once to compile once.
-    - `method`: "gradient", or "em", which takes no optimiser and needs fewer iterations.
+    - `method`: "gradient", or "em", which takes no optimiser and needs fewer iterations, and a
+        known σ.
     - `num_iterations`: of the stochastic approximation.
-    - `num_bridges`: weighted bridges of each interval for the last step and the errors.
+    - `num_bridges`: weighted bridges of each interval for the last step and the errors; where σ
+        is unknown, for the likelihood whose maximum is the estimate.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Where σ is unknown** a path of its own tells nothing: given the whole of it σ is known. There
+    the transition densities of `transition_log_density` are differentiated, which takes proposals
+    that are pulled to the end point, by default the best of them. After the optimiser's steps, each
+    with a few new paths, Newton's method goes to the maximum of the likelihood by `num_bridges`
+    paths of each interval with fixed noise, a smooth function of θ. Half the estimated relative
+    variance of each density is added to its logarithm, whose mean is too small by that; what is
+    left of the bias falls with the square of `num_bridges`, and is small beside a standard error
+    where the root of the number of intervals is small beside the square of
+    `effective_sample_size`. For a σ that varies with the state the density's step error is of first
+    order: `num_steps` matters. Only σ σᵀ is in the law of the data: of a matrix, leave unknown
+    what that determines.
 
     **Returns:** `MaximumLikelihood`. Not differentiable.
 
@@ -139,28 +172,29 @@ def maximum_likelihood(
         )
     if method == "em" and optimizer is not None:
         raise ValueError('`method="em"` takes no `optimizer`.')
-    problem = as_problem(
-        key,
-        model,
-        times,
-        observations,
-        where,
-        num_steps,
-        step_size,
-        "differentiate `transition_log_density` with a proposal that is pulled to the end point, "
-        "use `pmmh`, or pick the others with `where=`.",
-    )
+    problem = as_problem(key, model, times, observations, where, num_steps, step_size)
     unknowns, theta = problem.unknowns, problem.theta
     check_allowed(constraint, unknowns, theta)
-    complete_key, run_key, score_key = jax.random.split(key, 3)
     proposal = "auto" if proposal is None else proposal
     bounds = (num_counts, max_proposals, max_trials)
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    optimizer = _ADAM if optimizer is None else optimizer
+    if sigma_is_unknown(problem):
+        if method == "em":
+            raise ValueError(
+                "σ depends on the unknown parameters, and given a whole path σ is known, so that "
+                'EM would never leave it: use `method="gradient"`, or pick the other parameters '
+                "with `where=`."
+            )
+        proposal = as_pulled(proposal, model, problem.like, bounds)
+        search = (problem, proposal, constraint, optimizer, num_iterations, num_bridges, meter)
+        return _by_simulation(key, *search)
+    complete_key, run_key, score_key = jax.random.split(key, 3)
     arguments = (problem.intervals, problem.groups, proposal, "exact", None, bounds)
     completion = complete(complete_key, model, *arguments)
     forms = target_forms(completion.parts, model)
     form = quadratic_form(unknowns, theta, problem.like, forms) or forms[0]
-    rule = _EM() if method == "em" else _Gradient(_ADAM if optimizer is None else optimizer)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    rule = _EM() if method == "em" else _Gradient(optimizer)
     setting = _Setting(unknowns, completion, constraint, rule, form)
     iterates, lost = _approximate(run_key, setting, theta, num_iterations, meter)
     rough = iterates[-1] if method == "em" else jnp.mean(iterates[num_iterations // 2 :], axis=0)
@@ -186,7 +220,20 @@ def maximum_likelihood(
     newton = rough + step
     ok = definite & near & allowed(constraint, unknowns, newton)
     estimate = jnp.where(ok, newton, rough)
-    left = covariance @ at_rough.covariance @ covariance
+    return _summary(unknowns, estimate, iterates, at_rough, lost, ok)
+
+
+def _summary(
+    unknowns: Unknowns,
+    estimate: Float[Array, " p"],
+    iterates: Float[Array, "n p"],
+    score: Score,
+    lost: Lost,
+    ok: Bool[Array, ""],
+) -> MaximumLikelihood:
+    """The estimate with its errors, which are those of the score times the inverse information."""
+    covariance = jnp.linalg.inv(score.information)
+    left = covariance @ score.covariance @ covariance
     standard, monte_carlo = (
         unknowns.pick(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
     )
@@ -197,12 +244,47 @@ def maximum_likelihood(
         estimate,
         covariance,
         iterates,
-        at_rough,
+        score,
         lost.missing,
-        lost.truncated + at_rough.num_truncated,
+        lost.truncated + score.num_truncated,
         lost.refused,
         ok,
     )
+
+
+def _by_simulation(
+    key: Key[Array, ""],
+    problem: Problem,
+    proposal: Any,
+    constraint: Constraint | None,
+    optimizer: optax.GradientTransformation,
+    num_iterations: int,
+    num_bridges: int,
+    meter: diffrax.AbstractProgressMeter,
+) -> MaximumLikelihood:
+    """The maximum of the simulated likelihood."""
+    unknowns, theta = problem.unknowns, problem.theta
+    pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
+    parts = pulled_parts(pilot_key, unknowns.at(theta), problem, proposal)
+    search = (unknowns, parts, constraint, optimizer, theta, num_iterations, meter)
+    iterates, lost = wander(run_key, *search)
+    last, mean = iterates[-1], jnp.mean(iterates[num_iterations // 2 :], axis=0)
+    # What suits the data at the first θ need not do so at the last.
+    parts = pulled_parts(last_pilot_key, unknowns.at(last), problem, proposal)
+    starts = jnp.stack([theta, last, mean])
+    maximum = climb(last_key, unknowns, parts, constraint, starts, num_bridges)
+    made = maximum.simulated
+    at_maximum = Score(
+        unknowns.pick(made.gradient),
+        unknowns.pick(jnp.sqrt(jnp.diagonal(made.covariance))),
+        made.gradient,
+        made.covariance,
+        made.information,
+        made.effective_sample_size,
+        made.num_missing,
+        jnp.int32(0),
+    )
+    return _summary(unknowns, maximum.theta, iterates, at_maximum, lost, maximum.found)
 
 
 class _Gradient(eqx.Module):
@@ -246,14 +328,6 @@ class _Setting(eqx.Module):
     form: Form = eqx.field(static=True)
 
 
-class _Lost(NamedTuple):
-    """Bridges that were not found, weights that were cut off, and steps that were not made."""
-
-    missing: Shaped[Array, "..."]
-    truncated: Shaped[Array, "..."]
-    refused: Shaped[Array, "..."]
-
-
 class _State(NamedTuple):
     theta: Float[Array, " p"]
     paths: Paths
@@ -268,7 +342,7 @@ def _approximate(
     theta: Float[Array, " p"],
     num_iterations: int,
     meter: diffrax.AbstractProgressMeter,
-) -> tuple[Float[Array, "n p"], _Lost]:
+) -> tuple[Float[Array, "n p"], Lost]:
     """The iterates, and what was lost on the way."""
     setting = nondifferentiable(setting)
     unknowns, completion = setting.unknowns, setting.completion
@@ -283,13 +357,10 @@ def _approximate(
             unknowns, completion, paths, jnp.zeros_like, setting.constraint, setting.form
         )
         moved, rule = setting.rule.update(i, state.theta, state.rule, data, num_intervals)
-        finite = all_finite_leaves(rule)
-        ok = allowed(setting.constraint, unknowns, moved) & finite
-        theta = jnp.where(ok, moved, state.theta)
-        # What an optimiser remembers must not be spoilt for all steps to come.
-        rule = jax.tree.map(lambda new, old: jnp.where(finite, new, old), rule, state.rule)
+        old = state.theta, state.rule
+        theta, rule, ok = guarded(setting.constraint, unknowns, old, (moved, rule))
         progress = meter.step(state.meter, (i + 1).astype(jnp.float32) / num_iterations)
-        lost = _Lost(renewed.missing, renewed.truncated, ~ok)
+        lost = Lost(renewed.missing, renewed.truncated, ~ok)
         lost = jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)
         return _State(theta, paths, rule, progress), (theta, lost)
 

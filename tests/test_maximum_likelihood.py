@@ -100,4 +100,4 @@ def test_bad_input_is_refused(unchecked):
     with pytest.raises(ValueError, match="takes no `optimizer`"):
         jb.maximum_likelihood(*arguments, optax.sgd(0.1), method="em", **OPTIONS)
     with pytest.raises(ValueError, match="σ depends"):
-        jb.maximum_likelihood(*arguments)
+        jb.maximum_likelihood(*arguments, method="em", num_steps=20)
