@@ -16,7 +16,7 @@ from .intervals import Intervals
 from .likelihood import Form, forms_of_target
 from .observations import Group
 from .renewal_chain import as_pairs
-from .start_laws import Reversed, Stationary, needs_burn_in
+from .start_laws import Stationary, needs_burn_in
 from .transition import check_for_density
 from .weighted import AbstractWeightedProposal
 
@@ -73,7 +73,7 @@ def make_parts(
     if for_density:
         check_for_density(given, model)
     if moving and weighted:
-        _check_for_moving(given, model, for_density)
+        _check_for_moving(given, model)
     if only_couplings:
         given = as_pairs(given) if weighted else as_pairs(given, *_FOR_APPROXIMATE)
     parts = []
@@ -96,9 +96,7 @@ def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
     return forms_of_target(proposals, model, parts[0].intervals.start[0])
 
 
-def _check_for_moving(
-    proposal: AbstractWeightedProposal, model: Diffusion, for_density: bool
-) -> None:
+def _check_for_moving(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
     """Raise `ValueError` where something is known at the first parameters only."""
     laws = [
         single.coupling.start_law
@@ -111,12 +109,4 @@ def _check_for_moving(
             "replaces it depends on the parameters: pass `sample_stationary=` to `Diffusion`, give "
             "the coupling `Stationary(burn_in=...)` that is long enough for all parameters to "
             "come, or choose proposals that are pulled to the end point."
-        )
-    stationary = any(isinstance(law, Stationary | Reversed) for law in laws)
-    if for_density and stationary and not model.normalised:
-        raise ValueError(
-            "densities by this coupling are in proportion to `log_stationary`, whose constant "
-            "depends on the parameters: normalise it and declare that by `Diffusion(..., "
-            "normalised=True)`, give the coupling a start law with a density, or choose proposals "
-            "that are pulled to the end point."
         )
