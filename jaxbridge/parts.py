@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from .choice import Choice, as_proposal, default_candidates, settled, singles, undecided_between
+from .choice import (
+    Choice,
+    as_proposal,
+    default_candidates,
+    settled,
+    singles,
+    undecided_between,
+    why_left_out,
+)
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion
@@ -20,6 +28,10 @@ from .start_laws import Stationary, needs_burn_in
 from .transition import check_for_density
 from .weighted import AbstractWeightedProposal
 
+_NO_SAMPLER = (
+    "the parameters move, and with them the time that replaces a sampler of the stationary law "
+    "(`Diffusion(..., sample_stationary=)`)"
+)
 _FOR_APPROXIMATE = ('bridges="approximate"', 'bridges="exact"')
 
 # num_counts, max_proposals, max_trials
@@ -66,7 +78,8 @@ def make_parts(
     if moving and weighted and proposal == "auto" and needs_burn_in(Stationary(), model):
         candidates = default_candidates(model, like, for_density)
         candidates = [each for each in candidates if not isinstance(each, AbstractCoupling)]
-        proposal = undecided_between(candidates, model, like, None, *bounds)
+        left_out = why_left_out(model, for_density) or _NO_SAMPLER
+        proposal = undecided_between(candidates, model, like, None, *bounds, left_out=left_out)
         bounds = (None, None, None)
     given = as_proposal(proposal, model, like, *bounds, for_density=for_density)
     given.check(model, intervals)

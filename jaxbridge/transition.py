@@ -89,8 +89,9 @@ def transition_log_density(
         or parameters are not finite.
 
     **Returns:** `TransitionLogDensity`. With proposals that are pulled to the end point `value` is
-    differentiable, forward and reverse: an estimate of the score. With couplings, and with a
-    choice between several proposals, a derivative raises `TypeError`.
+    differentiable, forward and reverse: an estimate of the score. So it is with a choice between
+    such proposals, by `choose_proposal` or, where that tries no couplings, by "auto". With
+    couplings, and a choice that may take them, a derivative raises `TypeError`.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
