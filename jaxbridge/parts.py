@@ -98,9 +98,15 @@ def make_parts(
         chosen = settled(chosen, part_key, model, mine, group.num_steps)
         if weighted:
             chosen = chosen.prepared(part_key, model, mine, group.num_steps)
-        fractions = jnp.asarray(np.diff(chosen.fractions(group.num_steps)), mine.duration.dtype)
-        parts.append(Part(mine, jnp.asarray(group.which), fractions, chosen))
+        parts.append(part_of(intervals, group, chosen))
     return tuple(parts)
+
+
+def part_of(intervals: Intervals, group: Group, proposal: AbstractWeightedProposal) -> Part:
+    """The intervals of one group, of all, with a proposal that is settled for them."""
+    mine = jax.tree.map(lambda leaf: leaf[group.which], intervals)
+    fractions = jnp.asarray(np.diff(proposal.fractions(group.num_steps)), mine.duration.dtype)
+    return Part(mine, jnp.asarray(group.which), fractions, proposal)
 
 
 def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
