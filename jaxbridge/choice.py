@@ -87,8 +87,8 @@ class Choice(AbstractWeightedProposal):
         """The choice for some of the intervals."""
         made = (self.seconds, self.efficiency, self.chosen)
         seconds, efficiency, chosen = jax.tree.map(lambda leaf: leaf[..., which], made)
-        words = (self.num_pilot, self.used, self.left_out)
-        return Choice(self.candidates, seconds, efficiency, chosen, *words)
+        made = (seconds, efficiency, chosen)
+        return Choice(self.candidates, *made, self.num_pilot, self.used, self.left_out)
 
     def check(self, model, intervals):
         for candidate in self.candidates:
@@ -465,8 +465,8 @@ def run_pilots(
     rates = jnp.where(jnp.isnan(efficiency), -1, efficiency / seconds)
     chosen = jnp.argmax(rates, axis=0).astype(jnp.int32)
     used = range(len(candidates)) if is_traced(chosen) else np.unique(chosen).tolist()
-    words = (num_pilot, tuple(used), undecided.left_out)
-    return Choice(tuple(candidates), seconds, efficiency, chosen, *words)
+    made = (seconds, efficiency, chosen)
+    return Choice(tuple(candidates), *made, num_pilot, tuple(used), undecided.left_out)
 
 
 class _Pilot(NamedTuple):

@@ -58,7 +58,9 @@ class GibbsPosterior(AbstractPosterior):
     if there are several.
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
-    - `theta`: the unknown ones as vectors, shape (*chains, n, p), with entries as in `names`.
+    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
+        the keys are in alphabetical order.
     - `parameters_moved`: whether θ moved, shape (*chains, n).
     - `bridges_moved`: the share of bridges that were replaced, shape (*chains, n).
     - `num_simulated`: paths simulated or weighed, shape (*chains, n).
@@ -69,12 +71,11 @@ class GibbsPosterior(AbstractPosterior):
     - `state`: where it ended; pass it as `init` to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.
-    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
-        the keys are in alphabetical order.
     """
 
     params: PyTree
     theta: Float[Array, "*chains n p"]
+    names: tuple[str, ...] = eqx.field(static=True)
     parameters_moved: Bool[Array, "*chains n"]
     bridges_moved: Float[Array, "*chains n"]
     num_simulated: Int[Array, "*chains n"]
@@ -83,7 +84,6 @@ class GibbsPosterior(AbstractPosterior):
     state: GibbsState
     completion: Completion
     exact_parameters: bool = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)
 
 
 def gibbs(
@@ -291,6 +291,7 @@ def _run(
     return GibbsPosterior(
         params,
         theta,
+        setting.unknowns.names,
         told.parameters_moved,
         told.bridges_moved,
         told.num_simulated,
@@ -299,5 +300,4 @@ def _run(
         state,
         setting.completion,
         exact,
-        setting.unknowns.names,
     )

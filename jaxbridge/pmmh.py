@@ -81,15 +81,16 @@ class PMMHPosterior(AbstractPosterior):
     if there are several.
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
-    - `theta`: the unknown ones as vectors, shape (*chains, n, p), with entries as in `names`.
+    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
+        the keys are in alphabetical order.
     - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
     - `log_likelihood_variance`: the variance of these estimates given θ, the median over the draws,
         shape (*chains,): that of log p̂ by the delta method, summed over the intervals, which with
         heavy tails of the weights is too small. It should be about one. Much above, say at more
-        than three, the chain holds on to lucky estimates and
-        hardly moves: take as many times more `num_proposals`, or a better `proposal`; far below,
-        fewer make iterations cheaper. Infinite where weights were cut off (`num_truncated`), and
-        with one proposal.
+        than three, the chain holds on to lucky estimates and hardly moves: take as many times more
+        `num_proposals`, or a better `proposal`; far below, fewer make iterations cheaper. Infinite
+        where weights were cut off (`num_truncated`), and with one proposal.
     - `accepted`: shape (*chains, n).
     - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
         parameters were refused because no estimate was to be had, shape (*chains,). With couplings
@@ -97,19 +98,17 @@ class PMMHPosterior(AbstractPosterior):
     - `num_truncated`: weights that `max_trials` cut off, in all these iterations, shape
         (*chains,): where there are many the law is not exact.
     - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
-    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
-        the keys are in alphabetical order.
     """
 
     params: PyTree
     theta: Float[Array, "*chains n p"]
+    names: tuple[str, ...] = eqx.field(static=True)
     log_likelihood: Float[Array, "*chains n"]
     log_likelihood_variance: Float[Array, "*chains"]
     accepted: Bool[Array, "*chains n"]
     num_without_estimate: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
     state: PMMHState
-    names: tuple[str, ...] = eqx.field(static=True)
 
 
 def pmmh(
@@ -203,7 +202,7 @@ def pmmh(
     made, chain = _run(run_key, setting, chain, num_done, num_warmup, num_iterations, thin, meter)
     num_done = num_done + num_warmup + num_iterations * thin
     state = PMMHState(*chain, num_done, tuple(part.proposal for part in parts))
-    return PMMHPosterior(*made, state, unknowns.names)
+    return PMMHPosterior(**made, state=state, names=unknowns.names)
 
 
 def _parts_of_state(state: PMMHState, problem: Problem) -> tuple[Part, ...]:
@@ -340,7 +339,7 @@ def _run(
     num_iterations: int,
     thin: int,
     progress_meter: diffrax.AbstractProgressMeter,
-) -> tuple[tuple, _Chain]:
+) -> tuple[dict[str, Any], _Chain]:
     """The fields of the posterior, and where the chains are."""
     setting, state = nondifferentiable((setting, state))
     p, dtype = state.theta.shape[-1], state.theta.dtype
@@ -381,9 +380,16 @@ def _run(
         )
     as_params = jax.vmap(setting.unknowns.all)
     params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
-    held = jnp.median(variance, axis=0)
-    counts = sums.unknown, sums.num_truncated
-    return (params, theta, log_likelihood, held, accepted, *counts), state
+    fields = {
+        "params": params,
+        "theta": theta,
+        "log_likelihood": log_likelihood,
+        "log_likelihood_variance": jnp.median(variance, axis=0),
+        "accepted": accepted,
+        "num_without_estimate": sums.unknown,
+        "num_truncated": sums.num_truncated,
+    }
+    return fields, state
 
 
 def _add_up(told: _Told) -> _Told:

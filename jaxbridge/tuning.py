@@ -341,7 +341,9 @@ def _pilots(
     laws: list[AnyStartLaw] = [stationary]
     if model.has_density:
         fits = (_gaussian_fit(draws), _gaussian_fit(starts))
-        gaussian = [_between(*fits, share, bridges.paths.dtype) for share in _SHARES]
+        gaussian: list[AnyStartLaw] = [
+            _between(*fits, share, bridges.paths.dtype) for share in _SHARES
+        ]
         only_gaussian = for_density and not model.normalised
         laws = gaussian if only_gaussian else [stationary, *gaussian[1:]]
     pilots = []
