@@ -72,8 +72,23 @@ def _refuse(primals, tangents):
         "what corrects bridges to their exact law has no derivative path by path: whether a pair "
         "meets, and how often a bridge is hit, depends on the parameters too. Apply "
         "`jax.lax.stop_gradient` to the parameters where bridges are made, and differentiate a "
-        "likelihood of their paths. (Of a choice between proposals: make it before, with "
-        "`choose_proposal`, between those that are pulled to the end point.)"
+        "likelihood of their paths."
+    )
+
+
+@eqx.filter_custom_jvp
+def nondifferentiable_choice(tree: PyTree) -> PyTree:
+    """The tree, of which no derivative may be taken because of a choice that may be a coupling."""
+    return tree
+
+
+@nondifferentiable_choice.def_jvp
+def _refuse_choice(primals, tangents):
+    raise TypeError(
+        "this choice may take couplings, which have no derivative path by path, for whether a pair "
+        "meets depends on the parameters too. Choose before, outside of `grad`, between proposals "
+        "that are pulled to the end point, `choice = choose_proposal(..., candidates="
+        "[ModifiedDiffusionBridge(), Guided()])`, and pass `proposal=choice`: it is differentiable."
     )
 
 

@@ -20,13 +20,15 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from .arrays import is_traced, nondifferentiable
+from .arrays import is_traced, nondifferentiable_choice
 from .averages import effective_size, normalised
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling, Coupling
@@ -66,6 +68,11 @@ class Choice(AbstractWeightedProposal):
     - `num_pilot`: pilot paths of each candidate for each interval, or `None` for the default.
     - `used`: the numbers of those that were chosen for any interval; inside `jit`, where that is
         not known, of all. Only they are compiled, so that another set compiles again.
+    - `left_out`: why "auto" does not try couplings, empty where it does: for a density the constant
+        of `log_stationary` must be known, and without a time reversal there are none.
+
+    Where all that are used are pulled to the end point, paths and weights are differentiable,
+    forward and reverse, each interval by its own proposal. Others have no derivatives.
     """
 
     candidates: tuple[AbstractWeightedProposal, ...]
@@ -74,12 +81,14 @@ class Choice(AbstractWeightedProposal):
     chosen: Int[Array, " I"] | None
     num_pilot: int | None = eqx.field(static=True)
     used: tuple[int, ...] = eqx.field(static=True)
+    left_out: str = eqx.field(static=True, default="")
 
     def of(self, which: Int[np.ndarray, " J"]) -> "Choice":
         """The choice for some of the intervals."""
         made = (self.seconds, self.efficiency, self.chosen)
         seconds, efficiency, chosen = jax.tree.map(lambda leaf: leaf[..., which], made)
-        return Choice(self.candidates, seconds, efficiency, chosen, self.num_pilot, self.used)
+        made = (seconds, efficiency, chosen)
+        return Choice(self.candidates, *made, self.num_pilot, self.used, self.left_out)
 
     def check(self, model, intervals):
         for candidate in self.candidates:
@@ -102,7 +111,7 @@ class Choice(AbstractWeightedProposal):
     def prepared(self, key, model, intervals, num_steps):
         if self.chosen is not None:
             return self
-        model, intervals = nondifferentiable((model, intervals))
+        model, intervals = _for_pilots(self, model, intervals)
         return run_pilots(key, model, self, intervals, num_steps, timed=False)
 
     def fractions(self, num_steps):
@@ -124,14 +133,13 @@ class Choice(AbstractWeightedProposal):
         active=None,
         progress_meter=None,
     ):
-        if len(self.used) > 1:
-            model, intervals = nondifferentiable((model, intervals))
-
-        def draw(candidate, active):
-            arguments = (keys, model, intervals, num_steps, stored, misses_count, active)
-            return candidate.draw(*arguments, progress_meter)
-
-        return self._of_each(draw, active)
+        draws = (keys, num_steps, stored, misses_count, active, progress_meter)
+        if len(self.used) == 1:
+            return _draw_each(self, model, intervals, *draws)
+        if uses_couplings(self):
+            model, intervals = nondifferentiable_choice((model, intervals))
+            return _draw_each(self, model, intervals, *draws)
+        return _draw_pulled((self, model, intervals), *draws)
 
     def reweigh(self, keys, model, intervals, paths, active=None):
         def reweigh(candidate, active):
@@ -158,9 +166,10 @@ class Choice(AbstractWeightedProposal):
 
     def __str__(self) -> str:
         made = self.chosen is not None and not is_traced(self.chosen, self.efficiency, self.seconds)
+        reason = [f"couplings left out: {self.left_out}"] if self.left_out else []
         if not made:
             names = ", ".join(describe(candidate) for candidate in self.candidates)
-            return f"a choice to be made between {names}"
+            return "\n".join([f"a choice to be made between {names}", *reason])
         chosen, efficiency = np.asarray(self.chosen), np.asarray(self.efficiency, float)
         seconds = np.asarray(self.seconds, float)
         rates = efficiency / seconds
@@ -178,7 +187,76 @@ class Choice(AbstractWeightedProposal):
                 f"{describe(candidate):<44}  {share:>18}  {cost:>14}  {speed:>6}  "
                 f"{np.sum(chosen == i)} of {len(chosen)}"
             )
-        return "\n".join(lines)
+        return "\n".join([*lines, *reason])
+
+
+def _draw_each(
+    choice: Choice,
+    model: Diffusion,
+    intervals: Intervals,
+    keys: Key[Array, "I n"],
+    num_steps: int,
+    stored: Int[Array, " K"] | None,
+    misses_count: bool,
+    active: Bool[Array, " I"] | None,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> WeightedPaths:
+    """Each interval by its candidate, which is run for no other."""
+
+    def draw(candidate, active):
+        arguments = (keys, model, intervals, num_steps, stored, misses_count, active)
+        return candidate.draw(*arguments, progress_meter)
+
+    return choice._of_each(draw, active)
+
+
+@eqx.filter_custom_jvp
+def _draw_pulled(inputs: tuple[Choice, Diffusion, Intervals], *draws) -> WeightedPaths:
+    """`_draw_each` between proposals that are pulled to the end point, with derivatives."""
+    return _draw_each(*inputs, *draws)
+
+
+@_draw_pulled.def_jvp
+def _draw_pulled_tangents(primals, tangents):
+    """Running a candidate for a few intervals only takes a loop of unknown length, which has no
+    reverse mode, so derivatives run each for all. In the place of an interval that is another's
+    stands one of its own: a masked 0 · ∞ from where a proposal does not serve would be NaN."""
+    inputs, keys, num_steps, stored, misses_count, active, _ = primals
+    drawn = _draw_pulled(*primals)
+
+    def again(inputs):
+        choice, model, intervals = inputs
+        total = None
+        for i in choice.used:
+            mine = choice.chosen == i
+            mine = mine if active is None else mine & active
+            stand_in = jnp.where(mine, jnp.arange(len(mine)), jnp.argmax(mine))
+            each = jax.tree.map(lambda leaf, at=stand_in: leaf[at], intervals)
+            arguments = (keys[stand_in], model, each, num_steps, stored, misses_count)
+            made = choice.candidates[i].draw(*arguments)
+            masked = [
+                jnp.where(mine.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
+                for leaf in (made.paths, made.log_weights)
+            ]
+            total = masked if total is None else [a + b for a, b in zip(total, masked, strict=True)]
+        assert total is not None
+        return tuple(total)
+
+    _, (paths, log_weights) = eqx.filter_jvp(again, (inputs,), (tangents[0],))
+    return drawn, WeightedPaths(paths, log_weights, None, None, None, None)  # pyright: ignore
+
+
+def _for_pilots(
+    undecided: Choice, model: Diffusion, intervals: Intervals
+) -> tuple[Diffusion, Intervals]:
+    """What pilot runs see: numbers only. What is chosen has no derivative in them, but that of
+    which it is chosen may have one, unless it may be a coupling."""
+    if uses_couplings(undecided):
+        return nondifferentiable_choice((model, intervals))
+    return jax.tree.map(
+        lambda leaf: lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf,
+        (model, intervals),
+    )
 
 
 def _pick(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
@@ -260,7 +338,8 @@ def as_proposal(
     bounds = (num_counts, max_proposals, max_trials)
     if isinstance(proposal, str) and proposal == "auto":
         candidates = default_candidates(model, like, for_density)
-        return undecided_between(candidates, model, like, None, *bounds)
+        left_out = why_left_out(model, for_density)
+        return undecided_between(candidates, model, like, None, *bounds, left_out=left_out)
     if isinstance(proposal, AbstractWeightedProposal):
         if bounds != (None, None, None):
             raise ValueError(
@@ -310,6 +389,21 @@ def default_candidates(
     return [*guided_candidates(model, like), *couplings]
 
 
+def why_left_out(model: Diffusion, for_density: bool) -> str:
+    """Why there are no couplings among `default_candidates`; empty where there are."""
+    if not model.has_reversal:
+        return (
+            "the time reversal of the model is not known (give `Diffusion` a `log_stationary`, a "
+            "`reverse_drift` or `reversible=True`)"
+        )
+    if for_density and not model.normalised:
+        return (
+            "their densities rest on `log_stationary`, which is not declared to be normalised "
+            "(`Diffusion(..., normalised=True)`)"
+        )
+    return ""
+
+
 def undecided_between(
     candidates: Sequence[Any],
     model: Diffusion,
@@ -318,6 +412,7 @@ def undecided_between(
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
+    left_out: str = "",
 ) -> Choice:
     """A choice between these, not yet made."""
     if len(candidates) == 0:
@@ -333,7 +428,7 @@ def undecided_between(
     if len(grids) > 1:
         raise ValueError("`candidates` must be on one grid: give all the same `refinement`.")
     everything = tuple(range(len(proposals)))
-    return Choice(tuple(proposals), None, None, None, num_pilot, everything)
+    return Choice(tuple(proposals), None, None, None, num_pilot, everything, left_out)
 
 
 def run_pilots(
@@ -375,7 +470,8 @@ def run_pilots(
     rates = jnp.where(jnp.isnan(efficiency), -1, efficiency / seconds)
     chosen = jnp.argmax(rates, axis=0).astype(jnp.int32)
     used = range(len(candidates)) if is_traced(chosen) else np.unique(chosen).tolist()
-    return Choice(tuple(candidates), seconds, efficiency, chosen, num_pilot, tuple(used))
+    made = (seconds, efficiency, chosen)
+    return Choice(tuple(candidates), *made, num_pilot, tuple(used), undecided.left_out)
 
 
 class _Pilot(NamedTuple):
@@ -442,6 +538,8 @@ def settled(
     compiled."""
     if not isinstance(proposal, Choice) or proposal.chosen is not None:
         return proposal
+    if not uses_couplings(proposal):
+        model, intervals = _for_pilots(proposal, model, intervals)  # may be known under `grad`
     if not is_traced(key, model, proposal, intervals):
         return run_pilots(key, model, proposal, intervals, num_steps, timed=False)
     return proposal

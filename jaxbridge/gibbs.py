@@ -62,6 +62,8 @@ class GibbsPosterior(AbstractPosterior):
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
     - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
+        the keys are in alphabetical order.
     - `parameters_moved`: whether θ moved, shape (*chains, n).
     - `bridges_moved`: the share of bridges that were replaced, shape (*chains, n).
     - `num_simulated`: paths simulated or weighed, shape (*chains, n).
@@ -79,6 +81,7 @@ class GibbsPosterior(AbstractPosterior):
 
     params: PyTree
     theta: Float[Array, "*chains n p"]
+    names: tuple[str, ...] = eqx.field(static=True)
     parameters_moved: Bool[Array, "*chains n"]
     bridges_moved: Float[Array, "*chains n"]
     num_simulated: Int[Array, "*chains n"]
@@ -295,6 +298,7 @@ def _run(
     return GibbsPosterior(
         params,
         theta,
+        setting.unknowns.names,
         told.parameters_moved,
         told.bridges_moved,
         told.num_simulated,

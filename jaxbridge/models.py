@@ -26,6 +26,8 @@ def stationary_diffusion(
     V: Callable | None = None,
     Q: Callable | None = None,
     params: PyTree = None,
+    *,
+    normalised: bool = False,
 ) -> Diffusion:
     """Every diffusion with a given stationary density ν and diffusion matrix V:
 
@@ -36,7 +38,8 @@ def stationary_diffusion(
 
     **Arguments:** functions `(x, params)` of one point `x` of shape (d,): `log_density`, log ν
     up to a constant; `V`, positive definite, shape (d, d), or (d,) for a diagonal, by default
-    the identity; `Q`, shape (d, d), by default zero. `params`, any pytree, is what they receive.
+    the identity; `Q`, shape (d, d), by default zero. `params`, any pytree, is what they receive;
+    `normalised` as in `Diffusion`.
 
     **Raises:** `TypeError` for arguments that are not functions.
 
@@ -57,14 +60,17 @@ def stationary_diffusion(
         params=params,
         reverse_drift=None if Q is None else _RecipeDrift(log_density, V, Q, -1),
         reversible=Q is None,
+        normalised=normalised,
     )
 
 
-def langevin(log_density: Callable, params: PyTree = None) -> Diffusion:
+def langevin(
+    log_density: Callable, params: PyTree = None, *, normalised: bool = False
+) -> Diffusion:
     """The Langevin diffusion `dX = ½ ∇log ν(X) dt + dW`: reversible, with stationary density ν.
 
     **Arguments:** `log_density`, `(x, params) -> ()`, is log ν up to a constant; `params`, any
-    pytree, is what it receives.
+    pytree, is what it receives; `normalised` as in `Diffusion`.
 
     **Example:**
 
@@ -72,7 +78,7 @@ def langevin(log_density: Callable, params: PyTree = None) -> Diffusion:
     double_well = jb.langevin(lambda x, p: -p * (x @ x - 1) ** 2, params=1.0)
     ```
     """
-    return stationary_diffusion(log_density, params=params)
+    return stationary_diffusion(log_density, params=params, normalised=normalised)
 
 
 def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:

@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from .choice import Choice, as_proposal, default_candidates, settled, singles, undecided_between
+from .choice import (
+    Choice,
+    as_proposal,
+    default_candidates,
+    settled,
+    singles,
+    undecided_between,
+    why_left_out,
+)
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion
@@ -16,10 +24,14 @@ from .intervals import Intervals
 from .likelihood import Form, forms_of_target
 from .observations import Group
 from .renewal_chain import as_pairs
-from .start_laws import Reversed, Stationary, needs_burn_in
+from .start_laws import Stationary, needs_burn_in
 from .transition import check_for_density
 from .weighted import AbstractWeightedProposal
 
+_NO_SAMPLER = (
+    "the parameters move, and with them the time that replaces a sampler of the stationary law "
+    "(`Diffusion(..., sample_stationary=)`)"
+)
 _FOR_APPROXIMATE = ('bridges="approximate"', 'bridges="exact"')
 
 # num_counts, max_proposals, max_trials
@@ -66,14 +78,15 @@ def make_parts(
     if moving and weighted and proposal == "auto" and needs_burn_in(Stationary(), model):
         candidates = default_candidates(model, like, for_density)
         candidates = [each for each in candidates if not isinstance(each, AbstractCoupling)]
-        proposal = undecided_between(candidates, model, like, None, *bounds)
+        left_out = why_left_out(model, for_density) or _NO_SAMPLER
+        proposal = undecided_between(candidates, model, like, None, *bounds, left_out=left_out)
         bounds = (None, None, None)
     given = as_proposal(proposal, model, like, *bounds, for_density=for_density)
     given.check(model, intervals)
     if for_density:
         check_for_density(given, model)
     if moving and weighted:
-        _check_for_moving(given, model, for_density)
+        _check_for_moving(given, model)
     if only_couplings:
         given = as_pairs(given) if weighted else as_pairs(given, *_FOR_APPROXIMATE)
     parts = []
@@ -85,9 +98,15 @@ def make_parts(
         chosen = settled(chosen, part_key, model, mine, group.num_steps)
         if weighted:
             chosen = chosen.prepared(part_key, model, mine, group.num_steps)
-        fractions = jnp.asarray(np.diff(chosen.fractions(group.num_steps)), mine.duration.dtype)
-        parts.append(Part(mine, jnp.asarray(group.which), fractions, chosen))
+        parts.append(part_of(intervals, group, chosen))
     return tuple(parts)
+
+
+def part_of(intervals: Intervals, group: Group, proposal: AbstractWeightedProposal) -> Part:
+    """The intervals of one group, of all, with a proposal that is settled for them."""
+    mine = jax.tree.map(lambda leaf: leaf[group.which], intervals)
+    fractions = jnp.asarray(np.diff(proposal.fractions(group.num_steps)), mine.duration.dtype)
+    return Part(mine, jnp.asarray(group.which), fractions, proposal)
 
 
 def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
@@ -96,9 +115,7 @@ def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
     return forms_of_target(proposals, model, parts[0].intervals.start[0])
 
 
-def _check_for_moving(
-    proposal: AbstractWeightedProposal, model: Diffusion, for_density: bool
-) -> None:
+def _check_for_moving(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
     """Raise `ValueError` where something is known at the first parameters only."""
     laws = [
         single.coupling.start_law
@@ -111,12 +128,4 @@ def _check_for_moving(
             "replaces it depends on the parameters: pass `sample_stationary=` to `Diffusion`, give "
             "the coupling `Stationary(burn_in=...)` that is long enough for all parameters to "
             "come, or choose proposals that are pulled to the end point."
-        )
-    stationary = any(isinstance(law, Stationary | Reversed) for law in laws)
-    if for_density and stationary and not model.normalised:
-        raise ValueError(
-            "densities by this coupling are in proportion to `log_stationary`, whose constant "
-            "depends on the parameters: normalise it and declare that by `Diffusion(..., "
-            "normalised=True)`, give the coupling a start law with a density, or choose proposals "
-            "that are pulled to the end point."
         )

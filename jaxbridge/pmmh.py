@@ -26,10 +26,10 @@ from .diffusion import Diffusion
 from .intervals import check_count
 from .kernels import acceptance_rate
 from .linalg import any_cholesky, any_inverse
-from .parts import Part, make_parts
+from .parts import Part, make_parts, part_of
 from .posterior import AbstractPosterior
-from .problem import as_problem, starting_points
-from .transition import estimate_log_density
+from .problem import Problem, as_problem, starting_points
+from .transition import check_for_density, estimate_log_density
 from .unknowns import (
     Constraint,
     GivenDensity,
@@ -41,9 +41,19 @@ from .unknowns import (
     as_log_prior,
     as_normal,
 )
+from .weighted import AbstractWeightedProposal
 
 # Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
 _TARGET = 0.2
+
+
+class _Chain(NamedTuple):
+    """Where a chain is: θ, the estimate that it holds with its variance, and S."""
+
+    theta: Float[Array, "*chains p"]
+    log_likelihood: Float[Array, "*chains"]
+    variance: Float[Array, "*chains"]
+    root: Float[Array, "*chains p p"]
 
 
 class PMMHState(NamedTuple):
@@ -51,12 +61,19 @@ class PMMHState(NamedTuple):
 
     - `theta`: θ, shape (p,).
     - `log_likelihood`: the estimate that the chain holds, shape ().
+    - `variance`: that of this estimate, shape ().
     - `root`: S of the covariance S Sᵀ of proposals, shape (p, p).
+    - `num_done`: iterations so far, with those of the warm-up. Going on with the same key draws
+        the random numbers of those that come after.
+    - `proposals`: of the paths, decided, for each group of intervals with one number of steps.
     """
 
     theta: Float[Array, "*chains p"]
     log_likelihood: Float[Array, "*chains"]
+    variance: Float[Array, "*chains"]
     root: Float[Array, "*chains p p"]
+    num_done: Int[Array, ""]
+    proposals: tuple[AbstractWeightedProposal, ...]
 
 
 class PMMHPosterior(AbstractPosterior):
@@ -65,7 +82,15 @@ class PMMHPosterior(AbstractPosterior):
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
     - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
+        the keys are in alphabetical order.
     - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
+    - `log_likelihood_variance`: the variance of these estimates given θ, the median over the draws,
+        shape (*chains,): that of log p̂ by the delta method, summed over the intervals, which with
+        heavy tails of the weights is too small. It should be about one. Much above, say at more
+        than three, the chain holds on to lucky estimates and hardly moves: take as many times more
+        `num_proposals`, or a better `proposal`; far below, fewer make iterations cheaper. Infinite
+        where weights were cut off (`num_truncated`), and with one proposal.
     - `accepted`: shape (*chains, n).
     - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
         parameters were refused because no estimate was to be had, shape (*chains,). With couplings
@@ -77,7 +102,9 @@ class PMMHPosterior(AbstractPosterior):
 
     params: PyTree
     theta: Float[Array, "*chains n p"]
+    names: tuple[str, ...] = eqx.field(static=True)
     log_likelihood: Float[Array, "*chains n"]
+    log_likelihood_variance: Float[Array, "*chains"]
     accepted: Bool[Array, "*chains n"]
     num_without_estimate: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
@@ -118,14 +145,16 @@ def pmmh(
         needs it to be invertible, say so in `constraint`.
     - `num_warmup`: iterations before, in which the covariance of proposals is learnt.
     - `num_proposals`: weighted paths for each interval in each estimate. The variance of the
-        estimated log likelihood should be about one: with n intervals that takes in
-        proportion to n.
+        estimated log likelihood, `log_likelihood_variance` of the result, should be about one:
+        with n intervals that takes in proportion to n.
     - `proposal`: as in `transition_log_density`, but "auto" by default. Densities by a
         coupling from the stationary law rest on a normalised `log_stationary`, whose constant
         depends on the parameters.
     - `covariance`: of the first proposals, shape (p,) for a diagonal or (p, p); by default a tenth
         of the prior's standard deviations, or a tenth of θ where the prior is not normal.
-    - `init`: unknown parameters to start from, or the `state` of earlier draws.
+    - `init`: unknown parameters to start from, or the `state` of earlier draws, which go on with
+        the proposals of paths, and their bounds, that they had. Another `proposal` than "auto"
+        takes their place; the estimate that the chain holds is still one of theirs.
     - `num_counts`, `max_trials`: as in `transition_log_density`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
@@ -156,14 +185,46 @@ def pmmh(
     if state is not None and covariance is not None:
         raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
     pilot_key, run_key = jax.random.split(key)
-    arguments = (problem.intervals, problem.groups, proposal, (num_counts, None, max_trials))
-    parts = make_parts(pilot_key, problem.pilot_model(theta), *arguments, for_density=True)
+    if state is not None and isinstance(proposal, str) and proposal == "auto":
+        parts = _parts_of_state(state, problem)
+    else:
+        arguments = (problem.intervals, problem.groups, proposal, (num_counts, None, max_trials))
+        parts = make_parts(pilot_key, problem.pilot_model(theta), *arguments, for_density=True)
     setting = _Setting(unknowns, parts, log_prior, constraint, num_proposals)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    num_done = jnp.int32(0)
     if state is None:
         root = jnp.broadcast_to(root, (*theta.shape[:-1], *root.shape))
-        state = _start(run_key, setting, theta, root)
-    return _run(run_key, setting, state, num_warmup, num_iterations, thin, meter)
+        chain = _start(run_key, setting, theta, root)
+    else:
+        num_done = state.num_done
+        chain = _Chain(state.theta, state.log_likelihood, state.variance, state.root)
+    made, chain = _run(run_key, setting, chain, num_done, num_warmup, num_iterations, thin, meter)
+    num_done = num_done + num_warmup + num_iterations * thin
+    state = PMMHState(*chain, num_done, tuple(part.proposal for part in parts))
+    return PMMHPosterior(**made, state=state, names=unknowns.names)
+
+
+def _parts_of_state(state: PMMHState, problem: Problem) -> tuple[Part, ...]:
+    """The intervals with the proposals of earlier draws.
+
+    **Raises:** `ValueError` where these were for other intervals.
+    """
+    groups = problem.groups
+    if len(state.proposals) != len(groups):
+        raise ValueError(
+            f"`init` is a state of draws whose intervals had {len(state.proposals)} numbers of "
+            f"steps, but here they have {len(groups)}: go on with the same `times`, `num_steps` "
+            "and `step_size`, or start anew from `init=` unknown parameters."
+        )
+    model = problem.pilot_model(state.theta)
+    parts = []
+    for group, proposal in zip(groups, state.proposals, strict=True):
+        part = part_of(problem.intervals, group, proposal)
+        proposal.check(model, part.intervals)
+        check_for_density(proposal, model)
+        parts.append(part)
+    return tuple(parts)
 
 
 class _Setting(eqx.Module):
@@ -177,17 +238,20 @@ class _Setting(eqx.Module):
 
     def estimate(
         self, key: Key[Array, ""], theta: Float[Array, " p"]
-    ) -> tuple[Float[Array, ""], Int[Array, ""]]:
-        """log of an unbiased estimate of the likelihood, -inf where there is none; and how many
-        of its weights were cut off."""
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
+        """log of an unbiased estimate of the likelihood, -inf where there is none, with its
+        variance; and how many of its weights were cut off."""
         model = self.unknowns.at(theta).prepared()
-        log_likelihood, num_truncated = jnp.zeros((), theta.dtype), jnp.int32(0)
+        log_likelihood = variance = jnp.zeros((), theta.dtype)
+        num_truncated = jnp.int32(0)
         for part_key, part in zip(jax.random.split(key, len(self.parts)), self.parts, strict=True):
             size = (self.num_proposals, part.num_steps)
             made = estimate_log_density(part_key, model, part.proposal, part.intervals, *size)
             log_likelihood += jnp.sum(made.value)
+            variance += jnp.sum(made.standard_error**2)
             num_truncated += jnp.sum(made.num_truncated, dtype=jnp.int32)
-        return jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood), num_truncated
+        log_likelihood = jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood)
+        return log_likelihood, variance, num_truncated
 
 
 def _first_root(
@@ -217,16 +281,16 @@ def _first_root(
 
 
 @eqx.filter_jit
-def _start(key, setting: _Setting, theta, root) -> PMMHState:
+def _start(key, setting: _Setting, theta, root) -> _Chain:
     key = jax.random.fold_in(key, 0)
 
     def estimate(key, theta):
-        return setting.estimate(key, theta)[0]
+        return setting.estimate(key, theta)[:2]
 
     if theta.ndim == 1:
-        return PMMHState(theta, estimate(key, theta), root)
+        return _Chain(theta, *estimate(key, theta), root)
     keys = jax.random.split(key, len(theta))
-    return PMMHState(theta, jax.vmap(estimate)(keys, theta), root)
+    return _Chain(theta, *jax.vmap(estimate)(keys, theta), root)
 
 
 class _Told(NamedTuple):
@@ -238,7 +302,7 @@ class _Told(NamedTuple):
     num_truncated: Int[Array, "*chains"]
 
 
-def _iterate(key, setting: _Setting, state: PMMHState, gain: Float[Array, ""]):
+def _iterate(key, setting: _Setting, state: _Chain, gain: Float[Array, ""]):
     """One step, and what is told of it; S moves by `gain`."""
     walk_key, estimate_key, accept_key = jax.random.split(key, 3)
     noise = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
@@ -246,7 +310,7 @@ def _iterate(key, setting: _Setting, state: PMMHState, gain: Float[Array, ""]):
     inside = allowed(setting.constraint, setting.unknowns, proposed)
     # Outside the constraint the model may not be simulated: θ stands in, and is refused.
     proposed = jnp.where(inside, proposed, state.theta)
-    estimated, num_truncated = setting.estimate(estimate_key, proposed)
+    estimated, variance, num_truncated = setting.estimate(estimate_key, proposed)
     new = jnp.where(inside, estimated + setting.log_prior(proposed), -jnp.inf)
     rate = acceptance_rate(state.log_likelihood + setting.log_prior(state.theta), new)
     accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
@@ -256,9 +320,10 @@ def _iterate(key, setting: _Setting, state: PMMHState, gain: Float[Array, ""]):
     root = any_cholesky(state.root @ state.root.T + change * jnp.outer(moved, moved))
     root = jnp.where((gain > 0) & jnp.all(jnp.isfinite(root)), root, state.root)
     unknown = inside & (estimated == -jnp.inf)
-    state = PMMHState(
+    state = _Chain(
         jnp.where(accepted, proposed, state.theta),
         jnp.where(accepted, estimated, state.log_likelihood),
+        jnp.where(accepted, variance, state.variance),
         root,
     )
     return state, _Told(accepted, unknown.astype(jnp.int32), num_truncated)
@@ -268,12 +333,14 @@ def _iterate(key, setting: _Setting, state: PMMHState, gain: Float[Array, ""]):
 def _run(
     key: Key[Array, ""],
     setting: _Setting,
-    state: PMMHState,
+    state: _Chain,
+    num_done: Int[Array, ""],
     num_warmup: int,
     num_iterations: int,
     thin: int,
     progress_meter: diffrax.AbstractProgressMeter,
-) -> PMMHPosterior:
+) -> tuple[dict[str, Any], _Chain]:
+    """The fields of the posterior, and where the chains are."""
     setting, state = nondifferentiable((setting, state))
     p, dtype = state.theta.shape[-1], state.theta.dtype
     total = num_warmup + num_iterations * thin
@@ -282,7 +349,7 @@ def _run(
         state, meter = carry
         learning = jnp.minimum(1.0, p * (i + 1).astype(dtype) ** (-2 / 3))
         gain = jnp.where(i < num_warmup, learning, 0)
-        mine = jax.random.fold_in(key, i + 1)  # number 0 made the first estimate
+        mine = jax.random.fold_in(key, num_done + i + 1)  # number 0 made the first estimate
         if state.theta.ndim == 1:
             state, told = _iterate(mine, setting, state, gain)
         else:
@@ -298,11 +365,11 @@ def _run(
         carry, told = lax.scan(iterate, carry, steps)
         state, _ = carry
         told = _add_up(told)._replace(accepted=jnp.any(told.accepted, axis=0))
-        return carry, (state.theta, state.log_likelihood, told)
+        return carry, (state.theta, state.log_likelihood, state.variance, told)
 
     carry = (state, progress_meter.init())
     carry, lost = lax.scan(iterate, carry, jnp.arange(num_warmup))
-    (state, meter), (theta, log_likelihood, told) = lax.scan(
+    (state, meter), (theta, log_likelihood, variance, told) = lax.scan(
         kept, carry, jnp.arange(num_iterations)
     )
     progress_meter.close(meter)
@@ -313,8 +380,16 @@ def _run(
         )
     as_params = jax.vmap(setting.unknowns.all)
     params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
-    counts = sums.unknown, sums.num_truncated
-    return PMMHPosterior(params, theta, log_likelihood, accepted, *counts, state)
+    fields = {
+        "params": params,
+        "theta": theta,
+        "log_likelihood": log_likelihood,
+        "log_likelihood_variance": jnp.median(variance, axis=0),
+        "accepted": accepted,
+        "num_without_estimate": sums.unknown,
+        "num_truncated": sums.num_truncated,
+    }
+    return fields, state
 
 
 def _add_up(told: _Told) -> _Told:

@@ -15,6 +15,7 @@ class AbstractPosterior(eqx.Module):
 
     params: eqx.AbstractVar[PyTree]
     theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
+    names: eqx.AbstractVar[tuple[str, ...]]
 
     @property
     def _chains(self) -> Float[Array, "chains n p"]:

@@ -16,7 +16,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from .arrays import Numbers
-from .choice import Choice, as_proposal, settled, singles, uses_couplings
+from .choice import as_proposal, settled, singles, uses_couplings
 from .coupled_pairs import CoupledPairs
 from .diffusion import Diffusion, check_diffusion
 from .intervals import Intervals, as_intervals, check_count, check_key
@@ -33,12 +33,13 @@ class TransitionLogDensity(eqx.Module):
     of them.
 
     - `value`: log p̂_T(a, b); `exp(value)` is unbiased. -inf where no proposal became a bridge.
-    - `standard_error`: that of `value`, by the delta method; infinite where nothing is known.
-        Only to be trusted where `effective_sample_size` is large.
+    - `standard_error`: that of `value`, by the delta method; infinite where nothing is known, and
+        where weights were cut off (`num_truncated`), for it would not tell by how much that shifts
+        the estimate. Only to be trusted where `effective_sample_size` is large.
     - `effective_sample_size`: (Σw)²/Σw² over the proposals.
     - `num_met`: how many proposals became bridges.
     - `num_truncated`: how many of their weights were cut off by `max_trials`. Each makes the
-        estimate too small on average.
+        estimate too small on average; more trials, or a start law that hits sooner, avoid it.
     - `num_simulated`: paths simulated in all.
     - `num_nonfinite`: how many of them left the finite numbers.
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
@@ -97,9 +98,10 @@ def transition_log_density(
         density is with respect to `end`, in units of space to the power -d.
     - `num_proposals`: for each interval. One that does not meet counts as zero.
     - `proposal`: a `Coupling`, with its start law; by default `Coupling(gamma=0.0)` if the model
-        is declared `normalised`. With `Stationary()` the model's `log_stationary` must be
-        normalised (those of `ornstein_uhlenbeck` and `hyperbolic` are); with a start law that has
-        a density it need not be, for its constant cancels. Or `ModifiedDiffusionBridge()`,
+        is declared `normalised`. With `Stationary()` and `Reversed()` it must be (those of
+        `ornstein_uhlenbeck` and `hyperbolic` are); with a start law that has a density, such as
+        `fit_start_law(..., for_density=True)` finds, it need not be, for the constant of
+        `log_stationary` cancels. Or `ModifiedDiffusionBridge()`,
         `ResidualBridge()` or `Guided()`, which need no stationary law; or "auto", which tries
         couplings only if the model is declared `normalised`; or what `choose_proposal` returns.
     - `num_counts`: N hitting counts for each proposal, by default one.
@@ -110,8 +112,9 @@ def transition_log_density(
         finite.
 
     **Returns:** `TransitionLogDensity`. With proposals that are pulled to the end point `value` is
-    differentiable, forward and reverse: an estimate of the score. With couplings, and with a
-    choice between several proposals, a derivative raises `TypeError`.
+    differentiable, forward and reverse: an estimate of the score. So it is with a choice between
+    such proposals, by `choose_proposal` or, where that tries no couplings, by "auto". With
+    couplings, and a choice that may take them, a derivative raises `TypeError`.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
@@ -130,14 +133,6 @@ def transition_log_density(
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, _ = as_intervals(start, end, duration)
     like = intervals.start[0]
-    if proposal is None and model.has_density and not model.normalised:
-        raise ValueError(
-            "the default proposal, a coupling from the stationary law, gives the density in "
-            "proportion to `log_stationary`: where that is normalised, declare it by "
-            "`Diffusion(..., normalised=True)`; otherwise choose a `proposal`, for instance "
-            '"auto", `ModifiedDiffusionBridge()`, or a `Coupling` with a start law that has a '
-            "density (`fit_start_law`)."
-        )
     proposal = as_proposal(proposal, model, like, num_counts, None, max_trials, for_density=True)
     proposal.check(model, intervals)
     check_for_density(proposal, model)
@@ -160,7 +155,13 @@ def transition_log_density(
 
 
 def check_for_density(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
-    """Raise `ValueError` where the size of the proposal's weights is not known."""
+    """Raise `ValueError` where the size of the weights of a proposal that may be used rests on
+    what is not known.
+
+    A coupling's weights have the factor ν(b)/ν(x_0) · μ(x_0), in which the constant of ν cancels if
+    μ has a density of its own. From ν itself, and from the law that the paper prints, whose
+    weights are taken to be those of ν, the factor is ν(b): in proportion to `log_stationary`.
+    """
     pairs = [single for single in singles(proposal) if isinstance(single, CoupledPairs)]
     if pairs and not model.has_density:
         raise ValueError(
@@ -169,11 +170,15 @@ def check_for_density(proposal: AbstractWeightedProposal, model: Diffusion) -> N
             "proposal that does not need it, such as `ModifiedDiffusionBridge()` or `Guided()`."
         )
     stationary = [isinstance(pair.coupling.start_law, Stationary | Reversed) for pair in pairs]
-    if any(stationary) and isinstance(proposal, Choice) and not model.normalised:
+    if any(stationary) and not model.normalised:
         raise ValueError(
-            "this choice may use a coupling from the stationary law, whose densities are known "
-            "only in proportion, unless `log_stationary` is normalised: declare that by "
-            "`Diffusion(..., normalised=True)`, or choose between other proposals."
+            "a coupling from the stationary law gives densities in proportion to "
+            "`log_stationary`, which is not declared to be normalised, so that they may be wrong "
+            "by any factor: if it is normalised, for all parameters, say so by `Diffusion(..., "
+            "normalised=True)`; otherwise give the coupling a start law with a density, "
+            "`Coupling(..., start_law=fit_start_law(..., for_density=True))`, or choose "
+            '`proposal="auto"` or one that is pulled to the end point, such as '
+            "`ModifiedDiffusionBridge()` or `Guided()`."
         )
 
 
@@ -208,6 +213,7 @@ def estimate_log_density(
     variance = jnp.maximum(inverse_size - 1 / num_proposals, 0)
     variance *= num_proposals / max(num_proposals - 1, 1)
     error = jnp.sqrt(variance) if num_proposals > 1 else jnp.full_like(variance, jnp.inf)
+    known = some & ~jnp.any(drawn.truncated, axis=1)
 
     step_error = of_log_mean(
         drawn.log_weights, drawn.log_halving, proposal.step_share(model, intervals)
@@ -221,7 +227,7 @@ def estimate_log_density(
 
     return TransitionLogDensity(
         of_interval(log_sum + largest[:, 0] - math.log(num_proposals)),
-        of_interval(jnp.where(some, error, jnp.inf)),
+        of_interval(jnp.where(known, error, jnp.inf)),
         of_interval(jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0)),
         total(drawn.found),
         total(drawn.truncated),

@@ -26,6 +26,7 @@ from .choice import (
     default_candidates,
     run_pilots,
     undecided_between,
+    why_left_out,
 )
 from .coupled_pairs import CoupledPairs
 from .coupling import Coupling
@@ -35,6 +36,7 @@ from .importance import weigh_bridges
 from .intervals import Intervals, as_intervals, check_count, check_key
 from .search import key_for, most_lanes
 from .start_laws import AnyStartLaw, Stationary, draw_starts, needs_burn_in
+from .transition import check_for_density
 
 _SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 # Efficiencies this close are not told apart by a pilot run; of such laws the one closest to ν
@@ -96,6 +98,7 @@ def fit_start_law(
     num_steps: int = 50,
     coupling: Coupling | None = None,
     num_pilot: int = 2000,
+    for_density: bool = False,
 ) -> AnyStartLaw:
     """The start law μ with most effective samples per simulated path, between ν and a Gaussian
     fit to the reversed paths' starts. Of laws that come within a tenth of the most, the one closest
@@ -103,9 +106,14 @@ def fit_start_law(
 
     A choice made outside `jit`, of one interval: it looks at numbers.
 
-    **Arguments:** as in `sample_bridges`; `num_pilot` is the number of bridges of the pilot run.
+    **Arguments:** as in `sample_bridges`; `num_pilot` is the number of bridges of the pilot run;
+    `for_density` is for transition densities, whose size with ν itself rests on a normalised
+    `log_stationary`: where the model is not declared so, only laws with a density of their own are
+    tried, from the Gaussian fit to ν on. Where ν has far lighter tails than that, or is bent, their
+    weights vary much, and proposals that are pulled to the end point are the better choice.
 
-    **Returns:** `Stationary()` or a `GaussianLaw`.
+    **Returns:** `Stationary()` or a `GaussianLaw`; with `for_density` the latter, unless the model
+    is declared `normalised`.
 
     **Raises:** `ValueError` where too few pilot bridges are found, or for arguments that do not
     fit; `TypeError` inside `jit`.
@@ -118,7 +126,8 @@ def fit_start_law(
     ```
     """
     coupling = Coupling() if coupling is None else coupling
-    pilots = _pilots(key, model, start, end, duration, num_steps, coupling, num_pilot)
+    sizes = (num_steps, num_pilot, for_density)
+    pilots = _pilots(key, model, start, end, duration, coupling, *sizes)
     return _best(pilots).coupling.start_law
 
 
@@ -132,6 +141,7 @@ def tune_coupling(
     num_steps: int = 50,
     couplings: Sequence[Coupling] | None = None,
     num_pilot: int = 2000,
+    for_density: bool = False,
 ) -> Tuning:
     """The γ and the start law with most effective samples per simulated path; within a tenth of the
     most, the law closest to ν, as in `fit_start_law`.
@@ -140,7 +150,7 @@ def tune_coupling(
 
     **Arguments:** as in `sample_bridges`; `couplings` are the candidates, by default those with
     γ = -1, 0, 0.5 and 0.9, and each is tried with start laws between ν and a Gaussian fit;
-    `num_pilot` is the number of bridges of each pilot run.
+    `num_pilot` is the number of bridges of each pilot run; `for_density` as in `fit_start_law`.
 
     **Returns:** `Tuning`; printed, it is a table.
 
@@ -159,10 +169,8 @@ def tune_coupling(
         couplings = [Coupling(gamma) for gamma in (-1.0, 0.0, 0.5, 0.9)]
     if len(couplings) == 0:
         raise ValueError("`couplings` must have at least one candidate.")
-    runs = (
-        _pilots(key, model, start, end, duration, num_steps, coupling, num_pilot)
-        for coupling in couplings
-    )
+    sizes = (num_steps, num_pilot, for_density)
+    runs = (_pilots(key, model, start, end, duration, coupling, *sizes) for coupling in couplings)
     pilots = list(itertools.chain.from_iterable(runs))
     return Tuning(_best(pilots).coupling, pilots)
 
@@ -177,6 +185,7 @@ def choose_proposal(
     num_steps: int = 50,
     candidates: Sequence[Any] | None = None,
     num_pilot: int | None = None,
+    for_density: bool = False,
 ) -> Choice:
     """The proposal with most effective samples per second for each interval, by a pilot run.
 
@@ -195,6 +204,9 @@ def choose_proposal(
         comes near the best, one with its start law tuned.
     - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
         all intervals, at least 32 and at most 512.
+    - `for_density`: for `transition_log_density` and `pmmh`. Then couplings that start from the
+        stationary law are candidates only if the model is declared `normalised`; one with a fitted
+        law is tried where the others do badly on a single interval.
 
     **Returns:** `Choice`; printed, it is a table.
 
@@ -222,26 +234,38 @@ def choose_proposal(
     if num_pilot is not None:
         num_pilot = check_count("num_pilot", num_pilot, 2)
     like = intervals.start[0]
-    given = default_candidates(model, like) if candidates is None else list(candidates)
+    left_out = ""
+    if candidates is None:
+        given = default_candidates(model, like, for_density)
+        left_out = why_left_out(model, for_density)
+    else:
+        given = list(candidates)
 
-    def choose_between(candidates):
-        undecided = undecided_between(candidates, model, like, num_pilot)
+    def choose_between(candidates, left_out=""):
+        undecided = undecided_between(candidates, model, like, num_pilot, left_out=left_out)
         undecided.check(model, intervals)
+        if for_density:
+            check_for_density(undecided, model)
         return run_pilots(key, model, undecided, intervals, num_steps, timed=True)
 
-    choice = choose_between(given)
-    if candidates is None and not batched and _worth_tuning(choice):
-        tuned = _tuned_coupling(key, model, start, end, duration, num_steps, intervals)
+    choice = choose_between(given, left_out)
+    possible = model.has_reversal and (model.has_density or not for_density)
+    if candidates is None and not batched and possible and _worth_tuning(choice):
+        arguments = (key, model, start, end, duration, num_steps, intervals, for_density)
+        tuned = _tuned_coupling(*arguments)
         choice = choice if tuned is None else choose_between([*given, tuned])
     return choice
 
 
 def _worth_tuning(choice: Choice) -> bool:
-    """Whether a coupling comes near the best proposal, so that a start law might put it first."""
+    """Whether a coupling comes near the best proposal, so that a start law might put it first; or,
+    where none was tried, whether the best one at all might be put behind."""
     assert choice.efficiency is not None and choice.seconds is not None
     rates = np.asarray(choice.efficiency / choice.seconds)[:, 0]
     coupled = [isinstance(candidate, CoupledPairs) for candidate in choice.candidates]
     rates = np.where(np.isnan(rates), 0, rates)
+    if not any(coupled):
+        return bool(np.all(np.asarray(choice.efficiency)[:, 0] * _GAIN_OF_TUNING < 1))
     return bool(np.max(rates, where=coupled, initial=0) * _GAIN_OF_TUNING > rates.max())
 
 
@@ -253,12 +277,14 @@ def _tuned_coupling(
     duration: Numbers,
     num_steps: int,
     intervals: Intervals,
+    for_density: bool,
 ) -> Coupling | None:
     """The best of a few couplings, `None` where no pilot run succeeded."""
     num_pilot = max(_TUNING_PILOT, 20 * intervals.start.shape[1])
     pilots = []
     for coupling in (Coupling(0.0), Coupling(0.5)):
-        pilots += _pilots(key, model, start, end, duration, num_steps, coupling, num_pilot)
+        sizes = (num_steps, num_pilot, for_density)
+        pilots += _pilots(key, model, start, end, duration, coupling, *sizes)
     if all(np.isnan(pilot.efficiency) for pilot in pilots):
         return None
     return _best(pilots).coupling
@@ -270,12 +296,19 @@ def _pilots(
     start: Numbers,
     end: Numbers,
     duration: Numbers,
-    num_steps: int,
     coupling: Coupling,
+    num_steps: int,
     num_pilot: int,
+    for_density: bool,
 ) -> list[Pilot]:
     check_key(key)
     check_diffusion(model)
+    if for_density and not model.has_density:
+        raise ValueError(
+            "densities by couplings need the stationary one, with any start law: give `Diffusion` "
+            "a `log_stationary` (up to a constant), or choose a proposal that is pulled to the end "
+            "point."
+        )
     if not isinstance(coupling, Coupling):
         raise TypeError(f"a start law is chosen for a `Coupling`; got {coupling!r}.")
     if is_traced(key, model, coupling, start, end, duration):
@@ -308,7 +341,11 @@ def _pilots(
     laws: list[AnyStartLaw] = [stationary]
     if model.has_density:
         fits = (_gaussian_fit(draws), _gaussian_fit(starts))
-        laws += [_between(*fits, share, bridges.paths.dtype) for share in _SHARES[1:]]
+        gaussian: list[AnyStartLaw] = [
+            _between(*fits, share, bridges.paths.dtype) for share in _SHARES
+        ]
+        only_gaussian = for_density and not model.normalised
+        laws = gaussian if only_gaussian else [stationary, *gaussian[1:]]
     pilots = []
     for share, law in zip(_SHARES, laws, strict=False):
         weighted = weigh_bridges(weigh_key, model, bridges, start_law=law, max_trials=_PILOT_TRIALS)

@@ -21,6 +21,21 @@ from .diffusion import Diffusion, uses_argument
 from .linalg import any_inverse, dot, matvec
 
 
+class _Named:
+    """A parameter's name in its place, and its shape, if it is of floating point numbers."""
+
+    def __init__(self, name: str, shape: tuple[int, ...] | None):
+        self.name, self.shape = name, shape
+
+    @property
+    def entries(self) -> list[str]:
+        """The names of its entries, in the order of `ravel`."""
+        if self.shape is None:
+            return []
+        places = [",".join(map(str, place)) for place in np.ndindex(self.shape)]
+        return [f"{self.name}[{place}]" if place else self.name for place in places]
+
+
 class Unknowns(eqx.Module):
     """The model, and which of its parameters are unknown."""
 
@@ -31,6 +46,19 @@ class Unknowns(eqx.Module):
     def params(self) -> PyTree:
         """The unknown parameters, as they are in the model."""
         return self.model.params if self.where is None else self.where(self.model.params)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of θ's entries, as the model's parameters have them: "alpha", "B[0,1]"; "0" and
+        "1" for those of a tuple, and "theta" where the parameters are one array without a name."""
+
+        def named(path, leaf):
+            name = jax.tree_util.keystr(path, simple=True, separator=".") or "theta"
+            return _Named(name, np.shape(leaf) if eqx.is_inexact_array(leaf) else None)
+
+        leaves = jax.tree_util.tree_map_with_path(named, self.model.params)
+        leaves = jax.tree.leaves(leaves if self.where is None else self.where(leaves))
+        return tuple(name for leaf in leaves for name in leaf.entries)
 
     def vector(self, params: PyTree) -> Float[Array, " p"]:
         """θ of these unknown parameters."""

@@ -42,9 +42,8 @@ from .intervals import as_intervals, check_count, check_key
 from .meeting import AbstractMeeting, BrownianCrossing
 from .schemes import AbstractScheme, Euler, GaussianTransition, Heun
 from .search import key_for
-from .start_laws import Reversed, Stationary
 from .step_density import AbstractStepDensity, ItoTaylorDensity
-from .transition import transition_log_density
+from .transition import check_for_density, transition_log_density
 
 METHODS = ("approximate", "weights", "pseudo_marginal", "renewal", "crank_nicolson", "density")
 _FOR_COUPLINGS, _FOR_GUIDED = ("approximate", "renewal"), ("crank_nicolson",)
@@ -318,6 +317,9 @@ def work_precision(
     ]
     if not runs:
         raise ValueError(f"none of `proposals` fits any of `methods`; got {tuple(methods)}.")
+    if "density" in methods:
+        for candidate in candidates:
+            check_for_density(candidate, model)
     finest = (
         4 * max(steps)
         if reference_steps is None
@@ -333,7 +335,7 @@ def work_precision(
         exact = {
             density: _given(reference, log_density, density)
             or _closed_form(fine_key, scene, density, min(20 * most, 1_000_000))
-            or _finest(fine_key, scene, name, _judge(candidates, model, density), finest, most)
+            or _finest(fine_key, scene, name, candidates[0], finest, most)
             for name, density in [("weights", False), ("density", True)]
             if density in {method == "density" for method, *_ in runs}
         }
@@ -431,23 +433,6 @@ def _estimate(scene: _Scene, method: str, result: Any) -> _Estimate:
         size = len(values) if independent else np.asarray(effective_sample_size(values), float)
         error = sd / np.sqrt(size)
     return _Estimate(mean, error, sd, int(simulated), missing)
-
-
-def _judge(candidates: Sequence[Any], model: Diffusion, density: bool) -> Any:
-    """The proposal of the reference: the first, or for densities the first whose do not rest on a
-    normalised ν."""
-    if not density or model.normalised:
-        return candidates[0]
-    for candidate in candidates:
-        if not isinstance(candidate, CoupledPairs) or not isinstance(
-            candidate.coupling.start_law, Stationary | Reversed
-        ):
-            return candidate
-    raise ValueError(
-        'for method="density" these couplings need a normalised `log_stationary`: declare that by '
-        "`Diffusion(..., normalised=True)`, pass `log_density`, or add a proposal that does "
-        "without, such as `Guided()`."
-    )
 
 
 def _given(

@@ -115,7 +115,7 @@ def test_densities_are_not_mixed_where_they_have_different_constants():
     )
     assert not any(isinstance(c, jb.CoupledPairs) for c in estimate.proposal.candidates)
     mixed = mixed_choice(model, 2)
-    with pytest.raises(ValueError, match="only if `log_stationary` is normalised"):
+    with pytest.raises(ValueError, match="in proportion to `log_stationary`"):
         jb.transition_log_density(*arguments, num_steps=10, num_proposals=2, proposal=mixed)
 
 
@@ -209,10 +209,144 @@ def test_errors_say_what_to_change(unchecked):
         jb.sample_exact_bridges(*arguments, proposal="auto", method="crank_nicolson")
     with pytest.raises(ValueError, match="`num_pilot` must be at least 2"):
         jb.choose_proposal(*arguments, num_pilot=1)
-    with pytest.raises(TypeError, match="stop_gradient"):
-        mixed = mixed_choice(model, 3)
-        jax.grad(
-            lambda b: jb.sample_weighted_bridges(
-                key, model, jnp.zeros((3, 2)), b, 1.0, num_bridges=2, proposal=mixed
-            ).mean()[0, 5, 0]
-        )(jnp.full((3, 2), 0.3))
+    for proposal in (mixed_choice(model, 3), "auto"):
+        with pytest.raises(TypeError, match=r"`choice = choose_proposal\(..., candidates="):
+            jax.grad(
+                lambda b, proposal=proposal: jb.sample_weighted_bridges(
+                    key, model, jnp.zeros((3, 2)), b, 1.0, num_bridges=2, proposal=proposal
+                ).mean()[0, 5, 0]
+            )(jnp.full((3, 2), 0.3))
+
+
+PULLED = [
+    jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+    jb.Guided("end", jb.TrapezoidDensity()),
+    jb.Guided("path", jb.TrapezoidDensity()),
+]
+NUM = 6
+
+
+def pulled_choice():
+    """Three proposals in turn, of which two are used."""
+    chosen = jnp.array([0, 2, 0, 0, 2, 2], jnp.int32)
+    return Choice(tuple(PULLED), None, None, chosen, None, (0, 2))
+
+
+def pulled_setting():
+    """Ornstein–Uhlenbeck transitions, and the sum of their log densities as a function of B."""
+    rng = np.random.default_rng(2)
+    starts, ends = rng.normal(size=(2, NUM, 2)).astype(np.float32) * 0.5
+
+    def at(B):
+        model = jb.ornstein_uhlenbeck(jnp.array([[1.0, 0.4], [-0.3, 0.8]]))
+        return model.with_params(model.params._replace(B=B))
+
+    return starts, ends, at, jnp.array([[1.0, 0.4], [-0.3, 0.8]])
+
+
+@slow
+def test_each_interval_is_differentiated_by_its_own_proposal():
+    """Forward and reverse, in parameters and end points: as one by one."""
+    starts, ends, at, B = pulled_setting()
+
+    def values(arguments, proposal):
+        B, ends = arguments
+        return jb.transition_log_density(
+            jax.random.key(0), at(B), starts, ends, 0.5, num_proposals=8, num_steps=10,
+            proposal=proposal,
+        ).value  # fmt: skip
+
+    choice = pulled_choice()
+    alone = [jax.jacfwd(values)((B, ends), PULLED[i]) for i in choice.used]
+    own = np.asarray(choice.chosen == 0)
+    expected = jax.tree.map(
+        lambda first, second: np.where(own.reshape(-1, *[1] * (first.ndim - 1)), first, second),
+        *alone,
+    )
+    for derivative in (jax.jacfwd, jax.jacrev):
+        found = derivative(values)((B, ends), choice)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-4), found,
+                     expected)  # fmt: skip
+
+
+@slow
+def test_the_score_by_a_choice_is_that_of_the_closed_form():
+    starts, ends, at, B = pulled_setting()
+    choice = jb.choose_proposal(
+        jax.random.key(5), at(B), starts, ends, 0.5, num_steps=40, candidates=PULLED
+    )
+    forced = pulled_choice()
+
+    def score(proposal):
+        def value(B, key):
+            return jb.transition_log_density(
+                key, at(B), starts, ends, 0.5, num_proposals=50, num_steps=40, proposal=proposal
+            ).value.sum()  # fmt: skip
+
+        keys = jax.random.split(jax.random.key(0), 200)
+        return np.asarray(jax.jit(jax.vmap(jax.grad(value), (None, 0)))(B, keys))
+
+    exact = jax.grad(
+        lambda B: jax.vmap(lambda a, b: jb.ou_transition(at(B), a, 0.5).log_density(b))(
+            jnp.asarray(starts), jnp.asarray(ends)
+        ).sum()
+    )(B)
+    for proposal in (choice, forced):
+        found = score(proposal)
+        error = found.std(0) / np.sqrt(len(found))
+        assert (error < 0.05).all()
+        np.testing.assert_array_less(np.abs(found.mean(0) - exact), 5 * error + 0.01)
+
+
+def test_what_a_proposal_makes_of_another_ones_interval_does_not_spoil_derivatives():
+    """Where the explicit path of a guide overflows its derivative is not a number, times zero as
+    well."""
+    model = jb.Diffusion(lambda x, p: -p * x**5, params=1.0)
+    starts, ends = jnp.array([[0.0], [6.0]]), jnp.array([[0.3], [6.1]])
+    guided, bridge = jb.Guided("path"), jb.ModifiedDiffusionBridge()
+    choice = Choice((bridge, guided), None, None, jnp.array([1, 0], jnp.int32), None, (0, 1))
+
+    def first(params, proposal):
+        return jb.transition_log_density(
+            jax.random.key(0), model.with_params(params), starts, ends, 0.5, num_proposals=4,
+            num_steps=5, proposal=proposal,
+        ).value[0]  # fmt: skip
+
+    found = jax.grad(first)(jnp.asarray(1.0), choice)
+    expected = jax.jacfwd(first)(jnp.asarray(1.0), guided)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
+
+
+@slow
+def test_auto_is_differentiable_where_it_tries_no_couplings():
+    """Pilot runs see numbers only, so the choice is that of a call without derivatives."""
+    model = jb.langevin(lambda x, p: -p * x @ x, 1.0)
+
+    def density(params):
+        made = jb.transition_log_density(
+            jax.random.key(0), model.with_params(params), jnp.zeros((2, 1)), [[0.3], [0.9]],
+            [0.1, 3.0], num_proposals=20, num_steps=10, proposal="auto",
+        )  # fmt: skip
+        return made.value.sum(), made.proposal.chosen
+
+    (value, chosen), slope = jax.value_and_grad(density, has_aux=True)(1.0)
+    plain, plainly_chosen = density(1.0)
+    np.testing.assert_allclose(value, plain, rtol=1e-5)
+    np.testing.assert_array_equal(chosen, plainly_chosen)
+    inside = jax.jit(jax.grad(lambda params: density(params)[0]))(1.0)
+    np.testing.assert_allclose(inside, slope, rtol=1e-3)
+    assert np.isfinite(slope)
+
+
+def test_what_auto_leaves_out_is_said():
+    """An undeclared normaliser, for densities only; and an unknown time reversal."""
+    key, ends, model = jax.random.key(0), ([0.0], [0.3], 0.1), jb.langevin(lambda x, p: -x @ x)
+    options = dict(num_steps=5, proposal="auto")
+    density = jb.transition_log_density(key, model, *ends, num_proposals=4, **options)
+    lines = str(density.proposal).splitlines()
+    assert lines[-1].startswith("couplings left out: ") and "normalised=True" in lines[-1]
+    undecided = as_proposal("auto", model, jnp.zeros(1), for_density=True)
+    assert "couplings left out: " in str(undecided)
+    assert "left out" not in str(as_proposal("auto", model, jnp.zeros(1)))
+    blind = as_proposal("auto", BLIND, jnp.zeros(1))
+    assert "time reversal" in blind.left_out

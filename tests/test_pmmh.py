@@ -7,6 +7,7 @@ import pytest
 from inference import ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
+from jaxbridge.unknowns import Unknowns
 
 TIMES = np.arange(0, 12, 0.5)
 DATA = ou_data(7, TIMES, rate=0.8, sigma=0.7)
@@ -71,6 +72,87 @@ def test_goes_on_from_its_state_and_may_start_anywhere():
         jax.random.key(1), *arguments, num_iterations=3, num_warmup=0, init=made.state, **options
     )
     np.testing.assert_array_equal(more.state.root, made.state.root)
+    assert made.names == ("0", "1") and made.log_likelihood_variance.shape == (2,)
+
+
+def test_going_on_is_one_run():
+    """Ten iterations and ten more, by the proposals that "auto" had decided on, are twenty."""
+    options = dict(OPTIONS, num_proposals=5, num_chains=2, num_warmup=0)
+    arguments = (jax.random.key(3), ou_1d(1.0, 0.8), TIMES[:6], DATA[:6])
+    whole = jb.pmmh(*arguments, num_iterations=20, **options)
+    first = jb.pmmh(*arguments, num_iterations=10, **options)
+    more = jb.pmmh(*arguments, num_iterations=10, init=first.state, **options)
+    np.testing.assert_array_equal(
+        np.concatenate([first.theta, more.theta], axis=1), np.asarray(whole.theta)
+    )
+    np.testing.assert_array_equal(more.state.log_likelihood, whole.state.log_likelihood)
+    assert more.state.num_done == 20
+    (before,), (after,) = first.state.proposals, more.state.proposals
+    assert after is before and before.chosen.shape == (5,)
+    with pytest.raises(ValueError, match="had 1 numbers of steps, but here they have 2"):
+        jb.pmmh(
+            arguments[0],
+            arguments[1],
+            np.array([0.0, 0.1, 1.0]),
+            DATA[:3],
+            num_iterations=1,
+            init=first.state,
+            **dict(options, num_steps=None, step_size=0.05),
+        )
+
+
+@pytest.mark.slow
+def test_the_variance_of_the_estimate_is_that_of_repetitions():
+    bridge = jb.ModifiedDiffusionBridge(jb.TrapezoidDensity())
+    model = ou_1d(1.5, 0.7)
+    made = jb.pmmh(
+        jax.random.key(0),
+        model,
+        TIMES,
+        DATA,
+        num_iterations=400,
+        num_warmup=200,
+        num_proposals=10,
+        proposal=bridge,
+        **OPTIONS,
+    )
+    # At the mean of the posterior, where the chain is: fresh estimates.
+    model = model.with_params(tuple(float(each.mean()) for each in made.params))
+
+    def estimate(key):
+        return jb.transition_log_density(
+            key,
+            model,
+            DATA[:-1],
+            DATA[1:],
+            0.5,
+            num_proposals=10,
+            num_steps=8,
+            proposal=bridge,
+        ).value.sum()
+
+    repeated = jax.jit(jax.vmap(estimate))(jax.random.split(jax.random.key(1), 2000))
+    ratio = float(made.log_likelihood_variance) / float(jnp.var(repeated))
+    assert made.log_likelihood_variance.shape == () and abs(np.log(ratio)) < 0.3
+    print(f"{float(made.log_likelihood_variance):.5f}, repeated {float(jnp.var(repeated)):.5f}")
+
+
+def test_unknown_parameters_have_names():
+    model = jb.Diffusion(
+        lambda x, p: -p["rate"] * x,
+        lambda x, p: p["noise"][0],
+        params={"rate": 1.0, "noise": jnp.ones(2), "count": jnp.arange(2)},
+    )
+    assert Unknowns(model, None).names == ("noise[0]", "noise[1]", "rate")
+    assert Unknowns(model, lambda p: p["rate"]).names == ("rate",)
+    ou = jb.ornstein_uhlenbeck(jnp.eye(2), sigma=jnp.eye(2))
+    names = Unknowns(ou, lambda p: (p.sigma, p.B)).names
+    assert names == tuple(f"{n}[{i},{j}]" for n in ("sigma", "B") for i in (0, 1) for j in (0, 1))
+    assert Unknowns(jb.Diffusion(lambda x, p: -p * x, params=1.0), None).names == ("theta",)
+    # In the order of the vector.
+    unknowns = Unknowns(model, None)
+    picked = unknowns.pick(jnp.array([1.0, 2.0, 3.0]))
+    assert picked["rate"] == 3 and list(picked["noise"]) == [1, 2]
 
 
 def test_bad_input_is_refused(unchecked):

@@ -81,7 +81,69 @@ def test_model_without_a_density_or_a_sampler():
     assert isinstance(law, jb.Stationary) and law.burn_in > 2
 
 
-def test_errors_say_what_to_change():
+@pytest.mark.slow
+def test_a_law_for_densities_does_not_rest_on_the_normaliser():
+    """The same process with a constant of 7 in log ν, where ν itself would be the best law."""
+    ends = ([0.0], [0.3])
+    model = jb.Diffusion(
+        lambda x, p: -x,
+        None,
+        lambda x, p: 7 - x @ x,
+        reversible=True,
+        sample_stationary=lambda key, p: jax.random.normal(key, (1,)) / jnp.sqrt(2.0),
+    )
+    options = dict(num_steps=20, num_pilot=300)
+    assert isinstance(
+        jb.fit_start_law(jax.random.key(0), model, *ends, 1.0, **options), jb.Stationary
+    )
+    law = jb.fit_start_law(jax.random.key(0), model, *ends, 1.0, for_density=True, **options)
+    tuning = jb.tune_coupling(
+        jax.random.key(0), model, *ends, 1.0, couplings=[jb.Coupling(0.0)], for_density=True,
+        **options,
+    )  # fmt: skip
+    exact = jb.ou_transition(jb.ornstein_uhlenbeck([[1.0]]), jnp.array(ends[0]), 1.0)
+    exact = float(exact.log_density(jnp.array(ends[1])))
+    for coupling in (jb.Coupling(0.0, start_law=law), tuning.coupling):
+        assert isinstance(coupling.start_law, jb.GaussianLaw)
+        estimate = jb.transition_log_density(
+            jax.random.key(1), model, *ends, 1.0, num_proposals=10_000, num_steps=20,
+            proposal=coupling,
+        )  # fmt: skip
+        error = float(estimate.standard_error)
+        assert error < 0.05
+        assert abs(float(estimate.value) - exact) < 5 * error + 0.01
+    declared = jb.fit_start_law(
+        jax.random.key(0), jb.ornstein_uhlenbeck([[1.0]]), *ends, 1.0, for_density=True, **options
+    )
+    assert isinstance(declared, jb.Stationary)
+
+
+@pytest.mark.slow
+def test_a_choice_for_densities_may_be_used_for_them():
+    """On a long interval, where only couplings serve, and these must have a law with a density."""
+    model = jb.langevin(lambda x, p: 7 - 2 * jnp.sqrt(1 + x @ x))
+    ends = ([0.0, 0.0], [1.0, 0.5], 60.0)
+    choice = jb.choose_proposal(jax.random.key(0), model, *ends, num_steps=600, for_density=True)
+    coupled = [each.coupling for each in choice.candidates if isinstance(each, jb.CoupledPairs)]
+    assert len(coupled) == 1 and isinstance(coupled[0].start_law, jb.GaussianLaw)
+    estimate = jb.transition_log_density(
+        jax.random.key(1), model, *ends, num_steps=600, num_proposals=1_000, proposal=choice
+    )
+    # After so many relaxation times the density is the stationary one.
+    exact = -2 * np.sqrt(2.25) - np.log(2 * np.pi * 3 / 4 * np.exp(-2))
+    error = float(estimate.standard_error)
+    assert error < 0.2
+    assert abs(float(estimate.value) - exact) < 5 * error + 0.02
+
+
+def test_errors_say_what_to_change(unchecked):
+    key, blind = jax.random.key(0), jb.Diffusion(lambda x, p: -x, reversible=True)
+    with pytest.raises(ValueError, match="need the stationary one, with any start law"):
+        jb.fit_start_law(key, blind, [0.0], [0.1], 1.0, for_density=True)
+    rough = jb.langevin(lambda x, p: -x @ x)
+    with pytest.raises(ValueError, match="in proportion to `log_stationary`"):
+        candidates = [jb.Coupling()]
+        jb.choose_proposal(key, rough, [0.0], [0.1], 1.0, candidates=candidates, for_density=True)
     model = paper_model()
     with pytest.raises(TypeError, match="which `jit` and `vmap` hide"):
         jax.jit(lambda a: jb.fit_start_law(jax.random.key(0), model, a, a, 1.0))(jnp.zeros(2))

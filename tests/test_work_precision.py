@@ -188,6 +188,16 @@ def test_errors_say_what_to_change(changes, message, unchecked):
         jb.work_precision(KEY, paper_model(), **arguments)
 
 
+def test_densities_with_a_constant_that_is_not_known_are_refused_before_anything_runs():
+    """Even where the right density is given: what a coupling finds would be another."""
+    model = jb.langevin(lambda x, p: 7 - x @ x)
+    arguments = (KEY, model, [0.2], [0.5], 1.0)
+    with pytest.raises(ValueError, match="in proportion to `log_stationary`"):
+        jb.work_precision(
+            *arguments, proposals=[jb.Coupling()], methods=("density",), log_density=-0.4
+        )
+
+
 @pytest.mark.slow
 def test_bridges_that_are_not_found_are_counted():
     """Ends that no pair joins in so short a time."""
