@@ -28,7 +28,7 @@ def test_trapezoid_density_is_of_second_order(reversible, x64):
             1.0,
             num_proposals=400_000,
             num_steps=int(num_steps),
-            proposal=jb.Guided(density=jb.TrapezoidDensity()),
+            proposal=jb.Guided(density=jb.ItoTaylorDensity()),
         )
         errors.append(float(estimate.value) - exact)
         assert estimate.standard_error < 0.002
@@ -45,7 +45,7 @@ def test_curl_is_called_for():
     exact = float(jb.ou_transition(model, ends[0], 1.0).log_density(ends[1]))
     estimate = jb.transition_log_density(
         jax.random.key(0), model, *ends, 1.0, num_proposals=50_000, num_steps=40,
-        proposal=jb.Guided(density=jb.TrapezoidDensity()),
+        proposal=jb.Guided(density=jb.ItoTaylorDensity()),
     )  # fmt: skip
     # Without it log p̂ lacks δ T |Ω|²/12 and, with E ΔwΔwᵀ = δ I, δ T |Ω|²/6; here |Ω|² = 18.
     lacking = 18 / 40 / 12 + 18 / 40 / 6
@@ -69,7 +69,7 @@ def test_nonlinear_drift_by_quadrature(x64):
     kernel = (states[start] * np.exp(-duration * energies)) @ states[end] / width
     exact = np.log(kernel) + A[end] - A[start]
 
-    density, dynamics = jb.TrapezoidDensity(), model.forward(jnp.zeros(1))
+    density, dynamics = jb.ItoTaylorDensity(), model.forward(jnp.zeros(1))
     sizes, errors = np.array([10, 20, 40]), []
     for num_steps in sizes:
         dt = jnp.asarray(duration / num_steps)
@@ -94,7 +94,7 @@ def test_linear_step_in_one_dimension_against_the_exact_density(x64):
     """One step of dX = -βX dt + dW: the error of its log density, averaged over where it leads."""
     model = jb.ornstein_uhlenbeck([[0.8]])
     x, nodes = jnp.array([0.6]), np.polynomial.hermite_e.hermegauss(40)
-    density, dynamics = jb.TrapezoidDensity(), model.forward(jnp.zeros(1))
+    density, dynamics = jb.ItoTaylorDensity(), model.forward(jnp.zeros(1))
     sizes, errors = np.array([0.2, 0.1, 0.05]), []
     for dt in sizes:
         law = jb.ou_transition(model, x, dt)
@@ -117,5 +117,5 @@ def test_state_dependent_sigma_is_refused():
     with pytest.raises(ValueError, match="is for constant σ"):
         jb.sample_weighted_bridges(
             jax.random.key(0), model, [0.3], [0.1], 1.0, num_bridges=2,
-            proposal=jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+            proposal=jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
         )  # fmt: skip

@@ -85,7 +85,7 @@ def test_the_closed_form_serves_functions_of_the_path():
         KEY,
         paper_model(),
         *ENDS,
-        proposals=[jb.Guided(density=jb.TrapezoidDensity())],
+        proposals=[jb.Guided(density=jb.ItoTaylorDensity())],
         num_steps=(20,),
         methods=("weights",),
         num_bridges=20_000,
@@ -94,7 +94,7 @@ def test_the_closed_form_serves_functions_of_the_path():
         repeats=1,
     )
     (setting,) = result.settings
-    assert setting.scheme == "TrapezoidDensity" and np.isnan(setting.gamma)
+    assert setting.scheme == "ItoTaylorDensity" and np.isnan(setting.gamma)
     assert result.reference == "1,000,000 draws of the exact law"
     assert setting.error < 5 * setting.uncertainty
 
