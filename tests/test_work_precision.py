@@ -188,6 +188,36 @@ def test_errors_say_what_to_change(changes, message, unchecked):
         jb.work_precision(KEY, paper_model(), **arguments)
 
 
+def test_constants_of_one_precision_are_refused_before_anything_runs(unchecked):
+    """NumPy's, which JAX takes for those of the precision in which it sees them first."""
+    height = np.array([-2.0, -1.0])
+    arguments = (KEY, [0.2], [0.5], 1.0)
+
+    def run(log_density):
+        key, *ends = arguments
+        jb.work_precision(
+            key,
+            jb.langevin(log_density),
+            *ends,
+            proposals=[jb.ModifiedDiffusionBridge()],
+            num_steps=(2,),
+            methods=("weights",),
+            dtypes=("float32", "float64"),
+            num_bridges=50,
+            reference_bridges=50,
+            repeats=1,
+        )
+
+    with pytest.raises(TypeError, match=r"`jnp.asarray\(constant, x.dtype\)`, or give them"):
+        run(lambda x, p: jnp.sum(height * jnp.exp(x[0] ** 2 * height * 0.1)) - x @ x)
+
+    def cast(x, p):
+        mine = jnp.asarray(height, x.dtype)
+        return jnp.sum(mine * jnp.exp(x[0] ** 2 * mine * 0.1)) - x @ x
+
+    run(cast)
+
+
 def test_densities_with_a_constant_that_is_not_known_are_refused_before_anything_runs():
     """Even where the right density is given: what a coupling finds would be another."""
     model = jb.langevin(lambda x, p: 7 - x @ x)
