@@ -106,8 +106,11 @@ class Choice(AbstractWeightedProposal):
     def of(self, which: Int[np.ndarray, " J"]) -> "Choice":
         """The choice for some of the intervals."""
         made = (self.seconds, self.efficiency, self.step_error, self.pareto_k, self.chosen)
-        made = jax.tree.map(lambda leaf: leaf[..., which], made)
-        return Choice(self.candidates, *made, self.num_pilot, self.used, self.left_out)
+        seconds, efficiency, step_error, shape, chosen = (
+            None if leaf is None else leaf[..., which] for leaf in made
+        )
+        told = (seconds, efficiency, step_error, shape, chosen)
+        return Choice(self.candidates, *told, self.num_pilot, self.used, self.left_out)
 
     def check(self, model, intervals):
         for candidate in self.candidates:
