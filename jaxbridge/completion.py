@@ -28,7 +28,7 @@ from .intervals import Intervals
 from .kernels import acceptance_rate
 from .likelihood import Form, log_likelihoods
 from .observations import Group
-from .parts import Bounds, Part, make_parts
+from .parts import Bounds, Part, log_halvings, make_parts, step_shares
 from .renewal_chain import as_pairs, first_paths, propose_paths, renew
 from .start_laws import run_is_cut
 from .weighted import AbstractWeightedProposal
@@ -208,6 +208,18 @@ class Completion(eqx.Module):
             for part, mine in zip(self.parts, paths, strict=True)
         ]
         return jnp.concatenate(values)
+
+    def log_step_error(self, model: Diffusion, paths: Paths, form: Form) -> Float[Array, ""]:
+        """The step error of the log density of these paths, summed over the intervals: D of
+        `halving`, times the share of it that is the error."""
+        model = model.prepared()
+        return sum(
+            (
+                jnp.sum(step_shares(part, model, form) * log_halvings(part, model, mine, form))
+                for part, mine in zip(self.parts, paths, strict=True)
+            ),
+            start=jnp.zeros((), paths[0].dtype),
+        )
 
     def points(self, paths: Paths) -> tuple[Float[Array, "points d"], Float[Array, " points"]]:
         """All points of the paths but their ends, and the steps that begin there."""

@@ -41,6 +41,9 @@ from .unknowns import (
     as_log_prior,
 )
 
+# Of about so many of the draws the step error is worked out.
+_STEP_ERRORS = 256
+
 
 class GibbsState(NamedTuple):
     """Where a chain of `gibbs` is, with chains in a leading axis if there are several.
@@ -74,6 +77,9 @@ class GibbsPosterior(AbstractPosterior):
         that path. Where this does not go to zero choose another proposal for such intervals.
     - `num_truncated`: weights that `max_trials` cut off, shape (*chains, n): where there are many
         the law is not exact.
+    - `log_step_error`: an estimate of the step error of the log density of the completed data at
+        each draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
+        `step_error`, that of the posterior mean, is made of.
     - `state`: where it ended; pass it as `init` to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.
@@ -87,6 +93,7 @@ class GibbsPosterior(AbstractPosterior):
     num_simulated: Int[Array, "*chains n"]
     num_missing: Int[Array, "*chains n"]
     num_truncated: Int[Array, "*chains n"]
+    log_step_error: Float[Array, "*chains n"]
     state: GibbsState
     completion: Completion
     exact_parameters: bool = eqx.field(static=True)
@@ -272,12 +279,25 @@ def _run(
         keys = jax.random.split(key, len(state.theta))
         return jax.vmap(lambda key, state: _iterate(key, setting, state))(keys, state)
 
+    # As many draws as tell a covariance, for D takes a good part of the time of an iteration.
+    every = max(1, num_iterations // _STEP_ERRORS)
+
+    def step_error(state):
+        model = setting.unknowns.at(state.theta)
+        return setting.completion.log_step_error(model, state.paths, setting.form)
+
+    def step_errors(i, state):
+        each = step_error if state.theta.ndim == 1 else jax.vmap(step_error)
+        unknown = jnp.full(state.theta.shape[:-1], jnp.nan, state.theta.dtype)
+        return lax.cond(i % every == every - 1, each, lambda _: unknown, state)
+
     def kept(carry, i):
         state, meter = carry
         # Number 0 made the first paths.
         keys = jax.random.split(jax.random.fold_in(key, i + 1), thin)
         state, sweeps = lax.scan(iterate, state, keys)
         meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / num_iterations)
+        error = step_errors(i, state)
         told = _Sweep(
             jnp.any(sweeps.parameters_moved, axis=0),
             jnp.mean(sweeps.bridges_moved, axis=0),
@@ -285,13 +305,15 @@ def _run(
             jnp.sum(sweeps.num_missing, axis=0, dtype=jnp.int32),
             jnp.sum(sweeps.num_truncated, axis=0, dtype=jnp.int32),
         )
-        return (state, meter), (state.theta, told)
+        return (state, meter), (state.theta, told, error)
 
     carry = (state, progress_meter.init())
-    (state, meter), (theta, told) = lax.scan(kept, carry, jnp.arange(num_iterations))
+    (state, meter), (theta, told, error) = lax.scan(kept, carry, jnp.arange(num_iterations))
     progress_meter.close(meter)
     if theta.ndim == 3:
-        theta, told = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, told))
+        theta, told, error = jax.tree.map(
+            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, told, error)
+        )
     as_params = jax.vmap(setting.unknowns.all)
     params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
     exact = isinstance(setting.kernel, NormalDraw)
@@ -304,6 +326,7 @@ def _run(
         told.num_simulated,
         told.num_missing,
         told.num_truncated,
+        error,
         state,
         setting.completion,
         exact,

@@ -209,6 +209,11 @@ def forms_of(model: Diffusion, like: Float[Array, " d"]) -> tuple[Form, ...]:
     return ("ito", "ito_taylor", "girsanov") if gradient else ("ito_taylor", "girsanov")
 
 
+def density_of_form(form: Form) -> AbstractStepDensity:
+    """The density of steps that the form is, or comes nearest to."""
+    return EulerDensity() if form in ("girsanov", "euler") else ItoTaylorDensity()
+
+
 def forms_of_target(
     proposals: PyTree, model: Diffusion, like: Float[Array, " d"]
 ) -> tuple[Form, ...]:

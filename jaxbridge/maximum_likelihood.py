@@ -44,8 +44,10 @@ from .simulated_likelihood import (
     guarded,
     pulled_parts,
     sigma_is_unknown,
+    step_error_of_score,
     wander,
 )
+from .step_error import StepError, dominates
 from .unknowns import (
     Constraint,
     Unknowns,
@@ -66,6 +68,8 @@ class MaximumLikelihood(eqx.Module):
         smaller.
     - `theta`, `covariance`: the unknown parameters as a vector, shape (p,), and the inverse of
         the observed information, shape (p, p).
+    - `step_error`: what `theta` is too large by for the length of the steps, an estimate, shape
+        (p,), with a standard error of it, `step_uncertainty`. NaN where it is not known.
     - `iterates`: of the stochastic approximation, shape (n, p).
     - `score`: at the average of the iterates, before the last step; where σ is unknown, at the
         estimate, so that its gradient is about zero, and the covariance of that by the noise of
@@ -89,12 +93,21 @@ class MaximumLikelihood(eqx.Module):
     monte_carlo_errors: PyTree
     theta: Float[Array, " p"]
     covariance: Float[Array, "p p"]
+    step_error: Float[Array, " p"]
+    step_uncertainty: Float[Array, " p"]
     iterates: Float[Array, "n p"]
     score: Score
     num_missing: Int[Array, ""]
     num_truncated: Int[Array, ""]
     num_refused: Int[Array, ""]
     newton: Bool[Array, ""]
+
+    @property
+    def step_error_dominates(self) -> Bool[Array, " p"]:
+        """Whether the step error is beyond the standard error of the estimate, or not known well
+        enough to say: then more steps are needed."""
+        error = StepError(self.step_error, self.step_uncertainty)
+        return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
 
 
 def maximum_likelihood(
@@ -234,6 +247,8 @@ def _summary(
     """The estimate with its errors, which are those of the score times the inverse information."""
     covariance = jnp.linalg.inv(score.information)
     left = covariance @ score.covariance @ covariance
+    # Where the score is too large by this, so is its zero by that times the inverse information.
+    step_doubt = jnp.sqrt(covariance**2 @ score.step_uncertainty**2)
     standard, monte_carlo = (
         unknowns.pick(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
     )
@@ -243,6 +258,8 @@ def _summary(
         monte_carlo,
         estimate,
         covariance,
+        covariance @ score.step_error,
+        step_doubt,
         iterates,
         score,
         lost.missing,
@@ -281,6 +298,8 @@ def _by_simulation(
         made.covariance,
         made.information,
         made.effective_sample_size,
+        made.pareto_k,
+        *step_error_of_score(last_key, unknowns, parts, maximum, num_bridges),
         made.num_missing,
         jnp.int32(0),
     )

@@ -20,11 +20,13 @@ from .choice import (
 from .coupled_pairs import CoupledPairs
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion
+from .halving import log_halving_of_paths
 from .intervals import Intervals
-from .likelihood import Form, forms_of_target
+from .likelihood import Form, density_of_form, forms_of_target
 from .observations import Group
 from .renewal_chain import as_pairs
 from .start_laws import Stationary, needs_burn_in
+from .step_error import share_of_order
 from .transition import check_for_density
 from .weighted import AbstractWeightedProposal
 
@@ -107,6 +109,23 @@ def part_of(intervals: Intervals, group: Group, proposal: AbstractWeightedPropos
     mine = jax.tree.map(lambda leaf: leaf[group.which], intervals)
     fractions = jnp.asarray(np.diff(proposal.fractions(group.num_steps)), mine.duration.dtype)
     return Part(mine, jnp.asarray(group.which), fractions, proposal)
+
+
+def log_halvings(
+    part: Part, model: Diffusion, paths: Float[Array, "P points d"], form: Form, repeats: int = 1
+) -> Float[Array, " P"]:
+    """D of `halving` under the step law of this form of the likelihood, of so many paths for each
+    interval."""
+    steps = jnp.repeat(part.steps, repeats, axis=1)
+    dynamics = model.forward(part.intervals.start[0])
+    return log_halving_of_paths(density_of_form(form), dynamics, steps, paths)
+
+
+def step_shares(part: Part, model: Diffusion, form: Form) -> Float[Array, " I"]:
+    """The step error of each interval, of its bridges or of this form, as a share of what half as
+    many steps change."""
+    share = share_of_order(density_of_form(form).order)
+    return jnp.maximum(part.proposal.step_share(model, part.intervals), share)
 
 
 def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:

@@ -53,6 +53,7 @@ class _Chain(NamedTuple):
     theta: Float[Array, "*chains p"]
     log_likelihood: Float[Array, "*chains"]
     variance: Float[Array, "*chains"]
+    log_step_error: Float[Array, "*chains"]
     root: Float[Array, "*chains p p"]
 
 
@@ -61,7 +62,7 @@ class PMMHState(NamedTuple):
 
     - `theta`: θ, shape (p,).
     - `log_likelihood`: the estimate that the chain holds, shape ().
-    - `variance`: that of this estimate, shape ().
+    - `variance`: that of this estimate, shape (), and `log_step_error`, its step error.
     - `root`: S of the covariance S Sᵀ of proposals, shape (p, p).
     - `num_done`: iterations so far, with those of the warm-up. Going on with the same key draws
         the random numbers of those that come after.
@@ -71,6 +72,7 @@ class PMMHState(NamedTuple):
     theta: Float[Array, "*chains p"]
     log_likelihood: Float[Array, "*chains"]
     variance: Float[Array, "*chains"]
+    log_step_error: Float[Array, "*chains"]
     root: Float[Array, "*chains p p"]
     num_done: Int[Array, ""]
     proposals: tuple[AbstractWeightedProposal, ...]
@@ -91,6 +93,8 @@ class PMMHPosterior(AbstractPosterior):
         than three, the chain holds on to lucky estimates and hardly moves: take as many times more
         `num_proposals`, or a better `proposal`; far below, fewer make iterations cheaper. Infinite
         where weights were cut off (`num_truncated`), and with one proposal.
+    - `log_step_error`: an estimate of the step error of each of these estimates, shape
+        (*chains, n): what `step_error`, that of the posterior mean, is made of.
     - `accepted`: shape (*chains, n).
     - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
         parameters were refused because no estimate was to be had, shape (*chains,). With couplings
@@ -105,6 +109,7 @@ class PMMHPosterior(AbstractPosterior):
     names: tuple[str, ...] = eqx.field(static=True)
     log_likelihood: Float[Array, "*chains n"]
     log_likelihood_variance: Float[Array, "*chains"]
+    log_step_error: Float[Array, "*chains n"]
     accepted: Bool[Array, "*chains n"]
     num_without_estimate: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
@@ -198,7 +203,7 @@ def pmmh(
         chain = _start(run_key, setting, theta, root)
     else:
         num_done = state.num_done
-        chain = _Chain(state.theta, state.log_likelihood, state.variance, state.root)
+        chain = _Chain(*state[: len(_Chain._fields)])
     made, chain = _run(run_key, setting, chain, num_done, num_warmup, num_iterations, thin, meter)
     num_done = num_done + num_warmup + num_iterations * thin
     state = PMMHState(*chain, num_done, tuple(part.proposal for part in parts))
@@ -238,20 +243,21 @@ class _Setting(eqx.Module):
 
     def estimate(
         self, key: Key[Array, ""], theta: Float[Array, " p"]
-    ) -> tuple[Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
         """log of an unbiased estimate of the likelihood, -inf where there is none, with its
-        variance; and how many of its weights were cut off."""
+        variance and its step error; and how many of its weights were cut off."""
         model = self.unknowns.at(theta).prepared()
-        log_likelihood = variance = jnp.zeros((), theta.dtype)
+        log_likelihood = variance = step_error = jnp.zeros((), theta.dtype)
         num_truncated = jnp.int32(0)
         for part_key, part in zip(jax.random.split(key, len(self.parts)), self.parts, strict=True):
             size = (self.num_proposals, part.num_steps)
             made = estimate_log_density(part_key, model, part.proposal, part.intervals, *size)
             log_likelihood += jnp.sum(made.value)
             variance += jnp.sum(made.standard_error**2)
+            step_error += jnp.sum(made.step_error)
             num_truncated += jnp.sum(made.num_truncated, dtype=jnp.int32)
         log_likelihood = jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood)
-        return log_likelihood, variance, num_truncated
+        return log_likelihood, variance, step_error, num_truncated
 
 
 def _first_root(
@@ -285,7 +291,7 @@ def _start(key, setting: _Setting, theta, root) -> _Chain:
     key = jax.random.fold_in(key, 0)
 
     def estimate(key, theta):
-        return setting.estimate(key, theta)[:2]
+        return setting.estimate(key, theta)[:3]
 
     if theta.ndim == 1:
         return _Chain(theta, *estimate(key, theta), root)
@@ -310,7 +316,7 @@ def _iterate(key, setting: _Setting, state: _Chain, gain: Float[Array, ""]):
     inside = allowed(setting.constraint, setting.unknowns, proposed)
     # Outside the constraint the model may not be simulated: θ stands in, and is refused.
     proposed = jnp.where(inside, proposed, state.theta)
-    estimated, variance, num_truncated = setting.estimate(estimate_key, proposed)
+    estimated, variance, step_error, num_truncated = setting.estimate(estimate_key, proposed)
     new = jnp.where(inside, estimated + setting.log_prior(proposed), -jnp.inf)
     rate = acceptance_rate(state.log_likelihood + setting.log_prior(state.theta), new)
     accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
@@ -324,6 +330,7 @@ def _iterate(key, setting: _Setting, state: _Chain, gain: Float[Array, ""]):
         jnp.where(accepted, proposed, state.theta),
         jnp.where(accepted, estimated, state.log_likelihood),
         jnp.where(accepted, variance, state.variance),
+        jnp.where(accepted, step_error, state.log_step_error),
         root,
     )
     return state, _Told(accepted, unknown.astype(jnp.int32), num_truncated)
@@ -365,18 +372,18 @@ def _run(
         carry, told = lax.scan(iterate, carry, steps)
         state, _ = carry
         told = _add_up(told)._replace(accepted=jnp.any(told.accepted, axis=0))
-        return carry, (state.theta, state.log_likelihood, state.variance, told)
+        held = (state.log_likelihood, state.variance, state.log_step_error)
+        return carry, (state.theta, *held, told)
 
     carry = (state, progress_meter.init())
     carry, lost = lax.scan(iterate, carry, jnp.arange(num_warmup))
-    (state, meter), (theta, log_likelihood, variance, told) = lax.scan(
-        kept, carry, jnp.arange(num_iterations)
-    )
+    (state, meter), made = lax.scan(kept, carry, jnp.arange(num_iterations))
+    theta, log_likelihood, variance, step_error, told = made
     progress_meter.close(meter)
     sums, accepted = jax.tree.map(jnp.add, _add_up(lost), _add_up(told)), told.accepted
     if theta.ndim == 3:
-        theta, log_likelihood, accepted = jax.tree.map(
-            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, log_likelihood, accepted)
+        theta, log_likelihood, step_error, accepted = jax.tree.map(
+            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, log_likelihood, step_error, accepted)
         )
     as_params = jax.vmap(setting.unknowns.all)
     params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
@@ -385,6 +392,7 @@ def _run(
         "theta": theta,
         "log_likelihood": log_likelihood,
         "log_likelihood_variance": jnp.median(variance, axis=0),
+        "log_step_error": step_error,
         "accepted": accepted,
         "num_without_estimate": sums.unknown,
         "num_truncated": sums.num_truncated,

@@ -5,9 +5,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from .diagnostics import effective_sample_size, potential_scale_reduction
+from .step_error import StepError, dominates
+
+# Of fewer draws a covariance tells nothing.
+_FEWEST = 10
 
 
 class AbstractPosterior(eqx.Module):
@@ -16,6 +20,7 @@ class AbstractPosterior(eqx.Module):
     params: eqx.AbstractVar[PyTree]
     theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
     names: eqx.AbstractVar[tuple[str, ...]]
+    log_step_error: eqx.AbstractVar[Float[Array, "*chains n"]]
 
     @property
     def _chains(self) -> Float[Array, "chains n p"]:
@@ -31,6 +36,49 @@ class AbstractPosterior(eqx.Module):
     def r_hat(self) -> Float[Array, " p"]:
         """R̂ of each unknown parameter, from the halves of all chains."""
         return potential_scale_reduction(self._chains)
+
+    @property
+    def step_error(self) -> Float[Array, " p"]:
+        """What the posterior mean of each unknown parameter is too large by for the length of the
+        steps, an estimate: to first order the covariance of θ and the error of the log likelihood,
+        `log_step_error`. NaN where that is not known, as of one step."""
+        return self._step_error.value
+
+    @property
+    def step_uncertainty(self) -> Float[Array, " p"]:
+        """A standard error of `step_error`."""
+        return self._step_error.uncertainty
+
+    @property
+    def standard_error(self) -> Float[Array, " p"]:
+        """The Monte Carlo error of the posterior mean of each unknown parameter."""
+        draws = self.theta.reshape(-1, self.theta.shape[-1])
+        return jnp.std(draws, axis=0) / jnp.sqrt(self.effective_sample_size)
+
+    @property
+    def step_error_dominates(self) -> Bool[Array, " p"]:
+        """Whether the step error is beyond the Monte Carlo error, or not known well enough to say:
+        then more steps help, and more iterations do not."""
+        return dominates(self._step_error, self.standard_error)
+
+    @property
+    def _step_error(self) -> StepError:
+        known = jnp.isfinite(self.log_step_error)
+        number = jnp.sum(known)
+        error = jnp.where(known, self.log_step_error, 0)
+        error = jnp.where(known, error - jnp.sum(error) / number.astype(error.dtype), 0)
+        deviation = self.theta - jnp.mean(self.theta, axis=tuple(range(self.theta.ndim - 1)))
+        products = (deviation * error[..., None]).reshape(-1, self.theta.shape[-1])
+        count = jnp.maximum(number, 1).astype(products.dtype)
+        mean = jnp.sum(products, axis=0) / count
+        each = jnp.where(known.reshape(-1, 1), products - mean, 0)
+        # Draws that follow each other are not independent, and no more so than those of θ.
+        share = self.effective_sample_size / error.size
+        spread = jnp.sqrt(jnp.sum(each**2, axis=0) / jnp.minimum(count * share, count)) / jnp.sqrt(
+            count
+        )
+        unknown = number < _FEWEST
+        return StepError(jnp.where(unknown, jnp.nan, mean), jnp.where(unknown, jnp.nan, spread))
 
     def to_arviz(self) -> Any:
         """As ArviZ's `InferenceData` (a `DataTree` since its version 1). Needs ArviZ."""

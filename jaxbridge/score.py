@@ -21,10 +21,13 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from .arrays import Numbers, nondifferentiable
 from .averages import effective_size, normalised
 from .diffusion import Diffusion
+from .halving import num_looked
 from .intervals import check_count
 from .likelihood import Form, log_likelihoods
-from .parts import Part, make_parts, target_forms
+from .pareto import pareto_k
+from .parts import Part, log_halvings, make_parts, step_shares, target_forms
 from .problem import as_problem
+from .step_error import StepError, of_mean
 from .unknowns import Unknowns
 
 # Bridges of all intervals that are made at a time.
@@ -41,6 +44,10 @@ class Score(eqx.Module):
     - `information`: the observed information, -∇² of the log likelihood, shape (p, p).
     - `effective_sample_size`: of the bridges of each interval, shape (I,). Errors can be trusted
         where it is large.
+    - `pareto_k`: k̂ of the weights of each interval, shape (I,): where it is above 0.7 neither
+        its part of the score nor the error of that can be trusted.
+    - `step_error`: what `gradient` is too large by for the length of the steps, an estimate, shape
+        (p,), with a standard error of it, `step_uncertainty`. NaN where it is not known.
     - `num_missing`: intervals without any bridge. They are left out.
     - `num_truncated`: weights that `max_trials` cut off.
     """
@@ -51,6 +58,9 @@ class Score(eqx.Module):
     covariance: Float[Array, "p p"]
     information: Float[Array, "p p"]
     effective_sample_size: Float[Array, " I"]
+    pareto_k: Float[Array, " I"]
+    step_error: Float[Array, " p"]
+    step_uncertainty: Float[Array, " p"]
     num_missing: Int[Array, ""]
     num_truncated: Int[Array, ""]
 
@@ -116,10 +126,12 @@ def score(
         _interval_moments(part_key, unknowns, theta, part, form, num_bridges, progress_meter)
         for part_key, part in zip(keys, parts, strict=True)
     ]
-    moments, sizes, truncated = zip(*made, strict=True)
+    moments, sizes, shapes, step_errors, truncated = zip(*made, strict=True)
     gradient, covariance, information = jax.tree.map(lambda *parts: sum(parts), *moments)
-    order = jnp.concatenate([part.index for part in parts])
-    size = jnp.concatenate(sizes)[jnp.argsort(order)]
+    order = jnp.argsort(jnp.concatenate([part.index for part in parts]))
+    size, shape = jnp.concatenate(sizes)[order], jnp.concatenate(shapes)[order]
+    step_error = sum(error.value for error in step_errors)
+    step_variance = sum(error.uncertainty**2 for error in step_errors)
     error = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
     return Score(
         unknowns.pick(gradient),
@@ -128,6 +140,9 @@ def score(
         covariance,
         information,
         size,
+        shape,
+        jnp.asarray(step_error),
+        jnp.sqrt(step_variance),
         jnp.sum(size == 0, dtype=jnp.int32),
         jnp.sum(jnp.stack(truncated), dtype=jnp.int32),
     )
@@ -142,14 +157,19 @@ def _interval_moments(
     form: Form,
     num_bridges: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
-) -> tuple[tuple[Array, Array, Array], Float[Array, " I"], Int[Array, ""]]:
+) -> tuple[
+    tuple[Array, Array, Array], Float[Array, " I"], Float[Array, " I"], StepError, Int[Array, ""]
+]:
     """Σ over intervals of the score, of the covariance of its error, and of the information; the
-    effective number of bridges of each; and how many weights were cut off."""
+    effective number of bridges of each, and k̂; the step error of the score; and how many weights
+    were cut off."""
     unknowns, intervals = nondifferentiable((unknowns, part.intervals))
     model = unknowns.at(theta).prepared()
     num_intervals, num_steps = intervals.start.shape[0], part.num_steps
     at_once = min(num_bridges, max(1, _PATHS // num_intervals))
     num_batches = -(-num_bridges // at_once)
+    varies = model.forward(intervals.start[0]).sigma_varies
+    num_some = num_looked(at_once, varies)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     steps = jnp.repeat(part.steps, at_once, axis=1)
 
@@ -168,18 +188,35 @@ def _interval_moments(
             derivative.reshape(num_intervals, at_once, *derivative.shape[1:])
             for derivative in (gradient(theta), jax.jacfwd(gradient)(theta))
         )
+        some = paths.reshape(num_intervals, at_once, *paths.shape[1:])[:, :num_some]
+        some = some.reshape(-1, *paths.shape[1:])
+
+        def log_halving(theta):
+            return log_halvings(part, unknowns.at(theta).prepared(), some, form, num_some)
+
+        D, slope = (
+            leaf.reshape(num_intervals, num_some, *leaf.shape[1:])
+            for leaf in (log_halving(theta), jax.jacfwd(log_halving)(theta))
+        )
         state = meter.step(state, (i + 1).astype(jnp.float32) / num_batches)
-        return state, (drawn.log_weights, g, H, drawn.truncated)
+        return state, (drawn.log_weights, g, H, drawn.truncated, D, slope)
 
     state, made = lax.scan(batch, meter.init(), jnp.arange(num_batches))
     meter.close(state)
 
     def join(leaf):
         leaf = jnp.moveaxis(leaf, 0, 1)
-        leaf = leaf.reshape(num_intervals, -1, *leaf.shape[3:])
-        return leaf[:, :num_bridges]
+        return leaf.reshape(num_intervals, -1, *leaf.shape[3:])
 
-    log_weights, g, H, truncated = map(join, made)
+    *made, D, slope = made
+    some_weights, some_g = (join(leaf[:, :, :num_some]) for leaf in made[:2])
+    share = step_shares(part, model, form)
+    halves = (some_g, some_g + join(slope))
+    error = of_mean(some_weights, join(D), share, *halves)
+    step_error = StepError(
+        jnp.sum(error.value, axis=0), jnp.sqrt(jnp.sum(error.uncertainty**2, axis=0))
+    )
+    log_weights, g, H, truncated = (join(leaf)[:, :num_bridges] for leaf in made)
     weights = normalised(log_weights)
     mean = jnp.sum(weights[..., None] * g, axis=1)
     deviation = g - mean[:, None]
@@ -192,4 +229,5 @@ def _interval_moments(
     information = -jnp.sum(weights[..., None, None] * H, axis=1) - spread
     num_truncated = jnp.sum(truncated, dtype=jnp.int32)
     moments = (mean.sum(axis=0), covariance.sum(axis=0), information.sum(axis=0))
-    return moments, effective_size(weights), num_truncated
+    shape = pareto_k(log_weights)
+    return moments, effective_size(weights), shape, step_error, num_truncated

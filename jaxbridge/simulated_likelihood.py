@@ -32,8 +32,10 @@ from .arrays import all_finite_leaves, is_traced, nondifferentiable
 from .averages import effective_size, normalised
 from .choice import Choice, as_proposal, guided_candidates, undecided_between, uses_couplings
 from .diffusion import Diffusion, uses_argument
+from .pareto import pareto_k
 from .parts import Bounds, Part, make_parts
 from .problem import Problem
+from .step_error import StepError
 from .unknowns import Constraint, Unknowns, allowed
 
 # Paths of each interval for a noisy gradient.
@@ -52,13 +54,14 @@ _SHORTEST = 1e-4
 class Simulated(NamedTuple):
     """ℓ̂ and its derivatives at one θ, over the intervals that have any path: its value, ∇ℓ̂, the
     covariance of that by the noise of the paths, and -∇²ℓ̂; the effective number of paths of each
-    interval; how many intervals have none; and the rounding error of the value."""
+    interval, and k̂ of their weights; how many intervals have none; and the rounding error of the value."""
 
     value: Float[Array, ""]
     gradient: Float[Array, " p"]
     covariance: Float[Array, "p p"]
     information: Float[Array, "p p"]
     effective_sample_size: Float[Array, " I"]
+    pareto_k: Float[Array, " I"]
     num_missing: Int[Array, ""]
     rounding: Float[Array, ""]
 
@@ -185,11 +188,47 @@ def simulated(
         for part_key, part in zip(jax.random.split(key, len(parts)), parts, strict=True)
     ]
     sizes = jnp.concatenate([each.effective_sample_size for each in made])
+    shapes = jnp.concatenate([each.pareto_k for each in made])
     order = jnp.argsort(jnp.concatenate([part.index for part in parts]))
-    total = jax.tree.map(
-        lambda *leaves: sum(leaves), *(each._replace(effective_sample_size=0) for each in made)
-    )
-    return total._replace(effective_sample_size=sizes[order])
+    sums = (each._replace(effective_sample_size=0, pareto_k=0) for each in made)
+    total = jax.tree.map(lambda *leaves: sum(leaves), *sums)
+    return total._replace(effective_sample_size=sizes[order], pareto_k=shapes[order])
+
+
+@eqx.filter_jit
+def step_error_of_score(
+    key: Key[Array, ""],
+    unknowns: Unknowns,
+    parts: tuple[Part, ...],
+    maximum: Maximum,
+    num_paths: int,
+) -> StepError:
+    """That of ∇ℓ̂ at the maximum, by as many paths of half as many steps; NaN where a path has one
+    step only."""
+    unknowns, parts = nondifferentiable((unknowns, parts))
+    model = unknowns.at(maximum.theta)
+    error, variance = jnp.zeros_like(maximum.theta), jnp.zeros_like(maximum.theta)
+    for part_key, part in zip(jax.random.split(key, len(parts)), parts, strict=True):
+        if part.num_steps < 2:
+            unknown = jnp.full_like(error, jnp.nan)
+            return StepError(unknown, unknown)
+        fractions = jnp.asarray(np.diff(part.proposal.fractions(part.num_steps // 2)), error.dtype)
+        half = Part(part.intervals, part.index, fractions, part.proposal)
+        # Of all that are pulled each has one order for all intervals.
+        share = part.proposal.step_share(model, part.intervals)[0]
+
+        def difference(theta, key=part_key, part=part, half=half):
+            values = (
+                jnp.sum(_log_densities(*_log_weights(key, unknowns, each, num_paths, theta)))
+                for each in (part, half)
+            )
+            fine, coarse = values
+            return coarse - fine
+
+        error += share * jax.jacfwd(difference)(maximum.theta)
+        variance = jnp.maximum(variance, share**2)
+    noise = 2 * jnp.diagonal(maximum.simulated.covariance)
+    return StepError(error, jnp.sqrt(variance * noise))
 
 
 def _of_part(key, unknowns, part: Part, theta: Float[Array, " p"], num_paths: int) -> Simulated:
@@ -220,6 +259,7 @@ def _of_part(key, unknowns, part: Part, theta: Float[Array, " p"], num_paths: in
         jnp.einsum("kji,kjl->il", deviation, deviation),
         (information + information.T) / 2,
         effective_size(weights),
+        pareto_k(jnp.where(found, made, -jnp.inf)),
         jnp.sum(~some, dtype=jnp.int32),
         4 * jnp.finfo(theta.dtype).eps * jnp.sum(jnp.abs(densities)),
     )

@@ -5,10 +5,10 @@ an estimate changes by when it takes those is (2^p - 1) times its error, where t
 
     error = (2^p - 1)⁻¹ [estimate of N/2 steps - estimate of N steps],
 
-in its leading term. The two share their paths, and so the difference has far less Monte Carlo error
-than either where D is small; what it has is told beside it. Where a few of the paths have nearly all of
-the weights w e^D, the two laws have little in common: steps are too long for this, or for anything,
-and the uncertainty is infinite.
+in its leading term. The two share their paths, and so the difference has far less Monte Carlo
+error than either where D is small; what it has is told beside it. Where a few of the paths have
+nearly all of the weights w e^D, the two laws have little in common: steps are too long for this, or
+for anything, and the uncertainty is infinite.
 """
 
 from typing import NamedTuple
@@ -58,14 +58,17 @@ def of_mean(
     log_halving: Float[Array, "*I n"],
     share: Float[Array, "*I"],
     values: Inexact[Array, "..."],
+    coarse_values: Inexact[Array, "..."] | None = None,
 ) -> StepError:
-    """Of the weighted mean of these values, shape (*I, n, ...), entry by entry."""
+    """Of the weighted mean of these values, shape (*I, n, ...), entry by entry; half as many steps
+    may have values of their own."""
+    coarse_values = values if coarse_values is None else coarse_values
     weights, known = _known(log_weights, log_halving)
     D = jnp.where(known, log_halving, -jnp.inf)
     coarse = normalised(jnp.where(weights > 0, jnp.log(jnp.where(weights > 0, weights, 1)) + D, D))
     axis = weights.ndim - 1
-    fine_mean, coarse_mean = weighted_mean(weights, values), weighted_mean(coarse, values)
-    each = expanded(coarse, values) * (values - jnp.expand_dims(coarse_mean, axis))
+    fine_mean, coarse_mean = weighted_mean(weights, values), weighted_mean(coarse, coarse_values)
+    each = expanded(coarse, values) * (coarse_values - jnp.expand_dims(coarse_mean, axis))
     each -= expanded(weights, values) * (values - jnp.expand_dims(fine_mean, axis))
     spread = jnp.sqrt(jnp.sum(jnp.where(expanded(known, values), each, 0) ** 2, axis))
     overlap = _overlap(weights, coarse)
