@@ -54,7 +54,8 @@ _SHORTEST = 1e-4
 class Simulated(NamedTuple):
     """ℓ̂ and its derivatives at one θ, over the intervals that have any path: its value, ∇ℓ̂, the
     covariance of that by the noise of the paths, and -∇²ℓ̂; the effective number of paths of each
-    interval, and k̂ of their weights; how many intervals have none; and the rounding error of the value."""
+    interval, and k̂ of their weights; how many intervals have none; and the rounding error of the
+    value."""
 
     value: Float[Array, ""]
     gradient: Float[Array, " p"]
@@ -322,7 +323,8 @@ def climb(
         expected = jnp.where(starting, 0, 1e-4 * state.fraction * (old.gradient @ state.step))
         higher = made.value >= old.value + expected - jnp.where(starting, 0, old.rounding)
         fewer, as_many = made.num_missing < old.num_missing, made.num_missing == old.num_missing
-        better = inside & all_finite_leaves(made) & (fewer | (as_many & higher))
+        finite = all_finite_leaves(made._replace(pareto_k=old.value))  # k̂ need not be
+        better = inside & finite & (fewer | (as_many & higher))
         theta, made = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (tried, made), (state.theta, old)
         )
