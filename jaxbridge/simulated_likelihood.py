@@ -323,7 +323,7 @@ def climb(
         expected = jnp.where(starting, 0, 1e-4 * state.fraction * (old.gradient @ state.step))
         higher = made.value >= old.value + expected - jnp.where(starting, 0, old.rounding)
         fewer, as_many = made.num_missing < old.num_missing, made.num_missing == old.num_missing
-        finite = all_finite_leaves(made._replace(pareto_k=old.value))  # k̂ need not be
+        finite = all_finite_leaves(made._replace(pareto_k=made.rounding))  # k̂ need not be
         better = inside & finite & (fewer | (as_many & higher))
         theta, made = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (tried, made), (state.theta, old)
