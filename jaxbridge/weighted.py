@@ -7,6 +7,7 @@ random weights (`coupled_pairs`), proposals that are pulled to the end point wei
 functions of the path (`guided`), and each interval may have its own (`choice`).
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
@@ -130,9 +131,12 @@ def in_blocks(
     Active intervals come first, and blocks without any are not run.
     """
     num_intervals, num_draws = keys.shape
-    columns = _even_blocks(num_draws, most_rows)
-    rows = _even_blocks(num_intervals, most_rows // columns.shape[1])
-    if rows.shape[0] * columns.shape[0] == 1 and active is None:
+    unit = _VECTOR if num_draws >= _WORTH_FILLING else 1
+    columns = _even_blocks(num_draws, most_rows, unit)
+    unit = _VECTOR // math.gcd(columns.shape[1], _VECTOR)
+    unit = unit if num_intervals * num_draws >= _WORTH_FILLING * unit else 1
+    rows = _even_blocks(num_intervals, most_rows // columns.shape[1], unit)
+    if rows.shape == (1, num_intervals) and columns.shape == (1, num_draws) and active is None:
         return function(keys, intervals, active)
     order = jnp.arange(num_intervals)
     num_active = jnp.int32(num_intervals)
@@ -203,8 +207,15 @@ def masked(made: WeightedPaths, active: Bool[Array, " I"]) -> WeightedPaths:
     )
 
 
-def _even_blocks(size: int, most: int) -> Int[Array, "blocks length"]:
-    """0, ..., size - 1 in blocks of one length, the last of them repeated to fill up."""
+# XLA's loops on CPU may be twice as fast where lanes fill whole vectors, of so many numbers. Few
+# lanes are not worth a copy.
+_VECTOR, _WORTH_FILLING = 16, 256
+
+
+def _even_blocks(size: int, most: int, unit: int = 1) -> Int[Array, "blocks length"]:
+    """0, ..., size - 1 in blocks of one length, a multiple of `unit`, the last of them repeated to
+    fill up."""
     num_blocks = -(-size // max(most, 1))
     length = -(-size // num_blocks)
+    length = -(-length // unit) * unit
     return jnp.minimum(jnp.arange(num_blocks * length), size - 1).reshape(num_blocks, length)
