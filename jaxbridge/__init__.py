@@ -8,20 +8,22 @@ from some law (`start_laws`, `burn_in`), hits it or not (`hitting`), which makes
 (`coupled_pairs`). Proposals that are pulled to the end point (`guided`) have a weight made of the
 densities of their steps (`step_density`), and pilot runs choose (`choice`, `tuning`). On weighted
 proposals (`weighted`) are built importance sampling (`importance`), transition densities
-(`transition`) and Markov chains (`chains`, one method a module), with their `averages` and
-`diagnostics`, and what makes them hard (`hitting_variation`); what was not found raises an error
-where that is asked for (`throwing`). The likelihood of a path (`likelihood`) and what is not known
-(`unknowns`, `observations`, `problem`) make inference: bridges complete the observations (`parts`,
+(`transition`) and Markov chains (`chains`, one method a module), with their `averages`
+(`exact_bridges`) and `diagnostics`, and what makes them hard (`hitting_variation`). They say how
+far to trust them: by what half as many steps would have given (`halving`, `step_error`), and by the
+tails of their weights (`pareto`); what was not found raises an error where that is asked for
+(`throwing`). The likelihood of a path (`likelihood`) and what is not known (`unknowns`,
+`observations`, `problem`) make inference: bridges complete the observations (`parts`,
 `completion`), and parameters follow from complete paths (`parameter_steps`), in turn (`gibbs`), or
-from densities (`pmmh`), or as maximum likelihood estimates (`score`, `maximum_likelihood`);
-`expectation` has derivatives that are right. What a program simulates is decided in one table
-(`decisions`, `scene`), and its loops run over many lanes of small points (`lanes`, `noise`). Other
-coordinates are for state spaces with a boundary (`transform`), or for a σ of one (`lamperti`).
-Exact laws stand beside (`gaussian`, `linear`), what accuracy costs above (`work_precision`), and
-the studies above all (`study`, `exact_study`, `accuracy_study`, `bayes_study`, `crossover_study`,
-`benchmark`), with their pictures (`plot`, `copula`, `study_figures`). References to equations and
-sections are to Bladt, Finch & Sørensen, *Simulation of multivariate diffusion bridges*; equations
-go by their labels in its source.
+from densities (`pmmh`), or as maximum likelihood estimates (`score`, `maximum_likelihood`,
+`simulated_likelihood`); `expectation` has derivatives that are right. What a program simulates is
+decided in one table (`decisions`, `scene`), and its loops run over many lanes of small points
+(`lanes`, `noise`). Other coordinates are for state spaces with a boundary (`transform`), or for a σ
+of one (`lamperti`). Exact laws stand beside (`gaussian`, `linear`), what accuracy costs above
+(`work_precision`), and the studies above all (`study`, `exact_study`, `accuracy_study`,
+`bayes_study`, `crossover_study`, `benchmark`), with their pictures (`plot`, `copula`,
+`study_figures`). References to equations and sections are to Bladt, Finch & Sørensen, *Simulation
+of multivariate diffusion bridges*; equations go by their labels in its source.
 
 What examples take for granted:
 
@@ -104,6 +106,7 @@ from .models import (
     langevin,
     stationary_diffusion,
 )
+from .pareto import pareto_k
 from .pmmh import PMMHPosterior, PMMHState, pmmh
 from .posterior import AbstractPosterior
 from .pseudo_marginal_chain import pseudo_marginal
@@ -128,6 +131,9 @@ from .step_density import (
     AbstractStepDensity,
     EulerDensity,
     ItoTaylorDensity,
+    LinearStep,
+    StepLaw,
+    StepsFrom,
 )
 from .transform import Transformed, transform
 from .transition import (
@@ -230,6 +236,7 @@ __all__ = [
     "hitting_variation",
     "HittingVariation",
     "effective_sample_size",
+    "pareto_k",
     "potential_scale_reduction",
     "work_precision",
     "WorkPrecision",
@@ -247,6 +254,9 @@ __all__ = [
     "PairStep",
     "AbstractScheme",
     "AbstractStepDensity",
+    "StepLaw",
+    "StepsFrom",
+    "LinearStep",
     "AbstractGuidedProposal",
     "Step",
     "AbstractWeightedProposal",

@@ -98,14 +98,17 @@ class WeightedBridges(AbstractExactBridges):
         return self.log_weights
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """That of `mean(fn)`, by the delta method, entry by entry."""
+        """That of `mean(fn)`, by the delta method, entry by entry; infinite where weights were cut
+        off, for then the mean is off by more than it shows."""
         weights, axis = self.weights, self.log_weights.ndim - 1
+        cut = jnp.any(self.truncated, axis=-1)
 
         def error(value):
             mean, each = weighted_mean(weights, value), expanded(weights, value)
             deviation = value - jnp.expand_dims(mean, axis)
             squares = jnp.where(each > 0, (each * deviation) ** 2, 0)
-            return jnp.where(jnp.isnan(mean), jnp.nan, jnp.sqrt(jnp.sum(squares, axis)))
+            whole = jnp.where(expanded(cut, mean), jnp.inf, jnp.sqrt(jnp.sum(squares, axis)))
+            return jnp.where(jnp.isnan(mean), jnp.nan, whole)
 
         return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
 
@@ -205,7 +208,7 @@ def _or_throw(
         ~weighted.met,
         weighted.truncated,
         coupled=uses_couplings(proposal),
-        heavy=~is_reliable(weighted.pareto_k),
+        heavy=~is_reliable(weighted.pareto_k, weighted.effective_sample_size),
         gross=is_gross(weighted.step_error_in_sds()),
     )
 

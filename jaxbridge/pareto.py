@@ -27,11 +27,15 @@ _PRIOR_COUNT, _PRIOR_SHAPE = 10, 0.5
 
 # Above, the error of a mean falls too slowly with the number of weights, and is not seen in them.
 _MOST_RELIABLE = 0.7
+# A few weights far beyond many others hardly move the fit, but fewer effective ones tell nothing.
+_FEWEST_EFFECTIVE = 5
 
 
-def is_reliable(k: Float[Array, "*I"]) -> Bool[Array, "*I"]:
-    """Whether a mean of weights of this shape is to be trusted."""
-    return k < _MOST_RELIABLE
+def is_reliable(
+    k: Float[Array, "*I"], effective: Float[Array, "*I"] | float = math.inf
+) -> Bool[Array, "*I"]:
+    """Whether a mean of weights of this shape is to be trusted, given how many are effective."""
+    return (k < _MOST_RELIABLE) & (effective >= _FEWEST_EFFECTIVE)
 
 
 def pareto_k(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:
@@ -39,6 +43,12 @@ def pareto_k(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:
 
     Below 0.7 the mean of the weights, and its standard error, can be trusted. The estimate is that
     of Zhang & Stephens (2009), with a weak prior (Vehtari et al. 2024). It has no derivative.
+
+    **Example:**
+
+    ```python
+    jb.pareto_k(jax.random.normal(key, (1000,)))  # of log-normal weights
+    ```
 
     **Arguments:** `log_weights`, logarithms of weights up to a constant. -inf is a weight of zero,
     which counts as a weight; so is what adds nothing to the largest weight in its precision.

@@ -69,9 +69,9 @@ class TransitionLogDensity(eqx.Module):
 
     @property
     def trustworthy(self) -> Bool[Array, "*I"]:
-        """Whether `value` and `standard_error` are to be trusted: a mean that large weights do not
-        decide, no weight cut off, and a step error that does not dominate."""
-        trusted = is_reliable(self.pareto_k) & (self.num_truncated == 0)
+        """Whether `value` and `standard_error` are to be trusted: a mean that few large weights do
+        not decide, no weight cut off, and a step error that does not dominate."""
+        trusted = is_reliable(self.pareto_k, self.effective_sample_size) & (self.num_truncated == 0)
         return trusted & ~self.step_error_dominates & (self.num_met > 0)
 
 
@@ -149,7 +149,7 @@ def transition_log_density(
         estimate.num_met == 0,
         estimate.num_truncated > 0,
         coupled=uses_couplings(proposal),
-        heavy=~is_reliable(estimate.pareto_k),
+        heavy=~is_reliable(estimate.pareto_k, estimate.effective_sample_size),
         gross=estimate.step_error_dominates & is_gross(error),
     )
 

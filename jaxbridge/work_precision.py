@@ -40,6 +40,7 @@ from .guided import AbstractGuidedProposal
 from .importance import sample_weighted_bridges
 from .intervals import as_intervals, check_count, check_key
 from .meeting import AbstractMeeting, BrownianCrossing
+from .pareto import is_reliable
 from .schemes import AbstractScheme, Euler, GaussianTransition, Heun
 from .search import key_for
 from .step_density import AbstractStepDensity, ItoTaylorDensity
@@ -64,6 +65,8 @@ class Setting(NamedTuple):
     - `per_second`: those, per second.
     - `num_missing`: bridges that were not found, or whose weights were cut off: the estimate is
         that of the others, or NaN if there are none.
+    - `pareto_k`: k̂ of the weights, NaN where there are none. Above 0.7 no figure of the row is to
+        be trusted.
     """
 
     method: str
@@ -85,6 +88,7 @@ class Setting(NamedTuple):
     effective_samples: float
     per_second: float
     num_missing: int = 0
+    pareto_k: float = np.nan
 
     @property
     def curve(self) -> str:
@@ -176,6 +180,8 @@ class WorkPrecision(NamedTuple):
                 times = (f"{s.seconds:.3f}", f"{s.compile_seconds:.1f}")
                 work = (f"{s.num_simulated:,}", f"{s.per_second:,.0f}")
                 missing = f"   {s.num_missing:,} missing" if s.num_missing else ""
+                if not (np.isnan(s.pareto_k) or is_reliable(jnp.asarray(s.pareto_k))):
+                    missing += f"   heavy tails, k = {s.pareto_k:.2f}"
                 lines.append(row.format(s.num_steps, *errors, *times, *work) + missing)
         lines.append(f"reference: {self.reference}")
         if self.target is not None:
@@ -574,6 +580,7 @@ def _measure(
         result, first = run()
         seconds = float(np.median([run()[1] for _ in range(repeats)]))
         found = _estimate(scene, method, result)
+        shape = getattr(result, "pareto_k", None)
 
     def size(difference):
         ratio = difference[exact.is_random] / exact.sd[exact.is_random]
@@ -602,6 +609,7 @@ def _measure(
         effective,
         effective / seconds,
         found.num_missing,
+        np.nan if shape is None else float(shape),
     )
 
 
