@@ -56,7 +56,7 @@ def test_chain_has_the_law_of_the_closed_form():
     model, ends = paper_model(), ([0.785, 0.785], [1.091, 1.091])
     chain = jb.sample_exact_bridges(
         jax.random.key(0), model, *ends, 1.0, num_bridges=20_000, num_steps=40, step_size=0.6,
-        proposal=jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()), method="crank_nicolson",
+        proposal=jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()), method="crank_nicolson",
         save_at=[0.5],
     )  # fmt: skip
     law = jb.gaussian_bridge(model, *ends, 1.0, [0.5])

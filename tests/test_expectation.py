@@ -27,7 +27,7 @@ def bridges():
         *ENDS,
         num_bridges=100_000,
         num_steps=20,
-        proposal=jb.Guided(density=jb.TrapezoidDensity()),
+        proposal=jb.Guided(density=jb.ItoTaylorDensity()),
     )
 
 
@@ -125,7 +125,7 @@ def test_what_cannot_be_differentiated_is_refused(bridges, unchecked):
 
 @pytest.mark.parametrize(
     "density",
-    [jb.EulerDensity(), pytest.param(jb.TrapezoidDensity(), marks=pytest.mark.slow)],
+    [jb.EulerDensity(), pytest.param(jb.ItoTaylorDensity(), marks=pytest.mark.slow)],
     ids=["euler", "trapezoid"],
 )
 def test_on_a_grid_with_short_last_steps(density):

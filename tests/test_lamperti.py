@@ -51,7 +51,7 @@ def test_the_reversal_follows_from_the_density(x64):
     "proposal",
     [
         pytest.param(jb.Coupling(0.0, scheme=jb.Heun()), marks=pytest.mark.slow),
-        jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+        jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
     ],
     ids=["coupling", "modified diffusion bridge"],
 )
