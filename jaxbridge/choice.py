@@ -1,18 +1,28 @@
-"""Which proposal for which interval? The one with most effective samples per second.
+"""Which proposal for which interval? The one with the least error for a second of work.
 
 On short intervals proposals that are pulled to the end point are nearly exact, and coupled
 pairs do not meet; on long ones it is the other way round. Where the one becomes better than
 the other depends on the model, the end points and the step, so a pilot run decides, interval
 by interval: each candidate draws a few weighted paths, and
 
-    effective samples / (simulated paths × seconds per path)
+    rate = effective samples / (simulated paths × seconds per path)
 
-is compared, as it would be in a larger sample. A candidate makes no pilot run where it could
-not win: of a coupling's simulated paths at most one in 1 + N is an effective sample, for each
-proposal needs N hitting counts. Seconds go by a rule, so that one key gives one choice; or by
-the clock, where `choose_proposal` makes the choice.
+is compared, as it would be in a larger sample, after two deductions. Candidates have different
+targets, at so many steps, and so different step errors (`step_error`). More paths do not reduce
+them: with W seconds the mean square error of log p̂ is about 1 / (W rate) + (step error)², which is
+that of a rate of
 
-A wrong choice costs time only. Weights stay exact, for the pilot's paths are not used again.
+    rate / (1 + W rate (step error)²),
+
+with W the seconds of ten thousand of the cheapest paths, and the step error as far as it is seen
+beyond two of its own standard errors. And weights with a Pareto shape above 0.7 come last.
+
+A candidate makes no pilot run where it could not win: of a coupling's simulated paths at most one
+in 1 + N is an effective sample, for each proposal needs N hitting counts. Seconds go by a rule, so
+that one key gives one choice; or by the clock, where `choose_proposal` makes the choice.
+
+The pilot's paths are not used again, so weights stay what they are whatever is chosen; but a pilot
+of finite size can be deceived, by a second way to the end point that it never saw for instance.
 """
 
 import functools
@@ -36,9 +46,11 @@ from .diffusion import Diffusion
 from .guided import Guided, ModifiedDiffusionBridge
 from .hitting import check_max_trials
 from .intervals import Intervals, check_count
+from .pareto import is_reliable, pareto_k
 from .search import check_bound, key_for
 from .start_laws import Stationary
 from .step_density import EulerDensity, ItoTaylorDensity
+from .step_error import of_log_mean
 from .weighted import AbstractWeightedProposal, WeightedPaths
 
 # Bounds the tries for one bridge, unless the user says otherwise.
@@ -51,6 +63,10 @@ _PILOT_TRIALS = 64
 # Seconds per simulated path beside those of a modified diffusion bridge, as measured for models
 # whose functions cost little beside the random numbers.
 _GUIDED_SECONDS, _COUPLED_SECONDS = 1.3, 3.5
+# W, in units of a modified diffusion bridge's paths.
+_WORK = 10_000
+# What weights of heavy tails are worth beside others.
+_HEAVY = 1e-6
 # The rule may be wrong by this factor.
 _CONTENDS = 3.0
 
@@ -64,6 +80,8 @@ class Choice(AbstractWeightedProposal):
         diffusion bridge, or measured where that could change the choice.
     - `efficiency`: effective samples per simulated path in the pilot run, extrapolated to
         a larger one, shape (C, I); NaN where none was needed because the candidate could not win.
+    - `step_error`: of log p̂, as far as it was seen, and `pareto_k`, k̂ of the weights, both in the
+        pilot run and of shape (C, I).
     - `chosen`: the number of each interval's candidate, shape (I,).
     - `num_pilot`: pilot paths of each candidate for each interval, or `None` for the default.
     - `used`: the numbers of those that were chosen for any interval; inside `jit`, where that is
@@ -78,6 +96,8 @@ class Choice(AbstractWeightedProposal):
     candidates: tuple[AbstractWeightedProposal, ...]
     seconds: Float[Array, "C I"] | None
     efficiency: Float[Array, "C I"] | None
+    step_error: Float[Array, "C I"] | None
+    pareto_k: Float[Array, "C I"] | None
     chosen: Int[Array, " I"] | None
     num_pilot: int | None = eqx.field(static=True)
     used: tuple[int, ...] = eqx.field(static=True)
@@ -85,10 +105,12 @@ class Choice(AbstractWeightedProposal):
 
     def of(self, which: Int[np.ndarray, " J"]) -> "Choice":
         """The choice for some of the intervals."""
-        made = (self.seconds, self.efficiency, self.chosen)
-        seconds, efficiency, chosen = jax.tree.map(lambda leaf: leaf[..., which], made)
-        made = (seconds, efficiency, chosen)
-        return Choice(self.candidates, *made, self.num_pilot, self.used, self.left_out)
+        made = (self.seconds, self.efficiency, self.step_error, self.pareto_k, self.chosen)
+        seconds, efficiency, step_error, shape, chosen = (
+            None if leaf is None else leaf[..., which] for leaf in made
+        )
+        told = (seconds, efficiency, step_error, shape, chosen)
+        return Choice(self.candidates, *told, self.num_pilot, self.used, self.left_out)
 
     def check(self, model, intervals):
         for candidate in self.candidates:
@@ -170,23 +192,30 @@ class Choice(AbstractWeightedProposal):
         if not made:
             names = ", ".join(describe(candidate) for candidate in self.candidates)
             return "\n".join([f"a choice to be made between {names}", *reason])
+        assert self.efficiency is not None and self.seconds is not None
+        assert self.step_error is not None and self.pareto_k is not None
         chosen, efficiency = np.asarray(self.chosen), np.asarray(self.efficiency, float)
-        seconds = np.asarray(self.seconds, float)
-        rates = efficiency / seconds
+        seconds, step_error = np.asarray(self.seconds, float), np.asarray(self.step_error, float)
+        shape = np.asarray(self.pareto_k, float)
+        rates = _rates(self.efficiency, self.seconds, self.step_error, self.pareto_k)
+        rates = np.asarray(rates, float)
         best = np.maximum(np.nanmax(rates, axis=0), np.finfo(float).tiny)
-        head = ("", "effective per path", "cost of a path", "speed")
-        lines = ["{:<44}  {:>18}  {:>14}  {:>6}  chosen for".format(*head)]
+        head = ("", "effective per path", "step error", "k", "cost of a path", "value")
+        row = "{:<44}  {:>18}  {:>10}  {:>5}  {:>14}  {:>6}  {}"
+        lines = [row.format(*head, "chosen for")]
         for i, candidate in enumerate(self.candidates):
             known = ~np.isnan(efficiency[i])
-            share, speed = "-", "-"
+            seen = 4 * ["-"]
             if known.any():
-                share = f"{np.median(efficiency[i, known]):.3g}"
-                speed = f"{np.median(rates[i, known] / best[known]):.2f}"
+                seen = [
+                    f"{np.median(efficiency[i, known]):.3g}",
+                    f"{np.median(np.abs(step_error[i, known])):.3g}",
+                    f"{np.median(shape[i, known]):.2f}",
+                    f"{np.median(rates[i, known] / best[known]):.2f}",
+                ]
             cost = f"{np.median(seconds[i] / seconds[0]):.2f}"
-            lines.append(
-                f"{describe(candidate):<44}  {share:>18}  {cost:>14}  {speed:>6}  "
-                f"{np.sum(chosen == i)} of {len(chosen)}"
-            )
+            count = f"{np.sum(chosen == i)} of {len(chosen)}"
+            lines.append(row.format(describe(candidate), *seen[:3], cost, seen[3], count))
         return "\n".join([*lines, *reason])
 
 
@@ -243,7 +272,7 @@ def _draw_pulled_tangents(primals, tangents):
         return tuple(total)
 
     _, (paths, log_weights) = eqx.filter_jvp(again, (inputs,), (tangents[0],))
-    return drawn, WeightedPaths(paths, log_weights, None, None, None, None)  # pyright: ignore
+    return drawn, WeightedPaths(paths, log_weights, *5 * [None])  # pyright: ignore
 
 
 def _for_pilots(
@@ -282,6 +311,29 @@ def most_efficient(proposal: AbstractWeightedProposal) -> float:
     return 1 / (1 + proposal.num_counts) if isinstance(proposal, CoupledPairs) else 1.0
 
 
+class _Seen(NamedTuple):
+    """What a pilot run shows: the first three as the fields of a `Choice`, and the paths that were
+    simulated."""
+
+    efficiency: Float[Array, " I"]
+    step_error: Float[Array, " I"]
+    pareto_k: Float[Array, " I"]
+    num_simulated: Int[Array, " I"]
+
+
+def _rates(
+    efficiency: Float[Array, "*C I"],
+    seconds: Float[Array, "*C I"],
+    step_error: Float[Array, "*C I"],
+    shape: Float[Array, "*C I"],
+) -> Float[Array, "*C I"]:
+    """Effective samples per second after the deductions for step errors and heavy tails."""
+    cheapest = jnp.min(seconds, axis=0) if seconds.ndim == 2 else 1.0
+    rate = efficiency / seconds
+    rate /= 1 + _WORK * cheapest * rate * step_error**2
+    return rate * jnp.where(is_reliable(shape) | jnp.isnan(shape), 1, _HEAVY)
+
+
 @eqx.filter_jit
 def _pilot(
     key: Key[Array, ""],
@@ -291,20 +343,26 @@ def _pilot(
     active: Bool[Array, " I"],
     num_steps: int,
     num_pilot: int,
-) -> tuple[Float[Array, " I"], Int[Array, " I"]]:
-    """Effective samples per simulated path of each active interval, NaN for the others; and the
-    simulated paths."""
+) -> _Seen:
+    """What a pilot run shows of each active interval, NaN of the others."""
     if isinstance(candidate, CoupledPairs):
         bound = jnp.minimum(candidate.max_trials, _PILOT_TRIALS * candidate.num_counts)
         candidate = eqx.tree_at(lambda c: c.max_trials, candidate, bound)
     keys = jax.random.split(key, (len(intervals.duration), num_pilot))
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
-    drawn = candidate.draw(keys, model.prepared(), intervals, num_steps, nothing, True, active)
+    model = model.prepared()
+    drawn = candidate.draw(keys, model, intervals, num_steps, nothing, True, active)
     num_simulated = jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32)
     # What takes too long to hit would have a weight beyond those that are seen.
     size = _extrapolated_size(jnp.where(drawn.truncated, -jnp.inf, drawn.log_weights))
     efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
-    return jnp.where(active, efficiency, jnp.nan), num_simulated
+    share = candidate.step_share(model, intervals)
+    error = of_log_mean(drawn.log_weights, drawn.log_halving, share)
+    seen_error = jnp.maximum(jnp.abs(error.value) - 2 * error.uncertainty, 0)
+    seen_error = jnp.where(jnp.isnan(seen_error), 0, seen_error)  # nothing is known of one step
+    told = (efficiency, seen_error, pareto_k(drawn.log_weights))
+    efficiency, seen_error, shape = (jnp.where(active, value, jnp.nan) for value in told)
+    return _Seen(efficiency, seen_error, shape, num_simulated)
 
 
 def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
@@ -428,7 +486,7 @@ def undecided_between(
     if len(grids) > 1:
         raise ValueError("`candidates` must be on one grid: give all the same `refinement`.")
     everything = tuple(range(len(proposals)))
-    return Choice(tuple(proposals), None, None, None, num_pilot, everything, left_out)
+    return Choice(tuple(proposals), None, None, None, None, None, num_pilot, everything, left_out)
 
 
 def run_pilots(
@@ -457,20 +515,26 @@ def run_pilots(
         if called_for:
             candidate = candidate.prepared(key, model, intervals, num_steps)
             seconds, active, called_for = look_at(candidate)
-        run, efficiency, num_simulated = None, jnp.full(num_intervals, jnp.nan, dtype), None
+        run, nothing = None, jnp.full(num_intervals, jnp.nan, dtype)
+        seen = _Seen(nothing, nothing, nothing, jnp.zeros(num_intervals, jnp.int32))
         if called_for:
             arguments = (model, candidate, intervals, active, num_steps, num_pilot)
             run = functools.partial(_pilot, key_for(f"pilot {i}", key), *arguments)
-            efficiency, num_simulated = run()
+            seen = run()
         candidates.append(candidate)
-        pilots.append(_Pilot(run, efficiency, num_simulated, seconds))
-        best = jnp.fmax(best, efficiency / seconds)
-    seconds = _measured(pilots, best) if timed else [pilot.seconds for pilot in pilots]
-    efficiency, seconds = jnp.stack([pilot.efficiency for pilot in pilots]), jnp.stack(seconds)
-    rates = jnp.where(jnp.isnan(efficiency), -1, efficiency / seconds)
+        pilots.append(_Pilot(run, seen, seconds))
+        best = jnp.fmax(best, pilots[-1].rate)
+    each = _measured(pilots, best) if timed else [pilot.seconds for pilot in pilots]
+    seconds, seen = (
+        jnp.stack(each),
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *(pilot.seen for pilot in pilots)),
+    )
+    told = (seen.efficiency, seen.step_error, seen.pareto_k)
+    rates = _rates(told[0], seconds, *told[1:])
+    rates = jnp.where(jnp.isnan(rates), -1, rates)
     chosen = jnp.argmax(rates, axis=0).astype(jnp.int32)
     used = range(len(candidates)) if is_traced(chosen) else np.unique(chosen).tolist()
-    made = (seconds, efficiency, chosen)
+    made = (seconds, *told, chosen)
     return Choice(tuple(candidates), *made, num_pilot, tuple(used), undecided.left_out)
 
 
@@ -479,26 +543,28 @@ class _Pilot(NamedTuple):
     take."""
 
     run: Callable[[], Any] | None
-    efficiency: Float[Array, " I"]
-    num_simulated: Int[Array, " I"] | None
+    seen: _Seen
     seconds: Float[Array, " I"]
+
+    @property
+    def rate(self) -> Float[Array, " I"]:
+        return _rates(self.seen.efficiency, self.seconds, self.seen.step_error, self.seen.pareto_k)
 
 
 def _measured(pilots: list[_Pilot], best: Float[Array, " I"]) -> list[Float[Array, " I"]]:
     """Seconds per path by the clock, where that could change the choice; else by rule."""
 
     def contends(pilot: _Pilot) -> bool:
-        rate = pilot.efficiency / pilot.seconds
-        return pilot.run is not None and bool(np.any(rate * _CONTENDS > best))
+        return pilot.run is not None and bool(np.any(pilot.rate * _CONTENDS > best))
 
     contenders = [pilot for pilot in pilots if contends(pilot)]
     if len(contenders) < 2:
         return [pilot.seconds for pilot in pilots]
     factors = {}
     for pilot in contenders:
-        assert pilot.run is not None and pilot.num_simulated is not None
+        assert pilot.run is not None
         took = min(_seconds_of(pilot.run) for _ in range(3))
-        expected = pilot.seconds * pilot.num_simulated.astype(pilot.seconds.dtype)
+        expected = pilot.seconds * pilot.seen.num_simulated.astype(pilot.seconds.dtype)
         factors[id(pilot)] = took / float(jnp.sum(expected))
     others = float(np.median(list(factors.values())))
     return [pilot.seconds * factors.get(id(pilot), others) for pilot in pilots]

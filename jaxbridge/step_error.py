@@ -6,7 +6,9 @@ an estimate changes by when it takes those is (2^p - 1) times its error, where t
     error = (2^p - 1)⁻¹ [estimate of N/2 steps - estimate of N steps],
 
 in its leading term. The two share their paths, and so the difference has far less Monte Carlo error
-than either where D is small; what it has is told beside it.
+than either where D is small; what it has is told beside it. Where a few of the paths have nearly all of
+the weights w e^D, the two laws have little in common: steps are too long for this, or for anything,
+and the uncertainty is infinite.
 """
 
 from typing import NamedTuple
@@ -14,8 +16,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Inexact
 
-from .averages import expanded, normalised, weighted_mean
+from .averages import effective_size, expanded, normalised, weighted_mean
 
+# Fewer effective paths than this share of those without e^D tell nothing.
+_LEAST_OVERLAP = 0.1
 # Where steps are so long, in standard deviations or in log p, more paths do not help.
 _GROSS = 0.1
 
@@ -44,7 +48,9 @@ def of_log_mean(
     ratio = jnp.where(some, mean, 1)
     spread = jnp.sqrt(jnp.sum((weights * (factors - mean[..., None])) ** 2, axis=-1)) / ratio
     change = jnp.log(ratio) + largest[..., 0]
-    return StepError(*(_told(share, value, some) for value in (change, spread)))
+    overlap = _overlap(weights, weights * factors / ratio[..., None])
+    spread = jnp.where(overlap, spread, jnp.inf)
+    return StepError(_told(share, change, some), _told(share, spread, some))
 
 
 def of_mean(
@@ -62,7 +68,11 @@ def of_mean(
     each = expanded(coarse, values) * (values - jnp.expand_dims(coarse_mean, axis))
     each -= expanded(weights, values) * (values - jnp.expand_dims(fine_mean, axis))
     spread = jnp.sqrt(jnp.sum(jnp.where(expanded(known, values), each, 0) ** 2, axis))
-    share = share.reshape(*share.shape, *[1] * (spread.ndim - share.ndim))
+    overlap = _overlap(weights, coarse)
+    share, overlap = (
+        leaf.reshape(*leaf.shape, *[1] * (spread.ndim - leaf.ndim)) for leaf in (share, overlap)
+    )
+    spread = jnp.where(overlap, spread, jnp.inf)
     some = jnp.isfinite(coarse_mean) & jnp.isfinite(fine_mean)
     return StepError(
         _told(share, jnp.where(some, coarse_mean - fine_mean, 0), some),
@@ -85,6 +95,11 @@ def is_gross(error: StepError) -> Bool[Array, "..."]:
 def share_of_order(order: int) -> float:
     """(2^p - 1)⁻¹."""
     return 1 / (2**order - 1)
+
+
+def _overlap(weights: Float[Array, "*I n"], coarse: Float[Array, "*I n"]) -> Bool[Array, "*I"]:
+    """Whether many of the paths have weight under both laws."""
+    return effective_size(coarse) >= _LEAST_OVERLAP * effective_size(weights)
 
 
 def _known(

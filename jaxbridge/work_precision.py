@@ -238,7 +238,9 @@ def work_precision(
     - `methods`: "approximate" for couplings; "weights", "pseudo_marginal", "renewal",
         "crank_nicolson" for exact bridges; "density" for p_T(a, b), whose error is relative. Where
         a proposal does not fit a method the pair is left out.
-    - `dtypes`: "float32", "float64". The latter needs no configuration.
+    - `dtypes`: "float32", "float64". The latter needs no configuration, but constants in the
+        model's functions must be of the precision of the point, or in `params`: the reference is
+        in double precision whatever is asked for here.
     - `num_bridges`: samples of each setting: what their number leaves of uncertainty cannot be
         told from a step error.
     - `fn`: what to estimate, a function of the path at `save_at`, shape (K, d), to an array; by
@@ -330,6 +332,9 @@ def work_precision(
         if reference_bridges is None
         else check_count("reference_bridges", reference_bridges)
     )
+    known = {True: log_density is not None, False: reference is not None}
+    alone = "approximate" not in methods and all(known[m == "density"] for m in methods)
+    _check_precisions(scene, dtypes if alone else ("float32", "float64"))
     fine_key = key_for("reference", key)
     with jax.enable_x64(True):  # references are made in double precision
         exact = {
@@ -378,6 +383,34 @@ class _Scene(NamedTuple):
     def values(self, paths: Float[Array, "n K d"]) -> Float[np.ndarray, "n m"]:
         """`fn` of each path."""
         return np.asarray(jax.vmap(lambda path: jnp.ravel(self.fn(path)))(paths), float)
+
+
+def _check_precisions(scene: _Scene, dtypes: Sequence[str]) -> None:
+    """Raise `TypeError` where the model's functions cannot be traced in all of these, before
+    anything is compiled: JAX remembers the precision in which it first saw a NumPy constant inside
+    a derivative, and then mixes that with another."""
+
+    def look(model: Diffusion, x: Array):
+        forward = model.forward(x)
+        seen = [jax.jacfwd(forward.drift)(x), forward.sigma(x).as_matrix(x.shape[0], x.dtype)]
+        if model.has_density:
+            seen.append(jax.grad(model.log_stationary)(x))
+        if model.has_reversal:
+            seen.append(model.backward(x).drift(x))
+        return seen
+
+    for dtype in dict.fromkeys(dtypes):
+        with jax.enable_x64(dtype == "float64"):
+            model, x, *_ = scene.interval(dtype)
+            try:
+                eqx.filter_eval_shape(eqx.filter_jit(look), model, x)
+            except TypeError as error:
+                raise TypeError(
+                    "the model's functions do not serve in single and in double precision, in "
+                    "which settings and the reference are run: take constants to the precision of "
+                    "the point, `jnp.asarray(constant, x.dtype)`, or give them to `Diffusion` "
+                    f"among its `params`. ({error})"
+                ) from error
 
 
 def _run(

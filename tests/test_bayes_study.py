@@ -32,7 +32,7 @@ def test_brownian_bridges_give_the_likelihood_of_the_trapezoid_rule():
             1.0,
             num_proposals=2_000,
             num_steps=20,
-            proposal=jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+            proposal=jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
         )
         return jnp.sum(estimate.value)
 

@@ -152,7 +152,7 @@ def test_inside_jit_the_choice_goes_by_rule():
     assert (estimate.proposal.chosen == 0).all()
     alone = jb.transition_log_density(
         jax.random.key(0), model, starts, ends, jnp.array([0.02, 0.1, 0.5]), num_proposals=50,
-        num_steps=20, proposal=jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+        num_steps=20, proposal=jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
     )  # fmt: skip
     np.testing.assert_allclose(alone.value, estimate.value, atol=1e-4)
 
@@ -219,9 +219,9 @@ def test_errors_say_what_to_change(unchecked):
 
 
 PULLED = [
-    jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
-    jb.Guided("end", jb.TrapezoidDensity()),
-    jb.Guided("path", jb.TrapezoidDensity()),
+    jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
+    jb.Guided("end", jb.ItoTaylorDensity()),
+    jb.Guided("path", jb.ItoTaylorDensity()),
 ]
 NUM = 6
 

@@ -15,7 +15,7 @@ RATE = lambda params: params[0]
 POSITIVE = lambda rate: rate > 0
 PRIOR = jb.NormalPrior(1.0, 1.0)
 OPTIONS = dict(prior=PRIOR, where=RATE, constraint=POSITIVE)
-TRAPEZOID = jb.TrapezoidDensity()
+TRAPEZOID = jb.ItoTaylorDensity()
 
 
 def exact_moments(log_prior=lambda rate: -((rate - 1) ** 2) / 2):

@@ -167,7 +167,7 @@ def test_very_unlikely_bridges(precision):
         1.0,
         num_proposals=500,
         num_steps=400,
-        proposal=jb.Guided(density=jb.TrapezoidDensity()),
+        proposal=jb.Guided(density=jb.ItoTaylorDensity()),
     )
     assert exact(*far) < -500
     assert abs(float(guided.value) / exact(*far) - 1) < 1e-3
@@ -364,7 +364,7 @@ def test_nearly_singular_sigma(mixing, precision):
     exact = jb.ou_transition(paper_model(), jnp.array([0.3, -0.2]), 1.0).log_density(
         jnp.array([0.5, 0.4])
     ) - np.log(np.linalg.det(mixing))
-    for proposal in (jb.Coupling(0.5), jb.ModifiedDiffusionBridge(jb.TrapezoidDensity())):
+    for proposal in (jb.Coupling(0.5), jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())):
         estimate = jb.transition_log_density(
             jax.random.key(0), model, *ends, 1.0, num_proposals=20_000, proposal=proposal
         )

@@ -18,7 +18,7 @@ import jaxbridge as jb
 OPTIONS = dict(
     where=lambda params: params.B,
     num_steps=20,
-    proposal=jb.Guided(density=jb.TrapezoidDensity()),
+    proposal=jb.Guided(density=jb.ItoTaylorDensity()),
 )
 
 
@@ -51,7 +51,7 @@ def test_one_unknown_rate():
         constraint=lambda rate: rate > 0,
         num_steps=15,
         num_bridges=500,
-        proposal=jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+        proposal=jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
     )
     arguments = (jax.random.key(0), ou_1d(), times, data)
     made = jb.maximum_likelihood(*arguments, method="em", num_iterations=60, **options)

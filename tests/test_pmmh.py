@@ -30,7 +30,7 @@ def exact_moments():
 @pytest.mark.parametrize(
     "proposal",
     [
-        jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+        jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
         pytest.param(jb.Coupling(0.0), marks=pytest.mark.slow),
     ],
     ids=["bridge", "coupling"],
@@ -103,7 +103,7 @@ def test_going_on_is_one_run():
 
 @pytest.mark.slow
 def test_the_variance_of_the_estimate_is_that_of_repetitions():
-    bridge = jb.ModifiedDiffusionBridge(jb.TrapezoidDensity())
+    bridge = jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())
     model = ou_1d(1.5, 0.7)
     made = jb.pmmh(
         jax.random.key(0),
@@ -231,7 +231,7 @@ def test_ranks_of_true_parameters_are_uniform():
             thin=25,
             num_proposals=10,
             num_steps=6,
-            proposal=jb.ModifiedDiffusionBridge(jb.TrapezoidDensity()),
+            proposal=jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
         )
         return jnp.array([jnp.sum(made.params[0] < rate), jnp.sum(made.params[1] < sigma)])
 

@@ -24,7 +24,7 @@ def exact_derivatives():
 @pytest.mark.parametrize(
     "proposal",
     [
-        jb.Guided(density=jb.TrapezoidDensity()),
+        jb.Guided(density=jb.ItoTaylorDensity()),
         jb.Coupling(0.0),
     ],
     ids=["guided", "coupling"],

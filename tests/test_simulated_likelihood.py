@@ -16,7 +16,7 @@ from jaxbridge.choice import guided_candidates, undecided_between
 from jaxbridge.problem import as_problem
 
 POSITIVE = lambda params: jnp.all(jnp.stack(params) > 0)
-BRIDGE = jb.ModifiedDiffusionBridge(jb.TrapezoidDensity())
+BRIDGE = jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())
 SHORT = dict(num_iterations=20, num_bridges=20, num_steps=10, proposal=BRIDGE, constraint=POSITIVE)
 
 

@@ -85,7 +85,7 @@ def test_the_closed_form_serves_functions_of_the_path():
         KEY,
         paper_model(),
         *ENDS,
-        proposals=[jb.Guided(density=jb.TrapezoidDensity())],
+        proposals=[jb.Guided(density=jb.ItoTaylorDensity())],
         num_steps=(20,),
         methods=("weights",),
         num_bridges=20_000,
@@ -94,7 +94,7 @@ def test_the_closed_form_serves_functions_of_the_path():
         repeats=1,
     )
     (setting,) = result.settings
-    assert setting.scheme == "TrapezoidDensity" and np.isnan(setting.gamma)
+    assert setting.scheme == "ItoTaylorDensity" and np.isnan(setting.gamma)
     assert result.reference == "1,000,000 draws of the exact law"
     assert setting.error < 5 * setting.uncertainty
 
@@ -186,6 +186,36 @@ def test_errors_say_what_to_change(changes, message, unchecked):
     arguments = dict(start=[0.0, 0.0], end=[1.0, 0.0], duration=1.0, num_steps=(4,)) | changes
     with pytest.raises(ValueError, match=message):
         jb.work_precision(KEY, paper_model(), **arguments)
+
+
+def test_constants_of_one_precision_are_refused_before_anything_runs(unchecked):
+    """NumPy's, which JAX takes for those of the precision in which it sees them first."""
+    height = np.array([-2.0, -1.0])
+    arguments = (KEY, [0.2], [0.5], 1.0)
+
+    def run(log_density):
+        key, *ends = arguments
+        jb.work_precision(
+            key,
+            jb.langevin(log_density),
+            *ends,
+            proposals=[jb.ModifiedDiffusionBridge()],
+            num_steps=(2,),
+            methods=("weights",),
+            dtypes=("float32", "float64"),
+            num_bridges=50,
+            reference_bridges=50,
+            repeats=1,
+        )
+
+    with pytest.raises(TypeError, match=r"`jnp.asarray\(constant, x.dtype\)`, or give them"):
+        run(lambda x, p: jnp.sum(height * jnp.exp(x[0] ** 2 * height * 0.1)) - x @ x)
+
+    def cast(x, p):
+        mine = jnp.asarray(height, x.dtype)
+        return jnp.sum(mine * jnp.exp(x[0] ** 2 * mine * 0.1)) - x @ x
+
+    run(cast)
 
 
 def test_densities_with_a_constant_that_is_not_known_are_refused_before_anything_runs():
