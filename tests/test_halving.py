@@ -54,8 +54,8 @@ def test_linear_drift_is_known(density, x64):
 
 
 CASES = {
-    "well, euler": (WELL, jb.EulerDensity(), 0.2),
-    "well, ito_taylor": (WELL, jb.ItoTaylorDensity(), 0.2),
+    "well, euler": (WELL, jb.EulerDensity(), 0.3),
+    "well, ito_taylor": (WELL, jb.ItoTaylorDensity(), 0.3),
     "varying, euler": (VARYING, jb.EulerDensity(), 0.6),
 }
 
