@@ -63,6 +63,8 @@ from .weighted import (
     masked,
 )
 
+# δ |F| of a step that has nothing in common with the diffusion: where long steps threw ξ far out.
+_FAR_OUT = 10.0
 # Of the duration: shorter steps are lost in the rounding of points.
 _SHORTEST_STEP = 1e-10
 
@@ -251,7 +253,8 @@ class Guided(AbstractGuidedProposal):
 
     - `linearisation`: "end", the drift linearised at b, F = ∇α(b), α̃ = α(b), σ̃ = σ(b); "path", all
         of them linearised along the deterministic path dξ = α(ξ) dt from the start, bent so that
-        it ends in b; or a matrix F of shape (d, d), with α(b) and σ(b).
+        it ends in b, and straight where steps are so long that they throw it far out; or a matrix
+        F of shape (d, d), with α(b) and σ(b).
     - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
         `ItoTaylorDensity()` is far closer to the diffusion.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
@@ -312,6 +315,10 @@ class Guided(AbstractGuidedProposal):
             xi, xi_end = deterministic_path(self.density, dynamics, start, dt)
             done = jnp.concatenate([jnp.zeros_like(dt[:1]), jnp.cumsum(dt)[:-1]]) / jnp.sum(dt)
             points = xi + done[:, None] * (end - xi_end)
+            straight = start + done[:, None] * (end - start)
+            rates = jax.vmap(jax.jacfwd(dynamics.drift))(lax.stop_gradient(points))
+            near = dt * jnp.max(jnp.abs(rates), axis=(1, 2)) < _FAR_OUT
+            points = jnp.where(near[:, None], points, straight)
         coefficients = jax.vmap(lambda x: self._linear(dynamics, x, end))(points)
 
         def back(guess: _GaussianGuess, inputs) -> tuple[_GaussianGuess, _GaussianGuess]:

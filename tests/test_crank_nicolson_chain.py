@@ -96,6 +96,37 @@ def test_chain_is_that_of_the_kernel_and_runs_in_blackjax():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "decay, speed, duration, num_steps", [(0.1, 20, 2, 200), (1, 6.2832, 5, 100)]
+)
+def test_fast_rotation(decay, speed, duration, num_steps, x64):
+    """Paths of a linear process are linear in the noise, and all moves are accepted: the mid-point
+    is autoregressive, of which the effective sample size is known. Mean and second moments are
+    those of the closed form, up to the step error that is told."""
+    model = jb.ornstein_uhlenbeck([[decay, speed], [-speed, decay]])
+    ends, size, beta = (jnp.array([0.5, 0.2]), jnp.array([-0.4, 0.6])), 20_000, 0.9
+    exact = jb.gaussian_bridge(model, *ends, float(duration), [duration / 2])
+    mean, variance = exact.mean[0], jnp.diag(exact.covariance[0])
+    chain = jb.sample_exact_bridges(
+        jax.random.key(0), model, *ends, float(duration), num_bridges=size, num_steps=num_steps,
+        proposal=jb.Guided(density=jb.ItoTaylorDensity()), method="crank_nicolson",
+        step_size=beta,
+    )  # fmt: skip
+    assert chain.acceptance_rate > 0.999
+    functions = {
+        1: lambda path: path[num_steps // 2] - mean,
+        2: lambda path: (path[num_steps // 2] - mean) ** 2 - variance,
+    }
+    for power, fn in functions.items():
+        rho = (1 - beta**2) ** (power / 2)
+        sd = jnp.sqrt(variance) if power == 1 else jnp.sqrt(2) * variance
+        error = sd / np.sqrt(size * (1 - rho) / (1 + rho))
+        told, doubt = chain.step_error(fn), chain.step_uncertainty(fn)
+        assert np.all(np.abs(chain.mean(fn) - told) < 5 * np.hypot(error, doubt))
+        assert np.all(np.abs(told) < 0.1 * sd + 5 * doubt)
+
+
+@pytest.mark.slow
 def test_a_path_that_enters_is_the_state():
     """`init` finds the noise of a path, so a step of size β moves it by no more than that."""
     weighted = jb.sample_weighted_bridges(

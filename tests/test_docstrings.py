@@ -38,7 +38,7 @@ RESULTS = {
     "WorkPrecision": ["work_precision"],
 }
 # What classes of one's own are given.
-GIVEN = {"Frame", "NoiseLaw", "PairStep", "Step"}
+GIVEN = {"Frame", "PairStep", "Step", "StepLaw"}
 WITHOUT_EXAMPLE = {
     *RESULTS,
     *GIVEN,

@@ -273,14 +273,15 @@ def test_noise_makes_the_path_and_the_path_gives_the_noise(precision):
     xi = jax.random.normal(jax.random.key(0), (2, 9, 2))
     tolerance = 2e-4 if precision == "float32" else 1e-11
     for proposal in (jb.ModifiedDiffusionBridge(), jb.Guided("path", refinement=1.5)):
-        paths, log_weights = jax.jit(
+        paths, log_weights, log_halving = jax.jit(
             lambda xi, proposal=proposal: path_of(proposal, dynamics, intervals, xi)
         )(xi)
-        noise, again = jax.jit(
+        noise, again, halving_again = jax.jit(
             lambda paths, proposal=proposal: noise_of(proposal, dynamics, intervals, paths)
         )(paths)
         np.testing.assert_allclose(noise, xi, atol=tolerance)
         np.testing.assert_allclose(again, log_weights, atol=tolerance)
+        np.testing.assert_allclose(halving_again, log_halving, atol=tolerance)
 
 
 @pytest.mark.slow

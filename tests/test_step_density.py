@@ -1,115 +1,325 @@
-"""Densities of steps: the order of the error that they add up to along a path."""
+"""Densities of steps: that they are densities, and the order of the error that they add up to
+along a path, by quadrature and closed forms, without Monte Carlo."""
 
+import fokker_planck
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import FULL_SIGMA, NON_REVERSIBLE, loglog_slope, paper_model
+from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, loglog_slope
+from scipy.stats import multivariate_normal
 
 import jaxbridge as jb
+from jaxbridge.linear import linear_transition
+
+DENSITIES = {"euler": jb.EulerDensity(), "ito_taylor": jb.ItoTaylorDensity()}
+J = np.array([[0.0, 1.0], [-1.0, 0.0]])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("reversible", [False, True])
-def test_trapezoid_density_is_of_second_order(reversible, x64):
-    """log p̂ against the closed form, for a drift that is a gradient and for one with a curl and
-    a full σ; each error is far beyond its standard error."""
-    model, ends = paper_model(), (jnp.array([0.785, 0.785]), jnp.array([-0.2, 0.4]))
-    if not reversible:
-        model = jb.ornstein_uhlenbeck(2 * NON_REVERSIBLE, [0.2, -0.1], FULL_SIGMA)
-    exact = float(jb.ou_transition(model, ends[0], 1.0).log_density(ends[1]))
-    sizes, errors = np.array([4, 8, 16]), []
-    for num_steps in sizes:
+class Rotation:
+    """α = κ|x|²Jx - |x|²x in any dimension, J antisymmetric, with its derivatives by hand."""
+
+    def __init__(self, d, kappa=5.0, sigma=None):
+        self.J = kappa * (np.eye(d, k=1) - np.eye(d, k=-1)) - np.eye(d)
+        self.sigma = np.eye(d) if sigma is None else np.asarray(sigma)
+        self.model = jb.Diffusion(self.drift, lambda x, p: jnp.asarray(self.sigma, x.dtype))
+
+    def drift(self, x, params=None):
+        return (x @ x) * (jnp.asarray(self.J, x.dtype) @ x)
+
+    def moments(self, x, dt):
+        """Mean and covariance of the Itô–Taylor step."""
+        x, V, J = np.asarray(x, float), self.sigma @ self.sigma.T, self.J
+        alpha = (x @ x) * (J @ x)
+        G = (x @ x) * J + np.outer(J @ x, 2 * x)
+        bend = J @ (2 * np.trace(V) * x + 4 * V @ x)  # tr V∇²α
+        mean = x + dt * alpha + dt**2 / 2 * (G @ alpha + bend / 2)
+        flow = G @ V
+        return mean, dt * V + dt**2 / 2 * (flow + flow.T) + dt**3 / 3 * flow @ G.T
+
+
+def step_law(density, model, x, dt):
+    return density.steps_from(model.forward(x), x).law(jnp.asarray(dt, x.dtype))
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 5])
+@pytest.mark.parametrize("dt", [0.01, 0.3, 20.0])
+def test_ito_taylor_step_is_normal_with_these_moments(d, dt, precision):
+    """Of a superlinear drift with a full σ, by hand; the density is that of what is simulated, and
+    so it integrates to one."""
+    rng = np.random.default_rng(d)
+    sigma = np.eye(d) + 0.3 * rng.normal(size=(d, d))
+    rotation, x = Rotation(d, sigma=sigma), jnp.asarray(rng.normal(size=d))
+    law = step_law(jb.ItoTaylorDensity(), rotation.model, x, dt)
+    mean, covariance = rotation.moments(x, dt)
+    tolerance = {"float32": 2e-3, "float64": 1e-9}[precision]
+    scale = np.sqrt(np.diag(covariance))
+    units = [law.point(jnp.asarray(unit, x.dtype)) - law.mean for unit in np.eye(d)]
+    made = np.stack(units, axis=1)
+    np.testing.assert_allclose(law.mean / scale, mean / scale, atol=tolerance, rtol=tolerance)
+    np.testing.assert_allclose(
+        made @ made.T / np.outer(scale, scale),
+        covariance / np.outer(scale, scale),
+        atol=tolerance,
+    )
+    xi = jnp.asarray(rng.normal(size=d))
+    point = law.point(xi)
+    np.testing.assert_allclose(law.noise(point), xi, rtol=tolerance, atol=10 * tolerance)
+    expected = multivariate_normal(np.asarray(law.mean, float), covariance).logpdf(
+        np.asarray(point, float)
+    )
+    np.testing.assert_allclose(law.log_density(point), expected, atol=20 * tolerance)
+    v = jnp.asarray(rng.normal(size=d))
+    np.testing.assert_allclose(
+        law.pulled_back(v), made.T @ np.asarray(v), rtol=tolerance, atol=tolerance * scale.max()
+    )
+
+
+@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+@pytest.mark.parametrize("dt", [0.1, 30.0])
+@pytest.mark.parametrize("d", [1, 2])
+def test_steps_integrate_to_one(density, dt, d, x64):
+    """By quadrature over where they lead, also in steps out of all proportion."""
+    rotation, x = Rotation(d), jnp.array([0.7, -1.1])[:d]
+    law = step_law(density, rotation.model, x, dt)
+    covariance = rotation.moments(x, dt)[1] if density.order == 2 else dt * np.eye(d)
+    root, nodes = np.linalg.cholesky(covariance), np.linspace(-9, 9, 91)
+    grid = np.stack([g.ravel() for g in np.meshgrid(*d * [nodes])], axis=-1)
+    points = np.asarray(law.mean) + grid @ root.T
+    values = np.exp(np.asarray(jax.vmap(law.log_density)(jnp.asarray(points))))
+    volume = (nodes[1] - nodes[0]) ** d * np.linalg.det(root)
+    assert abs(values.sum() * volume - 1) < 1e-8
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 5])
+def test_covariance_is_never_near_singular(d, x64):
+    """LLᵀ ≥ ¼ I, however long the step: equality where A is symmetric and δ = 3/2 of its rate."""
+    rng = np.random.default_rng(10 + d)
+    matrices = jnp.asarray([*rng.normal(size=(50, d, d)), -np.eye(d)])
+    least = []
+    for dt in (0.1, 1.5, 4.0, 1e3):
+        for F in matrices:
+            model = jb.Diffusion(lambda x, p, F=F: F @ x)
+            law = step_law(jb.ItoTaylorDensity(), model, jnp.zeros(d), dt)
+            least.append(np.linalg.svd(np.asarray(law.root), compute_uv=False)[-1] ** 2)
+    assert abs(min(least) - 0.25) < 1e-9
+
+
+@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+def test_linear_step_is_the_step_of_a_linear_drift(density, precision):
+    d, dt = 3, 0.4
+    rng = np.random.default_rng(0)
+    F, c, sigma = rng.normal(size=(d, d)), rng.normal(size=d), rng.normal(size=(d, d)) + np.eye(d)
+    F, c, sigma, x, dt = (jnp.asarray(leaf) for leaf in (F, c, sigma, rng.normal(size=d), dt))
+    model = jb.Diffusion(lambda x, p: c + F @ x, lambda x, p: sigma)
+    steps = density.steps_from(model.forward(x), x)
+    law, made = steps.law(dt), density.linear_step(F, sigma @ sigma.T, dt)
+    tolerance = {"float32": 1e-5, "float64": 1e-12}[precision]
+    root = law.root * jnp.eye(d) if law.root.ndim == 0 else law.root
+    covariance = dt * sigma @ root @ root.T @ sigma.T
+    np.testing.assert_allclose(law.mean, made.decay @ x + made.integral @ c, rtol=tolerance * 10)
+    np.testing.assert_allclose(covariance, made.covariance, rtol=10 * tolerance, atol=tolerance)
+    decay = sigma @ steps.decay(dt) @ jnp.linalg.inv(sigma)
+    np.testing.assert_allclose(decay, made.decay, rtol=10 * tolerance, atol=10 * tolerance)
+
+
+@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+def test_linear_step_is_near_the_transition(density, x64):
+    """Decay, integral and covariance, each to O(δ^(p+1)) in a step."""
+    rng = np.random.default_rng(1)
+    F, V = jnp.asarray(rng.normal(size=(3, 3))), jnp.asarray(np.diag([1.0, 0.5, 2.0]) + 0.1)
+    sizes = np.array([0.04, 0.02, 0.01])
+    exact = [linear_transition(F, V, jnp.asarray(dt)) for dt in sizes]
+    made = [density.linear_step(F, V, jnp.asarray(dt)) for dt in sizes]
+    for name in ("decay", "integral", "covariance"):
+        pairs = [(getattr(e, name), getattr(m, name)) for e, m in zip(exact, made, strict=True)]
+        errors = [np.abs(e - m).max() for e, m in pairs]
+        assert abs(loglog_slope(sizes, errors) - (density.order + 1)) < 0.1
+
+
+def log_density_of_chain(density, B, sigma, start, end, duration, num_steps, centre=0.0):
+    """log p̂ of a chain of steps of dX = -B(X - centre) dt + σ dW, in closed form."""
+    F, V, dt = jnp.asarray(-np.asarray(B)), jnp.asarray(sigma) @ jnp.asarray(sigma).T, duration
+    step = density.linear_step(F, V, jnp.asarray(dt / num_steps))
+    decay, covariance = np.asarray(step.decay), np.asarray(step.covariance)
+    mean, spread = np.asarray(start, float) - centre, np.zeros_like(covariance)
+    for _ in range(num_steps):
+        mean, spread = decay @ mean, decay @ spread @ decay.T + covariance
+    return multivariate_normal(mean + centre, spread).logpdf(np.asarray(end))
+
+
+GRADIENT_2D = (PAPER_B, np.eye(2), [0.785, 0.785], [-0.2, 0.4], 1.0)
+CURL_2D = (2 * NON_REVERSIBLE, FULL_SIGMA, [0.785, 0.785], [-0.2, 0.4], 1.0)
+ONE_D = ([[0.8]], [[1.2]], [-0.5], [1.5], 1.0)
+
+
+@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+@pytest.mark.parametrize("case", [ONE_D, GRADIENT_2D, CURL_2D], ids=["1d", "gradient", "curl"])
+def test_order_with_linear_drift(density, case, x64):
+    B, sigma, start, end, duration = (np.asarray(leaf, float) for leaf in case)
+    model = jb.ornstein_uhlenbeck(B, np.full(len(B), 0.1), sigma)
+    exact = float(jb.ou_transition(model, start, duration).log_density(jnp.asarray(end)))
+    sizes = np.array([64, 128, 256])
+    errors = [log_density_of_chain(density, *case, int(size), centre=0.1) - exact for size in sizes]
+    assert abs(loglog_slope(1 / sizes, np.abs(errors)) - density.order) < 0.2
+
+
+FROM, TO = [0.5, 0.2], [-0.4, 0.6]
+
+
+def rotating(decay, speed):
+    return decay * np.eye(2) + speed * J
+
+
+@pytest.mark.parametrize(
+    "decay, speed, duration, at_50, at_100",
+    [(1.0, 2 * np.pi, 5.0, 0.10, 0.02), (0.5, 3.0, 10.0, 0.10, 0.02), (0.5, 3.0, 5.0, 0.02, 0.005)],
+)
+def test_long_bridges_of_fast_rotation(decay, speed, duration, at_50, at_100, x64):
+    """Where a density that does not integrate to one gives infinity, or a factor of two: log p̂ of
+    guided paths, all of one weight, is that of the chain, and near log p."""
+    B = rotating(decay, speed)
+    model = jb.ornstein_uhlenbeck(B)
+    exact = float(jb.ou_transition(model, FROM, duration).log_density(jnp.asarray(TO)))
+    for num_steps, bound in [(50, at_50), (100, at_100)]:
         estimate = jb.transition_log_density(
-            jax.random.key(0),
-            model,
-            *ends,
-            1.0,
-            num_proposals=400_000,
-            num_steps=int(num_steps),
+            jax.random.key(0), model, FROM, TO, duration, num_proposals=100, num_steps=num_steps,
             proposal=jb.Guided(density=jb.ItoTaylorDensity()),
+        )  # fmt: skip
+        chain = log_density_of_chain(
+            jb.ItoTaylorDensity(), B, np.eye(2), FROM, TO, duration, num_steps
         )
-        errors.append(float(estimate.value) - exact)
-        assert estimate.standard_error < 0.002
-        if num_steps < 16:
-            assert abs(errors[-1]) > 4 * float(estimate.standard_error)
-    assert abs(loglog_slope(1 / sizes, np.abs(errors)) - 2) < 0.3
+        assert abs(float(estimate.value) - chain) < 1e-9
+        assert estimate.standard_error < 1e-7
+        assert abs(float(estimate.value) - exact) < bound
 
 
-@pytest.mark.slow
-def test_curl_is_called_for():
-    """Without the term of Lévy's area the error is of first order."""
-    model = jb.ornstein_uhlenbeck([[0.5, 3.0], [-3.0, 0.5]])
-    ends = jnp.array([0.5, 0.0]), jnp.array([-0.3, 0.3])
-    exact = float(jb.ou_transition(model, ends[0], 1.0).log_density(ends[1]))
-    estimate = jb.transition_log_density(
-        jax.random.key(0), model, *ends, 1.0, num_proposals=50_000, num_steps=40,
-        proposal=jb.Guided(density=jb.ItoTaylorDensity()),
-    )  # fmt: skip
-    # Without it log p̂ lacks δ T |Ω|²/12 and, with E ΔwΔwᵀ = δ I, δ T |Ω|²/6; here |Ω|² = 18.
-    lacking = 18 / 40 / 12 + 18 / 40 / 6
-    assert abs(float(estimate.value) - exact) < 5 * float(estimate.standard_error) + lacking / 10
+def quadrature(density, model, start, end, duration, num_steps, nodes):
+    """log p̂ of the chain, by quadrature on a grid that has the points in every dimension."""
+    d, width = len(start), nodes[1] - nodes[0]
+    grid = jnp.asarray(np.stack([g.ravel() for g in np.meshgrid(*d * [nodes])], axis=-1))
+    start, end = jnp.asarray(start), jnp.asarray(end)
+    dynamics, dt = model.forward(start), jnp.asarray(duration / num_steps)
+
+    def log_densities(x, points):
+        return jax.vmap(density.steps_from(dynamics, x).law(dt).log_density)(points)
+
+    between = np.exp(np.asarray(jax.jit(jax.vmap(log_densities, (0, None)))(grid, grid)))
+    mass = np.exp(np.asarray(log_densities(start, grid)))
+    for _ in range(num_steps - 2):
+        mass = mass @ between * width**d
+    last = np.exp(np.asarray(jax.vmap(log_densities, (0, None))(grid, end[None])))[:, 0]
+    return np.log(mass @ last * width**d)
 
 
-def test_nonlinear_drift_by_quadrature(x64):
-    """A double well in one dimension: the chain of trapezoid densities against e^{-TH}, H being
-    the Schrödinger operator of the process, without any Monte Carlo."""
-    model = jb.Diffusion(lambda x, p: 1.2 * (x - x**3))
-    grid = np.linspace(-3.5, 3.5, 1401)
-    width, start, end, duration = grid[1] - grid[0], 640, 900, 1.0
+def assert_order(density, model, start, end, duration, exact, sizes, nodes, slack=0.25):
+    errors = [
+        quadrature(density, model, start, end, duration, int(size), nodes) - exact for size in sizes
+    ]
+    slope = loglog_slope(1 / np.array(sizes), np.abs(errors))
+    assert abs(slope - density.order) < slack, (slope, errors)
+    return errors
+
+
+@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+def test_order_in_a_double_well(density, x64):
+    """In one dimension, against e^{-TH}, H being the Schrödinger operator of the process."""
+    start, end, duration = -0.3, 1.0, 1.0
 
     def beta(x):
-        return 1.2 * (x - x**3)
+        return 2 * (x - x**3)
 
-    potential = (beta(grid) ** 2 + 1.2 * (1 - 3 * grid**2)) / 2
-    diagonal, off = potential + 1 / width**2, np.full(len(grid) - 1, -0.5 / width**2)
-    energies, states = scipy.linalg.eigh_tridiagonal(diagonal, off)
-    A = 1.2 * (grid**2 / 2 - grid**4 / 4)
-    kernel = (states[start] * np.exp(-duration * energies)) @ states[end] / width
-    exact = np.log(kernel) + A[end] - A[start]
+    def log_density(num_nodes):
+        grid = np.linspace(-3.5, 3.5, num_nodes)
+        width = grid[1] - grid[0]
+        potential = (beta(grid) ** 2 + 2 * (1 - 3 * grid**2)) / 2
+        diagonal, off = potential + 1 / width**2, np.full(len(grid) - 1, -0.5 / width**2)
+        energies, states = scipy.linalg.eigh_tridiagonal(
+            diagonal, off, select="v", select_range=(-10.0, 60.0)
+        )
+        i, j = (np.argmin(np.abs(grid - x)) for x in (start, end))
+        kernel = (states[i] * np.exp(-duration * energies)) @ states[j] / width
+        return np.log(kernel) + end**2 - end**4 / 2 - start**2 + start**4 / 2
 
-    density, dynamics = jb.ItoTaylorDensity(), model.forward(jnp.zeros(1))
-    sizes, errors = np.array([10, 20, 40]), []
-    for num_steps in sizes:
-        dt = jnp.asarray(duration / num_steps)
+    exact = (4 * log_density(1401) - log_density(701)) / 3
+    model = jb.Diffusion(lambda x, p: beta(x))
+    ends = [start], [end]
+    nodes = np.linspace(-3.5, 3.5, 351)
+    errors = assert_order(density, model, *ends, duration, exact, [16, 32, 64], nodes)
+    assert abs(errors[-1]) < {1: 0.05, 2: 1e-3}[density.order]
 
-        def log_step(x, y, dt=dt):
-            seen, seen_next = density.look(dynamics, x), density.look(dynamics, y)
-            euler = jb.GaussianLaw(x + dynamics.drift(x) * dt, jnp.eye(1) * dt).log_density(y)
-            return euler + density.log_ratio(dynamics, x, y, seen, seen_next, dt)
 
-        points = jnp.asarray(grid)[:, None]
-        step = jax.jit(jax.vmap(jax.vmap(log_step, (None, 0)), (0, None)))(points, points)
-        step = np.exp(np.asarray(step))
-        forward = step[start]
-        for _ in range(num_steps - 1):
-            forward = forward @ step * width
-        errors.append(np.log(forward[end]) - exact)
-    assert abs(loglog_slope(1 / sizes, np.abs(errors)) - 2) < 0.25
+def curled_well(curl):
+    """A double well beside a quartic one, coupled, with a curl that grows outwards."""
+
+    def drift(x, params):
+        well = jnp.stack([1.2 * (x[0] - x[0] ** 3), -0.8 * x[1] - 0.3 * x[1] ** 3])
+        coupled = 0.4 * jnp.stack([x[1], x[0]])
+        return well + coupled + curl * (1 + x @ x / 4) * jnp.stack([x[1], -x[0]])
+
+    return jb.Diffusion(drift)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("curl", [0.0, 2.0], ids=["gradient", "curl"])
+def test_order_in_two_dimensions(curl, x64):
+    """Against the Fokker–Planck equation on a grid."""
+    model, start, end, duration = curled_well(curl), [0.6, -0.3], [-0.4, 0.5], 1.0
+    oracle = fokker_planck.solve_model(model, start, end, duration, 2 * [(-2.8, 2.8)], 49)
+    nodes = np.linspace(-2.8, 2.8, 41)
+    density = jb.ItoTaylorDensity()
+    errors = assert_order(
+        density, model, start, end, duration, oracle.log_density, [8, 16, 32], nodes, slack=0.3
+    )
+    assert oracle.log_density_error < 0.03 * abs(errors[-1])
     assert abs(errors[-1]) < 0.01
 
 
-def test_linear_step_in_one_dimension_against_the_exact_density(x64):
-    """One step of dX = -βX dt + dW: the error of its log density, averaged over where it leads."""
-    model = jb.ornstein_uhlenbeck([[0.8]])
-    x, nodes = jnp.array([0.6]), np.polynomial.hermite_e.hermegauss(40)
-    density, dynamics = jb.ItoTaylorDensity(), model.forward(jnp.zeros(1))
-    sizes, errors = np.array([0.2, 0.1, 0.05]), []
-    for dt in sizes:
-        law = jb.ou_transition(model, x, dt)
-        points = law.mean + jnp.sqrt(law.covariance[0, 0]) * jnp.asarray(nodes[0])[:, None]
+SUPERLINEAR = Rotation(2).model
+PROPOSALS = {
+    "mdb": lambda density: jb.ModifiedDiffusionBridge(density),
+    "end": lambda density: jb.Guided("end", density),
+    "path": lambda density: jb.Guided("path", density),
+}
 
-        def error(y, dt=dt, law=law):
-            seen, seen_next = density.look(dynamics, x), density.look(dynamics, y)
-            ratio = density.log_ratio(dynamics, x, y, seen, seen_next, jnp.asarray(dt))
-            euler = jb.GaussianLaw(x + dynamics.drift(x) * dt, jnp.eye(1) * dt).log_density(y)
-            return ratio + euler - law.log_density(y)
 
-        values = np.asarray(jax.vmap(error)(points))
-        errors.append(np.expm1(values) @ nodes[1] / nodes[1].sum())
-    # O(δ³) on average in each step, so O(δ²) along a path.
-    assert abs(loglog_slope(sizes, np.abs(errors)) - 3) < 0.25
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROPOSALS)
+def test_superlinear_rotation_is_finite_and_converges(name):
+    """α = 5|x|²Jx - |x|²x, from where it turns fast: log p̂ is finite however long the steps, that
+    of the chain, and tends to a limit at least as fast as its step error says."""
+    start, end, estimates = [1.0, 0.2], [-0.4, 0.6], {}
+    for num_steps in (4, 10, 25, 50, 100):
+        estimates[num_steps] = estimate = jb.transition_log_density(
+            jax.random.key(1), SUPERLINEAR, start, end, 1.0, num_proposals=4000,
+            num_steps=num_steps, proposal=PROPOSALS[name](jb.ItoTaylorDensity()),
+        )  # fmt: skip
+        assert np.isfinite(estimate.value)
+        assert estimate.num_met > 3000
+        assert estimate.step_error < 0
+    if name == "mdb":
+        assert all(e.pareto_k > 0.7 and not e.trustworthy for e in estimates.values())
+        return
+    with jax.enable_x64(True):
+        nodes = np.linspace(-2.4, 2.4, 41)
+        chain = quadrature(jb.ItoTaylorDensity(), SUPERLINEAR, start, end, 1.0, 25, nodes)
+    assert abs(estimates[25].value - chain) < 5 * estimates[25].standard_error < 0.25
+    for num_steps in (25, 50):
+        coarse, fine = estimates[num_steps], estimates[2 * num_steps]
+        noise = np.hypot(coarse.standard_error, fine.standard_error) + coarse.step_uncertainty
+        limit = fine.value - coarse.value + coarse.step_error
+        assert abs(limit) < 5 * noise + 0.5 * abs(coarse.step_error)
+
+
+def test_guides_along_a_path_that_explodes_are_finite(precision):
+    """In four steps the deterministic path of the superlinear rotation is off by 1e8."""
+    estimate = jb.transition_log_density(
+        jax.random.key(1), SUPERLINEAR, jnp.array([1.0, 0.2]), jnp.array([-0.4, 0.6]), 1.0,
+        num_proposals=100, num_steps=4, proposal=jb.Guided("path", jb.ItoTaylorDensity()),
+    )  # fmt: skip
+    assert estimate.num_met == 100
+    assert estimate.effective_sample_size > 5
 
 
 def test_state_dependent_sigma_is_refused():

@@ -1,0 +1,120 @@
+"""Step errors against known ones, and what is said of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B
+from test_step_density import DENSITIES, FROM, TO
+
+import jaxbridge as jb
+from jaxbridge.step_error import StepError, dominates, is_gross, of_log_mean, of_mean
+
+
+@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+@pytest.mark.parametrize("refinement", [1.0, 1.5])
+@pytest.mark.parametrize("curl", [False, True], ids=["gradient", "curl"])
+def test_error_of_a_log_density(density, refinement, curl, x64):
+    """Within a factor of two of the true one, told with its uncertainty."""
+    B, sigma = (2 * NON_REVERSIBLE, FULL_SIGMA) if curl else (PAPER_B, np.eye(2))
+    model = jb.ornstein_uhlenbeck(B, sigma=sigma)
+    ends = jnp.array([0.785, 0.785]), jnp.array([-0.2, 0.4])
+    exact = float(jb.ou_transition(model, ends[0], 1.0).log_density(ends[1]))
+    estimate = jb.transition_log_density(
+        jax.random.key(0), model, *ends, 1.0, num_proposals=128_000,
+        num_steps={1: 32, 2: 16}[density.order],
+        proposal=jb.Guided(density=density, refinement=refinement),
+    )  # fmt: skip
+    error = float(estimate.value) - exact
+    assert estimate.standard_error < 1e-6 * abs(error)
+    noise = 5 * float(estimate.step_uncertainty)
+    assert noise < abs(error)
+    assert abs(float(estimate.step_error) - error) < 0.5 * abs(error) + noise
+    assert estimate.step_error_dominates and not estimate.trustworthy
+
+
+@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+@pytest.mark.parametrize("method", ["weighted", "chain"])
+def test_error_of_a_mean(density, method, x64):
+    """That of the mid-point, against the closed form."""
+    model = jb.ornstein_uhlenbeck(2 * NON_REVERSIBLE, sigma=FULL_SIGMA)
+    ends, num_steps = ([0.785, 0.785], [-0.2, 0.4]), {1: 64, 2: 16}[density.order]
+    exact = jb.gaussian_bridge(model, *map(jnp.array, ends), 1.0, [0.5]).mean[0]
+    middle = lambda path: path[num_steps // 2]
+    options = {"num_steps": num_steps, "proposal": jb.Guided(density=density)}
+    sample = jb.sample_weighted_bridges if method == "weighted" else jb.sample_exact_bridges
+    made = sample(jax.random.key(0), model, *ends, 1.0, num_bridges=100_000, **options)
+    error, told = made.mean(middle) - exact, made.step_error(middle)
+    noise = made.standard_error(middle) + made.step_uncertainty(middle)
+    assert np.all(np.abs(error - told) < 5 * noise + 0.5 * np.abs(told))
+
+
+def test_exact_transitions_have_none():
+    model = jb.ornstein_uhlenbeck(PAPER_B)
+    pairs = jb.Coupling(0.5, scheme=jb.GaussianTransition())
+    estimate = jb.transition_log_density(
+        jax.random.key(0), model, FROM, TO, 1.0, num_proposals=200, num_steps=10, proposal=pairs
+    )
+    assert estimate.step_error == 0 and estimate.step_uncertainty == 0
+    assert not estimate.step_error_dominates
+
+
+def test_of_one_step_nothing_is_known():
+    estimate = jb.transition_log_density(
+        jax.random.key(0), jb.ornstein_uhlenbeck(PAPER_B), FROM, TO, 0.1, num_proposals=100,
+        num_steps=1, proposal=jb.Guided(),
+    )  # fmt: skip
+    assert np.isnan(estimate.step_error) and np.isnan(estimate.step_uncertainty)
+    assert estimate.step_error_dominates and not estimate.trustworthy
+
+
+def test_changes_are_those_of_weights_and_factors():
+    rng = np.random.default_rng(0)
+    log_w, D, h = (jnp.asarray(rng.normal(size=50)) for _ in range(3))
+    D = D.at[40:].set(jnp.nan)
+    w, factors = np.exp(log_w[:40]), np.exp(D[:40])
+    share, one = jnp.asarray(1 / 3), jnp.asarray(1.0)
+    error = of_log_mean(log_w, D, share)
+    np.testing.assert_allclose(error.value, np.log((w * factors).sum() / w.sum()) / 3, atol=1e-5)
+    error = of_mean(log_w, D, one, h)
+    change = np.average(h[:40], weights=w * factors) - np.average(h[:40], weights=w)
+    np.testing.assert_allclose(error.value, change, atol=1e-5)
+    assert np.isnan(of_log_mean(log_w, jnp.full(50, jnp.nan), share).value)
+    assert of_log_mean(log_w, D, 0 * share).value == 0
+
+
+def test_uncertainty_is_the_spread_of_repetitions():
+    rng = np.random.default_rng(1)
+    log_w = jnp.asarray(0.5 * rng.normal(size=(4000, 200)))
+    h = jnp.asarray(rng.normal(size=(4000, 200))) + log_w
+    D = 0.2 * h + 0.1 * jnp.asarray(rng.normal(size=h.shape))
+    one = jnp.ones(4000)
+    for error in (of_log_mean(log_w, D, one), of_mean(log_w, D, one, h)):
+        spread = float(np.std(error.value))
+        assert float(np.mean(error.uncertainty)) == pytest.approx(spread, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "value, uncertainty, standard_error, expected",
+    [
+        (0.5, 0.0, 1.0, False),
+        (-1.5, 0.0, 1.0, True),
+        (1.5, 1.0, 1.0, False),  # no more than twice its uncertainty
+        (0.1, 4.0, 1.0, True),  # could be anything
+        (np.nan, np.nan, 1.0, True),
+        (0.0, np.inf, 1.0, True),
+        (0.0, 0.0, 0.0, False),
+        (0.5, 0.1, np.inf, False),
+    ],
+)
+def test_when_step_errors_dominate(value, uncertainty, standard_error, expected):
+    error = StepError(jnp.asarray(value), jnp.asarray(uncertainty))
+    assert bool(dominates(error, jnp.asarray(standard_error))) is expected
+
+
+@pytest.mark.parametrize(
+    "value, uncertainty, expected",
+    [(0.05, 0.0, False), (-0.2, 0.0, True), (0.2, 0.1, False), (np.nan, np.nan, True)],
+)
+def test_when_step_errors_are_gross(value, uncertainty, expected):
+    assert bool(is_gross(StepError(jnp.asarray(value), jnp.asarray(uncertainty)))) is expected
