@@ -8,28 +8,36 @@ from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B
 from test_step_density import DENSITIES, FROM, TO
 
 import jaxbridge as jb
-from jaxbridge.step_error import StepError, dominates, is_gross, of_log_mean, of_mean
+from jaxbridge.step_error import (
+    StepError,
+    dominates,
+    is_gross,
+    of_log_mean,
+    of_mean,
+    share_of_order,
+)
 
 
 @pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
 @pytest.mark.parametrize("refinement", [1.0, 1.5])
 @pytest.mark.parametrize("curl", [False, True], ids=["gradient", "curl"])
 def test_error_of_a_log_density(density, refinement, curl, x64):
-    """Within a factor of two of the true one, told with its uncertainty."""
+    """Within a quarter of the true one, and its uncertainty. Of second order and with a curl the
+    leading term is seen at 64 steps only: at 16 a half of the error is told."""
     B, sigma = (2 * NON_REVERSIBLE, FULL_SIGMA) if curl else (PAPER_B, np.eye(2))
     model = jb.ornstein_uhlenbeck(B, sigma=sigma)
     ends = jnp.array([0.785, 0.785]), jnp.array([-0.2, 0.4])
     exact = float(jb.ou_transition(model, ends[0], 1.0).log_density(ends[1]))
     estimate = jb.transition_log_density(
         jax.random.key(0), model, *ends, 1.0, num_proposals=128_000,
-        num_steps={1: 32, 2: 16}[density.order],
+        num_steps=32 if density.order == 1 else 64 if curl else 16,
         proposal=jb.Guided(density=density, refinement=refinement),
     )  # fmt: skip
     error = float(estimate.value) - exact
     assert estimate.standard_error < 1e-6 * abs(error)
     noise = 5 * float(estimate.step_uncertainty)
     assert noise < abs(error)
-    assert abs(float(estimate.step_error) - error) < 0.5 * abs(error) + noise
+    assert abs(float(estimate.step_error) - error) < 0.25 * abs(error) + noise
     assert estimate.step_error_dominates and not estimate.trustworthy
 
 
@@ -66,6 +74,12 @@ def test_of_one_step_nothing_is_known():
     )  # fmt: skip
     assert np.isnan(estimate.step_error) and np.isnan(estimate.step_uncertainty)
     assert estimate.step_error_dominates and not estimate.trustworthy
+
+
+def test_share_of_what_half_as_many_steps_change():
+    """An error c δ^p is c (2δ)^p with half as many."""
+    for order in (1, 2, 3):
+        assert share_of_order(order) * (0.2**order - 0.1**order) == pytest.approx(0.1**order)
 
 
 def test_changes_are_those_of_weights_and_factors():

@@ -214,7 +214,7 @@ def test_a_constant_that_is_not_known_is_refused(way, unchecked):
         "coupling": jb.Coupling(0.0),
         "printed": jb.Coupling.as_published(0.5),
         "pairs": pairs,
-        "choice": Choice((pairs,), None, None, jnp.zeros(1, jnp.int32), None, (0,)),
+        "choice": Choice((pairs,), None, None, None, None, jnp.zeros(1, jnp.int32), None, (0,)),
         "custom": jb.Coupling(0.0, start_law=jb.Stationary(burn_in=3.0)),
     }[way]
     arguments = (jax.random.key(0), model, [0.0], [0.5], 1.0)
