@@ -6,9 +6,9 @@ an estimate changes by when it takes those is (2^p - 1) times its error, where t
     error = (2^p - 1)⁻¹ [estimate of N/2 steps - estimate of N steps],
 
 in its leading term. The two share their paths, and so the difference has far less Monte Carlo error
-than either where D is small; what it has is told beside it. Where a few of the paths have nearly all of
-the weights w e^D, the two laws have little in common: steps are too long for this, or for anything,
-and the uncertainty is infinite.
+than either where D is small; what it has is told beside it. Where a few of the paths have nearly
+all of the weights w e^D, the two laws have little in common: steps are too long for this, or for
+anything, and the uncertainty is infinite.
 """
 
 from typing import NamedTuple
@@ -46,9 +46,11 @@ def of_log_mean(
     mean = jnp.sum(weights * factors, axis=-1)
     some = mean > 0
     ratio = jnp.where(some, mean, 1)
-    spread = jnp.sqrt(jnp.sum((weights * (factors - mean[..., None])) ** 2, axis=-1)) / ratio
+    # Normalised before they are squared, for beside a large D the others are tiny.
+    coarse = weights * factors / ratio[..., None]
+    spread = jnp.sqrt(jnp.sum((coarse - weights) ** 2, axis=-1))
     change = jnp.log(ratio) + largest[..., 0]
-    overlap = _overlap(weights, weights * factors / ratio[..., None])
+    overlap = _overlap(weights, coarse)
     spread = jnp.where(overlap, spread, jnp.inf)
     return StepError(_told(share, change, some), _told(share, spread, some))
 
