@@ -35,9 +35,9 @@ def all_finite(vector: Float[Array, " d"]) -> Bool[Array, ""]:
     return is_finite(_sum([jnp.abs(x) for x in vector]))
 
 
-def total(vector: Float[Array, " d"]) -> Float[Array, ""]:
-    """The sum of the coordinates."""
-    return _sum([vector[i] for i in range(vector.shape[0])])
+def total(terms: Float[Array, "n *shape"]) -> Float[Array, "*shape"]:
+    """The sum over the first axis, such as that of the coordinates of a vector."""
+    return _sum([terms[i] for i in range(terms.shape[0])])
 
 
 def log_product(numbers: Float[Array, " d"]) -> Float[Array, ""]:
