@@ -60,9 +60,9 @@ def path_log_likelihood(
     - `times`: increasing, shape (K,); or (I, K), for each of I intervals its own.
     - `path`: points at these times, shape (..., K, d); (I, ..., K, d) with times of shape (I, K).
         So the paths of bridges fit, for one interval or several.
-    - `form`: "girsanov", "trapezoid", "ito_taylor", "ito" or "euler"; by default the most accurate that the
-        model has: for constant σ "ito" if it is reversible with a known ν, "trapezoid" if it is
-        reversible or one-dimensional, else "ito_taylor"; "girsanov" for a σ that varies.
+    - `form`: "girsanov", "trapezoid", "ito_taylor", "ito" or "euler"; by default the most accurate
+        that the model has: for constant σ "ito" if it is reversible with a known ν, "trapezoid" if
+        it is reversible or one-dimensional, else "ito_taylor"; "girsanov" for a σ that varies.
 
     **Returns:** shape (...), in the dtype of `path`: relative to the law of σW, or, as "euler",
     to Lebesgue's measure.
@@ -259,8 +259,8 @@ def _form(model: Diffusion, like: Float[Array, " d"], form: Form | None) -> Form
         return form
     if form == "trapezoid" and "ito_taylor" in forms:
         raise ValueError(
-            '`form="trapezoid"` is for one dimension and models with `reversible=True`, whose drift '
-            'is a gradient: choose "ito_taylor".'
+            '`form="trapezoid"` is for one dimension and models with `reversible=True`, whose '
+            'drift is a gradient: choose "ito_taylor".'
         )
     if "ito_taylor" not in forms:
         raise ValueError(f'`form="{form}"` is for constant σ: choose "girsanov" or "euler".')
