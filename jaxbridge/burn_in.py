@@ -59,7 +59,9 @@ def with_burn_in(
     end = jnp.where(usable, end, end[jnp.argmax(usable)])  # bridges that were not found are NaN
     dt = duration[pairs] / num_steps
     time = _measure(key, model, coupling, end[pairs].T, dt, num_steps)
-    return eqx.tree_at(lambda c: c.start_law, coupling, Stationary(time))
+    # Not by the constructor, which takes no infinite time from a user.
+    law = eqx.tree_at(lambda law: law.burn_in, Stationary(1.0), time)
+    return eqx.tree_at(lambda c: c.start_law, coupling, law)
 
 
 def measure_burn_in(

@@ -46,9 +46,11 @@ def of_log_mean(
     mean = jnp.sum(weights * factors, axis=-1)
     some = mean > 0
     ratio = jnp.where(some, mean, 1)
-    spread = jnp.sqrt(jnp.sum((weights * (factors - mean[..., None])) ** 2, axis=-1)) / ratio
+    # Normalised before they are squared, for beside a large D the others are tiny.
+    coarse = weights * factors / ratio[..., None]
+    spread = jnp.sqrt(jnp.sum((coarse - weights) ** 2, axis=-1))
     change = jnp.log(ratio) + largest[..., 0]
-    overlap = _overlap(weights, weights * factors / ratio[..., None])
+    overlap = _overlap(weights, coarse)
     spread = jnp.where(overlap, spread, jnp.inf)
     return StepError(_told(share, change, some), _told(share, spread, some))
 

@@ -1,0 +1,449 @@
+"""No wrong number with a small error bar: what is wrong says so.
+
+Every result tells its Monte Carlo error, its step error, and whether large weights decide it. Where
+none of that is a warning the result must be right, within what it tells; and where it is wrong, by
+steps that are too long or weights of heavy tails, there must be a warning.
+"""
+
+import math
+from typing import NamedTuple
+
+import cir
+import fokker_planck
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import random_models
+from jax.scipy.special import logsumexp
+
+import jaxbridge as jb
+from jaxbridge.step_error import of_log_mean
+
+slow = pytest.mark.slow
+
+
+class Told(NamedTuple):
+    """A number, its standard error, its step error with the uncertainty of that, and whether it is
+    without a warning."""
+
+    value: float
+    error: float
+    step_error: float
+    uncertainty: float
+    trusted: bool
+
+    def allowance(self, num_sigma=4.5):
+        """More than this it must not be off by, if it is trusted: a step error that is told may be
+        so far off itself."""
+        return num_sigma * self.error + abs(self.step_error) + 2 * self.uncertainty
+
+
+def density(estimate):
+    """What a `TransitionLogDensity` of one interval tells."""
+    errors = estimate.standard_error, estimate.step_error, estimate.step_uncertainty
+    return Told(float(estimate.value), *map(float, errors), bool(estimate.trustworthy))
+
+
+def middles(weighted):
+    """The coordinates of the only point that is saved, by a `WeightedBridges`."""
+    usable = bool(weighted.pareto_k < 0.7) and not bool(weighted.truncated.any())
+    rows = [weighted.mean(), weighted.standard_error(), weighted.step_error()]
+    rows = np.array([row[0] for row in [*rows, weighted.step_uncertainty()]], float)
+    dominated = np.asarray(weighted.step_error_dominates())[0]
+    return [Told(*row, usable and not bad) for row, bad in zip(rows.T, dominated, strict=True)]
+
+
+def assert_right(told, exact, oracle_error=0.0):
+    if told.trusted:
+        assert abs(told.value - exact) < told.allowance() + oracle_error, (told, exact)
+
+
+def assert_agree(one, other):
+    if one.trusted and other.trusted:
+        # The standard error of the difference.
+        both = math.hypot(one.error, other.error) * 4.5 + 1e-3
+        both += one.allowance(0.0) + other.allowance(0.0)
+        assert abs(one.value - other.value) < both, (one, other)
+
+
+# Models nobody has chosen.
+
+
+def normalised(random, num_draws=500_000, pool=2**17):
+    """The random model with a log ν that is normalised and a sampler of ν, both by weights of
+    normal draws."""
+    params = jax.tree.map(lambda x: np.asarray(x, float), random.model.params)
+    rng, d = np.random.default_rng(0), len(params.centre)
+    gaps = 2.5 * rng.normal(size=(num_draws, d))
+    points = params.centre + gaps
+    logs = np.sum(gaps**2, 1) / (2 * 2.5**2) + d * np.log(2.5 * np.sqrt(2 * np.pi))
+    logs -= np.einsum("ni,ij,nj->n", gaps, params.precision, gaps)
+    logs -= np.sum((points @ params.quartic.T) ** 4, 1)
+    constant = np.log(np.mean(np.exp(logs)))
+    weights = np.exp(logs - constant) / num_draws
+    drawn = jnp.asarray(points[rng.choice(num_draws, pool, p=weights)], jnp.float32)
+    given = random.model
+    return jb.Diffusion(
+        lambda x, p: given.with_params(p).drift(x),
+        lambda x, p: given.with_params(p).diffusion(x),
+        lambda x, p: random_models.log_density(x, p) - constant,
+        given.params,
+        reverse_drift=lambda x, p: given.with_params(p).reverse_drift(x),
+        sample_stationary=lambda key, p: drawn[jax.random.randint(key, (), 0, pool)],
+        normalised=True,
+    )
+
+
+def methods(model, start):
+    varies = model.forward(jnp.asarray(start, jnp.float32)).sigma_varies
+    law = jb.EulerDensity() if varies else jb.ItoTaylorDensity()
+    made = {
+        "modified": jb.ModifiedDiffusionBridge(law),
+        "end": jb.Guided("end", law),
+        "path": jb.Guided("path", law),
+        "Heun": jb.Coupling(0.0, scheme=jb.Heun()),
+    }
+    return made | ({"Euler": jb.Coupling(0.0, scheme=jb.Euler())} if varies else {})
+
+
+def tell(key, model, random, proposal, num_steps, num_proposals=2_000):
+    """Of the density and the mid-point, in that order. With one proposal for each bridge the mean
+    of the weights is the density."""
+    coupled = isinstance(proposal, jb.Coupling)
+    weighted = jb.sample_weighted_bridges(
+        key,
+        model,
+        random.start,
+        random.end,
+        random.duration,
+        num_bridges=num_proposals,
+        num_steps=num_steps,
+        proposal=proposal,
+        save_at=[random.duration / 2],
+        **(dict(max_proposals=1, max_trials=1_000) if coupled else {}),
+    )
+    return [density_of(weighted), *middles(weighted)]
+
+
+def density_of(weighted):
+    """What `transition_log_density` would tell, from weights in which misses are zero."""
+    log_weights, num = weighted.log_weights, weighted.log_weights.size
+    value = logsumexp(log_weights) - math.log(num)
+    error = jnp.std(jnp.exp(log_weights - value)) / math.sqrt(num)
+    truncated = jnp.sum(weighted.truncated)
+    step_error = of_log_mean(log_weights, weighted.log_halving, weighted.step_share)
+    return density(
+        jb.TransitionLogDensity(
+            value,
+            jnp.where(truncated > 0, jnp.inf, error),
+            weighted.effective_sample_size,
+            jnp.sum(weighted.met),
+            truncated,
+            weighted.num_simulated,
+            weighted.num_nonfinite,
+            weighted.proposal,
+            weighted.pareto_k,
+            *step_error,
+        )
+    )
+
+
+def each_random_model(everywhere):
+    return [
+        pytest.param(i, id=random.name, marks=() if i in everywhere else slow)
+        for i, random in enumerate(random_models.random_models())
+    ]
+
+
+@pytest.mark.parametrize("index", each_random_model({0, 6}))
+def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):
+    """Densities and mid-points by proposals of all kinds, where none has a warning."""
+    random = random_models.random_models()[index]
+    model = normalised(random)
+    told = {
+        name: tell(jax.random.key(index), model, random, proposal, 50)
+        for name, proposal in [*methods(model, random.start).items(), ("auto", "auto")]
+    }
+    if random.name in random_models.EXACT:
+        log_density, middle = random_models.EXACT[random.name]
+        for each in told.values():
+            for one, exact in zip(each, [log_density, *middle], strict=True):
+                assert_right(one, exact, 2e-3)
+    rows = list(told.values())
+    for i, one in enumerate(rows):
+        for other in rows[:i]:
+            for pair in zip(one, other, strict=True):
+                assert_agree(*pair)
+    assert sum(one.trusted for each in rows for one in each[1:]) >= len(rows[0]) - 1
+
+
+# Wells.
+
+
+def muller_brown():
+    """The case of `fokker_planck`, normalised by a sum over a grid."""
+    bridge = fokker_planck.muller_brown()
+    axis = jnp.linspace(-3, 3, 1201)
+    grid = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
+    constant = float(logsumexp(jax.vmap(bridge.model.log_stationary)(grid)))
+    constant += 2 * math.log(float(axis[1] - axis[0]))
+    model = jb.Diffusion(
+        lambda x, p: bridge.model.drift(x),
+        None,
+        lambda x, p: bridge.model.log_stationary(x) - constant,
+        reversible=True,
+        normalised=True,
+    )
+    return bridge._replace(model=model)
+
+
+@pytest.mark.parametrize(
+    "num_steps, scheme",
+    [
+        pytest.param(num_steps, scheme, marks=() if (num_steps, i) == (50, 0) else slow)
+        for num_steps in (20, 50, 100, 200, 400)
+        for i, scheme in enumerate((jb.Heun(), jb.SemiImplicit()))
+    ],
+    ids=str,
+)
+def test_muller_brown(num_steps, scheme):
+    """Steps that are too long for the walls of the wells are told, with few and with many."""
+    bridge = muller_brown()
+    coupling = jb.Coupling(0.0, scheme=scheme, start_law=jb.Stationary(4.0))
+    options = dict(num_steps=num_steps, proposal=coupling, max_trials=2_000)
+    ends = (bridge.model, bridge.start, bridge.end, bridge.duration)
+    estimate = jb.transition_log_density(jax.random.key(0), *ends, num_proposals=2_000, **options)
+    weighted = jb.sample_weighted_bridges(
+        jax.random.key(1), *ends, num_bridges=1_000, save_at=[bridge.duration / 2], **options
+    )
+    told = [density(estimate), *middles(weighted)]
+    for one, exact in zip(told, [bridge.log_density, *bridge.mean], strict=True):
+        assert_right(one, exact, 2e-3)
+    if num_steps == 20:
+        assert not any(one.trusted for one in told)
+    if num_steps == 400:
+        assert told[0].trusted
+
+
+# Rotation.
+
+
+@pytest.mark.parametrize(
+    "rate, speed, duration, num_steps",
+    [
+        (1.0, 2 * np.pi, 2.0, 50),
+        (0.1, 20.0, 2.0, 50),
+        pytest.param(0.5, 3.0, 5.0, 50, marks=slow),
+        pytest.param(1.0, 2 * np.pi, 5.0, 50, marks=slow),
+        pytest.param(0.5, 3.0, 10.0, 50, marks=slow),
+        pytest.param(0.1, 20.0, 2.0, 200, marks=slow),
+    ],
+)
+def test_rotation_by_auto(rate, speed, duration, num_steps):
+    """Weights of a linear process are nearly equal, and what is wrong is by the steps alone."""
+    model = jb.ornstein_uhlenbeck([[rate, speed], [-speed, rate]])
+    start, end = jnp.array([0.5, 0.2]), jnp.array([-0.4, 0.6])
+    exact = float(jb.ou_transition(model, start, duration).log_density(end))
+    estimate = jb.transition_log_density(
+        jax.random.key(0), model, start, end, duration, num_proposals=20_000,
+        num_steps=num_steps, proposal="auto",
+    )  # fmt: skip
+    off = abs(float(estimate.value) - exact)
+    assert off < 0.03 + 4 * float(estimate.standard_error) or not estimate.trustworthy
+    # A step error that is known is about right: more is told than a third of it.
+    told = abs(float(estimate.step_error)) + 2 * float(estimate.step_uncertainty)
+    assert off < 0.01 + 3 * told
+
+
+_TURN = np.array([[0.0, -1.0], [1.0, 0.0]], np.float32)
+_LOG_TOTAL = math.log(math.pi * math.sqrt(math.pi / 2))
+
+
+def superlinear_rotation():
+    """κ|x|²Jx - |x|²x, κ = 5, with ν ∝ exp(-|x|⁴/2), of which |x|² is half normal."""
+
+    def drift(x, speed):
+        return (x @ x) * (speed * (_TURN @ x) - x)
+
+    def sample(key, speed):
+        radius = jnp.sqrt(jnp.abs(jax.random.normal(key)))
+        angle = 2 * jnp.pi * jax.random.uniform(jax.random.fold_in(key, 1))
+        return radius * jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+
+    return jb.Diffusion(
+        drift,
+        None,
+        lambda x, speed: -((x @ x) ** 2) / 2 - _LOG_TOTAL,
+        5.0,
+        reverse_drift=lambda x, speed: drift(x, -speed),
+        sample_stationary=sample,
+        normalised=True,
+    )
+
+
+@pytest.mark.parametrize(
+    "num_steps", [5, pytest.param(10, marks=slow), pytest.param(50, marks=slow)]
+)
+def test_superlinear_rotation_is_finite_however_few_steps(num_steps):
+    """And less than any density of so short a time can be: no step density exceeds one."""
+    arguments = (jax.random.key(0), superlinear_rotation(), [0.5, 0.2], [-0.4, 0.6], 1.0)
+    law = jb.ItoTaylorDensity()
+    told = []
+    for proposal in [jb.ModifiedDiffusionBridge(law), jb.Coupling(0.0)]:
+        estimate = jb.transition_log_density(
+            *arguments, num_proposals=4_000, num_steps=num_steps, proposal=proposal,
+        )  # fmt: skip
+        assert np.isfinite(estimate.value) and estimate.value < 0.0
+        told.append(density(estimate))
+    for i, one in enumerate(told):
+        for other in told[:i]:
+            assert_agree(one, other)
+
+
+def test_no_burn_in_is_no_error_but_a_warning():
+    """Where none is found, what rests on it is cut off."""
+    given = superlinear_rotation()
+    model = jb.Diffusion(
+        given._drift,
+        None,
+        given._log_stationary,
+        5.0,
+        reverse_drift=given._reverse_drift,
+        normalised=True,
+    )
+    arguments = (jax.random.key(0), model, [0.5, 0.2], [-0.4, 0.6], 1.0)
+    choice = jb.choose_proposal(*arguments, num_steps=5, candidates=[jb.Coupling(0.0)])
+    assert choice.candidates[0].coupling.start_law.burn_in == np.inf
+    estimate = jb.transition_log_density(
+        *arguments, num_steps=5, num_proposals=100, proposal=choice
+    )
+    assert not estimate.trustworthy
+
+
+def test_one_path_beyond_all_others_does_not_hide_the_uncertainty():
+    """A path of next to no weight, which half as many steps make e⁶⁰ times as likely."""
+    log_weights = jnp.zeros(200).at[0].set(-60.0)
+    log_halving = jnp.linspace(-0.3, 0.3, 200).at[0].set(60.0)
+    made = of_log_mean(log_weights, log_halving, jnp.float32(1.0))
+    change = np.exp(np.asarray(log_halving[1:], float)).sum() / 199 + 1 / 199
+    np.testing.assert_allclose(made.value, np.log(change), rtol=1e-3)
+    assert 0.01 < made.uncertainty < 0.03
+
+
+# Weights of heavy tails, and an unknown σ: Cox, Ingersoll and Ross.
+
+
+def cir_log_densities(coordinates, params, proposal, num_steps=100, num_proposals=300):
+    """Of all intervals, and the exact ones."""
+    times, observations = cir.data()
+    if coordinates == "raw":
+        model, data, added = cir.model(params), observations, 0.0
+    else:
+        moved = {"roots": cir.in_roots, "logarithms": cir.in_logarithms}[coordinates](params)
+        model, data = moved.model, moved.forward(observations)
+        added = np.asarray(moved.log_jacobian(observations[1:]), float)
+    gaps = np.diff(times)
+    estimate = jb.transition_log_density(
+        jax.random.key(3), model, data[:-1], data[1:], gaps, num_steps=num_steps,
+        num_proposals=num_proposals, proposal=proposal,
+    )  # fmt: skip
+    exact = cir.log_density(params, observations[:-1, 0], observations[1:, 0], gaps)
+    return estimate, np.asarray(estimate.value, float) + added - exact
+
+
+_ITO_TAYLOR, _EULER = jb.ItoTaylorDensity(), jb.EulerDensity()
+
+
+@pytest.mark.parametrize(
+    "coordinates, proposal, which",
+    [
+        ("roots", jb.ModifiedDiffusionBridge(_ITO_TAYLOR), [4]),
+        pytest.param("roots", jb.ModifiedDiffusionBridge(_ITO_TAYLOR), [0, 1, 2, 3], marks=slow),
+        pytest.param("roots", jb.Guided("end", _ITO_TAYLOR), [0, 1, 2, 3, 4], marks=slow),
+        pytest.param("logarithms", jb.ModifiedDiffusionBridge(_EULER), [0, 2, 4], marks=slow),
+        pytest.param("raw", jb.ModifiedDiffusionBridge(_EULER), [0, 2, 4], marks=slow),
+    ],
+    ids=[
+        "roots, modified",
+        "roots, more",
+        "roots, guided",
+        "logarithms, modified",
+        "raw, modified",
+    ],
+)
+def test_no_likelihood_runs_away_along_the_ridge(coordinates, proposal, which):
+    """Where the process touches zero the drift of √X is singular: interval by interval, and in all,
+    what has no warning is right, and what has one is not far too large."""
+    times, observations = cir.data()
+    points, _ = cir.ridge(times, observations)
+    for params in points[which]:
+        estimate, off = cir_log_densities(coordinates, params, proposal)
+        told = np.abs(estimate.step_error) + 2 * estimate.step_uncertainty
+        error, trusted = np.asarray(estimate.standard_error, float), estimate.trustworthy
+        assert np.all(np.abs(off) < 4.5 * error + told, where=trusted)
+        total = np.sum(off, where=trusted)
+        variance = np.sum(error**2, where=trusted)
+        assert abs(total) < 4 * np.sqrt(variance) + np.sum(told, where=trusted)
+        assert off.sum() < 1 and off.max() < 0.5
+        assert trusted.sum() > (230 if coordinates == "roots" else 100)
+
+
+def test_heavy_tails_are_told_and_auto_takes_another():
+    """In logarithms σ(x) is large near zero, where a guide with that of the end pulls too hard: of
+    the paths that stay there one has a weight of all others together."""
+    times, observations = cir.data()
+    i, params = 149, cir.ridge(times, observations)[0][0]
+    start, end = np.log(observations[i]), np.log(observations[i + 1])
+    gap = np.diff(times)[i]
+    exact = cir.log_density(params, *observations[[i, i + 1], 0], gap) + end[0]
+    arguments = (jax.random.key(1), cir.in_logarithms(params).model, start, end, gap)
+    options = dict(num_proposals=4_000, num_steps=50)
+    guided = jb.transition_log_density(*arguments, **options, proposal=jb.Guided())
+    assert guided.pareto_k > 0.7 and not guided.trustworthy
+    assert abs(float(guided.value) - exact) > 4.5 * float(guided.standard_error)
+    with pytest.raises(Exception, match="tails so heavy"):
+        thrown = jb.transition_log_density(*arguments, **options, proposal=jb.Guided(), throw=True)
+        jax.block_until_ready(thrown.value)
+    candidates = [jb.Guided(), jb.ModifiedDiffusionBridge()]
+    chosen = jb.choose_proposal(*arguments, num_steps=50, candidates=candidates, num_pilot=4_000)
+    assert int(chosen.chosen[0]) == 1
+    other = jb.transition_log_density(*arguments, **options, proposal="auto")
+    assert other.pareto_k < 0.7 and abs(float(other.value) - exact) < 0.15
+
+
+@slow
+def test_unknown_sigma_of_cox_ingersoll_and_ross():
+    """All three parameters, by Euler's target, of first order, against the exact maximum."""
+    times, observations = cir.data()
+    fit = cir.fit(times, observations)
+    made = jb.maximum_likelihood(
+        jax.random.key(0),
+        cir.model(),
+        times,
+        observations,
+        num_iterations=200,
+        num_bridges=1_000,
+        num_steps=150,
+        proposal=jb.ModifiedDiffusionBridge(),
+        constraint=lambda params: jnp.all(jnp.stack(params) > 0),
+    )
+    assert made.newton and made.num_missing == 0
+    np.testing.assert_array_less(np.abs(made.theta - fit.params), 0.2 * fit.sd)
+    np.testing.assert_allclose(np.array(made.standard_errors), fit.sd, rtol=0.08)
+
+
+def test_unknown_sigma_is_refused_in_coordinates_that_move_with_it():
+    """Observations were mapped by a σ that is fixed."""
+    times, observations = cir.data()
+    moved = cir.in_roots()
+    arguments = (jax.random.key(0), moved.model, times, moved.forward(observations))
+    calls = [
+        lambda: jb.maximum_likelihood(*arguments),
+        lambda: jb.score(*arguments),
+        lambda: jb.gibbs(*arguments, num_samples=2),
+        lambda: jb.pmmh(*arguments, num_samples=2),
+    ]
+    for call in calls:
+        with pytest.raises(ValueError, match=r"coordinates of `lamperti` depend.*original"):
+            call()
