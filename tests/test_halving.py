@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from helpers import FULL_SIGMA, NON_REVERSIBLE
 from scipy.stats import multivariate_normal
-from test_step_density import DENSITIES, FROM, TO, log_density_of_chain
+from test_step_density import DENSITIES, FROM, TO, log_density_of_chain, quadrature
 
 import jaxbridge as jb
 from jaxbridge.guided import noise_of, path_of
@@ -66,7 +66,7 @@ def test_mean_is_that_of_half_as_many_steps(case, refinement):
     """Of the weight, and of the mid-point, against paths of half as many steps."""
     model, density, spread = case
     start, end = [-0.3], [1.0]
-    size = 40_000
+    size = 40_000 if model is VARYING else 160_000
     fine, coarse = (
         weighted_paths(model, start, end, size, n, density, n, refinement=refinement)
         for n in (16, 8)
@@ -82,6 +82,20 @@ def test_mean_is_that_of_half_as_many_steps(case, refinement):
     error = np.linalg.norm(w * (x - mean)) / w.sum()
     error = np.hypot(error, np.linalg.norm(other * (y - other_mean)) / other.sum())
     assert abs(mean - other_mean) < 5 * error < 0.2
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_factor_is_that_of_quadrature(case, x64):
+    """The weighted mean of e^D, which is the quotient of the densities of the two chains."""
+    model, density, _ = case
+    nodes = np.linspace(-5, 5, 401) if model is VARYING else np.linspace(-3.5, 3.5, 351)
+    fine, coarse = (quadrature(density, model, [-0.3], [1.0], 1.0, n, nodes) for n in (16, 8))
+    weighted = weighted_paths(model, [-0.3], [1.0], 160_000, 16, density)
+    known = ~np.isnan(weighted.log_halving)
+    w, D = np.exp(weighted.log_weights[known]), np.asarray(weighted.log_halving)[known]
+    w, factor = w / w.sum(), np.exp(D - (coarse - fine))
+    error = np.linalg.norm(w * (factor - w @ factor))
+    assert abs(w @ factor - 1) < 5 * error < 0.04
 
 
 @pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
