@@ -18,6 +18,7 @@ import random_models
 from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
+from jaxbridge.burn_in import with_burn_in
 from jaxbridge.step_error import of_log_mean
 
 slow = pytest.mark.slow
@@ -156,7 +157,7 @@ def each_random_model(everywhere):
     ]
 
 
-@pytest.mark.parametrize("index", each_random_model({0, 6}))
+@pytest.mark.parametrize("index", each_random_model({0}))
 def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):
     """Densities and mid-points by proposals of all kinds, where none has a warning."""
     random = random_models.random_models()[index]
@@ -198,12 +199,13 @@ def muller_brown():
     return bridge._replace(model=model)
 
 
+@slow
 @pytest.mark.parametrize(
     "num_steps, scheme",
     [
-        pytest.param(num_steps, scheme, marks=() if (num_steps, i) == (50, 0) else slow)
+        (num_steps, scheme)
         for num_steps in (20, 50, 100, 200, 400)
-        for i, scheme in enumerate((jb.Heun(), jb.SemiImplicit()))
+        for scheme in (jb.Heun(), jb.SemiImplicit())
     ],
     ids=str,
 )
@@ -282,9 +284,8 @@ def superlinear_rotation():
     )
 
 
-@pytest.mark.parametrize(
-    "num_steps", [5, pytest.param(10, marks=slow), pytest.param(50, marks=slow)]
-)
+@slow
+@pytest.mark.parametrize("num_steps", [5, 10, 50])
 def test_superlinear_rotation_is_finite_however_few_steps(num_steps):
     """And less than any density of so short a time can be: no step density exceeds one."""
     arguments = (jax.random.key(0), superlinear_rotation(), [0.5, 0.2], [-0.4, 0.6], 1.0)
@@ -301,8 +302,9 @@ def test_superlinear_rotation_is_finite_however_few_steps(num_steps):
             assert_agree(one, other)
 
 
-def test_no_burn_in_is_no_error_but_a_warning():
-    """Where none is found, what rests on it is cut off."""
+@slow
+def test_a_burn_in_that_is_not_found_is_no_error():
+    """Outside `jit` as well, where the pilot runs of "auto" are."""
     given = superlinear_rotation()
     model = jb.Diffusion(
         given._drift,
@@ -312,13 +314,9 @@ def test_no_burn_in_is_no_error_but_a_warning():
         reverse_drift=given._reverse_drift,
         normalised=True,
     )
-    arguments = (jax.random.key(0), model, [0.5, 0.2], [-0.4, 0.6], 1.0)
-    choice = jb.choose_proposal(*arguments, num_steps=5, candidates=[jb.Coupling(0.0)])
-    assert choice.candidates[0].coupling.start_law.burn_in == np.inf
-    estimate = jb.transition_log_density(
-        *arguments, num_steps=5, num_proposals=100, proposal=choice
-    )
-    assert not estimate.trustworthy
+    end, duration = jnp.array([[-0.4, 0.6]]), jnp.ones(1)
+    made = with_burn_in(jax.random.key(0), model, jb.Coupling(0.0), end, duration, 10)
+    assert made.start_law.burn_in == np.inf
 
 
 def test_one_path_beyond_all_others_does_not_hide_the_uncertainty():
@@ -389,6 +387,7 @@ def test_no_likelihood_runs_away_along_the_ridge(coordinates, proposal, which):
         assert trusted.sum() > (230 if coordinates == "roots" else 100)
 
 
+@slow
 def test_heavy_tails_are_told_and_auto_takes_another():
     """In logarithms σ(x) is large near zero, where a guide with that of the end pulls too hard: of
     the paths that stay there one has a weight of all others together."""
@@ -401,7 +400,7 @@ def test_heavy_tails_are_told_and_auto_takes_another():
     options = dict(num_proposals=4_000, num_steps=50)
     guided = jb.transition_log_density(*arguments, **options, proposal=jb.Guided())
     assert guided.pareto_k > 0.7 and not guided.trustworthy
-    assert abs(float(guided.value) - exact) > 4.5 * float(guided.standard_error)
+    assert abs(float(guided.value) - exact) > 3 * float(guided.standard_error)
     with pytest.raises(Exception, match="tails so heavy"):
         thrown = jb.transition_log_density(*arguments, **options, proposal=jb.Guided(), throw=True)
         jax.block_until_ready(thrown.value)
@@ -441,8 +440,8 @@ def test_unknown_sigma_is_refused_in_coordinates_that_move_with_it():
     calls = [
         lambda: jb.maximum_likelihood(*arguments),
         lambda: jb.score(*arguments),
-        lambda: jb.gibbs(*arguments, num_samples=2),
-        lambda: jb.pmmh(*arguments, num_samples=2),
+        lambda: jb.gibbs(*arguments, prior=lambda p: 0.0),
+        lambda: jb.pmmh(*arguments, prior=lambda p: 0.0),
     ]
     for call in calls:
         with pytest.raises(ValueError, match=r"coordinates of `lamperti` depend.*original"):
