@@ -25,12 +25,11 @@ from .averages import (
 )
 from .bridges import Bridges
 from .choice import as_proposal, settled, uses_couplings
-from .coupled_pairs import CoupledPairs, check_density, pair_log_weights, step_law_of, usable
+from .coupled_pairs import CoupledPairs, check_density, pair_log_weights, usable
 from .coupling import AbstractCoupling
 from .diffusion import Diffusion, check_diffusion
 from .exact_bridges import AbstractExactBridges
 from .grid import grid_times, stored_steps
-from .halving import log_halving_of_paths
 from .hitting import check_max_trials, counts_of, coupling_of, durations_of
 from .intervals import Intervals, as_intervals, check_count, check_key
 from .pareto import is_reliable, pareto_k
@@ -225,7 +224,11 @@ def _weigh_bridges(key, model, pairs, bridges, budget):
         counts.mean.reshape(-1),
     ).reshape(shape)
     log_weights, unusable = usable(log_weights, bridges.met)
-    log_halving, share = _halving_of_bridges(model, coupling, bridges)
+    paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
+    intervals = Intervals(paths[:, 0], paths[:, -1], durations_of(bridges))
+    prepared = model.prepared()
+    log_halving = pairs.log_halving(prepared, intervals, paths, shape[-1]).reshape(shape)
+    share = pairs.step_share(prepared, intervals).reshape(shape)[..., 0]
     num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)
     num_nonfinite = jnp.sum(counts.num_nonfinite, axis=-1, dtype=jnp.int32)
     return WeightedBridges(
@@ -241,20 +244,6 @@ def _weigh_bridges(key, model, pairs, bridges, budget):
         step_share=share,
         num_steps=bridges.num_steps,
     )
-
-
-def _halving_of_bridges(
-    model: Diffusion, coupling: AbstractCoupling, bridges: Bridges
-) -> tuple[Float[Array, "*I n"], Float[Array, "*I"]]:
-    """D of all bridges, and the share of the step error."""
-    model = model.prepared()
-    shape, paths = bridges.met.shape, bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
-    dynamics = model.forward(paths[0, 0])
-    density, share = step_law_of(coupling.scheme, dynamics)
-    steps = durations_of(bridges) / bridges.num_steps
-    dt = jnp.broadcast_to(steps, (bridges.num_steps, len(paths)))
-    log_halving = log_halving_of_paths(density, dynamics, dt, paths).reshape(shape)
-    return log_halving, jnp.full(shape[:-1], share, paths.dtype)
 
 
 def sample_weighted_bridges(
