@@ -106,7 +106,8 @@ class WeightedBridges(AbstractExactBridges):
             mean, each = weighted_mean(weights, value), expanded(weights, value)
             deviation = value - jnp.expand_dims(mean, axis)
             squares = jnp.where(each > 0, (each * deviation) ** 2, 0)
-            whole = jnp.where(expanded(cut, mean), jnp.inf, jnp.sqrt(jnp.sum(squares, axis)))
+            lost = cut.reshape(*cut.shape, *[1] * (mean.ndim - cut.ndim))
+            whole = jnp.where(lost, jnp.inf, jnp.sqrt(jnp.sum(squares, axis)))
             return jnp.where(jnp.isnan(mean), jnp.nan, whole)
 
         return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))

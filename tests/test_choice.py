@@ -19,7 +19,7 @@ def mixed_choice(model, num_intervals):
     """Proposals in turn, whatever is best."""
     proposals = tuple(as_proposal(candidate, model, jnp.zeros(2)) for candidate in CANDIDATES)
     chosen = jnp.arange(num_intervals, dtype=jnp.int32) % 3
-    return Choice(proposals, None, None, chosen, None, (0, 1, 2))
+    return Choice(proposals, None, None, None, None, chosen, None, (0, 1, 2))
 
 
 @slow
@@ -229,7 +229,7 @@ NUM = 6
 def pulled_choice():
     """Three proposals in turn, of which two are used."""
     chosen = jnp.array([0, 2, 0, 0, 2, 2], jnp.int32)
-    return Choice(tuple(PULLED), None, None, chosen, None, (0, 2))
+    return Choice(tuple(PULLED), None, None, None, None, chosen, None, (0, 2))
 
 
 def pulled_setting():
@@ -304,7 +304,9 @@ def test_what_a_proposal_makes_of_another_ones_interval_does_not_spoil_derivativ
     model = jb.Diffusion(lambda x, p: -p * x**5, params=1.0)
     starts, ends = jnp.array([[0.0], [6.0]]), jnp.array([[0.3], [6.1]])
     guided, bridge = jb.Guided("path"), jb.ModifiedDiffusionBridge()
-    choice = Choice((bridge, guided), None, None, jnp.array([1, 0], jnp.int32), None, (0, 1))
+    choice = Choice(
+        (bridge, guided), None, None, None, None, jnp.array([1, 0], jnp.int32), None, (0, 1)
+    )
 
     def first(params, proposal):
         return jb.transition_log_density(
