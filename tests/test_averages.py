@@ -24,6 +24,9 @@ def chain_of(paths):
         num_nonfinite=counts,
         num_truncated=counts,
         proposal=jb.ModifiedDiffusionBridge(),
+        pareto_k=None,
+        log_halving=jnp.zeros(met.shape, paths.dtype),
+        step_share=jnp.ones(paths.shape[:-3], paths.dtype),
         num_steps=paths.shape[-2] - 1,
     )
 
@@ -76,6 +79,8 @@ def test_values_without_weight_may_be_anything():
         num_simulated=jnp.int32(3),
         num_nonfinite=jnp.int32(0),
         proposal=jb.ModifiedDiffusionBridge(),
+        log_halving=jnp.zeros(3),
+        step_share=jnp.ones(()),
         num_steps=1,
     )
     log = lambda path: jnp.log(path[0, 0])  # NaN for the last

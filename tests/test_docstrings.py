@@ -38,7 +38,7 @@ RESULTS = {
     "WorkPrecision": ["work_precision"],
 }
 # What classes of one's own are given.
-GIVEN = {"Frame", "PairStep", "Step", "StepLaw"}
+GIVEN = {"Frame", "PairStep", "Step", "StepLaw", "StepsFrom", "LinearStep"}
 WITHOUT_EXAMPLE = {
     *RESULTS,
     *GIVEN,
