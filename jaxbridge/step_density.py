@@ -76,8 +76,8 @@ class StepLaw(NamedTuple):
 
 
 class LinearStep(NamedTuple):
-    """A step of dX = [c + F X] dt + σ dW: x' ~ N(`decay` x + `integral` c, `covariance`), matrices of
-    shape (d, d)."""
+    """A step of dX = [c + F X] dt + σ dW: x' ~ N(`decay` x + `integral` c, `covariance`), with
+    matrices of shape (d, d)."""
 
     decay: Float[Array, "d d"]
     integral: Float[Array, "d d"]
