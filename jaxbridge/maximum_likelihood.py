@@ -34,6 +34,7 @@ from .intervals import check_count
 from .likelihood import Form
 from .linalg import any_solve
 from .parameter_steps import CompleteData, quadratic_form
+from .pareto import is_reliable
 from .parts import target_forms
 from .problem import Problem, as_problem
 from .score import Score, score
@@ -101,6 +102,13 @@ class MaximumLikelihood(eqx.Module):
     num_truncated: Int[Array, ""]
     num_refused: Int[Array, ""]
     newton: Bool[Array, ""]
+
+    @property
+    def trustworthy(self) -> Bool[Array, ""]:
+        """Whether a maximum was found, by weights of no interval that a few large ones decide (k̂
+        below 0.7, five effective ones), and with a step error that does not dominate."""
+        weights = is_reliable(self.score.pareto_k, self.score.effective_sample_size)
+        return self.newton & jnp.all(weights) & ~jnp.any(self.step_error_dominates)
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:

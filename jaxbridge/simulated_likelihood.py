@@ -40,6 +40,8 @@ from .unknowns import Constraint, Unknowns, allowed
 
 # Paths of each interval for a noisy gradient.
 _FEW = 8
+# Less than rounding leaves of a sum, in logarithms.
+_NO_WEIGHT = -60.0
 # Newton's method has arrived where the square of the next step, in standard errors, is less.
 _GAIN = 1e-5
 # A Monte Carlo error of more, in standard errors, is too much for a maximum.
@@ -150,12 +152,15 @@ def _split(part: Part) -> tuple[Part, ...]:
 def _log_weights(
     key: Key[Array, ""], unknowns: Unknowns, part: Part, num_paths: int, theta: Float[Array, " p"]
 ) -> tuple[Float[Array, "I n"], Bool[Array, "I n"]]:
-    """log w at θ of the paths with this noise, zero for those that were lost; and which are not."""
+    """log w at θ of the paths with this noise, zero for those that were lost or have no weight beside
+    others, for where a path nearly overflows its derivatives do; and which are not."""
     keys = jax.random.split(key, (part.intervals.start.shape[0], num_paths))
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
     model = unknowns.at(theta).prepared()
     drawn = part.proposal.draw(keys, model, part.intervals, part.num_steps, nothing, True)
-    return jnp.where(drawn.found, drawn.log_weights, 0), drawn.found
+    largest = jnp.max(drawn.log_weights, axis=1, keepdims=True)
+    found = drawn.found & (drawn.log_weights > largest + _NO_WEIGHT)
+    return jnp.where(found, drawn.log_weights, 0), found
 
 
 def _log_densities(

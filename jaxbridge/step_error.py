@@ -18,8 +18,8 @@ from jaxtyping import Array, Bool, Float, Inexact
 
 from .averages import effective_size, expanded, normalised, weighted_mean
 
-# Fewer effective paths than this share of those without e^D tell nothing.
-_LEAST_OVERLAP = 0.1
+# Fewer effective paths than this, or than this share of those without e^D, tell nothing.
+_FEWEST_EFFECTIVE, _LEAST_OVERLAP = 5, 0.1
 # Where steps are so long, in standard deviations or in log p, more paths do not help.
 _GROSS = 0.1
 
@@ -103,8 +103,10 @@ def share_of_order(order: int) -> float:
 
 
 def _overlap(weights: Float[Array, "*I n"], coarse: Float[Array, "*I n"]) -> Bool[Array, "*I"]:
-    """Whether many of the paths have weight under both laws."""
-    return effective_size(coarse) >= _LEAST_OVERLAP * effective_size(weights)
+    """Whether many of the paths have weight under both laws, and there are many at all: one alone
+    would have no uncertainty."""
+    size = effective_size(weights)
+    return (effective_size(coarse) >= _LEAST_OVERLAP * size) & (size >= _FEWEST_EFFECTIVE)
 
 
 def _known(
