@@ -152,8 +152,8 @@ def _split(part: Part) -> tuple[Part, ...]:
 def _log_weights(
     key: Key[Array, ""], unknowns: Unknowns, part: Part, num_paths: int, theta: Float[Array, " p"]
 ) -> tuple[Float[Array, "I n"], Bool[Array, "I n"]]:
-    """log w at θ of the paths with this noise, zero for those that were lost or have no weight beside
-    others, for where a path nearly overflows its derivatives do; and which are not."""
+    """log w at θ of the paths with this noise, zero for those that were lost, or have no weight
+    beside others, for where a path nearly overflows its derivatives do; and which are not."""
     keys = jax.random.split(key, (part.intervals.start.shape[0], num_paths))
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
     model = unknowns.at(theta).prepared()
