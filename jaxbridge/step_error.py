@@ -93,8 +93,9 @@ def dominates(error: StepError, standard_error: Inexact[Array, "..."]) -> Bool[A
 
 def is_gross(error: StepError) -> Bool[Array, "..."]:
     """Whether a step error, of a log or in standard deviations, is large, whatever the number of
-    paths."""
-    return ~(jnp.abs(error.value) <= _GROSS + 2 * error.uncertainty)
+    paths. Where the uncertainty is infinite the size alone decides, or no error would be large."""
+    doubt = jnp.where(jnp.isinf(error.uncertainty), 0, error.uncertainty)
+    return ~(jnp.abs(error.value) <= _GROSS + 2 * doubt)
 
 
 def share_of_order(order: int) -> float:

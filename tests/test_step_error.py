@@ -128,7 +128,14 @@ def test_when_step_errors_dominate(value, uncertainty, standard_error, expected)
 
 @pytest.mark.parametrize(
     "value, uncertainty, expected",
-    [(0.05, 0.0, False), (-0.2, 0.0, True), (0.2, 0.1, False), (np.nan, np.nan, True)],
+    [
+        (0.05, 0.0, False),
+        (-0.2, 0.0, True),
+        (0.2, 0.1, False),
+        (0.2, np.inf, True),
+        (0.05, np.inf, False),
+        (np.nan, np.nan, True),
+    ],
 )
 def test_when_step_errors_are_gross(value, uncertainty, expected):
     assert bool(is_gross(StepError(jnp.asarray(value), jnp.asarray(uncertainty)))) is expected
