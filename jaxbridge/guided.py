@@ -2,22 +2,22 @@
 
 On a grid 0 = t_0 < ... < t_N = T with steps δ_i the target is a chain (`step_density`) of steps
 
-    x_{i+1} = μ_i + √δ_i R_i y_i,    R_i = σ(x_i) L(x_i),    y_i ~ N(0, I);
+    x_{i+1} ~ N(μ_i, δ_i σ(x_i) S_i σ(x_i)ᵀ);
 
-the Euler scheme has μ_i = x_i + α(x_i) δ_i and L = I. A proposal goes the same steps with
-y_i ~ N(m_i, C_i), which may depend on x_i, and x_N = b. Its weight is the density of the path under
-the target over that under the proposal,
+the Euler scheme has μ_i = x_i + α(x_i) δ_i and S = I. A proposal goes steps of another normal law
+q_i(x_{i+1}| x_i) with the same σ, and x_N = b. Its weight is the density of the path under the
+target over that under the proposal,
 
-    w = N(b; μ_{N-1}, R Rᵀ δ_{N-1}) Π_{i<N-1} N(y_i; 0, I) / N(y_i; m_i, C_i),
+    w = p_{N-1}(b| x_{N-1}) Π_{i<N-1} p_i(x_{i+1}| x_i) / q_i(x_{i+1}| x_i),
 
 so E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b] for the target without any further error, and for the
 diffusion up to the target's step error, O(δ), or O(δ²) by `ItoTaylorDensity`. No stationary law is
 called for.
 
-m and C follow from a guess h_{i+1}(x) of the density of b seen from x at t_{i+1}. Where log h
-is quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting N(0, I) by h gives
+q follows from a guess h_{i+1}(x) of the density of b seen from x at t_{i+1}. Where log h is
+quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting the target's step by h gives
 
-    C = (I + δ Rᵀ H̃ R)⁻¹,    m = √δ C Rᵀ r̃
+    q_i = N(μ_i + δ σ C σᵀ r̃, δ σ C σᵀ),    C = S (I + δ σᵀ H̃ σ S)⁻¹
 
 (r̃ and H̃ as in Schauer, van der Meulen & van Zanten 2017; the discrete form as in Whitaker,
 Golightly, Boys & Sherlock 2017). With the true density in the place of h this is Doob's
@@ -37,18 +37,10 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from .arrays import Numbers, as_floating, is_traced
 from .devices import num_devices
 from .diffusion import Diffusion, Dynamics
-from .halving import (
-    Opened,
-    Pairing,
-    close_pair,
-    num_looked,
-    of_all_steps,
-    open_pair,
-    pair_up,
-)
+from .halving import num_looked, of_all_steps, of_pair
 from .intervals import Intervals, check_model
 from .lanes import join_rows, over_lanes, split_rows
-from .linalg import all_finite, cholesky, inverse, matmul, matvec
+from .linalg import all_finite, inverse, matmul, matvec
 from .noise import Store, noisy_scan
 from .schemes import Euler
 from .search import most_lanes
@@ -347,10 +339,12 @@ class Guided(AbstractGuidedProposal):
         shift, H = step.guide
         r = shift - matvec(H, target.mean - step.end)
         columns = jax.vmap(target.pulled_back, in_axes=1, out_axes=1)(H)
-        C = inverse(jnp.eye(x.shape[0], dtype=x.dtype) + jax.vmap(target.pulled_back)(columns))
-        root, bend = cholesky((C + C.T) / 2), matvec(C, target.pulled_back(r))
-        root = target.root * root if target.root.ndim == 0 else matmul(target.root, root)
-        return target._replace(mean=target.point(bend), root=root)
+        K, S = jax.vmap(target.pulled_back)(columns), target.covariance
+        S = S * jnp.eye(x.shape[0], dtype=x.dtype) if S.ndim == 0 else S
+        C = matmul(S, inverse(jnp.eye(x.shape[0], dtype=x.dtype) + matmul(K, S)))
+        C = (C + C.T) / 2
+        bend = target.pushed_forward(matvec(C, target.pulled_back(r)))
+        return target._replace(mean=target.mean + bend, covariance=C)
 
     def _linear(self, dynamics: Dynamics, x: Float[Array, " d"], end: Float[Array, " d"]):
         """F, the linear drift at b, and Ṽ, when the diffusion is linearised at x."""
@@ -361,23 +355,30 @@ class Guided(AbstractGuidedProposal):
 
 
 class _Steps(NamedTuple):
-    """What changes from step to step, for a scan: the fields of `Step`, and the pairs of
-    `halving`."""
+    """What changes from step to step, for a scan: the fields of `Step`; and for `halving` the
+    length of the step before, and whether the two are a pair."""
 
     guide: PyTree
     dt: Float[Array, "*steps I"]
     remaining: Float[Array, "*steps I"]
-    pairing: Pairing
+    before: Float[Array, "*steps I"]
+    ends_pair: Bool[Array, "*steps"]
 
 
 class _State(NamedTuple):
-    """The point where a path is and its log weight so far; for some of the paths D of `halving`
-    so far, with the step before, which may have opened a pair."""
+    """The point where a path is, and its log densities so far under the target and under the
+    proposal; for some of the paths the point before, and D of `halving` so far.
+
+    The two are summed apart because XLA's CPU compiler (JAX 0.10.2) does not vectorise a sum in
+    place that reads a slice of the loop's inputs, as the noise is, and the target's takes most of
+    the work.
+    """
 
     x: Float[Array, "d *lanes"]
-    log_weight: Float[Array, "*lanes"]
+    log_target: Float[Array, "*lanes"]
+    log_proposal: Float[Array, "*lanes"]
+    before: Float[Array, "d *looked"]
     log_halving: Float[Array, "*looked"]
-    opened: Opened
 
 
 class _Lanes:
@@ -403,7 +404,7 @@ class _Lanes:
         self._num_looked = num_looked(num_draws, dynamics.sigma_varies)
         self._of_lane = None if start.shape[0] == 1 else -1
         self.start, self.end = start.T, end.T
-        each = (dt, remaining, pair_up(dt))
+        each = (dt, remaining, jnp.roll(dt, 1, axis=0), jnp.arange(num_steps) % 2 == 1)
         self.steps = _Steps(guide, *jax.tree.map(lambda leaf: leaf[:-1], each))
         self._last = _Steps(None, *jax.tree.map(lambda leaf: leaf[-1], each))
         self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.density
@@ -415,28 +416,22 @@ class _Lanes:
     def begin(self) -> _State:
         """Paths at their start, with weight one."""
         start = self.spread(self.start)
-
-        def open_none(x):  # as a pair that is never closed
-            zero = jnp.zeros((), x.dtype)
-            steps, one = self._density.steps_from(self._dynamics, x), jnp.ones((), x.dtype)
-            return zero, open_pair(self._dynamics, x, steps, one, one)
-
-        log_halving, opened = over_lanes(-1)(open_none)(self._looked(start))
-        return _State(start, jnp.zeros_like(start[0]), log_halving, opened)
+        some, zero = self._looked(start), jnp.zeros_like(start[0])
+        return _State(start, zero, zero, some, jnp.zeros_like(some[0]))
 
     def advance(self, state: _State, xi: Float[Array, "d lanes"], steps: _Steps) -> _State:
-        """One step with the noise ξ, and the weight with its factor."""
+        """One step with the noise ξ, and the densities with their factors."""
 
         def one(state, xi, step):
             steps = self._density.steps_from(self._dynamics, state.x)
             target = steps.law(step.dt)
             law = self._proposal.step_law(step, state.x, target)
             x_next = law.point(xi)
-            return x_next, self._log_weight(target, law, x_next, xi)
+            return x_next, self._log_densities(target, law, x_next, xi)
 
         each = (-1, -1, self._of_lane)
-        x_next, log_weight = over_lanes(*each)(one)(state, xi, self._of_each(self._step(steps)))
-        return self._moved(state, x_next, log_weight, steps)
+        x_next, log_densities = over_lanes(*each)(one)(state, xi, self._of_each(self._step(steps)))
+        return self._moved(state, x_next, log_densities, steps)
 
     def retrace(
         self, state: _State, x_next: Float[Array, "d lanes"], steps: _Steps
@@ -448,11 +443,11 @@ class _Lanes:
             target = steps.law(step.dt)
             law = self._proposal.step_law(step, state.x, target)
             xi = law.noise(x_next)
-            return xi, self._log_weight(target, law, x_next, xi)
+            return xi, self._log_densities(target, law, x_next, xi)
 
         each = (-1, -1, self._of_lane)
-        xi, log_weight = over_lanes(*each)(one)(state, x_next, self._of_each(self._step(steps)))
-        return self._moved(state, x_next, log_weight, steps), xi
+        xi, log_densities = over_lanes(*each)(one)(state, x_next, self._of_each(self._step(steps)))
+        return self._moved(state, x_next, log_densities, steps), xi
 
     def finish(self, state: _State) -> tuple[Float[Array, " lanes"], Float[Array, "I m"]]:
         """The log weights with that of the last step, to b, and D of the paths that are looked
@@ -467,11 +462,12 @@ class _Lanes:
             return jnp.where(inside, log_density, jnp.nan)
 
         last = self._of_each((self.end, self._last.dt))
-        log_weight = over_lanes(-1, self._of_lane)(one)(state.x, last)
+        log_density = over_lanes(-1, self._of_lane)(one)(state.x, last)
         end = self.spread(self.end)
-        state = self._moved(state, end, log_weight, self._last)
+        state = self._moved(state, end, (log_density, jnp.zeros_like(log_density)), self._last)
         log_halving = of_all_steps(state.log_halving, self._num_steps)
-        return state.log_weight, log_halving.reshape(-1, self._num_looked)
+        log_weights = state.log_target - state.log_proposal
+        return log_weights, log_halving.reshape(-1, self._num_looked)
 
     def _step(self, steps: _Steps) -> Step:
         return Step(steps.guide, steps.dt, steps.remaining, self.end)
@@ -488,30 +484,30 @@ class _Lanes:
         return leaf.reshape(*leaf.shape[:-2], -1)
 
     @staticmethod
-    def _log_weight(target: StepLaw, law: StepLaw, point, xi) -> Float[Array, ""]:
-        return target.log_relative(target.noise(point)) - law.log_relative(xi)
+    def _log_densities(target: StepLaw, law: StepLaw, point, xi):
+        return target.log_relative(point), law.log_relative_of_noise(xi)
 
-    def _moved(self, state: _State, x_next, log_weight, steps: _Steps) -> _State:
-        """The state at x_next, given the weight of the step."""
-        density, dynamics = self._density, self._dynamics
+    def _moved(self, state: _State, x_next, log_densities, steps: _Steps) -> _State:
+        """The state at x_next, given the log densities of the step."""
+        here, there = self._looked(state.x), self._looked(x_next)
 
-        def one(opened, x, x_next, dt, pairing):
-            steps, both = density.steps_from(dynamics, x), (pairing.before, dt)
-            change = close_pair(dynamics, opened, x, x_next, both, steps.law(dt))
-            change = jnp.where(pairing.ends, change, 0)
-            return change, open_pair(dynamics, x, steps, dt, pairing.after)
+        def one(before, x, x_next, dt_before, dt):
+            points, both = (before, x, x_next), (dt_before, dt)
+            return of_pair(self._density, self._dynamics, points, both)
 
-        of_intervals = (steps.dt, steps.pairing)
-        if self._of_lane is None:
-            of_intervals = self._of_each(of_intervals)
-        else:
-            repeat = lambda leaf: jnp.repeat(leaf, self._num_looked, axis=-1)
-            of_intervals = jax.tree.map(repeat, of_intervals)
-        points = (self._looked(state.x), self._looked(x_next))
-        change, opened = over_lanes(-1, -1, -1, self._of_lane, self._of_lane)(one)(
-            state.opened, *points, *of_intervals
-        )
-        return _State(x_next, state.log_weight + log_weight, state.log_halving + change, opened)
+        def of_pairs():
+            if self._of_lane is None:
+                both = self._of_each((steps.before, steps.dt))
+            else:
+                both = (jnp.repeat(dt, self._num_looked) for dt in (steps.before, steps.dt))
+            each = (-1, -1, -1, self._of_lane, self._of_lane)
+            return over_lanes(*each)(one)(state.before, here, there, *both)
+
+        change = lax.cond(steps.ends_pair, of_pairs, lambda: jnp.zeros_like(state.log_halving))
+        log_halving = state.log_halving + lax.stop_gradient(change)
+        target, proposal = log_densities
+        sums = state.log_target + target, state.log_proposal + proposal
+        return _State(x_next, *sums, here, log_halving)
 
 
 def noise_of(
@@ -692,8 +688,8 @@ def deterministic_path(
 
 def _bridge_law(step: Step, target: StepLaw, mean: Float[Array, " d"]) -> StepLaw:
     """With this mean and the covariance V δ (T - t_{i+1})/(T - t_i)."""
-    root = jnp.sqrt((step.remaining - step.dt) / step.remaining)
-    return target._replace(mean=mean, root=root)
+    shrunk = (step.remaining - step.dt) / step.remaining
+    return target._replace(mean=mean, covariance=shrunk)
 
 
 def _congruence_of_root(sigma: AbstractSigma, x: Float[Array, " d"]) -> Float[Array, "d d"]:

@@ -22,115 +22,50 @@ Of an odd number of steps the last is left as it is, and D counts for a little m
 nothing is known.
 """
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .diffusion import Dynamics
 from .lanes import over_lanes
-from .linalg import cholesky, matmul, matvec
-from .sigma import AbstractSigma
-from .step_density import AbstractStepDensity, StepLaw, StepsFrom
+from .linalg import matmul, matvec
+from .step_density import AbstractStepDensity, StepLaw
 
 # D is worked out for one in so many paths, but for so many at least.
-_LOOKED_SHARE, _LOOKED_SHARE_WHERE_SIGMA_VARIES, _FEWEST_LOOKED = 16, 2, 64
+_LOOKED_SHARE, _LOOKED_SHARE_WHERE_SIGMA_VARIES, _FEWEST_LOOKED = 32, 2, 64
 
 
-class Opened(NamedTuple):
-    """A pair of steps seen from where it began, x, without a σ that is constant.
-
-    - `twice`: mean and root of one step that lasts as long as both, q_2δ.
-    - `both`: those of the two together if the drift were linear, n_2.
-    - `second`: those of the second step if it began in x.
-    - `decay`: what that gains for each unit by which σ⁻¹x' is further on.
-    """
-
-    x: Float[Array, "d *lanes"]
-    sigma: AbstractSigma | None
-    twice: tuple[Float[Array, "d *lanes"], Float[Array, "..."]]
-    both: tuple[Float[Array, "d *lanes"], Float[Array, "..."]]
-    second: tuple[Float[Array, "d *lanes"], Float[Array, "..."]]
-    decay: Float[Array, "d d *lanes"]
-
-
-class Pairing(NamedTuple):
-    """The lengths of the steps before and after this one, and whether a pair ends with this."""
-
-    before: Float[Array, "*steps lanes"]
-    after: Float[Array, "*steps lanes"]
-    ends: Bool[Array, "*steps lanes"]
-
-
-def pair_up(dt: Float[Array, "N I"]) -> Pairing:
-    """The pairs of N steps of these lengths, of which the first opens one."""
-    odd = jnp.arange(dt.shape[0]) % 2 == 1
-    ends = jnp.broadcast_to(odd[:, None], dt.shape)
-    return Pairing(jnp.roll(dt, 1, axis=0), jnp.roll(dt, -1, axis=0), ends)
-
-
-def open_pair(
+def of_pair(
+    density: AbstractStepDensity,
     dynamics: Dynamics,
-    x: Float[Array, " d"],
-    steps: StepsFrom,
-    first: Float[Array, ""],
-    second: Float[Array, ""],
-) -> Opened:
-    """A pair of steps of these lengths from x."""
-    laws = steps.law(first), steps.law(second)
-    sigma, decay = laws[0].sigma, steps.decay(second)
-    S, S_second = (_square(law.root, x) for law in laws)
-    moved = sigma.mv(matvec(decay, sigma.solve(laws[0].mean - x)))
-    both = first * matmul(matmul(decay, S), decay.T) + second * S_second
-    return Opened(
-        x,
-        sigma if dynamics.sigma_varies else None,
-        _mean_and_root(steps.law(first + second)),
-        (laws[1].mean + moved, cholesky(both / (first + second))),
-        _mean_and_root(laws[1]),
-        decay,
-    )
-
-
-def close_pair(
-    dynamics: Dynamics,
-    opened: Opened,
-    x: Float[Array, " d"],
-    x_next: Float[Array, " d"],
+    points: tuple[Float[Array, " d"], Float[Array, " d"], Float[Array, " d"]],
     dt: tuple[Float[Array, ""], Float[Array, ""]],
-    law: StepLaw,
 ) -> Float[Array, ""]:
-    """The pair's part of D: it led to x, and from there, by this law, to x_next, in steps of these
-    lengths."""
-    first, second = dt
-    sigma = dynamics.sigma(opened.x) if opened.sigma is None else opened.sigma
-    twice, both = (
-        StepLaw(mean, sigma, root, first + second) for mean, root in (opened.twice, opened.both)
-    )
-    mean, root = opened.second
-    moved = sigma.mv(matvec(opened.decay, sigma.solve(x - opened.x)))
-    linear = StepLaw(mean + moved, sigma, root, second)
-    value = _log_relative(twice, x_next) - _log_relative(both, x_next)
-    value += _log_relative(linear, x_next) - _log_relative(law, x_next)
+    """The part of D of a pair of steps of these lengths, through x, x' and x''."""
+    (x, middle, x_next), (first, second) = points, dt
+    steps, law = density.steps_from(dynamics, x), density.steps_from(dynamics, middle).law(second)
+    twice, once, again = steps.law(first + second), steps.law(first), steps.law(second)
+    sigma, decay = again.sigma, steps.decay(second)
+
+    def carried(to):
+        """By how much further the second step leads, if the drift is linear, for this x'."""
+        return sigma.mv(matvec(decay, sigma.solve(to - x)))
+
+    covariance = first * matmul(matmul(decay, _matrix(once, x)), decay.T)
+    covariance = (covariance + second * _matrix(again, x)) / (first + second)
+    both = StepLaw(again.mean + carried(once.mean), sigma, covariance, first + second)
+    linear = again._replace(mean=again.mean + carried(middle))
+    value = twice.log_relative(x_next) - both.log_relative(x_next)
+    value += linear.log_relative(x_next) - law.log_relative(x_next)
     if dynamics.sigma_varies:
         value += law.sigma.log_abs_det() - sigma.log_abs_det()
     return value
 
 
-def _log_relative(law: StepLaw, point: Float[Array, " d"]) -> Float[Array, ""]:
-    return law.log_relative(law.noise(point))
-
-
-def _mean_and_root(law: StepLaw) -> tuple[Float[Array, " d"], Float[Array, "..."]]:
-    return law.mean, law.root
-
-
-def _square(root: Float[Array, "..."], x: Float[Array, " d"]) -> Float[Array, "d d"]:
-    """L Lᵀ."""
-    if root.ndim == 0:
-        return root**2 * jnp.eye(x.shape[0], dtype=x.dtype)
-    return matmul(root, root.T)
+def _matrix(law: StepLaw, x: Float[Array, " d"]) -> Float[Array, "d d"]:
+    """S."""
+    S = law.covariance
+    return S * jnp.eye(x.shape[0], dtype=x.dtype) if S.ndim == 0 else S
 
 
 def of_all_steps(log_halving: Float[Array, "*rows"], num_steps: int) -> Float[Array, "*rows"]:
@@ -155,10 +90,7 @@ def log_halving_of_paths(
     points = lax.optimization_barrier(jnp.moveaxis(paths, (0, 1), (-1, -2)))
 
     def one(x, middle, x_next, first, second):
-        steps, from_middle = (density.steps_from(dynamics, point) for point in (x, middle))
-        opened = open_pair(dynamics, x, steps, first, second)
-        law = from_middle.law(second)
-        return close_pair(dynamics, opened, middle, x_next, (first, second), law)
+        return of_pair(density, dynamics, (x, middle, x_next), (first, second))
 
     def every_other(leaf, shift):
         leaf = leaf[..., shift : shift + 2 * num_pairs : 2, :][..., :num_pairs, :]

@@ -114,11 +114,13 @@ class Coordinates(AbstractForm):
     moves: ClassVar[dict[str, Callable]] = {
         "broadcast_in_dim": lambda value, **params: _broadcast(value, **params),
         "concatenate": lambda *values, dimension: np.concatenate(values, dimension),
+        "pad": lambda value, padding, **params: _pad(value, padding, **params),
         "reshape": lambda value, **params: _reshape(value, **params),
         "rev": lambda value, *, dimensions: np.flip(value, dimensions),
         "slice": lambda value, **params: value[_slices(**params)],
         "split": lambda value, *, sizes, axis: np.split(value, np.cumsum(sizes)[:-1], axis),
         "squeeze": lambda value, *, dimensions: value.squeeze(dimensions),
+        "stack": lambda *values, axis: np.stack(values, axis),
         "transpose": lambda value, *, permutation: value.transpose(permutation),
     }
 
@@ -177,12 +179,14 @@ class LanesLast(AbstractForm):
         "broadcast_in_dim": lambda array, *, shape, broadcast_dimensions, **_: lax.broadcast_in_dim(
             array, (*shape, array.shape[-1]), (*broadcast_dimensions, len(shape))
         ),
-        "concatenate": lambda *arrays, dimension: _concatenate(arrays, dimension),
+        "concatenate": lambda *arrays, dimension: jnp.concatenate(_wide(arrays), dimension),
+        "pad": lambda array, padding, **params: _pad_lanes(array, padding, **params),
         "reshape": lambda array, **params: _reshape(array, **params, kept=1),
         "rev": lambda array, *, dimensions: jnp.flip(array, dimensions),
         "slice": lambda array, **params: array[_slices(**params)],
         "split": lambda array, *, sizes, axis: jnp.split(array, np.cumsum(sizes)[:-1], axis),
         "squeeze": lambda array, *, dimensions: array.squeeze(dimensions),
+        "stack": lambda *arrays, axis: jnp.stack(_wide(arrays), axis),
         "transpose": lambda array, *, permutation: array.transpose(*permutation, array.ndim - 1),
     }
 
@@ -225,11 +229,40 @@ def _reshape(value, *, new_sizes, dimensions=None, kept=0, **_):
     return value.reshape(*new_sizes, *(value.shape[axis] for axis in last))
 
 
+def _pad(value, padding, *, padding_config):
+    """As `lax.pad`, of objects: negative widths cut off."""
+    wide = [
+        (max(int(low), 0), max(int(high), 0), max(size + (size - 1) * int(between), 0))
+        for size, (low, high, between) in zip(value.shape, padding_config, strict=True)
+    ]
+    shape = tuple(low + size + high for low, high, size in wide)
+    filling = padding.item()
+    padded = _objects(shape, lambda _: filling)
+    inside = [
+        slice(low, low + size, between + 1)
+        for (low, _, size), (_, _, between) in zip(wide, padding_config, strict=True)
+    ]
+    padded[tuple(inside)] = value
+    cut = [slice(max(-low, 0), min(high, 0) or None) for low, high, _ in padding_config]
+    return padded[tuple(cut)]
+
+
+def _pad_lanes(array, padding, *, padding_config):
+    """The same of arrays, each lane with its own number."""
+
+    def pad(value, filling):
+        config = [*padding_config, *[(0, 0, 0)] * (value.ndim - len(padding_config))]
+        return lax.pad(value, jnp.asarray(filling, value.dtype), config)
+
+    inside = pad(jnp.ones(array.shape[:-1], bool), False)[..., None]
+    return jnp.where(inside, pad(array, 0), padding)
+
+
 def _slices(*, start_indices, limit_indices, strides) -> tuple[slice, ...]:
     return tuple(map(slice, start_indices, limit_indices, strides or [None] * len(start_indices)))
 
 
-def _concatenate(arrays, dimension):
+def _wide(arrays):
+    """All with as many lanes as any has."""
     num_lanes = max(array.shape[-1] for array in arrays)
-    wide = [jnp.broadcast_to(array, (*array.shape[:-1], num_lanes)) for array in arrays]
-    return jnp.concatenate(wide, dimension)
+    return [jnp.broadcast_to(array, (*array.shape[:-1], num_lanes)) for array in arrays]

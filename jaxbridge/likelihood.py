@@ -210,7 +210,7 @@ def _ito_taylor(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
     """log of the density of the step, relative to N(x'; x, V δ)."""
     law = ItoTaylorDensity().steps_from(dynamics, x).law(dt)
     dw = dynamics.sigma(x).solve(x_next - x)
-    return law.log_relative(law.noise(x_next)) + dot(dw, dw) / (2 * dt)
+    return law.log_relative(x_next) + dot(dw, dw) / (2 * dt)
 
 
 def _driftless(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:

@@ -40,10 +40,11 @@ def total(terms: Float[Array, "d *shape"]) -> Float[Array, "*shape"]:
     return _sum([terms[i] for i in range(terms.shape[0])])
 
 
-def log_product(numbers: Float[Array, " d"]) -> Float[Array, ""]:
-    """The log of the product of positive numbers, by few logarithms."""
-    groups = [numbers[i : i + _FACTORS] for i in range(0, numbers.shape[0], _FACTORS)]
-    return _sum([jnp.log(functools.reduce(operator.mul, list(group))) for group in groups])
+def log_of_product(numbers: list[Float[Array, ""]]) -> Float[Array, ""]:
+    """The log of the product of positive numbers, by few logarithms; NaN if one is not positive."""
+    groups = [numbers[i : i + _FACTORS] for i in range(0, len(numbers), _FACTORS)]
+    value = _sum([jnp.log(functools.reduce(operator.mul, group)) for group in groups])
+    return jnp.where(functools.reduce(jnp.minimum, numbers) > 0, value, jnp.nan)
 
 
 # Of so many the product of numbers near one does not overflow.
@@ -112,6 +113,26 @@ def cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
         columns.append(column)
         rest = rest - column[:, None] * column
     return jnp.stack(columns, axis=1)
+
+
+def quadratic_form(
+    matrix: Float[Array, "d d"], vector: Float[Array, " d"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """vᵀM⁻¹v and log det M of a positive definite matrix, NaN of another, by elimination: without
+    the square roots of `cholesky`, with which XLA does not vectorise loops over lanes on CPU."""
+    d = matrix.shape[0]
+    rows = [[matrix[i, j] for j in range(i + 1)] for i in range(d)]  # of the lower triangle
+    left, terms, pivots = list(vector), [], []
+    for k in range(d):
+        pivot = rows[k][k]
+        for i in range(k + 1, d):
+            share = rows[i][k] / pivot
+            left[i] = left[i] - share * left[k]
+            for j in range(k + 1, i + 1):
+                rows[i][j] = rows[i][j] - share * rows[j][k]
+        terms.append(left[k] * left[k] / pivot)
+        pivots.append(pivot)
+    return _sum(terms), log_of_product(pivots)
 
 
 def solve_lower(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float[Array, " d"]:

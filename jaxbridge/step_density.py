@@ -2,18 +2,18 @@
 
 The target of a weighted path is a Markov chain on its grid, whose steps are normal,
 
-    x' = μ(x) + √δ σ(x) L(x) ξ,    ξ ~ N(0, I),    L lower triangular.
+    x' ~ N(μ(x), δ σ(x) S(x) σ(x)ᵀ).
 
 Each step has a probability density, so the weights have the chain's own transition density as
 their mean: finite, whatever the model. How near that is to p_T is the step error.
 
-`EulerDensity`, μ = x + αδ and L = I, is O(δ) away, for any σ. For constant σ more is known. In the
+`EulerDensity`, μ = x + αδ and S = I, is O(δ) away, for any σ. For constant σ more is known. In the
 coordinates of the noise, with β = σ⁻¹α and A = ∇β, the first terms of Itô's and Taylor's expansion
 (Kloeden & Platen 1992, section 14.2) are normal as well, `ItoTaylorDensity`,
 
     x + βδ + ½δ² (Aβ + ½Δβ) + ∫_0^δ [I + (δ-s) A] dW_s,
 
-with L Lᵀ = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ ≥ ¼ I or so however long the step, and O(δ²) away from p_T.
+with S = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ ≥ ¼ I however long the step, and O(δ²) away from p_T.
 """
 
 from abc import abstractmethod
@@ -27,52 +27,70 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .diffusion import Dynamics
-from .linalg import cholesky, dot, log_product, matmul, matvec, solve_lower, total
+from .linalg import cholesky, dot, matmul, matvec, quadratic_form, solve_lower, total
 from .sigma import AbstractSigma
 
 
 class StepLaw(NamedTuple):
-    """N(μ, δ σ L Lᵀ σᵀ), the law of a step from one point in a time δ.
+    """N(μ, δ σ S σᵀ), the law of a step from one point in a time δ.
 
     - `mean`: μ, shape (d,).
     - `sigma`: σ at the point.
-    - `root`: L, a lower triangle, shape (d, d), or a number, shape ().
+    - `covariance`: S in the coordinates of the noise, shape (d, d), or a number, shape (), for a
+        multiple of I.
     - `dt`: δ.
     """
 
     mean: Float[Array, "d *lanes"]
     sigma: AbstractSigma
-    root: Float[Array, "..."]
+    covariance: Float[Array, "..."]
     dt: Float[Array, "*lanes"]
 
     def point(self, xi: Float[Array, " d"]) -> Float[Array, " d"]:
-        """μ + √δ σ L ξ."""
-        noise = self.root * xi if self.root.ndim == 0 else matvec(self.root, xi)
-        return self.mean + jnp.sqrt(self.dt) * self.sigma.mv(noise)
+        """μ + √δ σ L ξ, with S = L Lᵀ."""
+        S = self.covariance
+        noise = jnp.sqrt(S) * xi if S.ndim == 0 else matvec(cholesky(S), xi)
+        return self.mean + self.pushed_forward(noise)
 
     def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """ξ of the step to this point."""
-        scaled = self.sigma.solve(point - self.mean) / jnp.sqrt(self.dt)
-        return scaled / self.root if self.root.ndim == 0 else solve_lower(self.root, scaled)
+        S, scaled = self.covariance, self._scaled(point)
+        return scaled / jnp.sqrt(S) if S.ndim == 0 else solve_lower(cholesky(S), scaled)
+
+    def pushed_forward(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
+        """√δ σ v."""
+        return jnp.sqrt(self.dt) * self.sigma.mv(vector)
 
     def pulled_back(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
-        """√δ (σ L)ᵀ v."""
-        vector = jnp.sqrt(self.dt) * self.sigma.mv_transpose(vector)
-        return self.root * vector if self.root.ndim == 0 else matvec(self.root.T, vector)
+        """√δ σᵀ v."""
+        return jnp.sqrt(self.dt) * self.sigma.mv_transpose(vector)
 
-    def log_relative(self, xi: Float[Array, " d"]) -> Float[Array, ""]:
-        """log of the density at the point of this noise, but for factors that all laws with this
-        σ and δ share: -½ |ξ|² - log det L."""
-        if self.root.ndim == 0:
-            log_det = xi.shape[0] * jnp.log(self.root)
+    def log_relative(self, point: Float[Array, " d"]) -> Float[Array, ""]:
+        """log of the density, but for factors that all laws with this σ and δ share:
+        ½ (d - |ξ|² - log det S), of which sums along a path stay small."""
+        scaled = self._scaled(point)
+        if self.covariance.ndim == 0:
+            square, log_det = dot(scaled, scaled) / self.covariance, self._log_det()
         else:
-            log_det = log_product(jnp.diagonal(self.root))
-        return -dot(xi, xi) / 2 - log_det
+            square, log_det = quadratic_form(self.covariance, scaled)
+        return (scaled.shape[0] - square - log_det) / 2
+
+    def log_relative_of_noise(self, xi: Float[Array, " d"]) -> Float[Array, ""]:
+        """The same at the point of this noise."""
+        return (xi.shape[0] - dot(xi, xi) - self._log_det()) / 2
 
     def log_density(self, point: Float[Array, " d"]) -> Float[Array, ""]:
         """Of the step to this point, in units of space to the power -d."""
         scale = self.sigma.log_abs_det() + point.shape[0] * jnp.log(2 * np.pi * self.dt) / 2
-        return self.log_relative(self.noise(point)) - scale
+        return self.log_relative(point) - point.shape[0] / 2 - scale
+
+    def _scaled(self, point):
+        return self.sigma.solve(point - self.mean) / jnp.sqrt(self.dt)
+
+    def _log_det(self):
+        if self.covariance.ndim == 0:
+            return self.mean.shape[0] * jnp.log(self.covariance)
+        return quadratic_form(self.covariance, jnp.zeros_like(self.mean))[1]
 
 
 class LinearStep(NamedTuple):
@@ -176,8 +194,8 @@ class ItoTaylorDensity(AbstractStepDensity):
         twice, square, identity = A + A.T, matmul(A, A.T), jnp.eye(d, dtype=x.dtype)
 
         def law(dt):
-            root = cholesky(identity + dt / 2 * twice + dt**2 / 3 * square)
-            return StepLaw(x + dt * drift + dt**2 / 2 * bent, sigma, root, dt)
+            S = identity + dt / 2 * twice + dt**2 / 3 * square
+            return StepLaw(x + dt * drift + dt**2 / 2 * bent, sigma, S, dt)
 
         def decay(dt):
             return identity + dt * A + dt**2 / 2 * matmul(A, A)

@@ -3,6 +3,7 @@ dtypes and warnings as errors."""
 
 import os
 import shutil
+import sys
 import tempfile
 
 from jaxtyping import config as jaxtyping_config, install_import_hook
@@ -55,3 +56,11 @@ def compiled_programs_end_with_the_module():
     some thousand programs would run out of them, and the compiler would crash."""
     yield
     jax.clear_caches()
+
+
+@pytest.fixture(autouse=True)
+def figures_end_with_the_test():
+    """Whichever worker drew what, no test finds the figures of others open."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")

@@ -33,7 +33,7 @@ def test_linear_drift_is_known(density, x64):
     weighted = weighted_paths(model, FROM, TO, 64_000, num_steps, density)
     assert jnp.ptp(weighted.log_weights) < 1e-9
     known = ~np.isnan(weighted.log_halving)
-    assert known.sum() == num_looked(64_000, False) == 4_000  # the first ones of each block
+    assert known.sum() == num_looked(64_000, False) == 2_000  # the first ones of each block
     D = np.asarray(weighted.log_halving)[known]
 
     F, V = jnp.asarray(-B), jnp.asarray(FULL_SIGMA @ FULL_SIGMA.T)
@@ -66,7 +66,7 @@ def test_mean_is_that_of_half_as_many_steps(case, refinement):
     """Of the weight, and of the mid-point, against paths of half as many steps."""
     model, density, spread = case
     start, end = [-0.3], [1.0]
-    size = 40_000 if model is VARYING else 160_000
+    size = 40_000 if model is VARYING else 320_000
     fine, coarse = (
         weighted_paths(model, start, end, size, n, density, n, refinement=refinement)
         for n in (16, 8)
@@ -90,7 +90,7 @@ def test_factor_is_that_of_quadrature(case, x64):
     model, density, _ = case
     nodes = np.linspace(-5, 5, 401) if model is VARYING else np.linspace(-3.5, 3.5, 351)
     fine, coarse = (quadrature(density, model, [-0.3], [1.0], 1.0, n, nodes) for n in (16, 8))
-    weighted = weighted_paths(model, [-0.3], [1.0], 160_000, 16, density)
+    weighted = weighted_paths(model, [-0.3], [1.0], 320_000, 16, density)
     known = ~np.isnan(weighted.log_halving)
     w, D = np.exp(weighted.log_weights[known]), np.asarray(weighted.log_halving)[known]
     w, factor = w / w.sum(), np.exp(D - (coarse - fine))

@@ -43,6 +43,8 @@ FUNCTIONS = {
     "reductions": lambda x: jnp.stack([x.sum(), x.max(), x.min(), jnp.prod(x), x.mean()]),
     "any": lambda x: (jnp.any(x > 1), jnp.all(jnp.isfinite(x)), jnp.argmax(x)),
     "stacked": lambda x: jnp.concatenate([x[::-1], jnp.stack([x[0] * x[1], -x[2]]), x[1:]]),
+    "side by side": lambda x: jnp.stack([x, x * x, jnp.ones(3, x.dtype)], axis=1) @ x,
+    "padded": lambda x: lax.pad(jnp.outer(x, x[:2]), x[2], [(1, 2, 1), (-1, 3, 0)]),
     "moved": lambda x: jnp.broadcast_to(x[:, None], (3, 2)).T.reshape(-1)[::2],
     "column by column": lambda x: jnp.outer(x, jnp.arange(2.0, dtype=x.dtype)).reshape(
         -1, order="F"
@@ -100,6 +102,24 @@ def test_derivatives_equal_those_of_vmap(name):
     total = lambda f: lambda x: sum(jnp.sum(jnp.sin(leaf)) for leaf in jax.tree.leaves(f(x)))
     if name != "set":
         _assert_close(jax.grad(total(by_lanes))(x), jax.grad(total(by_vmap))(x))
+
+
+@pytest.mark.parametrize("d", [2, 8])  # coordinate by coordinate, and array by array
+@pytest.mark.parametrize("density", [jb.EulerDensity(), jb.ItoTaylorDensity()])
+def test_every_equation_of_a_step_has_a_rule(density, d, monkeypatch):
+    """To go through `vmap` is right, but several times slower: new primitives would show."""
+    model = jb.langevin(lambda x, p: -jnp.sum(x**4) - x[0] * x[1])
+
+    def refuse(jaxpr, equation, *_):
+        raise AssertionError(equation.primitive.name)
+
+    def step(x, xi):
+        law = density.steps_from(model.forward(x), x).law(jnp.array(0.1))
+        return law.log_relative(law.point(xi))
+
+    monkeypatch.setattr("jaxbridge.lanes._by_vmap", refuse)
+    x = jnp.ones((d, 16))
+    assert over_lanes(-1, -1)(step)(x, x).shape == (16,)
 
 
 def test_derivatives_by_what_the_function_closes_over():

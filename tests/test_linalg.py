@@ -14,6 +14,7 @@ from jaxbridge.linalg import (
     matmul,
     matvec,
     polar_factor,
+    quadratic_form,
     safe_norm,
     solve,
 )
@@ -128,6 +129,24 @@ def test_cholesky_equals_numpys(d, precision):
 def test_cholesky_of_an_indefinite_matrix_is_nan():
     indefinite = np.resize([[1.0, 2.0], [2.0, 1.0]], (COUNT, 2, 2)).astype(np.float32)
     assert np.isnan(many_cholesky(indefinite)).any((1, 2)).all()
+
+
+@pytest.mark.parametrize("d", DIMENSIONS)
+def test_quadratic_form_equals_numpys(d, precision):
+    rng = np.random.default_rng(d)
+    roots = with_singular_values(rng, np.linspace(1, 3, d))
+    matrices = (roots @ roots.swapaxes(1, 2)).astype(precision)
+    vectors = rng.normal(size=(COUNT, d)).astype(precision)
+    forms, log_dets = jax.vmap(quadratic_form)(matrices, vectors)
+    solved = np.linalg.solve(matrices, vectors[..., None])[..., 0]
+    tolerance = 20 * TOLERANCE[precision]
+    np.testing.assert_allclose(forms, np.sum(vectors * solved, axis=1), atol=tolerance)
+    np.testing.assert_allclose(log_dets, np.linalg.slogdet(matrices)[1], atol=tolerance)
+
+
+@pytest.mark.parametrize("diagonal", [(-1.0, 1.0), (-1.0, -1.0), (0.0, 1.0)])
+def test_quadratic_form_of_what_is_not_positive_definite_has_no_log(diagonal):
+    assert np.isnan(quadratic_form(jnp.diag(jnp.array(diagonal)), jnp.ones(2))[1])
 
 
 @pytest.mark.parametrize("d", DIMENSIONS)
