@@ -17,11 +17,19 @@ called for.
 q follows from a guess h_{i+1}(x) of the density of b seen from x at t_{i+1}. Where log h is
 quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting the target's step by h gives
 
-    q_i = N(μ_i + δ σ C σᵀ r̃, δ σ C σᵀ),    C = S (I + δ σᵀ H̃ σ S)⁻¹
+    q_i = N(μ_i + δ L C Lᵀ r̃, δ L C Lᵀ),    C = S (I + δ Lᵀ H̃ L S)⁻¹,    L Lᵀ = V(x_i)
 
 (r̃ and H̃ as in Schauer, van der Meulen & van Zanten 2017; the discrete form as in Whitaker,
 Golightly, Boys & Sherlock 2017). With the true density in the place of h this is Doob's
 h-transform, and w is constant.
+
+A guess of a linear process has a Ṽ = L̃ L̃ᵀ of its own. Where V(x) is larger it pulls too hard,
+where V(x) is smaller not hard enough, and the weights have heavy tails. What V is on the way to b
+is nearer to the mean V̄ = L̄ L̄ᵀ of the two, to which the guess's deviations are scaled:
+
+    H̃ := L̄⁻ᵀ L̃ᵀ H L̃ L̄⁻¹,    r̃ := L̄⁻ᵀ [(L̄⁻¹ L̃)ᵀ L̃ᵀ ρ - L̃ᵀ H L̃ L̄⁻¹ (μ_i - b)],
+
+which where V(x) = Ṽ is the guess itself.
 """
 
 from abc import abstractmethod
@@ -40,11 +48,11 @@ from .diffusion import Diffusion, Dynamics
 from .halving import num_looked, of_all_steps, of_pair
 from .intervals import Intervals, check_model
 from .lanes import join_rows, over_lanes, split_rows
-from .linalg import all_finite, inverse, matmul, matvec
+from .linalg import all_finite, cholesky, inverse, matmul, matvec
 from .noise import Store, noisy_scan
 from .schemes import Euler
 from .search import most_lanes
-from .sigma import AbstractSigma
+from .sigma import AbstractSigma, Triangular
 from .step_density import AbstractStepDensity, EulerDensity, StepLaw
 from .step_error import share_of_order
 from .weighted import (
@@ -233,6 +241,15 @@ class _GaussianGuess(NamedTuple):
     precision: Float[Array, "d d"]
 
 
+class _NoiseGuess(NamedTuple):
+    """The same in the coordinates of the noise: L̃ᵀρ and L̃ᵀH L̃, and L̃, the root of the guess's own
+    V."""
+
+    shift: Float[Array, "d *lanes"]
+    precision: Float[Array, "d d *lanes"]
+    root: Float[Array, "d d *lanes"]
+
+
 class Guided(AbstractGuidedProposal):
     """Guided proposals (Schauer, van der Meulen & van Zanten 2017): h is the transition density
     of a linear process
@@ -240,6 +257,8 @@ class Guided(AbstractGuidedProposal):
         dX̃ = [α̃ + F (X̃ - b)] dt + σ̃ dW,
 
     in steps as the target's, so that for an Ornstein–Uhlenbeck process all weights are equal.
+    Where σ varies its deviations are scaled to the mean of V(x) and Ṽ (not in that paper): else the
+    weights have heavy tails, and far fewer paths count than it seems.
 
     **Arguments:**
 
@@ -332,19 +351,36 @@ class Guided(AbstractGuidedProposal):
         each = jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (num_steps, *leaf.shape[1:]))[:-1], coefficients
         )
-        _, guesses = lax.scan(back, last, (each, dt[:-1]), reverse=True)
-        return guesses
+        _, (shift, H) = lax.scan(back, last, (each, dt[:-1]), reverse=True)
+        roots = jax.vmap(lambda x: dynamics.sigma(x).root().as_matrix(d, x.dtype))(points)
+        roots = jnp.broadcast_to(roots, (num_steps, d, d))[:-1]
+        pull_back = jnp.swapaxes(roots, 1, 2)
+        shift = jax.vmap(matvec)(pull_back, shift)
+        return _NoiseGuess(shift, jax.vmap(matmul)(jax.vmap(matmul)(pull_back, H), roots), roots)
 
     def step_law(self, step, x, target):
-        shift, H = step.guide
-        r = shift - matvec(H, target.mean - step.end)
-        columns = jax.vmap(target.pulled_back, in_axes=1, out_axes=1)(H)
-        K, S = jax.vmap(target.pulled_back)(columns), target.covariance
-        S = S * jnp.eye(x.shape[0], dtype=x.dtype) if S.ndim == 0 else S
-        C = matmul(S, inverse(jnp.eye(x.shape[0], dtype=x.dtype) + matmul(K, S)))
-        C = (C + C.T) / 2
-        bend = target.pushed_forward(matvec(C, target.pulled_back(r)))
-        return target._replace(mean=target.mean + bend, covariance=C)
+        shift, H, L_guess = step.guide
+        identity, S = jnp.eye(len(x), dtype=x.dtype), target.covariance
+        S = S * identity if S.ndim == 0 else S
+        L = target.sigma.root()
+        scale, from_guess, from_here = self._scales(L, L_guess, x)
+        K = matmul(from_here.T, matmul(H, from_here))
+        C = matmul(S, inverse(identity + step.dt * matmul(K, S)))
+        r = matvec(from_guess.T, shift) - matvec(H, scale.solve(target.mean - step.end))
+        bend = step.dt * L.mv(matvec(C, matvec(from_here.T, r)))
+        return StepLaw(target.mean + bend, L, (C + C.T) / 2, step.dt)
+
+    @staticmethod
+    def _scales(L: AbstractSigma, L_guess: Float[Array, "d d"], x: Float[Array, " d"]):
+        """L̄ of the mean of V(x) and Ṽ, with L̄⁻¹ L̃ and L̄⁻¹ L."""
+        if not L.varies:
+            identity = jnp.eye(len(x), dtype=x.dtype)
+            return L, identity, identity
+        matrix = L.as_matrix(len(x), x.dtype)
+        V, V_guess = matmul(matrix, matrix.T), matmul(L_guess, L_guess.T)
+        mean = Triangular(cholesky((V + V_guess) / 2))
+        columns = ([mean.solve(each[:, j]) for j in range(len(x))] for each in (L_guess, matrix))
+        return mean, *(jnp.stack(each, axis=1) for each in columns)
 
     def _linear(self, dynamics: Dynamics, x: Float[Array, " d"], end: Float[Array, " d"]):
         """F, the linear drift at b, and Ṽ, when the diffusion is linearised at x."""

@@ -1,21 +1,35 @@
 """The diffusion coefficient σ(x) at one point, as the operator its form calls for.
 
-Four forms: the identity, a constant matrix (inverted outside the loop over time), a
-diagonal and a full matrix. Whoever holds a `Sigma` multiplies and solves without knowing
-which; what a form does not need is never computed.
+Forms: the identity, a constant matrix (inverted outside the loop over time), a diagonal and a
+full matrix, and the triangular root of that. Whoever holds a `Sigma` multiplies and solves without
+knowing which; what a form does not need is never computed.
 """
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .linalg import any_inverse, log_abs_det, matvec, solve, total
+from .linalg import (
+    any_inverse,
+    cholesky,
+    log_abs_det,
+    log_of_product,
+    matmul,
+    matvec,
+    solve,
+    solve_lower,
+    total,
+)
 
 
 class AbstractSigma(eqx.Module):
-    """σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,)."""
+    """σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,). It `varies` if
+    it may be another elsewhere."""
+
+    varies: ClassVar[bool]
 
     @abstractmethod
     def mv(self, noise: Float[Array, " d"]) -> Float[Array, " d"]:
@@ -41,9 +55,15 @@ class AbstractSigma(eqx.Module):
     def as_matrix(self, dim: int, dtype) -> Float[Array, "d d"]:
         """`σ` as a dense matrix."""
 
+    @abstractmethod
+    def root(self) -> "AbstractSigma":
+        """A root of V = σσᵀ: where σ varies one that V alone determines, however σ turns."""
+
 
 class Identity(AbstractSigma):
     """σ = I."""
+
+    varies: ClassVar[bool] = False
 
     def mv(self, noise):
         return noise
@@ -63,9 +83,14 @@ class Identity(AbstractSigma):
     def as_matrix(self, dim, dtype):
         return jnp.eye(dim, dtype=dtype)
 
+    def root(self):
+        return self
+
 
 class Constant(AbstractSigma):
     """The same matrix everywhere, kept with its inverse."""
+
+    varies: ClassVar[bool] = False
 
     matrix: Float[Array, "d d"]
     inverse: Float[Array, "d d"]
@@ -92,9 +117,14 @@ class Constant(AbstractSigma):
     def as_matrix(self, dim, dtype):
         return self.matrix
 
+    def root(self):
+        return self
+
 
 class Diagonal(AbstractSigma):
     """A diagonal matrix, given by its diagonal."""
+
+    varies: ClassVar[bool] = True
 
     diagonal: Float[Array, " d"]
 
@@ -117,9 +147,14 @@ class Diagonal(AbstractSigma):
     def as_matrix(self, dim, dtype):
         return jnp.diag(self.diagonal)
 
+    def root(self):
+        return Diagonal(jnp.abs(self.diagonal))
+
 
 class Full(AbstractSigma):
     """A full matrix that changes with the state."""
+
+    varies: ClassVar[bool] = True
 
     matrix: Float[Array, "d d"]
 
@@ -141,3 +176,36 @@ class Full(AbstractSigma):
 
     def as_matrix(self, dim, dtype):
         return self.matrix
+
+    def root(self):
+        return Triangular(cholesky(matmul(self.matrix, self.matrix.T)))
+
+
+class Triangular(AbstractSigma):
+    """A lower triangular matrix with a positive diagonal that changes with the state."""
+
+    varies: ClassVar[bool] = True
+
+    matrix: Float[Array, "d d"]
+
+    def mv(self, noise):
+        return matvec(self.matrix, noise)
+
+    def mv_transpose(self, vector):
+        return matvec(self.matrix.T, vector)
+
+    def solve(self, vector):
+        return solve_lower(self.matrix, vector)
+
+    def average(self, other):
+        assert isinstance(other, Triangular)
+        return Triangular((self.matrix + other.matrix) / 2)
+
+    def log_abs_det(self):
+        return log_of_product([self.matrix[i, i] for i in range(self.matrix.shape[0])])
+
+    def as_matrix(self, dim, dtype):
+        return self.matrix
+
+    def root(self):
+        return self

@@ -50,20 +50,12 @@ class StepLaw(NamedTuple):
         """μ + √δ σ L ξ, with S = L Lᵀ."""
         S = self.covariance
         noise = jnp.sqrt(S) * xi if S.ndim == 0 else matvec(cholesky(S), xi)
-        return self.mean + self.pushed_forward(noise)
+        return self.mean + jnp.sqrt(self.dt) * self.sigma.mv(noise)
 
     def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """ξ of the step to this point."""
         S, scaled = self.covariance, self._scaled(point)
         return scaled / jnp.sqrt(S) if S.ndim == 0 else solve_lower(cholesky(S), scaled)
-
-    def pushed_forward(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
-        """√δ σ v."""
-        return jnp.sqrt(self.dt) * self.sigma.mv(vector)
-
-    def pulled_back(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
-        """√δ σᵀ v."""
-        return jnp.sqrt(self.dt) * self.sigma.mv_transpose(vector)
 
     def log_relative(self, point: Float[Array, " d"]) -> Float[Array, ""]:
         """log of the density, but for factors that all laws with this σ and δ share:

@@ -17,7 +17,7 @@ from helpers import (
 )
 
 import jaxbridge as jb
-from jaxbridge.guided import noise_of, path_of
+from jaxbridge.guided import Step, noise_of, path_of
 from jaxbridge.intervals import Intervals
 
 slow = pytest.mark.slow
@@ -282,6 +282,56 @@ def test_noise_makes_the_path_and_the_path_gives_the_noise(precision):
         np.testing.assert_allclose(noise, xi, atol=tolerance)
         np.testing.assert_allclose(again, log_weights, atol=tolerance)
         np.testing.assert_allclose(halving_again, log_halving, atol=tolerance)
+
+
+@pytest.mark.parametrize("diagonal", [True, False])
+def test_without_drift_a_guess_has_the_mean_of_both_covariances(diagonal, x64):
+    """A normal law of variance V δ tilted by one of variance ½ (V(x) + V(b)) (T - t), by hand."""
+
+    def sigma(x, p):
+        scale = jnp.exp(jnp.sin(2 * x) - x)
+        return scale if diagonal else jnp.diag(scale) + jnp.array([[0.0, 0.7], [-0.4, 0.0]])
+
+    model, x, end = jb.Diffusion(lambda x, p: 0 * x, sigma), jnp.array([0.0, 0.3]), [1.5, -1.0]
+    proposal, dt, end = jb.Guided(), jnp.full(5, 0.2), jnp.array(end)
+    dynamics = model.forward(x)
+    guide = jax.tree.map(lambda leaf: leaf[2], proposal.guide(dynamics, x, end, dt))
+    target = proposal.density.steps_from(dynamics, x).law(dt[0])
+    law = proposal.step_law(Step(guide, dt[0], jnp.array(0.6), end), x, target)
+
+    V, V_end = (
+        np.asarray(matrix @ matrix.T)
+        for matrix in (dynamics.sigma(point).as_matrix(2, x.dtype) for point in (x, end))
+    )
+    H = np.linalg.inv(0.4 * (V + V_end) / 2)
+    covariance = np.linalg.inv(np.linalg.inv(0.2 * V) + H)
+    np.testing.assert_allclose(law.mean, x + covariance @ H @ (end - x), atol=1e-12)
+    units = np.stack([law.point(unit) - law.mean for unit in jnp.eye(2)], axis=1)
+    np.testing.assert_allclose(units @ units.T, covariance, atol=1e-12)
+
+
+@pytest.mark.parametrize("linearisation", ["end", "path"])
+def test_sigma_may_turn_and_a_guess_does_not_see_it(linearisation, x64):
+    """The law depends on V alone."""
+
+    def sigma(x, p):
+        return jnp.array([[1.0 + x[0] ** 2, 0.0], [0.4 * jnp.sin(x[1]), 0.5 + jnp.cos(x[0]) ** 2]])
+
+    def turned(x, p):
+        angle = 3 * x[0] - x[1]
+        cos, sin = jnp.cos(angle), jnp.sin(angle)
+        return sigma(x, p) @ jnp.array([[cos, -sin], [sin, cos]])
+
+    made = [
+        jb.sample_weighted_bridges(
+            jax.random.key(0), jb.Diffusion(lambda x, p: -x + jnp.sin(x[::-1]), each),
+            [0.0, 0.3], [1.0, -0.5], 1.0, num_bridges=100, num_steps=20,
+            proposal=jb.Guided(linearisation),
+        )
+        for each in (sigma, turned)
+    ]  # fmt: skip
+    np.testing.assert_allclose(made[0].paths, made[1].paths, atol=1e-9)
+    np.testing.assert_allclose(made[0].log_weights, made[1].log_weights, atol=1e-8)
 
 
 @pytest.mark.slow

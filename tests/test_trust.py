@@ -157,6 +157,14 @@ def each_random_model(everywhere):
     ]
 
 
+@pytest.fixture
+def forgets():
+    """So many models' programs have more memory maps than a process may have."""
+    yield
+    jax.clear_caches()
+
+
+@pytest.mark.usefixtures("forgets")
 @pytest.mark.parametrize("index", each_random_model({0}))
 def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):
     """Densities and mid-points by proposals of all kinds, where none has a warning."""
@@ -372,6 +380,8 @@ _ITO_TAYLOR, _EULER = jb.ItoTaylorDensity(), jb.EulerDensity()
             ],
         ),
         pytest.param("logarithms", jb.ModifiedDiffusionBridge(_EULER), [0, 2, 4], marks=slow),
+        pytest.param("logarithms", jb.Guided("end", _EULER), [0, 3, 4], marks=slow),
+        pytest.param("logarithms", jb.Guided("path", _EULER), [3], marks=slow),
         pytest.param("raw", jb.ModifiedDiffusionBridge(_EULER), [0, 2, 4], marks=slow),
     ],
     ids=[
@@ -380,6 +390,8 @@ _ITO_TAYLOR, _EULER = jb.ItoTaylorDensity(), jb.EulerDensity()
         "roots, guided",
         "roots, guided, touching zero",
         "logarithms, modified",
+        "logarithms, guided",
+        "logarithms, guided along a path",
         "raw, modified",
     ],
 )
