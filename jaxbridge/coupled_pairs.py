@@ -30,6 +30,9 @@ from .weighted import AbstractWeightedProposal, WeightedPaths, in_blocks
 # Whole paths are kept only until they are weighed: at most this many bytes of them at a time.
 _BLOCK_BYTES = 2**28
 
+# A path costs so many others that D of more of them may be looked at than where it costs one.
+_LOOKED = 4
+
 
 class CoupledPairs(AbstractWeightedProposal):
     """The proposals of a coupling, weighted by hitting counts: `proposal` of what
@@ -158,8 +161,8 @@ class CoupledPairs(AbstractWeightedProposal):
         """D of the first of n paths of each interval, NaN of the others."""
         dynamics = model.forward(intervals.start[0])
         density, _ = step_law_of(self.coupling.scheme, dynamics)
-        some = jnp.arange(len(paths)).reshape(-1, n)[:, : num_looked(n, dynamics.sigma_varies)]
-        some = some.reshape(-1)
+        num_some = num_looked(_LOOKED * n, dynamics.sigma_varies)
+        some = jnp.arange(len(paths)).reshape(-1, n)[:, :num_some].reshape(-1)
         num_steps = paths.shape[1] - 1
         dt = jnp.broadcast_to(intervals.duration[some] / num_steps, (num_steps, len(some)))
         log_halving = log_halving_of_paths(density, dynamics, dt, paths[some])
