@@ -210,7 +210,8 @@ def _ito_taylor(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
     """log of the density of the step, relative to N(x'; x, V δ)."""
     law = ItoTaylorDensity().steps_from(dynamics, x).law(dt)
     dw = dynamics.sigma(x).solve(x_next - x)
-    return law.log_relative(x_next) + dot(dw, dw) / (2 * dt)
+    driftless = (x.shape[0] - dot(dw, dw) / dt) / 2  # `log_relative` of N(x, V δ)
+    return law.log_relative(x_next) - driftless
 
 
 def _driftless(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
