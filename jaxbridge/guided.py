@@ -48,11 +48,11 @@ from .diffusion import Diffusion, Dynamics
 from .halving import num_looked, of_all_steps, of_pair
 from .intervals import Intervals, check_model
 from .lanes import join_rows, over_lanes, split_rows
-from .linalg import all_finite, cholesky, inverse, matmul, matvec
+from .linalg import all_finite, inverse, matmul, matvec
 from .noise import Store, noisy_scan
 from .schemes import Euler
 from .search import most_lanes
-from .sigma import AbstractSigma, Triangular
+from .sigma import AbstractSigma, root_of
 from .step_density import AbstractStepDensity, EulerDensity, StepLaw
 from .step_error import share_of_order
 from .weighted import (
@@ -242,12 +242,12 @@ class _GaussianGuess(NamedTuple):
 
 
 class _NoiseGuess(NamedTuple):
-    """The same in the coordinates of the noise: L̃ᵀρ and L̃ᵀH L̃, and L̃, the root of the guess's own
-    V."""
+    """The same in the coordinates of the noise: L̃ᵀρ and L̃ᵀH L̃, and Ṽ = L̃ L̃ᵀ's root L̃, which where σ
+    is constant is that of every point."""
 
     shift: Float[Array, "d *lanes"]
     precision: Float[Array, "d d *lanes"]
-    root: Float[Array, "d d *lanes"]
+    root: Float[Array, "d d *lanes"] | None
 
 
 class Guided(AbstractGuidedProposal):
@@ -356,31 +356,27 @@ class Guided(AbstractGuidedProposal):
         roots = jnp.broadcast_to(roots, (num_steps, d, d))[:-1]
         pull_back = jnp.swapaxes(roots, 1, 2)
         shift = jax.vmap(matvec)(pull_back, shift)
-        return _NoiseGuess(shift, jax.vmap(matmul)(jax.vmap(matmul)(pull_back, H), roots), roots)
+        H = jax.vmap(matmul)(jax.vmap(matmul)(pull_back, H), roots)
+        return _NoiseGuess(shift, H, roots if dynamics.sigma_varies else None)
 
     def step_law(self, step, x, target):
         shift, H, L_guess = step.guide
-        identity, S = jnp.eye(len(x), dtype=x.dtype), target.covariance
-        S = S * identity if S.ndim == 0 else S
-        L = target.sigma.root()
-        scale, from_guess, from_here = self._scales(L, L_guess, x)
-        K = matmul(from_here.T, matmul(H, from_here))
-        C = matmul(S, inverse(identity + step.dt * matmul(K, S)))
-        r = matvec(from_guess.T, shift) - matvec(H, scale.solve(target.mean - step.end))
-        bend = step.dt * L.mv(matvec(C, matvec(from_here.T, r)))
-        return StepLaw(target.mean + bend, L, (C + C.T) / 2, step.dt)
-
-    @staticmethod
-    def _scales(L: AbstractSigma, L_guess: Float[Array, "d d"], x: Float[Array, " d"]):
-        """L̄ of the mean of V(x) and Ṽ, with L̄⁻¹ L̃ and L̄⁻¹ L."""
-        if not L.varies:
-            identity = jnp.eye(len(x), dtype=x.dtype)
-            return L, identity, identity
-        matrix = L.as_matrix(len(x), x.dtype)
-        V, V_guess = matmul(matrix, matrix.T), matmul(L_guess, L_guess.T)
-        mean = Triangular(cholesky((V + V_guess) / 2))
-        columns = ([mean.solve(each[:, j]) for j in range(len(x))] for each in (L_guess, matrix))
-        return mean, *(jnp.stack(each, axis=1) for each in columns)
+        L, S, gap = target.sigma.root(), target.matrix, target.mean - step.end
+        if L_guess is None:
+            K, r = H, shift - matvec(H, L.solve(gap))  # Lᵀ H̃ L and Lᵀ r̃
+        else:
+            here = L.as_matrix(len(x), x.dtype)
+            scale = root_of((matmul(here, here.T) + matmul(L_guess, L_guess.T)) / 2)  # L̄
+            from_guess, from_here = (
+                jnp.stack([scale.solve(root[:, j]) for j in range(len(x))], axis=1)
+                for root in (L_guess, here)
+            )
+            K = matmul(from_here.T, matmul(H, from_here))
+            r = matvec(from_guess.T, shift) - matvec(H, scale.solve(gap))
+            r = matvec(from_here.T, r)
+        C = matmul(S, inverse(jnp.eye(len(x), dtype=x.dtype) + step.dt * matmul(K, S)))
+        mean = target.mean + step.dt * L.mv(matvec(C, r))
+        return StepLaw(mean, L, (C + C.T) / 2, step.dt)
 
     def _linear(self, dynamics: Dynamics, x: Float[Array, " d"], end: Float[Array, " d"]):
         """F, the linear drift at b, and Ṽ, when the diffusion is linearised at x."""

@@ -51,8 +51,8 @@ def of_pair(
         """By how much further the second step leads, if the drift is linear, for this x'."""
         return sigma.mv(matvec(decay, sigma.solve(to - x)))
 
-    covariance = first * matmul(matmul(decay, _matrix(once, x)), decay.T)
-    covariance = (covariance + second * _matrix(again, x)) / (first + second)
+    covariance = first * matmul(matmul(decay, once.matrix), decay.T)
+    covariance = (covariance + second * again.matrix) / (first + second)
     both = StepLaw(again.mean + carried(once.mean), sigma, covariance, first + second)
     linear = again._replace(mean=again.mean + carried(middle))
     value = twice.log_relative(x_next) - both.log_relative(x_next)
@@ -60,12 +60,6 @@ def of_pair(
     if dynamics.sigma_varies:
         value += law.sigma.log_abs_det() - sigma.log_abs_det()
     return value
-
-
-def _matrix(law: StepLaw, x: Float[Array, " d"]) -> Float[Array, "d d"]:
-    """S."""
-    S = law.covariance
-    return S * jnp.eye(x.shape[0], dtype=x.dtype) if S.ndim == 0 else S
 
 
 def of_all_steps(log_halving: Float[Array, "*rows"], num_steps: int) -> Float[Array, "*rows"]:

@@ -1,12 +1,11 @@
 """The diffusion coefficient σ(x) at one point, as the operator its form calls for.
 
-Forms: the identity, a constant matrix (inverted outside the loop over time), a diagonal and a
-full matrix, and the triangular root of that. Whoever holds a `Sigma` multiplies and solves without
-knowing which; what a form does not need is never computed.
+Four forms: the identity, a constant matrix (inverted outside the loop over time), a
+diagonal and a full matrix. Whoever holds a `Sigma` multiplies and solves without knowing
+which; what a form does not need is never computed.
 """
 
 from abc import abstractmethod
-from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -16,7 +15,6 @@ from .linalg import (
     any_inverse,
     cholesky,
     log_abs_det,
-    log_of_product,
     matmul,
     matvec,
     solve,
@@ -26,10 +24,7 @@ from .linalg import (
 
 
 class AbstractSigma(eqx.Module):
-    """σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,). It `varies` if
-    it may be another elsewhere."""
-
-    varies: ClassVar[bool]
+    """σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,)."""
 
     @abstractmethod
     def mv(self, noise: Float[Array, " d"]) -> Float[Array, " d"]:
@@ -63,8 +58,6 @@ class AbstractSigma(eqx.Module):
 class Identity(AbstractSigma):
     """σ = I."""
 
-    varies: ClassVar[bool] = False
-
     def mv(self, noise):
         return noise
 
@@ -89,8 +82,6 @@ class Identity(AbstractSigma):
 
 class Constant(AbstractSigma):
     """The same matrix everywhere, kept with its inverse."""
-
-    varies: ClassVar[bool] = False
 
     matrix: Float[Array, "d d"]
     inverse: Float[Array, "d d"]
@@ -124,8 +115,6 @@ class Constant(AbstractSigma):
 class Diagonal(AbstractSigma):
     """A diagonal matrix, given by its diagonal."""
 
-    varies: ClassVar[bool] = True
-
     diagonal: Float[Array, " d"]
 
     def mv(self, noise):
@@ -152,11 +141,11 @@ class Diagonal(AbstractSigma):
 
 
 class Full(AbstractSigma):
-    """A full matrix that changes with the state."""
-
-    varies: ClassVar[bool] = True
+    """A full matrix that changes with the state; `lower` says that it is triangular, for which less
+    need be solved."""
 
     matrix: Float[Array, "d d"]
+    lower: bool = eqx.field(static=True, default=False)
 
     def mv(self, noise):
         return matvec(self.matrix, noise)
@@ -165,11 +154,11 @@ class Full(AbstractSigma):
         return matvec(self.matrix.T, vector)
 
     def solve(self, vector):
-        return solve(self.matrix, vector)
+        return (solve_lower if self.lower else solve)(self.matrix, vector)
 
     def average(self, other):
         assert isinstance(other, Full)
-        return Full((self.matrix + other.matrix) / 2)
+        return Full((self.matrix + other.matrix) / 2, self.lower and other.lower)
 
     def log_abs_det(self):
         return log_abs_det(self.matrix)
@@ -178,34 +167,9 @@ class Full(AbstractSigma):
         return self.matrix
 
     def root(self):
-        return Triangular(cholesky(matmul(self.matrix, self.matrix.T)))
+        return root_of(matmul(self.matrix, self.matrix.T))
 
 
-class Triangular(AbstractSigma):
-    """A lower triangular matrix with a positive diagonal that changes with the state."""
-
-    varies: ClassVar[bool] = True
-
-    matrix: Float[Array, "d d"]
-
-    def mv(self, noise):
-        return matvec(self.matrix, noise)
-
-    def mv_transpose(self, vector):
-        return matvec(self.matrix.T, vector)
-
-    def solve(self, vector):
-        return solve_lower(self.matrix, vector)
-
-    def average(self, other):
-        assert isinstance(other, Triangular)
-        return Triangular((self.matrix + other.matrix) / 2)
-
-    def log_abs_det(self):
-        return log_of_product([self.matrix[i, i] for i in range(self.matrix.shape[0])])
-
-    def as_matrix(self, dim, dtype):
-        return self.matrix
-
-    def root(self):
-        return self
+def root_of(V: Float[Array, "d d"]) -> Full:
+    """The lower triangular root of V."""
+    return Full(cholesky(V), lower=True)

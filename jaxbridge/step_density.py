@@ -46,6 +46,12 @@ class StepLaw(NamedTuple):
     covariance: Float[Array, "..."]
     dt: Float[Array, "*lanes"]
 
+    @property
+    def matrix(self) -> Float[Array, "d d"]:
+        """S, also where it is a number."""
+        S, d = self.covariance, self.mean.shape[0]
+        return S * jnp.eye(d, dtype=self.mean.dtype) if S.ndim == 0 else S
+
     def point(self, xi: Float[Array, " d"]) -> Float[Array, " d"]:
         """μ + √δ σ L ξ, with S = L Lᵀ."""
         S = self.covariance
