@@ -42,23 +42,55 @@ observations = jnp.array([[0.0, 0.0], [0.5, -0.3], [0.2, 0.4], [-0.3, 0.6]])
 ```
 """
 
-from .bridges import Bridges, sample_bridges
-from .burn_in import measure_burn_in
-from .chains import sample_exact_bridges
-from .choice import Choice
-from .coupled_pairs import CoupledPairs
-from .coupling import (
+from .coupling.bridges import Bridges, sample_bridges
+from .coupling.burn_in import measure_burn_in
+from .coupling.coupling import (
     AbstractCoupling,
     Coupling,
     no_rotation,
     polar_rotation,
     published_rotation,
 )
-from .crank_nicolson_chain import crank_nicolson
-from .diagnostics import effective_sample_size, potential_scale_reduction
-from .diffusion import Diffusion
-from .expectation import expectation
-from .gaussian import (
+from .coupling.effects import effects
+from .coupling.hitting import HittingCounts, hitting_counts
+from .coupling.meeting import AbstractMeeting, BrownianCrossing, PairStep, ReflectionPlane, SignTest
+from .coupling.start_laws import (
+    Reversed,
+    StartLaw,
+    Stationary,
+)
+from .engine.diagnostics import effective_sample_size, potential_scale_reduction
+from .engine.pareto import pareto_k
+from .exact.chains import sample_exact_bridges
+from .exact.crank_nicolson import crank_nicolson
+from .exact.density import (
+    TransitionLogDensity,
+    transition_log_density,
+)
+from .exact.expectation import expectation
+from .exact.importance import (
+    WeightedBridges,
+    sample_weighted_bridges,
+    weigh_bridges,
+)
+from .exact.kernels import Chain, Kernel
+from .exact.pseudo_marginal import pseudo_marginal
+from .exact.renewal import renewal
+from .inference.gibbs import (
+    GibbsPosterior,
+    GibbsState,
+    gibbs,
+)
+from .inference.maximum_likelihood import (
+    MaximumLikelihood,
+    maximum_likelihood,
+)
+from .inference.pmmh import PMMHPosterior, PMMHState, pmmh
+from .inference.posterior import AbstractPosterior
+from .inference.score import Score, score
+from .inference.unknowns import NormalPrior
+from .models.diffusion import Diffusion
+from .models.gaussian import (
     GaussianBridge,
     GaussianLaw,
     OrnsteinUhlenbeckParams,
@@ -67,52 +99,27 @@ from .gaussian import (
     ou_stationary,
     ou_transition,
 )
-from .gibbs import (
-    GibbsPosterior,
-    GibbsState,
-    gibbs,
+from .models.lamperti import lamperti
+from .models.langevin import (
+    hyperbolic,
+    langevin,
+    stationary_diffusion,
 )
-from .guided import (
+from .models.simulate import simulate
+from .models.transform import Transformed, transform
+from .proposals.base import AbstractWeightedProposal
+from .proposals.choice import Choice
+from .proposals.coupled import CoupledPairs
+from .proposals.guided import (
     AbstractGuidedProposal,
     Guided,
     ModifiedDiffusionBridge,
     ResidualBridge,
     Step,
 )
-from .hitting import HittingCounts, hitting_counts
-from .hitting_variation import HittingVariation, hitting_variation
-from .importance import (
-    WeightedBridges,
-    sample_weighted_bridges,
-    weigh_bridges,
-)
-from .kernels import Chain, Kernel
-from .lamperti import lamperti
-from .likelihood import path_log_likelihood
-from .maximum_likelihood import (
-    MaximumLikelihood,
-    maximum_likelihood,
-)
-from .meeting import (
-    AbstractMeeting,
-    BrownianCrossing,
-    Frame,
-    PairStep,
-    ReflectionPlane,
-    SignTest,
-)
-from .models import (
-    hyperbolic,
-    langevin,
-    stationary_diffusion,
-)
-from .pareto import pareto_k
-from .pmmh import PMMHPosterior, PMMHState, pmmh
-from .posterior import AbstractPosterior
-from .pseudo_marginal_chain import pseudo_marginal
-from .renewal_chain import renewal
-from .scene import effects
-from .schemes import (
+from .schemes.frame import Frame
+from .schemes.path_likelihood import path_log_likelihood
+from .schemes.schemes import (
     AbstractScheme,
     Euler,
     GaussianTransition,
@@ -120,14 +127,7 @@ from .schemes import (
     Milstein,
     SemiImplicit,
 )
-from .score import Score, score
-from .simulate import simulate
-from .start_laws import (
-    Reversed,
-    StartLaw,
-    Stationary,
-)
-from .step_density import (
+from .schemes.step_density import (
     AbstractStepDensity,
     EulerDensity,
     ItoTaylorDensity,
@@ -135,21 +135,15 @@ from .step_density import (
     StepLaw,
     StepsFrom,
 )
-from .transform import Transformed, transform
-from .transition import (
-    TransitionLogDensity,
-    transition_log_density,
-)
-from .tuning import (
+from .tuning.hitting_variation import HittingVariation, hitting_variation
+from .tuning.tuning import (
     Pilot,
     Tuning,
     choose_proposal,
     fit_start_law,
     tune_coupling,
 )
-from .unknowns import NormalPrior
-from .weighted import AbstractWeightedProposal
-from .work_precision import (
+from .tuning.work_precision import (
     Setting,
     WorkPrecision,
     work_precision,

@@ -10,7 +10,7 @@ from typing import NoReturn
 
 import jax
 
-from .accuracy_study import (
+from .studies.accuracy import (
     format_accuracy,
     format_effects,
     format_sigmas,
@@ -18,10 +18,10 @@ from .accuracy_study import (
     run_effect_costs,
     write_accuracy_figures,
 )
-from .bayes_study import format_bayes, run_bayes, write_bayes_figures
-from .benchmark import DURATIONS, format_ratios, run_benchmark, save
-from .crossover_study import format_crossover, processes, write_crossover_figure
-from .exact_study import (
+from .studies.bayes import format_bayes, run_bayes, write_bayes_figures
+from .studies.benchmark import DURATIONS, format_ratios, run_benchmark, save
+from .studies.crossover import format_crossover, processes, write_crossover_figure
+from .studies.exact import (
     draw_as_many,
     format_cost,
     format_exact,
@@ -32,7 +32,7 @@ from .exact_study import (
     slope,
     write_exact_figures,
 )
-from .study import format_table, run_study, write_figures
+from .studies.paper import format_table, run_study, write_figures
 
 _WHAT_TO_SEE = """\
 Approximate bridges have the law of the bridge given that an associated diffusion hits it. For

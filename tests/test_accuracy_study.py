@@ -7,8 +7,8 @@ import pytest
 from test_work_precision import made_up, table
 
 import jaxbridge as jb
-from jaxbridge import study_figures
-from jaxbridge.accuracy_study import (
+from jaxbridge.studies import figures as study_figures
+from jaxbridge.studies.accuracy import (
     EffectCost,
     curves,
     format_accuracy,
@@ -18,7 +18,7 @@ from jaxbridge.accuracy_study import (
     time_of_step,
     write_accuracy_figures,
 )
-from jaxbridge.study import study_model
+from jaxbridge.studies.paper import study_model
 
 
 @pytest.mark.slow

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
-from jaxbridge.averages import filled, values_of, weighted_mean
-from jaxbridge.kernels import Chain
+from jaxbridge.engine.averages import filled, values_of, weighted_mean
+from jaxbridge.exact.kernels import Chain
 
 
 def chain_of(paths):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
-from jaxbridge.bayes_study import (
+from jaxbridge.studies.bayes import (
     brownian_posterior,
     format_bayes,
     hyperbolic_data,

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxbridge.benchmark import (
+from jaxbridge.studies.benchmark import (
     Benchmark,
     Ratio,
     draw_floor,
@@ -14,7 +14,7 @@ from jaxbridge.benchmark import (
     markdown,
     save,
 )
-from jaxbridge.crossover_study import Rate
+from jaxbridge.studies.crossover import Rate
 
 
 def made_up():

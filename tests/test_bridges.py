@@ -19,9 +19,9 @@ from helpers import (
 )
 
 import jaxbridge as jb
-import jaxbridge.bridges
-from jaxbridge.numpy_bridges import approximate_bridges
-from jaxbridge.proposals import propose
+import jaxbridge.coupling.bridges
+from jaxbridge.coupling.pair import propose
+from jaxbridge.studies.numpy_bridges import approximate_bridges
 
 NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
 
@@ -369,7 +369,7 @@ def test_a_caller_who_asks_for_no_gradient_pays_for_none(monkeypatch):
         calls.append(arguments)
         return propose(*arguments)
 
-    monkeypatch.setattr(jaxbridge.bridges, "propose", counted)
+    monkeypatch.setattr(jaxbridge.coupling.bridges, "propose", counted)
 
     def plain(start):
         params = jb.OrnsteinUhlenbeckParams(jnp.eye(2), jnp.zeros(2), None)
@@ -534,7 +534,7 @@ def test_a_thousand_long_bridges_take_less_than_two_gibibytes():
     run_program("""
         import resource
         import jax, jax.numpy as jnp, jaxbridge as jb
-        from jaxbridge.study import study_model
+        from jaxbridge.studies.paper import study_model
         bridges = jb.sample_bridges(
             jax.random.key(0), study_model(), [0.0, 0.0], [1.0, 0.0], 1_000.0, num_bridges=1_000,
             num_steps=50_000, save_at=jnp.linspace(0, 1_000, 11),

@@ -18,8 +18,8 @@ from helpers import (
 )
 
 import jaxbridge as jb
-from jaxbridge.choice import as_proposal
-from jaxbridge.intervals import Intervals
+from jaxbridge.models.intervals import Intervals
+from jaxbridge.proposals.choice import as_proposal
 
 CASES = exact_cases()
 EVERYWHERE = {"unlikely, gamma 0.5"}

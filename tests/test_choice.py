@@ -7,7 +7,7 @@ import pytest
 from helpers import assert_weighted_moments, count_compilations, paper_model
 
 import jaxbridge as jb
-from jaxbridge.choice import Choice, as_proposal
+from jaxbridge.proposals.choice import Choice, as_proposal
 
 slow = pytest.mark.slow
 HYPERBOLIC = jb.hyperbolic(0.8, 2)

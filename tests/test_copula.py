@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaxbridge.copula import empirical_copula, gaussian_copula
+from jaxbridge.plot.copula import empirical_copula, gaussian_copula
 
 
 @pytest.mark.parametrize("correlation", [-0.8, 0.0, 0.6])

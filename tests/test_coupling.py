@@ -10,9 +10,9 @@ import pytest
 from helpers import assert_moments, paper_model
 
 import jaxbridge as jb
-from jaxbridge.coupling import AbstractCoupling, polar_rotation, published_rotation
-from jaxbridge.meeting import frame
-from jaxbridge.sigma import Full
+from jaxbridge.coupling.coupling import AbstractCoupling, polar_rotation, published_rotation
+from jaxbridge.models.sigma import Full
+from jaxbridge.schemes.frame import frame
 
 # The example of the documentation, as it is printed there.
 _EXAMPLE = re.search(r"```python\n(.*?)```", inspect.cleandoc(AbstractCoupling.__doc__), re.DOTALL)

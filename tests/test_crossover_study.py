@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from jaxbridge import study_figures
-from jaxbridge.crossover_study import (
+from jaxbridge.studies import figures as study_figures
+from jaxbridge.studies.crossover import (
     Rate,
     double_well,
     format_crossover,

@@ -10,7 +10,7 @@ PRELUDE = """
 import re
 import jax, jax.numpy as jnp, jaxbridge as jb, numpy as np
 from jax.sharding import AxisType, PartitionSpec as P
-from jaxbridge.study import study_model
+from jaxbridge.studies.paper import study_model
 
 model, key = study_model(), jax.random.key(0)
 a, b, durations = jnp.array([[0.0, 0.0], [0.5, 0.5], [1.0, -1.0]]), [1.0, 0.0], [1.0, 0.5, 2.0]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
-from jaxbridge.exact_study import (
+from jaxbridge.studies.exact import (
     Cost,
     ExactResult,
     Variation,

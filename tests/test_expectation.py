@@ -7,7 +7,7 @@ import pytest
 from inference import multivariate_ou
 
 import jaxbridge as jb
-from jaxbridge.likelihood import forms_of_target
+from jaxbridge.schemes.path_likelihood import forms_of_target
 
 ENDS = ([0.5, -0.3], [1.0, 0.8], 1.0)
 

@@ -7,7 +7,7 @@ import pytest
 from inference import grid_moments, multivariate_ou, ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
-from jaxbridge.unknowns import as_normal, as_unknowns
+from jaxbridge.inference.unknowns import as_normal, as_unknowns
 
 TIMES = np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 20, 1.0)])
 DATA = ou_data(3, TIMES)

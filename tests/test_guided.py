@@ -17,8 +17,8 @@ from helpers import (
 )
 
 import jaxbridge as jb
-from jaxbridge.guided import Step, noise_of, path_of
-from jaxbridge.intervals import Intervals
+from jaxbridge.models.intervals import Intervals
+from jaxbridge.proposals.guided import Step, noise_of, path_of
 
 slow = pytest.mark.slow
 PROPOSALS = {

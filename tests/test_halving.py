@@ -9,9 +9,9 @@ from scipy.stats import multivariate_normal
 from test_step_density import DENSITIES, FROM, TO, log_density_of_chain, quadrature
 
 import jaxbridge as jb
-from jaxbridge.guided import noise_of, path_of
-from jaxbridge.halving import log_halving_of_paths, num_looked
-from jaxbridge.intervals import Intervals
+from jaxbridge.models.intervals import Intervals
+from jaxbridge.proposals.guided import noise_of, path_of
+from jaxbridge.schemes.halving import log_halving_of_paths, num_looked
 
 WELL = jb.Diffusion(lambda x, p: 1.2 * (x - x**3))
 VARYING = jb.Diffusion(lambda x, p: -0.8 * x, lambda x, p: 1 + 0.3 * jnp.tanh(x))

@@ -7,7 +7,7 @@ import pytest
 from helpers import PAPER_CASES, paper_model
 
 import jaxbridge as jb
-from jaxbridge.hitting_variation import _regress
+from jaxbridge.tuning.hitting_variation import _regress
 
 
 def test_regression_separates_the_variance_of_probabilities_from_that_of_counts():

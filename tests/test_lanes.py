@@ -9,9 +9,9 @@ import pytest
 from jax import lax
 
 import jaxbridge as jb
-from jaxbridge.lanes import join_rows, over_lanes, split_rows
-from jaxbridge.linalg import cholesky, inverse, polar_factor, safe_norm
-from jaxbridge.proposals import propose
+from jaxbridge.coupling.pair import propose
+from jaxbridge.engine.lanes import join_rows, over_lanes, split_rows
+from jaxbridge.engine.linalg import cholesky, inverse, polar_factor, safe_norm
 
 B = np.array([[1.5, 1.0, 0.2], [0.3, -1.0, 1.5], [0.0, 0.5, 2.0]])
 
@@ -117,7 +117,7 @@ def test_every_equation_of_a_step_has_a_rule(density, d, monkeypatch):
         law = density.steps_from(model.forward(x), x).law(jnp.array(0.1))
         return law.log_relative(law.point(xi))
 
-    monkeypatch.setattr("jaxbridge.lanes._by_vmap", refuse)
+    monkeypatch.setattr("jaxbridge.engine.lanes._by_vmap", refuse)
     x = jnp.ones((d, 16))
     assert over_lanes(-1, -1)(step)(x, x).shape == (16,)
 

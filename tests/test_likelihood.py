@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import jaxbridge as jb
-from jaxbridge.likelihood import forms_of
+from jaxbridge.schemes.path_likelihood import forms_of
 
 B = np.array([[1.2, 0.7], [-0.4, 0.9]])
 SIGMA = np.array([[0.8, 0.2], [0.0, 1.1]])

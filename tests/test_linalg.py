@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
-from jaxbridge.linalg import (
+from jaxbridge.engine.linalg import (
     all_finite,
     cholesky,
     dot,

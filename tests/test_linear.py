@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from jaxbridge.linear import linear_transition
+from jaxbridge.models.linear import linear_transition
 
 CASES = {
     "stable": [[-1.0, 0.4], [-0.3, -0.5]],

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from jaxbridge.benchmark import load
+from jaxbridge.studies.benchmark import load
 
 
 def run(*arguments, cwd):

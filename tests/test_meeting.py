@@ -8,8 +8,9 @@ from helpers import assert_moments
 from scipy.stats import norm
 
 import jaxbridge as jb
-from jaxbridge.coupling import see
-from jaxbridge.meeting import PairStep, frame
+from jaxbridge.coupling.coupling import see
+from jaxbridge.coupling.meeting import PairStep
+from jaxbridge.schemes.frame import frame
 
 NUM = 200_000
 DT = 0.02

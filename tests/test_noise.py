@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge.noise import Store, noisy_scan
+from jaxbridge.engine.noise import Store, noisy_scan
 
 LANES = 3
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge import pareto
+from jaxbridge.engine import pareto
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")

@@ -12,7 +12,8 @@ import scipy.stats
 from helpers import paper_model
 
 import jaxbridge as jb
-from jaxbridge import plot, study_figures
+from jaxbridge import plot
+from jaxbridge.studies import figures as study_figures
 
 
 def test_qq_of_the_exact_law_lies_on_the_diagonal():

@@ -7,7 +7,7 @@ import pytest
 from inference import ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
-from jaxbridge.unknowns import Unknowns
+from jaxbridge.inference.unknowns import Unknowns
 
 TIMES = np.arange(0, 12, 0.5)
 DATA = ou_data(7, TIMES, rate=0.8, sigma=0.7)

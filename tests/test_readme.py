@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from jaxbridge.benchmark import load, markdown
+from jaxbridge.studies.benchmark import load, markdown
 
 ROOT = pathlib.Path(__file__).parent.parent
 README = ROOT / "README.md"

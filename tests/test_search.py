@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge.search import Trials, _assign_lanes, default_num_lanes, search
+from jaxbridge.engine.rejection import Trials, _assign_lanes, default_num_lanes, search
 
 
 def test_lanes_of_each_problem_carry_consecutive_numbers():

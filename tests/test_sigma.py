@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge.sigma import Constant, Diagonal, Full, Identity
+from jaxbridge.models.sigma import Constant, Diagonal, Full, Identity
 
 rng = np.random.default_rng(0)
 

@@ -11,9 +11,9 @@ from inference import ou_1d, ou_data, ou_log_likelihood
 from scipy import optimize, stats
 
 import jaxbridge as jb
-from jaxbridge import simulated_likelihood
-from jaxbridge.choice import guided_candidates, undecided_between
-from jaxbridge.problem import as_problem
+from jaxbridge.inference import simulated_likelihood
+from jaxbridge.inference.problem import as_problem
+from jaxbridge.proposals.choice import guided_candidates, undecided_between
 
 POSITIVE = lambda params: jnp.all(jnp.stack(params) > 0)
 BRIDGE = jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())

@@ -8,8 +8,8 @@ import pytest
 from helpers import NON_REVERSIBLE, assert_moments, paper_model, slow_cases
 
 import jaxbridge as jb
-from jaxbridge import burn_in, start_laws
-from jaxbridge.start_laws import as_start_law, draw_starts
+from jaxbridge.coupling import burn_in, start_laws
+from jaxbridge.coupling.start_laws import as_start_law, draw_starts
 
 
 def starts(law, model, end, duration=1.0, num_steps=40, n=20_000):

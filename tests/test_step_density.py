@@ -11,7 +11,7 @@ from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, loglog_slope
 from scipy.stats import multivariate_normal
 
 import jaxbridge as jb
-from jaxbridge.linear import linear_transition
+from jaxbridge.models.linear import linear_transition
 
 DENSITIES = {"euler": jb.EulerDensity(), "ito_taylor": jb.ItoTaylorDensity()}
 J = np.array([[0.0, 1.0], [-1.0, 0.0]])

@@ -8,7 +8,7 @@ from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B
 from test_step_density import DENSITIES, FROM, TO
 
 import jaxbridge as jb
-from jaxbridge.step_error import (
+from jaxbridge.schemes.step_error import (
     StepError,
     dominates,
     is_gross,

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaxbridge.gaussian import GaussianLaw
-from jaxbridge.study import CASES, chance, compare, format_table, ks_distance, run_study
+from jaxbridge.models.gaussian import GaussianLaw
+from jaxbridge.studies.paper import CASES, chance, compare, format_table, ks_distance, run_study
 
 
 def test_ks_distance():

@@ -7,7 +7,7 @@ import pytest
 from helpers import PAPER_CASES, count_compilations, exact_cases, paper_model, slow_cases
 
 import jaxbridge as jb
-from jaxbridge.choice import Choice, as_proposal
+from jaxbridge.proposals.choice import Choice, as_proposal
 
 CASES = exact_cases()
 EVERYWHERE = {"unlikely, gamma 0.5"}

@@ -18,8 +18,8 @@ import random_models
 from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
-from jaxbridge.burn_in import with_burn_in
-from jaxbridge.step_error import of_log_mean
+from jaxbridge.coupling.burn_in import with_burn_in
+from jaxbridge.schemes.step_error import of_log_mean
 
 slow = pytest.mark.slow
 

@@ -1,0 +1,321 @@
+"""Approximate bridges by rejection (section 2.2): propose until the pair meets.
+
+The proposals of an interval are numbered trials (`search`), and its j-th success is the
+interval's j-th bridge.
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, Shaped
+
+from ..engine.checks import Numbers, check_bound, check_count, check_key
+from ..engine.devices import over_devices
+from ..engine.rejection import Found, Trials, default_num_lanes, numbered_keys, search
+from ..engine.throwing import throw_where_incomplete
+from ..models.diffusion import Diffusion, check_diffusion
+from ..models.grid import grid_times, stored_steps, uniform_fractions
+from ..models.intervals import Intervals, as_intervals
+from ..schemes.fit import check_model
+from .coupling import AbstractCoupling, Coupling, check_coupling
+from .pair import Proposals, propose
+
+
+class Bridges(eqx.Module):
+    """What `sample_bridges` returns. With I intervals arrays have a leading axis I; `times` has
+    it only where there are I durations.
+
+    - `times`: the K stored times, shape (K,), from 0 to the duration.
+    - `paths`: the bridges, shape (n, K, d). A bridge that was not found is NaN throughout.
+    - `met`: whether the bridge was found, shape (n,).
+    - `meeting_step`: ρ, the first step at which the path follows the reversed path, between 1
+        and N; -1 where no bridge was found. Shape (n,).
+    - `reverse_start`: the reversed path at time 0, shape (n, d); NaN where no bridge was found.
+    - `num_proposals`: proposals made until the last bridge was found, or until the bound.
+        `n / num_proposals` estimates the acceptance probability.
+    - `num_nonfinite`: how many of them left the finite numbers, or came further out than 1e18, and
+        were rejected for it.
+    - `coupling`, `num_steps`: those they were made with.
+    """
+
+    times: Float[Array, "*durations K"]
+    paths: Float[Array, "*I n K d"]
+    met: Bool[Array, "*I n"]
+    meeting_step: Int[Array, "*I n"]
+    reverse_start: Float[Array, "*I n d"]
+    num_proposals: Int[Array, "*I"]
+    num_nonfinite: Int[Array, "*I"]
+    coupling: AbstractCoupling
+    num_steps: int = eqx.field(static=True)
+
+
+def sample_bridges(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_bridges: int = 1,
+    num_steps: int = 50,
+    coupling: AbstractCoupling | None = None,
+    max_proposals: Numbers | None = None,
+    save_at: Numbers | None = None,
+    batch_size: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = False,
+) -> Bridges:
+    """Independent approximate (start, end, duration)-bridges: section 2.2 of the paper.
+
+    Their law is that of the diffusion bridge conditioned on being hit by its associated
+    diffusion (Theorem 1), close to the bridge's own law for end points that are likely, and
+    closer the longer the duration. The step size adds its own error.
+
+    **Arguments:**
+
+    - `key`: a typed key, `jax.random.key(...)`.
+    - `model`: the diffusion; its time reversal must be known.
+    - `start`, `end`: points, shape (d,), or (I, d) for I intervals at once. The widest
+        floating point type of these and the duration is that of the paths.
+    - `duration`: the length of the interval, in units of time, shape () or (I,).
+    - `num_bridges`: n, how many bridges of each interval.
+    - `num_steps`: N, so δ = duration / N. Compile time does not grow with it.
+    - `coupling`: by default `Coupling(gamma=0.0)`.
+    - `max_proposals`: bounds the proposals of each interval; by default 1,000 for each bridge
+        and at least 100,000.
+    - `save_at`: times in [0, duration] on the grid, increasing, shape (K,), at which paths are
+        kept; with several durations, fractions of them. By default the whole grid.
+    - `batch_size`: proposals simulated side by side; bounds memory, and changes results by
+        rounding only. By default no more than are useful, and as many as fit in 16 MiB, or 256
+        if these fit in 512 MiB.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time where a bridge was not found, or parameters are not
+        finite.
+
+    **Returns:** `Bridges`.
+
+    **Gradients** of the paths with respect to `params`, `start`, `end` and `duration`, forward
+    and reverse, are those at fixed noise and fixed meeting step: accepted paths are replayed
+    from their keys, all side by side, only when a derivative is asked for. They are *not*
+    derivatives of expectations over bridges, for whether a pair meets depends on the parameters
+    too.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit, as far as their
+    values are visible before tracing.
+
+    **Example:**
+
+    ```python
+    bridges = jb.sample_bridges(key, model, [0.0, 0.0], [1.0, 0.0], 1.0, num_bridges=100)
+    bridges.paths.shape, 100 / bridges.num_proposals  # (100, 51, 2) and the acceptance rate
+    ```
+    """
+    coupling = Coupling() if coupling is None else coupling
+    check_coupling(coupling)
+    check_key(key)
+    check_diffusion(model)
+    num_bridges = check_count("num_bridges", num_bridges)
+    num_steps = check_count("num_steps", num_steps)
+    intervals, batched, several_durations = as_intervals(start, end, duration)
+    check_model(model, intervals, coupling.scheme)
+    model.check_reversal()
+    fractions = uniform_fractions(num_steps)
+    stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
+    max_proposals = check_bound("max_proposals", max_proposals, max(1_000 * num_bridges, 100_000))
+    if batch_size is None:
+        num_wanted = num_bridges * intervals.start.shape[0]
+        batch_size = default_num_lanes(num_wanted, num_steps, intervals.start)
+    batch_size = check_count("batch_size", batch_size)
+    progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    bridges = _sample_bridges(
+        key,
+        model,
+        coupling,
+        intervals,
+        max_proposals,
+        stored,
+        num_bridges,
+        num_steps,
+        batch_size,
+        progress_meter,
+        batched,
+        several_durations,
+    )
+    return throw_where_incomplete(bridges, "paths", model, ~bridges.met) if throw else bridges
+
+
+class Inputs(NamedTuple):
+    """Everything a path may be differentiated with respect to."""
+
+    model: Diffusion
+    coupling: AbstractCoupling
+    intervals: Intervals
+
+
+@eqx.filter_jit
+def _sample_bridges(
+    key: Key[Array, ""],
+    model: Diffusion,
+    coupling: AbstractCoupling,
+    intervals: Intervals,
+    max_proposals: Int[Array, ""],
+    stored: Int[Array, " K"] | None,
+    num_bridges: int,
+    num_steps: int,
+    num_lanes: int,
+    progress_meter: diffrax.AbstractProgressMeter,
+    batched: bool,
+    several_durations: bool,
+) -> Bridges:
+    num_intervals = intervals.start.shape[0]
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_intervals))
+    inputs = Inputs(model.prepared(), coupling, intervals)
+    fixed = jax.tree.map(
+        lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs
+    )
+    everything = jnp.ones(num_intervals, bool)
+    found = find_bridges(
+        keys,
+        fixed,
+        everything,
+        num_bridges,
+        max_proposals,
+        num_steps,
+        stored,
+        num_lanes,
+        progress_meter,
+    )
+    paths, reverse_start, rho = found.outputs
+    met = rho <= num_steps
+    interval = jnp.repeat(jnp.arange(num_intervals), num_bridges)
+    accepted = (keys, interval, jnp.maximum(found.number, 0), stored, rho)
+    paths = _with_replayed_tangents(inputs, accepted, paths, num_steps)
+    paths = jnp.where(met[:, None, None], paths, jnp.nan)
+    return Bridges(
+        grid_times(intervals, stored, uniform_fractions(num_steps), several_durations),
+        unflatten_rows(paths, num_intervals, batched),
+        unflatten_rows(met, num_intervals, batched),
+        unflatten_rows(jnp.where(met, rho, -1), num_intervals, batched),
+        unflatten_rows(reverse_start, num_intervals, batched),
+        found.num_trials if batched else found.num_trials[0],
+        found.num_nonfinite if batched else found.num_nonfinite[0],
+        coupling,
+        num_steps,
+    )
+
+
+class Joined(NamedTuple):
+    """Accepted proposals: the path, X_0 and ρ of each row, N + 1 for a row not filled."""
+
+    paths: Float[Array, "rows K d"]
+    reverse_start: Float[Array, "rows d"]
+    meeting_step: Int[Array, " rows"]
+
+
+def find_bridges(
+    keys: Key[Array, " P"],
+    inputs: Inputs,
+    active: Bool[Array, " P"],
+    num_bridges: int,
+    max_proposals: Int[Array, ""],
+    num_steps: int,
+    stored: Int[Array, " K"] | None,
+    num_lanes: int,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> Found:
+    """Propose for each of P active problems, one interval and one key each, until it has its
+    bridges. The outputs are `Joined`."""
+    trial = eqx.Partial(_trial, inputs, keys, num_steps, stored)
+    (num_problems, d), dtype = inputs.intervals.start.shape, inputs.intervals.start.dtype
+    num_rows = num_problems * num_bridges
+    num_stored = num_steps + 1 if stored is None else stored.shape[0]
+    rows = Joined(
+        jnp.zeros((num_rows, num_stored, d), dtype),
+        jnp.full((num_rows, d), jnp.nan, dtype),
+        jnp.full(num_rows, num_steps + 1, jnp.int32),
+    )
+    return search(trial, rows, active, num_bridges, max_proposals, num_lanes, progress_meter)
+
+
+def _trial(
+    inputs: Inputs,
+    keys: Key[Array, " P"],
+    num_steps: int,
+    stored: Int[Array, " K"] | None,
+    problem: Int[Array, " lanes"],
+    number: Int[Array, " lanes"],
+) -> Trials:
+    made = _propose_numbered(inputs, keys, problem, number, num_steps, stored)
+    joined = Joined(jnp.moveaxis(made.paths, -1, 0), made.reverse_start.T, made.meeting_step)
+    return Trials(made.meeting_step <= num_steps, made.finite, joined)
+
+
+def unflatten_rows(rows: Shaped[Array, "rows ..."], num_intervals: int, batched: bool) -> Array:
+    """Rows (I × n, ...) as (I, n, ...), or as (n, ...) for the only interval."""
+    return rows.reshape(num_intervals, -1, *rows.shape[1:]) if batched else rows
+
+
+def _propose_numbered(
+    inputs: Inputs,
+    keys: Key[Array, " I"],
+    interval: Int[Array, " lanes"],
+    number: Int[Array, " lanes"],
+    num_steps: int,
+    stored: Int[Array, " K"] | None,
+    meeting_step: Int[Array, " lanes"] | None = None,
+    time_scale: Float[Array, " lanes"] | float = 1.0,
+) -> Proposals:
+    """The proposals with these numbers, of these intervals: a function of nothing else."""
+    start, end, duration = inputs.intervals
+    return propose(
+        inputs.model,
+        inputs.coupling,
+        numbered_keys(keys, interval, number),
+        start[interval].T,
+        end[interval].T,
+        duration[interval] * time_scale / num_steps,
+        num_steps,
+        stored,
+        meeting_step,
+    )
+
+
+@eqx.filter_custom_jvp
+def _with_replayed_tangents(inputs, accepted, paths, num_steps):
+    """`paths`, whose tangents come from a replay of the accepted proposals.
+
+    The search is a `while_loop`, which has no reverse mode, and most of its work was rejected.
+    """
+    return paths
+
+
+@_with_replayed_tangents.def_jvp
+def _replay_tangents(primals, tangents):
+    inputs, (keys, interval, number, stored, rho), paths, num_steps = primals
+
+    def replay(inputs):
+        # A row without a bridge replays a proposal of no duration, which cannot overflow: its
+        # tangent is masked by the caller, and in reverse mode 0 · ∞ would be NaN.
+        brief = jnp.where(rho <= num_steps, 1, 1e-12).astype(paths.dtype)
+        again = eqx.Partial(_replayed_paths, inputs, keys, num_steps, stored)
+        return over_devices(again, (0, 0, 0, 0))(interval, number, rho, brief)
+
+    return paths, eqx.filter_jvp(replay, (inputs,), (tangents[0],))[1]
+
+
+def _replayed_paths(
+    inputs: Inputs,
+    keys: Key[Array, " I"],
+    num_steps: int,
+    stored: Int[Array, " K"] | None,
+    interval: Int[Array, " rows"],
+    number: Int[Array, " rows"],
+    rho: Int[Array, " rows"],
+    time_scale: Float[Array, " rows"],
+) -> Float[Array, "rows K d"]:
+    made = _propose_numbered(inputs, keys, interval, number, num_steps, stored, rho, time_scale)
+    return jnp.moveaxis(made.paths, -1, 0)

@@ -1,0 +1,81 @@
+"""`effects`: what the compiled program of a scene contains, and why."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..engine.checks import Numbers, as_floating, check_count
+from ..engine.noise import stretches
+from ..models import decisions
+from ..models.decisions import Effects
+from ..models.diffusion import Diffusion, check_diffusion
+from .coupling import AbstractCoupling, Coupling, check_coupling, rotation_effect
+
+# Dimensions tried for a model that does not say its own; most that fit two fit them all.
+_DIMENSIONS = (2, 1, *range(3, 65))
+
+
+def effects(
+    model: Diffusion,
+    coupling: AbstractCoupling | None = None,
+    *,
+    at: Numbers | None = None,
+    num_steps: int = 50,
+    save_at: Numbers | None = None,
+) -> Effects:
+    """Which effects proposals of this scene simulate, which they leave out, and why: the very
+    decisions by which the program is made.
+
+    **Arguments:**
+
+    - `model`, `coupling`: as in `sample_bridges`.
+    - `at`: any point of the state space, shape (d,). By default zero, in the first of the
+        dimensions 2, 1, 3, 4, ... that the model's functions accept.
+    - `num_steps`, `save_at`: as in `sample_bridges`.
+
+    **Returns:** `Effects`, a table when printed.
+
+    **Raises:** `ValueError` where no dimension fits, or the time reversal is unknown; `TypeError`
+    for anything but a model and a coupling.
+
+    **Example:**
+
+    ```python
+    print(jb.effects(jb.hyperbolic(0.8, 2), jb.Coupling(-1.0)))
+    jb.effects(model).reverse_drift.why
+    ```
+    """
+    check_diffusion(model)
+    coupling = Coupling() if coupling is None else coupling
+    check_coupling(coupling)
+    num_steps = check_count("num_steps", num_steps)
+    model.check_reversal()
+    like = _find_point(model) if at is None else as_floating("at", at)
+    if like.ndim != 1:
+        raise ValueError(f"`at` must be one point, shape (d,); got {like.shape}.")
+    forward = model.forward(like)
+    sigma = type(eqx.filter_eval_shape(forward.sigma, like))
+    reverse_drift = model.reverse_drift_effect
+    return Effects(
+        reverse_drift,
+        decisions.divergence(reverse_drift, forward.sigma_varies),
+        decisions.solves(sigma),
+        rotation_effect(coupling, sigma, sigma),
+        decisions.independent_noise(coupling.independent_noise),
+        decisions.crossing_uniforms(coupling.meeting.draws_uniform),
+        decisions.stratonovich(coupling.scheme.stratonovich, forward.sigma_varies),
+        decisions.stored_times(None if save_at is None else as_floating("save_at", save_at).size),
+        decisions.early_stop(stretches(num_steps)[0]),
+    )
+
+
+def _find_point(model: Diffusion) -> Float[Array, " d"]:
+    for d in _DIMENSIONS:
+        like = jnp.zeros(d)
+        try:
+            jax.eval_shape(lambda x: (model.drift(x), model.diffusion(x)), like)
+        except (IndexError, TypeError, ValueError):  # a point of a wrong shape
+            continue
+        return like
+    raise ValueError("the dimension of this model is not visible: pass a point, `at=`, shape (d,).")

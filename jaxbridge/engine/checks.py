@@ -1,0 +1,146 @@
+"""What counts as numbers, and how they become arrays."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
+
+# Anything `jnp.asarray` takes: an array, a number, a (nested) list of numbers.
+Numbers = ArrayLike | Sequence[Any]
+
+# Trials are numbered in 32 bits.
+_MOST_TRIALS = 2**30
+
+
+def as_real(name: str, value: Numbers) -> Array:
+    """`value` as an array, which must be of floating point or whole numbers.
+
+    A value that is known stays known while a program around it is traced, so it can be checked.
+    Raises `TypeError`, naming the argument, for anything else.
+    """
+    try:
+        if is_traced(value):
+            array = jnp.asarray(value)
+        else:
+            with jax.ensure_compile_time_eval():
+                array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"`{name}` must be real numbers in an array; got {value!r}.") from error
+    if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer)):
+        raise TypeError(f"`{name}` must be real numbers; got dtype {array.dtype}.")
+    return array
+
+
+def as_floating(name: str, value: Numbers) -> Array:
+    """`value` as an array of floating point numbers, whole numbers in JAX's default type."""
+    array = as_real(name, value)
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    with jax.ensure_compile_time_eval():
+        return array.astype(float)
+
+
+def is_traced(*trees) -> bool:
+    """Whether any value in the trees is abstract, so that it cannot be looked at."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+
+
+def cast_floats(tree: PyTree, dtype) -> PyTree:
+    """The tree with all its floating point arrays in one precision."""
+    return jax.tree.map(
+        lambda leaf: leaf.astype(dtype) if eqx.is_inexact_array(leaf) else leaf, tree
+    )
+
+
+def all_finite_leaves(tree: PyTree) -> Bool[Array, ""]:
+    """Whether all numbers in the tree are finite."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves] or [True]))
+
+
+@eqx.filter_custom_jvp
+def nondifferentiable(tree: PyTree) -> PyTree:
+    """The tree, of which no derivative may be taken."""
+    return tree
+
+
+@nondifferentiable.def_jvp
+def _refuse(primals, tangents):
+    raise TypeError(
+        "what corrects bridges to their exact law has no derivative path by path: whether a pair "
+        "meets, and how often a bridge is hit, depends on the parameters too. Apply "
+        "`jax.lax.stop_gradient` to the parameters where bridges are made, and differentiate a "
+        "likelihood of their paths."
+    )
+
+
+@eqx.filter_custom_jvp
+def nondifferentiable_choice(tree: PyTree) -> PyTree:
+    """The tree, of which no derivative may be taken because of a choice that may be a coupling."""
+    return tree
+
+
+@nondifferentiable_choice.def_jvp
+def _refuse_choice(primals, tangents):
+    raise TypeError(
+        "this choice may take couplings, which have no derivative path by path, for whether a pair "
+        "meets depends on the parameters too. Choose before, outside of `grad`, between proposals "
+        "that are pulled to the end point, `choice = choose_proposal(..., candidates="
+        "[ModifiedDiffusionBridge(), Guided()])`, and pass `proposal=choice`: it is differentiable."
+    )
+
+
+def time_steps(name: str, times: Numbers) -> tuple[Array, Array]:
+    """Times as an array, and the differences of successive ones, in the last axis. Where times are
+    known these are taken before they are rounded to the array's precision.
+
+    **Raises:** `ValueError` where they are so large that rounding has spoilt the differences.
+    """
+    array = as_floating(name, times)
+    if is_traced(times):
+        return array, jnp.diff(array)
+    known = np.asarray(times)
+    known = known if np.issubdtype(known.dtype, np.floating) else known.astype(float)
+    steps = np.diff(known.astype(float))
+    smallest = np.min(np.abs(steps[steps != 0]), initial=np.inf)
+    if np.finfo(known.dtype).eps * np.max(np.abs(known), initial=0) > 0.05 * smallest:
+        raise ValueError(
+            f"`{name}` are too large for their differences to be known in {known.dtype}: count "
+            "them from a later zero, or pass them as a NumPy array of float64."
+        )
+    with jax.ensure_compile_time_eval():
+        return array, jnp.asarray(steps, array.dtype)
+
+
+def check_key(key) -> None:
+    """Raise `TypeError` for anything but one typed key."""
+    if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
+        raise TypeError(f"`key` must be a typed key, `jax.random.key(seed)`; got {key!r}.")
+    if key.shape != ():
+        raise ValueError(f"`key` must be a single key; got an array of keys, {key.shape}.")
+
+
+def check_count(name: str, value, minimum: int = 1) -> int:
+    """A static whole number of at least `minimum`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+        raise TypeError(f"`{name}` must be a Python integer, known when compiling; got {value!r}.")
+    if value < minimum:
+        raise ValueError(f"`{name}` must be at least {minimum}; got {value}.")
+    return int(value)
+
+
+def check_bound(name: str, value: Numbers | None, default: int) -> Int[Array, ""]:
+    """A bound on numbered trials, by default `default`; traced, so that it can change without
+    compiling again."""
+    if value is None:
+        value = min(default, _MOST_TRIALS)
+    elif not is_traced(value):
+        value = check_count(name, value)
+        if value > _MOST_TRIALS:
+            raise ValueError(f"`{name}` must be at most 2³⁰; got {value}.")
+    return jnp.asarray(value, jnp.int32)

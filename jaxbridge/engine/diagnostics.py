@@ -1,0 +1,69 @@
+"""How good is a chain?"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from .checks import Numbers, as_floating
+
+
+def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
+    """How many independent draws a chain is worth: n / (1 + 2 Σ_t ρ_t), with autocorrelations
+    summed as far as sums of adjacent pairs are positive, and made to decrease (Geyer 1992). NaN
+    where a draw is.
+
+    `draws`: one chain, shape (n, ...), for instance `chain.paths[:, 25]`.
+
+    **Example:**
+
+    ```python
+    draws = jax.random.normal(key, (1000, 2))  # as, of a chain, `chain.paths[:, 25]`
+    jb.effective_sample_size(draws)  # shape (2,)
+    ```
+    """
+    draws = as_floating("draws", draws)
+    if draws.ndim == 0 or draws.shape[0] < 4:
+        raise ValueError(
+            f"`draws` must be a chain of at least 4, shape (n, ...); got {draws.shape}."
+        )
+    n = draws.shape[0]
+    centred = draws - jnp.mean(draws, axis=0)
+    spectrum = jnp.fft.rfft(centred, 2 * n, axis=0)
+    covariance = jnp.fft.irfft(jnp.abs(spectrum) ** 2, 2 * n, axis=0)[:n]
+    moving = covariance[0] > 0
+    correlation = covariance / jnp.where(moving, covariance[0], 1)
+    pairs = correlation[: n // 2 * 2].reshape(n // 2, 2, *draws.shape[1:]).sum(1)
+    positive = jnp.cumprod(pairs > 0, axis=0)
+    pairs = jax.lax.cummin(jnp.where(positive, pairs, 0), axis=0)
+    time = 2 * jnp.sum(pairs, axis=0) - 1
+    # A chain that alternates can be worth more than n, but how much is not well determined.
+    size = jnp.minimum(n / jnp.maximum(time, 1 / n), n * math.log10(n))
+    size = jnp.where(moving, size, 1)
+    return jnp.where(jnp.isfinite(covariance[0]), size, jnp.nan)
+
+
+def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
+    """R̂ from the halves of several chains (Gelman & Rubin 1992, split): near one if they agree.
+
+    `draws`: shape (chains, n, ...).
+
+    **Example:**
+
+    ```python
+    draws = jax.random.normal(key, (4, 1000, 2))  # as `theta` of a posterior of four chains
+    jb.potential_scale_reduction(draws)  # shape (2,)
+    ```
+    """
+    draws = as_floating("draws", draws)
+    if draws.ndim < 2 or draws.shape[1] < 4:
+        raise ValueError(
+            "`draws` must be chains of at least 4 draws each, shape (chains, n, ...); got "
+            f"{draws.shape}."
+        )
+    n = draws.shape[1] // 2
+    halves = jnp.concatenate([draws[:, :n], draws[:, -n:]])
+    between = jnp.var(jnp.mean(halves, axis=1), axis=0, ddof=1)
+    within = jnp.mean(jnp.var(halves, axis=1, ddof=1), axis=0)
+    return jnp.sqrt((n - 1) / n + between / within)

@@ -1,0 +1,141 @@
+"""Markov chains whose law is that of the exact bridge: very many steps in one call.
+
+* Pseudo-marginal Metropolis–Hastings (`pseudo_marginal_chain`), for every proposal.
+* Renewal (`renewal_chain`), for couplings.
+* Preconditioned Crank–Nicolson moves of the noise (`crank_nicolson_chain`), for proposals that
+  are pulled to the end point.
+
+Each comes as a kernel of two functions, `init` and `step`, too.
+"""
+
+from typing import Any, Literal
+
+import diffrax
+from jaxtyping import Array, Key
+
+from ..engine.checks import Numbers, check_count, check_key
+from ..engine.pareto import is_reliable
+from ..engine.throwing import throw_where_incomplete
+from ..models.diffusion import Diffusion, check_diffusion
+from ..models.grid import stored_steps
+from ..models.intervals import as_intervals
+from ..proposals.choice import as_proposal, settled, uses_couplings
+from ..proposals.guided import Guided
+from ..schemes.step_error import is_gross
+from .crank_nicolson import as_guided, check_step_size, run_crank_nicolson
+from .kernels import Chain
+from .pseudo_marginal import run_pseudo_marginal
+from .renewal import as_pairs, run_renewal
+
+
+def sample_exact_bridges(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_bridges: int = 1,
+    num_steps: int = 50,
+    proposal: Any = None,
+    method: Literal["pseudo_marginal", "renewal", "crank_nicolson"] = "pseudo_marginal",
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+    step_size: Numbers | None = None,
+    save_at: Numbers | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = False,
+) -> Chain:
+    """A Markov chain of bridges with the exact law: section 2.3 of the paper.
+
+    The law is exact up to the step error, which `num_steps` controls. Proposals do not depend
+    on the chain, so they and their counts are made ahead, thousands at a time; the renewal
+    chain runs in segments that are joined where they agree. The chain is, up to rounding, that
+    of the kernel: with `run_key, init_key = jax.random.split(key)`, the one that starts from
+    `init(None, init_key)` and steps with `jax.random.split(run_key, num_bridges)`.
+
+    **Arguments:**
+
+    - `key`: a typed key. With I intervals the i-th chain has the key
+        `jax.random.fold_in(key, i)`.
+    - `model`, `start`, `end`, `duration`, `num_steps`, `save_at`: as in `sample_bridges`.
+    - `num_bridges`: n, the number of iterations.
+    - `proposal`: a `Coupling`, with its start law, by default `Coupling(gamma=0.0)`; or
+        `ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()` (the default of
+        "crank_nicolson"), whose target is made of the densities of their steps; or "auto",
+        which finds the best for each interval by a pilot run, or
+        what `choose_proposal` returns.
+    - `method`: "pseudo_marginal"; "renewal", for couplings, which needs many more iterations for
+        bridges as good, each of which costs less; or "crank_nicolson", for proposals that are
+        pulled to the end point, where few of them are accepted: it moves the noise of the current
+        path a little in each iteration.
+    - `num_counts`: N, hitting counts for each proposal of the pseudo-marginal chain; by default
+        one.
+    - `max_proposals`: bounds the tries for each new path; by default 10,000.
+    - `max_trials`: bounds the trials for the counts of each path; by default 10,000 for each
+        count. See `Chain.truncated`. It and `num_counts` are not for the renewal chain.
+    - `step_size`: β in (0, 1] of "crank_nicolson", by default 0.5; see `crank_nicolson`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, k̂ is
+        above 0.7, the step error is above 0.1 standard deviations, or parameters are not finite.
+
+    **Returns:** `Chain`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    chain = jb.sample_exact_bridges(key, model, start, end, 1.0, num_bridges=1000)
+    chain.paths.shape, chain.acceptance_rate  # (1000, 51, 2)
+    ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_bridges = check_count("num_bridges", num_bridges)
+    num_steps = check_count("num_steps", num_steps)
+    intervals, batched, several_durations = as_intervals(start, end, duration)
+    if proposal is None and method == "crank_nicolson":
+        proposal = Guided()
+    like = intervals.start[0]
+    proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
+    proposal.check(model, intervals)
+    if step_size is not None and method != "crank_nicolson":
+        raise ValueError('`step_size` is for method="crank_nicolson".')
+    if method == "crank_nicolson":
+        proposal = as_guided(proposal)
+    elif method == "renewal":
+        proposal = as_pairs(proposal)
+        if not (num_counts is None and max_trials is None):
+            raise ValueError(
+                "`num_counts` and `max_trials` are for the pseudo-marginal chain: the renewal "
+                "chain counts nothing."
+            )
+    elif method != "pseudo_marginal":
+        raise ValueError(
+            f'`method` must be "pseudo_marginal", "renewal" or "crank_nicolson"; got {method!r}.'
+        )
+    fractions = proposal.fractions(num_steps)
+    stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
+    proposal = settled(proposal, key, model, intervals, num_steps)
+    arguments = (key, model, proposal, intervals, stored, num_bridges, num_steps, batched)
+    arguments = (*arguments, several_durations, progress_meter)
+    if method == "crank_nicolson":
+        chain = run_crank_nicolson(*arguments, check_step_size(step_size))
+    else:
+        chain = (run_renewal if method == "renewal" else run_pseudo_marginal)(*arguments)
+    if not throw:
+        return chain
+    # The renewal chain keeps no weights that could be cut off, but its trials may start wrongly.
+    truncated = chain.num_truncated > 0 if chain.truncated is None else chain.truncated
+    return throw_where_incomplete(
+        chain,
+        "paths",
+        model,
+        ~chain.met,
+        truncated,
+        coupled=uses_couplings(proposal),
+        heavy=None if chain.pareto_k is None else ~is_reliable(chain.pareto_k),
+        gross=is_gross(chain.step_error_in_sds()),
+    )

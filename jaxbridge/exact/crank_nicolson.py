@@ -1,0 +1,266 @@
+"""Preconditioned Crank–Nicolson moves on bridges: a chain that moves the noise a little.
+
+A proposal that is pulled to the end point (`guided`) maps noise ξ ~ N(0, I) to a path, and the
+bridge is that law weighted with w(ξ). The move
+
+    ξ' = √(1-β²) ξ + β η,    η ~ N(0, I),
+
+leaves N(0, I) invariant, so ξ' is accepted with probability min(1, w(ξ')/w(ξ)): for long or
+hard bridges, where paths that are proposed from scratch are hardly ever accepted. β = 1 is that
+again. The number of steps does not matter for the acceptance (Beskos, Roberts, Stuart & Voss
+2008; Cotter, Roberts, Stuart & White 2013).
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..engine.checks import (
+    Numbers,
+    as_floating,
+    check_count,
+    check_key,
+    is_traced,
+    nondifferentiable,
+)
+from ..models.diffusion import Diffusion, check_diffusion
+from ..models.grid import grid_times
+from ..models.intervals import Intervals
+from ..proposals.base import AbstractWeightedProposal
+from ..proposals.choice import as_proposal
+from ..proposals.guided import AbstractGuidedProposal, Guided, noise_of, path_of
+from .kernels import (
+    Chain,
+    Kernel,
+    acceptance_rate,
+    chain_keys,
+    check_path,
+    one_interval,
+    sum_by_interval,
+)
+
+
+class CrankNicolsonState(NamedTuple):
+    """`position`, the path, shape (N+1, d); the `noise` it is made from, (N-1, d); its
+    `log_weight`, -inf for a path that left the finite numbers; and its `log_halving`, the log of
+    the factor by which half as many steps would change that (`halving`)."""
+
+    position: Float[Array, "*I points d"]
+    noise: Float[Array, "*I steps d"]
+    log_weight: Float[Array, "*I"]
+    log_halving: Float[Array, "*I"]
+
+
+class CrankNicolsonInfo(NamedTuple):
+    """Of one step: the `acceptance_rate`, whether the move was accepted, and the log weight of
+    the path that was proposed, -inf where it left the finite numbers."""
+
+    acceptance_rate: Float[Array, "*I"]
+    is_accepted: Bool[Array, "*I"]
+    log_weight: Float[Array, "*I"]
+
+
+def crank_nicolson(
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_steps: int = 50,
+    proposal: Any = None,
+    step_size: Numbers | None = None,
+) -> Kernel:
+    """The preconditioned Crank–Nicolson kernel on (start, end, duration)-bridges.
+
+    `init(position, rng_key)` takes a path of shape (N+1, d), and so may enter a chain, as a block
+    of a Gibbs sampler; or `None`, for a first path by proposal. `step(rng_key, state)` gives a
+    `CrankNicolsonState` and a `CrankNicolsonInfo`.
+
+    **Arguments:** as in `sample_exact_bridges`, but `proposal` is by default `Guided()`;
+    `step_size` is β in (0, 1], by default 0.5: aim at accepting a quarter to a half.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    kernel = jb.crank_nicolson(model, start, end, 10.0, num_steps=500, step_size=0.3)
+    state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
+    ```
+    """
+    check_diffusion(model)
+    intervals = one_interval(start, end, duration)
+    proposal = Guided() if proposal is None else proposal
+    proposal = as_guided(as_proposal(proposal, model, intervals.start[0]))
+    num_steps = check_count("num_steps", num_steps)
+    proposal.check(model, intervals)
+    beta = check_step_size(step_size)
+    setting = (model, proposal, intervals)
+
+    def init(position, rng_key):
+        check_key(rng_key)
+        if position is not None:
+            position = check_path(position, intervals, num_steps)[None]
+        state = _init(rng_key[None], position, *setting, num_steps)
+        return jax.tree.map(lambda leaf: leaf[0], state)
+
+    def step(rng_key, state):
+        return _step(rng_key, state, *setting, beta)
+
+    return Kernel(init, step)
+
+
+@eqx.filter_jit
+def _init(
+    keys: Key[Array, " I"],
+    paths: Float[Array, "I points d"] | None,
+    model: Diffusion,
+    proposal: AbstractGuidedProposal,
+    intervals: Intervals,
+    num_steps: int,
+) -> CrankNicolsonState:
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    dynamics = model.forward(intervals.start[0])
+    if paths is None:
+        noise = _normal(keys, num_steps, intervals)
+        paths, log_weights, log_halving = path_of(proposal, dynamics, intervals, noise)
+    else:
+        noise, log_weights, log_halving = noise_of(proposal, dynamics, intervals, paths)
+        noise = jnp.where(jnp.isfinite(noise), noise, 0)  # a path outside the state space is left
+    return CrankNicolsonState(paths, noise, _finite(log_weights), log_halving)
+
+
+@eqx.filter_jit
+def _step(rng_key, state, model, proposal, intervals, beta):
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    dynamics = model.forward(intervals.start[0])
+    state = jax.tree.map(lambda leaf: leaf[None], state)
+    moved = _move(rng_key[None], state, proposal, dynamics, intervals, beta)
+    return jax.tree.map(lambda leaf: leaf[0], moved)
+
+
+def _move(
+    keys: Key[Array, " I"],
+    state: CrankNicolsonState,
+    proposal: AbstractGuidedProposal,
+    dynamics,
+    intervals: Intervals,
+    beta: Float[Array, ""],
+) -> tuple[CrankNicolsonState, CrankNicolsonInfo]:
+    """One move of each of I chains."""
+    noise_keys, accept_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    dtype = state.noise.dtype
+    beta = beta.astype(dtype)
+    fresh = _normal(noise_keys, state.noise.shape[1] + 1, intervals)
+    noise = jnp.sqrt((1 - beta) * (1 + beta)) * state.noise + beta * fresh
+    paths, log_weights, log_halving = path_of(proposal, dynamics, intervals, noise)
+    candidate = CrankNicolsonState(paths, noise, _finite(log_weights), log_halving)
+    rate = acceptance_rate(state.log_weight, candidate.log_weight)
+    uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=dtype))(accept_keys)
+    accepted = uniform < rate
+
+    def choose(new, old):
+        return jnp.where(accepted.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    info = CrankNicolsonInfo(rate, accepted, candidate.log_weight)
+    return jax.tree.map(choose, candidate, state), info
+
+
+@eqx.filter_jit
+def run_crank_nicolson(
+    key: Key[Array, ""],
+    model: Diffusion,
+    proposal: AbstractGuidedProposal,
+    intervals: Intervals,
+    stored: Int[Array, " K"] | None,
+    num_bridges: int,
+    num_steps: int,
+    batched: bool,
+    several_durations: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+    beta: Float[Array, ""],
+) -> Chain:
+    """The chain of each interval, side by side."""
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    dynamics = model.forward(intervals.start[0])
+    num_intervals = intervals.start.shape[0]
+    step_keys, init_keys = chain_keys(key, num_intervals, num_bridges, batched)
+    first = _init(init_keys, None, model, proposal, intervals, num_steps)
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+
+    def step(carry, inputs):
+        state, meter_state = carry
+        i, keys = inputs
+        state, info = _move(keys, state, proposal, dynamics, intervals, beta)
+        meter_state = meter.step(meter_state, (i + 1).astype(jnp.float32) / num_bridges)
+        met = state.log_weight > -jnp.inf
+        path = jnp.where(met[:, None, None], state.position, jnp.nan)
+        path = path if stored is None else path[:, stored]
+        lost = info.log_weight == -jnp.inf
+        made = (path, info.is_accepted, state.log_weight, met, state.log_halving, lost)
+        return (state, meter_state), made
+
+    (_, meter_state), made = lax.scan(
+        step, (first, meter.init()), (jnp.arange(num_bridges), step_keys.T)
+    )
+    meter.close(meter_state)
+    made = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), made)
+    *_, lost = made
+    lost = jnp.concatenate([(first.log_weight == -jnp.inf)[:, None], lost], axis=1)
+    path, accepted, log_weight, met, log_halving, _ = jax.tree.map(
+        lambda leaf: leaf if batched else leaf[0], made
+    )
+    ones = jnp.ones((num_intervals, num_bridges + 1), jnp.int32)
+    share = proposal.step_share(model, intervals)
+    return Chain(
+        times=grid_times(intervals, stored, proposal.fractions(num_steps), several_durations),
+        paths=path,
+        accepted=accepted,
+        log_weights=log_weight,
+        met=met,
+        truncated=jnp.zeros_like(met),
+        num_simulated=sum_by_interval(ones, num_intervals, batched),
+        num_nonfinite=sum_by_interval(lost.astype(jnp.int32), num_intervals, batched),
+        num_truncated=sum_by_interval(jnp.zeros_like(ones), num_intervals, batched),
+        proposal=proposal,
+        pareto_k=None,
+        log_halving=log_halving,
+        step_share=share if batched else share[0],
+        num_steps=num_steps,
+    )
+
+
+def _normal(
+    keys: Key[Array, " I"], num_steps: int, intervals: Intervals
+) -> Float[Array, "I steps d"]:
+    _, d = intervals.start.shape
+    dtype = intervals.start.dtype
+    return jax.vmap(lambda key: jax.random.normal(key, (num_steps - 1, d), dtype))(keys)
+
+
+def _finite(log_weights: Float[Array, " I"]) -> Float[Array, " I"]:
+    return jnp.where(jnp.isfinite(log_weights), log_weights, -jnp.inf)
+
+
+def as_guided(proposal: AbstractWeightedProposal) -> AbstractGuidedProposal:
+    """The proposal itself, if it makes paths from normal noise."""
+    if not isinstance(proposal, AbstractGuidedProposal):
+        raise TypeError(
+            "Crank–Nicolson moves are for proposals that make paths from normal noise: "
+            "`ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()`."
+        )
+    return proposal
+
+
+def check_step_size(step_size: Numbers | None) -> Float[Array, ""]:
+    """β, in (0, 1]."""
+    beta = as_floating("step_size", 0.5 if step_size is None else step_size)
+    if beta.shape != () or not (is_traced(beta) or 0 < np.asarray(beta) <= 1):
+        raise ValueError(f"`step_size` must be a number in (0, 1]; got {step_size}.")
+    return beta

@@ -1,0 +1,352 @@
+"""Importance sampling: bridges whose weights make them exact.
+
+    E_bridge[h] = E[w h(path)] / E[w],
+
+by weighing approximate bridges, or from any weighted proposal.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from ..coupling.bridges import Bridges
+from ..coupling.coupling import AbstractCoupling
+from ..coupling.hitting import check_max_trials, counts_of, coupling_of, durations_of
+from ..coupling.start_laws import AnyStartLaw
+from ..engine.averages import (
+    PathFunction,
+    effective_size,
+    expanded,
+    filled,
+    normalised,
+    values_of,
+    weighted_mean,
+)
+from ..engine.checks import Numbers, check_count, check_key
+from ..engine.pareto import is_reliable, pareto_k
+from ..engine.rejection import key_for
+from ..engine.throwing import throw_where_incomplete
+from ..models.diffusion import Diffusion, check_diffusion
+from ..models.grid import grid_times, stored_steps
+from ..models.intervals import Intervals, as_intervals
+from ..proposals.base import AbstractWeightedProposal
+from ..proposals.choice import as_proposal, settled, uses_couplings
+from ..proposals.coupled import CoupledPairs, check_density, pair_log_weights, usable
+from ..schemes.step_error import is_gross
+from .exact_bridges import AbstractExactBridges
+
+
+class WeightedBridges(AbstractExactBridges):
+    """Bridges whose weights make them exact, from `weigh_bridges` or `sample_weighted_bridges`;
+    with I intervals arrays have a leading axis I.
+
+    - `times`, `paths`: as in `Bridges`, shapes (K,) and (n, K, d).
+    - `log_weights`: shape (n,), up to a common constant; -inf for a bridge that is missing.
+    - `met`: whether the bridge was found, shape (n,).
+    - `truncated`: whether its counts were cut off by `max_trials`, shape (n,). Such a weight is
+        finite and too small on average, so that paths that are hard to hit weigh too little.
+        Also where the start law's density was not a number: then the weight is zero.
+    - `num_simulated`: paths simulated in all, proposals and trials.
+    - `num_nonfinite`: how many of them left the finite numbers.
+    - `proposal`, `num_steps`: those they were made with. The coupling of a proposal has the
+        start law of the weights; a `Stationary` that had to be run has its `burn_in` in it.
+    - `log_halving`: log of the factor by which half as many steps would change a weight, NaN where
+        none was worked out; and `step_share`, the step error as a share of what that changes.
+    """
+
+    times: Float[Array, "*durations K"]
+    paths: Float[Array, "*I n K d"]
+    log_weights: Float[Array, "*I n"]
+    met: Bool[Array, "*I n"]
+    truncated: Bool[Array, "*I n"]
+    num_simulated: Int[Array, "*I"]
+    num_nonfinite: Int[Array, "*I"]
+    proposal: AbstractWeightedProposal
+    log_halving: Float[Array, "*I n"]
+    step_share: Float[Array, "*I"]
+    num_steps: int = eqx.field(static=True)
+
+    @property
+    def coupling(self) -> AbstractCoupling | None:
+        """That of the proposal, if it has one."""
+        return self.proposal.coupling if isinstance(self.proposal, CoupledPairs) else None
+
+    @property
+    def weights(self) -> Float[Array, "*I n"]:
+        """The weights, normalised to sum to one; all zero where no bridge was found."""
+        return normalised(self.log_weights)
+
+    @property
+    def effective_sample_size(self) -> Float[Array, "*I"]:
+        """(Σw)²/Σw²: how many exact bridges these are worth, between 0 and n."""
+        return effective_size(self.weights)
+
+    @property
+    def efficiency(self) -> Float[Array, "*I"]:
+        """Effective sample size per simulated path."""
+        size = self.effective_sample_size
+        return size / jnp.maximum(self.num_simulated, 1).astype(size.dtype)
+
+    @property
+    def log_mean_weights(self) -> Float[Array, "*I n"]:
+        """Those of the bridges."""
+        return self.log_weights
+
+    def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """That of `mean(fn)`, by the delta method, entry by entry; infinite where weights were cut
+        off, for then the mean is off by more than it shows."""
+        weights, axis = self.weights, self.log_weights.ndim - 1
+        cut = jnp.any(self.truncated, axis=-1)
+
+        def error(value):
+            mean, each = weighted_mean(weights, value), expanded(weights, value)
+            deviation = value - jnp.expand_dims(mean, axis)
+            squares = jnp.where(each > 0, (each * deviation) ** 2, 0)
+            lost = cut.reshape(*cut.shape, *[1] * (mean.ndim - cut.ndim))
+            whole = jnp.where(lost, jnp.inf, jnp.sqrt(jnp.sum(squares, axis)))
+            return jnp.where(jnp.isnan(mean), jnp.nan, whole)
+
+        return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
+
+    @property
+    def pareto_k(self) -> Float[Array, "*I"]:
+        """k̂ of the weights. Above 0.7 neither means nor their standard errors can be trusted."""
+        return pareto_k(self.log_weights)
+
+    def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:
+        """Equally weighted paths by systematic resampling, shape (m, K, d): many effective ones
+        are needed for few repetitions. NaN where no bridge was found."""
+        num_bridges = check_count("num_bridges", num_bridges)
+
+        check_key(key)
+
+        def one_interval(key, weights, paths):
+            shift = jax.random.uniform(key, dtype=weights.dtype)
+            points = (jnp.arange(num_bridges, dtype=weights.dtype) + shift) / num_bridges
+            cumulated = jnp.cumsum(weights)
+            chosen = jnp.searchsorted(cumulated, points * cumulated[-1], side="right")
+            # Rounding may lead past the last positive weight.
+            last = jnp.max(jnp.where(weights > 0, jnp.arange(len(weights)), 0))
+            return paths[jnp.minimum(chosen, last)]
+
+        if self.log_weights.ndim == 1:
+            return one_interval(key, self.weights, self.paths)
+        keys = jax.random.split(key, len(self.log_weights))
+        return jax.vmap(one_interval)(keys, self.weights, self.paths)
+
+
+def weigh_bridges(
+    key: Key[Array, ""],
+    model: Diffusion,
+    bridges: Bridges,
+    num_counts: int = 1,
+    *,
+    start_law: AnyStartLaw | None = None,
+    max_trials: int | None = None,
+    batch_size: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = False,
+) -> WeightedBridges:
+    """Weights that correct approximate bridges to the exact law: importance sampling.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: the model the bridges were made with.
+    - `bridges`: from `sample_bridges`, with their whole paths (no `save_at`).
+    - `num_counts`: N hitting counts for each bridge. More make a weight less noisy; one is often
+        the best use of time.
+    - `start_law`: μ, by default that of the bridges' coupling.
+    - `max_trials`: bounds the trials of each bridge; by default 10,000 for each count. See
+        `WeightedBridges.truncated`.
+    - `batch_size`: trials simulated side by side; changes results by rounding only.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, k̂ is
+        above 0.7, the step error is above 0.1 standard deviations, or parameters are not finite.
+
+    **Returns:** `WeightedBridges`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    weighted = jb.weigh_bridges(jax.random.key(1), model, bridges)
+    weighted.mean(lambda path: path[25]), weighted.effective_sample_size
+    ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    if not isinstance(bridges, Bridges):
+        raise TypeError(
+            f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}. (Those of "
+            "`sample_exact_bridges` and `weigh_bridges` are exact already.)"
+        )
+    coupling = coupling_of(bridges, start_law)
+    num_counts = check_count("num_counts", num_counts)
+    bound = check_max_trials(max_trials, num_counts)
+    check_density(coupling.start_law, model)
+    batch_size = None if batch_size is None else check_count("batch_size", batch_size)
+    budget = (num_counts, bound, batch_size, progress_meter)
+    like = bridges.reverse_start.reshape(-1, bridges.paths.shape[-1])[0]
+    pairs = as_proposal(coupling, model, like, num_counts, None, max_trials)
+    weighted = _weigh_bridges(key_for("weights", key), model, pairs, bridges, budget)
+    return _or_throw(weighted, model, pairs) if throw else weighted
+
+
+def _or_throw(
+    weighted: WeightedBridges, model: Diffusion, proposal: AbstractWeightedProposal
+) -> WeightedBridges:
+    return throw_where_incomplete(
+        weighted,
+        "log_weights",
+        model,
+        ~weighted.met,
+        weighted.truncated,
+        coupled=uses_couplings(proposal),
+        heavy=~is_reliable(weighted.pareto_k, weighted.effective_sample_size),
+        gross=is_gross(weighted.step_error_in_sds()),
+    )
+
+
+@eqx.filter_jit
+def _weigh_bridges(key, model, pairs, bridges, budget):
+    counts, coupling = counts_of(key, model, pairs.coupling, bridges, *budget)
+    d, shape = bridges.paths.shape[-1], bridges.met.shape
+    log_weights = pair_log_weights(
+        coupling.start_law,
+        model.prepared(),
+        bridges.paths[..., -1, :].reshape(-1, d),
+        bridges.reverse_start.reshape(-1, d),
+        counts.mean.reshape(-1),
+    ).reshape(shape)
+    log_weights, unusable = usable(log_weights, bridges.met)
+    paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
+    intervals = Intervals(paths[:, 0], paths[:, -1], durations_of(bridges))
+    prepared = model.prepared()
+    log_halving = pairs.log_halving(prepared, intervals, paths, shape[-1]).reshape(shape)
+    share = pairs.step_share(prepared, intervals).reshape(shape)[..., 0]
+    num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)
+    num_nonfinite = jnp.sum(counts.num_nonfinite, axis=-1, dtype=jnp.int32)
+    return WeightedBridges(
+        times=bridges.times,
+        paths=bridges.paths,
+        log_weights=log_weights,
+        met=bridges.met,
+        truncated=counts.truncated | unusable,
+        num_simulated=bridges.num_proposals + num_trials,
+        num_nonfinite=bridges.num_nonfinite + num_nonfinite,
+        proposal=eqx.tree_at(lambda p: p.coupling, pairs, coupling),
+        log_halving=log_halving,
+        step_share=share,
+        num_steps=bridges.num_steps,
+    )
+
+
+def sample_weighted_bridges(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_bridges: int = 1000,
+    num_steps: int = 50,
+    proposal: Any = None,
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+    save_at: Numbers | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = False,
+) -> WeightedBridges:
+    """Independent weighted bridges from any proposal: importance sampling.
+
+    **Arguments:**
+
+    - `key`, `model`, `start`, `end`, `duration`, `num_steps`, `save_at`: as in `sample_bridges`.
+    - `num_bridges`: n, for each interval.
+    - `proposal`, `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, k̂ is
+        above 0.7, the step error is above 0.1 standard deviations, or parameters are not finite.
+
+    **Returns:** `WeightedBridges`.
+
+    **Gradients.** From proposals that are pulled to the end point (`ModifiedDiffusionBridge`,
+    `ResidualBridge`, `Guided`) paths and weights are smooth functions of `params`, `start`, `end`
+    and `duration`, so derivatives of weighted means, forward and reverse, are estimates of the
+    derivatives of expectations. Those of couplings, and of a choice that uses several
+    proposals, raise `TypeError`.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    proposal = jb.ModifiedDiffusionBridge()
+    weighted = jb.sample_weighted_bridges(key, model, start, end, 0.1, proposal=proposal)
+    weighted.mean(lambda path: path[25]), weighted.effective_sample_size
+    ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_bridges = check_count("num_bridges", num_bridges)
+    num_steps = check_count("num_steps", num_steps)
+    intervals, batched, several_durations = as_intervals(start, end, duration)
+    like = intervals.start[0]
+    proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
+    proposal.check(model, intervals)
+    proposal = settled(proposal, key, model, intervals, num_steps)
+    fractions = proposal.fractions(num_steps)
+    stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
+    sizes = (num_bridges, num_steps, batched, several_durations, progress_meter)
+    weighted = _sample_weighted(key, model, proposal, intervals, stored, *sizes)
+    return _or_throw(weighted, model, proposal) if throw else weighted
+
+
+@eqx.filter_jit
+def _sample_weighted(
+    key: Key[Array, ""],
+    model: Diffusion,
+    proposal: AbstractWeightedProposal,
+    intervals: Intervals,
+    stored: Int[Array, " K"] | None,
+    num_bridges: int,
+    num_steps: int,
+    batched: bool,
+    several_durations: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> WeightedBridges:
+    model, num_intervals = model.prepared(), intervals.start.shape[0]
+    proposal = proposal.prepared(key, model, intervals, num_steps)
+    fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
+    keys = fold_in(key, jnp.arange(num_intervals * num_bridges)).reshape(num_intervals, -1)
+    drawn = proposal.draw(
+        keys, model, intervals, num_steps, stored, False, progress_meter=progress_meter
+    )
+    drawn = drawn._replace(
+        num_simulated=jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32),
+        num_nonfinite=jnp.sum(drawn.num_nonfinite, axis=1, dtype=jnp.int32),
+    )
+    times = grid_times(intervals, stored, proposal.fractions(num_steps), several_durations)
+    share = proposal.step_share(model, intervals)
+    if not batched:
+        drawn = jax.tree.map(lambda leaf: leaf[0], drawn)
+    return WeightedBridges(
+        times=times,
+        paths=drawn.paths,
+        log_weights=drawn.log_weights,
+        met=drawn.found,
+        truncated=drawn.truncated,
+        num_simulated=drawn.num_simulated,
+        num_nonfinite=drawn.num_nonfinite,
+        proposal=proposal,
+        log_halving=drawn.log_halving,
+        step_share=share if batched else share[0],
+        num_steps=num_steps,
+    )

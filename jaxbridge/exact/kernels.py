@@ -1,0 +1,164 @@
+"""What the Markov chains on bridges have in common: kernels of two functions, their keys, and the
+chain that many steps make."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
+
+from ..coupling.coupling import AbstractCoupling
+from ..engine.averages import (
+    PathFunction,
+    expanded,
+    filled,
+    normalised,
+    values_of,
+    weighted_mean,
+)
+from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.diagnostics import effective_sample_size
+from ..models.intervals import Intervals, as_intervals
+from ..proposals.base import AbstractWeightedProposal
+from ..proposals.coupled import CoupledPairs
+from .exact_bridges import AbstractExactBridges
+
+
+class Kernel(NamedTuple):
+    """A Markov kernel on bridges, from `pseudo_marginal`, `renewal` or `crank_nicolson`. Runners
+    that look for its two functions, such as BlackJAX's, take it as it is.
+
+    - `init`: a function `(position, rng_key) -> state`.
+    - `step`: a function `(rng_key, state) -> (state, info)`.
+    """
+
+    init: Callable
+    step: Callable
+
+
+class Chain(AbstractExactBridges):
+    """What `sample_exact_bridges` returns: the states of a chain. With I intervals arrays have a
+    leading axis I.
+
+    - `times`: the K stored times, shape (K,); (I, K) for I durations.
+    - `paths`: the states of the chain after each step, shape (n, K, d); NaN until a first path
+        was found.
+    - `accepted`: whether the step took a new path, shape (n,).
+    - `log_weights`: those of the states, shape (n,); `None` for the renewal chain, which has none.
+    - `met`: whether there is a path, shape (n,).
+    - `truncated`: whether the state's counts were cut off by `max_trials`: then it has too
+        little weight, and the chain's law is not exact. Shape (n,), or `None` as `log_weights`.
+    - `num_simulated`: paths simulated in all, shape ().
+    - `num_nonfinite`: how many of them left the finite numbers.
+    - `num_truncated`: how many proposals, accepted or not, had counts cut off; for the renewal
+        chain all its steps where the run that replaces a sampler of ν was (see `Stationary`).
+    - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
+    - `pareto_k`: k̂ of the weights of all proposals: above 0.7 states with large weights stay too
+        long for any error to be trusted. `None` where no new weights are proposed, as by renewal
+        and Crank–Nicolson moves.
+    - `log_halving`: log of the factor by which half as many steps would change the weight of a
+        state, NaN where none was worked out; and `step_share`, the step error as a share of what
+        that changes.
+    - `num_steps`: N.
+    """
+
+    times: Float[Array, "*durations K"]
+    paths: Float[Array, "*I n K d"]
+    accepted: Bool[Array, "*I n"]
+    log_weights: Float[Array, "*I n"] | None
+    met: Bool[Array, "*I n"]
+    truncated: Bool[Array, "*I n"] | None
+    num_simulated: Int[Array, "*I"]
+    num_nonfinite: Int[Array, "*I"]
+    num_truncated: Int[Array, "*I"]
+    proposal: AbstractWeightedProposal
+    pareto_k: Float[Array, "*I"] | None
+    log_halving: Float[Array, "*I n"]
+    step_share: Float[Array, "*I"]
+    num_steps: int = eqx.field(static=True)
+
+    @property
+    def coupling(self) -> AbstractCoupling | None:
+        """That of the proposal, if it has one."""
+        return self.proposal.coupling if isinstance(self.proposal, CoupledPairs) else None
+
+    @property
+    def acceptance_rate(self) -> Float[Array, "*I"]:
+        """The share of steps that took a new path."""
+        return jnp.mean(self.accepted, axis=-1)
+
+    @property
+    def log_mean_weights(self) -> Float[Array, "*I n"]:
+        """All states count alike."""
+        return jnp.where(self.met, 0.0, -jnp.inf).astype(self.paths.dtype)
+
+    def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """That of `mean(fn)`, from the effective sample size of the chain, of at least four states,
+        entry by entry."""
+        weights, axis = normalised(self.log_mean_weights), self.met.ndim - 1
+        size = effective_sample_size
+        for _ in range(axis):
+            size = jax.vmap(size)
+
+        def error(value):
+            deviation = value - jnp.expand_dims(weighted_mean(weights, value), axis)
+            there = expanded(self.met, value)
+            share = jnp.mean(there, axis=axis, dtype=value.dtype)
+            many = size(jnp.where(there, deviation, 0)) * share
+            return jnp.sqrt(weighted_mean(weights, deviation**2) / many)
+
+        return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
+
+
+def acceptance_rate(
+    log_weight: Float[Array, "*I"], candidate: Float[Array, "*I"]
+) -> Float[Array, "*I"]:
+    """min(1, ratio of the weights); a missing candidate is refused, a missing state left."""
+    ratio = jnp.where(candidate > -jnp.inf, candidate - log_weight, -jnp.inf)
+    return jnp.exp(jnp.minimum(ratio, 0))
+
+
+def chain_keys(
+    key: Key[Array, ""], num_intervals: int, num_bridges: int, batched: bool
+) -> tuple[Key[Array, "I n"], Key[Array, " I"]]:
+    """The keys of the steps and of the first state of each interval's chain."""
+    keys = key[None]
+    if batched:
+        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_intervals))
+    run_keys, init_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    return jax.vmap(lambda key: jax.random.split(key, num_bridges))(run_keys), init_keys
+
+
+def one_interval(start: Numbers, end: Numbers, duration: Numbers) -> Intervals:
+    intervals, batched, _ = as_intervals(start, end, duration)
+    if batched:
+        raise ValueError(
+            "a kernel is for one interval: `start` and `end` of shape (d,), `duration` (); use "
+            "`jax.vmap`, or `sample_exact_bridges`, for several."
+        )
+    return intervals
+
+
+def check_path(position: Numbers, intervals: Intervals, num_steps: int) -> Array:
+    path = as_floating("position", position)
+    shape = (num_steps + 1, intervals.start.shape[1])
+    if path.shape != shape:
+        raise ValueError(f"`position` must be a path, shape {shape}, or `None`; got {path.shape}.")
+    if not is_traced(path, intervals):
+        ends = np.stack([intervals.start[0], intervals.end[0]])
+        if not (
+            np.all(np.isfinite(path)) and np.allclose(path[np.array([0, -1])], ends, atol=1e-3)
+        ):
+            raise ValueError(f"`position` must be a finite path from and to {ends}.")
+    return path.astype(intervals.start.dtype)
+
+
+def sum_by_interval(
+    counts: Shaped[Array, "..."], num_intervals: int, batched: bool
+) -> Int[Array, "*I"]:
+    """The sums of counts of which each interval has as many, in order."""
+    sums = jnp.sum(counts.reshape(num_intervals, -1), axis=1, dtype=jnp.int32)
+    return sums if batched else sums[0]

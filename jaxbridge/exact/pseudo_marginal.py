@@ -1,0 +1,195 @@
+"""Pseudo-marginal Metropolis–Hastings on bridges (section 2.3 of the paper).
+
+Propose a weighted path, accept with the ratio of the weights. Weights are random but unbiased,
+and a state keeps its own. Proposals do not depend on the chain, so they are made ahead, all at
+once, and the chain itself is a scan over numbers.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
+from ..engine.pareto import pareto_k
+from ..models.diffusion import Diffusion, check_diffusion
+from ..models.grid import grid_times
+from ..models.intervals import Intervals
+from ..proposals.base import AbstractWeightedProposal, WeightedPaths
+from ..proposals.choice import as_proposal
+from .kernels import (
+    Chain,
+    Kernel,
+    acceptance_rate,
+    chain_keys,
+    check_path,
+    one_interval,
+    sum_by_interval,
+)
+
+
+class PseudoMarginalState(NamedTuple):
+    """`position`, the path, shape (N+1, d); its `log_weight`; whether that was `truncated`.
+
+    A state without a path, where none was found, has weight -inf.
+    """
+
+    position: Float[Array, "points d"]
+    log_weight: Float[Array, ""]
+    truncated: Bool[Array, ""]
+
+
+class PseudoMarginalInfo(NamedTuple):
+    """Of one step: the `acceptance_rate` and whether the proposal was accepted, its log weight
+    (-inf if none was found), and the number of paths simulated for it."""
+
+    acceptance_rate: Float[Array, ""]
+    is_accepted: Bool[Array, ""]
+    log_weight: Float[Array, ""]
+    num_simulated: Int[Array, ""]
+
+
+def pseudo_marginal(
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_steps: int = 50,
+    proposal: Any = None,
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+) -> Kernel:
+    """The pseudo-marginal Metropolis–Hastings kernel on (start, end, duration)-bridges.
+
+    `init(position, rng_key)` takes a path of shape (N+1, d), draws its weight from the law that
+    it has in the chain, and so may enter a chain, as a block of a Gibbs sampler; or `None`, for
+    a first path by proposal. `step(rng_key, state)` gives a `PseudoMarginalState` and a
+    `PseudoMarginalInfo`. Arguments are those of `sample_exact_bridges`.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    kernel = jb.pseudo_marginal(model, start, end, 1.0, proposal=jb.Coupling(0.5))
+    state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
+    ```
+    """
+    check_diffusion(model)
+    intervals = one_interval(start, end, duration)
+    like = intervals.start[0]
+    proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
+    num_steps = check_count("num_steps", num_steps)
+    proposal.check(model, intervals)
+    proposal.check_prepared(model)
+    setting = (model, proposal, intervals, num_steps)
+
+    def init(position, rng_key):
+        check_key(rng_key)
+        if position is None:
+            return _draw_state(rng_key, *setting)[0]
+        path = check_path(position, intervals, num_steps)
+        return _reweigh_state(rng_key, path, *setting)
+
+    def step(rng_key, state):
+        return _pseudo_marginal_step(rng_key, state, *setting)
+
+    return Kernel(init, step)
+
+
+@eqx.filter_jit
+def _draw_state(rng_key, model, proposal, intervals, num_steps):
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    drawn = proposal.draw(rng_key[None, None], model, intervals, num_steps, None, False)
+    return _first(drawn), drawn.num_simulated[0, 0]
+
+
+@eqx.filter_jit
+def _reweigh_state(rng_key, path, model, proposal, intervals, num_steps):
+    model, intervals, path = nondifferentiable((model.prepared(), intervals, path))
+    return _first(proposal.reweigh(rng_key[None], model, intervals, path[None]))
+
+
+def _first(drawn: WeightedPaths) -> PseudoMarginalState:
+    return PseudoMarginalState(drawn.paths[0, 0], drawn.log_weights[0, 0], drawn.truncated[0, 0])
+
+
+@eqx.filter_jit
+def _pseudo_marginal_step(rng_key, state, *setting):
+    draw_key, accept_key = jax.random.split(rng_key)
+    candidate, num_simulated = _draw_state(draw_key, *setting)
+    uniform = jax.random.uniform(accept_key, dtype=candidate.position.dtype)
+    rate = acceptance_rate(state.log_weight, candidate.log_weight)
+    accepted = uniform < rate
+    kept = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
+    return kept, PseudoMarginalInfo(rate, accepted, candidate.log_weight, num_simulated)
+
+
+@eqx.filter_jit
+def run_pseudo_marginal(
+    key: Key[Array, ""],
+    model: Diffusion,
+    proposal: AbstractWeightedProposal,
+    intervals: Intervals,
+    stored: Int[Array, " K"] | None,
+    num_bridges: int,
+    num_steps: int,
+    batched: bool,
+    several_durations: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> Chain:
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    num_intervals = intervals.start.shape[0]
+    proposal = proposal.prepared(key, model, intervals, num_steps)
+    step_keys, init_keys = chain_keys(key, num_intervals, num_bridges, batched)
+    draw_keys, accept_keys = jax.vmap(jax.random.split, out_axes=1)(step_keys.reshape(-1))
+    # Row 0 of each interval is its first state, and row i the candidate of step i.
+    draw_keys = jnp.concatenate([init_keys[:, None], draw_keys.reshape(step_keys.shape)], axis=1)
+    drawn = proposal.draw(
+        draw_keys, model, intervals, num_steps, stored, False, progress_meter=progress_meter
+    )
+    uniform = jax.vmap(lambda k: jax.random.uniform(k, dtype=intervals.start.dtype))(accept_keys)
+
+    def step(state, inputs):
+        row, log_weight = state
+        i, candidate, uniform = inputs
+        accepted = uniform < acceptance_rate(log_weight, candidate)
+        state = jnp.where(accepted, i, row), jnp.where(accepted, candidate, log_weight)
+        return state, (*state, accepted)
+
+    init = (jnp.zeros(num_intervals, jnp.int32), drawn.log_weights[:, 0])
+    candidates = jnp.arange(1, num_bridges + 1, dtype=jnp.int32), drawn.log_weights[:, 1:].T
+    inputs = (*candidates, uniform.reshape(step_keys.shape).T)
+    _, (row, log_weights, accepted) = lax.scan(step, init, inputs)
+
+    def of_interval(leaf):
+        return leaf if batched else leaf[0]
+
+    def of_states(leaf):
+        return of_interval(leaf[jnp.arange(num_intervals)[:, None], row.T])
+
+    def total(leaf):
+        return sum_by_interval(leaf, num_intervals, batched)
+
+    return Chain(
+        times=grid_times(intervals, stored, proposal.fractions(num_steps), several_durations),
+        paths=of_states(drawn.paths),
+        accepted=of_interval(accepted.T),
+        log_weights=of_interval(log_weights.T),
+        met=of_states(drawn.found),
+        truncated=of_states(drawn.truncated),
+        num_simulated=total(drawn.num_simulated),
+        num_nonfinite=total(drawn.num_nonfinite),
+        num_truncated=total(drawn.truncated),
+        proposal=proposal,
+        pareto_k=of_interval(pareto_k(drawn.log_weights)),
+        log_halving=of_states(drawn.log_halving),
+        step_share=of_interval(proposal.step_share(model, intervals)),
+        num_steps=num_steps,
+    )

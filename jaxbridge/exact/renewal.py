@@ -1,0 +1,334 @@
+"""The renewal chain, the paper's alternative algorithm (section 2.3).
+
+Run one diffusion associated with the current bridge; if it hits, take a new proposal. The chain
+keeps nothing but the path. Where μ is not ν, and the trial that hit had started in x_0, the
+proposal with x_0' is taken with probability `min(1, (μ/ν)(x_0') / (μ/ν)(x_0))`, for then
+
+    f(z) μ(x_0) h(z|x_0) · ν(x_0') h(z'|x_0') f(z') · min(1, μ(x_0')ν(x_0) / ν(x_0')μ(x_0))
+
+is symmetric in (z, x_0) and (z', x_0'), h being the probability of a hit from x_0.
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..coupling.associated import run_associated
+from ..coupling.bridges import Inputs, Joined, find_bridges
+from ..coupling.coupling import AbstractCoupling
+from ..coupling.start_laws import log_ratio, run_is_cut
+from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
+from ..engine.rejection import Found, default_num_lanes, most_lanes
+from ..models.diffusion import Diffusion, check_diffusion
+from ..models.grid import grid_times
+from ..models.intervals import Intervals
+from ..proposals.base import AbstractWeightedProposal
+from ..proposals.choice import as_proposal
+from ..proposals.coupled import CoupledPairs
+from .kernels import Chain, Kernel, chain_keys, check_path, one_interval, sum_by_interval
+
+
+class RenewalState(NamedTuple):
+    """`position`, the path, shape (N+1, d); NaN where none was found."""
+
+    position: Float[Array, "points d"]
+
+
+class RenewalInfo(NamedTuple):
+    """Of one step: whether the associated diffusion hit, whether the path was replaced, whether
+    none was found to replace it, the number of paths simulated, and of those that left the
+    finite numbers."""
+
+    is_hit: Bool[Array, ""]
+    is_accepted: Bool[Array, ""]
+    is_missing: Bool[Array, ""]
+    num_simulated: Int[Array, ""]
+    num_nonfinite: Int[Array, ""]
+
+
+def renewal(
+    model: Diffusion,
+    start: Numbers,
+    end: Numbers,
+    duration: Numbers,
+    *,
+    num_steps: int = 50,
+    proposal: AbstractCoupling | None = None,
+    max_proposals: int | None = None,
+) -> Kernel:
+    """The renewal kernel on (start, end, duration)-bridges, for couplings.
+
+    `init(position, rng_key)` takes a path of shape (N+1, d), or `None` for a first path by
+    proposal. `step(rng_key, state)` gives a `RenewalState` and a `RenewalInfo`. Arguments are
+    those of `sample_exact_bridges`.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    kernel = jb.renewal(model, start, end, 1.0, proposal=jb.Coupling(0.5))
+    state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
+    ```
+    """
+    check_diffusion(model)
+    intervals = one_interval(start, end, duration)
+    if isinstance(proposal, AbstractWeightedProposal):
+        as_pairs(proposal)
+    pairs = as_pairs(as_proposal(proposal, model, intervals.start[0], 1, max_proposals))
+    num_steps = check_count("num_steps", num_steps)
+    pairs.check(model, intervals)
+    pairs.check_prepared(model)
+    setting = (model, pairs, intervals)
+
+    def init(position, rng_key):
+        check_key(rng_key)
+        if position is None:
+            return RenewalState(first_paths(rng_key[None], *setting, num_steps)[0][0])
+        return RenewalState(check_path(position, intervals, num_steps))
+
+    def step(rng_key, state):
+        return _renewal_step(rng_key, state, *setting)
+
+    return Kernel(init, step)
+
+
+@eqx.filter_jit
+def _renewal_step(rng_key, state, model, pairs, intervals):
+    everything = jnp.ones(1, bool)
+    model, intervals, path = nondifferentiable((model.prepared(), intervals, state.position))
+    paths, info = renew(rng_key[None], model, pairs, intervals, path[None], everything)
+    return RenewalState(paths[0]), jax.tree.map(lambda leaf: leaf[0], info)
+
+
+# Segments of the renewal chain run side by side: as many as keep each this long, and no more
+# than fill the lanes. Those that must be run again are few, and run this many at a time.
+_SHORTEST_SEGMENT = 64
+_REPAIR_WIDTH = 128
+
+
+class _Segments(NamedTuple):
+    """The trajectories of S segments of L steps, and the path in which each ends.
+
+    `stale` marks segments whose recorded trajectory did not begin with the path in which the
+    segment before it ends.
+    """
+
+    paths: Float[Array, "L S K d"]
+    moved: Bool[Array, "L S"]
+    ends: Float[Array, "S points d"]
+    stale: Bool[Array, " S"]
+    num_simulated: Int[Array, " S"]
+    num_nonfinite: Int[Array, " S"]
+
+
+@eqx.filter_jit
+def run_renewal(
+    key: Key[Array, ""],
+    model: Diffusion,
+    pairs: CoupledPairs,
+    intervals: Intervals,
+    stored: Int[Array, " K"] | None,
+    num_bridges: int,
+    num_steps: int,
+    batched: bool,
+    several_durations: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> Chain:
+    """Segments of the chain start from guesses, and are run again from where the segment before
+    them ends until all fit. Two trajectories that take new paths in the same step take the same
+    one, since a proposal depends on the key of its step only: from there on they are one, and
+    the rest of the record holds. So a repair is short, and the result that of one long run.
+    """
+    model, intervals = nondifferentiable((model.prepared(), intervals))
+    num_intervals = intervals.start.shape[0]
+    pairs = pairs.prepared(key, model, intervals, num_steps)
+    step_keys, init_keys = chain_keys(key, num_intervals, num_bridges, batched)
+    first, num_tried, num_failed = first_paths(init_keys, model, pairs, intervals, num_steps)
+    most_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
+    num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, most_segments))
+    length = -(-num_bridges // num_segments)
+    # The last steps of the last segment may be too many: they repeat a key, and are dropped.
+    steps = jnp.minimum(jnp.arange(num_segments * length), num_bridges - 1)
+    keys = step_keys[:, steps].reshape(num_intervals * num_segments, length)
+    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_segments, axis=0), intervals)
+    num = num_intervals * num_segments
+    head = jnp.tile(jnp.arange(num_segments) == 0, num_intervals)
+    before = jnp.maximum(jnp.arange(num) - 1, 0)
+
+    def run_again(segments: _Segments, chosen: Int[Array, " W"], progress_meter) -> _Segments:
+        """Run these segments from where the ones before them end, until they rejoin."""
+        place = jnp.minimum(chosen, num - 1)  # those beyond the last only fill the width
+        chosen_keys, chosen_intervals = keys[place], jax.tree.map(lambda x: x[place], each)
+        entry = jnp.where(
+            head[place, None, None], first[place // num_segments], segments.ends[before[place]]
+        )
+
+        def one_step(state):
+            i, positions, active, segments, meter = state
+            positions, info = renew(
+                chosen_keys[:, i], model, pairs, chosen_intervals, positions, active
+            )
+            rejoined = info.is_accepted & segments.moved[i, place]
+            row = jnp.where(active, chosen, num)
+            kept = positions if stored is None else positions[:, stored]
+            segments = segments._replace(
+                paths=segments.paths.at[i, row].set(kept, mode="drop"),
+                moved=segments.moved.at[i, row].set(info.is_accepted, mode="drop"),
+                num_simulated=segments.num_simulated.at[row].add(info.num_simulated, mode="drop"),
+                num_nonfinite=segments.num_nonfinite.at[row].add(info.num_nonfinite, mode="drop"),
+            )
+            meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / length)
+            return i + 1, positions, active & ~rejoined, segments, meter
+
+        state = (jnp.int32(0), entry, chosen < num, segments, progress_meter.init())
+        state = lax.while_loop(lambda s: (s[0] < length) & jnp.any(s[2]), one_step, state)
+        _, positions, changed, segments, meter = state
+        progress_meter.close(meter)
+        ends = segments.ends.at[jnp.where(changed, chosen, num)].set(positions, mode="drop")
+        stale = segments.stale.at[chosen].set(False, mode="drop")
+        after = jnp.where(changed, chosen + 1, num)
+        stale = stale.at[after].set(True, mode="drop") & ~head
+        return segments._replace(ends=ends, stale=stale)
+
+    def repair(segments):
+        chosen = jnp.nonzero(segments.stale, size=min(_REPAIR_WIDTH, num), fill_value=num)[0]
+        return run_again(segments, chosen, diffrax.NoProgressMeter())
+
+    num_stored = num_steps + 1 if stored is None else stored.shape[0]
+    d, dtype = intervals.start.shape[1], intervals.start.dtype
+    segments = _Segments(
+        jnp.zeros((length, num, num_stored, d), dtype),
+        jnp.zeros((length, num), bool),
+        jnp.repeat(first, num_segments, axis=0),
+        jnp.zeros(num, bool),
+        jnp.zeros(num, jnp.int32),
+        jnp.zeros(num, jnp.int32),
+    )
+    progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    segments = run_again(segments, jnp.arange(num), progress_meter)
+    # The first stale segment starts from where the chain is, so each pass settles it at least.
+    segments = lax.while_loop(lambda s: jnp.any(s.stale), repair, segments)
+
+    def of_steps(leaf):
+        leaf = jnp.moveaxis(leaf, 0, 1).reshape(num_intervals, -1, *leaf.shape[2:])
+        leaf = leaf[:, :num_bridges]
+        return leaf if batched else leaf[0]
+
+    paths = of_steps(segments.paths)
+    # D of the states in which segments end, all but the last, which may be too long.
+    log_halving = pairs.log_halving(model, each, segments.ends, 1)
+    last = jnp.arange(num_segments * length) % length == length - 1
+    last = (last & (jnp.arange(num_segments * length) < num_bridges)).reshape(num_segments, -1)
+    log_halving = jnp.where(last, log_halving.reshape(num_intervals, -1, 1), jnp.nan)
+    log_halving = log_halving.reshape(num_intervals, -1)[:, :num_bridges]
+    share = pairs.step_share(model, intervals)
+
+    def total(leaf):
+        return sum_by_interval(leaf, num_intervals, batched)
+
+    # Nothing is counted, but no hit is what it should be if its trial did not start from μ.
+    cut = run_is_cut(pairs.coupling.start_law, model, intervals.duration / num_steps, num_steps)
+
+    return Chain(
+        times=grid_times(intervals, stored, pairs.fractions(num_steps), several_durations),
+        paths=paths,
+        accepted=of_steps(segments.moved),
+        log_weights=None,
+        met=jnp.all(jnp.isfinite(paths), axis=(-2, -1)),
+        truncated=None,
+        num_simulated=total(segments.num_simulated) + total(num_tried),
+        num_nonfinite=total(segments.num_nonfinite) + total(num_failed),
+        num_truncated=total(jnp.where(cut, num_bridges, 0)),
+        proposal=pairs,
+        pareto_k=None,
+        log_halving=log_halving if batched else log_halving[0],
+        step_share=share if batched else share[0],
+        num_steps=num_steps,
+    )
+
+
+def renew(
+    keys: Key[Array, " S"],
+    model: Diffusion,
+    pairs: CoupledPairs,
+    intervals: Intervals,
+    paths: Float[Array, "S points d"],
+    active: Bool[Array, " S"],
+) -> tuple[Float[Array, "S points d"], RenewalInfo]:
+    """One renewal step of each of S chains that is active: hit first, propose only then."""
+    num_steps = paths.shape[1] - 1
+    trial_keys, propose_keys, accept_keys = jax.vmap(
+        lambda key: jax.random.split(key, 3), out_axes=1
+    )(keys)
+    dt = intervals.duration / num_steps
+    lanes = jnp.moveaxis(paths, 0, -1)
+    associated = run_associated(model, pairs.coupling, trial_keys, lanes, dt)
+    missing = ~jnp.all(jnp.isfinite(paths), axis=(1, 2))
+    called_for = active & (associated.hit | missing)
+    proposed = propose_paths(propose_keys, model, pairs, intervals, called_for, num_steps)
+    found = proposed.num_found > 0
+    new_paths, new_start, _ = proposed.outputs
+
+    def ratio(x):
+        return log_ratio(pairs.coupling.start_law, model, x)
+
+    log_rate = jax.vmap(ratio)(new_start) - jax.vmap(ratio)(associated.start.T)
+    uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=paths.dtype))(accept_keys)
+    accepted = found & (missing | (uniform < jnp.exp(jnp.minimum(log_rate, 0))))
+    info = RenewalInfo(
+        associated.hit & active,
+        accepted,
+        called_for & ~found,
+        active.astype(jnp.int32) + proposed.num_trials,
+        (active & ~missing & ~associated.finite).astype(jnp.int32) + proposed.num_nonfinite,
+    )
+    return jnp.where(accepted[:, None, None], new_paths, paths), info
+
+
+def propose_paths(
+    keys: Key[Array, " I"],
+    model: Diffusion,
+    pairs: CoupledPairs,
+    intervals: Intervals,
+    active: Bool[Array, " I"] | None,
+    num_steps: int,
+) -> Found:
+    """A bridge by proposal for each interval; or for those that are active, which often are few."""
+    num_wanted = len(keys) if active is None else len(keys) // 4
+    active = jnp.ones(len(keys), bool) if active is None else active
+    num_lanes = default_num_lanes(num_wanted, num_steps, intervals.start)
+    inputs = Inputs(model, pairs.coupling, intervals)
+    return find_bridges(keys, inputs, active, 1, pairs.max_proposals, num_steps, None, num_lanes)
+
+
+@eqx.filter_jit
+def first_paths(
+    keys: Key[Array, " I"],
+    model: Diffusion,
+    pairs: CoupledPairs,
+    intervals: Intervals,
+    num_steps: int,
+) -> tuple[Float[Array, "I points d"], Int[Array, " I"], Int[Array, " I"]]:
+    """A bridge by proposal for each interval, NaN where none was found; how many proposals that
+    took, and how many of them left the finite numbers."""
+    proposed = propose_paths(keys, model.prepared(), pairs, intervals, None, num_steps)
+    joined: Joined = proposed.outputs
+    paths = jnp.where((proposed.num_found > 0)[:, None, None], joined.paths, jnp.nan)
+    return paths, proposed.num_trials, proposed.num_nonfinite
+
+
+def as_pairs(
+    proposal: AbstractWeightedProposal,
+    method: str = "renewal",
+    instead: str = 'method="pseudo_marginal"',
+) -> CoupledPairs:
+    """The proposal, which must be a coupling's for this method."""
+    if not isinstance(proposal, CoupledPairs):
+        raise TypeError(f"{method} is for couplings: pass a `Coupling`, or choose {instead}.")
+    return proposal

@@ -1,0 +1,397 @@
+"""Maximum likelihood: by stochastic approximation over bridges, or of a simulated likelihood.
+
+Where σ is known, bridges are moved by their exact kernel at the current θ, once an iteration
+(Gu & Kong 1998), and θ by what the completed path says:
+
+* "gradient": a step of an optimiser along ∇ log f_θ(Z), whose mean over bridges is the score;
+  the estimate is the average of the second half of the iterates.
+* "em": with c and P of the expansion of log f at θ, cᵀθ - ½ θᵀPθ, averaged over iterations, θ
+  becomes P⁻¹c. For a drift that is linear in θ this is the EM algorithm with averaged
+  statistics (Delyon, Lavielle & Moulines 1999); in any case a fixed point has score zero.
+
+Then, at the estimate, `score` with independent bridges gives the observed information I, one step
+of Newton's method, θ + I⁻¹ ∇ log L(θ), and the Monte Carlo error that is left.
+
+Where σ depends on the unknown parameters paths are of no use, and the maximum is that of the
+likelihood by simulation (`simulated_likelihood`).
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from ..engine.checks import Numbers, check_count, nondifferentiable
+from ..engine.linalg import any_solve
+from ..engine.pareto import is_reliable
+from ..models.diffusion import Diffusion
+from ..schemes.path_likelihood import Form
+from ..schemes.step_error import StepError, dominates
+from .completion import Completion, Paths, complete
+from .parameter_steps import CompleteData, quadratic_form
+from .parts import target_forms
+from .problem import Problem, as_problem
+from .score import Score, score
+from .simulated_likelihood import (
+    Lost,
+    as_pulled,
+    climb,
+    guarded,
+    pulled_parts,
+    sigma_is_unknown,
+    step_error_of_score,
+    wander,
+)
+from .unknowns import (
+    Constraint,
+    Unknowns,
+    allowed,
+    check_allowed,
+)
+
+# Made once, for optimisers are compared by identity.
+_ADAM = optax.adam(1e-2)
+
+
+class MaximumLikelihood(eqx.Module):
+    """The maximum likelihood estimate, from `maximum_likelihood`.
+
+    - `params`: all parameters of the model, the unknown ones estimated.
+    - `standard_errors`: a pytree like the unknown parameters, from the observed information.
+    - `monte_carlo_errors`: likewise, of the search for the maximum; more `num_bridges` make them
+        smaller.
+    - `theta`, `covariance`: the unknown parameters as a vector, shape (p,), and the inverse of
+        the observed information, shape (p, p).
+    - `step_error`: what `theta` is too large by for the length of the steps, an estimate, shape
+        (p,), with a standard error of it, `step_uncertainty`. NaN where it is not known.
+    - `iterates`: of the stochastic approximation, shape (n, p).
+    - `score`: at the average of the iterates, before the last step; where σ is unknown, at the
+        estimate, so that its gradient is about zero, and the covariance of that by the noise of
+        the bridges is what matters. Errors can be trusted where its `effective_sample_size` is
+        large in all intervals.
+    - `num_missing`: iterations' bridges that were not found, in all.
+    - `num_truncated`: weights that `max_trials` cut off.
+    - `num_refused`: iterations whose step led out of the constraint, or to what is not finite, and
+        was not made.
+    - `newton`: whether the last step was made. Not so if the information was not positive definite,
+        or the step longer than about a standard error, or out of the constraint: then the average
+        of the iterates is returned, which is not the maximum, and more iterations are needed, or
+        longer steps. Where σ is unknown: whether a maximum was found, and no Monte Carlo error,
+        in any direction, is more than half a standard error. If not, `params` are those of the
+        largest simulated likelihood that was seen, which may be a maximum of the noise alone: more
+        bridges are needed, or a better proposal, unless the maximum lies out of the constraint.
+    """
+
+    params: PyTree
+    standard_errors: PyTree
+    monte_carlo_errors: PyTree
+    theta: Float[Array, " p"]
+    covariance: Float[Array, "p p"]
+    step_error: Float[Array, " p"]
+    step_uncertainty: Float[Array, " p"]
+    iterates: Float[Array, "n p"]
+    score: Score
+    num_missing: Int[Array, ""]
+    num_truncated: Int[Array, ""]
+    num_refused: Int[Array, ""]
+    newton: Bool[Array, ""]
+
+    @property
+    def trustworthy(self) -> Bool[Array, ""]:
+        """Whether a maximum was found, by weights of no interval that a few large ones decide (k̂
+        below 0.7, five effective ones), and with a step error that does not dominate."""
+        weights = is_reliable(self.score.pareto_k, self.score.effective_sample_size)
+        return self.newton & jnp.all(weights) & ~jnp.any(self.step_error_dominates)
+
+    @property
+    def step_error_dominates(self) -> Bool[Array, " p"]:
+        """Whether the step error is beyond the standard error of the estimate, or not known well
+        enough to say: then more steps are needed."""
+        error = StepError(self.step_error, self.step_uncertainty)
+        return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
+
+
+def maximum_likelihood(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    optimizer: optax.GradientTransformation | None = None,
+    *,
+    method: Literal["gradient", "em"] = "gradient",
+    num_iterations: int = 500,
+    num_bridges: int = 100,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    proposal: Any = "auto",
+    where: Callable[[PyTree], PyTree] | None = None,
+    constraint: Constraint | None = None,
+    num_counts: int | None = None,
+    max_proposals: int | None = None,
+    max_trials: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> MaximumLikelihood:
+    """The maximum likelihood estimate of a model's parameters, given discrete observations.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: its `params` are where the search starts. σ may depend on the unknown parameters:
+        then the maximum is that of the likelihood by simulation, as below.
+    - `times`, `observations`, `num_steps`, `step_size`, `proposal`, `where`, `constraint`: as in
+        `gibbs`. A step that would leave the constraint is not made.
+    - `optimizer`: any of optax's, by default `optax.adam(0.01)`; it is given the gradient of minus
+        the mean log likelihood per interval, in the unknown parameters as a vector. Optimisers are
+        compared by identity: make one once to compile once.
+    - `method`: "gradient", or "em", which takes no optimiser and needs fewer iterations, and a
+        known σ.
+    - `num_iterations`: of the stochastic approximation.
+    - `num_bridges`: weighted bridges of each interval for the last step and the errors; where σ
+        is unknown, for the likelihood whose maximum is the estimate.
+    - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Where σ is unknown** a path of its own tells nothing: given the whole of it σ is known. There
+    the transition densities of `transition_log_density` are differentiated, which takes proposals
+    that are pulled to the end point, by default the best of them. After the optimiser's steps, each
+    with a few new paths, Newton's method goes to the maximum of the likelihood by `num_bridges`
+    paths of each interval with fixed noise, a smooth function of θ. Half the estimated relative
+    variance of each density is added to its logarithm, whose mean is too small by that; what is
+    left of the bias falls with the square of `num_bridges`, and is small beside a standard error
+    where the root of the number of intervals is small beside the square of
+    `effective_sample_size`. For a σ that varies with the state the density's step error is of first
+    order: `num_steps` matters. Only σ σᵀ is in the law of the data: of a matrix, leave unknown
+    what that determines.
+
+    **Returns:** `MaximumLikelihood`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    estimate = jb.maximum_likelihood(
+        key, jb.hyperbolic(1.0, 2), times, observations, num_iterations=200, num_steps=20
+    )
+    estimate.params, estimate.standard_errors
+    ```
+    """
+    num_iterations = check_count("num_iterations", num_iterations, 2)
+    num_bridges = check_count("num_bridges", num_bridges, 2)
+    if method not in ("gradient", "em"):
+        raise ValueError(f'`method` must be "gradient" or "em"; got {method!r}.')
+    if not (optimizer is None or isinstance(optimizer, optax.GradientTransformation)):
+        raise TypeError(
+            f"`optimizer` must be one of optax's, such as `optax.adam(1e-2)`; got {optimizer!r}."
+        )
+    if method == "em" and optimizer is not None:
+        raise ValueError('`method="em"` takes no `optimizer`.')
+    problem = as_problem(key, model, times, observations, where, num_steps, step_size)
+    unknowns, theta = problem.unknowns, problem.theta
+    check_allowed(constraint, unknowns, theta)
+    proposal = "auto" if proposal is None else proposal
+    bounds = (num_counts, max_proposals, max_trials)
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    optimizer = _ADAM if optimizer is None else optimizer
+    if sigma_is_unknown(problem):
+        if method == "em":
+            raise ValueError(
+                "σ depends on the unknown parameters, and given a whole path σ is known, so that "
+                'EM would never leave it: use `method="gradient"`, or pick the other parameters '
+                "with `where=`."
+            )
+        proposal = as_pulled(proposal, model, problem.like, bounds)
+        search = (problem, proposal, constraint, optimizer, num_iterations, num_bridges, meter)
+        return _by_simulation(key, *search)
+    complete_key, run_key, score_key = jax.random.split(key, 3)
+    arguments = (problem.intervals, problem.groups, proposal, "exact", None, bounds)
+    completion = complete(complete_key, model, *arguments)
+    forms = target_forms(completion.parts, model)
+    form = quadratic_form(unknowns, theta, problem.like, forms) or forms[0]
+    rule = _EM() if method == "em" else _Gradient(optimizer)
+    setting = _Setting(unknowns, completion, constraint, rule, form)
+    iterates, lost = _approximate(run_key, setting, theta, num_iterations, meter)
+    rough = iterates[-1] if method == "em" else jnp.mean(iterates[num_iterations // 2 :], axis=0)
+    at_rough = score(
+        score_key,
+        unknowns.at(rough),
+        times,
+        observations,
+        num_bridges=num_bridges,
+        num_steps=num_steps,
+        step_size=step_size,
+        proposal=proposal,
+        where=where,
+        num_counts=num_counts,
+        max_proposals=max_proposals,
+        max_trials=max_trials,
+    )
+    covariance = jnp.linalg.inv(at_rough.information)
+    step = covariance @ at_rough.gradient
+    definite = jnp.all(jnp.linalg.eigvalsh(at_rough.information) > 0)
+    # Further off the likelihood need not be near its quadratic approximation.
+    near = at_rough.gradient @ step < theta.shape[0]
+    newton = rough + step
+    ok = definite & near & allowed(constraint, unknowns, newton)
+    estimate = jnp.where(ok, newton, rough)
+    return _summary(unknowns, estimate, iterates, at_rough, lost, ok)
+
+
+def _summary(
+    unknowns: Unknowns,
+    estimate: Float[Array, " p"],
+    iterates: Float[Array, "n p"],
+    score: Score,
+    lost: Lost,
+    ok: Bool[Array, ""],
+) -> MaximumLikelihood:
+    """The estimate with its errors, which are those of the score times the inverse information."""
+    covariance = jnp.linalg.inv(score.information)
+    left = covariance @ score.covariance @ covariance
+    # Where the score is too large by this, so is its zero by that times the inverse information.
+    step_doubt = jnp.sqrt(covariance**2 @ score.step_uncertainty**2)
+    standard, monte_carlo = (
+        unknowns.pick(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
+    )
+    return MaximumLikelihood(
+        unknowns.all(estimate),
+        standard,
+        monte_carlo,
+        estimate,
+        covariance,
+        covariance @ score.step_error,
+        step_doubt,
+        iterates,
+        score,
+        lost.missing,
+        lost.truncated + score.num_truncated,
+        lost.refused,
+        ok,
+    )
+
+
+def _by_simulation(
+    key: Key[Array, ""],
+    problem: Problem,
+    proposal: Any,
+    constraint: Constraint | None,
+    optimizer: optax.GradientTransformation,
+    num_iterations: int,
+    num_bridges: int,
+    meter: diffrax.AbstractProgressMeter,
+) -> MaximumLikelihood:
+    """The maximum of the simulated likelihood."""
+    unknowns, theta = problem.unknowns, problem.theta
+    pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
+    parts = pulled_parts(pilot_key, unknowns.at(theta), problem, proposal)
+    search = (unknowns, parts, constraint, optimizer, theta, num_iterations, meter)
+    iterates, lost = wander(run_key, *search)
+    last, mean = iterates[-1], jnp.mean(iterates[num_iterations // 2 :], axis=0)
+    # What suits the data at the first θ need not do so at the last.
+    parts = pulled_parts(last_pilot_key, unknowns.at(last), problem, proposal)
+    starts = jnp.stack([theta, last, mean])
+    maximum = climb(last_key, unknowns, parts, constraint, starts, num_bridges)
+    made = maximum.simulated
+    at_maximum = Score(
+        unknowns.pick(made.gradient),
+        unknowns.pick(jnp.sqrt(jnp.diagonal(made.covariance))),
+        made.gradient,
+        made.covariance,
+        made.information,
+        made.effective_sample_size,
+        made.pareto_k,
+        *step_error_of_score(last_key, unknowns, parts, maximum, num_bridges),
+        made.num_missing,
+        jnp.int32(0),
+    )
+    return _summary(unknowns, maximum.theta, iterates, at_maximum, lost, maximum.found)
+
+
+class _Gradient(eqx.Module):
+    """Steps of an optimiser."""
+
+    optimizer: optax.GradientTransformation = eqx.field(static=True)
+
+    def init(self, theta):
+        return self.optimizer.init(theta)
+
+    def update(self, i, theta, state, data: CompleteData, num_intervals):
+        gradient = jax.grad(data.log_likelihood)(theta) / num_intervals
+        updates, state = self.optimizer.update(-gradient, state, theta)
+        return theta + jnp.asarray(updates), state
+
+
+class _EM(eqx.Module):
+    """The maximum of the averaged expansions of the log likelihood; they are averaged over the
+    later half of the iterations so far, about."""
+
+    def init(self, theta):
+        return theta, jnp.zeros((*theta.shape, *theta.shape), theta.dtype)
+
+    def update(self, i, theta, state, data: CompleteData, num_intervals):
+        gradient = jax.grad(data.log_likelihood)(theta)
+        P = data.information(theta)
+        made = gradient + P @ theta, P
+        gain = jnp.minimum(1.0, 2.0 / (i + 1).astype(theta.dtype))
+        state = jax.tree.map(lambda old, new: old + gain * (new - old), state, made)
+        c, P = state
+        return any_solve(P, c), state
+
+
+class _Setting(eqx.Module):
+    """What does not change from iteration to iteration."""
+
+    unknowns: Unknowns
+    completion: Completion
+    constraint: Constraint | None = eqx.field(static=True)
+    rule: _Gradient | _EM
+    form: Form = eqx.field(static=True)
+
+
+class _State(NamedTuple):
+    theta: Float[Array, " p"]
+    paths: Paths
+    rule: PyTree
+    meter: Any
+
+
+@eqx.filter_jit
+def _approximate(
+    key: Key[Array, ""],
+    setting: _Setting,
+    theta: Float[Array, " p"],
+    num_iterations: int,
+    meter: diffrax.AbstractProgressMeter,
+) -> tuple[Float[Array, "n p"], Lost]:
+    """The iterates, and what was lost on the way."""
+    setting = nondifferentiable(setting)
+    unknowns, completion = setting.unknowns, setting.completion
+    first_key, run_key = jax.random.split(key)
+    num_intervals = completion.num_intervals
+
+    def iterate(state, i):
+        paths, renewed = completion.renew(
+            jax.random.fold_in(run_key, i), unknowns.at(state.theta), state.paths
+        )
+        data = CompleteData(
+            unknowns, completion, paths, jnp.zeros_like, setting.constraint, setting.form
+        )
+        moved, rule = setting.rule.update(i, state.theta, state.rule, data, num_intervals)
+        old = state.theta, state.rule
+        theta, rule, ok = guarded(setting.constraint, unknowns, old, (moved, rule))
+        progress = meter.step(state.meter, (i + 1).astype(jnp.float32) / num_iterations)
+        lost = Lost(renewed.missing, renewed.truncated, ~ok)
+        lost = jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)
+        return _State(theta, paths, rule, progress), (theta, lost)
+
+    first = completion.first(first_key, unknowns.at(theta))
+    state = _State(theta, first, setting.rule.init(theta), meter.init())
+    state, (iterates, lost) = lax.scan(iterate, state, jnp.arange(num_iterations))
+    meter.close(state.meter)
+    return iterates, jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)

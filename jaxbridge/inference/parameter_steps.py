@@ -1,0 +1,226 @@
+"""The parameters given the paths: one step of a Markov kernel on θ.
+
+Where the log likelihood is quadratic in θ, as it is if the drift is linear in θ, and the prior
+normal, θ given the paths is normal, and is drawn:
+
+    N(θ_0 + P⁻¹ g, P⁻¹),    g = ∇(ℓ + log π)(θ_0),    P = -∇²(ℓ + log π),
+
+by autodiff, at any θ_0; drawn again until it satisfies the constraint. Whether it is quadratic is
+read off the program that computes the Hessian: there θ does not occur.
+
+Otherwise by Metropolis–Hastings with normal proposals that would be exact for a quadratic,
+
+    θ' ~ N(θ + (1 - √(1-τ²)) G⁻¹ g, τ² G⁻¹),    G = ∫ Jᵀ J dt + (prior precision),  J = ∂_θ σ⁻¹α,
+
+with g and the information G of the paths at θ, and τ = 1, a Newton step, or less, by chance.
+With τ = 1 and constant G this is the draw above, always accepted.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Key
+
+from ..engine.lanes import over_lanes
+from ..engine.linalg import any_cholesky, any_solve, dot, matvec
+from ..models.diffusion import uses_argument
+from ..schemes.path_likelihood import Form, log_likelihoods
+from .completion import Completion, Paths
+from .unknowns import Constraint, NormalDensity, Unknowns, allowed
+
+# Draws from a normal law until one satisfies the constraint: if none does, θ stays, which leaves
+# the law invariant too.
+_MOST_DRAWS = 100
+# Steps of Metropolis–Hastings, by chance one of these.
+_SCALES = (1.0, 0.3)
+
+
+class ParameterStep(NamedTuple):
+    """θ after a step, and whether it moved."""
+
+    theta: Float[Array, " p"]
+    accepted: Bool[Array, ""]
+
+
+class CompleteData(NamedTuple):
+    """What a step of θ is made from: the completed observations, and the prior."""
+
+    unknowns: Unknowns
+    completion: Completion
+    paths: Paths
+    log_prior: Callable[[Array], Array]
+    constraint: Constraint | None
+    form: Form
+
+    def log_likelihood(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
+        model = self.unknowns.at(theta)
+        return jnp.sum(self.completion.log_likelihoods(model, self.paths, self.form))
+
+    def log_posterior_inside(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
+        """log of likelihood times prior, as if there were no constraint."""
+        return self.log_likelihood(theta) + self.log_prior(theta)
+
+    def log_posterior(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
+        """-inf where the constraint is not satisfied."""
+        inside = allowed(self.constraint, self.unknowns, theta)
+        return jnp.where(inside, self.log_posterior_inside(theta), -jnp.inf)
+
+    def information(self, theta: Float[Array, " p"]) -> Float[Array, "p p"]:
+        """G(θ), with the prior's precision where it is normal."""
+        points, steps = self.completion.points(self.paths)
+
+        def of_point(x, dt):
+            def beta(theta):
+                dynamics = self.unknowns.at(theta).prepared().forward(x)
+                return dynamics.sigma(x).solve(dynamics.drift(x))
+
+            J = jax.jacfwd(beta)(theta)
+            return dt * sum(row[:, None] * row for row in J)
+
+        G = jnp.sum(over_lanes(-1, -1)(of_point)(points.T, steps), axis=-1)
+        if isinstance(self.log_prior, NormalDensity):
+            G = G + self.log_prior.precision
+        return G
+
+
+def quadratic_form(
+    unknowns: Unknowns,
+    theta: Float[Array, " p"],
+    like: Float[Array, " d"],
+    forms: Sequence[Form],
+) -> Form | None:
+    """The first of these forms in which the log likelihood is quadratic in θ, if there is one."""
+    steps, paths = jnp.ones((1, 1), like.dtype), jnp.stack([like, like])[None]
+    for form in forms:
+
+        def log_likelihood(theta, form: Form = form):
+            return log_likelihoods(unknowns.at(theta), steps, paths, form)[0]
+
+        if not uses_argument(jax.jacfwd(jax.jacfwd(log_likelihood)), theta):
+            return form
+    return None
+
+
+class AbstractParameterKernel(eqx.Module):
+    """A Markov kernel on θ, given the paths."""
+
+    @abstractmethod
+    def step(
+        self, key: Key[Array, ""], theta: Float[Array, " p"], data: CompleteData
+    ) -> ParameterStep:
+        """One step from θ."""
+
+
+class NormalDraw(AbstractParameterKernel):
+    """θ from its normal law given the paths."""
+
+    def step(self, key, theta, data):
+        gradient, root = _gradient_and_root(data, theta)
+        mean = theta + _solve_root(root, gradient)
+
+        def draw(carry):
+            i, _, _ = carry
+            noise = jax.random.normal(jax.random.fold_in(key, i), theta.shape, theta.dtype)
+            drawn = mean + any_solve(root.T, noise)
+            return i + 1, drawn, allowed(data.constraint, data.unknowns, drawn)
+
+        def missed(carry):
+            i, _, ok = carry
+            return (i < _MOST_DRAWS) & ~ok
+
+        _, drawn, ok = lax.while_loop(missed, draw, (jnp.int32(0), theta, jnp.asarray(False)))
+        return ParameterStep(jnp.where(ok, drawn, theta), ok)
+
+
+class NewtonStep(AbstractParameterKernel):
+    """Metropolis–Hastings with proposals from the gradient and the information at θ."""
+
+    def step(self, key, theta, data):
+        scale_key, noise_key, accept_key = jax.random.split(key, 3)
+        tau = jax.random.choice(scale_key, jnp.asarray(_SCALES, theta.dtype))
+
+        def look(theta):
+            """The log density at θ, and mean and root of the proposals from it."""
+            value, gradient = jax.value_and_grad(data.log_posterior_inside)(theta)
+            root = any_cholesky(data.information(theta))
+            mean = theta + (1 - jnp.sqrt((1 - tau) * (1 + tau))) * _solve_root(root, gradient)
+            return value, mean, root
+
+        def log_density(place, mean, root):
+            noise = matvec(root.T, place - mean) / tau
+            return jnp.sum(jnp.log(jnp.diagonal(root))) - dot(noise, noise) / 2
+
+        value, mean, root = look(theta)
+        noise = jax.random.normal(noise_key, theta.shape, theta.dtype)
+        proposed = mean + tau * any_solve(root.T, noise)
+        ok = allowed(data.constraint, data.unknowns, proposed)
+        proposed = jnp.where(ok, proposed, theta)
+        other_value, other_mean, other_root = look(proposed)
+        log_ratio = other_value - value + log_density(theta, other_mean, other_root)
+        log_ratio -= log_density(proposed, mean, root)
+        # A comparison with NaN is false, and refuses.
+        accepted = ok & (jnp.log(jax.random.uniform(accept_key, dtype=theta.dtype)) < log_ratio)
+        return ParameterStep(jnp.where(accepted, proposed, theta), accepted)
+
+
+class GivenKernel(AbstractParameterKernel):
+    """A kernel of the user's, as BlackJAX makes them from a log density: `init(position)` and
+    `step(key, state) -> (state, info)`, on the unknown parameters."""
+
+    build: Callable[[Callable], Any] = eqx.field(static=True)
+
+    def step(self, key, theta, data):
+        def log_density(params):
+            return data.log_posterior(data.unknowns.vector(params))
+
+        kernel = self.build(log_density)
+        state, _ = kernel.step(key, kernel.init(data.unknowns.pick(theta)))
+        moved = data.unknowns.vector(state.position)
+        ok = allowed(data.constraint, data.unknowns, moved)
+        moved = jnp.where(ok, moved, theta)
+        return ParameterStep(moved, jnp.any(moved != theta))
+
+
+def check_kernel(kernel: Any) -> None:
+    """Raise `TypeError` for anything but a function, or `None`."""
+    if kernel is not None and not callable(kernel):
+        raise TypeError(
+            "`parameter_kernel` must be a function that makes a kernel from a log density, for "
+            f"instance `lambda f: blackjax.mala(f, 0.1)`; got {kernel!r}."
+        )
+
+
+def choose_kernel(
+    kernel: Callable[[Callable], Any] | None, is_quadratic: bool, log_prior: Callable
+) -> AbstractParameterKernel:
+    """The user's, if there is one; else the exact draw where it is to be had."""
+    if kernel is not None:
+        return GivenKernel(kernel)
+    exact = is_quadratic and isinstance(log_prior, NormalDensity)
+    return NormalDraw() if exact else NewtonStep()
+
+
+def _derivatives(
+    function: Callable[[Array], Array], theta: Float[Array, " p"]
+) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
+    """Gradient and Hessian; forward over reverse where there are many parameters."""
+    gradient = jax.jacfwd(function) if theta.shape[0] < 3 else jax.grad(function)
+    return gradient(theta), jax.jacfwd(gradient)(theta)
+
+
+def _gradient_and_root(
+    data: CompleteData, theta: Float[Array, " p"]
+) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
+    """g, and the root of P."""
+    gradient, hessian = _derivatives(data.log_posterior_inside, theta)
+    return gradient, any_cholesky(-hessian)
+
+
+def _solve_root(root: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:
+    """(L Lᵀ)⁻¹ v."""
+    return any_solve(root.T, any_solve(root, right))

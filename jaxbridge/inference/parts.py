@@ -1,0 +1,150 @@
+"""The proposals of all intervals, in parts of one number of steps each."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from ..coupling.coupling import AbstractCoupling
+from ..coupling.start_laws import Stationary, needs_burn_in
+from ..exact.density import check_for_density
+from ..exact.renewal import as_pairs
+from ..models.diffusion import Diffusion
+from ..models.intervals import Intervals
+from ..proposals.base import AbstractWeightedProposal
+from ..proposals.choice import (
+    Choice,
+    as_proposal,
+    default_candidates,
+    settled,
+    singles,
+    undecided_between,
+    why_left_out,
+)
+from ..proposals.coupled import CoupledPairs
+from ..schemes.halving import log_halving_of_paths
+from ..schemes.path_likelihood import Form, density_of_form, forms_of_target
+from ..schemes.step_error import share_of_order
+from .observations import Group
+
+_NO_SAMPLER = (
+    "the parameters move, and with them the time that replaces a sampler of the stationary law "
+    "(`Diffusion(..., sample_stationary=)`)"
+)
+_FOR_APPROXIMATE = ('bridges="approximate"', 'bridges="exact"')
+
+# num_counts, max_proposals, max_trials
+Bounds = tuple[int | None, int | None, int | None]
+
+
+class Part(eqx.Module):
+    """Intervals with one number of steps, which are these fractions of their durations; which of
+    all intervals they are; and their proposal."""
+
+    intervals: Intervals
+    index: Int[Array, " I"]
+    fractions: Float[Array, " N"]
+    proposal: AbstractWeightedProposal
+
+    @property
+    def num_steps(self) -> int:
+        return self.fractions.shape[0]
+
+    @property
+    def steps(self) -> Float[Array, "N I"]:
+        return self.fractions[:, None] * self.intervals.duration
+
+
+def make_parts(
+    key: Key[Array, ""],
+    model: Diffusion,
+    intervals: Intervals,
+    groups: tuple[Group, ...],
+    proposal: Any,
+    bounds: Bounds,
+    *,
+    for_density: bool = False,
+    only_couplings: bool = False,
+    moving: bool = True,
+    weighted: bool = True,
+) -> tuple[Part, ...]:
+    """The proposal that the user gave, checked, and settled and prepared for each part at this
+    model: parameters that are `moving` leave from there.
+
+    **Raises:** `ValueError` and `TypeError` for a proposal that does not fit.
+    """
+    like = intervals.start[0]
+    if moving and weighted and proposal == "auto" and needs_burn_in(Stationary(), model):
+        candidates = default_candidates(model, like, for_density)
+        candidates = [each for each in candidates if not isinstance(each, AbstractCoupling)]
+        left_out = why_left_out(model, for_density) or _NO_SAMPLER
+        proposal = undecided_between(candidates, model, like, None, *bounds, left_out=left_out)
+        bounds = (None, None, None)
+    given = as_proposal(proposal, model, like, *bounds, for_density=for_density)
+    given.check(model, intervals)
+    if for_density:
+        check_for_density(given, model)
+    if moving and weighted:
+        _check_for_moving(given, model)
+    if only_couplings:
+        given = as_pairs(given) if weighted else as_pairs(given, *_FOR_APPROXIMATE)
+    parts = []
+    for part_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
+        mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
+        chosen = given
+        if isinstance(given, Choice) and given.chosen is not None:
+            chosen = given.of(group.which)
+        chosen = settled(chosen, part_key, model, mine, group.num_steps)
+        if weighted:
+            chosen = chosen.prepared(part_key, model, mine, group.num_steps)
+        parts.append(part_of(intervals, group, chosen))
+    return tuple(parts)
+
+
+def part_of(intervals: Intervals, group: Group, proposal: AbstractWeightedProposal) -> Part:
+    """The intervals of one group, of all, with a proposal that is settled for them."""
+    mine = jax.tree.map(lambda leaf: leaf[group.which], intervals)
+    fractions = jnp.asarray(np.diff(proposal.fractions(group.num_steps)), mine.duration.dtype)
+    return Part(mine, jnp.asarray(group.which), fractions, proposal)
+
+
+def log_halvings(
+    part: Part, model: Diffusion, paths: Float[Array, "P points d"], form: Form, repeats: int = 1
+) -> Float[Array, " P"]:
+    """D of `halving` under the step law of this form of the likelihood, of so many paths for each
+    interval."""
+    steps = jnp.repeat(part.steps, repeats, axis=1)
+    dynamics = model.forward(part.intervals.start[0])
+    return log_halving_of_paths(density_of_form(form), dynamics, steps, paths)
+
+
+def step_shares(part: Part, model: Diffusion, form: Form) -> Float[Array, " I"]:
+    """The step error of each interval, of its bridges or of this form, as a share of what half as
+    many steps change."""
+    share = share_of_order(density_of_form(form).order)
+    return jnp.maximum(part.proposal.step_share(model, part.intervals), share)
+
+
+def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
+    """Those of the path likelihood that go with the bridges of all parts."""
+    proposals = [singles(part.proposal) for part in parts]
+    return forms_of_target(proposals, model, parts[0].intervals.start[0])
+
+
+def _check_for_moving(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
+    """Raise `ValueError` where something is known at the first parameters only."""
+    laws = [
+        single.coupling.start_law
+        for single in singles(proposal)
+        if isinstance(single, CoupledPairs)
+    ]
+    if any(needs_burn_in(law, model) for law in laws):
+        raise ValueError(
+            "this model has no sampler of its stationary law, and how long a run takes that "
+            "replaces it depends on the parameters: pass `sample_stationary=` to `Diffusion`, give "
+            "the coupling `Stationary(burn_in=...)` that is long enough for all parameters to "
+            "come, or choose proposals that are pulled to the end point."
+        )

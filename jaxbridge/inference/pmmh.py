@@ -1,0 +1,403 @@
+"""Particle-marginal Metropolis–Hastings over any parameters, those of σ included.
+
+The likelihood of the observations is a product of transition densities, of which weighted
+proposals give unbiased estimates (`transition`). A chain that accepts with the ratio of
+estimates, and keeps that of its state, has the exact posterior (Andrieu & Roberts 2009), up to
+the step error. Proposals are normal random walks, whose covariance S Sᵀ is learnt in a warm-up
+
+    S Sᵀ ← S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,    η_i = min(1, p i^(-2/3)),
+
+from the acceptance rates α_i (Vihola 2012), and fixed thereafter.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from ..engine.checks import Numbers, as_floating, check_count, is_traced, nondifferentiable
+from ..engine.linalg import any_cholesky, any_inverse
+from ..exact.density import check_for_density, estimate_log_density
+from ..exact.kernels import acceptance_rate
+from ..models.diffusion import Diffusion
+from ..proposals.base import AbstractWeightedProposal
+from .parts import Part, make_parts, part_of
+from .posterior import AbstractPosterior
+from .problem import Problem, as_problem, starting_points
+from .unknowns import (
+    Constraint,
+    GivenDensity,
+    NormalDensity,
+    NormalPrior,
+    Prior,
+    Unknowns,
+    allowed,
+    as_log_prior,
+    as_normal,
+)
+
+# Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
+_TARGET = 0.2
+
+
+class _Chain(NamedTuple):
+    """Where a chain is: θ, the estimate that it holds with its variance, and S."""
+
+    theta: Float[Array, "*chains p"]
+    log_likelihood: Float[Array, "*chains"]
+    variance: Float[Array, "*chains"]
+    log_step_error: Float[Array, "*chains"]
+    root: Float[Array, "*chains p p"]
+
+
+class PMMHState(NamedTuple):
+    """Where a chain of `pmmh` is, with chains in a leading axis if there are several.
+
+    - `theta`: θ, shape (p,).
+    - `log_likelihood`: the estimate that the chain holds, shape ().
+    - `variance`: that of this estimate, shape (), and `log_step_error`, its step error.
+    - `root`: S of the covariance S Sᵀ of proposals, shape (p, p).
+    - `num_done`: iterations so far, with those of the warm-up. Going on with the same key draws
+        the random numbers of those that come after.
+    - `proposals`: of the paths, decided, for each group of intervals with one number of steps.
+    """
+
+    theta: Float[Array, "*chains p"]
+    log_likelihood: Float[Array, "*chains"]
+    variance: Float[Array, "*chains"]
+    log_step_error: Float[Array, "*chains"]
+    root: Float[Array, "*chains p p"]
+    num_done: Int[Array, ""]
+    proposals: tuple[AbstractWeightedProposal, ...]
+
+
+class PMMHPosterior(AbstractPosterior):
+    """What `pmmh` returns: draws of the unknown parameters. Arrays have a leading axis of chains
+    if there are several.
+
+    - `params`: all parameters of the model, each with leading axes (*chains, n).
+    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
+        the keys are in alphabetical order.
+    - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
+    - `log_likelihood_variance`: the variance of these estimates given θ, the median over the draws,
+        shape (*chains,): that of log p̂ by the delta method, summed over the intervals, which with
+        heavy tails of the weights is too small. It should be about one. Much above, say at more
+        than three, the chain holds on to lucky estimates and hardly moves: take as many times more
+        `num_proposals`, or a better `proposal`; far below, fewer make iterations cheaper. Infinite
+        where weights were cut off (`num_truncated`), and with one proposal.
+    - `log_step_error`: an estimate of the step error of each of these estimates, shape
+        (*chains, n): what `step_error`, that of the posterior mean, is made of.
+    - `accepted`: shape (*chains, n).
+    - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
+        parameters were refused because no estimate was to be had, shape (*chains,). With couplings
+        also where no pair met, which is an estimate of zero and leaves the law exact.
+    - `num_truncated`: weights that `max_trials` cut off, in all these iterations, shape
+        (*chains,): where there are many the law is not exact.
+    - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
+    """
+
+    params: PyTree
+    theta: Float[Array, "*chains n p"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    log_likelihood: Float[Array, "*chains n"]
+    log_likelihood_variance: Float[Array, "*chains"]
+    log_step_error: Float[Array, "*chains n"]
+    accepted: Bool[Array, "*chains n"]
+    num_without_estimate: Int[Array, "*chains"]
+    num_truncated: Int[Array, "*chains"]
+    state: PMMHState
+
+
+def pmmh(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    *,
+    prior: Prior,
+    num_iterations: int = 1000,
+    num_warmup: int = 500,
+    num_proposals: int = 50,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    proposal: Any = "auto",
+    where: Callable[[PyTree], PyTree] | None = None,
+    constraint: Constraint | None = None,
+    covariance: Numbers | None = None,
+    num_chains: int | None = None,
+    thin: int = 1,
+    init: PyTree | PMMHState = None,
+    num_counts: int | None = None,
+    max_trials: int | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> PMMHPosterior:
+    """Draws from the posterior of any parameters of a model, given discrete observations.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: its `params` are where chains start.
+    - `times`, `observations`, `prior`, `num_iterations`, `num_steps`, `step_size`, `where`,
+        `constraint`, `num_chains`, `thin`: as in `gibbs`. Parameters of σ are allowed; where σ
+        needs it to be invertible, say so in `constraint`.
+    - `num_warmup`: iterations before, in which the covariance of proposals is learnt.
+    - `num_proposals`: weighted paths for each interval in each estimate. The variance of the
+        estimated log likelihood, `log_likelihood_variance` of the result, should be about one:
+        with n intervals that takes in proportion to n.
+    - `proposal`: as in `transition_log_density`, but "auto" by default. Densities by a
+        coupling from the stationary law rest on a normalised `log_stationary`, whose constant
+        depends on the parameters.
+    - `covariance`: of the first proposals, shape (p,) for a diagonal or (p, p); by default a tenth
+        of the prior's standard deviations, or a tenth of θ where the prior is not normal.
+    - `init`: unknown parameters to start from, or the `state` of earlier draws, which go on with
+        the proposals of paths, and their bounds, that they had. Another `proposal` than "auto"
+        takes their place; the estimate that the chain holds is still one of theirs.
+    - `num_counts`, `max_trials`: as in `transition_log_density`.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Returns:** `PMMHPosterior`. Not differentiable.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    posterior = jb.pmmh(
+        key, jb.ornstein_uhlenbeck([[1.0]], sigma=[[0.5]]), times, observations[:, :1],
+        where=lambda params: (params.B, params.sigma), prior=jb.NormalPrior(1.0, 1.0),
+        constraint=lambda unknown: (unknown[0][0, 0] > 0) & (unknown[1][0, 0] > 0),
+        num_iterations=200, num_warmup=100,
+    )
+    posterior.theta.mean(0), posterior.accepted.mean()
+    ```
+    """
+    num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
+    num_warmup = check_count("num_warmup", num_warmup, 0)
+    num_proposals = check_count("num_proposals", num_proposals)
+    problem = as_problem(key, model, times, observations, where, num_steps, step_size)
+    unknowns = problem.unknowns
+    log_prior = as_log_prior(prior, unknowns, problem.theta)
+    root = _first_root(covariance, prior, unknowns, problem.theta)
+    theta, state = starting_points(problem, init, num_chains, constraint, log_prior, PMMHState)
+    if state is not None and covariance is not None:
+        raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
+    pilot_key, run_key = jax.random.split(key)
+    if state is not None and isinstance(proposal, str) and proposal == "auto":
+        parts = _parts_of_state(state, problem)
+    else:
+        arguments = (problem.intervals, problem.groups, proposal, (num_counts, None, max_trials))
+        parts = make_parts(pilot_key, problem.pilot_model(theta), *arguments, for_density=True)
+    setting = _Setting(unknowns, parts, log_prior, constraint, num_proposals)
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    num_done = jnp.int32(0)
+    if state is None:
+        root = jnp.broadcast_to(root, (*theta.shape[:-1], *root.shape))
+        chain = _start(run_key, setting, theta, root)
+    else:
+        num_done = state.num_done
+        chain = _Chain(*state[: len(_Chain._fields)])
+    made, chain = _run(run_key, setting, chain, num_done, num_warmup, num_iterations, thin, meter)
+    num_done = num_done + num_warmup + num_iterations * thin
+    state = PMMHState(*chain, num_done, tuple(part.proposal for part in parts))
+    return PMMHPosterior(**made, state=state, names=unknowns.names)
+
+
+def _parts_of_state(state: PMMHState, problem: Problem) -> tuple[Part, ...]:
+    """The intervals with the proposals of earlier draws.
+
+    **Raises:** `ValueError` where these were for other intervals.
+    """
+    groups = problem.groups
+    if len(state.proposals) != len(groups):
+        raise ValueError(
+            f"`init` is a state of draws whose intervals had {len(state.proposals)} numbers of "
+            f"steps, but here they have {len(groups)}: go on with the same `times`, `num_steps` "
+            "and `step_size`, or start anew from `init=` unknown parameters."
+        )
+    model = problem.pilot_model(state.theta)
+    parts = []
+    for group, proposal in zip(groups, state.proposals, strict=True):
+        part = part_of(problem.intervals, group, proposal)
+        proposal.check(model, part.intervals)
+        check_for_density(proposal, model)
+        parts.append(part)
+    return tuple(parts)
+
+
+class _Setting(eqx.Module):
+    """What does not change from iteration to iteration."""
+
+    unknowns: Unknowns
+    parts: tuple[Part, ...]
+    log_prior: NormalDensity | GivenDensity
+    constraint: Constraint | None = eqx.field(static=True)
+    num_proposals: int = eqx.field(static=True)
+
+    def estimate(
+        self, key: Key[Array, ""], theta: Float[Array, " p"]
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
+        """log of an unbiased estimate of the likelihood, -inf where there is none, with its
+        variance and its step error; and how many of its weights were cut off."""
+        model = self.unknowns.at(theta).prepared()
+        log_likelihood = variance = step_error = jnp.zeros((), theta.dtype)
+        num_truncated = jnp.int32(0)
+        for part_key, part in zip(jax.random.split(key, len(self.parts)), self.parts, strict=True):
+            size = (self.num_proposals, part.num_steps)
+            made = estimate_log_density(part_key, model, part.proposal, part.intervals, *size)
+            log_likelihood += jnp.sum(made.value)
+            variance += jnp.sum(made.standard_error**2)
+            step_error += jnp.sum(made.step_error)
+            num_truncated += jnp.sum(made.num_truncated, dtype=jnp.int32)
+        log_likelihood = jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood)
+        return log_likelihood, variance, step_error, num_truncated
+
+
+def _first_root(
+    covariance: Numbers | None, prior: Prior, unknowns: Unknowns, theta: Float[Array, " p"]
+) -> Float[Array, "p p"]:
+    p = theta.shape[0]
+    if covariance is not None:
+        matrix = as_floating("covariance", covariance).astype(theta.dtype)
+        if matrix.shape not in ((p,), (p, p)):
+            raise ValueError(
+                f"`covariance` must have shape ({p},) or ({p}, {p}); got {matrix.shape}."
+            )
+        matrix = jnp.diag(matrix) if matrix.ndim == 1 else matrix
+        if not is_traced(matrix):
+            known = np.asarray(matrix, float)
+            symmetric = np.allclose(known, known.T, rtol=1e-5)
+            if not (np.all(np.isfinite(known)) and symmetric and np.linalg.eigvalsh(known)[0] > 0):
+                raise ValueError(
+                    "`covariance` must be finite, symmetric and positive definite; got "
+                    f"{covariance}."
+                )
+        return any_cholesky(matrix)
+    if isinstance(prior, NormalPrior):
+        variance = any_inverse(as_normal(prior, unknowns, theta).precision)
+        return 0.1 * jnp.diag(jnp.sqrt(jnp.diagonal(variance)))
+    return 0.1 * jnp.diag(jnp.maximum(jnp.abs(theta), 0.1))
+
+
+@eqx.filter_jit
+def _start(key, setting: _Setting, theta, root) -> _Chain:
+    key = jax.random.fold_in(key, 0)
+
+    def estimate(key, theta):
+        return setting.estimate(key, theta)[:3]
+
+    if theta.ndim == 1:
+        return _Chain(theta, *estimate(key, theta), root)
+    keys = jax.random.split(key, len(theta))
+    return _Chain(theta, *jax.vmap(estimate)(keys, theta), root)
+
+
+class _Told(NamedTuple):
+    """Of one step: whether it was accepted, was refused because no estimate was to be had, and
+    how many weights of the estimate were cut off."""
+
+    accepted: Bool[Array, "*chains"]
+    unknown: Int[Array, "*chains"]
+    num_truncated: Int[Array, "*chains"]
+
+
+def _iterate(key, setting: _Setting, state: _Chain, gain: Float[Array, ""]):
+    """One step, and what is told of it; S moves by `gain`."""
+    walk_key, estimate_key, accept_key = jax.random.split(key, 3)
+    noise = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
+    proposed = state.theta + state.root @ noise
+    inside = allowed(setting.constraint, setting.unknowns, proposed)
+    # Outside the constraint the model may not be simulated: θ stands in, and is refused.
+    proposed = jnp.where(inside, proposed, state.theta)
+    estimated, variance, step_error, num_truncated = setting.estimate(estimate_key, proposed)
+    new = jnp.where(inside, estimated + setting.log_prior(proposed), -jnp.inf)
+    rate = acceptance_rate(state.log_likelihood + setting.log_prior(state.theta), new)
+    accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
+    direction = noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6)
+    moved = state.root @ direction
+    change = gain * (jnp.where(jnp.isnan(rate), 0, rate) - _TARGET)
+    root = any_cholesky(state.root @ state.root.T + change * jnp.outer(moved, moved))
+    root = jnp.where((gain > 0) & jnp.all(jnp.isfinite(root)), root, state.root)
+    unknown = inside & (estimated == -jnp.inf)
+    state = _Chain(
+        jnp.where(accepted, proposed, state.theta),
+        jnp.where(accepted, estimated, state.log_likelihood),
+        jnp.where(accepted, variance, state.variance),
+        jnp.where(accepted, step_error, state.log_step_error),
+        root,
+    )
+    return state, _Told(accepted, unknown.astype(jnp.int32), num_truncated)
+
+
+@eqx.filter_jit
+def _run(
+    key: Key[Array, ""],
+    setting: _Setting,
+    state: _Chain,
+    num_done: Int[Array, ""],
+    num_warmup: int,
+    num_iterations: int,
+    thin: int,
+    progress_meter: diffrax.AbstractProgressMeter,
+) -> tuple[dict[str, Any], _Chain]:
+    """The fields of the posterior, and where the chains are."""
+    setting, state = nondifferentiable((setting, state))
+    p, dtype = state.theta.shape[-1], state.theta.dtype
+    total = num_warmup + num_iterations * thin
+
+    def iterate(carry, i):
+        state, meter = carry
+        learning = jnp.minimum(1.0, p * (i + 1).astype(dtype) ** (-2 / 3))
+        gain = jnp.where(i < num_warmup, learning, 0)
+        mine = jax.random.fold_in(key, num_done + i + 1)  # number 0 made the first estimate
+        if state.theta.ndim == 1:
+            state, told = _iterate(mine, setting, state, gain)
+        else:
+            keys = jax.random.split(mine, len(state.theta))
+            state, told = jax.vmap(lambda key, state: _iterate(key, setting, state, gain))(
+                keys, state
+            )
+        meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / total)
+        return (state, meter), told
+
+    def kept(carry, i):
+        steps = num_warmup + i * thin + jnp.arange(thin)
+        carry, told = lax.scan(iterate, carry, steps)
+        state, _ = carry
+        told = _add_up(told)._replace(accepted=jnp.any(told.accepted, axis=0))
+        held = (state.log_likelihood, state.variance, state.log_step_error)
+        return carry, (state.theta, *held, told)
+
+    carry = (state, progress_meter.init())
+    carry, lost = lax.scan(iterate, carry, jnp.arange(num_warmup))
+    (state, meter), made = lax.scan(kept, carry, jnp.arange(num_iterations))
+    theta, log_likelihood, variance, step_error, told = made
+    progress_meter.close(meter)
+    sums, accepted = jax.tree.map(jnp.add, _add_up(lost), _add_up(told)), told.accepted
+    if theta.ndim == 3:
+        theta, log_likelihood, step_error, accepted = jax.tree.map(
+            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, log_likelihood, step_error, accepted)
+        )
+    as_params = jax.vmap(setting.unknowns.all)
+    params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
+    fields = {
+        "params": params,
+        "theta": theta,
+        "log_likelihood": log_likelihood,
+        "log_likelihood_variance": jnp.median(variance, axis=0),
+        "log_step_error": step_error,
+        "accepted": accepted,
+        "num_without_estimate": sums.unknown,
+        "num_truncated": sums.num_truncated,
+    }
+    return fields, state
+
+
+def _add_up(told: _Told) -> _Told:
+    return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0, dtype=jnp.int32), told)

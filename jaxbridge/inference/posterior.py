@@ -1,0 +1,97 @@
+"""Draws from a posterior, and how far to trust them."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
+from ..schemes.step_error import StepError, dominates
+
+# Of fewer draws a covariance tells nothing.
+_FEWEST = 10
+
+
+class AbstractPosterior(eqx.Module):
+    """Draws of unknown parameters; arrays have a leading axis of chains if there are several."""
+
+    params: eqx.AbstractVar[PyTree]
+    theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
+    names: eqx.AbstractVar[tuple[str, ...]]
+    log_step_error: eqx.AbstractVar[Float[Array, "*chains n"]]
+
+    @property
+    def _chains(self) -> Float[Array, "chains n p"]:
+        return self.theta if self.theta.ndim == 3 else self.theta[None]
+
+    @property
+    def effective_sample_size(self) -> Float[Array, " p"]:
+        """Of each unknown parameter, summed over the chains: to be trusted where `r_hat` says that
+        they agree."""
+        return jnp.sum(jax.vmap(effective_sample_size)(self._chains), axis=0)
+
+    @property
+    def r_hat(self) -> Float[Array, " p"]:
+        """R̂ of each unknown parameter, from the halves of all chains."""
+        return potential_scale_reduction(self._chains)
+
+    @property
+    def step_error(self) -> Float[Array, " p"]:
+        """What the posterior mean of each unknown parameter is too large by for the length of the
+        steps, an estimate: to first order the covariance of θ and the error of the log likelihood,
+        `log_step_error`. NaN where that is not known, as of one step."""
+        return self._step_error.value
+
+    @property
+    def step_uncertainty(self) -> Float[Array, " p"]:
+        """A standard error of `step_error`."""
+        return self._step_error.uncertainty
+
+    @property
+    def standard_error(self) -> Float[Array, " p"]:
+        """The Monte Carlo error of the posterior mean of each unknown parameter."""
+        draws = self.theta.reshape(-1, self.theta.shape[-1])
+        return jnp.std(draws, axis=0) / jnp.sqrt(self.effective_sample_size)
+
+    @property
+    def step_error_dominates(self) -> Bool[Array, " p"]:
+        """Whether the step error is beyond the Monte Carlo error, or not known well enough to say:
+        then more steps help, and more iterations do not."""
+        return dominates(self._step_error, self.standard_error)
+
+    @property
+    def _step_error(self) -> StepError:
+        known = jnp.isfinite(self.log_step_error)
+        number = jnp.sum(known)
+        error = jnp.where(known, self.log_step_error, 0)
+        error = jnp.where(known, error - jnp.sum(error) / number.astype(error.dtype), 0)
+        deviation = self.theta - jnp.mean(self.theta, axis=tuple(range(self.theta.ndim - 1)))
+        products = (deviation * error[..., None]).reshape(-1, self.theta.shape[-1])
+        count = jnp.maximum(number, 1).astype(products.dtype)
+        mean = jnp.sum(products, axis=0) / count
+        each = jnp.where(known.reshape(-1, 1), products - mean, 0)
+        # Draws that follow each other are not independent, and no more so than those of θ.
+        share = self.effective_sample_size / error.size
+        spread = jnp.sqrt(jnp.sum(each**2, axis=0) / jnp.minimum(count * share, count)) / jnp.sqrt(
+            count
+        )
+        unknown = number < _FEWEST
+        return StepError(jnp.where(unknown, jnp.nan, mean), jnp.where(unknown, jnp.nan, spread))
+
+    def to_arviz(self) -> Any:
+        """As ArviZ's `InferenceData` (a `DataTree` since its version 1). Needs ArviZ."""
+        import arviz
+
+        def of_chains(leaf):
+            return jax.device_get(leaf if self.theta.ndim == 3 else leaf[None])
+
+        leaves = jax.tree_util.tree_leaves_with_path(self.params)
+        posterior = {
+            jax.tree_util.keystr(path, simple=True, separator=".") or "theta": of_chains(leaf)
+            for path, leaf in leaves
+        }
+        if int(arviz.__version__.split(".")[0]) >= 1:
+            return arviz.from_dict({"posterior": posterior})
+        return arviz.from_dict(posterior=posterior)

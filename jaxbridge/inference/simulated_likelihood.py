@@ -1,0 +1,429 @@
+"""The maximum of a simulated likelihood: where σ is unknown too.
+
+Given a whole path σ is known, so there nothing can be learnt from completed paths (Fisher's
+identity, EM). But paths that are pulled to the end point are smooth functions of θ and of their
+noise, and so are their weights: with the noise of n paths of each interval held fixed,
+
+    ℓ̂(θ) = Σ_k log p̂_k(θ),    p̂_k = (1/n) Σ_j w_kj(θ),
+
+is a smooth function, simulated maximum likelihood (Pedersen 1995; Durham & Gallant 2002). Since
+E[p̂] = p, the mean of log p̂ is below log p, by half the relative variance of p̂ to leading order.
+That depends on θ, so that the maximum is off by O(1/n), in the same direction in all intervals.
+Therefore half of its estimate, [Σ w²/(Σ w)² - 1/n] n/(n - 1), is added to each log p̂_k, which
+leaves O(1/n²); where weights are so uneven that this is no small correction it is at most one half.
+
+The search begins with an optimiser's steps along noisy gradients, few new paths in each, and ends
+with Newton's steps at fixed noise. All derivatives are forward ones, so that memory does not grow
+with the number of steps: that takes p² of them, for p unknown parameters.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
+
+from ..engine.averages import effective_size, normalised
+from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
+from ..engine.pareto import pareto_k
+from ..models.diffusion import Diffusion, uses_argument
+from ..proposals.choice import (
+    Choice,
+    as_proposal,
+    guided_candidates,
+    undecided_between,
+    uses_couplings,
+)
+from ..schemes.step_error import StepError
+from .parts import Bounds, Part, make_parts
+from .problem import Problem
+from .unknowns import Constraint, Unknowns, allowed
+
+# Paths of each interval for a noisy gradient.
+_FEW = 8
+# Less than rounding leaves of a sum, in logarithms.
+_NO_WEIGHT = -60.0
+# Newton's method has arrived where the square of the next step, in standard errors, is less.
+_GAIN = 1e-5
+# A Monte Carlo error of more, in standard errors, is too much for a maximum.
+_NOISE = 0.5
+# The longest step, in standard errors.
+_LONGEST = 2.0
+# Points that are tried, and the shortest fraction of a step so bounded.
+_MOST_POINTS = 60
+_SHORTEST = 1e-4
+
+
+class Simulated(NamedTuple):
+    """ℓ̂ and its derivatives at one θ, over the intervals that have any path: its value, ∇ℓ̂, the
+    covariance of that by the noise of the paths, and -∇²ℓ̂; the effective number of paths of each
+    interval, and k̂ of their weights; how many intervals have none; and the rounding error of the
+    value."""
+
+    value: Float[Array, ""]
+    gradient: Float[Array, " p"]
+    covariance: Float[Array, "p p"]
+    information: Float[Array, "p p"]
+    effective_sample_size: Float[Array, " I"]
+    pareto_k: Float[Array, " I"]
+    num_missing: Int[Array, ""]
+    rounding: Float[Array, ""]
+
+
+class Maximum(NamedTuple):
+    """Where Newton's method ended, what ℓ̂ is there, and whether that is a maximum."""
+
+    theta: Float[Array, " p"]
+    simulated: Simulated
+    found: Bool[Array, ""]
+
+
+def sigma_is_unknown(problem: Problem) -> bool:
+    """Whether σ depends on the unknown parameters."""
+    unknowns, like = problem.unknowns, problem.like
+    return uses_argument(lambda theta: unknowns.at(theta).diffusion(like), problem.theta)
+
+
+def as_pulled(proposal: Any, model: Diffusion, like: Float[Array, " d"], bounds: Bounds) -> Any:
+    """The proposal that the user gave, "auto" without couplings.
+
+    **Raises:** `ValueError` and `TypeError` for one whose weights have no derivatives.
+    """
+    if isinstance(proposal, str) and proposal == "auto":
+        proposal = undecided_between(guided_candidates(model, like), model, like, None)
+    given = as_proposal(proposal, model, like, *bounds)
+    if uses_couplings(given):
+        raise ValueError(
+            "σ depends on the unknown parameters, and given a whole path σ is known: the "
+            "likelihood itself is differentiated, and with couplings its estimates have no "
+            "derivative. Choose proposals that are pulled to the end point, such as `Guided()`, "
+            '`ModifiedDiffusionBridge()` or "auto", or use `pmmh`.'
+        )
+    return given
+
+
+def pulled_parts(
+    key: Key[Array, ""], model: Diffusion, problem: Problem, proposal: Any
+) -> tuple[Part, ...]:
+    """The parts with one proposal each, for a choice between several has no derivative: that
+    which leaves the least variance in all at this model, or, where the user has chosen interval by
+    interval, a part for each."""
+    groups, intervals = problem.groups, problem.intervals
+    chosen = isinstance(proposal, Choice) and proposal.chosen is not None
+    parts = make_parts(key, model, intervals, groups, proposal, (None, None, None))
+    return tuple(
+        single for part in parts for single in (_split(part) if chosen else (_decided(part),))
+    )
+
+
+def _decided(part: Part) -> Part:
+    """One candidate for all intervals. The error of ℓ̂ is Σ 1/(effective paths) over them."""
+    choice = part.proposal
+    if not isinstance(choice, Choice):
+        return part
+    assert choice.efficiency is not None and choice.seconds is not None
+    if is_traced(choice.efficiency, choice.seconds):
+        raise ValueError(
+            '`proposal="auto"` decides by a pilot run, which cannot be looked at inside `jit`: '
+            "name a proposal that is pulled to the end point, such as `Guided()`."
+        )
+    # No pilot run was made of what could not win even if all its paths were effective.
+    efficiency = np.nan_to_num(np.asarray(choice.efficiency), nan=1.0)
+    cost = np.asarray(choice.seconds) / np.maximum(efficiency, 1e-6)
+    best = choice.candidates[int(np.argmin(cost.sum(axis=1)))]
+    return Part(part.intervals, part.index, part.fractions, best)
+
+
+def _split(part: Part) -> tuple[Part, ...]:
+    """A part for each candidate that was chosen."""
+    choice = part.proposal
+    assert isinstance(choice, Choice) and choice.chosen is not None
+    if len(choice.used) == 1:
+        single = choice.candidates[choice.used[0]]
+        return (Part(part.intervals, part.index, part.fractions, single),)
+    made = []
+    for i in choice.used:
+        which = np.flatnonzero(np.asarray(choice.chosen) == i)
+        if which.size > 0:
+            mine = jax.tree.map(lambda leaf, which=which: leaf[which], part.intervals)
+            made.append(Part(mine, part.index[which], part.fractions, choice.candidates[i]))
+    return tuple(made)
+
+
+def _log_weights(
+    key: Key[Array, ""], unknowns: Unknowns, part: Part, num_paths: int, theta: Float[Array, " p"]
+) -> tuple[Float[Array, "I n"], Bool[Array, "I n"]]:
+    """log w at θ of the paths with this noise, zero for those that were lost, or have no weight
+    beside others, for where a path nearly overflows its derivatives do; and which are not."""
+    keys = jax.random.split(key, (part.intervals.start.shape[0], num_paths))
+    nothing = jnp.zeros(0, jnp.int32)  # no path is kept
+    model = unknowns.at(theta).prepared()
+    drawn = part.proposal.draw(keys, model, part.intervals, part.num_steps, nothing, True)
+    largest = jnp.max(drawn.log_weights, axis=1, keepdims=True)
+    found = drawn.found & (drawn.log_weights > largest + _NO_WEIGHT)
+    return jnp.where(found, drawn.log_weights, 0), found
+
+
+def _log_densities(
+    log_weights: Float[Array, "I n"], found: Bool[Array, "I n"]
+) -> Float[Array, " I"]:
+    """log p̂ of each interval with half the relative variance of p̂ added; zero where no path was
+    found."""
+    n, some = log_weights.shape[1], jnp.any(found, axis=1)
+    largest = jnp.max(log_weights, axis=1, initial=-jnp.inf, where=found)
+    largest = lax.stop_gradient(jnp.where(some, largest, 0))
+    # What is lost has no weight, and is not raised to a power: in reverse mode a masked 0 · ∞
+    # would be NaN.
+    weights = jnp.exp(jnp.where(found, log_weights - largest[:, None], 0))
+    weights = jnp.where(found, weights, 0)
+    sums, squares = jnp.sum(weights, axis=1), jnp.sum(weights**2, axis=1)
+    sums = jnp.where(some, sums, 1)
+    variance = (squares / sums**2 - 1 / n) * (n / (n - 1))
+    return jnp.where(some, jnp.log(sums) + largest - np.log(n) + variance / 2, 0)
+
+
+def simulated(
+    key: Key[Array, ""],
+    unknowns: Unknowns,
+    parts: tuple[Part, ...],
+    theta: Float[Array, " p"],
+    num_paths: int,
+) -> Simulated:
+    """ℓ̂ at θ with the noise of this key, and all that is to be known of it."""
+    made = [
+        _of_part(part_key, unknowns, part, theta, num_paths)
+        for part_key, part in zip(jax.random.split(key, len(parts)), parts, strict=True)
+    ]
+    sizes = jnp.concatenate([each.effective_sample_size for each in made])
+    shapes = jnp.concatenate([each.pareto_k for each in made])
+    order = jnp.argsort(jnp.concatenate([part.index for part in parts]))
+    sums = (each._replace(effective_sample_size=0, pareto_k=0) for each in made)
+    total = jax.tree.map(lambda *leaves: sum(leaves), *sums)
+    return total._replace(effective_sample_size=sizes[order], pareto_k=shapes[order])
+
+
+@eqx.filter_jit
+def step_error_of_score(
+    key: Key[Array, ""],
+    unknowns: Unknowns,
+    parts: tuple[Part, ...],
+    maximum: Maximum,
+    num_paths: int,
+) -> StepError:
+    """That of ∇ℓ̂ at the maximum, by as many paths of half as many steps; NaN where a path has one
+    step only."""
+    unknowns, parts = nondifferentiable((unknowns, parts))
+    model = unknowns.at(maximum.theta)
+    error, variance = jnp.zeros_like(maximum.theta), jnp.zeros_like(maximum.theta)
+    for part_key, part in zip(jax.random.split(key, len(parts)), parts, strict=True):
+        if part.num_steps < 2:
+            unknown = jnp.full_like(error, jnp.nan)
+            return StepError(unknown, unknown)
+        fractions = jnp.asarray(np.diff(part.proposal.fractions(part.num_steps // 2)), error.dtype)
+        half = Part(part.intervals, part.index, fractions, part.proposal)
+        # Of all that are pulled each has one order for all intervals.
+        share = part.proposal.step_share(model, part.intervals)[0]
+
+        def difference(theta, key=part_key, part=part, half=half):
+            values = (
+                jnp.sum(_log_densities(*_log_weights(key, unknowns, each, num_paths, theta)))
+                for each in (part, half)
+            )
+            fine, coarse = values
+            return coarse - fine
+
+        error += share * jax.jacfwd(difference)(maximum.theta)
+        variance = jnp.maximum(variance, share**2)
+    noise = 2 * jnp.diagonal(maximum.simulated.covariance)
+    return StepError(error, jnp.sqrt(variance * noise))
+
+
+def _of_part(key, unknowns, part: Part, theta: Float[Array, " p"], num_paths: int) -> Simulated:
+    def log_weights(theta):
+        made, found = _log_weights(key, unknowns, part, num_paths, theta)
+        return made, (made, found)
+
+    def first(theta):
+        g, (made, found) = jax.jacfwd(log_weights, has_aux=True)(theta)
+        return g, (made, found, g)
+
+    H, (made, found, g) = jax.jacfwd(first, has_aux=True)(theta)
+
+    def total(t):
+        """ℓ̂ at θ + t, with the log weights expanded to second order."""
+        return jnp.sum(_log_densities(made + g @ t + ((H @ t) @ t) / 2, found))
+
+    at_theta = jnp.zeros_like(theta)
+    information = -jax.jacfwd(jax.grad(total))(at_theta)
+    weights = normalised(jnp.where(found, made, -jnp.inf))
+    mean = jnp.sum(weights[..., None] * g, axis=1, keepdims=True)
+    deviation = weights[..., None] * (g - mean)
+    some = jnp.any(found, axis=1)
+    densities = _log_densities(made, found)
+    return Simulated(
+        jnp.sum(densities),
+        jax.grad(total)(at_theta),
+        jnp.einsum("kji,kjl->il", deviation, deviation),
+        (information + information.T) / 2,
+        effective_size(weights),
+        pareto_k(jnp.where(found, made, -jnp.inf)),
+        jnp.sum(~some, dtype=jnp.int32),
+        4 * jnp.finfo(theta.dtype).eps * jnp.sum(jnp.abs(densities)),
+    )
+
+
+def ascent(gradient: Float[Array, " p"], information: Float[Array, "p p"]) -> Float[Array, " p"]:
+    """Newton's step where ℓ̂ is concave; elsewhere that with curvatures of the other sign turned
+    round, in units in which those along the axes are ±1: uphill in any case."""
+    scale = jnp.sqrt(jnp.abs(jnp.diagonal(information)))
+    scale = jnp.where((scale > 0) & jnp.isfinite(scale), scale, 1)
+    scaled = information / scale[:, None] / scale
+    scaled = jnp.where(
+        jnp.all(jnp.isfinite(scaled)), scaled, jnp.eye(len(scale), dtype=scale.dtype)
+    )
+    curvature, axes = jnp.linalg.eigh(scaled)
+    # Below this a curvature is not known from zero.
+    curvature = jnp.maximum(jnp.abs(curvature), 10 * jnp.finfo(scale.dtype).eps)
+    return axes @ ((axes.T @ (gradient / scale)) / curvature) / scale
+
+
+class _Climb(NamedTuple):
+    """The best point so far, the step from there, and the fraction of it to be tried next."""
+
+    i: Int[Array, ""]
+    theta: Float[Array, " p"]
+    simulated: Simulated
+    step: Float[Array, " p"]
+    fraction: Float[Array, ""]
+    done: Bool[Array, ""]
+
+
+@eqx.filter_jit
+def climb(
+    key: Key[Array, ""],
+    unknowns: Unknowns,
+    parts: tuple[Part, ...],
+    constraint: Constraint | None,
+    starts: Float[Array, "starts p"],
+    num_paths: int,
+) -> Maximum:
+    """The maximum of ℓ̂ at fixed noise by Newton's method, from the best of several points, the
+    first of which must be allowed.
+
+    A step that leads down, out of the constraint, or to where more intervals have no path, is
+    shortened.
+    """
+    unknowns, parts, starts = nondifferentiable((unknowns, parts, starts))
+    at_start = len(starts)
+
+    def at(theta):
+        return simulated(key, unknowns, parts, theta, num_paths)
+
+    def next_point(state):
+        start = starts[jnp.minimum(state.i, at_start - 1)]
+        starting = state.i < at_start
+        tried = jnp.where(starting, start, state.theta + state.fraction * state.step)
+        inside = allowed(constraint, unknowns, tried)
+        # Outside the constraint the model may not be simulated.
+        made, old = at(jnp.where(inside, tried, starts[0])), state.simulated
+        expected = jnp.where(starting, 0, 1e-4 * state.fraction * (old.gradient @ state.step))
+        higher = made.value >= old.value + expected - jnp.where(starting, 0, old.rounding)
+        fewer, as_many = made.num_missing < old.num_missing, made.num_missing == old.num_missing
+        finite = all_finite_leaves(made._replace(pareto_k=made.rounding))  # k̂ need not be
+        better = inside & finite & (fewer | (as_many & higher))
+        theta, made = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old), (tried, made), (state.theta, old)
+        )
+        step = ascent(made.gradient, made.information)
+        gain = made.gradient @ step
+        # A leap could end where weights are so uneven that ℓ̂ has maxima of its own.
+        longest = _LONGEST / jnp.sqrt(jnp.maximum(gain, _LONGEST**2))
+        fraction = jnp.where(better | starting, longest, state.fraction / 3).astype(theta.dtype)
+        # The last point that was tried is better, or no shorter step would do.
+        done = (state.i + 1 >= at_start) & ((gain < _GAIN) | (fraction < _SHORTEST * longest))
+        return _Climb(state.i + 1, theta, made, step, fraction, done)
+
+    nowhere = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(at, starts[0])
+    )
+    num_intervals = jnp.int32(nowhere.effective_sample_size.shape[0])
+    nowhere = nowhere._replace(
+        value=jnp.full_like(nowhere.value, -jnp.inf), num_missing=num_intervals
+    )
+    one, no = jnp.ones_like(starts[0, 0]), jnp.array(False)
+    first = _Climb(jnp.int32(0), starts[0], nowhere, jnp.zeros_like(starts[0]), one, no)
+    last = lax.while_loop(lambda state: ~state.done & (state.i < _MOST_POINTS), next_point, first)
+    made = last.simulated
+    # Positive definite, and by far: where weights are very uneven ℓ̂ has maxima of its own.
+    clear = jnp.all(jnp.linalg.eigvalsh(_NOISE**2 * made.information - made.covariance) > 0)
+    # By rounding a step may seem to lead down that does not.
+    found = clear & (made.gradient @ last.step < 100 * _GAIN)
+    return Maximum(last.theta, made, found)
+
+
+class Lost(NamedTuple):
+    """Bridges that were not found, weights that were cut off, and steps that were not made."""
+
+    missing: Shaped[Array, "..."]
+    truncated: Shaped[Array, "..."]
+    refused: Shaped[Array, "..."]
+
+
+def guarded(
+    constraint: Constraint | None,
+    unknowns: Unknowns,
+    old: tuple[Float[Array, " p"], PyTree],
+    new: tuple[Float[Array, " p"], PyTree],
+) -> tuple[Float[Array, " p"], PyTree, Bool[Array, ""]]:
+    """θ and the state of an optimiser after a step, or as they were where it leads out of the
+    constraint or to what is not finite; and whether it was made."""
+    finite = all_finite_leaves(new[1])
+    ok = allowed(constraint, unknowns, new[0]) & finite
+    theta = jnp.where(ok, new[0], old[0])
+    # What an optimiser remembers must not be spoilt for all steps to come.
+    rule = jax.tree.map(lambda new, old: jnp.where(finite, new, old), new[1], old[1])
+    return theta, rule, ok
+
+
+@eqx.filter_jit
+def wander(
+    key: Key[Array, ""],
+    unknowns: Unknowns,
+    parts: tuple[Part, ...],
+    constraint: Constraint | None,
+    optimizer: optax.GradientTransformation,
+    theta: Float[Array, " p"],
+    num_iterations: int,
+    meter: diffrax.AbstractProgressMeter,
+) -> tuple[Float[Array, "n p"], Lost]:
+    """The optimiser's iterates along ∇ℓ̂ with new noise in each, and what was lost on the way."""
+    unknowns, parts, theta = nondifferentiable((unknowns, parts, theta))
+    num_intervals = sum(part.intervals.start.shape[0] for part in parts)
+
+    def loss(theta, key):
+        value, missing = jnp.zeros((), theta.dtype), jnp.int32(0)
+        for part_key, part in zip(jax.random.split(key, len(parts)), parts, strict=True):
+            made, found = _log_weights(part_key, unknowns, part, _FEW, theta)
+            value += jnp.sum(_log_densities(made, found))
+            missing += jnp.sum(~jnp.any(found, axis=1), dtype=jnp.int32)
+        return -value / num_intervals, missing
+
+    def iterate(state, i):
+        theta, rule, progress = state
+        gradient, missing = jax.jacfwd(loss, has_aux=True)(theta, jax.random.fold_in(key, i))
+        updates, moved = optimizer.update(gradient, rule, theta)
+        new = theta + jnp.asarray(updates), moved
+        theta, rule, ok = guarded(constraint, unknowns, (theta, rule), new)
+        progress = meter.step(progress, (i + 1).astype(jnp.float32) / num_iterations)
+        return (theta, rule, progress), (theta, missing, ~ok)
+
+    state = theta, optimizer.init(theta), meter.init()
+    state, (iterates, missing, refused) = lax.scan(iterate, state, jnp.arange(num_iterations))
+    meter.close(state[2])
+    missing, refused = (jnp.sum(leaf, dtype=jnp.int32) for leaf in (missing, refused))
+    return iterates, Lost(missing, jnp.int32(0), refused)

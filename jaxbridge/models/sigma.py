@@ -1,0 +1,175 @@
+"""The diffusion coefficient σ(x) at one point, as the operator its form calls for.
+
+Four forms: the identity, a constant matrix (inverted outside the loop over time), a
+diagonal and a full matrix. Whoever holds a `Sigma` multiplies and solves without knowing
+which; what a form does not need is never computed.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..engine.linalg import (
+    any_inverse,
+    cholesky,
+    log_abs_det,
+    matmul,
+    matvec,
+    solve,
+    solve_lower,
+    total,
+)
+
+
+class AbstractSigma(eqx.Module):
+    """σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,)."""
+
+    @abstractmethod
+    def mv(self, noise: Float[Array, " d"]) -> Float[Array, " d"]:
+        """`σ w`."""
+
+    @abstractmethod
+    def mv_transpose(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
+        """`σᵀ v`."""
+
+    @abstractmethod
+    def solve(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
+        """`σ⁻¹ v`."""
+
+    @abstractmethod
+    def average(self, other: "AbstractSigma") -> "AbstractSigma":
+        """`½ (σ + other)`, for two coefficients of one model."""
+
+    @abstractmethod
+    def log_abs_det(self) -> Float[Array, ""]:
+        """`log |det σ|`."""
+
+    @abstractmethod
+    def as_matrix(self, dim: int, dtype) -> Float[Array, "d d"]:
+        """`σ` as a dense matrix."""
+
+    @abstractmethod
+    def root(self) -> "AbstractSigma":
+        """A root of V = σσᵀ: where σ varies one that V alone determines, however σ turns."""
+
+
+class Identity(AbstractSigma):
+    """σ = I."""
+
+    def mv(self, noise):
+        return noise
+
+    def mv_transpose(self, vector):
+        return vector
+
+    def solve(self, vector):
+        return vector
+
+    def average(self, other):
+        return self
+
+    def log_abs_det(self):
+        return jnp.asarray(0.0)
+
+    def as_matrix(self, dim, dtype):
+        return jnp.eye(dim, dtype=dtype)
+
+    def root(self):
+        return self
+
+
+class Constant(AbstractSigma):
+    """The same matrix everywhere, kept with its inverse."""
+
+    matrix: Float[Array, "d d"]
+    inverse: Float[Array, "d d"]
+
+    def __init__(self, matrix: Float[Array, "d d"], inverse: Float[Array, "d d"] | None = None):
+        self.matrix = matrix
+        self.inverse = any_inverse(matrix) if inverse is None else inverse
+
+    def mv(self, noise):
+        return matvec(self.matrix, noise)
+
+    def mv_transpose(self, vector):
+        return matvec(self.matrix.T, vector)
+
+    def solve(self, vector):
+        return matvec(self.inverse, vector)
+
+    def average(self, other):
+        return self
+
+    def log_abs_det(self):
+        return log_abs_det(self.matrix)
+
+    def as_matrix(self, dim, dtype):
+        return self.matrix
+
+    def root(self):
+        return self
+
+
+class Diagonal(AbstractSigma):
+    """A diagonal matrix, given by its diagonal."""
+
+    diagonal: Float[Array, " d"]
+
+    def mv(self, noise):
+        return self.diagonal * noise
+
+    def mv_transpose(self, vector):
+        return self.diagonal * vector
+
+    def solve(self, vector):
+        return vector / self.diagonal
+
+    def average(self, other):
+        assert isinstance(other, Diagonal)
+        return Diagonal((self.diagonal + other.diagonal) / 2)
+
+    def log_abs_det(self):
+        return total(jnp.log(jnp.abs(self.diagonal)))
+
+    def as_matrix(self, dim, dtype):
+        return jnp.diag(self.diagonal)
+
+    def root(self):
+        return Diagonal(jnp.abs(self.diagonal))
+
+
+class Full(AbstractSigma):
+    """A full matrix that changes with the state; `lower` says that it is triangular, for which less
+    need be solved."""
+
+    matrix: Float[Array, "d d"]
+    lower: bool = eqx.field(static=True, default=False)
+
+    def mv(self, noise):
+        return matvec(self.matrix, noise)
+
+    def mv_transpose(self, vector):
+        return matvec(self.matrix.T, vector)
+
+    def solve(self, vector):
+        return (solve_lower if self.lower else solve)(self.matrix, vector)
+
+    def average(self, other):
+        assert isinstance(other, Full)
+        return Full((self.matrix + other.matrix) / 2, self.lower and other.lower)
+
+    def log_abs_det(self):
+        return log_abs_det(self.matrix)
+
+    def as_matrix(self, dim, dtype):
+        return self.matrix
+
+    def root(self):
+        return root_of(matmul(self.matrix, self.matrix.T))
+
+
+def root_of(V: Float[Array, "d d"]) -> Full:
+    """The lower triangular root of V."""
+    return Full(cholesky(V), lower=True)

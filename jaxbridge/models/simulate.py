@@ -1,0 +1,132 @@
+"""Unconditional paths of the diffusion, by diffrax."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
+from .diffusion import Diffusion, Dynamics, check_diffusion, ito_correction
+from .sigma import AbstractSigma, Diagonal
+
+
+def simulate(
+    key: Key[Array, ""],
+    model: Diffusion,
+    x0: Numbers | None,
+    times: Numbers,
+    *,
+    num_paths: int = 1,
+    num_steps: int = 50,
+    solver: diffrax.AbstractSolver | None = None,
+) -> Float[Array, "num_paths K d"]:
+    """Unconditional paths, started at `times[0]`.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: the diffusion. Neither its reversal nor its stationary law is called for.
+    - `x0`: the start, shape (d,), or one for each path, (num_paths, d), or `None` to draw from
+        the stationary law by the model's sampler.
+    - `times`: increasing, shape (K,), in units of time.
+    - `num_paths`: how many paths.
+    - `num_steps`: solver steps between one time and the next.
+    - `solver`: a diffrax solver that takes fixed steps; by default `diffrax.Heun()`. A solver
+        for Stratonovich equations is given the drift in that form, and one that asks for a
+        Lévy area gets it.
+
+    **Returns:** paths, shape (num_paths, K, d). A path that left the finite numbers is NaN or
+    infinite from there on. Differentiable in forward mode.
+
+    **Raises:** `ValueError` for shapes that do not fit or times that do not increase.
+
+    **Example:**
+
+    ```python
+    paths = jb.simulate(key, model, start, jnp.linspace(0, 10, 101), num_paths=8)
+    paths.shape  # (8, 101, 2)
+    ```
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_paths = check_count("num_paths", num_paths)
+    num_steps = check_count("num_steps", num_steps)
+    times = as_floating("times", times)
+    if times.ndim != 1 or times.shape[0] < 2:
+        raise ValueError(f"`times` must have shape (K,) with K ≥ 2; got {times.shape}.")
+    if not is_traced(times) and not np.all(np.diff(times) > 0):
+        raise ValueError(f"`times` must increase; got {times}.")
+    start_key, path_key = jax.random.split(key)
+    if x0 is None:
+        x0 = jax.vmap(model.prepared().sample_stationary)(jax.random.split(start_key, num_paths))
+    x0 = as_floating("x0", x0)
+    if x0.shape[:-1] not in ((), (num_paths,)) or x0.ndim == 0:
+        raise ValueError(
+            f"`x0` must have shape (d,) or ({num_paths}, d), one for each path; got {x0.shape}."
+        )
+    x0 = jnp.broadcast_to(x0, (num_paths, x0.shape[-1]))
+    solver = diffrax.Heun() if solver is None else solver
+    return _simulate(path_key, model, x0, times.astype(x0.dtype), num_steps, solver)
+
+
+@eqx.filter_jit
+def _simulate(key, model, x0, times, num_steps, solver):
+    (num_paths, d), num_intervals = x0.shape, times.shape[0] - 1
+    dynamics = model.forward(x0[0])
+    fractions = jnp.arange(num_steps, dtype=times.dtype) / num_steps
+    grid = times[:-1, None] + fractions * jnp.diff(times)[:, None]
+    grid = jnp.append(grid.reshape(-1), times[-1])
+    stratonovich = isinstance(solver, diffrax.AbstractStratonovichSolver)
+
+    def drift(t, x, args):
+        if stratonovich and dynamics.sigma_varies:
+            return dynamics.drift(x) - ito_correction(dynamics, x)
+        return dynamics.drift(x)
+
+    def sigma(t, x, args):
+        return _as_operator(dynamics, x)
+
+    def one_path(key, x0):
+        noise = diffrax.UnsafeBrownianPath(
+            jax.ShapeDtypeStruct((d,), x0.dtype),
+            key,
+            _levy_area(solver),
+        )
+        solution = diffrax.diffeqsolve(
+            diffrax.MultiTerm(diffrax.ODETerm(drift), diffrax.ControlTerm(sigma, noise)),
+            solver,
+            times[0],
+            times[-1],
+            None,
+            x0,
+            saveat=diffrax.SaveAt(ts=times),
+            stepsize_controller=diffrax.StepTo(ts=grid),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=num_intervals * num_steps,
+            throw=False,
+        )
+        return jnp.asarray(solution.ys)
+
+    return jax.vmap(one_path)(jax.random.split(key, num_paths), x0)
+
+
+def _levy_area(solver: diffrax.AbstractSolver):
+    """The least that the solver must know of the Brownian path."""
+    least = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
+    candidates = (
+        diffrax.BrownianIncrement,
+        diffrax.SpaceTimeLevyArea,
+        diffrax.SpaceTimeTimeLevyArea,
+    )
+    return next(candidate for candidate in candidates if issubclass(candidate, least))
+
+
+def _as_operator(dynamics: Dynamics, x: Float[Array, " d"]) -> lx.AbstractLinearOperator:
+    sigma: AbstractSigma = dynamics.sigma(x)
+    if isinstance(sigma, Diagonal):
+        return lx.DiagonalLinearOperator(sigma.diagonal)
+    matrix = sigma.as_matrix(x.shape[0], x.dtype)
+    return lx.MatrixLinearOperator(matrix)

@@ -1,0 +1,230 @@
+"""The proposals of a coupling, with the random weight that makes them exact (section 2.3),
+
+    w = 1{met} · ν(b)/ν(x_0) · μ(x_0) · (mean of N hitting counts),
+
+where x_0 is the reversed path at time 0 and μ the law from which the associated diffusion
+starts: `start_laws` has the derivation.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ..coupling.bridges import Inputs, find_bridges
+from ..coupling.burn_in import with_burn_in
+from ..coupling.coupling import AbstractCoupling
+from ..coupling.hitting import HittingCounts, count_hits
+from ..coupling.start_laws import AnyStartLaw, Reversed, Stationary, log_ratio, needs_burn_in
+from ..engine.checks import nondifferentiable
+from ..engine.rejection import default_num_lanes
+from ..models.diffusion import Diffusion, Dynamics
+from ..models.grid import uniform_fractions
+from ..models.intervals import Intervals
+from ..schemes.fit import check_model
+from ..schemes.halving import log_halving_of_paths, num_looked
+from ..schemes.schemes import AbstractScheme, Euler, GaussianTransition, Milstein
+from ..schemes.step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
+from ..schemes.step_error import share_of_order
+from .base import AbstractWeightedProposal, WeightedPaths, in_blocks
+
+# Whole paths are kept only until they are weighed: at most this many bytes of them at a time.
+_BLOCK_BYTES = 2**28
+
+# A path costs so many others that D of more of them may be looked at than where it costs one.
+_LOOKED = 4
+
+
+class CoupledPairs(AbstractWeightedProposal):
+    """The proposals of a coupling, weighted by hitting counts: `proposal` of what
+    `sample_exact_bridges` and others return where they were given a `Coupling`.
+
+    - `coupling`: with its start law.
+    - `max_proposals`: bounds the tries for a pair that meets.
+    - `max_trials`: bounds the trials for the counts of each path.
+    - `num_counts`: N, hitting counts for each path.
+    """
+
+    coupling: AbstractCoupling
+    max_proposals: Int[Array, ""]
+    max_trials: Int[Array, ""]
+    num_counts: int = eqx.field(static=True)
+
+    def check(self, model, intervals):
+        check_model(model, intervals, self.coupling.scheme)
+        model.check_reversal()
+        check_density(self.coupling.start_law, model)
+
+    def check_prepared(self, model):
+        if needs_burn_in(self.coupling.start_law, model):
+            raise ValueError(
+                "this model has no sampler of its stationary law, so the length of the run that "
+                "replaces it must be known: use `Stationary(burn_in=...)`, in units of time, for "
+                "instance from `measure_burn_in`; or pass `sample_stationary=` to `Diffusion`, "
+                "or choose a start law with a density (`fit_start_law`)."
+            )
+
+    def prepared(self, key, model, intervals, num_steps):
+        _, end, duration = nondifferentiable(intervals)
+        coupling = with_burn_in(key, model, self.coupling, end, duration, num_steps)
+        return eqx.tree_at(lambda p: p.coupling, self, coupling)
+
+    def fractions(self, num_steps):
+        return uniform_fractions(num_steps)
+
+    def step_share(self, model, intervals):
+        _, share = step_law_of(self.coupling.scheme, model.forward(intervals.start[0]))
+        return jnp.full_like(intervals.duration, share)
+
+    def draw(
+        self,
+        keys,
+        model,
+        intervals,
+        num_steps,
+        stored,
+        misses_count,
+        active=None,
+        progress_meter=None,
+    ):
+        model, intervals = nondifferentiable((model, intervals))
+        max_proposals = jnp.int32(1) if misses_count else self.max_proposals
+
+        def block(keys, intervals, active):
+            num_intervals, num_draws = keys.shape
+            keys = keys.reshape(-1)
+            if active is None:
+                active = jnp.ones(num_intervals, bool)
+            active = jnp.repeat(active, num_draws)
+            intervals = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=0), intervals)
+            num_lanes = default_num_lanes(len(keys), num_steps, intervals.start)
+            propose_keys, count_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+            inputs = Inputs(model, self.coupling, intervals)
+            proposed = find_bridges(
+                propose_keys, inputs, active, 1, max_proposals, num_steps, None, num_lanes
+            )
+            paths, reverse_start, _ = proposed.outputs
+            found = proposed.num_found > 0
+            counts = self._counts(
+                count_keys, model, intervals, paths, found, self.num_counts, progress_meter
+            )
+            law = self.coupling.start_law
+            log_weights = pair_log_weights(law, model, intervals.end, reverse_start, counts.mean)
+            log_weights, unusable = usable(log_weights, found)
+            log_halving = self.log_halving(model, intervals, paths, num_draws)
+            kept = paths if stored is None else paths[:, stored]
+            made = WeightedPaths(
+                jnp.where(found[:, None, None], kept, jnp.nan),
+                log_weights,
+                found,
+                counts.truncated | unusable,
+                proposed.num_trials + counts.num_trials,
+                proposed.num_nonfinite + counts.num_nonfinite,
+                log_halving,
+            )
+            return jax.tree.map(
+                lambda leaf: leaf.reshape(num_intervals, num_draws, *leaf.shape[1:]), made
+            )
+
+        d, itemsize = intervals.start.shape[1], intervals.start.dtype.itemsize
+        most_rows = _BLOCK_BYTES // ((num_steps + 1) * d * itemsize)
+        return in_blocks(block, keys, intervals, most_rows, active)
+
+    def reweigh(self, keys, model, intervals, paths, active=None):
+        # Under the target the counts of a path are size-biased, and x_0 is where a trial that
+        # hit had started: N + 1 counts, less one trial.
+        model, intervals, paths = nondifferentiable((model, intervals, paths))
+        found = jnp.all(jnp.isfinite(paths), axis=(1, 2))
+        if active is not None:
+            found &= active
+        counts = self._counts(keys, model, intervals, paths, found, self.num_counts + 1)
+        num_hits = jnp.sum(counts.counts > 0, axis=1, dtype=jnp.int32)
+        one_less = jnp.maximum(counts.num_trials - 1, 1).astype(paths.dtype)
+        mean = one_less / jnp.maximum(num_hits - 1, 1).astype(paths.dtype)
+        # Where nothing hit, x_0 is unknown; any point serves for a weight that is flagged.
+        start = jnp.where((num_hits > 0)[:, None], counts.start, intervals.start)
+        log_weights = pair_log_weights(self.coupling.start_law, model, intervals.end, start, mean)
+        log_weights, unusable = usable(log_weights, found)
+        made = WeightedPaths(
+            jnp.where(found[:, None, None], paths, jnp.nan),
+            log_weights,
+            found,
+            counts.truncated | unusable,
+            counts.num_trials,
+            counts.num_nonfinite,
+            self.log_halving(model, intervals, paths, 1),
+        )
+        return jax.tree.map(lambda leaf: leaf[:, None], made)
+
+    def log_halving(
+        self, model: Diffusion, intervals: Intervals, paths: Float[Array, "P points d"], n: int
+    ) -> Float[Array, " P"]:
+        """D of the first of n paths of each interval, NaN of the others."""
+        dynamics = model.forward(intervals.start[0])
+        density, _ = step_law_of(self.coupling.scheme, dynamics)
+        num_some = num_looked(_LOOKED * n, dynamics.sigma_varies)
+        some = jnp.arange(len(paths)).reshape(-1, n)[:, :num_some].reshape(-1)
+        num_steps = paths.shape[1] - 1
+        dt = jnp.broadcast_to(intervals.duration[some] / num_steps, (num_steps, len(some)))
+        log_halving = log_halving_of_paths(density, dynamics, dt, paths[some])
+        return jnp.full(len(paths), jnp.nan, paths.dtype).at[some].set(log_halving)
+
+    def _counts(
+        self, keys, model, intervals, paths, found, num_counts, progress_meter=None
+    ) -> HittingCounts:
+        return count_hits(
+            keys,
+            model,
+            self.coupling,
+            paths,
+            intervals.duration,
+            found,
+            num_counts,
+            self.max_trials,
+            progress_meter=progress_meter,
+        )
+
+
+def step_law_of(scheme: AbstractScheme, dynamics: Dynamics) -> tuple[AbstractStepDensity, float]:
+    """The normal law of a step that comes nearest to that of the scheme, and the step error of the
+    scheme as a share of what half as many steps change with that law."""
+    if isinstance(scheme, GaussianTransition):
+        return EulerDensity(), 0.0  # there is no step error
+    if isinstance(scheme, Euler | Milstein):
+        return EulerDensity(), share_of_order(EulerDensity.order)
+    if dynamics.sigma_varies:
+        # Of first order like Euler's, and two to four times as large where it was measured.
+        return EulerDensity(), 3 * share_of_order(EulerDensity.order)
+    return ItoTaylorDensity(), share_of_order(ItoTaylorDensity.order)
+
+
+def pair_log_weights(
+    law: AnyStartLaw,
+    model: Diffusion,
+    end: Float[Array, "P d"],
+    reverse_start: Float[Array, "P d"],
+    mean_count: Float[Array, " P"],
+) -> Float[Array, " P"]:
+    """log [ν(b)/ν(x_0) · μ(x_0) · ρ̂]; without ν(b), a constant, where the model has no ν."""
+    log_weights = jax.vmap(lambda x: log_ratio(law, model, x))(reverse_start)
+    log_weights += jnp.log(mean_count)
+    if model.has_density:
+        log_weights += jax.vmap(model.log_stationary)(end)
+    return log_weights
+
+
+def usable(
+    log_weights: Float[Array, "*rows"], found: Bool[Array, "*rows"]
+) -> tuple[Float[Array, "*rows"], Bool[Array, "*rows"]]:
+    """Weights of which none spoils the others, and where one would have."""
+    number = log_weights < jnp.inf  # false for NaN, as densities of start laws may give
+    return jnp.where(found & number, log_weights, -jnp.inf), found & ~number
+
+
+def check_density(law: AnyStartLaw, model: Diffusion) -> None:
+    """Raise `ValueError` where a start law has a density but the model's ν is not known."""
+    if not isinstance(law, Stationary | Reversed) and not model.has_density:
+        raise ValueError(
+            "a start law other than `Stationary()` is paid for with ν(x): give `Diffusion` a "
+            "`log_stationary` (up to a constant)."
+        )

@@ -1,0 +1,750 @@
+"""Proposals that are pulled to the end point: a chain of normal steps with bent noise.
+
+On a grid 0 = t_0 < ... < t_N = T with steps δ_i the target is a chain (`step_density`) of steps
+
+    x_{i+1} ~ N(μ_i, δ_i σ(x_i) S_i σ(x_i)ᵀ);
+
+the Euler scheme has μ_i = x_i + α(x_i) δ_i and S = I. A proposal goes steps of another normal law
+q_i(x_{i+1}| x_i) with the same σ, and x_N = b. Its weight is the density of the path under the
+target over that under the proposal,
+
+    w = p_{N-1}(b| x_{N-1}) Π_{i<N-1} p_i(x_{i+1}| x_i) / q_i(x_{i+1}| x_i),
+
+so E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b] for the target without any further error, and for the
+diffusion up to the target's step error, O(δ), or O(δ²) by `ItoTaylorDensity`. No stationary law is
+called for.
+
+q follows from a guess h_{i+1}(x) of the density of b seen from x at t_{i+1}. Where log h is
+quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting the target's step by h gives
+
+    q_i = N(μ_i + δ L C Lᵀ r̃, δ L C Lᵀ),    C = S (I + δ Lᵀ H̃ L S)⁻¹,    L Lᵀ = V(x_i)
+
+(r̃ and H̃ as in Schauer, van der Meulen & van Zanten 2017; the discrete form as in Whitaker,
+Golightly, Boys & Sherlock 2017). With the true density in the place of h this is Doob's
+h-transform, and w is constant.
+
+A guess of a linear process has a Ṽ = L̃ L̃ᵀ of its own. Where V(x) is larger it pulls too hard,
+where V(x) is smaller not hard enough, and the weights have heavy tails. What V is on the way to b
+is nearer to the mean V̄ = L̄ L̄ᵀ of the two, to which the guess's deviations are scaled:
+
+    H̃ := L̄⁻ᵀ L̃ᵀ H L̃ L̄⁻¹,    r̃ := L̄⁻ᵀ [(L̄⁻¹ L̃)ᵀ L̃ᵀ ρ - L̃ᵀ H L̃ L̄⁻¹ (μ_i - b)],
+
+which where V(x) = Ṽ is the guess itself.
+"""
+
+from abc import abstractmethod
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.devices import num_devices
+from ..engine.lanes import join_rows, over_lanes, split_rows
+from ..engine.linalg import all_finite, inverse, matmul, matvec
+from ..engine.noise import Store, noisy_scan
+from ..engine.rejection import most_lanes
+from ..models.diffusion import Diffusion, Dynamics
+from ..models.intervals import Intervals
+from ..models.sigma import AbstractSigma, root_of
+from ..schemes.fit import check_model
+from ..schemes.halving import num_looked, of_all_steps, of_pair
+from ..schemes.schemes import Euler
+from ..schemes.step_density import AbstractStepDensity, EulerDensity, StepLaw
+from ..schemes.step_error import share_of_order
+from .base import (
+    AbstractWeightedProposal,
+    WeightedPaths,
+    block_over_devices,
+    in_blocks,
+    masked,
+)
+
+# δ |F| of a step that has nothing in common with the diffusion: where long steps threw ξ far out.
+_FAR_OUT = 10.0
+# Of the duration: shorter steps are lost in the rounding of points.
+_SHORTEST_STEP = 1e-10
+
+
+class Step(NamedTuple):
+    """One step of one interval, as `step_law` of an `AbstractGuidedProposal` sees it.
+
+    - `guide`: what the proposal worked out for the step.
+    - `dt`: its length δ_i, in units of time.
+    - `remaining`: T - t_i, the time from its beginning to the end.
+    - `end`: b, shape (d,).
+    """
+
+    guide: PyTree
+    dt: Float[Array, "*lanes"]
+    remaining: Float[Array, "*lanes"]
+    end: Float[Array, "d *lanes"]
+
+
+class AbstractGuidedProposal(AbstractWeightedProposal):
+    """Paths in steps as the target's, but pulled so that they end in b.
+
+    A proposal is another law of each step, `step_law`, and what can be worked out for it before
+    any path is simulated, `guide`. `density` is that of the target's steps, and `refinement` is ρ
+    in t_i = T [1 - (1 - i/N)^ρ].
+    """
+
+    density: eqx.AbstractVar[AbstractStepDensity]
+    refinement: eqx.AbstractVar[float]
+
+    @abstractmethod
+    def guide(
+        self,
+        dynamics: Dynamics,
+        start: Float[Array, " d"],
+        end: Float[Array, " d"],
+        dt: Float[Array, " N"],
+    ) -> PyTree:
+        """Anything with leading axis N - 1, of which `step_law` sees one entry per step."""
+
+    @abstractmethod
+    def step_law(self, step: Step, x: Float[Array, " d"], target: StepLaw) -> StepLaw:
+        """The law of the proposal's step from x_i = x, with the same σ, given the target's."""
+
+    def check(self, model, intervals):
+        check_model(model, intervals, Euler())
+
+    def check_prepared(self, model):
+        pass
+
+    def prepared(self, key, model, intervals, num_steps):
+        return self
+
+    def fractions(self, num_steps):
+        return 1 - self.remaining(num_steps)
+
+    def step_share(self, model, intervals):
+        return jnp.full_like(intervals.duration, share_of_order(self.density.order))
+
+    def remaining(self, num_steps: int) -> Float[np.ndarray, " points"]:
+        """(T - t_i) / T, down to zero."""
+        if num_steps**-self.refinement < _SHORTEST_STEP:
+            raise ValueError(
+                f"`refinement` = {self.refinement:g} makes the last of {num_steps} steps too short "
+                "to be told from none: choose a smaller one."
+            )
+        return (1 - np.arange(num_steps + 1) / num_steps) ** self.refinement
+
+    def draw(
+        self,
+        keys,
+        model,
+        intervals,
+        num_steps,
+        stored,
+        misses_count,
+        active=None,
+        progress_meter=None,
+    ):
+        block = block_over_devices(eqx.Partial(_draw_block, self, model, stored, num_steps))
+        rows = num_devices() * most_lanes(intervals.start.shape[1])
+        return in_blocks(block, keys, intervals, rows, active, progress_meter)
+
+    def reweigh(self, keys, model, intervals, paths, active=None):
+        dynamics = model.forward(intervals.start[0])
+        _, log_weights, log_halving = noise_of(self, dynamics, intervals, paths)
+        made = _weighted(paths[:, None], log_weights[:, None], log_halving[:, None])
+        return made if active is None else masked(made, active)
+
+
+class ModifiedDiffusionBridge(AbstractGuidedProposal):
+    """The modified diffusion bridge of Durham & Gallant (2002): as if α and V stayed as they are
+    at the current point,
+
+        x_{i+1} ~ N(x_i + (b - x_i) δ_i/(T - t_i), V(x_i) δ_i (T - t_{i+1})/(T - t_i)).
+
+    The best and cheapest proposal on intervals so short that the drift matters little. For
+    σ = I it is the Brownian bridge.
+
+    **Arguments:**
+
+    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
+        `ItoTaylorDensity()` is far closer to the diffusion.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
+        which pays where σ varies much on the way.
+
+    **Example:**
+
+    ```python
+    proposal = jb.ModifiedDiffusionBridge()
+    chain = jb.sample_exact_bridges(key, model, start, end, 0.1, num_bridges=100, proposal=proposal)
+    ```
+    """
+
+    density: AbstractStepDensity
+    refinement: float = eqx.field(static=True)
+
+    def __init__(self, density: AbstractStepDensity | None = None, refinement: float = 1.0):
+        self.density = _check_density(density)
+        self.refinement = _check_refinement(refinement)
+
+    def guide(self, dynamics, start, end, dt):
+        return None
+
+    def step_law(self, step, x, target):
+        return _bridge_law(step, target, x + (step.end - x) * (step.dt / step.remaining))
+
+
+class ResidualBridge(AbstractGuidedProposal):
+    """The residual bridge of Whitaker, Golightly, Boys & Sherlock (2017): the modified diffusion
+    bridge of x - ξ, where ξ solves dξ = α(ξ) dt from the start,
+
+        x_{i+1} = x_i + Δξ_i + (b - ξ_N - (x_i - ξ_i)) δ_i/(T - t_i) + noise.
+
+    Better where the drift carries all paths along, on intervals that are short beside the time
+    in which it would pull them together.
+
+    **Arguments:**
+
+    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
+        `ItoTaylorDensity()` is far closer to the diffusion.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
+        which pays where σ varies much on the way.
+
+    **Example:**
+
+    ```python
+    proposal = jb.ResidualBridge()
+    chain = jb.sample_exact_bridges(key, model, start, end, 0.5, num_bridges=100, proposal=proposal)
+    ```
+    """
+
+    density: AbstractStepDensity
+    refinement: float = eqx.field(static=True)
+
+    def __init__(self, density: AbstractStepDensity | None = None, refinement: float = 1.0):
+        self.density = _check_density(density)
+        self.refinement = _check_refinement(refinement)
+
+    def guide(self, dynamics, start, end, dt):
+        xi, xi_end = deterministic_path(self.density, dynamics, start, dt)
+        moved = jnp.concatenate([xi[1:], xi_end[None]]) - xi
+        return moved[:-1], (xi + end - xi_end)[:-1]
+
+    def step_law(self, step, x, target):
+        moved, aim = step.guide
+        return _bridge_law(step, target, x + moved + (aim - x) * (step.dt / step.remaining))
+
+
+class _GaussianGuess(NamedTuple):
+    """log h(x) = ρᵀ(x - b) - ½ (x - b)ᵀ H (x - b) + constant."""
+
+    shift: Float[Array, " d"]
+    precision: Float[Array, "d d"]
+
+
+class _NoiseGuess(NamedTuple):
+    """The same in the coordinates of the noise: L̃ᵀρ and L̃ᵀH L̃, and Ṽ = L̃ L̃ᵀ's root L̃, which where σ
+    is constant is that of every point."""
+
+    shift: Float[Array, "d *lanes"]
+    precision: Float[Array, "d d *lanes"]
+    root: Float[Array, "d d *lanes"] | None
+
+
+class Guided(AbstractGuidedProposal):
+    """Guided proposals (Schauer, van der Meulen & van Zanten 2017): h is the transition density
+    of a linear process
+
+        dX̃ = [α̃ + F (X̃ - b)] dt + σ̃ dW,
+
+    in steps as the target's, so that for an Ornstein–Uhlenbeck process all weights are equal.
+    Where σ varies its deviations are scaled to the mean of V(x) and Ṽ (not in that paper): else the
+    weights have heavy tails, and far fewer paths count than it seems.
+
+    **Arguments:**
+
+    - `linearisation`: "end", the drift linearised at b, F = ∇α(b), α̃ = α(b), σ̃ = σ(b); "path", all
+        of them linearised along the deterministic path dξ = α(ξ) dt from the start, bent so that
+        it ends in b, and straight where steps are so long that they throw it far out; or a matrix
+        F of shape (d, d), with α(b) and σ(b).
+    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
+        `ItoTaylorDensity()` is far closer to the diffusion.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
+        which pays where σ varies much on the way.
+
+    **Raises:** `ValueError` and `TypeError` for anything else.
+
+    **Example:**
+
+    ```python
+    proposal = jb.Guided()
+    chain = jb.sample_exact_bridges(key, model, start, end, 2.0, num_bridges=100, proposal=proposal)
+    ```
+    """
+
+    density: AbstractStepDensity
+    refinement: float = eqx.field(static=True)
+    _along: str = eqx.field(static=True)
+    _matrix: Float[Array, "d d"] | None
+
+    def __init__(
+        self,
+        linearisation: Literal["end", "path"] | Numbers = "end",
+        density: AbstractStepDensity | None = None,
+        refinement: float = 1.0,
+    ):
+        self.density = _check_density(density)
+        self.refinement = _check_refinement(refinement)
+        if isinstance(linearisation, str):
+            if linearisation not in ("end", "path"):
+                raise ValueError(
+                    f'`linearisation` must be "end", "path" or a matrix; got {linearisation!r}.'
+                )
+            self._along, self._matrix = linearisation, None
+            return
+        self._along, self._matrix = "end", as_floating("linearisation", linearisation)
+        if self._matrix.ndim != 2 or self._matrix.shape[0] != self._matrix.shape[1]:
+            raise ValueError(
+                f"`linearisation` must be a matrix, shape (d, d); got {self._matrix.shape}."
+            )
+        if not is_traced(self._matrix) and not np.all(np.isfinite(self._matrix)):
+            raise ValueError(f"`linearisation` must be finite; got {self._matrix}.")
+
+    @property
+    def linearisation(self) -> str:
+        """What the drift is linearised along, in a word."""
+        return f'"{self._along}"' if self._matrix is None else "matrix"
+
+    def guide(self, dynamics, start, end, dt):
+        d = end.shape[0]
+        if self._matrix is not None and self._matrix.shape != (d, d):
+            raise ValueError(
+                f"the matrix of `Guided` must have shape ({d}, {d}) for points in {d} dimensions; "
+                f"got {self._matrix.shape}."
+            )
+        points = end[None]
+        if self._along == "path":
+            xi, xi_end = deterministic_path(self.density, dynamics, start, dt)
+            done = jnp.concatenate([jnp.zeros_like(dt[:1]), jnp.cumsum(dt)[:-1]]) / jnp.sum(dt)
+            points = xi + done[:, None] * (end - xi_end)
+            straight = start + done[:, None] * (end - start)
+            rates = jax.vmap(jax.jacfwd(dynamics.drift))(lax.stop_gradient(points))
+            near = dt * jnp.max(jnp.abs(rates), axis=(1, 2)) < _FAR_OUT
+            points = jnp.where(near[:, None], points, straight)
+        coefficients = jax.vmap(lambda x: self._linear(dynamics, x, end))(points)
+
+        def back(guess: _GaussianGuess, inputs) -> tuple[_GaussianGuess, _GaussianGuess]:
+            """h_i from h_{i+1}, by one step of the linear process."""
+            (F, drift, V), dt = inputs
+            shift, H = guess
+            step = self.density.linear_step(F, V, dt)
+            gain = inverse(jnp.eye(d, dtype=end.dtype) + matmul(H, step.covariance))
+            shift = shift - matvec(H, matvec(step.integral, drift))
+            shift = matvec(step.decay.T, matvec(gain, shift))
+            H = matmul(step.decay.T, matmul(matmul(gain, H), step.decay))
+            return _GaussianGuess(shift, (H + H.T) / 2), guess
+
+        F, drift, V = jax.tree.map(lambda leaf: leaf[-1], coefficients)
+        step = self.density.linear_step(F, V, dt[-1])
+        pull = matmul(step.decay.T, inverse(step.covariance))  # from t_{N-1} to b itself
+        last = _GaussianGuess(-matvec(pull, matvec(step.integral, drift)), matmul(pull, step.decay))
+        num_steps = dt.shape[0]
+        each = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (num_steps, *leaf.shape[1:]))[:-1], coefficients
+        )
+        _, (shift, H) = lax.scan(back, last, (each, dt[:-1]), reverse=True)
+        roots = jax.vmap(lambda x: dynamics.sigma(x).root().as_matrix(d, x.dtype))(points)
+        roots = jnp.broadcast_to(roots, (num_steps, d, d))[:-1]
+        pull_back = jnp.swapaxes(roots, 1, 2)
+        shift = jax.vmap(matvec)(pull_back, shift)
+        H = jax.vmap(matmul)(jax.vmap(matmul)(pull_back, H), roots)
+        return _NoiseGuess(shift, H, roots if dynamics.sigma_varies else None)
+
+    def step_law(self, step, x, target):
+        shift, H, L_guess = step.guide
+        L, S, gap = target.sigma.root(), target.matrix, target.mean - step.end
+        if L_guess is None:
+            K, r = H, shift - matvec(H, L.solve(gap))  # Lᵀ H̃ L and Lᵀ r̃
+        else:
+            here = L.as_matrix(len(x), x.dtype)
+            scale = root_of((matmul(here, here.T) + matmul(L_guess, L_guess.T)) / 2)  # L̄
+            from_guess, from_here = (
+                jnp.stack([scale.solve(root[:, j]) for j in range(len(x))], axis=1)
+                for root in (L_guess, here)
+            )
+            K = matmul(from_here.T, matmul(H, from_here))
+            r = matvec(from_guess.T, shift) - matvec(H, scale.solve(gap))
+            r = matvec(from_here.T, r)
+        C = matmul(S, inverse(jnp.eye(len(x), dtype=x.dtype) + step.dt * matmul(K, S)))
+        mean = target.mean + step.dt * L.mv(matvec(C, r))
+        return StepLaw(mean, L, (C + C.T) / 2, step.dt)
+
+    def _linear(self, dynamics: Dynamics, x: Float[Array, " d"], end: Float[Array, " d"]):
+        """F, the linear drift at b, and Ṽ, when the diffusion is linearised at x."""
+        F = jax.jacfwd(dynamics.drift)(x) if self._matrix is None else self._matrix.astype(x.dtype)
+        sigma = dynamics.sigma(x)
+        V = _congruence_of_root(sigma, x)
+        return F, dynamics.drift(x) + matvec(F, end - x), V
+
+
+class _Steps(NamedTuple):
+    """What changes from step to step, for a scan: the fields of `Step`; and for `halving` the
+    length of the step before, and whether the two are a pair."""
+
+    guide: PyTree
+    dt: Float[Array, "*steps I"]
+    remaining: Float[Array, "*steps I"]
+    before: Float[Array, "*steps I"]
+    ends_pair: Bool[Array, "*steps"]
+
+
+class _State(NamedTuple):
+    """The point where a path is, and its log densities so far under the target and under the
+    proposal; for some of the paths the point before, and D of `halving` so far.
+
+    The two are summed apart because XLA's CPU compiler (JAX 0.10.2) does not vectorise a sum in
+    place that reads a slice of the loop's inputs, as the noise is, and the target's takes most of
+    the work.
+    """
+
+    x: Float[Array, "d *lanes"]
+    log_target: Float[Array, "*lanes"]
+    log_proposal: Float[Array, "*lanes"]
+    before: Float[Array, "d *looked"]
+    log_halving: Float[Array, "*looked"]
+
+
+class _Lanes:
+    """The steps of a proposal for n paths of each of I intervals, side by side: I n lanes. What
+    belongs to a single interval is worked out once and shared by its paths."""
+
+    def __init__(
+        self,
+        proposal: AbstractGuidedProposal,
+        dynamics: Dynamics,
+        intervals: Intervals,
+        num_steps: int,
+        num_draws: int = 1,
+    ):
+        start, end, duration = intervals
+        fractions = proposal.remaining(num_steps)
+        dt = jnp.asarray(-np.diff(fractions), start.dtype)[:, None] * duration
+        remaining = jnp.asarray(fractions[:-1], start.dtype)[:, None] * duration
+        guide = jax.vmap(proposal.guide, in_axes=(None, 0, 0, 1), out_axes=-1)(
+            dynamics, start, end, dt
+        )
+        self._num_draws, self._num_steps = num_draws, num_steps
+        self._num_looked = num_looked(num_draws, dynamics.sigma_varies)
+        self._of_lane = None if start.shape[0] == 1 else -1
+        self.start, self.end = start.T, end.T
+        each = (dt, remaining, jnp.roll(dt, 1, axis=0), jnp.arange(num_steps) % 2 == 1)
+        self.steps = _Steps(guide, *jax.tree.map(lambda leaf: leaf[:-1], each))
+        self._last = _Steps(None, *jax.tree.map(lambda leaf: leaf[-1], each))
+        self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.density
+
+    def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
+        """What belongs to an interval, for each of its lanes."""
+        return jnp.repeat(leaf, self._num_draws, axis=-1)
+
+    def begin(self) -> _State:
+        """Paths at their start, with weight one."""
+        start = self.spread(self.start)
+        some, zero = self._looked(start), jnp.zeros_like(start[0])
+        return _State(start, zero, zero, some, jnp.zeros_like(some[0]))
+
+    def advance(self, state: _State, xi: Float[Array, "d lanes"], steps: _Steps) -> _State:
+        """One step with the noise ξ, and the densities with their factors."""
+
+        def one(state, xi, step):
+            steps = self._density.steps_from(self._dynamics, state.x)
+            target = steps.law(step.dt)
+            law = self._proposal.step_law(step, state.x, target)
+            x_next = law.point(xi)
+            return x_next, self._log_densities(target, law, x_next, xi)
+
+        each = (-1, -1, self._of_lane)
+        x_next, log_densities = over_lanes(*each)(one)(state, xi, self._of_each(self._step(steps)))
+        return self._moved(state, x_next, log_densities, steps)
+
+    def retrace(
+        self, state: _State, x_next: Float[Array, "d lanes"], steps: _Steps
+    ) -> tuple[_State, Float[Array, "d lanes"]]:
+        """The step to these points, and the noise ξ that it takes."""
+
+        def one(state, x_next, step):
+            steps = self._density.steps_from(self._dynamics, state.x)
+            target = steps.law(step.dt)
+            law = self._proposal.step_law(step, state.x, target)
+            xi = law.noise(x_next)
+            return xi, self._log_densities(target, law, x_next, xi)
+
+        each = (-1, -1, self._of_lane)
+        xi, log_densities = over_lanes(*each)(one)(state, x_next, self._of_each(self._step(steps)))
+        return self._moved(state, x_next, log_densities, steps), xi
+
+    def finish(self, state: _State) -> tuple[Float[Array, " lanes"], Float[Array, "I m"]]:
+        """The log weights with that of the last step, to b, and D of the paths that are looked
+        at."""
+
+        def one(x, last):
+            # Steps may lead out of the state space, where no bridge ends.
+            end, dt = last
+            inside = all_finite(self._dynamics.drift(end))
+            inside &= jnp.isfinite(self._dynamics.sigma(end).log_abs_det())
+            log_density = self._density.steps_from(self._dynamics, x).law(dt).log_density(end)
+            return jnp.where(inside, log_density, jnp.nan)
+
+        last = self._of_each((self.end, self._last.dt))
+        log_density = over_lanes(-1, self._of_lane)(one)(state.x, last)
+        end = self.spread(self.end)
+        state = self._moved(state, end, (log_density, jnp.zeros_like(log_density)), self._last)
+        log_halving = of_all_steps(state.log_halving, self._num_steps)
+        log_weights = state.log_target - state.log_proposal
+        return log_weights, log_halving.reshape(-1, self._num_looked)
+
+    def _step(self, steps: _Steps) -> Step:
+        return Step(steps.guide, steps.dt, steps.remaining, self.end)
+
+    def _of_each(self, of_intervals: PyTree) -> PyTree:
+        """For each lane; without an axis for a single interval, which all lanes share."""
+        if self._of_lane is None:
+            return jax.tree.map(lambda leaf: leaf[..., 0], of_intervals)
+        return jax.tree.map(self.spread, of_intervals)
+
+    def _looked(self, leaf: Float[Array, "*shape lanes"]) -> Float[Array, "*shape looked"]:
+        """The first paths of each interval, of which D is worked out."""
+        leaf = leaf.reshape(*leaf.shape[:-1], -1, self._num_draws)[..., : self._num_looked]
+        return leaf.reshape(*leaf.shape[:-2], -1)
+
+    @staticmethod
+    def _log_densities(target: StepLaw, law: StepLaw, point, xi):
+        return target.log_relative(point), law.log_relative_of_noise(xi)
+
+    def _moved(self, state: _State, x_next, log_densities, steps: _Steps) -> _State:
+        """The state at x_next, given the log densities of the step."""
+        here, there = self._looked(state.x), self._looked(x_next)
+
+        def one(before, x, x_next, dt_before, dt):
+            points, both = (before, x, x_next), (dt_before, dt)
+            return of_pair(self._density, self._dynamics, points, both)
+
+        def of_pairs():
+            if self._of_lane is None:
+                both = self._of_each((steps.before, steps.dt))
+            else:
+                both = (jnp.repeat(dt, self._num_looked) for dt in (steps.before, steps.dt))
+            each = (-1, -1, -1, self._of_lane, self._of_lane)
+            return over_lanes(*each)(one)(state.before, here, there, *both)
+
+        change = lax.cond(steps.ends_pair, of_pairs, lambda: jnp.zeros_like(state.log_halving))
+        log_halving = state.log_halving + lax.stop_gradient(change)
+        target, proposal = log_densities
+        sums = state.log_target + target, state.log_proposal + proposal
+        return _State(x_next, *sums, here, log_halving)
+
+
+def noise_of(
+    proposal: AbstractGuidedProposal,
+    dynamics: Dynamics,
+    intervals: Intervals,
+    paths: Float[Array, "I points d"],
+) -> tuple[Float[Array, "I steps d"], Float[Array, " I"], Float[Array, " I"]]:
+    """The noise ξ_0, ..., ξ_{N-2} from which the proposal makes these paths, one for each
+    interval, their log weights, and D."""
+    lanes = _Lanes(proposal, dynamics, intervals, paths.shape[1] - 1)
+
+    def each(state, inputs):
+        x_next, steps = join_rows(inputs)
+        state, xi = lanes.retrace(join_rows(state), x_next, steps)
+        return split_rows(state), split_rows(xi)
+
+    inputs = split_rows((jnp.moveaxis(paths, 0, -1)[1:-1], lanes.steps), axis=1)
+    state, xi = lax.scan(each, split_rows(lanes.begin()), inputs)
+    return jnp.moveaxis(join_rows(xi, axis=1), -1, 0), *_flat(lanes.finish(join_rows(state)))
+
+
+def path_of(
+    proposal: AbstractGuidedProposal,
+    dynamics: Dynamics,
+    intervals: Intervals,
+    xi: Float[Array, "I steps d"],
+) -> tuple[Float[Array, "I points d"], Float[Array, " I"], Float[Array, " I"]]:
+    """The paths that the proposal makes from this noise, their log weights, and D: the inverse of
+    `noise_of`."""
+    lanes = _Lanes(proposal, dynamics, intervals, xi.shape[1] + 1)
+
+    def each(state, inputs):
+        state = lanes.advance(join_rows(state), *join_rows(inputs))
+        return split_rows(state), split_rows(state.x)
+
+    inputs = split_rows((jnp.moveaxis(xi, 0, -1), lanes.steps), axis=1)
+    state, path = lax.scan(each, split_rows(lanes.begin()), inputs)
+    path = jnp.concatenate([lanes.start[None], join_rows(path, axis=1), lanes.end[None]])
+    return jnp.moveaxis(path, -1, 0), *_flat(lanes.finish(join_rows(state)))
+
+
+def _flat(finished: tuple[Array, Array]) -> tuple[Float[Array, " I"], Float[Array, " I"]]:
+    """Of one path for each interval."""
+    log_weights, log_halving = finished
+    return log_weights, log_halving[:, 0]
+
+
+def _weighted(
+    paths: Float[Array, "I n K d"],
+    log_weights: Float[Array, "I n"],
+    log_halving: Float[Array, "I n"],
+) -> WeightedPaths:
+    """One simulated path each; those that left the finite numbers are not found."""
+    found = jnp.isfinite(log_weights)
+    return WeightedPaths(
+        jnp.where(found[..., None, None], paths, jnp.nan),
+        jnp.where(found, log_weights, -jnp.inf),
+        found,
+        jnp.zeros_like(found),
+        jnp.ones(found.shape, jnp.int32),
+        (~found).astype(jnp.int32),
+        log_halving,
+    )
+
+
+class _Inputs(NamedTuple):
+    """Everything that paths and weights may be differentiated with respect to."""
+
+    proposal: AbstractGuidedProposal
+    model: Diffusion
+    intervals: Intervals
+
+
+def _draw_block(
+    proposal: AbstractGuidedProposal,
+    model: Diffusion,
+    stored: Int[Array, " K"] | None,
+    num_steps: int,
+    keys: Key[Array, "I n"],
+    intervals: Intervals,
+    active: Bool[Array, " I"] | None,
+) -> WeightedPaths:
+    return _weighted(*_draw(_Inputs(proposal, model, intervals), keys, stored, num_steps))
+
+
+@eqx.filter_custom_jvp
+def _draw(
+    inputs: _Inputs, keys: Key[Array, "I n"], stored: Int[Array, " K"] | None, num_steps: int
+) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"], Float[Array, "I n"]]:
+    """One path for each key, its log weight, and D, which has no derivatives."""
+    return _simulate(inputs, keys, stored, num_steps, None)
+
+
+@_draw.def_jvp
+def _draw_tangents(primals, tangents):
+    """Paths that left the finite numbers have no derivatives. They are run without noise here, for
+    in reverse mode a masked 0 · ∞ would be NaN."""
+    inputs, keys, stored, num_steps = primals
+    drawn = _draw(inputs, keys, stored, num_steps)
+    found = jnp.isfinite(drawn[1])
+
+    def again(inputs):
+        paths, log_weights, _ = _simulate(inputs, keys, stored, num_steps, found)
+        return jnp.where(found[..., None, None], paths, 0), jnp.where(found, log_weights, 0)
+
+    _, along = eqx.filter_jvp(again, (inputs,), (tangents[0],))
+    return drawn, (*along, jnp.zeros_like(drawn[2]))
+
+
+def _simulate(
+    inputs: _Inputs,
+    keys: Key[Array, "I n"],
+    stored: Int[Array, " K"] | None,
+    num_steps: int,
+    noisy: Bool[Array, "I n"] | None,
+) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"], Float[Array, "I n"]]:
+    """Paths, log weights and D; without noise where `noisy` is given and false."""
+    proposal, model, intervals = inputs
+    dynamics = model.forward(intervals.start[0])
+    (num_intervals, num_draws), (_, d) = keys.shape, intervals.start.shape
+    dtype = intervals.start.dtype
+    lanes = _Lanes(proposal, dynamics, intervals, num_steps, num_draws)
+    state, end = lanes.begin(), lanes.spread(lanes.end)
+    path = state.x[None][:0]
+    store = slots = None
+    if stored is not None:
+        # Row K is for waste; rows of the first and the last step are filled by hand.
+        rows = jnp.broadcast_to(state.x, (stored.shape[0] + 1, *state.x.shape))
+        slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(len(stored)))
+        store = Store(slots[1:-1], rows)
+    start = state.x
+    if num_steps > 1:
+
+        def step(state, inputs):
+            xi, steps = inputs
+            xi = xi if noisy is None else jnp.where(noisy.reshape(-1), xi, 0)
+            state = lanes.advance(state, xi, steps)
+            return state, state.x
+
+        state, path = noisy_scan(
+            step,
+            state,
+            keys.reshape(-1),
+            lambda key, k: jax.random.normal(key, (k, d), dtype),
+            lanes.steps,
+            num_steps - 1,
+            store=store,
+        )
+    elif store is not None:
+        path = store.rows
+    log_weights, some = lanes.finish(state)
+    log_weights = log_weights.reshape(keys.shape)
+    unseen = jnp.full((num_intervals, num_draws - some.shape[1]), jnp.nan, dtype)
+    log_halving = jnp.concatenate([some, unseen], axis=1)
+    if slots is None:
+        path = jnp.concatenate([start[None], path, end[None]])
+    else:
+        path = path.at[slots[-1]].set(end)[:-1]
+    path = path.reshape(-1, d, num_intervals, num_draws)
+    return jnp.moveaxis(path, (2, 3), (0, 1)), log_weights, log_halving
+
+
+def deterministic_path(
+    density: AbstractStepDensity,
+    dynamics: Dynamics,
+    start: Float[Array, " d"],
+    dt: Float[Array, " N"],
+) -> tuple[Float[Array, "N d"], Float[Array, " d"]]:
+    """ξ_0, ..., ξ_{N-1} and ξ_N of the target's steps from the start, without noise."""
+
+    def step(xi, dt):
+        return density.steps_from(dynamics, xi).law(dt).mean, xi
+
+    end, path = lax.scan(step, start, dt)
+    return path, end
+
+
+def _bridge_law(step: Step, target: StepLaw, mean: Float[Array, " d"]) -> StepLaw:
+    """With this mean and the covariance V δ (T - t_{i+1})/(T - t_i)."""
+    shrunk = (step.remaining - step.dt) / step.remaining
+    return target._replace(mean=mean, covariance=shrunk)
+
+
+def _congruence_of_root(sigma: AbstractSigma, x: Float[Array, " d"]) -> Float[Array, "d d"]:
+    """V = σ σᵀ."""
+    matrix = sigma.as_matrix(x.shape[0], x.dtype)
+    return matmul(matrix, matrix.T)
+
+
+def _check_density(density: AbstractStepDensity | None) -> AbstractStepDensity:
+    density = EulerDensity() if density is None else density
+    if not isinstance(density, AbstractStepDensity):
+        raise TypeError(
+            f"`density` must be `EulerDensity()` or `ItoTaylorDensity()`; got {density!r}."
+        )
+    return density
+
+
+def _check_refinement(refinement: float) -> float:
+    if isinstance(refinement, bool) or not isinstance(refinement, int | float):
+        raise TypeError(
+            f"`refinement` must be a Python number, known when compiling; got {refinement!r}."
+        )
+    if not 1 <= refinement <= 4:
+        raise ValueError(f"`refinement` must be between 1 (equal steps) and 4; got {refinement}.")
+    return float(refinement)

@@ -1,0 +1,51 @@
+"""Do the model, the end points and the scheme fit?"""
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..engine.checks import is_traced
+from ..models.diffusion import Diffusion, check_invertible
+from ..models.intervals import Intervals
+from .schemes import AbstractScheme, Milstein
+
+
+def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) -> None:
+    """Raise `ValueError` where the model does not fit the end points, or the scheme the model.
+
+    Shapes are checked wherever the model's functions are traced, so here only values are.
+    """
+    if is_traced(model, intervals.start, intervals.end):
+        return
+    for name, points in [("start", intervals.start), ("end", intervals.end)]:
+        coefficients = _coefficients(model, points, isinstance(scheme, Milstein))
+        if is_traced(coefficients):  # the model's functions close over traced values
+            return
+        drift, sigma, slopes = jax.device_get(coefficients)
+        for value in (drift, sigma):
+            bad = ~np.all(np.isfinite(value).reshape(len(value), -1), axis=1)
+            if bad.any():
+                raise ValueError(
+                    f"the coefficients of the model are not finite at `{name}` = "
+                    f"{points[bad.argmax()]}: is that point inside the state space?"
+                )
+        worst = np.linalg.cond(sigma).argmax()
+        check_invertible(f"diffusion` at `{name}", sigma[worst])
+        if slopes is None:
+            continue
+        other_coordinates = 1 - np.eye(points.shape[1])[:, None, :]
+        if np.any(slopes * other_coordinates != 0):
+            raise ValueError(
+                "`Milstein` needs diagonal noise in which σ_i depends on x_i alone; here it "
+                "depends on other coordinates too. Choose `Heun` or `Euler`."
+            )
+
+
+@eqx.filter_jit
+def _coefficients(model: Diffusion, points: Float[Array, "n d"], with_slopes: bool):
+    """α and σ at the points, a constant σ only once; ∂σ where it is asked for and varies."""
+    varies = model.forward(points[0]).sigma_varies
+    sigma = jax.vmap(model.diffusion)(points if varies else points[:1])
+    slopes = jax.vmap(jax.jacfwd(model.diffusion))(points) if varies and with_slopes else None
+    return jax.vmap(model.drift)(points), sigma, slopes

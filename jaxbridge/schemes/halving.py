@@ -1,0 +1,104 @@
+"""What half as many steps would have given, from the same paths.
+
+Every other point of a path on the grid is a path on the grid of half as many steps, whose law has
+steps of twice the length, of density q_2δ. With points between of some density r(x'| x, x'') that
+is a law of whole paths, and so, with weights w for the law of N steps,
+
+    E[w e^D h(path)] = the same for N/2 steps,
+    D = Σ log [q_2δ(x, x'') r(x'| x, x'')] - log [q_δ(x, x') q_δ(x', x'')],
+
+a sum over every other step, and nothing need be simulated anew. The nearer r is to what it is for
+N steps, the less random is D. It is here what it would be if the drift were linear, as it is seen
+from x, and σ were as it is there: then the second step has a density n(x''| x, x'), normal with a
+mean linear in x', both steps together a normal density n_2(x''| x), and r = q_δ n / n_2, so that
+
+    D = Σ log [q_2δ(x, x'') / n_2(x''| x)] + log [n(x''| x, x') / q_δ(x', x'')].
+
+Where σ is constant its variance is O(δ²): differences are known to a fraction of a standard error.
+Otherwise it is of O(1), like log weights themselves. An error of O(δ^p) is the (2^p - 1)-th part of
+the difference (`step_error`).
+
+Of an odd number of steps the last is left as it is, and D counts for a little more; of one step
+nothing is known.
+"""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..engine.lanes import over_lanes
+from ..engine.linalg import matmul, matvec
+from ..models.diffusion import Dynamics
+from .step_density import AbstractStepDensity, StepLaw
+
+# D is worked out for one in so many paths, but for so many at least.
+_LOOKED_SHARE, _LOOKED_SHARE_WHERE_SIGMA_VARIES, _FEWEST_LOOKED = 32, 2, 64
+
+
+def of_pair(
+    density: AbstractStepDensity,
+    dynamics: Dynamics,
+    points: tuple[Float[Array, " d"], Float[Array, " d"], Float[Array, " d"]],
+    dt: tuple[Float[Array, ""], Float[Array, ""]],
+) -> Float[Array, ""]:
+    """The part of D of a pair of steps of these lengths, through x, x' and x''."""
+    (x, middle, x_next), (first, second) = points, dt
+    steps, law = density.steps_from(dynamics, x), density.steps_from(dynamics, middle).law(second)
+    twice, once, again = steps.law(first + second), steps.law(first), steps.law(second)
+    sigma, decay = again.sigma, steps.decay(second)
+
+    def carried(to):
+        """By how much further the second step leads, if the drift is linear, for this x'."""
+        return sigma.mv(matvec(decay, sigma.solve(to - x)))
+
+    covariance = first * matmul(matmul(decay, once.matrix), decay.T)
+    covariance = (covariance + second * again.matrix) / (first + second)
+    both = StepLaw(again.mean + carried(once.mean), sigma, covariance, first + second)
+    linear = again._replace(mean=again.mean + carried(middle))
+    value = twice.log_relative(x_next) - both.log_relative(x_next)
+    value += linear.log_relative(x_next) - law.log_relative(x_next)
+    if dynamics.sigma_varies:
+        value += law.sigma.log_abs_det() - sigma.log_abs_det()
+    return value
+
+
+def of_all_steps(log_halving: Float[Array, "*rows"], num_steps: int) -> Float[Array, "*rows"]:
+    """D as if all steps had been in pairs; NaN of a single step. What overflowed was of steps out
+    of all proportion, and the other density is taken to be zero."""
+    paired = num_steps - num_steps % 2
+    if not paired:
+        return jnp.full_like(log_halving, jnp.nan)
+    return jnp.where(jnp.isfinite(log_halving), log_halving * (num_steps / paired), -jnp.inf)
+
+
+def log_halving_of_paths(
+    density: AbstractStepDensity,
+    dynamics: Dynamics,
+    dt: Float[Array, "N P"],
+    paths: Float[Array, "P points d"],
+) -> Float[Array, " P"]:
+    """D of given paths, with the lengths of their steps in the columns of `dt`."""
+    num_steps, num_pairs = dt.shape[0], dt.shape[0] // 2
+    if num_pairs == 0:
+        return jnp.full(paths.shape[0], jnp.nan, paths.dtype)
+    points = lax.optimization_barrier(jnp.moveaxis(paths, (0, 1), (-1, -2)))
+
+    def one(x, middle, x_next, first, second):
+        return of_pair(density, dynamics, (x, middle, x_next), (first, second))
+
+    def every_other(leaf, shift):
+        leaf = leaf[..., shift : shift + 2 * num_pairs : 2, :][..., :num_pairs, :]
+        return leaf.reshape(*leaf.shape[:-2], -1)
+
+    pairs = [every_other(points, shift) for shift in (0, 1)]
+    pairs.append(every_other(points[:, 2:], 0))
+    steps = [every_other(dt, shift) for shift in (0, 1)]
+    parts = over_lanes(-1, -1, -1, -1, -1)(one)(*pairs, *steps)
+    log_halving = jnp.sum(parts.reshape(num_pairs, -1), axis=0)
+    return of_all_steps(log_halving, num_steps)
+
+
+def num_looked(num_draws: int, sigma_varies: bool) -> int:
+    """Of how many paths of an interval D is worked out: of few where it is hardly random."""
+    share = _LOOKED_SHARE_WHERE_SIGMA_VARIES if sigma_varies else _LOOKED_SHARE
+    return min(num_draws, max(_FEWEST_LOOKED, num_draws // share))

@@ -1,0 +1,271 @@
+"""The likelihood of a path (section 4 of the paper, for any model).
+
+Of a path seen at times t_0 < ... < t_K, relative to the law of σW where σ does not depend on the
+parameters. By Girsanov's theorem its logarithm is
+
+    ∫ αᵀ V⁻¹ dX - ½ ∫ αᵀ V⁻¹ α dt,
+
+in three forms that have one limit, and as the Euler density itself. Orders are those of means
+over paths: path by path "girsanov" is off by O(√δ), and so is "ito_taylor" where the drift has a
+curl, for then the points of a path do not determine the integral; without one it is off by O(δ).
+
+* "girsanov": sums over left points, the Euler density without what does not depend on the drift.
+  For any σ(x); an error of O(δ).
+* "trapezoid": for constant σ and a drift without a curl, that is in one dimension and for models
+  declared reversible, the trapezoid rule in Stratonovich's form,
+
+      Σ ½ (β + β') · Δw - ¼ (|β|² + |β'|²) δ - ½ div β' δ,    β = σ⁻¹α,
+
+  where div β' at the end of each step makes up for what the rule is too large by in the first term;
+  an error of O(δ²). Quadratic in a β that is linear in parameters, and concave.
+* "ito_taylor": for constant σ, `ItoTaylorDensity` step by step; an error of O(δ²).
+* "ito": for a gradient drift V⁻¹α = ∇A with constant V, that is for reversible models, where
+  A = ½ log ν. By Itô's formula no stochastic integral is left,
+
+      A(X_T) - A(X_0) - ½ ∫ [tr(V ∇²A) + ∇AᵀV ∇A] dt,
+
+  in which tr(V ∇²A) = div α; the integral is by the trapezoid rule, with an error of O(δ²). For
+  the hyperbolic diffusion this is α H_T - ½ α² B_T, equation (likelihood).
+* "euler": Σ log N(x_{i+1}; x_i + α(x_i) δ_i, V(x_i) δ_i), a density in the points of the path.
+  The one form in which σ may depend on parameters.
+"""
+
+import math
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, PyTree
+
+from ..engine.checks import Numbers, as_floating, is_traced, time_steps
+from ..engine.lanes import over_lanes
+from ..engine.linalg import dot, total
+from ..models.diffusion import Diffusion, Dynamics, check_diffusion
+from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
+
+Form = Literal["girsanov", "trapezoid", "ito_taylor", "ito", "euler"]
+
+
+def path_log_likelihood(
+    model: Diffusion, times: Numbers, path: Numbers, *, form: Form | None = None
+) -> Float[Array, "*batch"]:
+    """The log likelihood of paths, differentiable in the parameters of the drift.
+
+    **Arguments:**
+
+    - `model`: the diffusion.
+    - `times`: increasing, shape (K,); or (I, K), for each of I intervals its own.
+    - `path`: points at these times, shape (..., K, d); (I, ..., K, d) with times of shape (I, K).
+        So the paths of bridges fit, for one interval or several.
+    - `form`: "girsanov", "trapezoid", "ito_taylor", "ito" or "euler"; by default the most accurate
+        that the model has: for constant σ "ito" if it is reversible with a known ν, "trapezoid" if
+        it is reversible or one-dimensional, else "ito_taylor"; "girsanov" for a σ that varies.
+
+    **Returns:** shape (...), in the dtype of `path`: relative to the law of σW, or, as "euler",
+    to Lebesgue's measure.
+
+    **Raises:** `ValueError` for shapes that do not fit, times that do not increase, or a form
+    that the model does not have; `TypeError` where a derivative is taken in parameters of σ,
+    except as "euler".
+
+    **Example:**
+
+    ```python
+    def log_likelihood(params):
+        return jb.path_log_likelihood(model.with_params(params), bridges.times, bridges.paths)
+
+    jax.jacfwd(log_likelihood)(model.params).B  # the score of each path, shape (100, 2, 2)
+    ```
+    """
+    check_diffusion(model)
+    (times, steps), path = time_steps("times", times), as_floating("path", path)
+    if path.ndim < 2 or path.shape[-2] < 2:
+        raise ValueError(
+            "`path` must hold two or more points in the axis before the last, shape (..., K, d); "
+            f"got {path.shape}."
+        )
+    num_times = path.shape[-2]
+    fits = times.shape == (num_times,) or (
+        path.ndim > 2 and times.shape == (path.shape[0], num_times)
+    )
+    if not fits:
+        raise ValueError(
+            f"`times` must have shape ({num_times},), as many as the path has points, or (I, "
+            f"{num_times}) for paths of shape (I, ..., {num_times}, d); got {times.shape} for "
+            f"paths of shape {path.shape}."
+        )
+    if not is_traced(steps) and not np.all(np.asarray(steps) > 0):
+        raise ValueError("`times` must be finite and increase.")
+    return log_likelihood_of_steps(model, steps.astype(path.dtype), path, form)
+
+
+def log_likelihood_of_steps(
+    model: Diffusion,
+    steps: Float[Array, "*I K"],
+    path: Float[Array, "*batch points d"],
+    form: Form | None = None,
+) -> Float[Array, "*batch"]:
+    """`path_log_likelihood`, given the steps of the grid: one for all paths, or one for each
+    interval."""
+    batch, (num_points, d) = path.shape[:-2], path.shape[-2:]
+    if steps.ndim == 2:
+        steps = steps.reshape(len(steps), *[1] * (len(batch) - 1), num_points - 1)
+    steps = jnp.broadcast_to(steps, (*batch, num_points - 1)).reshape(-1, num_points - 1)
+    paths = path.reshape(-1, num_points, d)
+    if form != "euler":
+        known_sigma(model.diffusion(paths[0, 0]))
+    return _compiled(model, steps.T, paths, form).reshape(batch)
+
+
+@eqx.filter_custom_jvp
+def known_sigma(sigma: Array) -> Array:
+    """σ, of which no derivative may be taken."""
+    return sigma
+
+
+@known_sigma.def_jvp
+def _refuse(primals, tangents):
+    raise TypeError(
+        "σ depends on parameters in which a derivative is taken, and paths have no density that "
+        "depends on σ: differentiate in the parameters of the drift only, or, for the density of "
+        'the Euler scheme at the points of the path, choose `form="euler"`.'
+    )
+
+
+def log_likelihoods(
+    model: Diffusion,
+    steps: Float[Array, "K P"],
+    paths: Float[Array, "P points d"],
+    form: Form | None = None,
+) -> Float[Array, " P"]:
+    """Those of P paths, with steps δ in the columns of `steps`."""
+    like = paths[0, 0]
+    model = model.prepared()
+    dynamics, form = model.forward(like), _form(model, like, form)
+    # (d, K+1, P), written out: loops over lanes that are not adjacent would not vectorise.
+    points = lax.optimization_barrier(jnp.moveaxis(paths, (0, 1), (-1, -2)))
+    if form == "ito":
+        return _ito(model, dynamics, steps, points)
+    d, num_points, num_paths = points.shape
+    lanes = points.reshape(d, -1)
+
+    def of_steps(leaf, shift):
+        leaf = leaf.reshape(*leaf.shape[:-1], num_points, num_paths)
+        leaf = lax.slice_in_dim(leaf, shift, num_points - 1 + shift, axis=-2)
+        return leaf.reshape(*leaf.shape[:-2], -1)
+
+    def of_step(x, x_next, dt):
+        if form in ("ito_taylor", "trapezoid"):
+            step = _ito_taylor if form == "ito_taylor" else _trapezoid
+            return step(dynamics, x, x_next, dt)
+        value = _girsanov(dynamics, x, x_next, dt)
+        return value + _driftless(dynamics, x, x_next, dt) if form == "euler" else value
+
+    ends = (of_steps(lanes, shift) for shift in (0, 1))
+    values = over_lanes(-1, -1, -1)(of_step)(*ends, steps.reshape(-1))
+    return jnp.sum(values.reshape(num_points - 1, num_paths), axis=0)
+
+
+_compiled = eqx.filter_jit(log_likelihoods)
+
+
+def _ito(model: Diffusion, dynamics: Dynamics, steps, points) -> Float[Array, " P"]:
+    def integrand(x):
+        """½ [div α + αᵀ V⁻¹ α]."""
+        alpha, slope = jax.linearize(dynamics.drift, x)
+        directions = [jnp.asarray(direction, x.dtype) for direction in np.eye(x.shape[0])]
+        divergence = total(jnp.stack([slope(e)[i] for i, e in enumerate(directions)]))
+        beta = dynamics.sigma(x).solve(alpha)
+        return (divergence + dot(beta, beta)) / 2
+
+    values = over_lanes(-1)(integrand)(points.reshape(points.shape[0], -1))
+    values = values.reshape(points.shape[1:])
+    integral = jnp.sum((values[1:] + values[:-1]) / 2 * steps, axis=0)
+    log_nu = over_lanes(-1)(model.log_stationary)
+    return (log_nu(points[:, -1]) - log_nu(points[:, 0])) / 2 - integral
+
+
+def _girsanov(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
+    """αᵀ V⁻¹ Δx - ½ αᵀ V⁻¹ α δ."""
+    sigma = dynamics.sigma(x)
+    beta = sigma.solve(dynamics.drift(x))
+    return dot(beta, sigma.solve(x_next - x) - dt / 2 * beta)
+
+
+def _trapezoid(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
+    """½ (β + β') · Δw - ¼ (|β|² + |β'|²) δ - ½ div β' δ."""
+    sigma = dynamics.sigma(x)
+    before, (after, slope) = dynamics.drift(x), jax.linearize(dynamics.drift, x_next)
+    before, after, dw = (sigma.solve(vector) for vector in (before, after, x_next - x))
+    units = [jnp.asarray(unit, x.dtype) for unit in np.eye(x.shape[0])]
+    divergence = total(jnp.stack([slope(unit)[i] for i, unit in enumerate(units)]))
+    squares = dot(before, before) + dot(after, after)
+    return dot(before + after, dw) / 2 - dt / 4 * squares - dt / 2 * divergence
+
+
+def _ito_taylor(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
+    """log of the density of the step, relative to N(x'; x, V δ)."""
+    law = ItoTaylorDensity().steps_from(dynamics, x).law(dt)
+    dw = dynamics.sigma(x).solve(x_next - x)
+    driftless = (x.shape[0] - dot(dw, dw) / dt) / 2  # `log_relative` of N(x, V δ)
+    return law.log_relative(x_next) - driftless
+
+
+def _driftless(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
+    """log N(x'; x, V(x) δ)."""
+    sigma, d = dynamics.sigma(x), x.shape[0]
+    dw = sigma.solve(x_next - x)
+    return -dot(dw, dw) / (2 * dt) - sigma.log_abs_det() - d / 2 * jnp.log(2 * math.pi * dt)
+
+
+def forms_of(model: Diffusion, like: Float[Array, " d"]) -> tuple[Form, ...]:
+    """The forms relative to the law of σW that the model has, the most accurate first."""
+    if model.forward(like).sigma_varies:
+        return ("girsanov",)
+    forms: tuple[Form, ...] = ("ito_taylor", "girsanov")
+    if model.reversible or like.shape[0] == 1:
+        forms = ("trapezoid", *forms)
+    return ("ito", *forms) if model.reversible and model.has_density else forms
+
+
+def density_of_form(form: Form) -> AbstractStepDensity:
+    """The density of steps that the form is, or comes nearest to."""
+    return EulerDensity() if form in ("girsanov", "euler") else ItoTaylorDensity()
+
+
+def forms_of_target(
+    proposals: PyTree, model: Diffusion, like: Float[Array, " d"]
+) -> tuple[Form, ...]:
+    """The forms that go with the target of the bridges of these proposals, the most accurate
+    first: weights that are exact for the Euler scheme call for its own likelihood, for otherwise
+    paths and parameters would belong to two laws."""
+    are_densities = lambda leaf: isinstance(leaf, AbstractStepDensity)
+    densities = jax.tree.leaves(proposals, is_leaf=are_densities)
+    if any(isinstance(density, EulerDensity) for density in densities):
+        return ("girsanov",)
+    forms = forms_of(model, like)
+    return forms if forms == ("girsanov",) else forms[:-1]
+
+
+def _form(model: Diffusion, like: Float[Array, " d"], form: Form | None) -> Form:
+    forms = forms_of(model, like)
+    if form is None:
+        return forms[0]
+    if form not in get_args(Form):
+        raise ValueError(f"`form` must be one of {', '.join(get_args(Form))}; got {form!r}.")
+    if form in (*forms, "euler"):
+        return form
+    if form == "trapezoid" and "ito_taylor" in forms:
+        raise ValueError(
+            '`form="trapezoid"` is for one dimension and models with `reversible=True`, whose '
+            'drift is a gradient: choose "ito_taylor".'
+        )
+    if "ito_taylor" not in forms:
+        raise ValueError(f'`form="{form}"` is for constant σ: choose "girsanov" or "euler".')
+    raise ValueError(
+        '`form="ito"` is for models with `reversible=True` and a `log_stationary`, whose drift is '
+        'a gradient: choose "ito_taylor".'
+    )

@@ -1,0 +1,126 @@
+"""How far is an estimate from its limit as the steps shrink?
+
+With D of `halving`, paths with weights w are paths of half as many steps with weights w e^D. What
+an estimate changes by when it takes those is (2^p - 1) times its error, where that is O(δ^p),
+
+    error = (2^p - 1)⁻¹ [estimate of N/2 steps - estimate of N steps],
+
+in its leading term. The two share their paths, and so the difference has far less Monte Carlo
+error than either where D is small; what it has is told beside it. Where a few of the paths have
+nearly all of the weights w e^D, the two laws have little in common: steps are too long for this, or
+for anything, and the uncertainty is infinite.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Inexact
+
+from ..engine.averages import effective_size, expanded, normalised, weighted_mean
+
+# Fewer effective paths than this, or than this share of those without e^D, tell nothing.
+_FEWEST_EFFECTIVE, _LEAST_OVERLAP = 5, 0.1
+# Where steps are so long, in standard deviations or in log p, more paths do not help.
+_GROSS = 0.1
+
+
+class StepError(NamedTuple):
+    """An estimate's error by its steps, with a standard error of that; not a number where nothing
+    is known."""
+
+    value: Inexact[Array, "..."]
+    uncertainty: Inexact[Array, "..."]
+
+
+def of_log_mean(
+    log_weights: Float[Array, "*I n"],
+    log_halving: Float[Array, "*I n"],
+    share: Float[Array, "*I"],
+) -> StepError:
+    """Of the log of the mean of the weights."""
+    weights, known = _known(log_weights, log_halving)
+    D = jnp.where(known, log_halving, 0)
+    largest = jnp.max(jnp.where(weights > 0, D, -jnp.inf), axis=-1, keepdims=True)
+    largest = jnp.where(jnp.isfinite(largest), largest, 0)
+    factors = jnp.where(weights > 0, jnp.exp(D - largest), 0)
+    mean = jnp.sum(weights * factors, axis=-1)
+    some = mean > 0
+    ratio = jnp.where(some, mean, 1)
+    # Normalised before they are squared, for beside a large D the others are tiny.
+    coarse = weights * factors / ratio[..., None]
+    spread = jnp.sqrt(jnp.sum((coarse - weights) ** 2, axis=-1))
+    change = jnp.log(ratio) + largest[..., 0]
+    overlap = _overlap(weights, coarse)
+    spread = jnp.where(overlap, spread, jnp.inf)
+    return StepError(_told(share, change, some), _told(share, spread, some))
+
+
+def of_mean(
+    log_weights: Float[Array, "*I n"],
+    log_halving: Float[Array, "*I n"],
+    share: Float[Array, "*I"],
+    values: Inexact[Array, "..."],
+    coarse_values: Inexact[Array, "..."] | None = None,
+) -> StepError:
+    """Of the weighted mean of these values, shape (*I, n, ...), entry by entry; half as many steps
+    may have values of their own."""
+    coarse_values = values if coarse_values is None else coarse_values
+    weights, known = _known(log_weights, log_halving)
+    D = jnp.where(known, log_halving, -jnp.inf)
+    coarse = normalised(jnp.where(weights > 0, jnp.log(jnp.where(weights > 0, weights, 1)) + D, D))
+    axis = weights.ndim - 1
+    fine_mean, coarse_mean = weighted_mean(weights, values), weighted_mean(coarse, coarse_values)
+    each = expanded(coarse, values) * (coarse_values - jnp.expand_dims(coarse_mean, axis))
+    each -= expanded(weights, values) * (values - jnp.expand_dims(fine_mean, axis))
+    spread = jnp.sqrt(jnp.sum(jnp.where(expanded(known, values), each, 0) ** 2, axis))
+    overlap = _overlap(weights, coarse)
+    share, overlap = (
+        leaf.reshape(*leaf.shape, *[1] * (spread.ndim - leaf.ndim)) for leaf in (share, overlap)
+    )
+    spread = jnp.where(overlap, spread, jnp.inf)
+    some = jnp.isfinite(coarse_mean) & jnp.isfinite(fine_mean)
+    return StepError(
+        _told(share, jnp.where(some, coarse_mean - fine_mean, 0), some),
+        _told(share, jnp.where(some, spread, 0), some),
+    )
+
+
+def dominates(error: StepError, standard_error: Inexact[Array, "..."]) -> Bool[Array, "..."]:
+    """Whether the step error is beyond the standard error, or could be without being seen."""
+    size, doubt = jnp.abs(error.value), error.uncertainty
+    return ~((size <= jnp.maximum(standard_error, 2 * doubt)) & (doubt <= 3 * standard_error))
+
+
+def is_gross(error: StepError) -> Bool[Array, "..."]:
+    """Whether a step error, of a log or in standard deviations, is large, whatever the number of
+    paths. Where the uncertainty is infinite the size alone decides, or no error would be large."""
+    doubt = jnp.where(jnp.isinf(error.uncertainty), 0, error.uncertainty)
+    return ~(jnp.abs(error.value) <= _GROSS + 2 * doubt)
+
+
+def share_of_order(order: int) -> float:
+    """(2^p - 1)⁻¹."""
+    return 1 / (2**order - 1)
+
+
+def _overlap(weights: Float[Array, "*I n"], coarse: Float[Array, "*I n"]) -> Bool[Array, "*I"]:
+    """Whether many of the paths have weight under both laws, and there are many at all: one alone
+    would have no uncertainty."""
+    size = effective_size(weights)
+    return (effective_size(coarse) >= _LEAST_OVERLAP * size) & (size >= _FEWEST_EFFECTIVE)
+
+
+def _known(
+    log_weights: Float[Array, "*I n"], log_halving: Float[Array, "*I n"]
+) -> tuple[Float[Array, "*I n"], Bool[Array, "*I n"]]:
+    """The normalised weights of the paths of which D is known, and which these are. A D that is
+    not a number though it was worked out is that of steps out of all proportion: -∞."""
+    looked = ~jnp.isnan(log_halving)
+    known = looked & (log_weights > -jnp.inf)
+    return normalised(jnp.where(known, log_weights, -jnp.inf)), known
+
+
+def _told(share, value, some):
+    """The share of a change, exactly zero where the share is; NaN where nothing is known."""
+    share = jnp.asarray(share, value.dtype)
+    return jnp.where(share == 0, 0, jnp.where(some, share * value, jnp.nan))

@@ -1,0 +1,148 @@
+"""The figures of the studies, made of the pictures of `plot`. Needs the extra `plot`."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from ..coupling.bridges import Bridges
+from ..models.gaussian import GaussianBridge, GaussianLaw
+from ..plot.pictures import bridge_fan, copula_levels, paths_in_space, qq, work_precision
+from ..plot.style import COLOURS, EXACT, MARKERS, Axes, Figure, Reals, axes_or_new, finish
+
+
+def margins_and_copula(
+    samples: Mapping[str, Float[Reals, "n 2"]], law: GaussianLaw, title: str
+) -> Figure:
+    """The figures of section 3: Q-Q plots of both margins and the copula, in one row."""
+    figure = Figure(figsize=(11, 4.1), layout="constrained")
+    *margins, dependence = figure.subplots(1, 3)
+    for i, ax in enumerate(margins):
+        margin = {name: values[:, i] for name, values in samples.items()}
+        qq(margin, float(law.mean[i]), float(jnp.sqrt(law.covariance[i, i])), ax)
+        ax.set_title(f"coordinate {i + 1}", fontsize="medium")
+        ax.set_box_aspect(1)
+    copula_levels(samples, law.covariance, ax=dependence)
+    dependence.set_title("copula, level curves", fontsize="medium")
+    dependence.set_box_aspect(1)
+    figure.suptitle(title)
+    return figure
+
+
+def bridges_overview(bridges: Bridges, exact: GaussianBridge) -> Figure:
+    """Two-dimensional bridges: paths with time upwards, and each coordinate's bands with those
+    of the exact law dashed over them."""
+    figure = Figure(figsize=(11, 3.8), layout="constrained")
+    paths_in_space(bridges.times, bridges.paths, figure.add_subplot(1, 3, 1, projection="3d"))
+    for i in range(2):
+        panel = figure.add_subplot(1, 3, i + 2)
+        ax = bridge_fan(bridges.times, bridges.paths, panel, coordinate=i, exact=exact)
+        bottom, top = ax.get_ylim()
+        ax.set_ylim(bottom - 0.2 * (top - bottom), top)  # room for the legend
+        ax.legend(frameon=False, fontsize="x-small", ncols=2, loc="lower center")
+    return figure
+
+
+def variation(results: Sequence[Any]) -> Figure:
+    """std/mean of 1/π_T against γ for each bridge: results of `exact_study.run_variation`."""
+    bridges = list(dict.fromkeys(result.bridge for result in results))
+    figure = Figure(figsize=(3.6 * len(bridges), 3.4), layout="constrained")
+    for ax, bridge in zip(figure.subplots(1, len(bridges), squeeze=False)[0], bridges, strict=True):
+        group = [result for result in results if result.bridge == bridge]
+        place = np.arange(len(group))
+        for i, (label, name) in enumerate([("ν", "right"), ("as printed", "published")]):
+            found = [getattr(result, name) for result in group]
+            ratio = [float(v.ratio) for v in found]
+            error = [2 * float(v.ratio_error) for v in found]
+            style = {"color": COLOURS[i], "marker": MARKERS[i], "capsize": 3, "markersize": 5}
+            ax.errorbar(place + 0.08 * i, ratio, error, label=label, **style)
+        ax.set(xticks=place, xticklabels=[f"{result.gamma:g}" for result in group], xlabel="γ")
+        ax.set(ylim=(-0.02, 0.8))
+        ax.set_title(bridge.replace("->", "→").replace("-", "−"), fontsize="medium")
+        finish(ax, title="start law")
+    figure.axes[0].set_ylabel("std / mean of $1/\\pi_T$, ± 2 s.e.")
+    return figure
+
+
+def cost(costs: Sequence[Any], slope: float) -> Figure:
+    """Seconds per effective bridge against the duration: results of `exact_study.run_cost`."""
+    figure = Figure(figsize=(7.6, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    duration = np.array([c.duration for c in costs])
+    seconds = np.array([c.seconds for c in costs])
+    left.loglog(duration, seconds, MARKERS[0] + "-", color=COLOURS[0], label="measured")
+    last = duration >= 10
+    line = seconds[-1] * (duration[last] / duration[-1]) ** slope
+    left.loglog(duration[last], line, "--", color=EXACT, label=f"slope {slope:.2f}")
+    left.set(xlabel="duration T", ylabel="seconds per effective bridge")
+    finish(left)
+    acceptance = [c.acceptance for c in costs]
+    right.semilogx(duration, acceptance, MARKERS[0] + "-", color=COLOURS[0])
+    right.set(xlabel="duration T", ylabel="share of steps accepted", ylim=(0, 1.03))
+    right.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def crossover(rates: Sequence[Any], long: float) -> Figure:
+    """Effective samples per second against the duration, a panel for each process: results of
+    `crossover_study.run_crossover`. Durations from `long` on, with more steps, are shaded."""
+    names = list(dict.fromkeys(rate.process for rate in rates))
+    figure = Figure(figsize=(4.1 * len(names), 3.8), layout="constrained")
+    panels = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
+    for ax, name in zip(panels, names, strict=True):
+        group = [rate for rate in rates if rate.process == name]
+        for i, proposal in enumerate(dict.fromkeys(rate.proposal for rate in group)):
+            points = [(r.duration, r.per_second) for r in group if r.proposal == proposal]
+            duration, value = np.array(points).T
+            if proposal == '"auto"':
+                style = {"color": EXACT, "linestyle": "--", "marker": "", "linewidth": 1.4}
+            else:
+                style = {"color": COLOURS[i % len(COLOURS)], "marker": MARKERS[i % 4]}
+                style |= {"markersize": 4, "linewidth": 1.2}
+            ax.loglog(duration, np.maximum(value, 1e-1), label=proposal, **style)
+        ax.set(xlabel="duration T", title=name.replace("-", "–"))
+        longest = max(rate.duration for rate in group)
+        if longest >= long:
+            ax.axvspan(long / 2, 2 * longest, color="0.95", zorder=0)
+        ax.set_xlim(0.7 * min(rate.duration for rate in group), 1.4 * longest)
+        ax.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("effective samples per second")
+    panels[0].set_ylim(bottom=3)
+    figure.legend(
+        *panels[0].get_legend_handles_labels(),
+        loc="outside lower center",
+        ncols=6,
+        frameon=False,
+        fontsize="small",
+    )
+    return figure
+
+
+def accuracy(results: Mapping[str, Any]) -> Figure:
+    """Error against time for the paper's process and for a full σ(x): results of
+    `accuracy_study.run_accuracy`."""
+    chosen = [results[title] for title in ("the paper's process", "a full σ(x)")]
+    figure = Figure(figsize=(11, 5.2), layout="constrained")
+    for ax, result in zip(figure.subplots(1, 2, sharey=True), chosen, strict=True):
+        work_precision(result, ax)
+        ax.legend(frameon=False, fontsize="x-small", loc="lower left")
+        ax.set_ylim(1e-3, 1)
+    figure.axes[1].set_ylabel("")
+    return figure
+
+
+def effect_costs(costs: Sequence[Any], ax: Axes | None = None) -> Axes:
+    """What each effect adds to the time of a path and step: results of
+    `accuracy_study.run_effect_costs`."""
+    ax = axes_or_new(ax)
+    names = [cost.scene for cost in costs]
+    nanoseconds = [cost.nanoseconds for cost in costs]
+    place = np.arange(len(costs))[::-1]
+    ax.barh(place, nanoseconds, color=COLOURS[0], height=0.6)
+    for y, value in zip(place, nanoseconds, strict=True):
+        ax.annotate(f" {value:.0f}", (value, y), va="center", fontsize="small")
+    ax.set(yticks=place, yticklabels=names, xlabel="nanoseconds a path and step")
+    ax.spines[["top", "right"]].set_visible(False)
+    return ax
