@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from inference import multivariate_ou, ou_1d, ou_transitions_log_density
+from inference_oracles import multivariate_ou, ou_1d, ou_transitions_log_density
 
 import jaxbridge as jb
 

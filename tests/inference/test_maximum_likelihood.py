@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from inference import (
+from inference_oracles import (
     multivariate_ou,
     ou_1d,
     ou_data,

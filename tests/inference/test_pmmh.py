@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from inference import ou_1d, ou_data, ou_log_likelihood
+from inference_oracles import ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
 from jaxbridge.inference.unknowns import Unknowns

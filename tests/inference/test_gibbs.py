@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from inference import grid_moments, multivariate_ou, ou_1d, ou_data, ou_log_likelihood
+from inference_oracles import grid_moments, multivariate_ou, ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
 from jaxbridge.inference.unknowns import as_normal, as_unknowns

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from inference import multivariate_ou
+from inference_oracles import multivariate_ou
 
 import jaxbridge as jb
 from jaxbridge.schemes.path_likelihood import forms_of_target

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import count_compilations
-from inference import ou_1d, ou_data, ou_log_likelihood
+from inference_oracles import ou_1d, ou_data, ou_log_likelihood
 from scipy import optimize, stats
 
 import jaxbridge as jb
