@@ -117,16 +117,14 @@ from .proposals.guided import (
     ResidualBridge,
     Step,
 )
+from .schemes.base import AbstractScheme
+from .schemes.euler import Euler
 from .schemes.frame import Frame
+from .schemes.gaussian_transition import GaussianTransition
+from .schemes.heun import Heun
+from .schemes.milstein import Milstein
 from .schemes.path_likelihood import path_log_likelihood
-from .schemes.schemes import (
-    AbstractScheme,
-    Euler,
-    GaussianTransition,
-    Heun,
-    Milstein,
-    SemiImplicit,
-)
+from .schemes.semi_implicit import SemiImplicit
 from .schemes.step_density import (
     AbstractStepDensity,
     EulerDensity,

@@ -19,7 +19,7 @@ from ..engine.lanes import over_lanes
 from ..engine.linalg import all_finite, is_finite
 from ..engine.noise import noisy_scan
 from ..models.diffusion import Diffusion
-from ..schemes.schemes import fitted_in_lanes
+from ..schemes.base import fitted_in_lanes
 from .coupling import AbstractCoupling, rotate_back, rotation_between, see
 from .meeting import PairStep
 from .pair import pair_noise, realise

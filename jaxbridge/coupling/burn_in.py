@@ -31,8 +31,8 @@ from ..engine.noise import noisy_scan
 from ..engine.rejection import key_for
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.intervals import as_intervals
+from ..schemes.base import fitted_in_lanes
 from ..schemes.fit import check_model
-from ..schemes.schemes import fitted_in_lanes
 from .coupling import AbstractCoupling, Coupling, rotate, rotation_between, see
 from .meeting import PairStep
 from .start_laws import MOST_STEPS, Stationary, needs_burn_in, run_for

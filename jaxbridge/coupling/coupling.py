@@ -29,8 +29,10 @@ from ..engine.linalg import dot, matmul, matvec, polar_factor
 from ..models import decisions
 from ..models.diffusion import Dynamics
 from ..models.sigma import AbstractSigma, Full
+from ..schemes.base import AbstractScheme
+from ..schemes.euler import Euler
 from ..schemes.frame import Frame, frame
-from ..schemes.schemes import AbstractScheme, Euler, Heun
+from ..schemes.heun import Heun
 from .meeting import AbstractMeeting, BrownianCrossing, ReflectionPlane, SignTest
 from .start_laws import AnyStartLaw, Reversed, Stationary, as_start_law
 

@@ -22,7 +22,7 @@ from ..engine.linalg import all_finite, is_finite
 from ..engine.noise import Store, noisy_scan
 from ..models import decisions
 from ..models.diffusion import Diffusion
-from ..schemes.schemes import fitted_in_lanes
+from ..schemes.base import fitted_in_lanes
 from .coupling import AbstractCoupling, rotate, rotation_between, see
 from .meeting import PairStep
 

@@ -29,7 +29,7 @@ from ..engine.lanes import over_lanes
 from ..engine.noise import noisy_scan
 from ..models.diffusion import Diffusion, Dynamics, check_value
 from ..models.gaussian import GaussianLaw
-from ..schemes.schemes import AbstractScheme, fitted_in_lanes
+from ..schemes.base import AbstractScheme, fitted_in_lanes
 
 # No run that replaces a sampler of ν takes more steps than this.
 MOST_STEPS = 2**18

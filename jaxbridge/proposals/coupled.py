@@ -21,9 +21,12 @@ from ..engine.rejection import default_num_lanes
 from ..models.diffusion import Diffusion, Dynamics
 from ..models.grid import uniform_fractions
 from ..models.intervals import Intervals
+from ..schemes.base import AbstractScheme
+from ..schemes.euler import Euler
 from ..schemes.fit import check_model
+from ..schemes.gaussian_transition import GaussianTransition
 from ..schemes.halving import log_halving_of_paths, num_looked
-from ..schemes.schemes import AbstractScheme, Euler, GaussianTransition, Milstein
+from ..schemes.milstein import Milstein
 from ..schemes.step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
 from ..schemes.step_error import share_of_order
 from .base import AbstractWeightedProposal, WeightedPaths, in_blocks

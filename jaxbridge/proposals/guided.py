@@ -51,9 +51,9 @@ from ..engine.rejection import most_lanes
 from ..models.diffusion import Diffusion, Dynamics
 from ..models.intervals import Intervals
 from ..models.sigma import AbstractSigma, root_of
+from ..schemes.euler import Euler
 from ..schemes.fit import check_model
 from ..schemes.halving import num_looked, of_all_steps, of_pair
-from ..schemes.schemes import Euler
 from ..schemes.step_density import AbstractStepDensity, EulerDensity, StepLaw
 from ..schemes.step_error import share_of_order
 from .base import (

@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 from ..engine.checks import is_traced
 from ..models.diffusion import Diffusion, check_invertible
 from ..models.intervals import Intervals
-from .schemes import AbstractScheme, Milstein
+from .base import AbstractScheme
+from .milstein import Milstein
 
 
 def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) -> None:

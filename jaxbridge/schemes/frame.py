@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..engine.linalg import safe_norm
+from ..models.diffusion import Dynamics
 from ..models.sigma import AbstractSigma
 
 
@@ -33,3 +34,11 @@ def frame_of(sigma: AbstractSigma, difference: Float[Array, " d"]) -> Frame:
     v = sigma.solve(difference)
     gap = safe_norm(v)
     return Frame(sigma, v / jnp.where(gap > 0, gap, 1), gap)
+
+
+def frame_after_drift(
+    dynamics: Dynamics, x: Float[Array, " d"], driven: Float[Array, " d"], dt: Float[Array, ""]
+) -> Frame:
+    """The gap when each has gone α δ."""
+    drift = dynamics.drift(x) - dynamics.drift(driven)
+    return frame_of(dynamics.sigma(driven), x - driven + drift * dt)

@@ -23,7 +23,9 @@ from ..engine.linalg import matvec, solve
 from ..models.diffusion import Diffusion
 from ..models.gaussian import gaussian_bridge
 from ..models.langevin import hyperbolic
-from ..schemes.schemes import Euler, GaussianTransition, Heun
+from ..schemes.euler import Euler
+from ..schemes.gaussian_transition import GaussianTransition
+from ..schemes.heun import Heun
 from ..tuning.work_precision import WorkPrecision, work_precision
 from .exact import UNLIKELY, fastest
 from .paper import study_model

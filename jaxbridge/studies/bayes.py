@@ -30,7 +30,7 @@ from ..inference.gibbs import GibbsPosterior, gibbs
 from ..inference.unknowns import NormalPrior
 from ..models.langevin import hyperbolic
 from ..models.simulate import simulate
-from ..schemes.schemes import Euler
+from ..schemes.euler import Euler
 
 ALPHA = 0.8
 PRIOR_MEAN, PRIOR_VARIANCE = 1.0, 1.0

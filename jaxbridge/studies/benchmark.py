@@ -27,7 +27,9 @@ from ..coupling.bridges import Bridges, sample_bridges
 from ..coupling.coupling import Coupling
 from ..coupling.meeting import SignTest
 from ..coupling.pair import propose
-from ..schemes.schemes import AbstractScheme, Euler, Heun
+from ..schemes.base import AbstractScheme
+from ..schemes.euler import Euler
+from ..schemes.heun import Heun
 from ..tuning.work_precision import work_precision
 from .accuracy import run_sigma_costs
 from .crossover import Process, Rate, run_crossover, share_of_best, thousands

@@ -43,7 +43,10 @@ from ..models.intervals import as_intervals
 from ..proposals.choice import as_proposal, describe, singles
 from ..proposals.coupled import CoupledPairs
 from ..proposals.guided import AbstractGuidedProposal
-from ..schemes.schemes import AbstractScheme, Euler, GaussianTransition, Heun
+from ..schemes.base import AbstractScheme
+from ..schemes.euler import Euler
+from ..schemes.gaussian_transition import GaussianTransition
+from ..schemes.heun import Heun
 from ..schemes.step_density import AbstractStepDensity, ItoTaylorDensity
 
 METHODS = ("approximate", "weights", "pseudo_marginal", "renewal", "crank_nicolson", "density")

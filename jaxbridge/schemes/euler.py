@@ -1,0 +1,33 @@
+"""Euler and Maruyama's scheme."""
+
+from typing import ClassVar
+
+from .base import AbstractScheme
+from .frame import frame_after_drift
+
+
+class Euler(AbstractScheme):
+    """Euler–Maruyama, `x + α(x)δ + σ(x)ΔW`, as in the paper. Its inverse is exact.
+
+    Strong order ½ (1 for constant σ), weak order 1.
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, scheme=jb.Euler())
+    ```
+    """
+
+    stratonovich: ClassVar[bool] = False
+
+    def fitted(self, dynamics, like, dt):
+        return self
+
+    def step(self, dynamics, x, dt, dw):
+        return x + dynamics.drift(x) * dt + dynamics.sigma(x).mv(dw)
+
+    def noise(self, dynamics, x, x_next, dt):
+        return dynamics.sigma(x).solve(x_next - x - dynamics.drift(x) * dt)
+
+    def frame(self, dynamics, x, driven, dt):
+        return frame_after_drift(dynamics, x, driven, dt)
