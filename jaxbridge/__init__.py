@@ -42,18 +42,14 @@ observations = jnp.array([[0.0, 0.0], [0.5, -0.3], [0.2, 0.4], [-0.3, 0.6]])
 ```
 """
 
+from .coupling.base import AbstractCoupling
 from .coupling.bridges import Bridges, sample_bridges
 from .coupling.burn_in import measure_burn_in
-from .coupling.coupling import (
-    AbstractCoupling,
-    Coupling,
-    no_rotation,
-    polar_rotation,
-    published_rotation,
-)
 from .coupling.effects import effects
+from .coupling.gamma import Coupling
 from .coupling.hitting import HittingCounts, hitting_counts
 from .coupling.meeting import AbstractMeeting, BrownianCrossing, PairStep, ReflectionPlane, SignTest
+from .coupling.rotation import no_rotation, polar_rotation, published_rotation
 from .coupling.start_laws import (
     Reversed,
     StartLaw,
@@ -90,33 +86,26 @@ from .inference.posterior import AbstractPosterior
 from .inference.score import Score, score
 from .inference.unknowns import NormalPrior
 from .models.diffusion import Diffusion
-from .models.gaussian import (
-    GaussianBridge,
-    GaussianLaw,
+from .models.gaussian_bridge import GaussianBridge, gaussian_bridge
+from .models.gaussian_law import GaussianLaw
+from .models.hyperbolic import hyperbolic
+from .models.lamperti import lamperti
+from .models.langevin import langevin, stationary_diffusion
+from .models.ornstein_uhlenbeck import (
     OrnsteinUhlenbeckParams,
-    gaussian_bridge,
     ornstein_uhlenbeck,
     ou_stationary,
     ou_transition,
-)
-from .models.lamperti import lamperti
-from .models.langevin import (
-    hyperbolic,
-    langevin,
-    stationary_diffusion,
 )
 from .models.simulate import simulate
 from .models.transform import Transformed, transform
 from .proposals.base import AbstractWeightedProposal
 from .proposals.choice import Choice
 from .proposals.coupled import CoupledPairs
-from .proposals.guided import (
-    AbstractGuidedProposal,
-    Guided,
-    ModifiedDiffusionBridge,
-    ResidualBridge,
-    Step,
-)
+from .proposals.guided import AbstractGuidedProposal, Step
+from .proposals.linear_guide import Guided
+from .proposals.modified_bridge import ModifiedDiffusionBridge
+from .proposals.residual_bridge import ResidualBridge
 from .schemes.base import AbstractScheme
 from .schemes.euler import Euler
 from .schemes.frame import Frame
@@ -133,14 +122,9 @@ from .schemes.step_density import (
     StepLaw,
     StepsFrom,
 )
+from .tuning.choose_proposal import choose_proposal
 from .tuning.hitting_variation import HittingVariation, hitting_variation
-from .tuning.tuning import (
-    Pilot,
-    Tuning,
-    choose_proposal,
-    fit_start_law,
-    tune_coupling,
-)
+from .tuning.pilots import Pilot, Tuning, fit_start_law, tune_coupling
 from .tuning.work_precision import (
     Setting,
     WorkPrecision,

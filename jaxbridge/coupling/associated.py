@@ -20,9 +20,10 @@ from ..engine.linalg import all_finite, is_finite
 from ..engine.noise import noisy_scan
 from ..models.diffusion import Diffusion
 from ..schemes.base import fitted_in_lanes
-from .coupling import AbstractCoupling, rotate_back, rotation_between, see
+from .base import AbstractCoupling, see
 from .meeting import PairStep
 from .pair import pair_noise, realise
+from .rotation import rotate_back, rotation_between
 from .start_laws import draw_starts
 
 

@@ -21,7 +21,8 @@ from ..models.diffusion import Diffusion, check_diffusion
 from ..models.grid import grid_times, stored_steps, uniform_fractions
 from ..models.intervals import Intervals, as_intervals
 from ..schemes.fit import check_model
-from .coupling import AbstractCoupling, Coupling, check_coupling
+from .base import AbstractCoupling, check_coupling
+from .gamma import Coupling
 from .pair import Proposals, propose
 
 

@@ -33,8 +33,10 @@ from ..models.diffusion import Diffusion, check_diffusion
 from ..models.intervals import as_intervals
 from ..schemes.base import fitted_in_lanes
 from ..schemes.fit import check_model
-from .coupling import AbstractCoupling, Coupling, rotate, rotation_between, see
+from .base import AbstractCoupling, see
+from .gamma import Coupling
 from .meeting import PairStep
+from .rotation import rotate, rotation_between
 from .start_laws import MOST_STEPS, Stationary, needs_burn_in, run_for
 
 _NUM_PAIRS = 512

@@ -10,7 +10,9 @@ from ..engine.noise import stretches
 from ..models import decisions
 from ..models.decisions import Effects
 from ..models.diffusion import Diffusion, check_diffusion
-from .coupling import AbstractCoupling, Coupling, check_coupling, rotation_effect
+from .base import AbstractCoupling, check_coupling
+from .gamma import Coupling
+from .rotation import rotation_effect
 
 # Dimensions tried for a model that does not say its own; most that fit two fit them all.
 _DIMENSIONS = (2, 1, *range(3, 65))

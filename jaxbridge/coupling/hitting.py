@@ -19,8 +19,8 @@ from ..engine.checks import check_bound, check_count, check_key, nondifferentiab
 from ..engine.rejection import Trials, default_num_lanes, key_for, numbered_keys, search
 from ..models.diffusion import Diffusion, check_diffusion
 from .associated import run_associated
+from .base import AbstractCoupling
 from .burn_in import with_burn_in
-from .coupling import AbstractCoupling
 from .start_laws import AnyStartLaw, as_start_law, run_is_cut
 
 # A count that takes longer than this is cut off, unless the user says otherwise.

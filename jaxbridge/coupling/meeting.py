@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import dot, safe_norm
-from ..models.diffusion import Dynamics
+from ..models.dynamics import Dynamics
 from ..schemes.frame import Frame
 
 

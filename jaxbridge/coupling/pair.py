@@ -23,8 +23,9 @@ from ..engine.noise import Store, noisy_scan
 from ..models import decisions
 from ..models.diffusion import Diffusion
 from ..schemes.base import fitted_in_lanes
-from .coupling import AbstractCoupling, rotate, rotation_between, see
+from .base import AbstractCoupling, see
 from .meeting import PairStep
+from .rotation import rotate, rotation_between
 
 
 class Proposals(NamedTuple):

@@ -27,8 +27,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
 from ..engine.lanes import over_lanes
 from ..engine.noise import noisy_scan
-from ..models.diffusion import Diffusion, Dynamics, check_value
-from ..models.gaussian import GaussianLaw
+from ..models.diffusion import Diffusion, check_value
+from ..models.dynamics import Dynamics
+from ..models.gaussian_law import GaussianLaw
 from ..schemes.base import AbstractScheme, fitted_in_lanes
 
 # No run that replaces a sampler of ν takes more steps than this.

@@ -20,7 +20,7 @@ from ..models.diffusion import Diffusion, check_diffusion
 from ..models.grid import stored_steps
 from ..models.intervals import as_intervals
 from ..proposals.choice import as_proposal, settled, uses_couplings
-from ..proposals.guided import Guided
+from ..proposals.linear_guide import Guided
 from ..schemes.step_error import is_gross
 from .crank_nicolson import as_guided, check_step_size, run_crank_nicolson
 from .kernels import Chain

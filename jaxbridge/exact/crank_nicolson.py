@@ -34,7 +34,8 @@ from ..models.grid import grid_times
 from ..models.intervals import Intervals
 from ..proposals.base import AbstractWeightedProposal
 from ..proposals.choice import as_proposal
-from ..proposals.guided import AbstractGuidedProposal, Guided, noise_of, path_of
+from ..proposals.guided import AbstractGuidedProposal, noise_of, path_of
+from ..proposals.linear_guide import Guided
 from .kernels import (
     Chain,
     Kernel,

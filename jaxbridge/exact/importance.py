@@ -13,8 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Bridges
-from ..coupling.coupling import AbstractCoupling
 from ..coupling.hitting import check_max_trials, counts_of, coupling_of, durations_of
 from ..coupling.start_laws import AnyStartLaw
 from ..engine.averages import (

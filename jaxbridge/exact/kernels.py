@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
-from ..coupling.coupling import AbstractCoupling
+from ..coupling.base import AbstractCoupling
 from ..engine.averages import (
     PathFunction,
     expanded,

@@ -19,8 +19,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..coupling.associated import run_associated
+from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Inputs, Joined, find_bridges
-from ..coupling.coupling import AbstractCoupling
 from ..coupling.start_laws import log_ratio, run_is_cut
 from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.rejection import Found, default_num_lanes, most_lanes

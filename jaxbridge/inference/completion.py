@@ -28,7 +28,7 @@ from ..models.diffusion import Diffusion
 from ..models.intervals import Intervals
 from ..proposals.base import AbstractWeightedProposal
 from ..proposals.coupled import CoupledPairs
-from ..proposals.guided import ModifiedDiffusionBridge
+from ..proposals.modified_bridge import ModifiedDiffusionBridge
 from ..schemes.path_likelihood import Form, log_likelihoods
 from .observations import Group
 from .parts import Bounds, Part, log_halvings, make_parts, step_shares

@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..engine.lanes import over_lanes
 from ..engine.linalg import any_cholesky, any_solve, dot, matvec
-from ..models.diffusion import uses_argument
+from ..models.tracing import uses_argument
 from ..schemes.path_likelihood import Form, log_likelihoods
 from .completion import Completion, Paths
 from .unknowns import Constraint, NormalDensity, Unknowns, allowed

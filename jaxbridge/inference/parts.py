@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from ..coupling.coupling import AbstractCoupling
+from ..coupling.base import AbstractCoupling
 from ..coupling.start_laws import Stationary, needs_burn_in
 from ..exact.density import check_for_density
 from ..exact.renewal import as_pairs

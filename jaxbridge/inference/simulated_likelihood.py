@@ -31,7 +31,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
 from ..engine.pareto import pareto_k
-from ..models.diffusion import Diffusion, uses_argument
+from ..models.diffusion import Diffusion
+from ..models.tracing import uses_argument
 from ..proposals.choice import (
     Choice,
     as_proposal,

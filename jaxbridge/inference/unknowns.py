@@ -18,7 +18,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.checks import as_floating, cast_floats, is_traced
 from ..engine.linalg import any_inverse, dot, matvec
-from ..models.diffusion import Diffusion, uses_argument
+from ..models.diffusion import Diffusion
+from ..models.tracing import uses_argument
 
 
 class _Named:

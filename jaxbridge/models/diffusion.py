@@ -12,10 +12,8 @@ in which the normaliser of ν cancels. It is reversible if and only if α* = α,
 
 import functools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.extend
 import jax.numpy as jnp
 import numpy as np
@@ -23,19 +21,9 @@ from jaxtyping import Array, Float, Inexact, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, is_traced
 from . import decisions
+from .dynamics import Dynamics, stationary_flux
 from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
-
-
-class Dynamics(NamedTuple):
-    """The coefficients of one stochastic differential equation, ready for a compiled loop.
-
-    `drift` maps a point, shape (d,), to a vector (d,); `sigma` maps it to σ(x);
-    `sigma_varies` tells whether σ depends on the point at all.
-    """
-
-    drift: Callable[[Array], Array]
-    sigma: Callable[[Array], AbstractSigma]
-    sigma_varies: bool
+from .tracing import uses_argument
 
 
 class Diffusion(eqx.Module):
@@ -190,7 +178,7 @@ class Diffusion(eqx.Module):
         points = as_floating("points", points)
         forward, log_nu = self.forward(points[0]), self._log_stationary_function()
         divergence = forward.sigma_varies
-        flux = functools.partial(_stationary_flux, forward, log_nu, divergence=divergence)
+        flux = functools.partial(stationary_flux, forward, log_nu, divergence=divergence)
         return jax.vmap(lambda x: forward.drift(x) - flux(x) / 2)(points)
 
     def with_params(self, params: PyTree) -> "Diffusion":
@@ -310,7 +298,7 @@ class Diffusion(eqx.Module):
             divergence = decisions.divergence(derived, forward.sigma_varies).simulated
 
             def derived_drift(x):
-                return -forward.drift(x) + _stationary_flux(forward, log_nu, x, divergence)
+                return -forward.drift(x) + stationary_flux(forward, log_nu, x, divergence)
 
             drift = derived_drift
 
@@ -349,46 +337,6 @@ class Diffusion(eqx.Module):
         return lambda x: check_value("log_stationary", log_stationary(x, params), (), x)
 
 
-def ito_correction(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
-    """½ Σ_jk ∂_k σ_ij σ_kj, by which Itô's drift exceeds Stratonovich's."""
-
-    def column(y, j):
-        return dynamics.sigma(y).as_matrix(y.shape[0], y.dtype)[:, j]
-
-    correction = jnp.zeros_like(x)
-    for j in range(x.shape[0]):
-        correction += jax.jvp(functools.partial(column, j=j), (x,), (column(x, j),))[1]
-    return correction / 2
-
-
-def weighted_divergence(
-    product: Callable[[Array, Array], Array],
-    log_nu: Callable[[Array], Array],
-    x: Float[Array, " d"],
-    varies: bool = True,
-) -> Float[Array, " d"]:
-    """ν⁻¹ Σ_j ∂_j(ν M_ij) = M ∇log ν + div M, for a matrix field given by `product(x, v)` =
-    M(x) v; div M is left out where M does not vary."""
-    flux = product(x, jax.grad(log_nu)(x))
-    if varies:
-        for direction in jnp.eye(x.shape[0], dtype=x.dtype):
-            _, tangent = jax.jvp(product, (x, direction), (direction, jnp.zeros_like(x)))
-            flux += tangent
-    return flux
-
-
-def _stationary_flux(
-    dynamics: Dynamics, log_nu: Callable, x: Float[Array, " d"], divergence: bool
-) -> Float[Array, " d"]:
-    """V ∇log ν + div V = α + α*, div V only where it is called for."""
-
-    def product(y, v):
-        sigma = dynamics.sigma(y)
-        return sigma.mv(sigma.mv_transpose(v))
-
-    return weighted_divergence(product, log_nu, x, divergence)
-
-
 def _as_sigma(
     values: Numbers | None, x: Float[Array, " d"], constant: bool = True
 ) -> AbstractSigma:
@@ -405,35 +353,6 @@ def _as_sigma(
     if values.ndim == 1:
         return Diagonal(values)
     return Constant(values) if constant else Full(values)
-
-
-def is_linear(dynamics: Dynamics, like: Float[Array, " d"]) -> bool:
-    """Whether the drift is linear, α(0) + A x, and σ constant."""
-    jacobian = jax.jacfwd(dynamics.drift)
-    return not (dynamics.sigma_varies or uses_argument(jacobian, like))
-
-
-def uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:
-    """Whether the values of `function` depend on its argument, by following its jaxpr."""
-    jaxpr = jax.make_jaxpr(function)(like).jaxpr
-    return any(_reached(jaxpr, [True] * len(jaxpr.invars)))
-
-
-def _reached(jaxpr: jax.extend.core.Jaxpr, given: list[bool]) -> list[bool]:
-    """Which results depend on the given arguments."""
-    reached = {var for var, own in zip(jaxpr.invars, given, strict=True) if own}
-
-    def is_reached(atom) -> bool:
-        return not isinstance(atom, jax.extend.core.Literal) and atom in reached
-
-    for equation in jaxpr.eqns:
-        into = [is_reached(atom) for atom in equation.invars]
-        if equation.primitive.name in ("jit", "pjit"):
-            out = _reached(equation.params["jaxpr"].jaxpr, into)
-        else:
-            out = [any(into)] * len(equation.outvars)
-        reached.update(var for var, own in zip(equation.outvars, out, strict=True) if own)
-    return [is_reached(atom) for atom in jaxpr.outvars]
 
 
 def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) -> Array:

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
-from .diffusion import Diffusion, Dynamics, check_diffusion, ito_correction
+from .diffusion import Diffusion, check_diffusion
+from .dynamics import Dynamics, ito_correction
 from .sigma import AbstractSigma, Diagonal
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Float
 
-from ..models.gaussian import GaussianBridge
+from ..models.gaussian_bridge import GaussianBridge
 from ..tuning.work_precision import WorkPrecision
 from .copula import empirical_copula, gaussian_copula
 from .style import (

@@ -38,7 +38,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..coupling.coupling import AbstractCoupling, Coupling
+from ..coupling.base import AbstractCoupling
+from ..coupling.gamma import Coupling
 from ..coupling.hitting import check_max_trials
 from ..coupling.start_laws import Stationary
 from ..engine.averages import effective_size, normalised
@@ -51,7 +52,8 @@ from ..schemes.step_density import EulerDensity, ItoTaylorDensity
 from ..schemes.step_error import of_log_mean
 from .base import AbstractWeightedProposal, WeightedPaths
 from .coupled import CoupledPairs
-from .guided import Guided, ModifiedDiffusionBridge
+from .linear_guide import Guided
+from .modified_bridge import ModifiedDiffusionBridge
 
 # Bounds the tries for one bridge, unless the user says otherwise.
 _MAX_PROPOSALS = 10_000

@@ -11,14 +11,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Inputs, find_bridges
 from ..coupling.burn_in import with_burn_in
-from ..coupling.coupling import AbstractCoupling
 from ..coupling.hitting import HittingCounts, count_hits
 from ..coupling.start_laws import AnyStartLaw, Reversed, Stationary, log_ratio, needs_burn_in
 from ..engine.checks import nondifferentiable
 from ..engine.rejection import default_num_lanes
-from ..models.diffusion import Diffusion, Dynamics
+from ..models.diffusion import Diffusion
+from ..models.dynamics import Dynamics
 from ..models.grid import uniform_fractions
 from ..models.intervals import Intervals
 from ..schemes.base import AbstractScheme

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from ..models.diffusion import Dynamics
+from ..models.dynamics import Dynamics
 from .frame import Frame
 
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..engine.linalg import safe_norm
-from ..models.diffusion import Dynamics
+from ..models.dynamics import Dynamics
 from ..models.sigma import AbstractSigma
 
 

@@ -6,7 +6,7 @@ import jax
 from jaxtyping import Array, Float
 
 from ..engine.linalg import cholesky, inverse, matmul, matvec, solve
-from ..models.diffusion import is_linear
+from ..models.dynamics import is_linear
 from ..models.linear import linear_transition
 from ..models.sigma import Constant
 from .base import AbstractScheme

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float
 
 from ..engine.lanes import over_lanes
 from ..engine.linalg import matmul, matvec
-from ..models.diffusion import Dynamics
+from ..models.dynamics import Dynamics
 from .step_density import AbstractStepDensity, StepLaw
 
 # D is worked out for one in so many paths, but for so many at least.

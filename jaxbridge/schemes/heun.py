@@ -5,7 +5,7 @@ from typing import ClassVar
 from jaxtyping import Array, Float
 
 from ..models import decisions
-from ..models.diffusion import Dynamics, ito_correction
+from ..models.dynamics import Dynamics, ito_correction
 from .base import AbstractScheme
 from .frame import frame, frame_after_drift
 

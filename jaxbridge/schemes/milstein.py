@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..models.diffusion import Dynamics
+from ..models.dynamics import Dynamics
 from ..models.sigma import Diagonal
 from .base import AbstractScheme
 from .frame import frame_after_drift

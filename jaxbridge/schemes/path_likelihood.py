@@ -43,7 +43,8 @@ from jaxtyping import Array, Float, PyTree
 from ..engine.checks import Numbers, as_floating, is_traced, time_steps
 from ..engine.lanes import over_lanes
 from ..engine.linalg import dot, total
-from ..models.diffusion import Diffusion, Dynamics, check_diffusion
+from ..models.diffusion import Diffusion, check_diffusion
+from ..models.dynamics import Dynamics
 from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
 
 Form = Literal["girsanov", "trapezoid", "ito_taylor", "ito", "euler"]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.linalg import matvec, solve
-from ..models.diffusion import Dynamics
+from ..models.dynamics import Dynamics
 from ..models.sigma import Constant
 from .base import AbstractScheme
 from .frame import frame_of

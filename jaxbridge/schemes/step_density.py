@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.linalg import cholesky, dot, matmul, matvec, quadratic_form, solve_lower, total
-from ..models.diffusion import Dynamics
+from ..models.dynamics import Dynamics
 from ..models.sigma import AbstractSigma
 
 

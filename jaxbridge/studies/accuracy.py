@@ -17,12 +17,13 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from ..coupling.bridges import sample_bridges
-from ..coupling.coupling import Coupling, no_rotation
+from ..coupling.gamma import Coupling
 from ..coupling.meeting import BrownianCrossing, SignTest
+from ..coupling.rotation import no_rotation
 from ..engine.linalg import matvec, solve
 from ..models.diffusion import Diffusion
-from ..models.gaussian import gaussian_bridge
-from ..models.langevin import hyperbolic
+from ..models.gaussian_bridge import gaussian_bridge
+from ..models.hyperbolic import hyperbolic
 from ..schemes.euler import Euler
 from ..schemes.gaussian_transition import GaussianTransition
 from ..schemes.heun import Heun

@@ -24,11 +24,11 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Key
 
-from ..coupling.coupling import Coupling
+from ..coupling.gamma import Coupling
 from ..engine.diagnostics import effective_sample_size
 from ..inference.gibbs import GibbsPosterior, gibbs
 from ..inference.unknowns import NormalPrior
-from ..models.langevin import hyperbolic
+from ..models.hyperbolic import hyperbolic
 from ..models.simulate import simulate
 from ..schemes.euler import Euler
 

@@ -24,7 +24,7 @@ from jax import lax
 from jaxtyping import Array, Key
 
 from ..coupling.bridges import Bridges, sample_bridges
-from ..coupling.coupling import Coupling
+from ..coupling.gamma import Coupling
 from ..coupling.meeting import SignTest
 from ..coupling.pair import propose
 from ..schemes.base import AbstractScheme

@@ -15,10 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ..coupling.coupling import Coupling
+from ..coupling.gamma import Coupling
 from ..exact.density import TransitionLogDensity, transition_log_density
 from ..models.diffusion import Diffusion
-from ..models.langevin import hyperbolic
+from ..models.hyperbolic import hyperbolic
 from ..proposals.choice import Choice, as_proposal, default_candidates, describe
 from .exact import fastest
 from .paper import Point, study_model

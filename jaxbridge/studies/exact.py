@@ -17,14 +17,15 @@ from jax import lax
 from jaxtyping import Array, Float, Key
 
 from ..coupling.bridges import sample_bridges
-from ..coupling.coupling import Coupling
+from ..coupling.gamma import Coupling
 from ..coupling.start_laws import AnyStartLaw, Reversed, Stationary
 from ..engine.diagnostics import effective_sample_size
 from ..exact.chains import sample_exact_bridges
 from ..exact.importance import weigh_bridges
-from ..models.gaussian import GaussianLaw, gaussian_bridge
+from ..models.gaussian_bridge import gaussian_bridge
+from ..models.gaussian_law import GaussianLaw
 from ..tuning.hitting_variation import HittingVariation, hitting_variation
-from ..tuning.tuning import fit_start_law
+from ..tuning.pilots import fit_start_law
 from .paper import CASES, Fit, Point, compare, study_model
 
 Ends = tuple[Point, Point]

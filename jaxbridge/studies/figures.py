@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ..coupling.bridges import Bridges
-from ..models.gaussian import GaussianBridge, GaussianLaw
+from ..models.gaussian_bridge import GaussianBridge
+from ..models.gaussian_law import GaussianLaw
 from ..plot.pictures import bridge_fan, copula_levels, paths_in_space, qq, work_precision
 from ..plot.style import COLOURS, EXACT, MARKERS, Axes, Figure, Reals, axes_or_new, finish
 

@@ -17,9 +17,11 @@ from jax.scipy.special import ndtr
 from jaxtyping import Array, Float, Key
 
 from ..coupling.bridges import Bridges, sample_bridges
-from ..coupling.coupling import Coupling
+from ..coupling.gamma import Coupling
 from ..models.diffusion import Diffusion
-from ..models.gaussian import GaussianBridge, GaussianLaw, gaussian_bridge, ornstein_uhlenbeck
+from ..models.gaussian_bridge import GaussianBridge, gaussian_bridge
+from ..models.gaussian_law import GaussianLaw
+from ..models.ornstein_uhlenbeck import ornstein_uhlenbeck
 
 Point = tuple[float, float]
 

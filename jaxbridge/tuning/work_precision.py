@@ -26,8 +26,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import sample_bridges
-from ..coupling.coupling import AbstractCoupling, Coupling
+from ..coupling.gamma import Coupling
 from ..coupling.meeting import AbstractMeeting, BrownianCrossing
 from ..engine.checks import Numbers, cast_floats, check_count, check_key
 from ..engine.diagnostics import effective_sample_size
@@ -36,10 +37,12 @@ from ..engine.rejection import key_for
 from ..exact.chains import sample_exact_bridges
 from ..exact.density import check_for_density, transition_log_density
 from ..exact.importance import sample_weighted_bridges
-from ..models.diffusion import Diffusion, check_diffusion, is_linear
-from ..models.gaussian import OrnsteinUhlenbeckParams, gaussian_bridge, ou_transition
+from ..models.diffusion import Diffusion, check_diffusion
+from ..models.dynamics import is_linear
+from ..models.gaussian_bridge import gaussian_bridge
 from ..models.grid import stored_steps
 from ..models.intervals import as_intervals
+from ..models.ornstein_uhlenbeck import OrnsteinUhlenbeckParams, ou_transition
 from ..proposals.choice import as_proposal, describe, singles
 from ..proposals.coupled import CoupledPairs
 from ..proposals.guided import AbstractGuidedProposal

@@ -10,7 +10,8 @@ import pytest
 from helpers import assert_moments, paper_model
 
 import jaxbridge as jb
-from jaxbridge.coupling.coupling import AbstractCoupling, polar_rotation, published_rotation
+from jaxbridge.coupling.base import AbstractCoupling
+from jaxbridge.coupling.rotation import polar_rotation, published_rotation
 from jaxbridge.models.sigma import Full
 from jaxbridge.schemes.frame import frame
 

@@ -8,7 +8,7 @@ from helpers import assert_moments
 from scipy.stats import norm
 
 import jaxbridge as jb
-from jaxbridge.coupling.coupling import see
+from jaxbridge.coupling.base import see
 from jaxbridge.coupling.meeting import PairStep
 from jaxbridge.schemes.frame import frame
 

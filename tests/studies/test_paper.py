@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaxbridge.models.gaussian import GaussianLaw
+from jaxbridge.models.gaussian_law import GaussianLaw
 from jaxbridge.studies.paper import CASES, chance, compare, format_table, ks_distance, run_study
 
 

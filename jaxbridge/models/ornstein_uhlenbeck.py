@@ -1,87 +1,24 @@
-"""The Ornstein–Uhlenbeck process and its bridges in closed form (section 3.1 of the paper).
+"""The Ornstein–Uhlenbeck process in closed form (section 3.1 of the paper).
 
 For `dX = -B (X - m) dt + σ dW`, V = σσᵀ and B with eigenvalues in the right half plane,
 
     Γ solves B Γ + Γ Bᵀ = V,   Γ_t = ∫_0^t e^{-sB} V e^{-sBᵀ} ds = Γ - e^{-tB} Γ e^{-tBᵀ},
 
-the stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x - m), Γ_t). The bridge
-from a to b in T is Gaussian. With the gain `K_t = Γ_t e^{-Bᵀ(T-t)} Γ_T⁻¹` its moments are
-
-    E Z_t = m + e^{-tB}(a - m) + K_t (b - m - e^{-TB}(a - m)),
-    Var Z_t = Γ_t - K_t e^{-B(T-t)} Γ_t.
-
-(The paper prints the gain without these transposes; that is right for reversible processes.)
+the stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x - m), Γ_t).
 """
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, is_traced
-from ..engine.linalg import any_cholesky, any_inverse, any_solve, dot, matvec, solve
+from ..engine.linalg import any_cholesky, any_inverse, dot, matvec, solve
 from .diffusion import Diffusion, check_invertible
+from .gaussian_law import GaussianLaw
 from .intervals import as_intervals
 from .linear import linear_transition
-
-
-class GaussianLaw(eqx.Module):
-    """The normal distribution N(mean, covariance).
-
-    **Arguments:** `mean`, shape (d,); `covariance`, shape (d, d).
-
-    **Raises:** `ValueError` for shapes that do not fit, or a covariance that is visibly not
-    symmetric and positive definite.
-
-    **Example:**
-
-    ```python
-    law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
-    coupling = jb.Coupling(0.5, start_law=law)
-    ```
-    """
-
-    mean: Float[Array, " d"]
-    covariance: Float[Array, "d d"]
-
-    def __init__(self, mean: Numbers, covariance: Numbers):
-        mean, covariance = as_floating("mean", mean), as_floating("covariance", covariance)
-        dtype = jnp.promote_types(mean.dtype, covariance.dtype)
-        self.mean, self.covariance = mean.astype(dtype), covariance.astype(dtype)
-        if mean.ndim != 1 or covariance.shape != 2 * mean.shape:
-            raise ValueError(
-                "`mean` must have shape (d,) and `covariance` (d, d); got "
-                f"{mean.shape} and {covariance.shape}."
-            )
-        if is_traced(covariance):
-            return
-        matrix = np.asarray(covariance, float)
-        tolerance = 100 * np.finfo(dtype).eps * np.abs(matrix).max()
-        symmetric = np.abs(matrix - matrix.T).max() <= tolerance  # false for NaN
-        if not (symmetric and np.linalg.eigvalsh(matrix).min() >= -tolerance):
-            raise ValueError(
-                f"`covariance` must be symmetric and positive definite; got {covariance}."
-            )
-
-    def __iter__(self) -> Iterator[Array]:
-        """`mean, covariance = law`."""
-        yield from (self.mean, self.covariance)
-
-    def sample(self, key: Key[Array, ""], model: Diffusion | None = None) -> Float[Array, " d"]:
-        """One draw, shape (d,). The model is not looked at: start laws are called with one."""
-        noise = jax.random.normal(key, self.mean.shape, self.mean.dtype)
-        return self.mean + matvec(any_cholesky(self.covariance), noise)
-
-    def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
-        """The normalised log density at a point."""
-        root = any_cholesky(self.covariance)
-        white = matvec(any_inverse(root), (x - self.mean).astype(root.dtype))
-        return -dot(white, white) / 2 - jnp.sum(jnp.log(jnp.sqrt(2 * np.pi) * jnp.diag(root)))
 
 
 class OrnsteinUhlenbeckParams(NamedTuple):
@@ -181,7 +118,7 @@ def ou_stationary(model: Diffusion) -> GaussianLaw:
     jb.ou_stationary(model).covariance  # shape (2, 2)
     ```
     """
-    prepared = _prepare(_ou_params(model))
+    prepared = _prepare(ou_params(model))
     return GaussianLaw(prepared.mean, prepared.covariance)
 
 
@@ -198,102 +135,10 @@ def ou_transition(model: Diffusion, start: Numbers, duration: Numbers) -> Gaussi
     law.log_density(end)
     ```
     """
-    params = _ou_params(model)
-    start, _, duration = _one_interval(params, start, start, duration)
-    decay, covariance = _decay_and_covariance(params, duration)
+    params = ou_params(model)
+    start, _, duration = single_interval(params, start, start, duration)
+    decay, covariance = decay_and_covariance(params, duration)
     return GaussianLaw(params.mean + decay @ (start - params.mean), covariance)
-
-
-class GaussianBridge(eqx.Module):
-    """The exact law of an Ornstein–Uhlenbeck bridge at K times, from `gaussian_bridge`.
-
-    `times` (K,), `mean` (K, d) and `covariance` (K, d, d), the covariance at each time;
-    `sample` draws whole paths.
-    """
-
-    times: Float[Array, " K"]
-    mean: Float[Array, "K d"]
-    covariance: Float[Array, "K d d"]
-    _model: Diffusion
-    _start: Float[Array, " d"]
-    _end: Float[Array, " d"]
-    _duration: Float[Array, ""]
-    _gain: Float[Array, "K d d"]
-
-    def sample(self, key: Key[Array, ""], num_paths: int) -> Float[Array, "n K d"]:
-        """Independent paths at `times`, exact in law: an unconditional path X, corrected by
-        `Z_t = X_t + K_t (b - X_T)`, as in the paper's lemma on the bridge."""
-        params = _ou_params(self._model)
-        grid = jnp.concatenate([self.times, self._duration[None]])
-        steps = jnp.diff(grid, prepend=jnp.zeros((), grid.dtype))
-        decay, covariance = jax.vmap(lambda t: _decay_and_covariance(params, t))(steps)
-        still = (steps <= 0)[:, None, None]  # two equal times: no noise between them
-        identity = jnp.eye(len(self._start), dtype=grid.dtype)
-        root = jax.vmap(any_cholesky)(jnp.where(still, identity, covariance))
-        root = jnp.where(still, 0, root)
-        noise = jax.random.normal(key, (len(steps), num_paths, len(self._start)), grid.dtype)
-
-        def step(x, inputs):  # x: deviations from the mean, (num_paths, d)
-            decay, root, noise = inputs
-            x = x @ decay.T + noise @ root.T
-            return x, x
-
-        start = jnp.broadcast_to(self._start - params.mean, (num_paths, len(self._start)))
-        _, path = lax.scan(step, start, (decay, root, noise))
-        miss = self._end - params.mean - path[-1]
-        correction = jnp.einsum("kij,nj->nki", self._gain, miss)
-        return params.mean + jnp.moveaxis(path[:-1], 0, 1) + correction
-
-
-def gaussian_bridge(
-    model: Diffusion,
-    start: Numbers,
-    end: Numbers,
-    duration: Numbers,
-    times: Numbers,
-) -> GaussianBridge:
-    """The exact law of the (start, end, duration)-bridge of an Ornstein–Uhlenbeck model: the
-    paper's lemma on the bridge, for any B.
-
-    **Arguments:**
-
-    - `model`: from `ornstein_uhlenbeck`. It need not be reversible.
-    - `start`, `end`: points, shape (d,).
-    - `duration`: in units of time, shape ().
-    - `times`: increasing, shape (K,), in [0, duration].
-
-    **Returns:** `GaussianBridge`.
-
-    **Raises:** `TypeError` for any other model, `ValueError` for arguments that do not fit.
-
-    **Example:**
-
-    ```python
-    exact = jb.gaussian_bridge(model, start, end, 1.0, times=[0.25, 0.5])
-    exact.mean[1], exact.covariance[1], exact.sample(key, num_paths=1000)
-    ```
-    """
-    params = _ou_params(model)
-    a, b, total = _one_interval(params, start, end, duration)
-    times = as_floating("times", times).astype(params.B.dtype)
-    if times.ndim != 1:
-        raise ValueError(f"`times` must have shape (K,); got {times.shape}.")
-    if not is_traced(times, total) and not (
-        np.all(np.diff(times, prepend=0, append=total) >= 0) and times.size
-    ):
-        raise ValueError(f"`times` must increase within [0, {total}]; got {times}.")
-    decay_T, covariance_T = _decay_and_covariance(params, total)
-    miss = b - params.mean - decay_T @ (a - params.mean)
-
-    def moments(t):
-        decay, covariance = _decay_and_covariance(params, t)
-        remaining, _ = _decay_and_covariance(params, total - t)
-        gain = any_solve(covariance_T, remaining @ covariance).T
-        mean = params.mean + decay @ (a - params.mean) + gain @ miss
-        return mean, covariance - gain @ remaining @ covariance, gain
-
-    mean, covariance, gain = jax.vmap(moments)(times)
-    return GaussianBridge(times, mean, covariance, model, a, b, total, gain)
 
 
 def _drift(x, p: _Prepared):
@@ -346,7 +191,7 @@ def _lyapunov(B: Float[Array, "d d"], V: Float[Array, "d d"]) -> Float[Array, "d
     return (solution + solution.T) / 2
 
 
-def _decay_and_covariance(
+def decay_and_covariance(
     params: OrnsteinUhlenbeckParams, t: Float[Array, ""]
 ) -> tuple[Float[Array, "d d"], Float[Array, "d d"]]:
     """e^{-tB} and Γ_t."""
@@ -354,7 +199,7 @@ def _decay_and_covariance(
     return moments.decay, moments.covariance
 
 
-def _one_interval(
+def single_interval(
     params: OrnsteinUhlenbeckParams, start: Numbers, end: Numbers, duration: Numbers
 ) -> tuple[Float[Array, " d"], Float[Array, " d"], Float[Array, ""]]:
     """The end points and the duration, checked and in the precision of the parameters."""
@@ -377,7 +222,7 @@ def _one_interval(
     )
 
 
-def _ou_params(model: Diffusion) -> OrnsteinUhlenbeckParams:
+def ou_params(model: Diffusion) -> OrnsteinUhlenbeckParams:
     params = getattr(model, "params", None)
     if not isinstance(params, OrnsteinUhlenbeckParams):
         raise TypeError(

@@ -10,7 +10,7 @@ all starts, met or not, is worse where few pairs meet.)
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -20,32 +20,23 @@ from jaxtyping import Array, Float, Key
 
 from ..coupling.bridges import sample_bridges
 from ..coupling.burn_in import measure_burn_in
-from ..coupling.coupling import Coupling
+from ..coupling.gamma import Coupling
 from ..coupling.start_laws import AnyStartLaw, Stationary, draw_starts, needs_burn_in
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.rejection import key_for, most_lanes
-from ..exact.density import check_for_density
 from ..exact.importance import weigh_bridges
 from ..models.diffusion import Diffusion, check_diffusion
-from ..models.gaussian import GaussianLaw
+from ..models.gaussian_law import GaussianLaw
 from ..models.intervals import Intervals, as_intervals
-from ..proposals.choice import (
-    Choice,
-    default_candidates,
-    run_pilots,
-    undecided_between,
-    why_left_out,
-)
-from ..proposals.coupled import CoupledPairs
 
 _SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+
+
 # Efficiencies this close are not told apart by a pilot run; of such laws the one closest to ν
 # is taken, whose weights are bounded more safely.
 _TOLERANCE = 1.1
-# Bridges of a pilot run that looks for the coupling to compare with other proposals.
-_TUNING_PILOT = 500
-# What a fitted start law may gain.
-_GAIN_OF_TUNING = 10.0
+
+
 # Pilot counts that take longer are cut off: the law is not a candidate then.
 _PILOT_TRIALS = 1_000
 
@@ -127,8 +118,8 @@ def fit_start_law(
     """
     coupling = Coupling() if coupling is None else coupling
     sizes = (num_steps, num_pilot, for_density)
-    pilots = _pilots(key, model, start, end, duration, coupling, *sizes)
-    return _best(pilots).coupling.start_law
+    pilots = coupling_pilots(key, model, start, end, duration, coupling, *sizes)
+    return best_pilot(pilots).coupling.start_law
 
 
 def tune_coupling(
@@ -170,127 +161,15 @@ def tune_coupling(
     if len(couplings) == 0:
         raise ValueError("`couplings` must have at least one candidate.")
     sizes = (num_steps, num_pilot, for_density)
-    runs = (_pilots(key, model, start, end, duration, coupling, *sizes) for coupling in couplings)
+    runs = (
+        coupling_pilots(key, model, start, end, duration, coupling, *sizes)
+        for coupling in couplings
+    )
     pilots = list(itertools.chain.from_iterable(runs))
-    return Tuning(_best(pilots).coupling, pilots)
+    return Tuning(best_pilot(pilots).coupling, pilots)
 
 
-def choose_proposal(
-    key: Key[Array, ""],
-    model: Diffusion,
-    start: Numbers,
-    end: Numbers,
-    duration: Numbers,
-    *,
-    num_steps: int = 50,
-    candidates: Sequence[Any] | None = None,
-    num_pilot: int | None = None,
-    for_density: bool = False,
-) -> Choice:
-    """The proposal with most effective samples per second for each interval, by a pilot run.
-
-    What `proposal="auto"` does in each call by a rule for the seconds, done once and by the
-    clock, compile time left out: for models whose functions take long, and to choose once and
-    use it often. Pass what it returns as `proposal=` for the same intervals. A choice made
-    outside `jit`; where two proposals are about as fast, either may be chosen.
-
-    **Arguments:**
-
-    - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`.
-    - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge`,
-        `Guided("end")` and `Guided("path")`, with `ItoTaylorDensity()` for constant σ, and so
-        with the same order of step error as couplings; where the time reversal of the model is
-        known `Coupling(0.0)` and `Coupling(0.5)`; and for a single interval for which one of them
-        comes near the best, one with its start law tuned.
-    - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
-        all intervals, at least 32 and at most 512.
-    - `for_density`: for `transition_log_density` and `pmmh`. Then couplings that start from the
-        stationary law are candidates only if the model is declared `normalised`; one with a fitted
-        law is tried where the others do badly on a single interval.
-
-    **Returns:** `Choice`; printed, it is a table.
-
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit; `TypeError` inside
-    `jit`.
-
-    **Example:**
-
-    ```python
-    candidates = [jb.Coupling(0.5), jb.Guided()]
-    choice = jb.choose_proposal(key, model, start, end, 1.0, candidates=candidates)
-    print(choice)
-    chain = jb.sample_exact_bridges(key, model, start, end, 1.0, proposal=choice)
-    ```
-    """
-    check_key(key)
-    check_diffusion(model)
-    intervals, batched, _ = as_intervals(start, end, duration)
-    if is_traced(key, model, intervals):
-        raise TypeError(
-            "a choice by the clock cannot be made inside `jit` or `vmap`: make it before, or use "
-            '`proposal="auto"`.'
-        )
-    num_steps = check_count("num_steps", num_steps)
-    if num_pilot is not None:
-        num_pilot = check_count("num_pilot", num_pilot, 2)
-    like = intervals.start[0]
-    left_out = ""
-    if candidates is None:
-        given = default_candidates(model, like, for_density)
-        left_out = why_left_out(model, for_density)
-    else:
-        given = list(candidates)
-
-    def choose_between(candidates, left_out=""):
-        undecided = undecided_between(candidates, model, like, num_pilot, left_out=left_out)
-        undecided.check(model, intervals)
-        if for_density:
-            check_for_density(undecided, model)
-        return run_pilots(key, model, undecided, intervals, num_steps, timed=True)
-
-    choice = choose_between(given, left_out)
-    possible = model.has_reversal and (model.has_density or not for_density)
-    if candidates is None and not batched and possible and _worth_tuning(choice):
-        arguments = (key, model, start, end, duration, num_steps, intervals, for_density)
-        tuned = _tuned_coupling(*arguments)
-        choice = choice if tuned is None else choose_between([*given, tuned])
-    return choice
-
-
-def _worth_tuning(choice: Choice) -> bool:
-    """Whether a coupling comes near the best proposal, so that a start law might put it first; or,
-    where none was tried, whether the best one at all might be put behind."""
-    assert choice.efficiency is not None and choice.seconds is not None
-    rates = np.asarray(choice.efficiency / choice.seconds)[:, 0]
-    coupled = [isinstance(candidate, CoupledPairs) for candidate in choice.candidates]
-    rates = np.where(np.isnan(rates), 0, rates)
-    if not any(coupled):
-        return bool(np.all(np.asarray(choice.efficiency)[:, 0] * _GAIN_OF_TUNING < 1))
-    return bool(np.max(rates, where=coupled, initial=0) * _GAIN_OF_TUNING > rates.max())
-
-
-def _tuned_coupling(
-    key: Key[Array, ""],
-    model: Diffusion,
-    start: Numbers,
-    end: Numbers,
-    duration: Numbers,
-    num_steps: int,
-    intervals: Intervals,
-    for_density: bool,
-) -> Coupling | None:
-    """The best of a few couplings, `None` where no pilot run succeeded."""
-    num_pilot = max(_TUNING_PILOT, 20 * intervals.start.shape[1])
-    pilots = []
-    for coupling in (Coupling(0.0), Coupling(0.5)):
-        sizes = (num_steps, num_pilot, for_density)
-        pilots += _pilots(key, model, start, end, duration, coupling, *sizes)
-    if all(np.isnan(pilot.efficiency) for pilot in pilots):
-        return None
-    return _best(pilots).coupling
-
-
-def _pilots(
+def coupling_pilots(
     key: Key[Array, ""],
     model: Diffusion,
     start: Numbers,
@@ -357,7 +236,7 @@ def _pilots(
     return pilots
 
 
-def _best(pilots: list[Pilot]) -> Pilot:
+def best_pilot(pilots: list[Pilot]) -> Pilot:
     if all(np.isnan(pilot.efficiency) for pilot in pilots):
         raise ValueError(
             "no pilot run succeeded: either the pair hardly ever meets here, or bridges are hardly "

@@ -1,0 +1,82 @@
+"""The rotation O(x, x') of a pair (section 2.1): it turns the noise of X so that σ(x')O points
+where σ(x) does.
+"""
+
+from jaxtyping import Array, Float
+
+from ..engine.linalg import matmul, matvec, polar_factor
+from ..models import decisions
+from ..models.sigma import AbstractSigma, Full
+from .base import AbstractCoupling
+
+
+def polar_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
+    """O(x, x'), the orthogonal matrix closest to σ(x')ᵀσ(x), so that σ(x')O ≈ σ(x).
+
+    `sigma` is σ(x), `driven_sigma` σ(x'), shape (d, d). The paper prints its transpose,
+    `published_rotation`.
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, rotation=jb.polar_rotation)
+    ```
+    """
+    return polar_factor(matmul(driven_sigma.T, sigma))
+
+
+def no_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
+    """O = I: as exact as any other rotation, but σ(x) and σ(x') may point elsewhere.
+
+    `sigma` is σ(x), `driven_sigma` σ(x'), shape (d, d).
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, rotation=jb.no_rotation)
+    ```
+    """
+    return None
+
+
+def published_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
+    """The orthogonal factor of σ(x)ᵀσ(x') as printed in the paper: the transpose of the
+    rotation that aligns the two, so it turns the wrong way. For comparisons.
+
+    `sigma` is σ(x), `driven_sigma` σ(x'), shape (d, d).
+
+    **Example:**
+
+    ```python
+    coupling = jb.Coupling(0.5, rotation=jb.published_rotation)
+    ```
+    """
+    return polar_factor(matmul(sigma.T, driven_sigma))
+
+
+def rotation_between(
+    coupling: AbstractCoupling, sigma: AbstractSigma, driven_sigma: AbstractSigma
+) -> Float[Array, "d d"] | None:
+    """O(x, x'), or `None` where σ calls for no rotation."""
+    if not rotation_effect(coupling, type(sigma), type(driven_sigma)).simulated:
+        return None
+    assert isinstance(sigma, Full) and isinstance(driven_sigma, Full)
+    rotation = polar_rotation if coupling.rotation is None else coupling.rotation
+    return rotation(sigma.matrix, driven_sigma.matrix)
+
+
+def rotation_effect(
+    coupling: AbstractCoupling, sigma: type[AbstractSigma], driven_sigma: type[AbstractSigma]
+) -> decisions.Effect:
+    """Whether the pair calls for a rotation."""
+    return decisions.rotation(sigma, driven_sigma, coupling.rotation is no_rotation)
+
+
+def rotate(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Float[Array, " d"]:
+    """O w."""
+    return dw if rotation is None else matvec(rotation, dw)
+
+
+def rotate_back(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Oᵀ w."""
+    return dw if rotation is None else matvec(rotation.T, dw)

@@ -1,0 +1,67 @@
+"""The normal law."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.linalg import any_cholesky, any_inverse, dot, matvec
+from .diffusion import Diffusion
+
+
+class GaussianLaw(eqx.Module):
+    """The normal distribution N(mean, covariance).
+
+    **Arguments:** `mean`, shape (d,); `covariance`, shape (d, d).
+
+    **Raises:** `ValueError` for shapes that do not fit, or a covariance that is visibly not
+    symmetric and positive definite.
+
+    **Example:**
+
+    ```python
+    law = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))
+    coupling = jb.Coupling(0.5, start_law=law)
+    ```
+    """
+
+    mean: Float[Array, " d"]
+    covariance: Float[Array, "d d"]
+
+    def __init__(self, mean: Numbers, covariance: Numbers):
+        mean, covariance = as_floating("mean", mean), as_floating("covariance", covariance)
+        dtype = jnp.promote_types(mean.dtype, covariance.dtype)
+        self.mean, self.covariance = mean.astype(dtype), covariance.astype(dtype)
+        if mean.ndim != 1 or covariance.shape != 2 * mean.shape:
+            raise ValueError(
+                "`mean` must have shape (d,) and `covariance` (d, d); got "
+                f"{mean.shape} and {covariance.shape}."
+            )
+        if is_traced(covariance):
+            return
+        matrix = np.asarray(covariance, float)
+        tolerance = 100 * np.finfo(dtype).eps * np.abs(matrix).max()
+        symmetric = np.abs(matrix - matrix.T).max() <= tolerance  # false for NaN
+        if not (symmetric and np.linalg.eigvalsh(matrix).min() >= -tolerance):
+            raise ValueError(
+                f"`covariance` must be symmetric and positive definite; got {covariance}."
+            )
+
+    def __iter__(self) -> Iterator[Array]:
+        """`mean, covariance = law`."""
+        yield from (self.mean, self.covariance)
+
+    def sample(self, key: Key[Array, ""], model: Diffusion | None = None) -> Float[Array, " d"]:
+        """One draw, shape (d,). The model is not looked at: start laws are called with one."""
+        noise = jax.random.normal(key, self.mean.shape, self.mean.dtype)
+        return self.mean + matvec(any_cholesky(self.covariance), noise)
+
+    def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
+        """The normalised log density at a point."""
+        root = any_cholesky(self.covariance)
+        white = matvec(any_inverse(root), (x - self.mean).astype(root.dtype))
+        return -dot(white, white) / 2 - jnp.sum(jnp.log(jnp.sqrt(2 * np.pi) * jnp.diag(root)))

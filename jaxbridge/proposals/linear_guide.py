@@ -1,0 +1,196 @@
+"""Guided proposals: pulled by the transition density of a linear process.
+
+The law q_i of a step (`guided`) follows from a guess h_{i+1}(x) of the density of b seen from x at t_{i+1}. Where log h is
+quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting the target's step by h gives
+
+    q_i = N(μ_i + δ L C Lᵀ r̃, δ L C Lᵀ),    C = S (I + δ Lᵀ H̃ L S)⁻¹,    L Lᵀ = V(x_i)
+
+(r̃ and H̃ as in Schauer, van der Meulen & van Zanten 2017; the discrete form as in Whitaker,
+Golightly, Boys & Sherlock 2017). With the true density in the place of h this is Doob's
+h-transform, and w is constant.
+
+A guess of a linear process has a Ṽ = L̃ L̃ᵀ of its own. Where V(x) is larger it pulls too hard,
+where V(x) is smaller not hard enough, and the weights have heavy tails. What V is on the way to b
+is nearer to the mean V̄ = L̄ L̄ᵀ of the two, to which the guess's deviations are scaled:
+
+    H̃ := L̄⁻ᵀ L̃ᵀ H L̃ L̄⁻¹,    r̃ := L̄⁻ᵀ [(L̄⁻¹ L̃)ᵀ L̃ᵀ ρ - L̃ᵀ H L̃ L̄⁻¹ (μ_i - b)],
+
+which where V(x) = Ṽ is the guess itself.
+"""
+
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.linalg import inverse, matmul, matvec
+from ..models.dynamics import Dynamics
+from ..models.sigma import AbstractSigma, root_of
+from ..schemes.step_density import AbstractStepDensity, StepLaw
+from .guided import AbstractGuidedProposal, check_refinement, check_step_density, deterministic_path
+
+# δ |F| of a step that has nothing in common with the diffusion: where long steps threw ξ far out.
+_FAR_OUT = 10.0
+
+
+class _GaussianGuess(NamedTuple):
+    """log h(x) = ρᵀ(x - b) - ½ (x - b)ᵀ H (x - b) + constant."""
+
+    shift: Float[Array, " d"]
+    precision: Float[Array, "d d"]
+
+
+class _NoiseGuess(NamedTuple):
+    """The same in the coordinates of the noise: L̃ᵀρ and L̃ᵀH L̃, and Ṽ = L̃ L̃ᵀ's root L̃, which where σ
+    is constant is that of every point."""
+
+    shift: Float[Array, "d *lanes"]
+    precision: Float[Array, "d d *lanes"]
+    root: Float[Array, "d d *lanes"] | None
+
+
+class Guided(AbstractGuidedProposal):
+    """Guided proposals (Schauer, van der Meulen & van Zanten 2017): h is the transition density
+    of a linear process
+
+        dX̃ = [α̃ + F (X̃ - b)] dt + σ̃ dW,
+
+    in steps as the target's, so that for an Ornstein–Uhlenbeck process all weights are equal.
+    Where σ varies its deviations are scaled to the mean of V(x) and Ṽ (not in that paper): else the
+    weights have heavy tails, and far fewer paths count than it seems.
+
+    **Arguments:**
+
+    - `linearisation`: "end", the drift linearised at b, F = ∇α(b), α̃ = α(b), σ̃ = σ(b); "path", all
+        of them linearised along the deterministic path dξ = α(ξ) dt from the start, bent so that
+        it ends in b, and straight where steps are so long that they throw it far out; or a matrix
+        F of shape (d, d), with α(b) and σ(b).
+    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
+        `ItoTaylorDensity()` is far closer to the diffusion.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
+        which pays where σ varies much on the way.
+
+    **Raises:** `ValueError` and `TypeError` for anything else.
+
+    **Example:**
+
+    ```python
+    proposal = jb.Guided()
+    chain = jb.sample_exact_bridges(key, model, start, end, 2.0, num_bridges=100, proposal=proposal)
+    ```
+    """
+
+    density: AbstractStepDensity
+    refinement: float = eqx.field(static=True)
+    _along: str = eqx.field(static=True)
+    _matrix: Float[Array, "d d"] | None
+
+    def __init__(
+        self,
+        linearisation: Literal["end", "path"] | Numbers = "end",
+        density: AbstractStepDensity | None = None,
+        refinement: float = 1.0,
+    ):
+        self.density = check_step_density(density)
+        self.refinement = check_refinement(refinement)
+        if isinstance(linearisation, str):
+            if linearisation not in ("end", "path"):
+                raise ValueError(
+                    f'`linearisation` must be "end", "path" or a matrix; got {linearisation!r}.'
+                )
+            self._along, self._matrix = linearisation, None
+            return
+        self._along, self._matrix = "end", as_floating("linearisation", linearisation)
+        if self._matrix.ndim != 2 or self._matrix.shape[0] != self._matrix.shape[1]:
+            raise ValueError(
+                f"`linearisation` must be a matrix, shape (d, d); got {self._matrix.shape}."
+            )
+        if not is_traced(self._matrix) and not np.all(np.isfinite(self._matrix)):
+            raise ValueError(f"`linearisation` must be finite; got {self._matrix}.")
+
+    @property
+    def linearisation(self) -> str:
+        """What the drift is linearised along, in a word."""
+        return f'"{self._along}"' if self._matrix is None else "matrix"
+
+    def guide(self, dynamics, start, end, dt):
+        d = end.shape[0]
+        if self._matrix is not None and self._matrix.shape != (d, d):
+            raise ValueError(
+                f"the matrix of `Guided` must have shape ({d}, {d}) for points in {d} dimensions; "
+                f"got {self._matrix.shape}."
+            )
+        points = end[None]
+        if self._along == "path":
+            xi, xi_end = deterministic_path(self.density, dynamics, start, dt)
+            done = jnp.concatenate([jnp.zeros_like(dt[:1]), jnp.cumsum(dt)[:-1]]) / jnp.sum(dt)
+            points = xi + done[:, None] * (end - xi_end)
+            straight = start + done[:, None] * (end - start)
+            rates = jax.vmap(jax.jacfwd(dynamics.drift))(lax.stop_gradient(points))
+            near = dt * jnp.max(jnp.abs(rates), axis=(1, 2)) < _FAR_OUT
+            points = jnp.where(near[:, None], points, straight)
+        coefficients = jax.vmap(lambda x: self._linear(dynamics, x, end))(points)
+
+        def back(guess: _GaussianGuess, inputs) -> tuple[_GaussianGuess, _GaussianGuess]:
+            """h_i from h_{i+1}, by one step of the linear process."""
+            (F, drift, V), dt = inputs
+            shift, H = guess
+            step = self.density.linear_step(F, V, dt)
+            gain = inverse(jnp.eye(d, dtype=end.dtype) + matmul(H, step.covariance))
+            shift = shift - matvec(H, matvec(step.integral, drift))
+            shift = matvec(step.decay.T, matvec(gain, shift))
+            H = matmul(step.decay.T, matmul(matmul(gain, H), step.decay))
+            return _GaussianGuess(shift, (H + H.T) / 2), guess
+
+        F, drift, V = jax.tree.map(lambda leaf: leaf[-1], coefficients)
+        step = self.density.linear_step(F, V, dt[-1])
+        pull = matmul(step.decay.T, inverse(step.covariance))  # from t_{N-1} to b itself
+        last = _GaussianGuess(-matvec(pull, matvec(step.integral, drift)), matmul(pull, step.decay))
+        num_steps = dt.shape[0]
+        each = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (num_steps, *leaf.shape[1:]))[:-1], coefficients
+        )
+        _, (shift, H) = lax.scan(back, last, (each, dt[:-1]), reverse=True)
+        roots = jax.vmap(lambda x: dynamics.sigma(x).root().as_matrix(d, x.dtype))(points)
+        roots = jnp.broadcast_to(roots, (num_steps, d, d))[:-1]
+        pull_back = jnp.swapaxes(roots, 1, 2)
+        shift = jax.vmap(matvec)(pull_back, shift)
+        H = jax.vmap(matmul)(jax.vmap(matmul)(pull_back, H), roots)
+        return _NoiseGuess(shift, H, roots if dynamics.sigma_varies else None)
+
+    def step_law(self, step, x, target):
+        shift, H, L_guess = step.guide
+        L, S, gap = target.sigma.root(), target.matrix, target.mean - step.end
+        if L_guess is None:
+            K, r = H, shift - matvec(H, L.solve(gap))  # Lᵀ H̃ L and Lᵀ r̃
+        else:
+            here = L.as_matrix(len(x), x.dtype)
+            scale = root_of((matmul(here, here.T) + matmul(L_guess, L_guess.T)) / 2)  # L̄
+            from_guess, from_here = (
+                jnp.stack([scale.solve(root[:, j]) for j in range(len(x))], axis=1)
+                for root in (L_guess, here)
+            )
+            K = matmul(from_here.T, matmul(H, from_here))
+            r = matvec(from_guess.T, shift) - matvec(H, scale.solve(gap))
+            r = matvec(from_here.T, r)
+        C = matmul(S, inverse(jnp.eye(len(x), dtype=x.dtype) + step.dt * matmul(K, S)))
+        mean = target.mean + step.dt * L.mv(matvec(C, r))
+        return StepLaw(mean, L, (C + C.T) / 2, step.dt)
+
+    def _linear(self, dynamics: Dynamics, x: Float[Array, " d"], end: Float[Array, " d"]):
+        """F, the linear drift at b, and Ṽ, when the diffusion is linearised at x."""
+        F = jax.jacfwd(dynamics.drift)(x) if self._matrix is None else self._matrix.astype(x.dtype)
+        sigma = dynamics.sigma(x)
+        V = _congruence_of_root(sigma, x)
+        return F, dynamics.drift(x) + matvec(F, end - x), V
+
+
+def _congruence_of_root(sigma: AbstractSigma, x: Float[Array, " d"]) -> Float[Array, "d d"]:
+    """V = σ σᵀ."""
+    matrix = sigma.as_matrix(x.shape[0], x.dtype)
+    return matmul(matrix, matrix.T)
