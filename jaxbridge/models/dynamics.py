@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax.extend
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
