@@ -1,7 +1,8 @@
 """Guided proposals: pulled by the transition density of a linear process.
 
 The law q_i of a step (`guided`) follows from a guess h_{i+1}(x) of the density of b seen from x at
-t_{i+1}. Where log h is quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting the target's step by h gives
+t_{i+1}. Where log h is quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting the target's step
+by h gives
 
     q_i = N(μ_i + δ L C Lᵀ r̃, δ L C Lᵀ),    C = S (I + δ Lᵀ H̃ L S)⁻¹,    L Lᵀ = V(x_i)
 
