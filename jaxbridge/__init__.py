@@ -124,7 +124,7 @@ from .schemes.step_density import (
 )
 from .tuning.choose_proposal import choose_proposal
 from .tuning.hitting_variation import HittingVariation, hitting_variation
-from .tuning.pilots import Pilot, Tuning, fit_start_law, tune_coupling
+from .tuning.start_law import Pilot, Tuning, fit_start_law, tune_coupling
 from .tuning.work_precision import (
     Setting,
     WorkPrecision,

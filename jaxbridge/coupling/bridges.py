@@ -11,15 +11,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_bound, check_count, check_key
 from ..engine.devices import over_devices
 from ..engine.rejection import Found, Trials, default_num_lanes, numbered_keys, search
 from ..engine.throwing import throw_where_incomplete
-from ..models.diffusion import Diffusion, check_diffusion
-from ..models.grid import grid_times, stored_steps, uniform_fractions
-from ..models.intervals import Intervals, as_intervals
+from ..models.bridge_problem import (
+    BridgeProblem,
+    Intervals,
+    bridge_problem,
+    uniform_fractions,
+)
+from ..models.diffusion import Diffusion
 from ..schemes.fit import check_model
 from .base import AbstractCoupling, check_coupling
 from .gamma import Coupling
@@ -118,34 +122,19 @@ def sample_bridges(
     coupling = Coupling() if coupling is None else coupling
     check_coupling(coupling)
     check_key(key)
-    check_diffusion(model)
+    problem = bridge_problem(model, start, end, duration, num_steps)
     num_bridges = check_count("num_bridges", num_bridges)
-    num_steps = check_count("num_steps", num_steps)
-    intervals, batched, several_durations = as_intervals(start, end, duration)
-    check_model(model, intervals, coupling.scheme)
+    check_model(model, problem.intervals, coupling.scheme)
     model.check_reversal()
-    fractions = uniform_fractions(num_steps)
-    stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
+    problem = problem.keep(save_at, duration, uniform_fractions(num_steps))
     max_proposals = check_bound("max_proposals", max_proposals, max(1_000 * num_bridges, 100_000))
     if batch_size is None:
-        num_wanted = num_bridges * intervals.start.shape[0]
-        batch_size = default_num_lanes(num_wanted, num_steps, intervals.start)
+        num_wanted = num_bridges * problem.num_intervals
+        batch_size = default_num_lanes(num_wanted, num_steps, problem.intervals.start)
     batch_size = check_count("batch_size", batch_size)
     progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    bridges = _sample_bridges(
-        key,
-        model,
-        coupling,
-        intervals,
-        max_proposals,
-        stored,
-        num_bridges,
-        num_steps,
-        batch_size,
-        progress_meter,
-        batched,
-        several_durations,
-    )
+    sizes = (num_bridges, batch_size)
+    bridges = _sample_bridges(key, model, coupling, problem, max_proposals, *sizes, progress_meter)
     return throw_where_incomplete(bridges, "paths", model, ~bridges.met) if throw else bridges
 
 
@@ -162,19 +151,15 @@ def _sample_bridges(
     key: Key[Array, ""],
     model: Diffusion,
     coupling: AbstractCoupling,
-    intervals: Intervals,
+    problem: BridgeProblem,
     max_proposals: Int[Array, ""],
-    stored: Int[Array, " K"] | None,
     num_bridges: int,
-    num_steps: int,
     num_lanes: int,
     progress_meter: diffrax.AbstractProgressMeter,
-    batched: bool,
-    several_durations: bool,
 ) -> Bridges:
-    num_intervals = intervals.start.shape[0]
-    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_intervals))
-    inputs = Inputs(model.prepared(), coupling, intervals)
+    num_intervals, num_steps, stored = problem.num_intervals, problem.num_steps, problem.stored
+    keys = problem.keys(key, 1)[:, 0]
+    inputs = Inputs(model.prepared(), coupling, problem.intervals)
     fixed = jax.tree.map(
         lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs
     )
@@ -196,14 +181,18 @@ def _sample_bridges(
     accepted = (keys, interval, jnp.maximum(found.number, 0), stored, rho)
     paths = _with_replayed_tangents(inputs, accepted, paths, num_steps)
     paths = jnp.where(met[:, None, None], paths, jnp.nan)
+
+    def of_rows(rows):
+        return problem.result(rows.reshape(num_intervals, num_bridges, *rows.shape[1:]))
+
     return Bridges(
-        grid_times(intervals, stored, uniform_fractions(num_steps), several_durations),
-        unflatten_rows(paths, num_intervals, batched),
-        unflatten_rows(met, num_intervals, batched),
-        unflatten_rows(jnp.where(met, rho, -1), num_intervals, batched),
-        unflatten_rows(reverse_start, num_intervals, batched),
-        found.num_trials if batched else found.num_trials[0],
-        found.num_nonfinite if batched else found.num_nonfinite[0],
+        problem.times(uniform_fractions(num_steps)),
+        of_rows(paths),
+        of_rows(met),
+        of_rows(jnp.where(met, rho, -1)),
+        of_rows(reverse_start),
+        problem.result(found.num_trials),
+        problem.result(found.num_nonfinite),
         coupling,
         num_steps,
     )
@@ -253,11 +242,6 @@ def _trial(
     made = _propose_numbered(inputs, keys, problem, number, num_steps, stored)
     joined = Joined(jnp.moveaxis(made.paths, -1, 0), made.reverse_start.T, made.meeting_step)
     return Trials(made.meeting_step <= num_steps, made.finite, joined)
-
-
-def unflatten_rows(rows: Shaped[Array, "rows ..."], num_intervals: int, batched: bool) -> Array:
-    """Rows (I × n, ...) as (I, n, ...), or as (n, ...) for the only interval."""
-    return rows.reshape(num_intervals, -1, *rows.shape[1:]) if batched else rows
 
 
 def _propose_numbered(

@@ -29,8 +29,8 @@ from ..engine.lanes import over_lanes
 from ..engine.linalg import all_finite, is_finite
 from ..engine.noise import noisy_scan
 from ..engine.rejection import key_for
+from ..models.bridge_problem import as_intervals
 from ..models.diffusion import Diffusion, check_diffusion
-from ..models.intervals import as_intervals
 from ..schemes.base import fitted_in_lanes
 from ..schemes.fit import check_model
 from .base import AbstractCoupling, see

@@ -8,6 +8,7 @@
 Each comes as a kernel of two functions, `init` and `step`, too.
 """
 
+import functools
 from typing import Any, Literal
 
 import diffrax
@@ -16,16 +17,17 @@ from jaxtyping import Array, Key
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.pareto import is_reliable
 from ..engine.throwing import throw_where_incomplete
-from ..models.diffusion import Diffusion, check_diffusion
-from ..models.grid import stored_steps
-from ..models.intervals import as_intervals
-from ..proposals.choice import as_proposal, settled, uses_couplings
+from ..models.bridge_problem import bridge_problem
+from ..models.diffusion import Diffusion
+from ..proposals.auto import Budget, as_proposal, resolve
+from ..proposals.coupled import as_pairs
+from ..proposals.guided import as_guided
 from ..proposals.linear_guide import Guided
 from ..schemes.step_error import is_gross
-from .crank_nicolson import as_guided, check_step_size, run_crank_nicolson
+from .crank_nicolson import check_step_size, run_crank_nicolson
 from .kernels import Chain
 from .pseudo_marginal import run_pseudo_marginal
-from .renewal import as_pairs, run_renewal
+from .renewal import run_renewal
 
 
 def sample_exact_bridges(
@@ -92,39 +94,34 @@ def sample_exact_bridges(
     ```
     """
     check_key(key)
-    check_diffusion(model)
+    problem = bridge_problem(model, start, end, duration, num_steps)
     num_bridges = check_count("num_bridges", num_bridges)
-    num_steps = check_count("num_steps", num_steps)
-    intervals, batched, several_durations = as_intervals(start, end, duration)
     if proposal is None and method == "crank_nicolson":
         proposal = Guided()
-    like = intervals.start[0]
-    proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
-    proposal.check(model, intervals)
+    budget = Budget(num_counts, max_proposals, max_trials)
+    proposal = as_proposal(proposal, model, problem.like, budget)
+    proposal.check(model, problem.intervals)
     if step_size is not None and method != "crank_nicolson":
         raise ValueError('`step_size` is for method="crank_nicolson".')
     if method == "crank_nicolson":
         proposal = as_guided(proposal)
+        run = functools.partial(run_crank_nicolson, beta=check_step_size(step_size))
     elif method == "renewal":
-        proposal = as_pairs(proposal)
+        proposal, run = as_pairs(proposal), run_renewal
         if not (num_counts is None and max_trials is None):
             raise ValueError(
                 "`num_counts` and `max_trials` are for the pseudo-marginal chain: the renewal "
                 "chain counts nothing."
             )
-    elif method != "pseudo_marginal":
+    elif method == "pseudo_marginal":
+        run = run_pseudo_marginal
+    else:
         raise ValueError(
             f'`method` must be "pseudo_marginal", "renewal" or "crank_nicolson"; got {method!r}.'
         )
-    fractions = proposal.fractions(num_steps)
-    stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
-    proposal = settled(proposal, key, model, intervals, num_steps)
-    arguments = (key, model, proposal, intervals, stored, num_bridges, num_steps, batched)
-    arguments = (*arguments, several_durations, progress_meter)
-    if method == "crank_nicolson":
-        chain = run_crank_nicolson(*arguments, check_step_size(step_size))
-    else:
-        chain = (run_renewal if method == "renewal" else run_pseudo_marginal)(*arguments)
+    proposal = resolve(proposal, key, model, problem.intervals, num_steps)
+    problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
+    chain = run(key, model, proposal, problem, num_bridges, progress_meter)
     if not throw:
         return chain
     # The renewal chain keeps no weights that could be cut off, but its trials may start wrongly.
@@ -135,7 +132,7 @@ def sample_exact_bridges(
         model,
         ~chain.met,
         truncated,
-        coupled=uses_couplings(proposal),
+        coupled=chain.proposal.coupled,
         heavy=None if chain.pareto_k is None else ~is_reliable(chain.pareto_k),
         gross=is_gross(chain.step_error_in_sds()),
     )

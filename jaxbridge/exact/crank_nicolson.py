@@ -19,32 +19,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from ..engine.checks import (
     Numbers,
     as_floating,
-    check_count,
     check_key,
     is_traced,
     nondifferentiable,
 )
-from ..models.diffusion import Diffusion, check_diffusion
-from ..models.grid import grid_times
-from ..models.intervals import Intervals
-from ..proposals.base import AbstractWeightedProposal
-from ..proposals.choice import as_proposal
-from ..proposals.guided import AbstractGuidedProposal, noise_of, path_of
+from ..models.bridge_problem import BridgeProblem, Intervals
+from ..models.diffusion import Diffusion
+from ..proposals.auto import as_proposal
+from ..proposals.guided import AbstractGuidedProposal, as_guided, noise_of, path_of
 from ..proposals.linear_guide import Guided
-from .kernels import (
-    Chain,
-    Kernel,
-    acceptance_rate,
-    chain_keys,
-    check_path,
-    one_interval,
-    sum_by_interval,
-)
+from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_path, one_interval
 
 
 class CrankNicolsonState(NamedTuple):
@@ -95,19 +84,17 @@ def crank_nicolson(
     state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
     ```
     """
-    check_diffusion(model)
-    intervals = one_interval(start, end, duration)
+    problem = one_interval(model, start, end, duration, num_steps)
     proposal = Guided() if proposal is None else proposal
-    proposal = as_guided(as_proposal(proposal, model, intervals.start[0]))
-    num_steps = check_count("num_steps", num_steps)
-    proposal.check(model, intervals)
+    proposal = as_guided(as_proposal(proposal, model, problem.like))
+    proposal.check(model, problem.intervals)
     beta = check_step_size(step_size)
-    setting = (model, proposal, intervals)
+    setting = (model, proposal, problem.intervals)
 
     def init(position, rng_key):
         check_key(rng_key)
         if position is not None:
-            position = check_path(position, intervals, num_steps)[None]
+            position = check_path(position, problem)[None]
         state = _init(rng_key[None], position, *setting, num_steps)
         return jax.tree.map(lambda leaf: leaf[0], state)
 
@@ -178,20 +165,16 @@ def run_crank_nicolson(
     key: Key[Array, ""],
     model: Diffusion,
     proposal: AbstractGuidedProposal,
-    intervals: Intervals,
-    stored: Int[Array, " K"] | None,
+    problem: BridgeProblem,
     num_bridges: int,
-    num_steps: int,
-    batched: bool,
-    several_durations: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
     beta: Float[Array, ""],
 ) -> Chain:
     """The chain of each interval, side by side."""
-    model, intervals = nondifferentiable((model.prepared(), intervals))
-    dynamics = model.forward(intervals.start[0])
-    num_intervals = intervals.start.shape[0]
-    step_keys, init_keys = chain_keys(key, num_intervals, num_bridges, batched)
+    model, problem = nondifferentiable((model.prepared(), problem))
+    intervals, num_steps = problem.intervals, problem.num_steps
+    dynamics = model.forward(problem.like)
+    step_keys, init_keys = chain_keys(key, problem, num_bridges)
     first = _init(init_keys, None, model, proposal, intervals, num_steps)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
 
@@ -200,39 +183,31 @@ def run_crank_nicolson(
         i, keys = inputs
         state, info = _move(keys, state, proposal, dynamics, intervals, beta)
         meter_state = meter.step(meter_state, (i + 1).astype(jnp.float32) / num_bridges)
-        met = state.log_weight > -jnp.inf
-        path = jnp.where(met[:, None, None], state.position, jnp.nan)
-        path = path if stored is None else path[:, stored]
-        lost = info.log_weight == -jnp.inf
-        made = (path, info.is_accepted, state.log_weight, met, state.log_halving, lost)
-        return (state, meter_state), made
+        kept = state._replace(position=problem.kept(state.position), noise=None)
+        return (state, meter_state), (kept, info)
 
     (_, meter_state), made = lax.scan(
         step, (first, meter.init()), (jnp.arange(num_bridges), step_keys.T)
     )
     meter.close(meter_state)
-    made = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), made)
-    *_, lost = made
-    lost = jnp.concatenate([(first.log_weight == -jnp.inf)[:, None], lost], axis=1)
-    path, accepted, log_weight, met, log_halving, _ = jax.tree.map(
-        lambda leaf: leaf if batched else leaf[0], made
-    )
-    ones = jnp.ones((num_intervals, num_bridges + 1), jnp.int32)
-    share = proposal.step_share(model, intervals)
+    states, info = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), made)
+    met = states.log_weight > -jnp.inf
+    tried = jnp.concatenate([first.log_weight[:, None], info.log_weight], axis=1)
+    paths = jnp.where(met[..., None, None], states.position, jnp.nan)
     return Chain(
-        times=grid_times(intervals, stored, proposal.fractions(num_steps), several_durations),
-        paths=path,
-        accepted=accepted,
-        log_weights=log_weight,
-        met=met,
-        truncated=jnp.zeros_like(met),
-        num_simulated=sum_by_interval(ones, num_intervals, batched),
-        num_nonfinite=sum_by_interval(lost.astype(jnp.int32), num_intervals, batched),
-        num_truncated=sum_by_interval(jnp.zeros_like(ones), num_intervals, batched),
+        times=problem.times(proposal.fractions(num_steps)),
+        paths=problem.result(paths),
+        accepted=problem.result(info.is_accepted),
+        log_weights=problem.result(states.log_weight),
+        met=problem.result(met),
+        truncated=problem.result(jnp.zeros_like(met)),
+        num_simulated=problem.total(jnp.ones_like(tried)),
+        num_nonfinite=problem.total(tried == -jnp.inf),
+        num_truncated=problem.total(jnp.zeros_like(tried)),
         proposal=proposal,
         pareto_k=None,
-        log_halving=log_halving,
-        step_share=share if batched else share[0],
+        log_halving=problem.result(states.log_halving),
+        step_share=problem.result(proposal.step_share(model, intervals)),
         num_steps=num_steps,
     )
 
@@ -247,16 +222,6 @@ def _normal(
 
 def _finite(log_weights: Float[Array, " I"]) -> Float[Array, " I"]:
     return jnp.where(jnp.isfinite(log_weights), log_weights, -jnp.inf)
-
-
-def as_guided(proposal: AbstractWeightedProposal) -> AbstractGuidedProposal:
-    """The proposal itself, if it makes paths from normal noise."""
-    if not isinstance(proposal, AbstractGuidedProposal):
-        raise TypeError(
-            "Crank–Nicolson moves are for proposals that make paths from normal noise: "
-            "`ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()`."
-        )
-    return proposal
 
 
 def check_step_size(step_size: Numbers | None) -> Float[Array, ""]:

@@ -9,23 +9,19 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..coupling.start_laws import Reversed, Stationary
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.pareto import is_reliable, pareto_k
 from ..engine.throwing import throw_where_incomplete
-from ..models.diffusion import Diffusion, check_diffusion
-from ..models.intervals import Intervals, as_intervals
-from ..proposals.base import AbstractWeightedProposal
-from ..proposals.choice import as_proposal, settled, singles, uses_couplings
-from ..proposals.coupled import CoupledPairs
+from ..models.bridge_problem import BridgeProblem, bridge_problem
+from ..models.diffusion import Diffusion
+from ..proposals.auto import Budget, as_proposal, resolve
+from ..proposals.base import AbstractProposal, AbstractWeightedProposal
 from ..schemes.step_error import StepError, dominates, is_gross, of_log_mean
-from .kernels import sum_by_interval
 
 
 class TransitionLogDensity(eqx.Module):
@@ -128,17 +124,14 @@ def transition_log_density(
     ```
     """
     check_key(key)
-    check_diffusion(model)
+    problem = bridge_problem(model, start, end, duration, num_steps)
     num_proposals = check_count("num_proposals", num_proposals)
-    num_steps = check_count("num_steps", num_steps)
-    intervals, batched, _ = as_intervals(start, end, duration)
-    like = intervals.start[0]
-    proposal = as_proposal(proposal, model, like, num_counts, None, max_trials, for_density=True)
-    proposal.check(model, intervals)
-    check_for_density(proposal, model)
-    proposal = settled(proposal, key, model, intervals, num_steps)
-    size = (num_proposals, num_steps, batched, progress_meter)
-    estimate = estimate_log_density(key, model, proposal, intervals, *size)
+    budget = Budget(num_counts, None, max_trials)
+    proposal = as_proposal(proposal, model, problem.like, budget, for_density=True)
+    proposal.check(model, problem.intervals)
+    proposal.check_for_density(model)
+    proposal = resolve(proposal, key, model, problem.intervals, num_steps)
+    estimate = estimate_log_density(key, model, proposal, problem, num_proposals, progress_meter)
     if not throw:
         return estimate
     error = StepError(estimate.step_error, estimate.step_uncertainty)
@@ -148,92 +141,77 @@ def transition_log_density(
         model,
         estimate.num_met == 0,
         estimate.num_truncated > 0,
-        coupled=uses_couplings(proposal),
+        coupled=estimate.proposal.coupled,
         heavy=~is_reliable(estimate.pareto_k, estimate.effective_sample_size),
         gross=estimate.step_error_dominates & is_gross(error),
     )
-
-
-def check_for_density(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
-    """Raise `ValueError` where the size of the weights of a proposal that may be used rests on
-    what is not known.
-
-    A coupling's weights have the factor ν(b)/ν(x_0) · μ(x_0), in which the constant of ν cancels if
-    μ has a density of its own. From ν itself, and from the law that the paper prints, whose
-    weights are taken to be those of ν, the factor is ν(b): in proportion to `log_stationary`.
-    """
-    pairs = [single for single in singles(proposal) if isinstance(single, CoupledPairs)]
-    if pairs and not model.has_density:
-        raise ValueError(
-            "with couplings the transition density needs the stationary one: give `Diffusion` a "
-            "`log_stationary`, normalised if the start law is `Stationary()`; or choose a "
-            "proposal that does not need it, such as `ModifiedDiffusionBridge()` or `Guided()`."
-        )
-    stationary = [isinstance(pair.coupling.start_law, Stationary | Reversed) for pair in pairs]
-    if any(stationary) and not model.normalised:
-        raise ValueError(
-            "a coupling from the stationary law gives densities in proportion to "
-            "`log_stationary`, which is not declared to be normalised, so that they may be wrong "
-            "by any factor: if it is normalised, for all parameters, say so by `Diffusion(..., "
-            "normalised=True)`; otherwise give the coupling a start law with a density, "
-            "`Coupling(..., start_law=fit_start_law(..., for_density=True))`, or choose "
-            '`proposal="auto"` or one that is pulled to the end point, such as '
-            "`ModifiedDiffusionBridge()` or `Guided()`."
-        )
 
 
 @eqx.filter_jit
 def estimate_log_density(
     key: Key[Array, ""],
     model: Diffusion,
-    proposal: AbstractWeightedProposal,
-    intervals: Intervals,
+    proposal: AbstractProposal,
+    problem: BridgeProblem,
     num_proposals: int,
-    num_steps: int,
-    batched: bool = True,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> TransitionLogDensity:
     """The estimates, for arguments that have been checked."""
-    model, num_intervals = model.prepared(), intervals.start.shape[0]
+    model, intervals, num_steps = model.prepared(), problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
-    fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
-    keys = fold_in(key, jnp.arange(num_intervals * num_proposals)).reshape(num_intervals, -1)
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
     drawn = proposal.draw(
-        keys, model, intervals, num_steps, nothing, True, progress_meter=progress_meter
+        problem.keys(key, num_proposals),
+        model,
+        intervals,
+        num_steps,
+        nothing,
+        True,
+        progress_meter=progress_meter,
     )
+    log_mean, error, size = log_mean_and_error(drawn.log_weights)
+    cut = jnp.any(drawn.truncated, axis=1)
+    share = proposal.step_share(model, intervals)
+    step_error = of_log_mean(drawn.log_weights, drawn.log_halving, share)
+    value, error, size, shape, step_error = problem.result(
+        (
+            log_mean,
+            jnp.where(cut, jnp.inf, error),
+            size,
+            pareto_k(drawn.log_weights),
+            lax.stop_gradient(step_error),
+        )
+    )
+    return TransitionLogDensity(
+        value,
+        error,
+        size,
+        problem.total(drawn.found),
+        problem.total(drawn.truncated),
+        problem.total(drawn.num_simulated),
+        problem.total(drawn.num_nonfinite),
+        proposal,
+        shape,
+        *step_error,
+    )
+
+
+def log_mean_and_error(
+    log_weights: Float[Array, "I n"],
+) -> tuple[Float[Array, " I"], Float[Array, " I"], Float[Array, " I"]]:
+    """The log of the mean of n weights, its standard error by the delta method, infinite where
+    nothing is known, and their effective number."""
+    n = log_weights.shape[1]
     # Relative to the largest, so that sums of squares keep their digits.
-    largest = lax.stop_gradient(jnp.max(drawn.log_weights, axis=1, keepdims=True))
+    largest = lax.stop_gradient(jnp.max(log_weights, axis=1, keepdims=True))
     largest = jnp.where(largest > -jnp.inf, largest, 0)
-    log_sum = logsumexp(drawn.log_weights - largest, axis=1)
-    log_squares = logsumexp(2 * (drawn.log_weights - largest), axis=1)
+    log_sum = logsumexp(log_weights - largest, axis=1)
+    log_squares = logsumexp(2 * (log_weights - largest), axis=1)
     some = log_sum > -jnp.inf
     inverse_size = jnp.where(some, jnp.exp(log_squares - 2 * log_sum), jnp.inf)
     # The variance of the mean, in squares of the mean: (Σw²/(Σw)² - 1/n) n/(n-1).
-    variance = jnp.maximum(inverse_size - 1 / num_proposals, 0)
-    variance *= num_proposals / max(num_proposals - 1, 1)
-    error = jnp.sqrt(variance) if num_proposals > 1 else jnp.full_like(variance, jnp.inf)
-    known = some & ~jnp.any(drawn.truncated, axis=1)
-
-    step_error = of_log_mean(
-        drawn.log_weights, drawn.log_halving, proposal.step_share(model, intervals)
-    )
-
-    def of_interval(leaf):
-        return leaf if batched else leaf[0]
-
-    def total(leaf):
-        return sum_by_interval(leaf, num_intervals, batched)
-
-    return TransitionLogDensity(
-        of_interval(log_sum + largest[:, 0] - math.log(num_proposals)),
-        of_interval(jnp.where(known, error, jnp.inf)),
-        of_interval(jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0)),
-        total(drawn.found),
-        total(drawn.truncated),
-        total(drawn.num_simulated),
-        total(drawn.num_nonfinite),
-        proposal,
-        of_interval(pareto_k(drawn.log_weights)),
-        *map(of_interval, lax.stop_gradient(step_error)),
-    )
+    variance = jnp.maximum(inverse_size - 1 / n, 0)
+    variance *= n / max(n - 1, 1)
+    error = jnp.sqrt(variance) if n > 1 else jnp.full_like(variance, jnp.inf)
+    size = jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0)
+    return log_sum + largest[:, 0] - math.log(n), jnp.where(some, error, jnp.inf), size

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ..coupling.base import AbstractCoupling
 from ..engine.averages import (
     PathFunction,
     filled,
@@ -15,6 +16,7 @@ from ..engine.averages import (
     values_of,
     weighted_mean,
 )
+from ..proposals.base import AbstractWeightedProposal
 from ..schemes.step_error import StepError, dominates, of_mean
 
 
@@ -26,12 +28,19 @@ class AbstractExactBridges(eqx.Module):
     - `log_halving`: log of the factor by which the weight of a path would change with half as many
         steps, NaN where none was worked out, shape (n,).
     - `step_share`: the step error as a share of what that changes, shape ().
+    - `proposal`: what they were made with.
     """
 
     paths: eqx.AbstractVar[Float[Array, "*I n K d"]]
     met: eqx.AbstractVar[Bool[Array, "*I n"]]
     log_halving: eqx.AbstractVar[Float[Array, "*I n"]]
     step_share: eqx.AbstractVar[Float[Array, "*I"]]
+    proposal: eqx.AbstractVar[AbstractWeightedProposal]
+
+    @property
+    def coupling(self) -> AbstractCoupling | None:
+        """That of the proposal, if it has one."""
+        return self.proposal.by_coupling
 
     @property
     @abstractmethod

@@ -20,8 +20,8 @@ from jaxtyping import PyTree
 
 from ..engine.averages import PathFunction, filled, values_of, weighted_mean
 from ..models.diffusion import Diffusion, check_diffusion
-from ..proposals.choice import singles
-from ..schemes.path_likelihood import forms_of_target, log_likelihood_of_steps
+from ..schemes.path_likelihood import forms_of_targets, log_likelihood_of_steps
+from .exact_bridges import AbstractExactBridges
 from .importance import WeightedBridges
 from .kernels import Chain
 
@@ -54,7 +54,7 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
     ```
     """
     check_diffusion(model)
-    if not isinstance(bridges, WeightedBridges | Chain):
+    if not isinstance(bridges, AbstractExactBridges):
         raise TypeError(
             "`bridges` must have the exact law: pass what `sample_weighted_bridges`, "
             f"`weigh_bridges` or `sample_exact_bridges` returned; got {type(bridges).__name__}."
@@ -66,15 +66,14 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
             "`save_at`."
         )
     paths = lax.stop_gradient(filled(bridges.paths, bridges.met))
-    log_weights = jnp.where(bridges.met, 0.0, -jnp.inf).astype(paths.dtype)
-    if isinstance(bridges, WeightedBridges):
-        log_weights = lax.stop_gradient(bridges.log_weights)
+    log_weights = lax.stop_gradient(bridges.log_mean_weights)
     # Of the grid, for differences of rounded times would not do where its steps are unequal.
     fractions = np.diff(bridges.proposal.fractions(bridges.num_steps))
     duration = lax.stop_gradient(bridges.times)[..., -1:]
     steps = jnp.asarray(fractions, duration.dtype) * duration
     like = paths.reshape(-1, paths.shape[-1])[0]
-    form = forms_of_target(singles(bridges.proposal), model, like)[0]
+    targets = [single.target for single in bridges.proposal.singles]
+    form = forms_of_targets(targets, model, like)[0]
     log_f = log_likelihood_of_steps(model, steps, paths, form)
     largest = jnp.max(log_weights, axis=-1, keepdims=True)
     ratios = jnp.exp(log_weights - largest + log_f - lax.stop_gradient(log_f))

@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Bridges
 from ..coupling.hitting import check_max_trials, counts_of, coupling_of, durations_of
 from ..coupling.start_laws import AnyStartLaw
@@ -30,12 +29,11 @@ from ..engine.checks import Numbers, check_count, check_key
 from ..engine.pareto import is_reliable, pareto_k
 from ..engine.rejection import key_for
 from ..engine.throwing import throw_where_incomplete
+from ..models.bridge_problem import BridgeProblem, Intervals, bridge_problem
 from ..models.diffusion import Diffusion, check_diffusion
-from ..models.grid import grid_times, stored_steps
-from ..models.intervals import Intervals, as_intervals
-from ..proposals.base import AbstractWeightedProposal
-from ..proposals.choice import as_proposal, settled, uses_couplings
-from ..proposals.coupled import CoupledPairs, check_density, pair_log_weights, usable
+from ..proposals.auto import Budget, as_proposal, resolve
+from ..proposals.base import AbstractProposal, AbstractWeightedProposal
+from ..proposals.coupled import check_density, pair_log_weights, usable
 from ..schemes.step_error import is_gross
 from .exact_bridges import AbstractExactBridges
 
@@ -69,11 +67,6 @@ class WeightedBridges(AbstractExactBridges):
     log_halving: Float[Array, "*I n"]
     step_share: Float[Array, "*I"]
     num_steps: int = eqx.field(static=True)
-
-    @property
-    def coupling(self) -> AbstractCoupling | None:
-        """That of the proposal, if it has one."""
-        return self.proposal.coupling if isinstance(self.proposal, CoupledPairs) else None
 
     @property
     def weights(self) -> Float[Array, "*I n"]:
@@ -193,21 +186,19 @@ def weigh_bridges(
     batch_size = None if batch_size is None else check_count("batch_size", batch_size)
     budget = (num_counts, bound, batch_size, progress_meter)
     like = bridges.reverse_start.reshape(-1, bridges.paths.shape[-1])[0]
-    pairs = as_proposal(coupling, model, like, num_counts, None, max_trials)
+    pairs = as_proposal(coupling, model, like, Budget(num_counts, None, max_trials))
     weighted = _weigh_bridges(key_for("weights", key), model, pairs, bridges, budget)
-    return _or_throw(weighted, model, pairs) if throw else weighted
+    return _or_throw(weighted, model) if throw else weighted
 
 
-def _or_throw(
-    weighted: WeightedBridges, model: Diffusion, proposal: AbstractWeightedProposal
-) -> WeightedBridges:
+def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
     return throw_where_incomplete(
         weighted,
         "log_weights",
         model,
         ~weighted.met,
         weighted.truncated,
-        coupled=uses_couplings(proposal),
+        coupled=weighted.proposal.coupled,
         heavy=~is_reliable(weighted.pareto_k, weighted.effective_sample_size),
         gross=is_gross(weighted.step_error_in_sds()),
     )
@@ -294,59 +285,48 @@ def sample_weighted_bridges(
     ```
     """
     check_key(key)
-    check_diffusion(model)
+    problem = bridge_problem(model, start, end, duration, num_steps)
     num_bridges = check_count("num_bridges", num_bridges)
-    num_steps = check_count("num_steps", num_steps)
-    intervals, batched, several_durations = as_intervals(start, end, duration)
-    like = intervals.start[0]
-    proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
-    proposal.check(model, intervals)
-    proposal = settled(proposal, key, model, intervals, num_steps)
-    fractions = proposal.fractions(num_steps)
-    stored = stored_steps(save_at, 1.0 if several_durations else duration, fractions)
-    sizes = (num_bridges, num_steps, batched, several_durations, progress_meter)
-    weighted = _sample_weighted(key, model, proposal, intervals, stored, *sizes)
-    return _or_throw(weighted, model, proposal) if throw else weighted
+    budget = Budget(num_counts, max_proposals, max_trials)
+    proposal = as_proposal(proposal, model, problem.like, budget)
+    proposal.check(model, problem.intervals)
+    proposal = resolve(proposal, key, model, problem.intervals, num_steps)
+    problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
+    weighted = _sample_weighted(key, model, proposal, problem, num_bridges, progress_meter)
+    return _or_throw(weighted, model) if throw else weighted
 
 
 @eqx.filter_jit
 def _sample_weighted(
     key: Key[Array, ""],
     model: Diffusion,
-    proposal: AbstractWeightedProposal,
-    intervals: Intervals,
-    stored: Int[Array, " K"] | None,
+    proposal: AbstractProposal,
+    problem: BridgeProblem,
     num_bridges: int,
-    num_steps: int,
-    batched: bool,
-    several_durations: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> WeightedBridges:
-    model, num_intervals = model.prepared(), intervals.start.shape[0]
+    model, intervals, num_steps = model.prepared(), problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
-    fold_in = jax.vmap(jax.random.fold_in, in_axes=(None, 0))
-    keys = fold_in(key, jnp.arange(num_intervals * num_bridges)).reshape(num_intervals, -1)
     drawn = proposal.draw(
-        keys, model, intervals, num_steps, stored, False, progress_meter=progress_meter
+        problem.keys(key, num_bridges),
+        model,
+        intervals,
+        num_steps,
+        problem.stored,
+        False,
+        progress_meter=progress_meter,
     )
-    drawn = drawn._replace(
-        num_simulated=jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32),
-        num_nonfinite=jnp.sum(drawn.num_nonfinite, axis=1, dtype=jnp.int32),
-    )
-    times = grid_times(intervals, stored, proposal.fractions(num_steps), several_durations)
-    share = proposal.step_share(model, intervals)
-    if not batched:
-        drawn = jax.tree.map(lambda leaf: leaf[0], drawn)
+    of_interval = problem.result(drawn)
     return WeightedBridges(
-        times=times,
-        paths=drawn.paths,
-        log_weights=drawn.log_weights,
-        met=drawn.found,
-        truncated=drawn.truncated,
-        num_simulated=drawn.num_simulated,
-        num_nonfinite=drawn.num_nonfinite,
+        times=problem.times(proposal.fractions(num_steps)),
+        paths=of_interval.paths,
+        log_weights=of_interval.log_weights,
+        met=of_interval.found,
+        truncated=of_interval.truncated,
+        num_simulated=problem.total(drawn.num_simulated),
+        num_nonfinite=problem.total(drawn.num_nonfinite),
         proposal=proposal,
-        log_halving=drawn.log_halving,
-        step_share=share if batched else share[0],
+        log_halving=of_interval.log_halving,
+        step_share=problem.result(proposal.step_share(model, intervals)),
         num_steps=num_steps,
     )

@@ -8,9 +8,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..coupling.base import AbstractCoupling
 from ..engine.averages import (
     PathFunction,
     expanded,
@@ -21,9 +20,9 @@ from ..engine.averages import (
 )
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.diagnostics import effective_sample_size
-from ..models.intervals import Intervals, as_intervals
+from ..models.bridge_problem import BridgeProblem, bridge_problem
+from ..models.diffusion import Diffusion
 from ..proposals.base import AbstractWeightedProposal
-from ..proposals.coupled import CoupledPairs
 from .exact_bridges import AbstractExactBridges
 
 
@@ -81,11 +80,6 @@ class Chain(AbstractExactBridges):
     num_steps: int = eqx.field(static=True)
 
     @property
-    def coupling(self) -> AbstractCoupling | None:
-        """That of the proposal, if it has one."""
-        return self.proposal.coupling if isinstance(self.proposal, CoupledPairs) else None
-
-    @property
     def acceptance_rate(self) -> Float[Array, "*I"]:
         """The share of steps that took a new path."""
         return jnp.mean(self.accepted, axis=-1)
@@ -122,29 +116,31 @@ def acceptance_rate(
 
 
 def chain_keys(
-    key: Key[Array, ""], num_intervals: int, num_bridges: int, batched: bool
+    key: Key[Array, ""], problem: BridgeProblem, num_bridges: int
 ) -> tuple[Key[Array, "I n"], Key[Array, " I"]]:
     """The keys of the steps and of the first state of each interval's chain."""
-    keys = key[None]
-    if batched:
-        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_intervals))
+    keys = problem.keys(key, 1)[:, 0] if problem.batched else key[None]
     run_keys, init_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
     return jax.vmap(lambda key: jax.random.split(key, num_bridges))(run_keys), init_keys
 
 
-def one_interval(start: Numbers, end: Numbers, duration: Numbers) -> Intervals:
-    intervals, batched, _ = as_intervals(start, end, duration)
-    if batched:
+def one_interval(
+    model: Diffusion, start: Numbers, end: Numbers, duration: Numbers, num_steps: int
+) -> BridgeProblem:
+    """The problem of a kernel."""
+    problem = bridge_problem(model, start, end, duration, num_steps)
+    if problem.batched:
         raise ValueError(
             "a kernel is for one interval: `start` and `end` of shape (d,), `duration` (); use "
             "`jax.vmap`, or `sample_exact_bridges`, for several."
         )
-    return intervals
+    return problem
 
 
-def check_path(position: Numbers, intervals: Intervals, num_steps: int) -> Array:
-    path = as_floating("position", position)
-    shape = (num_steps + 1, intervals.start.shape[1])
+def check_path(position: Numbers, problem: BridgeProblem) -> Array:
+    """A path of the problem."""
+    path, intervals = as_floating("position", position), problem.intervals
+    shape = (problem.num_steps + 1, intervals.start.shape[1])
     if path.shape != shape:
         raise ValueError(f"`position` must be a path, shape {shape}, or `None`; got {path.shape}.")
     if not is_traced(path, intervals):
@@ -154,11 +150,3 @@ def check_path(position: Numbers, intervals: Intervals, num_steps: int) -> Array
         ):
             raise ValueError(f"`position` must be a finite path from and to {ends}.")
     return path.astype(intervals.start.dtype)
-
-
-def sum_by_interval(
-    counts: Shaped[Array, "..."], num_intervals: int, batched: bool
-) -> Int[Array, "*I"]:
-    """The sums of counts of which each interval has as many, in order."""
-    sums = jnp.sum(counts.reshape(num_intervals, -1), axis=1, dtype=jnp.int32)
-    return sums if batched else sums[0]

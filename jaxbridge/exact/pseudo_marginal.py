@@ -14,22 +14,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
+from ..engine.checks import Numbers, check_key, nondifferentiable
 from ..engine.pareto import pareto_k
-from ..models.diffusion import Diffusion, check_diffusion
-from ..models.grid import grid_times
-from ..models.intervals import Intervals
-from ..proposals.base import AbstractWeightedProposal, WeightedPaths
-from ..proposals.choice import as_proposal
-from .kernels import (
-    Chain,
-    Kernel,
-    acceptance_rate,
-    chain_keys,
-    check_path,
-    one_interval,
-    sum_by_interval,
-)
+from ..models.bridge_problem import BridgeProblem
+from ..models.diffusion import Diffusion
+from ..proposals.auto import Budget, as_proposal
+from ..proposals.base import AbstractProposal, WeightedPaths
+from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_path, one_interval
 
 
 class PseudoMarginalState(NamedTuple):
@@ -81,20 +72,18 @@ def pseudo_marginal(
     state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
     ```
     """
-    check_diffusion(model)
-    intervals = one_interval(start, end, duration)
-    like = intervals.start[0]
-    proposal = as_proposal(proposal, model, like, num_counts, max_proposals, max_trials)
-    num_steps = check_count("num_steps", num_steps)
-    proposal.check(model, intervals)
+    problem = one_interval(model, start, end, duration, num_steps)
+    budget = Budget(num_counts, max_proposals, max_trials)
+    proposal = as_proposal(proposal, model, problem.like, budget)
+    proposal.check(model, problem.intervals)
     proposal.check_prepared(model)
-    setting = (model, proposal, intervals, num_steps)
+    setting = (model, proposal, problem.intervals, num_steps)
 
     def init(position, rng_key):
         check_key(rng_key)
         if position is None:
             return _draw_state(rng_key, *setting)[0]
-        path = check_path(position, intervals, num_steps)
+        path = check_path(position, problem)
         return _reweigh_state(rng_key, path, *setting)
 
     def step(rng_key, state):
@@ -135,61 +124,58 @@ def _pseudo_marginal_step(rng_key, state, *setting):
 def run_pseudo_marginal(
     key: Key[Array, ""],
     model: Diffusion,
-    proposal: AbstractWeightedProposal,
-    intervals: Intervals,
-    stored: Int[Array, " K"] | None,
+    proposal: AbstractProposal,
+    problem: BridgeProblem,
     num_bridges: int,
-    num_steps: int,
-    batched: bool,
-    several_durations: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Chain:
-    model, intervals = nondifferentiable((model.prepared(), intervals))
-    num_intervals = intervals.start.shape[0]
+    model, problem = nondifferentiable((model.prepared(), problem))
+    intervals, num_steps = problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
-    step_keys, init_keys = chain_keys(key, num_intervals, num_bridges, batched)
+    step_keys, init_keys = chain_keys(key, problem, num_bridges)
     draw_keys, accept_keys = jax.vmap(jax.random.split, out_axes=1)(step_keys.reshape(-1))
     # Row 0 of each interval is its first state, and row i the candidate of step i.
     draw_keys = jnp.concatenate([init_keys[:, None], draw_keys.reshape(step_keys.shape)], axis=1)
     drawn = proposal.draw(
-        draw_keys, model, intervals, num_steps, stored, False, progress_meter=progress_meter
+        draw_keys, model, intervals, num_steps, problem.stored, False, progress_meter=progress_meter
     )
     uniform = jax.vmap(lambda k: jax.random.uniform(k, dtype=intervals.start.dtype))(accept_keys)
+    row, accepted = accept_reject(drawn.log_weights, uniform.reshape(step_keys.shape))
+    interval = jnp.arange(problem.num_intervals)[:, None]
+    states = problem.result(jax.tree.map(lambda leaf: leaf[interval, row], drawn))
+    return Chain(
+        times=problem.times(proposal.fractions(num_steps)),
+        paths=states.paths,
+        accepted=problem.result(accepted),
+        log_weights=states.log_weights,
+        met=states.found,
+        truncated=states.truncated,
+        num_simulated=problem.total(drawn.num_simulated),
+        num_nonfinite=problem.total(drawn.num_nonfinite),
+        num_truncated=problem.total(drawn.truncated),
+        proposal=proposal,
+        pareto_k=problem.result(pareto_k(drawn.log_weights)),
+        log_halving=states.log_halving,
+        step_share=problem.result(proposal.step_share(model, intervals)),
+        num_steps=num_steps,
+    )
+
+
+def accept_reject(
+    log_weights: Float[Array, "I n+1"], uniform: Float[Array, "I n"]
+) -> tuple[Int[Array, "I n"], Bool[Array, "I n"]]:
+    """The chain on the weights alone: from the first of them n steps, each to the next one or not.
+    The number of the weight at which each step leaves the chain, and whether it moved."""
 
     def step(state, inputs):
         row, log_weight = state
         i, candidate, uniform = inputs
         accepted = uniform < acceptance_rate(log_weight, candidate)
         state = jnp.where(accepted, i, row), jnp.where(accepted, candidate, log_weight)
-        return state, (*state, accepted)
+        return state, (state[0], accepted)
 
-    init = (jnp.zeros(num_intervals, jnp.int32), drawn.log_weights[:, 0])
-    candidates = jnp.arange(1, num_bridges + 1, dtype=jnp.int32), drawn.log_weights[:, 1:].T
-    inputs = (*candidates, uniform.reshape(step_keys.shape).T)
-    _, (row, log_weights, accepted) = lax.scan(step, init, inputs)
-
-    def of_interval(leaf):
-        return leaf if batched else leaf[0]
-
-    def of_states(leaf):
-        return of_interval(leaf[jnp.arange(num_intervals)[:, None], row.T])
-
-    def total(leaf):
-        return sum_by_interval(leaf, num_intervals, batched)
-
-    return Chain(
-        times=grid_times(intervals, stored, proposal.fractions(num_steps), several_durations),
-        paths=of_states(drawn.paths),
-        accepted=of_interval(accepted.T),
-        log_weights=of_interval(log_weights.T),
-        met=of_states(drawn.found),
-        truncated=of_states(drawn.truncated),
-        num_simulated=total(drawn.num_simulated),
-        num_nonfinite=total(drawn.num_nonfinite),
-        num_truncated=total(drawn.truncated),
-        proposal=proposal,
-        pareto_k=of_interval(pareto_k(drawn.log_weights)),
-        log_halving=of_states(drawn.log_halving),
-        step_share=of_interval(proposal.step_share(model, intervals)),
-        num_steps=num_steps,
-    )
+    num_intervals, n = uniform.shape
+    init = (jnp.zeros(num_intervals, jnp.int32), log_weights[:, 0])
+    candidates = jnp.arange(1, n + 1, dtype=jnp.int32), log_weights[:, 1:].T
+    _, (row, accepted) = lax.scan(step, init, (*candidates, uniform.T))
+    return row.T, accepted.T

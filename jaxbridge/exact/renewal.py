@@ -22,15 +22,13 @@ from ..coupling.associated import run_associated
 from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Inputs, Joined, find_bridges
 from ..coupling.start_laws import log_ratio, run_is_cut
-from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
+from ..engine.checks import Numbers, check_key, nondifferentiable
 from ..engine.rejection import Found, default_num_lanes, most_lanes
-from ..models.diffusion import Diffusion, check_diffusion
-from ..models.grid import grid_times
-from ..models.intervals import Intervals
-from ..proposals.base import AbstractWeightedProposal
-from ..proposals.choice import as_proposal
-from ..proposals.coupled import CoupledPairs
-from .kernels import Chain, Kernel, chain_keys, check_path, one_interval, sum_by_interval
+from ..models.bridge_problem import BridgeProblem, Intervals
+from ..models.diffusion import Diffusion
+from ..proposals.auto import Budget, as_proposal
+from ..proposals.coupled import CoupledPairs, as_pairs
+from .kernels import Chain, Kernel, chain_keys, check_path, one_interval
 
 
 class RenewalState(NamedTuple):
@@ -76,21 +74,18 @@ def renewal(
     state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
     ```
     """
-    check_diffusion(model)
-    intervals = one_interval(start, end, duration)
-    if isinstance(proposal, AbstractWeightedProposal):
-        as_pairs(proposal)
-    pairs = as_pairs(as_proposal(proposal, model, intervals.start[0], 1, max_proposals))
-    num_steps = check_count("num_steps", num_steps)
-    pairs.check(model, intervals)
+    problem = one_interval(model, start, end, duration, num_steps)
+    budget = Budget(max_proposals=max_proposals)
+    pairs = as_pairs(as_proposal(proposal, model, problem.like, budget))
+    pairs.check(model, problem.intervals)
     pairs.check_prepared(model)
-    setting = (model, pairs, intervals)
+    setting = (model, pairs, problem.intervals)
 
     def init(position, rng_key):
         check_key(rng_key)
         if position is None:
             return RenewalState(first_paths(rng_key[None], *setting, num_steps)[0][0])
-        return RenewalState(check_path(position, intervals, num_steps))
+        return RenewalState(check_path(position, problem))
 
     def step(rng_key, state):
         return _renewal_step(rng_key, state, *setting)
@@ -127,17 +122,96 @@ class _Segments(NamedTuple):
     num_nonfinite: Int[Array, " S"]
 
 
+class _Runner(NamedTuple):
+    """What runs segments of the chains of a problem: all have one length, and as many are those of
+    one interval. `first` are the paths from which the chains start, and `keys` those of the steps
+    of each segment. The last steps of an interval's last segment may be too many: they repeat a
+    key, and are dropped."""
+
+    model: Diffusion
+    pairs: CoupledPairs
+    problem: BridgeProblem
+    first: Float[Array, "I points d"]
+    keys: Key[Array, "S L"]
+    intervals: Intervals
+
+    @property
+    def head(self) -> Bool[Array, " S"]:
+        """Which segments are the first of their interval."""
+        num_segments = len(self.keys) // self.problem.num_intervals
+        return jnp.arange(len(self.keys)) % num_segments == 0
+
+    def begin(self) -> _Segments:
+        """No steps, and for each segment a guess of where the one before it ends."""
+        num, length = self.keys.shape
+        points, d = self.first.shape[1:]
+        num_kept = points if self.problem.stored is None else len(self.problem.stored)
+        return _Segments(
+            jnp.zeros((length, num, num_kept, d), self.first.dtype),
+            jnp.zeros((length, num), bool),
+            jnp.repeat(self.first, num // self.problem.num_intervals, axis=0),
+            jnp.zeros(num, bool),
+            jnp.zeros(num, jnp.int32),
+            jnp.zeros(num, jnp.int32),
+        )
+
+    def run(
+        self, segments: _Segments, chosen: Int[Array, " W"], meter: diffrax.AbstractProgressMeter
+    ) -> _Segments:
+        """These segments, from where the ones before them end, until they rejoin what is recorded.
+        Numbers beyond the last only fill the width."""
+        num, length = self.keys.shape
+        place = jnp.minimum(chosen, num - 1)
+        intervals = jax.tree.map(lambda leaf: leaf[place], self.intervals)
+
+        def one_step(state):
+            i, positions, active, segments, meter_state = state
+            positions, info = renew(
+                self.keys[place, i], self.model, self.pairs, intervals, positions, active
+            )
+            rejoined = info.is_accepted & segments.moved[i, place]
+            row = jnp.where(active, chosen, num)
+            kept = self.problem.kept(positions)
+            segments = segments._replace(
+                paths=segments.paths.at[i, row].set(kept, mode="drop"),
+                moved=segments.moved.at[i, row].set(info.is_accepted, mode="drop"),
+                num_simulated=segments.num_simulated.at[row].add(info.num_simulated, mode="drop"),
+                num_nonfinite=segments.num_nonfinite.at[row].add(info.num_nonfinite, mode="drop"),
+            )
+            meter_state = meter.step(meter_state, (i + 1).astype(jnp.float32) / length)
+            return i + 1, positions, active & ~rejoined, segments, meter_state
+
+        entry = self._entries(segments)[place]
+        state = (jnp.int32(0), entry, chosen < num, segments, meter.init())
+        state = lax.while_loop(lambda s: (s[0] < length) & jnp.any(s[2]), one_step, state)
+        _, positions, changed, segments, meter_state = state
+        meter.close(meter_state)
+        ends = segments.ends.at[jnp.where(changed, chosen, num)].set(positions, mode="drop")
+        stale = segments.stale.at[chosen].set(False, mode="drop")
+        after = jnp.where(changed, chosen + 1, num)
+        stale = stale.at[after].set(True, mode="drop") & ~self.head
+        return segments._replace(ends=ends, stale=stale)
+
+    def repair(self, segments: _Segments) -> _Segments:
+        """Some of the stale segments, run again."""
+        num = len(self.keys)
+        chosen = jnp.nonzero(segments.stale, size=min(_REPAIR_WIDTH, num), fill_value=num)[0]
+        return self.run(segments, chosen, diffrax.NoProgressMeter())
+
+    def _entries(self, segments: _Segments) -> Float[Array, "S points d"]:
+        """Where each segment starts."""
+        before = jnp.maximum(jnp.arange(len(self.keys)) - 1, 0)
+        first = jnp.repeat(self.first, len(self.keys) // len(self.first), axis=0)
+        return jnp.where(self.head[:, None, None], first, segments.ends[before])
+
+
 @eqx.filter_jit
 def run_renewal(
     key: Key[Array, ""],
     model: Diffusion,
     pairs: CoupledPairs,
-    intervals: Intervals,
-    stored: Int[Array, " K"] | None,
+    problem: BridgeProblem,
     num_bridges: int,
-    num_steps: int,
-    batched: bool,
-    several_durations: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Chain:
     """Segments of the chain start from guesses, and are run again from where the segment before
@@ -145,110 +219,53 @@ def run_renewal(
     one, since a proposal depends on the key of its step only: from there on they are one, and
     the rest of the record holds. So a repair is short, and the result that of one long run.
     """
-    model, intervals = nondifferentiable((model.prepared(), intervals))
-    num_intervals = intervals.start.shape[0]
+    model, problem = nondifferentiable((model.prepared(), problem))
+    intervals, num_steps, num_intervals = (
+        problem.intervals,
+        problem.num_steps,
+        problem.num_intervals,
+    )
     pairs = pairs.prepared(key, model, intervals, num_steps)
-    step_keys, init_keys = chain_keys(key, num_intervals, num_bridges, batched)
+    step_keys, init_keys = chain_keys(key, problem, num_bridges)
     first, num_tried, num_failed = first_paths(init_keys, model, pairs, intervals, num_steps)
     most_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
     num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, most_segments))
     length = -(-num_bridges // num_segments)
-    # The last steps of the last segment may be too many: they repeat a key, and are dropped.
     steps = jnp.minimum(jnp.arange(num_segments * length), num_bridges - 1)
     keys = step_keys[:, steps].reshape(num_intervals * num_segments, length)
     each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_segments, axis=0), intervals)
-    num = num_intervals * num_segments
-    head = jnp.tile(jnp.arange(num_segments) == 0, num_intervals)
-    before = jnp.maximum(jnp.arange(num) - 1, 0)
-
-    def run_again(segments: _Segments, chosen: Int[Array, " W"], progress_meter) -> _Segments:
-        """Run these segments from where the ones before them end, until they rejoin."""
-        place = jnp.minimum(chosen, num - 1)  # those beyond the last only fill the width
-        chosen_keys, chosen_intervals = keys[place], jax.tree.map(lambda x: x[place], each)
-        entry = jnp.where(
-            head[place, None, None], first[place // num_segments], segments.ends[before[place]]
-        )
-
-        def one_step(state):
-            i, positions, active, segments, meter = state
-            positions, info = renew(
-                chosen_keys[:, i], model, pairs, chosen_intervals, positions, active
-            )
-            rejoined = info.is_accepted & segments.moved[i, place]
-            row = jnp.where(active, chosen, num)
-            kept = positions if stored is None else positions[:, stored]
-            segments = segments._replace(
-                paths=segments.paths.at[i, row].set(kept, mode="drop"),
-                moved=segments.moved.at[i, row].set(info.is_accepted, mode="drop"),
-                num_simulated=segments.num_simulated.at[row].add(info.num_simulated, mode="drop"),
-                num_nonfinite=segments.num_nonfinite.at[row].add(info.num_nonfinite, mode="drop"),
-            )
-            meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / length)
-            return i + 1, positions, active & ~rejoined, segments, meter
-
-        state = (jnp.int32(0), entry, chosen < num, segments, progress_meter.init())
-        state = lax.while_loop(lambda s: (s[0] < length) & jnp.any(s[2]), one_step, state)
-        _, positions, changed, segments, meter = state
-        progress_meter.close(meter)
-        ends = segments.ends.at[jnp.where(changed, chosen, num)].set(positions, mode="drop")
-        stale = segments.stale.at[chosen].set(False, mode="drop")
-        after = jnp.where(changed, chosen + 1, num)
-        stale = stale.at[after].set(True, mode="drop") & ~head
-        return segments._replace(ends=ends, stale=stale)
-
-    def repair(segments):
-        chosen = jnp.nonzero(segments.stale, size=min(_REPAIR_WIDTH, num), fill_value=num)[0]
-        return run_again(segments, chosen, diffrax.NoProgressMeter())
-
-    num_stored = num_steps + 1 if stored is None else stored.shape[0]
-    d, dtype = intervals.start.shape[1], intervals.start.dtype
-    segments = _Segments(
-        jnp.zeros((length, num, num_stored, d), dtype),
-        jnp.zeros((length, num), bool),
-        jnp.repeat(first, num_segments, axis=0),
-        jnp.zeros(num, bool),
-        jnp.zeros(num, jnp.int32),
-        jnp.zeros(num, jnp.int32),
-    )
+    runner = _Runner(model, pairs, problem, first, keys, each)
     progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    segments = run_again(segments, jnp.arange(num), progress_meter)
+    segments = runner.run(runner.begin(), jnp.arange(len(keys)), progress_meter)
     # The first stale segment starts from where the chain is, so each pass settles it at least.
-    segments = lax.while_loop(lambda s: jnp.any(s.stale), repair, segments)
+    segments = lax.while_loop(lambda s: jnp.any(s.stale), runner.repair, segments)
 
     def of_steps(leaf):
         leaf = jnp.moveaxis(leaf, 0, 1).reshape(num_intervals, -1, *leaf.shape[2:])
-        leaf = leaf[:, :num_bridges]
-        return leaf if batched else leaf[0]
+        return problem.result(leaf[:, :num_bridges])
 
     paths = of_steps(segments.paths)
     # D of the states in which segments end, all but the last, which may be too long.
-    log_halving = pairs.log_halving(model, each, segments.ends, 1)
-    last = jnp.arange(num_segments * length) % length == length - 1
-    last = (last & (jnp.arange(num_segments * length) < num_bridges)).reshape(num_segments, -1)
-    log_halving = jnp.where(last, log_halving.reshape(num_intervals, -1, 1), jnp.nan)
+    last = (steps == jnp.arange(len(steps))) & (jnp.arange(len(steps)) % length == length - 1)
+    ends = pairs.log_halving(model, each, segments.ends, 1).reshape(num_intervals, -1, 1)
+    log_halving = jnp.where(last.reshape(num_segments, -1), ends, jnp.nan)
     log_halving = log_halving.reshape(num_intervals, -1)[:, :num_bridges]
-    share = pairs.step_share(model, intervals)
-
-    def total(leaf):
-        return sum_by_interval(leaf, num_intervals, batched)
-
     # Nothing is counted, but no hit is what it should be if its trial did not start from μ.
     cut = run_is_cut(pairs.coupling.start_law, model, intervals.duration / num_steps, num_steps)
-
     return Chain(
-        times=grid_times(intervals, stored, pairs.fractions(num_steps), several_durations),
+        times=problem.times(pairs.fractions(num_steps)),
         paths=paths,
         accepted=of_steps(segments.moved),
         log_weights=None,
         met=jnp.all(jnp.isfinite(paths), axis=(-2, -1)),
         truncated=None,
-        num_simulated=total(segments.num_simulated) + total(num_tried),
-        num_nonfinite=total(segments.num_nonfinite) + total(num_failed),
-        num_truncated=total(jnp.where(cut, num_bridges, 0)),
+        num_simulated=problem.total(segments.num_simulated) + problem.total(num_tried),
+        num_nonfinite=problem.total(segments.num_nonfinite) + problem.total(num_failed),
+        num_truncated=problem.total(jnp.where(cut, num_bridges, 0)),
         proposal=pairs,
         pareto_k=None,
-        log_halving=log_halving if batched else log_halving[0],
-        step_share=share if batched else share[0],
+        log_halving=problem.result(log_halving),
+        step_share=problem.result(pairs.step_share(model, intervals)),
         num_steps=num_steps,
     )
 
@@ -321,14 +338,3 @@ def first_paths(
     joined: Joined = proposed.outputs
     paths = jnp.where((proposed.num_found > 0)[:, None, None], joined.paths, jnp.nan)
     return paths, proposed.num_trials, proposed.num_nonfinite
-
-
-def as_pairs(
-    proposal: AbstractWeightedProposal,
-    method: str = "renewal",
-    instead: str = 'method="pseudo_marginal"',
-) -> CoupledPairs:
-    """The proposal, which must be a coupling's for this method."""
-    if not isinstance(proposal, CoupledPairs):
-        raise TypeError(f"{method} is for couplings: pass a `Coupling`, or choose {instead}.")
-    return proposal

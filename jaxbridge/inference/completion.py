@@ -23,15 +23,16 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..coupling.start_laws import run_is_cut
 from ..engine.checks import is_traced
 from ..exact.kernels import acceptance_rate
-from ..exact.renewal import as_pairs, first_paths, propose_paths, renew
+from ..exact.renewal import first_paths, propose_paths, renew
+from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..models.intervals import Intervals
+from ..proposals.auto import Budget
 from ..proposals.base import AbstractWeightedProposal
-from ..proposals.coupled import CoupledPairs
+from ..proposals.coupled import CoupledPairs, as_pairs
 from ..proposals.modified_bridge import ModifiedDiffusionBridge
 from ..schemes.path_likelihood import Form, log_likelihoods
 from .observations import Group
-from .parts import Bounds, Part, log_halvings, make_parts, step_shares
+from .parts import Part, log_halvings, make_parts, step_shares
 
 # One array of shape (I, N+1, d) for each part.
 Paths = tuple[Float[Array, "_ _ d"], ...]
@@ -248,7 +249,7 @@ def complete(
     proposal: Any,
     bridges: Literal["exact", "approximate"],
     method: Literal["pseudo_marginal", "renewal"] | None,
-    bounds: Bounds,
+    bounds: Budget,
 ) -> Completion:
     """The completion that the user asked for; pilot runs and burn-ins are at the parameters of
     this model.
@@ -276,6 +277,6 @@ def _kernel(
 ) -> AbstractBridgeKernel:
     if bridges == "approximate":
         return Unweighted(as_pairs(proposal))
-    if method == "renewal" or (method is None and isinstance(proposal, CoupledPairs)):
+    if method == "renewal" or (method is None and proposal.by_coupling is not None):
         return ByRenewal(as_pairs(proposal))
     return ByWeights(proposal)

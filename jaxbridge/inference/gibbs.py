@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..models.diffusion import Diffusion
+from ..proposals.auto import Budget
 from ..schemes.path_likelihood import Form
 from .completion import Completion, Paths, complete
 from .parameter_steps import (
@@ -188,7 +189,7 @@ def gibbs(
     log_prior = as_log_prior(prior, unknowns, problem.theta)
     theta, state = starting_points(problem, init, num_chains, constraint, log_prior, GibbsState)
     complete_key, run_key = jax.random.split(key)
-    bounds = (num_counts, max_proposals, max_trials)
+    bounds = Budget(num_counts, max_proposals, max_trials)
     arguments = (problem.intervals, problem.groups, proposal, bridges, method, bounds)
     completion = complete(complete_key, problem.pilot_model(theta), *arguments)
     forms = target_forms(completion.parts, model)

@@ -31,6 +31,7 @@ from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..engine.linalg import any_solve
 from ..engine.pareto import is_reliable
 from ..models.diffusion import Diffusion
+from ..proposals.auto import Budget
 from ..schemes.path_likelihood import Form
 from ..schemes.step_error import StepError, dominates
 from .completion import Completion, Paths, complete
@@ -196,7 +197,7 @@ def maximum_likelihood(
     unknowns, theta = problem.unknowns, problem.theta
     check_allowed(constraint, unknowns, theta)
     proposal = "auto" if proposal is None else proposal
-    bounds = (num_counts, max_proposals, max_trials)
+    bounds = Budget(num_counts, max_proposals, max_trials)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     optimizer = _ADAM if optimizer is None else optimizer
     if sigma_is_unknown(problem):

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced, time_steps
+from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion
-from ..models.intervals import Intervals, as_intervals
 
 # Numbers of steps are rounded up to one of so few per factor of two, for each is compiled.
 _STEPS_PER_OCTAVE = 2

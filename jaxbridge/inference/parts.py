@@ -8,25 +8,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from ..coupling.base import AbstractCoupling
 from ..coupling.start_laws import Stationary, needs_burn_in
-from ..exact.density import check_for_density
-from ..exact.renewal import as_pairs
+from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..models.intervals import Intervals
-from ..proposals.base import AbstractWeightedProposal
-from ..proposals.choice import (
-    Choice,
+from ..proposals.auto import (
+    Budget,
     as_proposal,
-    default_candidates,
-    settled,
-    singles,
-    undecided_between,
+    choice_between,
+    guided_candidates,
+    resolve,
     why_left_out,
 )
-from ..proposals.coupled import CoupledPairs
+from ..proposals.base import AbstractProposal, AbstractWeightedProposal
+from ..proposals.coupled import as_pairs
 from ..schemes.halving import log_halving_of_paths
-from ..schemes.path_likelihood import Form, density_of_form, forms_of_target
+from ..schemes.path_likelihood import Form, density_of_form, forms_of_targets
 from ..schemes.step_error import share_of_order
 from .observations import Group
 
@@ -35,9 +31,6 @@ _NO_SAMPLER = (
     "(`Diffusion(..., sample_stationary=)`)"
 )
 _FOR_APPROXIMATE = ('bridges="approximate"', 'bridges="exact"')
-
-# num_counts, max_proposals, max_trials
-Bounds = tuple[int | None, int | None, int | None]
 
 
 class Part(eqx.Module):
@@ -64,7 +57,7 @@ def make_parts(
     intervals: Intervals,
     groups: tuple[Group, ...],
     proposal: Any,
-    bounds: Bounds,
+    bounds: Budget,
     *,
     for_density: bool = False,
     only_couplings: bool = False,
@@ -78,15 +71,15 @@ def make_parts(
     """
     like = intervals.start[0]
     if moving and weighted and proposal == "auto" and needs_burn_in(Stationary(), model):
-        candidates = default_candidates(model, like, for_density)
-        candidates = [each for each in candidates if not isinstance(each, AbstractCoupling)]
         left_out = why_left_out(model, for_density) or _NO_SAMPLER
-        proposal = undecided_between(candidates, model, like, None, *bounds, left_out=left_out)
-        bounds = (None, None, None)
-    given = as_proposal(proposal, model, like, *bounds, for_density=for_density)
+        proposal, bounds = (
+            choice_between(guided_candidates(model, like), left_out=left_out),
+            Budget(),
+        )
+    given = as_proposal(proposal, model, like, bounds, for_density)
     given.check(model, intervals)
     if for_density:
-        check_for_density(given, model)
+        given.check_for_density(model)
     if moving and weighted:
         _check_for_moving(given, model)
     if only_couplings:
@@ -94,13 +87,16 @@ def make_parts(
     parts = []
     for part_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
         mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
-        chosen = given
-        if isinstance(given, Choice) and given.chosen is not None:
-            chosen = given.of(group.which)
-        chosen = settled(chosen, part_key, model, mine, group.num_steps)
-        if weighted:
-            chosen = chosen.prepared(part_key, model, mine, group.num_steps)
-        parts.append(part_of(intervals, group, chosen))
+        chosen = resolve(given.of(group.which), part_key, model, mine, group.num_steps)
+        parts.append(
+            part_of(
+                intervals,
+                group,
+                chosen.prepared(part_key, model, mine, group.num_steps)
+                if weighted
+                else as_pairs(chosen),
+            )
+        )
     return tuple(parts)
 
 
@@ -130,18 +126,13 @@ def step_shares(part: Part, model: Diffusion, form: Form) -> Float[Array, " I"]:
 
 def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
     """Those of the path likelihood that go with the bridges of all parts."""
-    proposals = [singles(part.proposal) for part in parts]
-    return forms_of_target(proposals, model, parts[0].intervals.start[0])
+    targets = [single.target for part in parts for single in part.proposal.singles]
+    return forms_of_targets(targets, model, parts[0].intervals.start[0])
 
 
-def _check_for_moving(proposal: AbstractWeightedProposal, model: Diffusion) -> None:
+def _check_for_moving(proposal: AbstractProposal, model: Diffusion) -> None:
     """Raise `ValueError` where something is known at the first parameters only."""
-    laws = [
-        single.coupling.start_law
-        for single in singles(proposal)
-        if isinstance(single, CoupledPairs)
-    ]
-    if any(needs_burn_in(law, model) for law in laws):
+    if any(single.must_measure(model) for single in proposal.singles):
         raise ValueError(
             "this model has no sampler of its stationary law, and how long a run takes that "
             "replaces it depends on the parameters: pass `sample_stationary=` to `Diffusion`, give "

@@ -23,9 +23,11 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced, nondifferentiable
 from ..engine.linalg import any_cholesky, any_inverse
-from ..exact.density import check_for_density, estimate_log_density
+from ..exact.density import estimate_log_density
 from ..exact.kernels import acceptance_rate
+from ..models.bridge_problem import BridgeProblem
 from ..models.diffusion import Diffusion
+from ..proposals.auto import Budget
 from ..proposals.base import AbstractWeightedProposal
 from .parts import Part, make_parts, part_of
 from .posterior import AbstractPosterior
@@ -192,7 +194,12 @@ def pmmh(
     if state is not None and isinstance(proposal, str) and proposal == "auto":
         parts = _parts_of_state(state, problem)
     else:
-        arguments = (problem.intervals, problem.groups, proposal, (num_counts, None, max_trials))
+        arguments = (
+            problem.intervals,
+            problem.groups,
+            proposal,
+            Budget(num_counts, None, max_trials),
+        )
         parts = make_parts(pilot_key, problem.pilot_model(theta), *arguments, for_density=True)
     setting = _Setting(unknowns, parts, log_prior, constraint, num_proposals)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
@@ -226,7 +233,7 @@ def _parts_of_state(state: PMMHState, problem: Problem) -> tuple[Part, ...]:
     for group, proposal in zip(groups, state.proposals, strict=True):
         part = part_of(problem.intervals, group, proposal)
         proposal.check(model, part.intervals)
-        check_for_density(proposal, model)
+        proposal.check_for_density(model)
         parts.append(part)
     return tuple(parts)
 
@@ -249,8 +256,9 @@ class _Setting(eqx.Module):
         log_likelihood = variance = step_error = jnp.zeros((), theta.dtype)
         num_truncated = jnp.int32(0)
         for part_key, part in zip(jax.random.split(key, len(self.parts)), self.parts, strict=True):
-            size = (self.num_proposals, part.num_steps)
-            made = estimate_log_density(part_key, model, part.proposal, part.intervals, *size)
+            problem = BridgeProblem(part.intervals, None, part.num_steps, True, True)
+            arguments = (model, part.proposal, problem, self.num_proposals)
+            made = estimate_log_density(part_key, *arguments)
             log_likelihood += jnp.sum(made.value)
             variance += jnp.sum(made.standard_error**2)
             step_error += jnp.sum(made.step_error)

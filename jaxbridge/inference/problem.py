@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, check_key, is_traced
+from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion, check_diffusion
-from ..models.intervals import Intervals
 from .observations import Group, as_observations, step_groups
 from .unknowns import (
     Constraint,

@@ -22,6 +22,7 @@ from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
+from ..proposals.auto import Budget
 from ..schemes.halving import num_looked
 from ..schemes.path_likelihood import Form, log_likelihoods
 from ..schemes.step_error import StepError, of_mean
@@ -116,7 +117,7 @@ def score(
         "or pick the others with `where=`.",
     )
     unknowns, theta = problem.unknowns, problem.theta
-    bounds = (num_counts, max_proposals, max_trials)
+    bounds = Budget(num_counts, max_proposals, max_trials)
     arguments = (problem.intervals, problem.groups, proposal, bounds)
     parts = make_parts(key, model, *arguments, moving=False)
     form = target_forms(parts, model)[0]

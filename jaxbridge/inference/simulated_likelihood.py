@@ -33,15 +33,9 @@ from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
 from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
-from ..proposals.choice import (
-    Choice,
-    as_proposal,
-    guided_candidates,
-    undecided_between,
-    uses_couplings,
-)
+from ..proposals.auto import Budget, as_proposal, choice_between, guided_candidates
 from ..schemes.step_error import StepError
-from .parts import Bounds, Part, make_parts
+from .parts import Part, make_parts
 from .problem import Problem
 from .unknowns import Constraint, Unknowns, allowed
 
@@ -90,15 +84,15 @@ def sigma_is_unknown(problem: Problem) -> bool:
     return uses_argument(lambda theta: unknowns.at(theta).diffusion(like), problem.theta)
 
 
-def as_pulled(proposal: Any, model: Diffusion, like: Float[Array, " d"], bounds: Bounds) -> Any:
+def as_pulled(proposal: Any, model: Diffusion, like: Float[Array, " d"], bounds: Budget) -> Any:
     """The proposal that the user gave, "auto" without couplings.
 
     **Raises:** `ValueError` and `TypeError` for one whose weights have no derivatives.
     """
     if isinstance(proposal, str) and proposal == "auto":
-        proposal = undecided_between(guided_candidates(model, like), model, like, None)
-    given = as_proposal(proposal, model, like, *bounds)
-    if uses_couplings(given):
+        proposal = choice_between(guided_candidates(model, like))
+    given = as_proposal(proposal, model, like, bounds)
+    if given.coupled:
         raise ValueError(
             "σ depends on the unknown parameters, and given a whole path σ is known: the "
             "likelihood itself is differentiated, and with couplings its estimates have no "
@@ -115,44 +109,28 @@ def pulled_parts(
     which leaves the least variance in all at this model, or, where the user has chosen interval by
     interval, a part for each."""
     groups, intervals = problem.groups, problem.intervals
-    chosen = isinstance(proposal, Choice) and proposal.chosen is not None
-    parts = make_parts(key, model, intervals, groups, proposal, (None, None, None))
-    return tuple(
-        single for part in parts for single in (_split(part) if chosen else (_decided(part),))
-    )
+    parts = make_parts(key, model, intervals, groups, proposal, Budget())
+    if proposal.is_open:
+        return tuple(_decided(part) for part in parts)
+    return tuple(single for part in parts for single in _split(part))
 
 
 def _decided(part: Part) -> Part:
     """One candidate for all intervals. The error of ℓ̂ is Σ 1/(effective paths) over them."""
-    choice = part.proposal
-    if not isinstance(choice, Choice):
-        return part
-    assert choice.efficiency is not None and choice.seconds is not None
-    if is_traced(choice.efficiency, choice.seconds):
+    if is_traced(part.proposal):
         raise ValueError(
             '`proposal="auto"` decides by a pilot run, which cannot be looked at inside `jit`: '
             "name a proposal that is pulled to the end point, such as `Guided()`."
         )
-    # No pilot run was made of what could not win even if all its paths were effective.
-    efficiency = np.nan_to_num(np.asarray(choice.efficiency), nan=1.0)
-    cost = np.asarray(choice.seconds) / np.maximum(efficiency, 1e-6)
-    best = choice.candidates[int(np.argmin(cost.sum(axis=1)))]
-    return Part(part.intervals, part.index, part.fractions, best)
+    return Part(part.intervals, part.index, part.fractions, part.proposal.for_all())
 
 
 def _split(part: Part) -> tuple[Part, ...]:
     """A part for each candidate that was chosen."""
-    choice = part.proposal
-    assert isinstance(choice, Choice) and choice.chosen is not None
-    if len(choice.used) == 1:
-        single = choice.candidates[choice.used[0]]
-        return (Part(part.intervals, part.index, part.fractions, single),)
     made = []
-    for i in choice.used:
-        which = np.flatnonzero(np.asarray(choice.chosen) == i)
-        if which.size > 0:
-            mine = jax.tree.map(lambda leaf, which=which: leaf[which], part.intervals)
-            made.append(Part(mine, part.index[which], part.fractions, choice.candidates[i]))
+    for which, single in part.proposal.split():
+        mine = jax.tree.map(lambda leaf, which=which: leaf[which], part.intervals)
+        made.append(Part(mine, part.index[which], part.fractions, single))
     return tuple(made)
 
 

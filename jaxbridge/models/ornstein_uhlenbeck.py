@@ -15,9 +15,9 @@ from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import any_cholesky, any_inverse, dot, matvec, solve
+from .bridge_problem import as_intervals
 from .diffusion import Diffusion, check_invertible
 from .gaussian_law import GaussianLaw
-from .intervals import as_intervals
 from .linear import linear_transition
 
 

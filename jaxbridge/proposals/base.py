@@ -3,13 +3,13 @@
     E[w h(path)] = p_T(a, b) E_bridge[h].
 
 Chains, importance means and transition densities are written on this alone. A coupling gives
-random weights (`coupled_pairs`), proposals that are pulled to the end point weights that are
-functions of the path (`guided`), and each interval may have its own (`choice`).
+random weights (`coupled`), proposals that are pulled to the end point weights that are functions of
+the path (`guided`), and each interval may have its own (`auto`).
 """
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import diffrax
@@ -20,9 +20,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from ..coupling.base import AbstractCoupling
 from ..engine.devices import over_devices, share
+from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..models.intervals import Intervals
+from ..schemes.step_density import AbstractStepDensity
 
 
 class WeightedPaths(NamedTuple):
@@ -43,11 +45,31 @@ class WeightedPaths(NamedTuple):
     log_halving: Float[Array, "I n"]
 
 
-class AbstractWeightedProposal(eqx.Module):
-    """A way to propose bridges, each with an unbiased weight.
+class AbstractProposal(eqx.Module):
+    """What may be given as `proposal`: one way to propose bridges, or several to choose between."""
 
-    Intervals that are not `active`, where that is given, cost no work, and have no paths.
-    """
+    @property
+    @abstractmethod
+    def singles(self) -> tuple["AbstractSingleProposal", ...]:
+        """The ways that may be used."""
+
+    @property
+    def coupled(self) -> bool:
+        """Whether any interval may have a coupling, of which no derivative may be taken."""
+        return any(single.by_coupling is not None for single in self.singles)
+
+    @property
+    @abstractmethod
+    def by_coupling(self) -> AbstractCoupling | None:
+        """The coupling whose pairs are proposed, if there is one way and that is it."""
+
+    @abstractmethod
+    def describe(self) -> str:
+        """The proposal in a few words."""
+
+    @abstractmethod
+    def fractions(self, num_steps: int) -> Float[np.ndarray, "N+1"]:
+        """The grid, t_i / T, from 0 to 1."""
 
     @abstractmethod
     def check(self, model: Diffusion, intervals: Intervals) -> None:
@@ -57,15 +79,40 @@ class AbstractWeightedProposal(eqx.Module):
     def check_prepared(self, model: Diffusion) -> None:
         """Raise `ValueError` where `prepared` would have to measure something."""
 
+    def check_for_density(self, model: Diffusion) -> None:
+        """Raise `ValueError` where the size of weights rests on what is not known."""
+        for single in self.singles:
+            single.check_size(model)
+
+    @property
+    @abstractmethod
+    def is_open(self) -> bool:
+        """Whether there is a choice yet to be made."""
+
+    @abstractmethod
+    def of(self, which: Int[np.ndarray, " J"]) -> "AbstractProposal":
+        """The proposal for some of the intervals that it is for."""
+
     @abstractmethod
     def prepared(
         self, key: Key[Array, ""], model: Diffusion, intervals: Intervals, num_steps: int
     ) -> "AbstractWeightedProposal":
         """The proposal with everything measured that it must know of these intervals."""
 
+
+class AbstractWeightedProposal(AbstractProposal):
+    """A proposal that has been prepared: paths, each with an unbiased weight.
+
+    Intervals that are not `active`, where that is given, cost no work, and have no paths.
+    """
+
     @abstractmethod
-    def fractions(self, num_steps: int) -> Float[np.ndarray, "N+1"]:
-        """The grid, t_i / T, from 0 to 1."""
+    def for_all(self) -> "AbstractSingleProposal":
+        """One way for all intervals. Not under `jit` where there are several."""
+
+    @abstractmethod
+    def split(self) -> Sequence[tuple[Int[np.ndarray, " J"] | slice, "AbstractSingleProposal"]]:
+        """The intervals of each way. Not under `jit` where there are several."""
 
     @abstractmethod
     def step_share(self, model: Diffusion, intervals: Intervals) -> Float[Array, " I"]:
@@ -100,6 +147,53 @@ class AbstractWeightedProposal(eqx.Module):
     ) -> WeightedPaths:
         """Given paths, one for each interval, with weights from their conditional law under the
         target of a chain."""
+
+
+class AbstractSingleProposal(AbstractWeightedProposal):
+    """One way to propose bridges, and what a choice between several must know of it."""
+
+    @property
+    @abstractmethod
+    def target(self) -> AbstractStepDensity | None:
+        """The law of the steps of the chain of which its bridges are exact; `None` where that is
+        the diffusion itself, but for the error of a scheme."""
+
+    @property
+    @abstractmethod
+    def efficiency_bound(self) -> float:
+        """Effective samples per simulated path, at most."""
+
+    @abstractmethod
+    def relative_seconds(self, model: Diffusion, intervals: Intervals) -> Float[Array, " I"]:
+        """Seconds per simulated path beside those of a modified diffusion bridge, as measured for
+        models whose functions cost little beside the random numbers."""
+
+    @abstractmethod
+    def ingredients(self) -> tuple[str, str, float]:
+        """The scheme, or the law of the target's steps, the meeting rule, and γ."""
+
+    @abstractmethod
+    def most_accurate(self, sigma_varies: bool) -> "AbstractSingleProposal":
+        """The same with the smallest step error that it can have."""
+
+    @abstractmethod
+    def for_pilot(self) -> "AbstractSingleProposal":
+        """The same, which gives up early what is not worth waiting for."""
+
+    @abstractmethod
+    def prepared(
+        self, key: Key[Array, ""], model: Diffusion, intervals: Intervals, num_steps: int
+    ) -> "AbstractSingleProposal":
+        """The proposal with everything measured that it must know of these intervals."""
+
+    @abstractmethod
+    def must_measure(self, model: Diffusion) -> bool:
+        """Whether `prepared` has something to measure."""
+
+    @abstractmethod
+    def check_size(self, model: Diffusion) -> None:
+        """Raise `ValueError` where the size of the weights, and not only their proportion, rests on
+        what is not known."""
 
 
 Block = Callable[[Key[Array, "I n"], Intervals, Bool[Array, " I"] | None], WeightedPaths]

@@ -9,37 +9,45 @@ starts: `start_laws` has the derivation.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Inputs, find_bridges
 from ..coupling.burn_in import with_burn_in
+from ..coupling.gamma import Coupling
 from ..coupling.hitting import HittingCounts, count_hits
+from ..coupling.meeting import AbstractMeeting, BrownianCrossing, SignTest
 from ..coupling.start_laws import AnyStartLaw, Reversed, Stationary, log_ratio, needs_burn_in
-from ..engine.checks import nondifferentiable
+from ..engine.checks import is_traced, nondifferentiable
 from ..engine.rejection import default_num_lanes
+from ..models.bridge_problem import Intervals, uniform_fractions
 from ..models.diffusion import Diffusion
 from ..models.dynamics import Dynamics
-from ..models.grid import uniform_fractions
-from ..models.intervals import Intervals
 from ..schemes.base import AbstractScheme
 from ..schemes.euler import Euler
 from ..schemes.fit import check_model
 from ..schemes.gaussian_transition import GaussianTransition
 from ..schemes.halving import log_halving_of_paths, num_looked
+from ..schemes.heun import Heun
 from ..schemes.milstein import Milstein
 from ..schemes.step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
 from ..schemes.step_error import share_of_order
-from .base import AbstractWeightedProposal, WeightedPaths, in_blocks
+from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths, in_blocks
 
 # Whole paths are kept only until they are weighed: at most this many bytes of them at a time.
 _BLOCK_BYTES = 2**28
+
+# Seconds per simulated path beside those of a modified diffusion bridge.
+_SECONDS = 3.5
+# Hits that take longer than this are not worth waiting for in a pilot run.
+_PILOT_TRIALS = 64
 
 # A path costs so many others that D of more of them may be looked at than where it costs one.
 _LOOKED = 4
 
 
-class CoupledPairs(AbstractWeightedProposal):
+class CoupledPairs(AbstractSingleProposal):
     """The proposals of a coupling, weighted by hitting counts: `proposal` of what
     `sample_exact_bridges` and others return where they were given a `Coupling`.
 
@@ -54,18 +62,107 @@ class CoupledPairs(AbstractWeightedProposal):
     max_trials: Int[Array, ""]
     num_counts: int = eqx.field(static=True)
 
+    @property
+    def singles(self):
+        return (self,)
+
+    @property
+    def is_open(self):
+        return False
+
+    @property
+    def by_coupling(self):
+        return self.coupling
+
+    @property
+    def target(self):
+        return None
+
+    @property
+    def efficiency_bound(self):
+        return 1 / (1 + self.num_counts)
+
+    def describe(self):
+        coupling, words = self.coupling, type(self.coupling).__name__
+        if isinstance(coupling, Coupling) and not is_traced(coupling.gamma):
+            words += f"({float(coupling.gamma):.3g})"
+        if not isinstance(coupling.start_law, Stationary):
+            words += f" from {type(coupling.start_law).__name__}"
+        return words
+
+    def relative_seconds(self, model, intervals):
+        seconds, law = jnp.full_like(intervals.duration, _SECONDS), self.coupling.start_law
+        if isinstance(law, Stationary) and not model.has_sampler and law.burn_in is not None:
+            # A run for the start of each trial, in steps that cost half as much; and of the
+            # simulated paths at least half are trials.
+            seconds *= 1 + law.burn_in.astype(seconds.dtype) / intervals.duration / 4
+        return seconds
+
+    def ingredients(self):
+        coupling, meeting = self.coupling, self.coupling.meeting
+        gamma = float(coupling.gamma) if isinstance(coupling, Coupling) else np.nan
+        radius = meeting.radius if isinstance(meeting, SignTest) else None
+        words = type(meeting).__name__ + ("" if radius is None else f"({float(radius):g})")
+        return type(coupling.scheme).__name__, words, gamma
+
+    def most_accurate(self, sigma_varies):
+        return eqx.tree_at(
+            lambda p: (p.coupling.meeting, p.coupling.scheme),
+            self,
+            (BrownianCrossing(), Heun()),
+            is_leaf=lambda leaf: isinstance(leaf, AbstractMeeting | AbstractScheme),
+        )
+
+    def for_pilot(self):
+        bound = jnp.minimum(self.max_trials, _PILOT_TRIALS * self.num_counts)
+        return eqx.tree_at(lambda p: p.max_trials, self, bound)
+
+    def of(self, which):
+        return self
+
+    def for_all(self):
+        return self
+
+    def split(self):
+        return [(slice(None), self)]
+
     def check(self, model, intervals):
         check_model(model, intervals, self.coupling.scheme)
         model.check_reversal()
         check_density(self.coupling.start_law, model)
 
     def check_prepared(self, model):
-        if needs_burn_in(self.coupling.start_law, model):
+        if self.must_measure(model):
             raise ValueError(
                 "this model has no sampler of its stationary law, so the length of the run that "
                 "replaces it must be known: use `Stationary(burn_in=...)`, in units of time, for "
                 "instance from `measure_burn_in`; or pass `sample_stationary=` to `Diffusion`, "
                 "or choose a start law with a density (`fit_start_law`)."
+            )
+
+    def must_measure(self, model):
+        return needs_burn_in(self.coupling.start_law, model)
+
+    def check_size(self, model):
+        """A coupling's weights have the factor ν(b)/ν(x_0) · μ(x_0), in which the constant of ν
+        cancels if μ has a density of its own. From ν itself, and from the law that the paper
+        prints, whose weights are taken to be those of ν, the factor is ν(b): in proportion to
+        `log_stationary`."""
+        if not model.has_density:
+            raise ValueError(
+                "with couplings the transition density needs the stationary one: give `Diffusion` "
+                "a `log_stationary`, normalised if the start law is `Stationary()`; or choose a "
+                "proposal that does not need it, such as `ModifiedDiffusionBridge()` or `Guided()`."
+            )
+        if isinstance(self.coupling.start_law, Stationary | Reversed) and not model.normalised:
+            raise ValueError(
+                "a coupling from the stationary law gives densities in proportion to "
+                "`log_stationary`, which is not declared to be normalised, so that they may be "
+                "wrong by any factor: if it is normalised, for all parameters, say so by "
+                "`Diffusion(..., normalised=True)`; otherwise give the coupling a start law with a "
+                "density, `Coupling(..., start_law=fit_start_law(..., for_density=True))`, or "
+                'choose `proposal="auto"` or one that is pulled to the end point, such as '
+                "`ModifiedDiffusionBridge()` or `Guided()`."
             )
 
     def prepared(self, key, model, intervals, num_steps):
@@ -232,3 +329,14 @@ def check_density(law: AnyStartLaw, model: Diffusion) -> None:
             "a start law other than `Stationary()` is paid for with ν(x): give `Diffusion` a "
             "`log_stationary` (up to a constant)."
         )
+
+
+def as_pairs(
+    proposal: AbstractProposal,
+    method: str = "renewal",
+    instead: str = 'method="pseudo_marginal"',
+) -> CoupledPairs:
+    """The proposal, which must be a coupling's for this method."""
+    if not isinstance(proposal, CoupledPairs):
+        raise TypeError(f"{method} is for couplings: pass a `Coupling`, or choose {instead}.")
+    return proposal

@@ -30,15 +30,22 @@ from ..engine.lanes import join_rows, over_lanes, split_rows
 from ..engine.linalg import all_finite
 from ..engine.noise import Store, noisy_scan
 from ..engine.rejection import most_lanes
+from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..models.dynamics import Dynamics
-from ..models.intervals import Intervals
 from ..schemes.euler import Euler
 from ..schemes.fit import check_model
 from ..schemes.halving import num_looked, of_all_steps, of_pair
-from ..schemes.step_density import AbstractStepDensity, EulerDensity, StepLaw
+from ..schemes.step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity, StepLaw
 from ..schemes.step_error import share_of_order
-from .base import AbstractWeightedProposal, WeightedPaths, block_over_devices, in_blocks, masked
+from .base import (
+    AbstractProposal,
+    AbstractSingleProposal,
+    WeightedPaths,
+    block_over_devices,
+    in_blocks,
+    masked,
+)
 
 # Of the duration: shorter steps are lost in the rounding of points.
 _SHORTEST_STEP = 1e-10
@@ -59,7 +66,7 @@ class Step(NamedTuple):
     end: Float[Array, "d *lanes"]
 
 
-class AbstractGuidedProposal(AbstractWeightedProposal):
+class AbstractGuidedProposal(AbstractSingleProposal):
     """Paths in steps as the target's, but pulled so that they end in b.
 
     A proposal is another law of each step, `step_law`, and what can be worked out for it before
@@ -69,6 +76,53 @@ class AbstractGuidedProposal(AbstractWeightedProposal):
 
     density: eqx.AbstractVar[AbstractStepDensity]
     refinement: eqx.AbstractVar[float]
+
+    @property
+    def singles(self):
+        return (self,)
+
+    @property
+    def is_open(self):
+        return False
+
+    @property
+    def by_coupling(self):
+        return None
+
+    @property
+    def target(self):
+        return self.density
+
+    @property
+    def efficiency_bound(self):
+        return 1.0
+
+    def ingredients(self):
+        return type(self.density).__name__, "", np.nan
+
+    def most_accurate(self, sigma_varies):
+        if sigma_varies:
+            return self
+        is_density = lambda leaf: isinstance(leaf, AbstractStepDensity)
+        return eqx.tree_at(lambda p: p.density, self, ItoTaylorDensity(), is_leaf=is_density)
+
+    def for_pilot(self):
+        return self
+
+    def of(self, which):
+        return self
+
+    def for_all(self):
+        return self
+
+    def split(self):
+        return [(slice(None), self)]
+
+    def check_size(self, model):
+        pass
+
+    def must_measure(self, model):
+        return False
 
     @abstractmethod
     def guide(
@@ -485,3 +539,13 @@ def check_refinement(refinement: float) -> float:
     if not 1 <= refinement <= 4:
         raise ValueError(f"`refinement` must be between 1 (equal steps) and 4; got {refinement}.")
     return float(refinement)
+
+
+def as_guided(proposal: AbstractProposal) -> AbstractGuidedProposal:
+    """The proposal itself, if it makes paths from normal noise."""
+    if not isinstance(proposal, AbstractGuidedProposal):
+        raise TypeError(
+            "Crank–Nicolson moves are for proposals that make paths from normal noise: "
+            "`ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()`."
+        )
+    return proposal

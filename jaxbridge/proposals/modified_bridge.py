@@ -1,6 +1,7 @@
 """The modified diffusion bridge."""
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from ..schemes.step_density import AbstractStepDensity
 from .guided import AbstractGuidedProposal, bridge_law, check_refinement, check_step_density
@@ -36,6 +37,12 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
     def __init__(self, density: AbstractStepDensity | None = None, refinement: float = 1.0):
         self.density = check_step_density(density)
         self.refinement = check_refinement(refinement)
+
+    def describe(self):
+        return "ModifiedDiffusionBridge"
+
+    def relative_seconds(self, model, intervals):
+        return jnp.full_like(intervals.duration, 1.0)
 
     def guide(self, dynamics, start, end, dt):
         return None

@@ -44,6 +44,12 @@ class ResidualBridge(AbstractGuidedProposal):
         self.density = check_step_density(density)
         self.refinement = check_refinement(refinement)
 
+    def describe(self):
+        return "ResidualBridge"
+
+    def relative_seconds(self, model, intervals):
+        return jnp.full_like(intervals.duration, 1.3)
+
     def guide(self, dynamics, start, end, dt):
         xi, xi_end = deterministic_path(self.density, dynamics, start, dt)
         moved = jnp.concatenate([xi[1:], xi_end[None]]) - xi

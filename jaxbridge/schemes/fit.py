@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.checks import is_traced
+from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion, check_invertible
-from ..models.intervals import Intervals
 from .base import AbstractScheme
 from .milstein import Milstein
 

@@ -31,6 +31,7 @@ curl, for then the points of a path do not determine the integral; without one i
 """
 
 import math
+from collections.abc import Iterable
 from typing import Literal, get_args
 
 import equinox as eqx
@@ -38,7 +39,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, is_traced, time_steps
 from ..engine.lanes import over_lanes
@@ -237,15 +238,13 @@ def density_of_form(form: Form) -> AbstractStepDensity:
     return EulerDensity() if form in ("girsanov", "euler") else ItoTaylorDensity()
 
 
-def forms_of_target(
-    proposals: PyTree, model: Diffusion, like: Float[Array, " d"]
+def forms_of_targets(
+    targets: Iterable[AbstractStepDensity | None], model: Diffusion, like: Float[Array, " d"]
 ) -> tuple[Form, ...]:
-    """The forms that go with the target of the bridges of these proposals, the most accurate
-    first: weights that are exact for the Euler scheme call for its own likelihood, for otherwise
-    paths and parameters would belong to two laws."""
-    are_densities = lambda leaf: isinstance(leaf, AbstractStepDensity)
-    densities = jax.tree.leaves(proposals, is_leaf=are_densities)
-    if any(isinstance(density, EulerDensity) for density in densities):
+    """The forms that go with bridges of these targets, `None` for the diffusion itself, the most
+    accurate first: weights that are exact for the Euler scheme call for its own likelihood, for
+    otherwise paths and parameters would belong to two laws."""
+    if any(target is not None and target.order == 1 for target in targets):
         return ("girsanov",)
     forms = forms_of(model, like)
     return forms if forms == ("girsanov",) else forms[:-1]

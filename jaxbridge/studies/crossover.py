@@ -19,7 +19,8 @@ from ..coupling.gamma import Coupling
 from ..exact.density import TransitionLogDensity, transition_log_density
 from ..models.diffusion import Diffusion
 from ..models.hyperbolic import hyperbolic
-from ..proposals.choice import Choice, as_proposal, default_candidates, describe
+from ..proposals.auto import Budget, as_proposal, default_candidates
+from ..proposals.choice import Choice
 from .exact import fastest
 from .paper import Point, study_model
 
@@ -148,7 +149,8 @@ def _run(
     coupled = isinstance(candidate, Coupling)
     bound = _MOST_TRIALS if coupled else None
     start = jnp.asarray(process.start)
-    proposal = as_proposal(candidate, process.model, start, max_trials=bound, for_density=True)
+    budget = Budget(max_trials=bound)
+    proposal = as_proposal(candidate, process.model, start, budget, for_density=True)
     num_steps, share = (50, _COUPLED_SHARE) if duration < _LONG else (1_000, _LONG_COUPLED_SHARE)
     work = work if duration < _LONG else 2 * work
     num_proposals = round(work / num_steps * (share if coupled else 1))
@@ -167,7 +169,7 @@ def _run(
             )
         )
 
-    return ('"auto"' if isinstance(candidate, str) else describe(proposal)), run
+    return ('"auto"' if isinstance(candidate, str) else proposal.describe()), run
 
 
 def _rate(
@@ -175,8 +177,8 @@ def _rate(
 ) -> Rate:
     effective = float(estimate.effective_sample_size)
     chosen, made = "", estimate.proposal
-    if isinstance(made, Choice) and made.chosen is not None:
-        chosen = describe(made.candidates[int(made.chosen[0])])
+    if isinstance(made, Choice):
+        chosen = made.candidates[int(made.chosen[0])].describe()
     return Rate(
         process.name,
         duration,

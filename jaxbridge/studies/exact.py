@@ -25,7 +25,7 @@ from ..exact.importance import weigh_bridges
 from ..models.gaussian_bridge import gaussian_bridge
 from ..models.gaussian_law import GaussianLaw
 from ..tuning.hitting_variation import HittingVariation, hitting_variation
-from ..tuning.pilots import fit_start_law
+from ..tuning.start_law import fit_start_law
 from .paper import CASES, Fit, Point, compare, study_model
 
 Ends = tuple[Point, Point]

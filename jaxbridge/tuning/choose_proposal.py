@@ -8,18 +8,11 @@ from jaxtyping import Array, Key
 
 from ..coupling.gamma import Coupling
 from ..engine.checks import Numbers, check_count, check_key, is_traced
-from ..exact.density import check_for_density
-from ..models.diffusion import Diffusion, check_diffusion
-from ..models.intervals import Intervals, as_intervals
-from ..proposals.choice import (
-    Choice,
-    default_candidates,
-    run_pilots,
-    undecided_between,
-    why_left_out,
-)
-from ..proposals.coupled import CoupledPairs
-from .pilots import best_pilot, coupling_pilots
+from ..models.bridge_problem import Intervals, bridge_problem
+from ..models.diffusion import Diffusion
+from ..proposals.auto import choice_between, default_candidates, why_left_out
+from ..proposals.choice import Choice
+from .start_law import best_pilot, coupling_pilots
 
 # Bridges of a pilot run that looks for the coupling to compare with other proposals.
 _TUNING_PILOT = 500
@@ -77,14 +70,13 @@ def choose_proposal(
     ```
     """
     check_key(key)
-    check_diffusion(model)
-    intervals, batched, _ = as_intervals(start, end, duration)
+    problem = bridge_problem(model, start, end, duration, num_steps)
+    intervals, batched = problem.intervals, problem.batched
     if is_traced(key, model, intervals):
         raise TypeError(
             "a choice by the clock cannot be made inside `jit` or `vmap`: make it before, or use "
             '`proposal="auto"`.'
         )
-    num_steps = check_count("num_steps", num_steps)
     if num_pilot is not None:
         num_pilot = check_count("num_pilot", num_pilot, 2)
     like = intervals.start[0]
@@ -96,11 +88,11 @@ def choose_proposal(
         given = list(candidates)
 
     def choose_between(candidates, left_out=""):
-        undecided = undecided_between(candidates, model, like, num_pilot, left_out=left_out)
-        undecided.check(model, intervals)
+        auto = choice_between(candidates, num_pilot=num_pilot, left_out=left_out)
+        auto.check(model, intervals)
         if for_density:
-            check_for_density(undecided, model)
-        return run_pilots(key, model, undecided, intervals, num_steps, timed=True)
+            auto.check_for_density(model)
+        return auto.choose(key, model, intervals, num_steps, timed=True)
 
     choice = choose_between(given, left_out)
     possible = model.has_reversal and (model.has_density or not for_density)
@@ -116,7 +108,7 @@ def _worth_tuning(choice: Choice) -> bool:
     where none was tried, whether the best one at all might be put behind."""
     assert choice.efficiency is not None and choice.seconds is not None
     rates = np.asarray(choice.efficiency / choice.seconds)[:, 0]
-    coupled = [isinstance(candidate, CoupledPairs) for candidate in choice.candidates]
+    coupled = [candidate.coupled for candidate in choice.candidates]
     rates = np.where(np.isnan(rates), 0, rates)
     if not any(coupled):
         return bool(np.all(np.asarray(choice.efficiency)[:, 0] * _GAIN_OF_TUNING < 1))

@@ -20,8 +20,10 @@ from jaxtyping import Array, Float, Int, Key
 
 from ..coupling.hitting import hitting_counts
 from ..coupling.start_laws import AnyStartLaw
+from ..engine.averages import normalised
 from ..engine.checks import check_count, check_key
 from ..engine.rejection import key_for
+from ..exact.exact_bridges import AbstractExactBridges
 from ..exact.importance import WeightedBridges
 from ..exact.kernels import Chain
 from ..models.diffusion import Diffusion
@@ -88,7 +90,7 @@ def hitting_variation(
     sizes = [check_count("num_counts", n) for n in num_counts]
     if len(sizes) < 2 or sorted(set(sizes)) != sizes:
         raise ValueError(f"`num_counts` must be two or more increasing numbers; got {num_counts}.")
-    if not isinstance(bridges, WeightedBridges | Chain):
+    if not isinstance(bridges, AbstractExactBridges):
         raise TypeError(
             "`bridges` must have the exact law: pass what `weigh_bridges` or "
             f"`sample_exact_bridges` returned; got {type(bridges).__name__}."
@@ -107,11 +109,7 @@ def hitting_variation(
         max_trials=max_trials,
     )
     usable = bridges.met & ~counted.truncated
-    dtype = bridges.paths.dtype
-    given = (
-        bridges.weights if isinstance(bridges, WeightedBridges) else jnp.ones(usable.shape, dtype)
-    )
-    weights = jnp.where(usable, given, 0)
+    weights = jnp.where(usable, normalised(bridges.log_mean_weights), 0)
     sums = jnp.cumsum(jnp.where(usable[:, None], counted.counts, 1), axis=1)
     ends = np.asarray(sizes)
     # ρ̂_N of each bridge, (n, K)

@@ -26,31 +26,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import sample_bridges
 from ..coupling.gamma import Coupling
-from ..coupling.meeting import AbstractMeeting, BrownianCrossing
 from ..engine.checks import Numbers, cast_floats, check_count, check_key
 from ..engine.diagnostics import effective_sample_size
 from ..engine.pareto import is_reliable
 from ..engine.rejection import key_for
 from ..exact.chains import sample_exact_bridges
-from ..exact.density import check_for_density, transition_log_density
+from ..exact.density import transition_log_density
 from ..exact.importance import sample_weighted_bridges
-from ..models.diffusion import Diffusion, check_diffusion
+from ..models.bridge_problem import bridge_problem
+from ..models.diffusion import Diffusion
 from ..models.dynamics import is_linear
 from ..models.gaussian_bridge import gaussian_bridge
-from ..models.grid import stored_steps
-from ..models.intervals import as_intervals
 from ..models.ornstein_uhlenbeck import OrnsteinUhlenbeckParams, ou_transition
-from ..proposals.choice import as_proposal, describe, singles
-from ..proposals.coupled import CoupledPairs
-from ..proposals.guided import AbstractGuidedProposal
-from ..schemes.base import AbstractScheme
+from ..proposals.auto import as_proposal
 from ..schemes.euler import Euler
 from ..schemes.gaussian_transition import GaussianTransition
 from ..schemes.heun import Heun
-from ..schemes.step_density import AbstractStepDensity, ItoTaylorDensity
 
 METHODS = ("approximate", "weights", "pseudo_marginal", "renewal", "crank_nicolson", "density")
 _FOR_COUPLINGS, _FOR_GUIDED = ("approximate", "renewal"), ("crank_nicolson",)
@@ -281,9 +274,8 @@ def work_precision(
     ```
     """
     check_key(key)
-    check_diffusion(model)
-    intervals, batched, several_durations = as_intervals(start, end, duration)
-    if batched or several_durations:
+    problem = bridge_problem(model, start, end, duration, 1)
+    if problem.batched:
         raise ValueError("`work_precision` looks at one interval: `start` and `end` of shape (d,).")
     steps = [check_count("num_steps", n) for n in num_steps]
     for name, count in [("num_bridges", num_bridges), ("repeats", repeats)]:
@@ -297,13 +289,13 @@ def work_precision(
         raise ValueError(f'`dtypes` must be "float32" or "float64"; got {tuple(dtypes)}.')
     if target is not None and not target > 0:
         raise ValueError(f"`target` must be positive; got {target}.")
-    like = intervals.start[0]
+    like, intervals = problem.like, problem.intervals
     if proposals is None:
         proposals = [Coupling(scheme=Heun()), Coupling(scheme=Euler())]
         if is_linear(model.forward(like), like):
             proposals.append(Coupling(scheme=GaussianTransition()))
     candidates = [as_proposal(proposal, model, like) for proposal in proposals]
-    if any(len(singles(candidate)) > 1 for candidate in candidates):
+    if any(len(candidate.singles) > 1 for candidate in candidates):
         raise ValueError('`proposals` must be single ones; "auto" chooses between several.')
     if save_at is None:
         save_at = [float(intervals.duration[0]) / 2]
@@ -313,7 +305,7 @@ def work_precision(
                 f"duration; got {tuple(steps)}."
             )
     for candidate, n in itertools.product(candidates, steps):
-        stored_steps(save_at, duration, candidate.fractions(n))
+        problem.keep(save_at, duration, candidate.fractions(n))
     scene = _Scene(
         model,
         np.asarray(intervals.start[0]),
@@ -333,7 +325,7 @@ def work_precision(
         raise ValueError(f"none of `proposals` fits any of `methods`; got {tuple(methods)}.")
     if "density" in methods:
         for candidate in candidates:
-            check_for_density(candidate, model)
+            candidate.check_for_density(model)
     finest = (
         4 * max(steps)
         if reference_steps is None
@@ -526,7 +518,8 @@ def _finest(
     num_bridges: int,
 ) -> _Estimate:
     """A fine run by the best scheme there is; to its error belongs what half the steps change."""
-    limit = _at_its_best(candidate, scene)
+    varies = scene.model.forward(jnp.asarray(scene.start)).sigma_varies
+    limit = candidate.most_accurate(varies)
 
     def run(key, num_steps):
         result = _run(key, scene, method, limit, "float64", num_steps, num_bridges)
@@ -535,31 +528,13 @@ def _finest(
     fine, coarse = run(key, num_steps), run(jax.random.fold_in(key, 1), max(num_steps // 2, 1))
     if not np.all(np.isfinite(fine.mean) & np.isfinite(coarse.mean)):
         raise ValueError(
-            f"the reference, {describe(limit)} in {num_steps} steps, found no bridges: choose "
+            f"the reference, {limit.describe()} in {num_steps} steps, found no bridges: choose "
             "other `proposals`, or pass what is known as `reference`."
         )
     chance = fine.error**2 + coarse.error**2
     changed = np.maximum((fine.mean - coarse.mean) ** 2 - chance, 0)
-    words = f"{describe(limit)}, {method}, {num_steps} steps, {num_bridges:,} bridges"
+    words = f"{limit.describe()}, {method}, {num_steps} steps, {num_bridges:,} bridges"
     return fine._replace(error=np.sqrt(fine.error**2 + changed), source=words)
-
-
-def _at_its_best(candidate: Any, scene: _Scene) -> Any:
-    """The same proposal with the best scheme there is for it."""
-
-    def is_leaf(node):
-        return isinstance(node, AbstractMeeting | AbstractScheme | AbstractStepDensity)
-
-    if isinstance(candidate, CoupledPairs):
-        return eqx.tree_at(
-            lambda pairs: (pairs.coupling.meeting, pairs.coupling.scheme),
-            candidate,
-            (BrownianCrossing(), Heun()),
-            is_leaf=is_leaf,
-        )
-    if scene.model.forward(jnp.asarray(scene.start)).sigma_varies:
-        return candidate
-    return eqx.tree_at(lambda p: p.density, candidate, ItoTaylorDensity(), is_leaf=is_leaf)
 
 
 def _measure(
@@ -594,10 +569,10 @@ def _measure(
 
     monte_carlo = size(found.error)
     effective = monte_carlo**-2 if monte_carlo > 0 else np.nan
-    scheme, meeting, gamma = _describe_parts(candidate)
+    scheme, meeting, gamma = candidate.ingredients()
     return Setting(
         method,
-        describe(candidate),
+        candidate.describe(),
         scheme,
         meeting,
         gamma,
@@ -620,21 +595,7 @@ def _measure(
 
 
 def _fits(method: str, candidate: Any) -> bool:
-    coupled = isinstance(candidate, CoupledPairs)
-    return method not in (_FOR_GUIDED if coupled else _FOR_COUPLINGS)
-
-
-def _describe_parts(candidate: Any) -> tuple[str, str, float]:
-    """Scheme, meeting rule and γ of a proposal."""
-    if isinstance(candidate, CoupledPairs):
-        coupling: AbstractCoupling = candidate.coupling
-        gamma = float(coupling.gamma) if isinstance(coupling, Coupling) else np.nan
-        radius = getattr(coupling.meeting, "radius", None)
-        meeting = type(coupling.meeting).__name__
-        meeting += "" if radius is None else f"({float(radius):g})"
-        return type(coupling.scheme).__name__, meeting, gamma
-    assert isinstance(candidate, AbstractGuidedProposal)
-    return type(candidate.density).__name__, "", np.nan
+    return method not in (_FOR_GUIDED if candidate.coupled else _FOR_COUPLINGS)
 
 
 def _fit_order(group: Sequence[Setting]) -> Order:

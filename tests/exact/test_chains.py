@@ -18,8 +18,8 @@ from helpers import (
 )
 
 import jaxbridge as jb
-from jaxbridge.models.intervals import Intervals
-from jaxbridge.proposals.choice import as_proposal
+from jaxbridge.models.bridge_problem import Intervals
+from jaxbridge.proposals.auto import as_proposal
 
 CASES = exact_cases()
 EVERYWHERE = {"unlikely, gamma 0.5"}

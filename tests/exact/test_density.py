@@ -7,7 +7,8 @@ import pytest
 from helpers import PAPER_CASES, count_compilations, exact_cases, paper_model, slow_cases
 
 import jaxbridge as jb
-from jaxbridge.proposals.choice import Choice, as_proposal
+from jaxbridge.proposals.auto import as_proposal
+from jaxbridge.proposals.choice import Choice
 
 CASES = exact_cases()
 EVERYWHERE = {"unlikely, gamma 0.5"}

@@ -13,7 +13,8 @@ from scipy import optimize, stats
 import jaxbridge as jb
 from jaxbridge.inference import simulated_likelihood
 from jaxbridge.inference.problem import as_problem
-from jaxbridge.proposals.choice import guided_candidates, undecided_between
+from jaxbridge.proposals.auto import guided_candidates
+from jaxbridge.proposals.choice import undecided_between
 
 POSITIVE = lambda params: jnp.all(jnp.stack(params) > 0)
 BRIDGE = jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())

@@ -7,7 +7,8 @@ import pytest
 from helpers import assert_weighted_moments, count_compilations, paper_model
 
 import jaxbridge as jb
-from jaxbridge.proposals.choice import Choice, as_proposal
+from jaxbridge.proposals.auto import as_proposal
+from jaxbridge.proposals.choice import Choice
 
 slow = pytest.mark.slow
 HYPERBOLIC = jb.hyperbolic(0.8, 2)

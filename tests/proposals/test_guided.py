@@ -17,7 +17,7 @@ from helpers import (
 )
 
 import jaxbridge as jb
-from jaxbridge.models.intervals import Intervals
+from jaxbridge.models.bridge_problem import Intervals
 from jaxbridge.proposals.guided import Step, noise_of, path_of
 
 slow = pytest.mark.slow

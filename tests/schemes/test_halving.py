@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from test_step_density import DENSITIES, FROM, TO, log_density_of_chain, quadrature
 
 import jaxbridge as jb
-from jaxbridge.models.intervals import Intervals
+from jaxbridge.models.bridge_problem import Intervals
 from jaxbridge.proposals.guided import noise_of, path_of
 from jaxbridge.schemes.halving import log_halving_of_paths, num_looked
 

@@ -25,9 +25,9 @@ from ..coupling.start_laws import AnyStartLaw, Stationary, draw_starts, needs_bu
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.rejection import key_for, most_lanes
 from ..exact.importance import weigh_bridges
+from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.gaussian_law import GaussianLaw
-from ..models.intervals import Intervals, as_intervals
 
 _SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 

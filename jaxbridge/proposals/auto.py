@@ -1,0 +1,227 @@
+"""Which proposal for which interval? The one with the least error for a second of work.
+
+On short intervals proposals that are pulled to the end point are nearly exact, and coupled
+pairs do not meet; on long ones it is the other way round. Where the one becomes better than
+the other depends on the model, the end points and the step, so pilot runs decide, interval
+by interval (`pilots`).
+
+Their paths are not used again, so weights stay what they are whatever is chosen; but a pilot
+of finite size can be deceived, by a second way to the end point that it never saw for instance.
+"""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+from jax import lax
+from jaxtyping import Array, Float, Key
+
+from ..coupling.base import AbstractCoupling
+from ..coupling.gamma import Coupling
+from ..coupling.hitting import check_max_trials
+from ..engine.checks import check_bound, check_count, is_traced, nondifferentiable_choice
+from ..models.bridge_problem import Intervals
+from ..models.diffusion import Diffusion
+from ..schemes.step_density import EulerDensity, ItoTaylorDensity
+from .base import AbstractProposal, AbstractSingleProposal
+from .choice import Choice
+from .coupled import CoupledPairs
+from .linear_guide import Guided
+from .modified_bridge import ModifiedDiffusionBridge
+from .pilots import run_pilots
+
+# Bounds the tries for one bridge, unless the user says otherwise.
+_MAX_PROPOSALS = 10_000
+
+
+class Auto(AbstractProposal):
+    """A choice to be made: between these, by pilot runs of so many paths, or the default.
+    `left_out` says why there are no couplings among them, where that is not the user's doing."""
+
+    candidates: tuple[AbstractSingleProposal, ...]
+    num_pilot: int | None = eqx.field(static=True, default=None)
+    left_out: str = eqx.field(static=True, default="")
+
+    @property
+    def singles(self):
+        return self.candidates
+
+    @property
+    def is_open(self):
+        return True
+
+    @property
+    def by_coupling(self):
+        return None
+
+    def describe(self):
+        names = ", ".join(candidate.describe() for candidate in self.candidates)
+        reason = f"\ncouplings left out: {self.left_out}" if self.left_out else ""
+        return f"a choice to be made between {names}{reason}"
+
+    def fractions(self, num_steps):
+        return self.candidates[0].fractions(num_steps)
+
+    def of(self, which):
+        return self
+
+    def check(self, model, intervals):
+        for candidate in self.candidates:
+            candidate.check(model, intervals)
+
+    def check_prepared(self, model):
+        raise ValueError(
+            'a kernel makes no pilot run, so `proposal="auto"` has nothing to go by: choose '
+            "with `choose_proposal` before, and pass what it returns."
+        )
+
+    def prepared(self, key, model, intervals, num_steps):
+        return self.choose(key, model, intervals, num_steps)
+
+    def choose(
+        self,
+        key: Key[Array, ""],
+        model: Diffusion,
+        intervals: Intervals,
+        num_steps: int,
+        timed: bool = False,
+    ) -> Choice:
+        """The choice, by the rule for seconds or by the clock. What is chosen has no derivative in
+        the model, but that of which it is chosen may have one, unless it may be a coupling."""
+        if self.coupled:
+            model, intervals = nondifferentiable_choice((model, intervals))
+        else:
+            model, intervals = _without_derivatives((model, intervals))
+        arguments = (self.candidates, intervals, num_steps, self.num_pilot)
+        choice = run_pilots(key, model, *arguments, timed)
+        return dataclasses.replace(choice, left_out=self.left_out)
+
+    def __str__(self) -> str:
+        return self.describe()
+
+
+def _without_derivatives(tree):
+    return jax.tree.map(
+        lambda leaf: lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree
+    )
+
+
+def resolve(
+    proposal: AbstractProposal,
+    key: Key[Array, ""],
+    model: Diffusion,
+    intervals: Intervals,
+    num_steps: int,
+) -> AbstractProposal:
+    """The proposal, with a choice made before compiling where that can be, so that only what was
+    chosen is compiled."""
+    if not isinstance(proposal, Auto):
+        return proposal
+    if not proposal.coupled:
+        model, intervals = _without_derivatives((model, intervals))  # known under `grad`
+    if is_traced(key, model, proposal, intervals):
+        return proposal
+    return proposal.choose(key, model, intervals, num_steps)
+
+
+class Budget(NamedTuple):
+    """What the user said of the work for a coupling's pairs: N hitting counts, and bounds on the
+    tries for a pair and on the trials for its counts."""
+
+    num_counts: int | None = None
+    max_proposals: int | None = None
+    max_trials: int | None = None
+
+
+_NO_BUDGET = Budget()
+
+
+def as_proposal(
+    proposal: Any,
+    model: Diffusion,
+    like: Float[Array, " d"],
+    budget: Budget = _NO_BUDGET,
+    for_density: bool = False,
+) -> AbstractProposal:
+    """What the user gave as `proposal`, for points like this one; `for_density` if the size of its
+    weights matters, and not only their proportion."""
+    if isinstance(proposal, str) and proposal == "auto":
+        candidates = default_candidates(model, like, for_density)
+        return choice_between(candidates, budget, left_out=why_left_out(model, for_density))
+    return _given(Coupling() if proposal is None else proposal, budget)
+
+
+def _given(proposal: Any, budget: Budget) -> AbstractProposal:
+    if isinstance(proposal, AbstractProposal):
+        if budget != _NO_BUDGET:
+            raise ValueError(
+                "`num_counts`, `max_proposals` and `max_trials` are for a `Coupling`; this "
+                "`proposal` has its own, or none."
+            )
+        return proposal
+    if not isinstance(proposal, AbstractCoupling):
+        raise TypeError(
+            "`proposal` must be a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, "
+            f'`Guided()`, what `choose_proposal` returns, or "auto"; got {proposal!r}.'
+        )
+    num_counts = 1 if budget.num_counts is None else check_count("num_counts", budget.num_counts)
+    return CoupledPairs(
+        proposal,
+        check_bound("max_proposals", budget.max_proposals, _MAX_PROPOSALS),
+        check_max_trials(budget.max_trials, num_counts),
+        num_counts,
+    )
+
+
+def choice_between(
+    candidates: Sequence[Any],
+    budget: Budget = _NO_BUDGET,
+    num_pilot: int | None = None,
+    left_out: str = "",
+) -> Auto:
+    """A choice between these, yet to be made; the budget is for couplings among them."""
+    if len(candidates) == 0:
+        raise ValueError("`candidates` must have at least one proposal.")
+    proposals = tuple(
+        _given(each, budget if isinstance(each, AbstractCoupling) else _NO_BUDGET)
+        for each in candidates
+    )
+    if not all(isinstance(proposal, AbstractSingleProposal) for proposal in proposals):
+        raise ValueError("`candidates` must be single proposals, not choices.")
+    grids = {tuple(proposal.fractions(8)) for proposal in proposals}
+    if len(grids) > 1:
+        raise ValueError("`candidates` must be on one grid: give all the same `refinement`.")
+    return Auto(proposals, num_pilot, left_out)  # pyright: ignore
+
+
+def guided_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[AbstractSingleProposal]:
+    """With the same order of step error as couplings, where that is to be had."""
+    density = EulerDensity() if model.forward(like).sigma_varies else ItoTaylorDensity()
+    guided = [Guided(along, density) for along in ("end", "path")]
+    return [ModifiedDiffusionBridge(density), *guided]
+
+
+def default_candidates(
+    model: Diffusion, like: Float[Array, " d"], for_density: bool = False
+) -> list[Any]:
+    """Couplings only where the time reversal is known; and for a density, where ν is."""
+    coupled = model.has_reversal and (model.normalised or not for_density)
+    couplings = [Coupling(0.0), Coupling(0.5)] if coupled else []
+    return [*guided_candidates(model, like), *couplings]
+
+
+def why_left_out(model: Diffusion, for_density: bool) -> str:
+    """Why there are no couplings among `default_candidates`; empty where there are."""
+    if not model.has_reversal:
+        return (
+            "the time reversal of the model is not known (give `Diffusion` a `log_stationary`, a "
+            "`reverse_drift` or `reversible=True`)"
+        )
+    if for_density and not model.normalised:
+        return (
+            "their densities rest on `log_stationary`, which is not declared to be normalised "
+            "(`Diffusion(..., normalised=True)`)"
+        )
+    return ""

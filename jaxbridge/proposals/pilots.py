@@ -1,0 +1,206 @@
+"""Pilot runs: each candidate draws a few weighted paths of each interval, and
+
+    rate = effective samples / (simulated paths × seconds per path)
+
+is compared, as it would be in a larger sample, after two deductions. Candidates have different
+targets, at so many steps, and so different step errors (`step_error`). More paths do not reduce
+them: with W seconds the mean square error of log p̂ is about 1 / (W rate) + (step error)², which is
+that of a rate of
+
+    rate / (1 + W rate (step error)²),
+
+with W the seconds of ten thousand of the cheapest paths, and the step error as far as it is seen
+beyond two of its own standard errors. And weights with a Pareto shape above 0.7 come last.
+
+A candidate makes no pilot run where it could not win: of a coupling's simulated paths at most one
+in 1 + N is an effective sample, for each proposal needs N hitting counts. Seconds go by a rule, so
+that one key gives one choice; or by the clock, where `choose_proposal` makes the choice.
+"""
+
+import functools
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..engine.averages import effective_size, normalised
+from ..engine.checks import is_traced
+from ..engine.pareto import pareto_k
+from ..engine.rejection import key_for
+from ..models.bridge_problem import Intervals
+from ..models.diffusion import Diffusion
+from ..schemes.step_error import of_log_mean
+from .base import AbstractSingleProposal
+from .choice import Choice, value_rates
+
+# A pilot run draws about so many paths of each candidate in all, and so many of each interval.
+_PILOT_PATHS = 4_096
+_PILOT_RANGE = (32, 512)
+# The rule for seconds may be wrong by this factor.
+_CONTENDS = 3.0
+
+
+class _Seen(NamedTuple):
+    """What a pilot run shows: the first three as the fields of a `Choice`, and the paths that were
+    simulated."""
+
+    efficiency: Float[Array, " I"]
+    step_error: Float[Array, " I"]
+    pareto_k: Float[Array, " I"]
+    num_simulated: Int[Array, " I"]
+
+
+class _Pilot(NamedTuple):
+    """A candidate, prepared; its pilot run, if there was one, and what that gave; and the seconds
+    per path that it should take."""
+
+    candidate: AbstractSingleProposal
+    run: Callable[[], Any] | None
+    seen: _Seen
+    seconds: Float[Array, " I"]
+
+    @property
+    def rate(self) -> Float[Array, " I"]:
+        efficiency, step_error, shape, _ = self.seen
+        return value_rates(efficiency, self.seconds, step_error, shape)
+
+
+def run_pilots(
+    key: Key[Array, ""],
+    model: Diffusion,
+    candidates: tuple[AbstractSingleProposal, ...],
+    intervals: Intervals,
+    num_steps: int,
+    num_pilot: int | None,
+    timed: bool,
+) -> Choice:
+    """The choice, from pilot runs of the candidates that could win."""
+    num_intervals = len(intervals.duration)
+    enough = int(np.clip(_PILOT_PATHS // num_intervals, *_PILOT_RANGE))
+    num_paths = enough if num_pilot is None else num_pilot
+    best = jnp.zeros(num_intervals, intervals.start.dtype)
+    pilots = []
+    for i, candidate in enumerate(candidates):
+        pilot_key = key_for(f"pilot {i}", key)
+        pilots.append(
+            _run_pilot((key, pilot_key), model, candidate, intervals, num_steps, num_paths, best)
+        )
+        best = jnp.fmax(best, pilots[-1].rate)
+    seconds = jnp.stack(_measured(pilots, best) if timed else [p.seconds for p in pilots])
+    seen: _Seen = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(p.seen for p in pilots))
+    rates = value_rates(seen.efficiency, seconds, seen.step_error, seen.pareto_k)
+    chosen = jnp.argmax(jnp.where(jnp.isnan(rates), -1, rates), axis=0).astype(jnp.int32)
+    used = range(len(candidates)) if is_traced(chosen) else np.unique(chosen).tolist()
+    return Choice(
+        tuple(pilot.candidate for pilot in pilots),
+        seconds,
+        seen.efficiency,
+        seen.step_error,
+        seen.pareto_k,
+        chosen,
+        tuple(used),
+    )
+
+
+def _run_pilot(
+    keys: tuple[Key[Array, ""], Key[Array, ""]],
+    model: Diffusion,
+    candidate: AbstractSingleProposal,
+    intervals: Intervals,
+    num_steps: int,
+    num_pilot: int,
+    best: Float[Array, " I"],
+) -> _Pilot:
+    """The pilot run of one candidate, on the intervals where it could beat the best so far."""
+
+    def look_at(candidate):
+        seconds = candidate.relative_seconds(model, intervals)
+        active = best < candidate.efficiency_bound / seconds
+        return seconds, active, is_traced(active) or bool(np.any(active))
+
+    seconds, active, called_for = look_at(candidate)
+    if called_for:
+        candidate = candidate.prepared(keys[0], model, intervals, num_steps)
+        seconds, active, called_for = look_at(candidate)
+    if not called_for:
+        nothing = jnp.full_like(best, jnp.nan)
+        seen = _Seen(nothing, nothing, nothing, jnp.zeros(len(best), jnp.int32))
+        return _Pilot(candidate, None, seen, seconds)
+    arguments = (model, candidate, intervals, active, num_steps, num_pilot)
+    run = functools.partial(_look, keys[1], *arguments)
+    return _Pilot(candidate, run, run(), seconds)
+
+
+@eqx.filter_jit
+def _look(
+    key: Key[Array, ""],
+    model: Diffusion,
+    candidate: AbstractSingleProposal,
+    intervals: Intervals,
+    active: Bool[Array, " I"],
+    num_steps: int,
+    num_pilot: int,
+) -> _Seen:
+    """What a pilot run shows of each active interval, NaN of the others."""
+    candidate = candidate.for_pilot()
+    keys = jax.random.split(key, (len(intervals.duration), num_pilot))
+    nothing = jnp.zeros(0, jnp.int32)  # no path is kept
+    model = model.prepared()
+    drawn = candidate.draw(keys, model, intervals, num_steps, nothing, True, active)
+    num_simulated = jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32)
+    # What takes too long to hit would have a weight beyond those that are seen.
+    size = _extrapolated_size(jnp.where(drawn.truncated, -jnp.inf, drawn.log_weights))
+    efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
+    share = candidate.step_share(model, intervals)
+    error = of_log_mean(drawn.log_weights, drawn.log_halving, share)
+    seen_error = jnp.maximum(jnp.abs(error.value) - 2 * error.uncertainty, 0)
+    seen_error = jnp.where(jnp.isnan(seen_error), 0, seen_error)  # nothing is known of one step
+    told = (efficiency, seen_error, pareto_k(drawn.log_weights))
+    efficiency, seen_error, shape = (jnp.where(active, value, jnp.nan) for value in told)
+    return _Seen(efficiency, seen_error, shape, num_simulated)
+
+
+def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
+    """Effective samples of n paths, as they would be in a sample 64 times as large.
+
+    Where weights have heavy tails the effective share falls with the sample, about as a power
+    of its size, since the largest weights are yet to come: a small sample looks too good. The
+    power is seen between eighths of the sample and the whole.
+    """
+    num_intervals, n = log_weights.shape
+    eighth = max(n // 8, 1)
+    share = effective_size(normalised(log_weights)) / n
+    parts = log_weights[:, : n // eighth * eighth].reshape(num_intervals, -1, eighth)
+    share_of_part = jnp.mean(effective_size(normalised(parts)), axis=1) / eighth
+    fall = jnp.minimum(share / jnp.where(share_of_part > 0, share_of_part, 1), 1)
+    return n * share * fall**2
+
+
+def _measured(pilots: list[_Pilot], best: Float[Array, " I"]) -> list[Float[Array, " I"]]:
+    """Seconds per path by the clock, where that could change the choice; else by rule."""
+
+    def contends(pilot: _Pilot) -> bool:
+        return pilot.run is not None and bool(np.any(pilot.rate * _CONTENDS > best))
+
+    contenders = [pilot for pilot in pilots if contends(pilot)]
+    if len(contenders) < 2:
+        return [pilot.seconds for pilot in pilots]
+    factors = {}
+    for pilot in contenders:
+        assert pilot.run is not None
+        took = min(_seconds_of(pilot.run) for _ in range(3))
+        expected = pilot.seconds * pilot.seen.num_simulated.astype(pilot.seconds.dtype)
+        factors[id(pilot)] = took / float(jnp.sum(expected))
+    others = float(np.median(list(factors.values())))
+    return [pilot.seconds * factors.get(id(pilot), others) for pilot in pilots]
+
+
+def _seconds_of(run: Callable[[], Any]) -> float:
+    begin = time.perf_counter()
+    jax.block_until_ready(run())
+    return time.perf_counter() - begin
