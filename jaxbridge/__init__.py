@@ -124,12 +124,9 @@ from .schemes.step_density import (
 )
 from .tuning.choose_proposal import choose_proposal
 from .tuning.hitting_variation import HittingVariation, hitting_variation
+from .tuning.settings import Setting, WorkPrecision
 from .tuning.start_law import Pilot, Tuning, fit_start_law, tune_coupling
-from .tuning.work_precision import (
-    Setting,
-    WorkPrecision,
-    work_precision,
-)
+from .tuning.work_precision import work_precision
 
 __all__ = [
     # A model, and its paths.

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
+from jaxbridge.proposals.choice import Choice
 
 # The process of section 3 of the paper.
 PAPER_B = np.array([[1.5, 1.0], [1.0, 1.5]])
@@ -26,6 +27,12 @@ PAPER_CASES = {
 
 def paper_model():
     return jb.ornstein_uhlenbeck(jnp.asarray(PAPER_B))
+
+
+def chosen_of(candidates, chosen, used):
+    """A choice that was made without pilot runs."""
+    unseen = jnp.full((len(candidates), len(chosen)), jnp.nan)
+    return Choice(candidates, *4 * [unseen], chosen, used)
 
 
 def run_program(program, deadline=240, num_devices=1):

@@ -8,7 +8,7 @@ from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Float
 
 from ..models.gaussian_bridge import GaussianBridge
-from ..tuning.work_precision import WorkPrecision
+from ..tuning.settings import WorkPrecision
 from .copula import empirical_copula, gaussian_copula
 from .style import (
     COLOURS,

@@ -27,7 +27,8 @@ from ..models.hyperbolic import hyperbolic
 from ..schemes.euler import Euler
 from ..schemes.gaussian_transition import GaussianTransition
 from ..schemes.heun import Heun
-from ..tuning.work_precision import WorkPrecision, work_precision
+from ..tuning.settings import WorkPrecision
+from ..tuning.work_precision import work_precision
 from .exact import UNLIKELY, fastest
 from .paper import study_model
 

@@ -19,7 +19,7 @@ from helpers import (
 
 import jaxbridge as jb
 from jaxbridge.models.bridge_problem import Intervals
-from jaxbridge.proposals.auto import as_proposal
+from jaxbridge.proposals.auto import Budget, as_proposal
 
 CASES = exact_cases()
 EVERYWHERE = {"unlikely, gamma 0.5"}
@@ -207,7 +207,7 @@ def test_weights_of_given_bridges_have_their_law_in_the_chain(law, num_counts):
     expected = met / float(jnp.exp(density))
 
     def inverse_weights(num_counts):
-        proposal = as_proposal(coupling, model, jnp.asarray(start), num_counts)
+        proposal = as_proposal(coupling, model, jnp.asarray(start), Budget(num_counts))
         intervals = jax.tree.map(
             lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, jnp.float32), (n, *jnp.shape(leaf))),
             Intervals(jnp.asarray(start), jnp.asarray(end), jnp.asarray(duration)),

@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import PAPER_CASES, count_compilations, exact_cases, paper_model, slow_cases
+from helpers import PAPER_CASES, chosen_of, count_compilations, exact_cases, paper_model, slow_cases
 
 import jaxbridge as jb
 from jaxbridge.proposals.auto import as_proposal
-from jaxbridge.proposals.choice import Choice
 
 CASES = exact_cases()
 EVERYWHERE = {"unlikely, gamma 0.5"}
@@ -215,7 +214,7 @@ def test_a_constant_that_is_not_known_is_refused(way, unchecked):
         "coupling": jb.Coupling(0.0),
         "printed": jb.Coupling.as_published(0.5),
         "pairs": pairs,
-        "choice": Choice((pairs,), None, None, None, None, jnp.zeros(1, jnp.int32), None, (0,)),
+        "choice": chosen_of((pairs,), jnp.zeros(1, jnp.int32), (0,)),
         "custom": jb.Coupling(0.0, start_law=jb.Stationary(burn_in=3.0)),
     }[way]
     arguments = (jax.random.key(0), model, [0.0], [0.5], 1.0)

@@ -7,7 +7,7 @@ import pytest
 from inference_oracles import multivariate_ou
 
 import jaxbridge as jb
-from jaxbridge.schemes.path_likelihood import forms_of_target
+from jaxbridge.schemes.path_likelihood import forms_of_targets
 
 ENDS = ([0.5, -0.3], [1.0, 0.8], 1.0)
 
@@ -152,4 +152,5 @@ def test_on_a_grid_with_short_last_steps(density):
     np.testing.assert_allclose(gradient, direct, atol=5 * 0.005)
     assert np.abs(direct).max() > 0.05
     form = "girsanov" if isinstance(density, jb.EulerDensity) else "trapezoid"
-    assert forms_of_target(bridges.proposal, model, bridges.paths[0, 0])[0] == form
+    targets = [single.target for single in bridges.proposal.singles]
+    assert forms_of_targets(targets, model, bridges.paths[0, 0])[0] == form

@@ -13,8 +13,7 @@ from scipy import optimize, stats
 import jaxbridge as jb
 from jaxbridge.inference import simulated_likelihood
 from jaxbridge.inference.problem import as_problem
-from jaxbridge.proposals.auto import guided_candidates
-from jaxbridge.proposals.choice import undecided_between
+from jaxbridge.proposals.auto import choice_between, guided_candidates
 
 POSITIVE = lambda params: jnp.all(jnp.stack(params) > 0)
 BRIDGE = jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())
@@ -208,7 +207,7 @@ def test_a_maximum_that_is_not_allowed_is_not_found():
 def test_proposals_that_are_not_pulled_are_refused(unchecked):
     times, data, *_ = ou_problem()
     arguments = (jax.random.key(0), ou_1d(), times[:3], data[:3])
-    undecided = undecided_between([jb.Coupling(0.0), BRIDGE], ou_1d(), jnp.zeros(1), None)
+    undecided = choice_between([jb.Coupling(0.0), BRIDGE])
     for proposal in (jb.Coupling(0.0), undecided):
         with pytest.raises(ValueError, match="with couplings its estimates have no derivative"):
             estimate(*arguments, **dict(SHORT, proposal=proposal))

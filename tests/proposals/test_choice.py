@@ -4,11 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_weighted_moments, count_compilations, paper_model
+from helpers import assert_weighted_moments, chosen_of, count_compilations, paper_model
 
 import jaxbridge as jb
 from jaxbridge.proposals.auto import as_proposal
-from jaxbridge.proposals.choice import Choice
 
 slow = pytest.mark.slow
 HYPERBOLIC = jb.hyperbolic(0.8, 2)
@@ -20,7 +19,7 @@ def mixed_choice(model, num_intervals):
     """Proposals in turn, whatever is best."""
     proposals = tuple(as_proposal(candidate, model, jnp.zeros(2)) for candidate in CANDIDATES)
     chosen = jnp.arange(num_intervals, dtype=jnp.int32) % 3
-    return Choice(proposals, None, None, None, None, chosen, None, (0, 1, 2))
+    return chosen_of(proposals, chosen, (0, 1, 2))
 
 
 @slow
@@ -230,7 +229,7 @@ NUM = 6
 def pulled_choice():
     """Three proposals in turn, of which two are used."""
     chosen = jnp.array([0, 2, 0, 0, 2, 2], jnp.int32)
-    return Choice(tuple(PULLED), None, None, None, None, chosen, None, (0, 2))
+    return chosen_of(tuple(PULLED), chosen, (0, 2))
 
 
 def pulled_setting():
@@ -305,9 +304,7 @@ def test_what_a_proposal_makes_of_another_ones_interval_does_not_spoil_derivativ
     model = jb.Diffusion(lambda x, p: -p * x**5, params=1.0)
     starts, ends = jnp.array([[0.0], [6.0]]), jnp.array([[0.3], [6.1]])
     guided, bridge = jb.Guided("path"), jb.ModifiedDiffusionBridge()
-    choice = Choice(
-        (bridge, guided), None, None, None, None, jnp.array([1, 0], jnp.int32), None, (0, 1)
-    )
+    choice = chosen_of((bridge, guided), jnp.array([1, 0], jnp.int32), (0, 1))
 
     def first(params, proposal):
         return jb.transition_log_density(

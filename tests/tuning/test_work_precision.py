@@ -8,7 +8,7 @@ from helpers import paper_model
 
 import jaxbridge as jb
 from jaxbridge import plot
-from jaxbridge.tuning.work_precision import Setting
+from jaxbridge.tuning.settings import Setting
 
 KEY = jax.random.key(0)
 ENDS = ([0.785, 0.785], [1.091, 1.091], 1.0)

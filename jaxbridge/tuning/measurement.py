@@ -1,0 +1,248 @@
+"""Estimates of one quantity over bridges: by a setting, in closed form, and by a reference."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from ..coupling.bridges import sample_bridges
+from ..engine.checks import Numbers, cast_floats
+from ..engine.diagnostics import effective_sample_size
+from ..exact.chains import sample_exact_bridges
+from ..exact.density import transition_log_density
+from ..exact.importance import sample_weighted_bridges
+from ..models.diffusion import Diffusion
+from ..models.gaussian_bridge import gaussian_bridge
+from ..models.ornstein_uhlenbeck import OrnsteinUhlenbeckParams, ou_transition
+from .settings import Setting
+
+
+class Estimate(NamedTuple):
+    """The mean of m variables, its standard error and their standard deviation, from simulated
+    paths, or another source in words."""
+
+    mean: Float[np.ndarray, " m"]
+    error: Float[np.ndarray, " m"]
+    sd: Float[np.ndarray, " m"]
+    num_simulated: int = 0
+    num_missing: int = 0
+    source: str = "exact"
+
+    @property
+    def is_random(self) -> np.ndarray:
+        """Not the same for all bridges, as end points are, up to rounding."""
+        scale = max(np.abs(self.mean).max(), self.sd.max())
+        return self.sd > 1e-6 * scale
+
+
+class Scene(NamedTuple):
+    """What is estimated."""
+
+    model: Diffusion
+    start: np.ndarray
+    end: np.ndarray
+    duration: float
+    save_at: np.ndarray
+    fn: Callable[[Array], Array]
+    is_path: bool
+
+    def interval(self, dtype: str) -> tuple[Any, ...]:
+        """The model and the interval in one precision; x64 must be enabled for float64."""
+        points = (jnp.asarray(point, dtype) for point in (self.start, self.end))
+        return cast_floats(self.model, dtype), *points, jnp.asarray(self.duration, dtype)
+
+    def values(self, paths: Float[Array, "n K d"]) -> Float[np.ndarray, "n m"]:
+        """`fn` of each path."""
+        return np.asarray(jax.vmap(lambda path: jnp.ravel(self.fn(path)))(paths), float)
+
+
+def check_precisions(scene: Scene, dtypes: Sequence[str]) -> None:
+    """Raise `TypeError` where the model's functions cannot be traced in all of these, before
+    anything is compiled: JAX remembers the precision in which it first saw a NumPy constant inside
+    a derivative, and then mixes that with another."""
+
+    def look(model: Diffusion, x: Array):
+        forward = model.forward(x)
+        seen = [jax.jacfwd(forward.drift)(x), forward.sigma(x).as_matrix(x.shape[0], x.dtype)]
+        if model.has_density:
+            seen.append(jax.grad(model.log_stationary)(x))
+        if model.has_reversal:
+            seen.append(model.backward(x).drift(x))
+        return seen
+
+    for dtype in dict.fromkeys(dtypes):
+        with jax.enable_x64(dtype == "float64"):
+            model, x, *_ = scene.interval(dtype)
+            try:
+                eqx.filter_eval_shape(eqx.filter_jit(look), model, x)
+            except TypeError as error:
+                raise TypeError(
+                    "the model's functions do not serve in single and in double precision, in "
+                    "which settings and the reference are run: take constants to the precision of "
+                    "the point, `jnp.asarray(constant, x.dtype)`, or give them to `Diffusion` "
+                    f"among its `params`. ({error})"
+                ) from error
+
+
+class Run(NamedTuple):
+    """A setting: a method with a proposal, in a precision and so many steps and bridges."""
+
+    method: str
+    proposal: Any
+    dtype: str
+    num_steps: int
+    num_bridges: int
+
+    def result(self, key: Key[Array, ""], scene: Scene) -> Any:
+        """The result of the call that is timed."""
+        arguments = (key, *scene.interval(self.dtype))
+        proposal, num_steps = cast_floats(self.proposal, self.dtype), self.num_steps
+        if self.method == "density":
+            size = {"num_proposals": self.num_bridges, "num_steps": num_steps}
+            return transition_log_density(*arguments, proposal=proposal, **size)
+        size = {"num_bridges": self.num_bridges, "num_steps": num_steps, "save_at": scene.save_at}
+        if self.method == "approximate":
+            return sample_bridges(*arguments, coupling=proposal.coupling, **size)
+        if self.method == "weights":
+            return sample_weighted_bridges(*arguments, proposal=proposal, **size)
+        chain: Any = self.method
+        return sample_exact_bridges(*arguments, proposal=proposal, method=chain, **size)
+
+
+def _estimate(scene: Scene, method: str, result: Any) -> Estimate:
+    """Means and their errors, in double precision, from what a run returned."""
+    if method == "density":
+        found = np.isfinite(result.value)
+        value = np.where(found, np.exp(np.asarray(result.value, float)), np.nan)[None]
+        relative = float(result.standard_error)
+        simulated, truncated = int(result.num_simulated), int(result.num_truncated)
+        return Estimate(value, value * relative, value, simulated, truncated)
+    met = np.asarray(result.met)
+    values = scene.values(result.paths)[met]
+    truncated = np.asarray(getattr(result, "truncated", False))
+    missing = int(np.sum(~met | truncated))
+    simulated = result.num_proposals if method == "approximate" else result.num_simulated
+    if len(values) == 0:
+        unknown = np.full(values.shape[1], np.nan)
+        return Estimate(unknown, unknown, unknown, int(simulated), missing)
+    if method == "weights":
+        weights = np.asarray(result.weights, float)[met]
+        weights /= weights.sum()
+        mean = weights @ values
+        deviations = (values - mean) ** 2
+        error, sd = np.sqrt(weights**2 @ deviations), np.sqrt(weights @ deviations)
+    else:
+        mean, sd = values.mean(0), values.std(0)
+        independent = method == "approximate"
+        size = len(values) if independent else np.asarray(effective_sample_size(values), float)
+        error = sd / np.sqrt(size)
+    return Estimate(mean, error, sd, int(simulated), missing)
+
+
+def given(reference: tuple[Numbers, Numbers] | None) -> Estimate | None:
+    """The mean and the standard deviation that the user knows."""
+    if reference is None:
+        return None
+    mean, sd = (np.ravel(np.asarray(part, float)) for part in reference)
+    return Estimate(mean, np.zeros_like(mean), sd)
+
+
+def given_density(log_density: Numbers | None) -> Estimate | None:
+    """The density that the user knows."""
+    if log_density is None:
+        return None
+    value = np.exp(np.ravel(np.asarray(log_density, float)))
+    return Estimate(value, np.zeros_like(value), value)
+
+
+def closed_form(
+    key: Key[Array, ""], scene: Scene, density: bool, num_draws: int
+) -> Estimate | None:
+    """The exact values for an Ornstein–Uhlenbeck process, of which only a function of the user's
+    own needs draws."""
+    if not isinstance(scene.model.params, OrnsteinUhlenbeckParams):
+        return None
+    model, start, end, duration = scene.interval("float64")
+    if density:
+        value = np.exp(np.asarray(ou_transition(model, start, duration).log_density(end)))[None]
+        return Estimate(value, np.zeros(1), value)
+    bridge = gaussian_bridge(model, start, end, duration, scene.save_at)
+    if not scene.is_path:
+        values = scene.values(bridge.sample(key, num_draws))
+        mean, sd = values.mean(0), values.std(0)
+        words = f"{num_draws:,} draws of the exact law"
+        return Estimate(mean, sd / np.sqrt(num_draws), sd, source=words)
+    mean = np.asarray(bridge.mean, float).ravel()
+    sd = np.sqrt(np.diagonal(np.asarray(bridge.covariance), axis1=1, axis2=2)).ravel()
+    return Estimate(mean, np.zeros_like(mean), sd)
+
+
+def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
+    """A fine run by the best scheme there is; to its error belongs what half the steps change."""
+    varies = scene.model.forward(jnp.asarray(scene.start)).sigma_varies
+    limit = run._replace(proposal=run.proposal.most_accurate(varies))
+    half = limit._replace(num_steps=max(run.num_steps // 2, 1))
+    fine = _estimate(scene, run.method, limit.result(key, scene))
+    coarse = _estimate(scene, run.method, half.result(jax.random.fold_in(key, 1), scene))
+    words = limit.proposal.describe()
+    if not np.all(np.isfinite(fine.mean) & np.isfinite(coarse.mean)):
+        raise ValueError(
+            f"the reference, {words} in {run.num_steps} steps, found no bridges: choose other "
+            "`proposals`, or pass what is known as `reference`."
+        )
+    chance = fine.error**2 + coarse.error**2
+    changed = np.maximum((fine.mean - coarse.mean) ** 2 - chance, 0)
+    words += f", {run.method}, {run.num_steps} steps, {run.num_bridges:,} bridges"
+    return fine._replace(error=np.sqrt(fine.error**2 + changed), source=words)
+
+
+def measure(
+    key: Key[Array, ""], scene: Scene, run: Run, exact: Estimate, limit: Estimate, repeats: int
+) -> Setting:
+    """Run one setting, time it and compare."""
+
+    def timed():
+        begin = time.perf_counter()
+        result = jax.block_until_ready(run.result(key, scene))
+        return result, time.perf_counter() - begin
+
+    with jax.enable_x64(run.dtype == "float64"):
+        result, first = timed()
+        seconds = float(np.median([timed()[1] for _ in range(repeats)]))
+        found = _estimate(scene, run.method, result)
+        shape = getattr(result, "pareto_k", None)
+
+    def size(difference):
+        ratio = difference[exact.is_random] / exact.sd[exact.is_random]
+        return float(np.sqrt(np.mean(ratio**2)))
+
+    monte_carlo = size(found.error)
+    effective = monte_carlo**-2 if monte_carlo > 0 else np.nan
+    scheme, meeting, gamma = run.proposal.ingredients()
+    return Setting(
+        run.method,
+        run.proposal.describe(),
+        scheme,
+        meeting,
+        gamma,
+        run.dtype,
+        run.num_steps,
+        size(found.mean - exact.mean),
+        size(np.hypot(found.error, exact.error)),
+        size(found.mean - limit.mean),
+        size(np.hypot(found.error, limit.error)),
+        size(limit.mean - exact.mean),
+        monte_carlo,
+        seconds,
+        max(first - seconds, 0.0),
+        found.num_simulated,
+        effective,
+        effective / seconds,
+        found.num_missing,
+        np.nan if shape is None else float(shape),
+    )
