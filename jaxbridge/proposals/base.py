@@ -153,6 +153,23 @@ class AbstractSingleProposal(AbstractWeightedProposal):
     """One way to propose bridges, and what a choice between several must know of it."""
 
     @property
+    def singles(self):
+        return (self,)
+
+    @property
+    def is_open(self):
+        return False
+
+    def of(self, which):
+        return self
+
+    def for_all(self):
+        return self
+
+    def split(self):
+        return [(slice(None), self)]
+
+    @property
     @abstractmethod
     def target(self) -> AbstractStepDensity | None:
         """The law of the steps of the chain of which its bridges are exact; `None` where that is

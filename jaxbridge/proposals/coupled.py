@@ -63,14 +63,6 @@ class CoupledPairs(AbstractSingleProposal):
     num_counts: int = eqx.field(static=True)
 
     @property
-    def singles(self):
-        return (self,)
-
-    @property
-    def is_open(self):
-        return False
-
-    @property
     def by_coupling(self):
         return self.coupling
 
@@ -116,15 +108,6 @@ class CoupledPairs(AbstractSingleProposal):
     def for_pilot(self):
         bound = jnp.minimum(self.max_trials, _PILOT_TRIALS * self.num_counts)
         return eqx.tree_at(lambda p: p.max_trials, self, bound)
-
-    def of(self, which):
-        return self
-
-    def for_all(self):
-        return self
-
-    def split(self):
-        return [(slice(None), self)]
 
     def check(self, model, intervals):
         check_model(model, intervals, self.coupling.scheme)

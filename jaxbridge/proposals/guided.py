@@ -78,14 +78,6 @@ class AbstractGuidedProposal(AbstractSingleProposal):
     refinement: eqx.AbstractVar[float]
 
     @property
-    def singles(self):
-        return (self,)
-
-    @property
-    def is_open(self):
-        return False
-
-    @property
     def by_coupling(self):
         return None
 
@@ -108,15 +100,6 @@ class AbstractGuidedProposal(AbstractSingleProposal):
 
     def for_pilot(self):
         return self
-
-    def of(self, which):
-        return self
-
-    def for_all(self):
-        return self
-
-    def split(self):
-        return [(slice(None), self)]
 
     def check_size(self, model):
         pass
