@@ -33,7 +33,8 @@ from ..schemes.heun import Heun
 from ..schemes.milstein import Milstein
 from ..schemes.step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
 from ..schemes.step_error import share_of_order
-from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths, in_blocks
+from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
+from .blocks import in_blocks
 
 # Whole paths are kept only until they are weighed: at most this many bytes of them at a time.
 _BLOCK_BYTES = 2**28

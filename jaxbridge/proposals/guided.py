@@ -38,14 +38,8 @@ from ..schemes.fit import check_model
 from ..schemes.halving import num_looked, of_all_steps, of_pair
 from ..schemes.step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity, StepLaw
 from ..schemes.step_error import share_of_order
-from .base import (
-    AbstractProposal,
-    AbstractSingleProposal,
-    WeightedPaths,
-    block_over_devices,
-    in_blocks,
-    masked,
-)
+from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
+from .blocks import block_over_devices, in_blocks, masked
 
 # Of the duration: shorter steps are lost in the rounding of points.
 _SHORTEST_STEP = 1e-10
