@@ -161,9 +161,10 @@ def work_precision(
         check_count("reference_bridges", most),
     )
     whole = (lambda points: points) if fn is None else fn
-    ends = (np.asarray(point[0]) for point in problem.intervals[:2])
+    start_point, end_point = (np.asarray(point[0]) for point in problem.intervals[:2])
     length = float(problem.intervals.duration[0])
-    scene = Scene(model, *ends, length, np.asarray(save_at, float), whole, fn is None)
+    times = np.asarray(save_at, float)
+    scene = Scene(model, start_point, end_point, length, times, whole, fn is None)
     given_values = {False: given(reference), True: given_density(log_density)}
     alone = all(m != "approximate" and given_values[m == "density"] for m in methods)
     check_precisions(scene, dtypes if alone else ("float32", "float64"))
