@@ -23,7 +23,7 @@ from ..models.intervals import Intervals, as_intervals
 from ..schemes.fit import check_model
 from .base import AbstractCoupling, check_coupling
 from .gamma import Coupling
-from .pair import Proposals, propose
+from .join import Proposals, propose
 
 
 class Bridges(eqx.Module):
