@@ -11,13 +11,13 @@ have met as a proposed pair: index 0 counts, and the rule is the coupling's own.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from ..engine.keys import split_each
 from ..engine.lanes import over_lanes
 from ..engine.linalg import is_finite
-from ..engine.noise import noisy_scan
+from ..engine.noise import noisy_scan_until
 from ..models.diffusion import Diffusion
 from .base import AbstractCoupling
 from .pair import drive_back, have_met, in_lanes, pair_noise
@@ -47,8 +47,7 @@ def run_associated(
     lane's key alone. Simulation ends when all lanes have hit."""
     num_steps, like = len(path) - 1, path[0, :, 0]
     forward = model.forward(like)
-    split_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
-    start_keys, path_keys, coupling_keys = split_keys
+    start_keys, path_keys, coupling_keys = split_each(keys, 3)
     lanes, axes = in_lanes(coupling, forward, like, coupling_keys, dt)
     law, scheme = lanes.coupling.start_law, lanes.coupling.scheme
     start = draw_starts(law, model, scheme, start_keys, path[-1], dt, num_steps)
@@ -63,14 +62,14 @@ def run_associated(
         noise, (z, z_next) = inputs
         return step_associated(*carry, z, z_next, noise, lanes), None
 
-    (y_end, hit), _ = noisy_scan(
+    y_end, hit = noisy_scan_until(
+        lambda carry: carry[1],
         step,
         (start, jnp.zeros(dt.shape, bool)),
         path_keys,
         pair_noise(coupling, path.dtype),
         (path[:-1], path[1:]),
         num_steps,
-        over=lambda carry: carry[1],
     )
     finite = jnp.all(is_finite(y_end), axis=0) | hit
     return Associated(hit, start, finite)

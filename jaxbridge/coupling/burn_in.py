@@ -25,10 +25,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key, is_traced
+from ..engine.keys import folded, key_for
 from ..engine.lanes import over_lanes
 from ..engine.linalg import is_finite
 from ..engine.noise import noisy_scan
-from ..engine.rejection import key_for
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.dynamics import Dynamics
 from ..models.intervals import as_intervals
@@ -190,7 +190,7 @@ def _run_pairs(
         return noisy_scan(
             lambda pairs, inputs: (step_pair(*pairs, *inputs[0], lanes), None),
             pairs,
-            jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, repeat),
+            folded(keys, repeat),
             draw,
             None,
             num_steps,

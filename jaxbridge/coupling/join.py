@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from ..engine.keys import split_each
 from ..engine.lanes import over_lanes
 from ..engine.linalg import is_finite
 from ..engine.noise import Store, noisy_scan
@@ -57,8 +58,7 @@ def propose(
     With `meeting_step` the pair is joined there, not where the coupling's rule says: a replay.
     """
     like = start[:, 0]
-    split_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
-    reverse_keys, driven_keys, coupling_keys = split_keys
+    reverse_keys, driven_keys, coupling_keys = split_each(keys, 3)
     backward, forward = model.backward(like), model.forward(like)
     x_start, x_path = reverse_path(backward, coupling.scheme, reverse_keys, end, dt, num_steps)
     pairs = in_lanes(coupling, forward, like, coupling_keys, dt)

@@ -25,6 +25,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
+from ..engine.keys import folded
 from ..engine.noise import noisy_scan
 from ..models.diffusion import Diffusion, check_value
 from ..models.dynamics import Dynamics
@@ -217,7 +218,7 @@ def run_for(
         end, _ = noisy_scan(
             lambda x, inputs: (step(x, inputs[0]), None),
             x,
-            jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, repeat),
+            folded(keys, repeat),
             lambda key, k: jax.random.normal(key, (k, x.shape[0]), x.dtype),
             None,
             num_steps,

@@ -124,8 +124,8 @@ def stored_times(num_stored: int | None) -> Effect:
     return Effect(False, f"only {num_stored} times were asked for")
 
 
-def early_stop(num_stretches: int) -> Effect:
+def early_stop(num_chunks: int) -> Effect:
     """Looking on the way whether all associated paths have hit."""
-    if num_stretches == 1:
+    if num_chunks == 1:
         return Effect(False, "the path is one stretch of noise, drawn at once")
-    return Effect(True, f"after each of {num_stretches} stretches of noise")
+    return Effect(True, f"after each of {num_chunks} stretches of noise")
