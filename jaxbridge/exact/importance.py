@@ -27,8 +27,8 @@ from ..engine.averages import (
     weighted_mean,
 )
 from ..engine.checks import Numbers, check_count, check_key
+from ..engine.keys import key_for
 from ..engine.pareto import is_reliable, pareto_k
-from ..engine.rejection import key_for
 from ..engine.throwing import throw_where_incomplete
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.grid import grid_times, stored_steps

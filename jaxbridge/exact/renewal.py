@@ -23,7 +23,7 @@ from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Inputs, Joined, find_bridges
 from ..coupling.start_laws import log_ratio, run_is_cut
 from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
-from ..engine.rejection import Found, default_num_lanes, most_lanes
+from ..engine.rejection import Accepted, default_num_lanes, most_lanes
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.grid import grid_times
 from ..models.intervals import Intervals
@@ -298,7 +298,7 @@ def propose_paths(
     intervals: Intervals,
     active: Bool[Array, " I"] | None,
     num_steps: int,
-) -> Found:
+) -> Accepted:
     """A bridge by proposal for each interval; or for those that are active, which often are few."""
     num_wanted = len(keys) if active is None else len(keys) // 4
     active = jnp.ones(len(keys), bool) if active is None else active

@@ -44,8 +44,8 @@ from ..coupling.hitting import check_max_trials
 from ..coupling.start_laws import Stationary
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import check_bound, check_count, is_traced, nondifferentiable_choice
+from ..engine.keys import key_for
 from ..engine.pareto import is_reliable, pareto_k
-from ..engine.rejection import key_for
 from ..models.diffusion import Diffusion
 from ..models.intervals import Intervals
 from ..schemes.step_density import EulerDensity, ItoTaylorDensity

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, Key
 from ..coupling.hitting import hitting_counts
 from ..coupling.start_laws import AnyStartLaw
 from ..engine.checks import check_count, check_key
-from ..engine.rejection import key_for
+from ..engine.keys import key_for
 from ..exact.importance import WeightedBridges
 from ..exact.kernels import Chain
 from ..models.diffusion import Diffusion

@@ -32,8 +32,8 @@ from ..coupling.gamma import Coupling
 from ..coupling.meeting import AbstractMeeting, BrownianCrossing
 from ..engine.checks import Numbers, cast_floats, check_count, check_key
 from ..engine.diagnostics import effective_sample_size
+from ..engine.keys import key_for
 from ..engine.pareto import is_reliable
-from ..engine.rejection import key_for
 from ..exact.chains import sample_exact_bridges
 from ..exact.density import check_for_density, transition_log_density
 from ..exact.importance import sample_weighted_bridges
