@@ -5,12 +5,8 @@ function of its place in a tree of keys (`keys`), so nothing depends on what run
 are small and lanes, one simulated path each, are many: a function of one point is evaluated with
 lanes in the last axis (`lanes`, whose values have one of the `lane_forms`), its algebra written
 out (`linalg`), in scans over time that draw their noise chunk by chunk (`noise`). Attempts are made
-until each of many problems has its successes,
-
-    number of the j-th success = min {i : i attempts, j successes},
-
-side by side in as many lanes as there are (`rejection`), on all `devices`, and say how far they are
-(`progress`). Of what comes out means are taken, Σ w h / Σ w (`averages`), whose weights have tails
+side by side until each of many problems has its successes (`rejection`), on all `devices`, in loops
+that tell how far they are (`progress`). Of what comes out means are taken, Σ w h / Σ w (`averages`), whose weights have tails
 that allow it or not (`pareto`) and whose draws are worth so many independent ones (`diagnostics`).
 What is missing is an error at run time for those who ask (`throwing`).
 """
