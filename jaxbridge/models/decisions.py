@@ -3,8 +3,8 @@
 A model and a coupling are a scene. What its compiled program contains is decided here and
 nowhere else, when it is traced: the model asks for the rules of the reversal, the scheme for
 that of its drift, the pair for those of its noise and its rotation. (Whether there is a matrix
-to solve with follows from the class of σ, which `solves` puts in words.) `coupling.effects` asks the
-same rules and prints their answers, so what it says is what is simulated.
+to solve with follows from the class of σ, which `solves` puts in words.) `coupling.effects` asks
+the same rules and prints their answers, so what it says is what is simulated.
 """
 
 from typing import NamedTuple

@@ -1,7 +1,7 @@
 """One step, x' = step(x, ΔW) with ΔW ~ N(0, δ I): made, inverted, and its density.
 
 A scheme (`base`) makes the step, says which noise made it, ΔW = noise(x, x'), and how a pair of
-points lies for that noise, by the unit vector u and the length of σ(x')⁻¹(x - x') (`frame`). Schemes
+points lies for that noise, by the direction u and the length of σ(x')⁻¹(x - x') (`frame`). Schemes
 are `euler` and `milstein`, `heun` of second order for constant σ, `semi_implicit` for stiff drift,
 and for a linear one its own transition (`gaussian_transition`); whether scheme, model and points
 fit is checked (`fit`). The density of a step, N(μ(x), δ σ S σᵀ) (`step_density`), makes the
