@@ -14,7 +14,7 @@ import scipy.stats
 from helpers import PAPER_B, paper_model, run_program
 
 import jaxbridge as jb
-from jaxbridge.coupling.pair import propose
+from jaxbridge.coupling.join import propose
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 ROWS: list[tuple[str, str, str, str]] = []

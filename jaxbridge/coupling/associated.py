@@ -11,19 +11,16 @@ have met as a proposed pair: index 0 counts, and the rule is the coupling's own.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
+from ..engine.keys import split_each
 from ..engine.lanes import over_lanes
-from ..engine.linalg import all_finite, is_finite
-from ..engine.noise import noisy_scan
+from ..engine.linalg import is_finite
+from ..engine.noise import noisy_scan_until
 from ..models.diffusion import Diffusion
-from ..schemes.base import fitted_in_lanes
-from .base import AbstractCoupling, see
-from .meeting import PairStep
-from .pair import pair_noise, realise
-from .rotation import rotate_back, rotation_between
+from .base import AbstractCoupling
+from .pair import drive_back, have_met, in_lanes, pair_noise
 from .start_laws import draw_starts
 
 
@@ -48,44 +45,31 @@ def run_associated(
 ) -> Associated:
     """One path associated with the bridge in each lane, whose random numbers depend on the
     lane's key alone. Simulation ends when all lanes have hit."""
-    num_steps, dtype = path.shape[0] - 1, path.dtype
-    forward = model.forward(path[0, :, 0])
-    rule = coupling.meeting
-    split_keys = jax.vmap(lambda key: jax.random.split(key, 3), out_axes=1)(keys)
-    start_keys, path_keys, coupling_keys = split_keys
-    coupling, coupling_axes = realise(coupling, coupling_keys, dtype)
-    start = draw_starts(
-        coupling.start_law, model, coupling.scheme, start_keys, path[-1], dt, num_steps
-    )
-    scheme = fitted_in_lanes(coupling.scheme, forward, path[0, :, 0], dt)
-    root_dt = jnp.sqrt(dt)
+    num_steps, like = len(path) - 1, path[0, :, 0]
+    forward = model.forward(like)
+    start_keys, path_keys, coupling_keys = split_each(keys, 3)
+    lanes, axes = in_lanes(coupling, forward, like, coupling_keys, dt)
+    law, scheme = lanes.coupling.start_law, lanes.coupling.scheme
+    start = draw_starts(law, model, scheme, start_keys, path[-1], dt, num_steps)
 
-    @over_lanes(-1, -1, -1, -1, -1, -1, coupling_axes)
-    def step_associated(y, hit, z, z_next, noise, lane, coupling):
-        dt, root_dt, scheme = lane
-        normal, uniform = noise
-        sigma, driven_sigma = forward.sigma(y), forward.sigma(z)
-        seen = see(coupling, scheme, forward, y, z, dt)
-        du = None if normal is None else root_dt * normal
-        dw = coupling.driving_noise(seen, scheme.noise(forward, z, z_next, dt), du)
-        dw = rotate_back(rotation_between(coupling, sigma, driven_sigma), dw)
-        y_next = scheme.step(forward, y, dt, dw)
-        pair = PairStep(seen, y, y_next, z, z_next, dt, coupling.gap_variance(seen))
-        return y_next, hit | (rule.met(pair, forward, uniform) & all_finite(y_next))
+    @over_lanes(-1, -1, -1, -1, -1, axes)
+    def step_associated(y, hit, z, z_next, noise, lane):
+        dw = lane.scheme.noise(forward, z, z_next, lane.dt)
+        pair = drive_back(forward, lane, y, z, z_next, dw, noise)
+        return pair.x_next, hit | have_met(forward, lane.coupling, pair, noise)
 
     def step(carry, inputs):
-        y, hit = carry
         noise, (z, z_next) = inputs
-        return step_associated(y, hit, z, z_next, noise, (dt, root_dt, scheme), coupling), None
+        return step_associated(*carry, z, z_next, noise, lanes), None
 
-    (y_end, hit), _ = noisy_scan(
+    y_end, hit = noisy_scan_until(
+        lambda carry: carry[1],
         step,
         (start, jnp.zeros(dt.shape, bool)),
         path_keys,
-        pair_noise(coupling, dtype),
+        pair_noise(coupling, path.dtype),
         (path[:-1], path[1:]),
         num_steps,
-        over=lambda carry: carry[1],
     )
     finite = jnp.all(is_finite(y_end), axis=0) | hit
     return Associated(hit, start, finite)

@@ -2,7 +2,7 @@
 
 The direction u of the gap, u ∝ σ(x')⁻¹(x - x'), is built with σ(x') whichever copy drives the
 other, x' being the state of X', and in discrete time from the gap when the noise of the step sets
-in (`meeting`, `see`). The rotation O(x, x') belongs to the pair, not to the coupling's geometry
+in (`meeting`, `pair`). The rotation O(x, x') belongs to the pair, not to the coupling's geometry
 (`rotation`): a coupling sees the noise of X after O has turned it, so one O serves both directions.
 """
 
@@ -12,9 +12,8 @@ from collections.abc import Callable
 import equinox as eqx
 from jaxtyping import Array, Float, Key
 
-from ..models.dynamics import Dynamics
 from ..schemes.base import AbstractScheme
-from ..schemes.frame import Frame, frame
+from ..schemes.frame import Frame
 from .meeting import AbstractMeeting
 from .start_laws import AnyStartLaw
 
@@ -87,21 +86,6 @@ class AbstractCoupling(eqx.Module):
     def realise(self, keys: Key[Array, " lanes"]) -> "AbstractCoupling":
         """The coupling of each of many proposals: arrays drawn at random get a trailing axis
         of lanes. A coupling without randomness of its own returns itself."""
-
-
-def see(
-    coupling: AbstractCoupling,
-    scheme: AbstractScheme,
-    dynamics: Dynamics,
-    x: Float[Array, " d"],
-    driven: Float[Array, " d"],
-    dt: Float[Array, ""],
-) -> Frame:
-    """How the pair lies at the beginning of a step, as the meeting rule wants it seen; `scheme` is
-    the coupling's, fitted to the step."""
-    if coupling.meeting.looks_ahead:
-        return scheme.frame(dynamics, x, driven, dt)
-    return frame(dynamics.sigma(driven), x, driven)
 
 
 def check_coupling(coupling) -> None:

@@ -1,6 +1,6 @@
 """Approximate bridges by rejection (section 2.2): propose until the pair meets.
 
-The proposals of an interval are numbered trials (`search`), and its j-th success is the
+The proposals of an interval are numbered attempts (`rejection`), and its j-th success is the
 interval's j-th bridge.
 """
 
@@ -15,7 +15,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_bound, check_count, check_key
 from ..engine.devices import over_devices
-from ..engine.rejection import Found, Trials, default_num_lanes, numbered_keys, search
+from ..engine.keys import numbered_keys
+from ..engine.rejection import Accepted, Attempts, default_num_lanes, rejection_sample
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import (
     BridgeProblem,
@@ -27,7 +28,7 @@ from ..models.diffusion import Diffusion
 from ..schemes.fit import check_model
 from .base import AbstractCoupling, check_coupling
 from .gamma import Coupling
-from .pair import Proposals, propose
+from .join import Proposals, propose
 
 
 class Bridges(eqx.Module):
@@ -132,7 +133,6 @@ def sample_bridges(
         num_wanted = num_bridges * problem.num_intervals
         batch_size = default_num_lanes(num_wanted, num_steps, problem.intervals.start)
     batch_size = check_count("batch_size", batch_size)
-    progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     sizes = (num_bridges, batch_size)
     bridges = _sample_bridges(key, model, coupling, problem, max_proposals, *sizes, progress_meter)
     return throw_where_incomplete(bridges, "paths", model, ~bridges.met) if throw else bridges
@@ -155,7 +155,7 @@ def _sample_bridges(
     max_proposals: Int[Array, ""],
     num_bridges: int,
     num_lanes: int,
-    progress_meter: diffrax.AbstractProgressMeter,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Bridges:
     num_intervals, num_steps, stored = problem.num_intervals, problem.num_steps, problem.stored
     keys = problem.keys(key, 1)[:, 0]
@@ -216,10 +216,10 @@ def find_bridges(
     stored: Int[Array, " K"] | None,
     num_lanes: int,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
-) -> Found:
+) -> Accepted:
     """Propose for each of P active problems, one interval and one key each, until it has its
     bridges. The outputs are `Joined`."""
-    trial = eqx.Partial(_trial, inputs, keys, num_steps, stored)
+    attempt = eqx.Partial(_attempt, inputs, keys, num_steps, stored)
     (num_problems, d), dtype = inputs.intervals.start.shape, inputs.intervals.start.dtype
     num_rows = num_problems * num_bridges
     num_stored = num_steps + 1 if stored is None else stored.shape[0]
@@ -228,20 +228,22 @@ def find_bridges(
         jnp.full((num_rows, d), jnp.nan, dtype),
         jnp.full(num_rows, num_steps + 1, jnp.int32),
     )
-    return search(trial, rows, active, num_bridges, max_proposals, num_lanes, progress_meter)
+    return rejection_sample(
+        attempt, rows, active, num_bridges, max_proposals, num_lanes, progress_meter
+    )
 
 
-def _trial(
+def _attempt(
     inputs: Inputs,
     keys: Key[Array, " P"],
     num_steps: int,
     stored: Int[Array, " K"] | None,
     problem: Int[Array, " lanes"],
     number: Int[Array, " lanes"],
-) -> Trials:
+) -> Attempts:
     made = _propose_numbered(inputs, keys, problem, number, num_steps, stored)
     joined = Joined(jnp.moveaxis(made.paths, -1, 0), made.reverse_start.T, made.meeting_step)
-    return Trials(made.meeting_step <= num_steps, made.finite, joined)
+    return Attempts(made.meeting_step <= num_steps, made.finite, joined)
 
 
 def _propose_numbered(
@@ -273,7 +275,7 @@ def _propose_numbered(
 def _with_replayed_tangents(inputs, accepted, paths, num_steps):
     """`paths`, whose tangents come from a replay of the accepted proposals.
 
-    The search is a `while_loop`, which has no reverse mode, and most of its work was rejected.
+    Rejection is a `while_loop`, which has no reverse mode, and most of its work was rejected.
     """
     return paths
 

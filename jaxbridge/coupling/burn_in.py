@@ -22,21 +22,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key, is_traced
+from ..engine.keys import folded, key_for
 from ..engine.lanes import over_lanes
-from ..engine.linalg import all_finite, is_finite
+from ..engine.linalg import is_finite
 from ..engine.noise import noisy_scan
-from ..engine.rejection import key_for
 from ..models.bridge_problem import as_intervals
 from ..models.diffusion import Diffusion, check_diffusion
-from ..schemes.base import fitted_in_lanes
+from ..models.dynamics import Dynamics
 from ..schemes.fit import check_model
-from .base import AbstractCoupling, see
+from .base import AbstractCoupling
 from .gamma import Coupling
-from .meeting import PairStep
-from .rotation import rotate, rotation_between
+from .pair import Lane, PairNoise, drive, have_met, in_lanes
 from .start_laws import MOST_STEPS, Stationary, needs_burn_in, run_for
 
 _NUM_PAIRS = 512
@@ -131,59 +130,21 @@ def _measure(
     num_steps: int,
 ) -> Float[Array, ""]:
     """2s for the first s = 1, 2, 4, ... times `num_steps` steps within which all pairs meet."""
-    dynamics, scheme = model.prepared().backward(end[:, 0]), coupling.scheme
-    fitted = fitted_in_lanes(scheme, dynamics, end[:, 0], dt)
-    reflection = Coupling(-1.0, scheme=scheme, rotation=coupling.rotation)
-    rule, root_dt = reflection.meeting, jnp.sqrt(dt)
-
-    @over_lanes(-1, -1, -1, -1, -1, -1, -1, -1)
-    def step_pair(x, driven, met, dw, uniform, dt, root_dt, scheme):
-        sigma, driven_sigma = dynamics.sigma(x), dynamics.sigma(driven)
-        seen = see(reflection, scheme, dynamics, x, driven, dt)
-        dw = root_dt * dw
-        turned = rotate(rotation_between(reflection, sigma, driven_sigma), dw)
-        x_next = scheme.step(dynamics, x, dt, dw)
-        driven_next = scheme.step(dynamics, driven, dt, reflection.driven_noise(seen, turned, None))
-        variance = reflection.gap_variance(seen).astype(x.dtype)
-        pair = PairStep(seen, x, x_next, driven, driven_next, dt, variance)
-        met |= rule.met(pair, dynamics, uniform) & all_finite(x_next) & all_finite(driven_next)
-        return x_next, jnp.where(met, x_next, driven_next), met
-
-    def step_pairs(pairs, inputs):
-        x, driven, met = pairs
-        (dw, uniform), _ = inputs
-        return step_pair(x, driven, met, dw, uniform, dt, root_dt, fitted), None
-
-    def draw(key, k):
-        normal_key, uniform_key = jax.random.split(key)
-        normal = jax.random.normal(normal_key, (k, end.shape[0]), end.dtype)
-        return normal, jax.random.uniform(uniform_key, (k,), end.dtype)
+    dynamics = model.prepared().backward(end[:, 0])
+    reflection = Coupling(-1.0, scheme=coupling.scheme, rotation=coupling.rotation)
+    pairs = in_lanes(reflection, dynamics, end[:, 0], jax.random.split(key, _NUM_PAIRS), dt)
+    most = max(0, (MOST_STEPS // 2 // num_steps).bit_length() - 1)
 
     def attempt(doublings):
-        repeats = 2**doublings
+        """Whether all pairs met, and whether too many exploded."""
         ahead_key, pair_key = jax.random.split(jax.random.fold_in(key, doublings))
-        ahead_keys = jax.random.split(ahead_key, _NUM_PAIRS)
+        keys, repeats = jax.random.split(ahead_key, _NUM_PAIRS), 2**doublings
         ahead = jnp.full(_NUM_PAIRS, repeats)
-        driven = run_for(dynamics, scheme, ahead_keys, end, dt, num_steps, ahead)
-        keys = jax.random.split(pair_key, _NUM_PAIRS)
-
-        def once(repeat, pairs):
-            return noisy_scan(
-                step_pairs,
-                pairs,
-                jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, repeat),
-                draw,
-                None,
-                num_steps,
-            )[0]
-
-        pairs = (end, driven, jnp.zeros(_NUM_PAIRS, bool))
-        x, driven, met = lax.fori_loop(0, repeats, once, pairs)
+        driven = run_for(dynamics, coupling.scheme, keys, end, dt, num_steps, ahead)
+        x, driven, met = _run_pairs(pair_key, dynamics, pairs, end, driven, num_steps, repeats)
         exploded = ~met & ~jnp.all(is_finite(x) & is_finite(driven), axis=0)
         too_many = jnp.mean(exploded) > _MOST_EXPLODED
         return jnp.all(met | exploded) & ~too_many, too_many
-
-    most = max(0, (MOST_STEPS // 2 // num_steps).bit_length() - 1)
 
     def going_on(state):
         doublings, (all_met, too_many) = state
@@ -197,3 +158,42 @@ def _measure(
     doublings, (all_met, _) = lax.while_loop(going_on, double, init)
     time = 2 * num_steps * jnp.max(dt) * (2**doublings).astype(dt.dtype)
     return jnp.where(all_met, time, jnp.inf)
+
+
+def _run_pairs(
+    key: Key[Array, ""],
+    dynamics: Dynamics,
+    pairs: tuple[Lane, Lane],
+    x: Float[Array, "d pairs"],
+    driven: Float[Array, "d pairs"],
+    num_steps: int,
+    repeats: Int[Array, ""],
+) -> tuple[Float[Array, "d pairs"], Float[Array, "d pairs"], Bool[Array, " pairs"]]:
+    """The pairs after `repeats` times `num_steps` steps, and which have met and stay together."""
+    lanes, axes = pairs
+    keys = jax.random.split(key, _NUM_PAIRS)
+
+    @over_lanes(-1, -1, -1, -1, -1, axes)
+    def step_pair(x, driven, met, normal, noise, lane):
+        dw = lane.root_dt * normal
+        x_next = lane.scheme.step(dynamics, x, lane.dt, dw)
+        pair = drive(dynamics, lane, x, x_next, dw, driven, noise)
+        met |= have_met(dynamics, lane.coupling, pair, noise)
+        return x_next, jnp.where(met, x_next, pair.driven_next), met
+
+    def draw(key, k):
+        normal_key, uniform_key = jax.random.split(key)
+        uniform = jax.random.uniform(uniform_key, (k,), x.dtype)
+        return jax.random.normal(normal_key, (k, len(x)), x.dtype), PairNoise(None, uniform)
+
+    def once(repeat, pairs):
+        return noisy_scan(
+            lambda pairs, inputs: (step_pair(*pairs, *inputs[0], lanes), None),
+            pairs,
+            folded(keys, repeat),
+            draw,
+            None,
+            num_steps,
+        )[0]
+
+    return lax.fori_loop(0, repeats, once, (x, driven, jnp.zeros(_NUM_PAIRS, bool)))

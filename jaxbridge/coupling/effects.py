@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, check_count
-from ..engine.noise import stretches
+from ..engine.noise import chunks
 from ..models import decisions
 from ..models.decisions import Effects
 from ..models.diffusion import Diffusion, check_diffusion
@@ -68,7 +68,7 @@ def effects(
         decisions.crossing_uniforms(coupling.meeting.draws_uniform),
         decisions.stratonovich(coupling.scheme.stratonovich, forward.sigma_varies),
         decisions.stored_times(None if save_at is None else as_floating("save_at", save_at).size),
-        decisions.early_stop(stretches(num_steps)[0]),
+        decisions.early_stop(chunks(num_steps)[0]),
     )
 
 

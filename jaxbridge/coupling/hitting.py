@@ -16,7 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import check_bound, check_count, check_key, nondifferentiable
-from ..engine.rejection import Trials, default_num_lanes, key_for, numbered_keys, search
+from ..engine.keys import key_for, numbered_keys
+from ..engine.rejection import Attempts, default_num_lanes, rejection_sample
 from ..models.diffusion import Diffusion, check_diffusion
 from .associated import run_associated
 from .base import AbstractCoupling
@@ -208,7 +209,7 @@ def count_hits(
     trial = eqx.Partial(_trial, keys, model, coupling, paths, duration)
     num_rows = paths.shape[0] * num_counts
     rows = jnp.full((num_rows, paths.shape[2]), jnp.nan, paths.dtype)
-    found = search(trial, rows, active, num_counts, max_trials, num_lanes, progress_meter)
+    found = rejection_sample(trial, rows, active, num_counts, max_trials, num_lanes, progress_meter)
     number = found.number.reshape(-1, num_counts)
     before = jnp.concatenate([jnp.full_like(number[:, :1], -1), number[:, :-1]], axis=1)
     last = jnp.maximum(found.num_found - 1, 0)
@@ -231,7 +232,7 @@ def _trial(
     duration: Float[Array, " P"],
     problem: Int[Array, " lanes"],
     number: Int[Array, " lanes"],
-) -> Trials:
+) -> Attempts:
     num_steps = paths.shape[1] - 1
     made = run_associated(
         model,
@@ -240,7 +241,7 @@ def _trial(
         jnp.moveaxis(paths[problem], 0, -1),
         duration[problem] / num_steps,
     )
-    return Trials(made.hit, made.finite, made.start.T)
+    return Attempts(made.hit, made.finite, made.start.T)
 
 
 def durations_of(bridges: BridgePaths) -> Float[Array, " P"]:

@@ -25,12 +25,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
-from ..engine.lanes import over_lanes
+from ..engine.keys import folded
 from ..engine.noise import noisy_scan
 from ..models.diffusion import Diffusion, check_value
 from ..models.dynamics import Dynamics
 from ..models.gaussian_law import GaussianLaw
-from ..schemes.base import AbstractScheme, fitted_in_lanes
+from ..schemes.base import AbstractScheme, steps_in_lanes
 
 # No run that replaces a sampler of ν takes more steps than this.
 MOST_STEPS = 2**18
@@ -212,18 +212,13 @@ def run_for(
     repeats: Int[Array, " lanes"],
 ) -> Float[Array, "d lanes"]:
     """The state after `repeats` times `num_steps` steps, in each lane."""
-    root_dt = jnp.sqrt(dt)
-    fitted = fitted_in_lanes(scheme, dynamics, x[:, 0], dt)
-
-    @over_lanes(-1, -1, -1, -1, -1)
-    def step(x, dw, dt, root_dt, scheme):
-        return scheme.step(dynamics, x, dt, root_dt * dw)
+    step = steps_in_lanes(scheme, dynamics, x[:, 0], dt)
 
     def once(repeat, x):
         end, _ = noisy_scan(
-            lambda x, inputs: (step(x, inputs[0], dt, root_dt, fitted), None),
+            lambda x, inputs: (step(x, inputs[0]), None),
             x,
-            jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, repeat),
+            folded(keys, repeat),
             lambda key, k: jax.random.normal(key, (k, x.shape[0]), x.dtype),
             None,
             num_steps,

@@ -1,28 +1,28 @@
-"""Numbered trials of many problems side by side, until each has its successes.
+"""Rejection sampling of many problems side by side, until each has its successes.
 
-A problem is an interval that lacks bridges, or a bridge that lacks hits. Its trials are
-numbered 0, 1, 2, ..., and what a trial does depends on its problem and number only; the j-th
-success is the problem's j-th result. Thousands of trials run at once, in lanes: each round
+A problem is an interval that lacks bridges, or a bridge that lacks hits. Its attempts are
+numbered 0, 1, 2, ..., and what an attempt does depends on its problem and number only; the j-th
+success is the problem's j-th result. Thousands of attempts run at once, in lanes: each round
 gives every lane to a problem that still lacks successes, more lanes to those that lack more
 or succeed less often. So results do not depend on the number of lanes, and no lane waits for
 the slowest problem.
 """
 
-import zlib
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .devices import num_devices, over_devices
+from .progress import metered_while_loop
 
 
-class Trials(NamedTuple):
-    """What one trial in each lane came to: `outputs` are arrays with lanes in the first axis,
+class Attempts(NamedTuple):
+    """What one attempt in each lane came to: `outputs` are arrays with lanes in the first axis,
     `finite` is false where a path left the finite numbers."""
 
     success: Bool[Array, " lanes"]
@@ -30,13 +30,13 @@ class Trials(NamedTuple):
     outputs: PyTree
 
 
-class Found(NamedTuple):
+class Accepted(NamedTuple):
     """The successes of P problems, `wanted` rows for each, in order.
 
-    - `outputs`: those of the successful trials; rows that were not filled are as they were.
-    - `number`: of the successful trial, -1 for a row that was not filled.
+    - `outputs`: those of the successful attempts; rows that were not filled are as they were.
+    - `number`: of the successful attempt, -1 for a row that was not filled.
     - `num_found`: successes of each problem.
-    - `num_trials`: trials of each problem up to its last success, or up to the bound.
+    - `num_trials`: attempts of each problem up to its last success, or up to the bound.
     - `num_nonfinite`: how many of them left the finite numbers.
     """
 
@@ -47,74 +47,91 @@ class Found(NamedTuple):
     num_nonfinite: Int[Array, " P"]
 
 
-class _Search(NamedTuple):
-    found: Found
-    num_tried: Int[Array, " P"]  # with the trials that turned out not to be needed
-    meter: Any
+class _State(NamedTuple):
+    accepted: Accepted
+    num_tried: Int[Array, " P"]  # with the attempts that turned out not to be needed
 
 
-def search(
-    trial: Callable[[Int[Array, " lanes"], Int[Array, " lanes"]], Trials],
+def rejection_sample(
+    attempt: Callable[[Int[Array, " lanes"], Int[Array, " lanes"]], Attempts],
     rows: PyTree,
     active: Bool[Array, " P"],
     wanted: int,
-    max_trials: Int[Array, ""],
+    max_attempts: Int[Array, ""],
     num_lanes: int,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
-) -> Found:
-    """Run `trial(problem, number)` until each active problem has `wanted` successes, or has
+) -> Accepted:
+    """Run `attempt(problem, number)` until each active problem has `wanted` successes, or has
     run out of tries. `rows`: arrays with leading axis P × wanted, to be filled. Lanes are split
-    over devices: see `over_devices` for the arrays that `trial` needs."""
-    num_problems = active.shape[0]
-    num_rows = num_problems * wanted
-    progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    trials = over_devices(trial, (0, 0))
+    over devices: see `over_devices` for the arrays that `attempt` needs."""
+    num_rows = active.shape[0] * wanted
+    attempts = over_devices(attempt, (0, 0))
 
-    def pending(state: _Search):
-        return active & (state.found.num_found < wanted) & (state.num_tried < max_trials)
+    def pending(state: _State):
+        return active & (state.accepted.num_found < wanted) & (state.num_tried < max_attempts)
 
-    def one_round(state: _Search) -> _Search:
-        found, num_tried, _ = state
+    def one_round(state: _State) -> _State:
+        accepted, num_tried = state
         first, problem, place = _assign_lanes(
-            found.num_found, num_tried, pending(state), wanted, num_lanes
+            accepted.num_found, num_tried, pending(state), wanted, num_lanes
         )
         number = num_tried[problem] + place
-        made = trials(problem, number)
-        tried = number < max_trials
+        made = attempts(problem, number)
+        tried = number < max_attempts
         success = tried & made.success
-        # The lanes of one problem lie side by side, in the order of their numbers.
-        successes = jnp.cumsum(success, dtype=jnp.int32)
-        successes_before = successes - success.astype(jnp.int32)
-        rank = found.num_found[problem] + successes_before - successes_before[first[problem]]
+        rank = accepted.num_found[problem] + _before(success, first[problem])
         needed = tried & (rank < wanted) & active[problem]
         row = jnp.where(success & needed, problem * wanted + rank, num_rows)
+        accepted = _add(accepted, made, problem, number, needed, row)
+        return _State(accepted, num_tried + _count(jnp.ones_like(tried), problem, len(active)))
 
-        def keep(rows, values):
-            return rows.at[row].set(values, mode="drop")
+    def progress(state: _State):
+        return jnp.sum(state.accepted.num_found).astype(jnp.float32) / num_rows
 
-        def count(lanes):
-            return jax.ops.segment_sum(
-                lanes.astype(jnp.int32), problem, num_problems, indices_are_sorted=True
-            )
+    nothing = jnp.zeros(active.shape, jnp.int32)
+    empty = Accepted(rows, jnp.full(num_rows, -1, jnp.int32), nothing, nothing, nothing)
+    init = _State(empty, nothing)
+    going_on = lambda state: jnp.any(pending(state))
+    return metered_while_loop(going_on, one_round, init, progress, progress_meter).accepted
 
-        num_found = found.num_found + count(success & needed)
-        progress = jnp.sum(num_found).astype(jnp.float32) / num_rows
-        found = Found(
-            jax.tree.map(keep, found.outputs, made.outputs),
-            keep(found.number, number),
-            num_found,
-            found.num_trials + count(needed),
-            found.num_nonfinite + count(needed & ~made.finite),
-        )
-        num_tried += count(jnp.ones_like(tried))
-        return _Search(found, num_tried, progress_meter.step(state.meter, progress))
 
-    nothing = jnp.zeros(num_problems, jnp.int32)
-    found = Found(rows, jnp.full(num_rows, -1, jnp.int32), nothing, nothing, nothing)
-    state = _Search(found, nothing, progress_meter.init())
-    state = lax.while_loop(lambda state: jnp.any(pending(state)), one_round, state)
-    progress_meter.close(state.meter)
-    return state.found
+def _before(success: Bool[Array, " lanes"], first: Int[Array, " lanes"]) -> Int[Array, " lanes"]:
+    """How many succeeded in the lanes from the `first` of the same problem up to this one: lanes of
+    one problem lie side by side, in the order of their numbers."""
+    before = jnp.cumsum(success, dtype=jnp.int32) - success.astype(jnp.int32)
+    return before - before[first]
+
+
+def _count(
+    lanes: Bool[Array, " lanes"], problem: Int[Array, " lanes"], num_problems: int
+) -> Int[Array, " P"]:
+    """How many of these lanes each problem has."""
+    return jax.ops.segment_sum(
+        lanes.astype(jnp.int32), problem, num_problems, indices_are_sorted=True
+    )
+
+
+def _add(
+    accepted: Accepted,
+    made: Attempts,
+    problem: Int[Array, " lanes"],
+    number: Int[Array, " lanes"],
+    needed: Bool[Array, " lanes"],
+    row: Int[Array, " lanes"],
+) -> Accepted:
+    """With the attempts that were needed, of which those that are kept have a row."""
+    num_problems, num_rows = len(accepted.num_found), len(accepted.number)
+
+    def keep(rows, values):
+        return rows.at[row].set(values, mode="drop")
+
+    return Accepted(
+        jax.tree.map(keep, accepted.outputs, made.outputs),
+        keep(accepted.number, number),
+        accepted.num_found + _count(row < num_rows, problem, num_problems),
+        accepted.num_trials + _count(needed, problem, num_problems),
+        accepted.num_nonfinite + _count(needed & ~made.finite, problem, num_problems),
+    )
 
 
 def _assign_lanes(
@@ -136,19 +153,6 @@ def _assign_lanes(
     lanes = jnp.arange(num_lanes, dtype=jnp.int32)
     problem = jnp.searchsorted(last, lanes, side="right").astype(jnp.int32)
     return first, problem, lanes - first[problem]
-
-
-def numbered_keys(
-    keys: Key[Array, " P"], problem: Int[Array, " lanes"], number: Int[Array, " lanes"]
-) -> Key[Array, " lanes"]:
-    """The key of each trial, from that of its problem."""
-    return jax.vmap(jax.random.fold_in)(keys[problem], number)
-
-
-def key_for(purpose: str, key: Key[Array, ""]) -> Key[Array, ""]:
-    """A key that no numbering of problems or trials leads to, so that a caller may use one key
-    for several calls on the same bridges."""
-    return jax.random.fold_in(key, zlib.crc32(purpose.encode()))
 
 
 # See `linalg`: beyond this many numbers per array, reductions that a user's model may contain

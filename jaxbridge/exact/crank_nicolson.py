@@ -18,7 +18,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
 from ..engine.checks import (
@@ -28,6 +27,7 @@ from ..engine.checks import (
     is_traced,
     nondifferentiable,
 )
+from ..engine.progress import metered_scan
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
 from ..proposals.auto import as_proposal
@@ -176,20 +176,13 @@ def run_crank_nicolson(
     dynamics = model.forward(problem.like)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)
     first = _init(init_keys, None, model, proposal, intervals, num_steps)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
 
-    def step(carry, inputs):
-        state, meter_state = carry
-        i, keys = inputs
+    def step(state, keys):
         state, info = _move(keys, state, proposal, dynamics, intervals, beta)
-        meter_state = meter.step(meter_state, (i + 1).astype(jnp.float32) / num_bridges)
         kept = state._replace(position=problem.kept(state.position), noise=None)
-        return (state, meter_state), (kept, info)
+        return state, (kept, info)
 
-    (_, meter_state), made = lax.scan(
-        step, (first, meter.init()), (jnp.arange(num_bridges), step_keys.T)
-    )
-    meter.close(meter_state)
+    _, made = metered_scan(step, first, step_keys.T, progress_meter)
     states, info = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), made)
     met = states.log_weight > -jnp.inf
     tried = jnp.concatenate([first.log_weight[:, None], info.log_weight], axis=1)

@@ -26,8 +26,8 @@ from ..engine.averages import (
     weighted_mean,
 )
 from ..engine.checks import Numbers, check_count, check_key
+from ..engine.keys import key_for
 from ..engine.pareto import is_reliable, pareto_k
-from ..engine.rejection import key_for
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import BridgeProblem, Intervals, bridge_problem
 from ..models.diffusion import Diffusion, check_diffusion

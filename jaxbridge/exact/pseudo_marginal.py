@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_key, nondifferentiable
+from ..engine.keys import split_each
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import BridgeProblem
 from ..models.diffusion import Diffusion
@@ -133,7 +134,7 @@ def run_pseudo_marginal(
     intervals, num_steps = problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)
-    draw_keys, accept_keys = jax.vmap(jax.random.split, out_axes=1)(step_keys.reshape(-1))
+    draw_keys, accept_keys = split_each(step_keys.reshape(-1), 2)
     # Row 0 of each interval is its first state, and row i the candidate of step i.
     draw_keys = jnp.concatenate([init_keys[:, None], draw_keys.reshape(step_keys.shape)], axis=1)
     drawn = proposal.draw(

@@ -23,7 +23,8 @@ from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Inputs, Joined, find_bridges
 from ..coupling.start_laws import log_ratio, run_is_cut
 from ..engine.checks import Numbers, check_key, nondifferentiable
-from ..engine.rejection import Found, default_num_lanes, most_lanes
+from ..engine.progress import metered_while_loop
+from ..engine.rejection import Accepted, default_num_lanes, most_lanes
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
 from ..proposals.auto import Budget, as_proposal
@@ -156,7 +157,10 @@ class _Runner(NamedTuple):
         )
 
     def run(
-        self, segments: _Segments, chosen: Int[Array, " W"], meter: diffrax.AbstractProgressMeter
+        self,
+        segments: _Segments,
+        chosen: Int[Array, " W"],
+        progress_meter: diffrax.AbstractProgressMeter | None = None,
     ) -> _Segments:
         """These segments, from where the ones before them end, until they rejoin what is recorded.
         Numbers beyond the last only fill the width."""
@@ -164,8 +168,12 @@ class _Runner(NamedTuple):
         place = jnp.minimum(chosen, num - 1)
         intervals = jax.tree.map(lambda leaf: leaf[place], self.intervals)
 
+        def going_on(state):
+            i, _, active, _ = state
+            return (i < length) & jnp.any(active)
+
         def one_step(state):
-            i, positions, active, segments, meter_state = state
+            i, positions, active, segments = state
             positions, info = renew(
                 self.keys[place, i], self.model, self.pairs, intervals, positions, active
             )
@@ -178,14 +186,14 @@ class _Runner(NamedTuple):
                 num_simulated=segments.num_simulated.at[row].add(info.num_simulated, mode="drop"),
                 num_nonfinite=segments.num_nonfinite.at[row].add(info.num_nonfinite, mode="drop"),
             )
-            meter_state = meter.step(meter_state, (i + 1).astype(jnp.float32) / length)
-            return i + 1, positions, active & ~rejoined, segments, meter_state
+            return i + 1, positions, active & ~rejoined, segments
 
-        entry = self._entries(segments)[place]
-        state = (jnp.int32(0), entry, chosen < num, segments, meter.init())
-        state = lax.while_loop(lambda s: (s[0] < length) & jnp.any(s[2]), one_step, state)
-        _, positions, changed, segments, meter_state = state
-        meter.close(meter_state)
+        def progress(state):
+            return state[0].astype(jnp.float32) / length
+
+        state = (jnp.int32(0), self._entries(segments)[place], chosen < num, segments)
+        state = metered_while_loop(going_on, one_step, state, progress, progress_meter)
+        _, positions, changed, segments = state
         ends = segments.ends.at[jnp.where(changed, chosen, num)].set(positions, mode="drop")
         stale = segments.stale.at[chosen].set(False, mode="drop")
         after = jnp.where(changed, chosen + 1, num)
@@ -196,7 +204,7 @@ class _Runner(NamedTuple):
         """Some of the stale segments, run again."""
         num = len(self.keys)
         chosen = jnp.nonzero(segments.stale, size=min(_REPAIR_WIDTH, num), fill_value=num)[0]
-        return self.run(segments, chosen, diffrax.NoProgressMeter())
+        return self.run(segments, chosen)
 
     def _entries(self, segments: _Segments) -> Float[Array, "S points d"]:
         """Where each segment starts."""
@@ -235,7 +243,6 @@ def run_renewal(
     keys = step_keys[:, steps].reshape(num_intervals * num_segments, length)
     each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_segments, axis=0), intervals)
     runner = _Runner(model, pairs, problem, first, keys, each)
-    progress_meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     segments = runner.run(runner.begin(), jnp.arange(len(keys)), progress_meter)
     # The first stale segment starts from where the chain is, so each pass settles it at least.
     segments = lax.while_loop(lambda s: jnp.any(s.stale), runner.repair, segments)
@@ -315,7 +322,7 @@ def propose_paths(
     intervals: Intervals,
     active: Bool[Array, " I"] | None,
     num_steps: int,
-) -> Found:
+) -> Accepted:
     """A bridge by proposal for each interval; or for those that are active, which often are few."""
     num_wanted = len(keys) if active is None else len(keys) // 4
     active = jnp.ones(len(keys), bool) if active is None else active

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
 from ..engine.checks import Numbers, as_floating, as_real, check_count, is_traced
+from ..engine.keys import numbered
 from .diffusion import Diffusion, check_diffusion
 
 
@@ -70,9 +71,7 @@ class BridgeProblem(eqx.Module):
 
     def keys(self, key: Key[Array, ""], num: int) -> Key[Array, "I num"]:
         """A key for each of so many paths of each interval, numbered through."""
-        numbers = jnp.arange(self.num_intervals * num)
-        keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, numbers)
-        return keys.reshape(self.num_intervals, num)
+        return numbered(key, self.num_intervals * num).reshape(self.num_intervals, num)
 
     def result(self, tree: PyTree) -> PyTree:
         """What was found of each interval; of the only one without an axis."""

@@ -3,8 +3,8 @@
 A model and a coupling are a scene. What its compiled program contains is decided here and
 nowhere else, when it is traced: the model asks for the rules of the reversal, the scheme for
 that of its drift, the pair for those of its noise and its rotation. (Whether there is a matrix
-to solve with follows from the class of σ, which `solves` puts in words.) `scene.effects` asks the
-same rules and prints their answers, so what it says is what is simulated.
+to solve with follows from the class of σ, which `solves` puts in words.) `coupling.effects` asks
+the same rules and prints their answers, so what it says is what is simulated.
 """
 
 from typing import NamedTuple
@@ -124,8 +124,8 @@ def stored_times(num_stored: int | None) -> Effect:
     return Effect(False, f"only {num_stored} times were asked for")
 
 
-def early_stop(num_stretches: int) -> Effect:
+def early_stop(num_chunks: int) -> Effect:
     """Looking on the way whether all associated paths have hit."""
-    if num_stretches == 1:
+    if num_chunks == 1:
         return Effect(False, "the path is one stretch of noise, drawn at once")
-    return Effect(True, f"after each of {num_stretches} stretches of noise")
+    return Effect(True, f"after each of {num_chunks} stretches of noise")

@@ -190,18 +190,8 @@ class Diffusion(eqx.Module):
         """The same model with `prepare` done, so that no loop repeats it."""
         if self._prepare is None:
             return self
-        return Diffusion(
-            self._drift,
-            self._constant_sigma if self._diffusion is None else self._diffusion,
-            self._log_stationary,
-            self._prepared_params(),
-            reverse_drift=self._reverse_drift,
-            sample_stationary=self._sample_stationary,
-            reversible=self.reversible,
-            normalised=self.normalised,
-            domain=self._domain,
-            _coordinates=self._coordinates,
-        )
+        sigma = self._constant_sigma if self._diffusion is None else self._diffusion
+        return self._functions_with(sigma, self._prepared_params())
 
     def unbound(self) -> "Diffusion":
         """The functions alone, for `with_params` of what `preparation` makes of the parameters. It
@@ -215,11 +205,18 @@ class Diffusion(eqx.Module):
                 "this model has a constant σ that is traced: let `diffusion` be a function "
                 "`(x, params)` that finds it in `params`."
             )
+        function = self._diffusion if sigma is None else _constant_function(_as_tuples(sigma))
+        return self._functions_with(function, None)
+
+    def _functions_with(
+        self, diffusion: Callable | Numbers | None, prepared_params: PyTree
+    ) -> "Diffusion":
+        """The same functions, of parameters that need no preparation."""
         return Diffusion(
             self._drift,
-            self._diffusion if sigma is None else _constant_function(_as_tuples(sigma)),
+            diffusion,
             self._log_stationary,
-            None,
+            prepared_params,
             reverse_drift=self._reverse_drift,
             sample_stationary=self._sample_stationary,
             reversible=self.reversible,

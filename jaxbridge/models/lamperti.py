@@ -8,6 +8,7 @@ inverse solves g' = σ(g), g(0) = a; it is tabulated, with cubic interpolation b
 once a call for the parameters of that call. F itself is found by quadrature from the node before.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Callable
@@ -18,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced
 from .diffusion import Diffusion, check_diffusion
@@ -63,7 +64,7 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
     if not reach > 0:
         raise ValueError(f"`reach` must be positive; got {reach}.")
     check_count("num_nodes", num_nodes)
-    functions = _functions(model.unbound(), model.preparation, origin, reach, num_nodes)
+    functions = _coordinates_of(model.unbound(), model.preparation, origin, reach, num_nodes)
     table = functions.prepare(model.params)
     slope = table.sigma[num_nodes]
     if not is_traced(slope) and not 0 < slope < math.inf:
@@ -110,106 +111,108 @@ class _Table(NamedTuple):
     params: PyTree
 
 
-class _Functions(NamedTuple):
-    """Those of the model of Y, given the table in the place of parameters, and the two maps."""
+@dataclasses.dataclass(frozen=True)
+class _Lamperti:
+    """The functions of the model of Y, given the table in the place of parameters, and the two
+    maps."""
 
-    prepare: Callable
-    drift: Callable
-    log_stationary: Callable
-    sample_stationary: Callable
-    forward: Callable
-    inverse: Callable
-    coordinates: Callable
+    unbound: Diffusion
+    preparation: Callable | None
+    origin: float
+    reach: float
+    num_nodes: int
 
+    @property
+    def spacing(self) -> float:
+        return self.reach / self.num_nodes
 
-@functools.lru_cache(maxsize=256)
-def _functions(
-    unbound: Diffusion, preparation: Callable | None, origin: float, reach: float, num_nodes: int
-) -> _Functions:
-    """The same functions for the same arguments, so that they compile once."""
-    spacing, last = reach / num_nodes, 2 * num_nodes
+    @functools.partial(jax.jit, static_argnums=0)
+    def prepare(self, params: PyTree) -> _Table:
+        params = params if self.preparation is None else self.preparation(params)
+        below, above = self._solve(-1, params), self._solve(1, params)
+        x = jnp.concatenate([below[::-1], jnp.asarray([self.origin], float), above])
+        return _Table(x, jax.vmap(lambda x: self._sigma(x, params))(x), params)
 
-    def sigma(x, params):
-        """σ at one number: NaN, with derivative zero, outside the state space."""
-        model = unbound.with_params(params)
-        inside = jax.lax.stop_gradient(model.diffusion(x[None])[0, 0]) > 0
-        safe = jnp.where(inside, x, jnp.asarray(origin, x.dtype))
-        return jnp.where(inside, model.diffusion(safe[None])[0, 0], jnp.nan)
-
-    @jax.jit
-    def prepare(params):
-        params = params if preparation is None else preparation(params)
-        field = diffrax.ODETerm(lambda y, x, args: sigma(x, args))
-
-        def solve(direction):
-            """g' = σ(g) away from a."""
-            ys = np.linspace(0, direction * reach, num_nodes + 1)
-            solution = diffrax.diffeqsolve(
-                field,
-                diffrax.Tsit5(),
-                ys[0],
-                ys[-1],
-                None,
-                jnp.asarray(origin, float),
-                params,
-                saveat=diffrax.SaveAt(steps=True),
-                stepsize_controller=diffrax.StepTo(ys),
-                # Differentiable in both modes with respect to the parameters of σ.
-                adjoint=diffrax.DirectAdjoint(),
-                max_steps=num_nodes,
-            )
-            return jnp.asarray(solution.ys)
-
-        x = jnp.concatenate([solve(-1)[::-1], jnp.asarray([origin], float), solve(1)])
-        return _Table(x, jax.vmap(lambda x: sigma(x, params))(x), params)
-
-    def inverse(table, y):
+    def inverse(self, table: _Table, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """g(y) = x, by cubic Hermite interpolation: NaN beyond the table."""
-        place = (y + reach) / spacing
-        cell = jnp.clip(jnp.floor(place), 0, last - 1).astype(int)
+        place = (y + self.reach) / self.spacing
+        cell = jnp.clip(jnp.floor(place), 0, 2 * self.num_nodes - 1).astype(int)
         s = place - cell.astype(y.dtype)
         left, right = (table.x[i].astype(y.dtype) for i in (cell, cell + 1))
-        before, after = (spacing * table.sigma[i].astype(y.dtype) for i in (cell, cell + 1))
+        before, after = (self.spacing * table.sigma[i].astype(y.dtype) for i in (cell, cell + 1))
         rise = right - left
         x = left + s * (
             before + s * (3 * rise - 2 * before - after + s * (before + after - 2 * rise))
         )
         return jnp.where((s >= 0) & (s <= 1), x, jnp.nan)
 
-    def forward(table, x):
+    def forward(self, table: _Table, x: Float[Array, " one"]) -> Float[Array, " one"]:
         """F(x) = F(x_i) + ∫ du/σ(u) from the node x_i before x: NaN beyond the table."""
-        nodes = table.x.astype(x.dtype)
-        middle = jnp.arange(last + 1) < num_nodes
-        ordered = jnp.where(jnp.isnan(nodes), jnp.where(middle, -jnp.inf, jnp.inf), nodes)
+        nodes, last = table.x.astype(x.dtype), 2 * self.num_nodes
+        lower = jnp.arange(last + 1) < self.num_nodes
+        ordered = jnp.where(jnp.isnan(nodes), jnp.where(lower, -jnp.inf, jnp.inf), nodes)
         cell = jnp.clip(jnp.searchsorted(ordered, x, side="right") - 1, 0, last - 1)
         half = (x - nodes[cell]) / 2
         points = nodes[cell] + half * (1 + jnp.asarray(_NODES, x.dtype)[:, None])
-        slopes = jax.vmap(lambda u: sigma(u, table.params))(points.ravel()).reshape(points.shape)
-        y = (cell.astype(x.dtype) - num_nodes) * spacing
-        y += half * jnp.sum(jnp.asarray(_WEIGHTS, x.dtype)[:, None] / slopes, axis=0)
+        slopes = jax.vmap(lambda u: self._sigma(u, table.params))(points.ravel())
+        weighted = jnp.asarray(_WEIGHTS, x.dtype)[:, None] / slopes.reshape(points.shape)
+        y = (cell.astype(x.dtype) - self.num_nodes) * self.spacing
+        y += half * jnp.sum(weighted, axis=0)
         return jnp.where((x >= nodes[cell]) & (x <= nodes[cell + 1]), y, jnp.nan)
 
-    def drift(y, table):
+    def drift(self, y: Float[Array, " one"], table: _Table) -> Float[Array, " one"]:
         if y.shape != (1,):
             raise ValueError(
                 f"Lamperti's transform is for a one-dimensional model; points have shape {y.shape}."
             )
-        x = inverse(table, y)
-        slope, bend = jax.jvp(lambda x: sigma(x[0], table.params), (x,), (jnp.ones_like(x),))
-        return unbound.with_params(table.params).drift(x) / slope - bend / 2
+        x = self.inverse(table, y)
+        sigma = lambda x: self._sigma(x[0], table.params)
+        slope, bend = jax.jvp(sigma, (x,), (jnp.ones_like(x),))
+        return self._model(table).drift(x) / slope - bend / 2
 
-    def log_stationary(y, table):
-        x, model = inverse(table, y), unbound.with_params(table.params)
-        return model.log_stationary(x) + jnp.log(sigma(x[0], table.params))
+    def log_stationary(self, y: Float[Array, " one"], table: _Table) -> Float[Array, ""]:
+        x = self.inverse(table, y)
+        return self._model(table).log_stationary(x) + jnp.log(self._sigma(x[0], table.params))
 
-    def sample_stationary(key, table):
-        return forward(table, unbound.with_params(table.params).sample_stationary(key))
+    def sample_stationary(self, key: Key[Array, ""], table: _Table) -> Float[Array, " one"]:
+        return self.forward(table, self._model(table).sample_stationary(key))
 
-    def coordinates(table):
+    def coordinates(self, table: _Table) -> PyTree:
         """Y depends on the parameters that σ depends on, at any point, and on those of the
         coordinates that it is made from."""
-        within = () if unbound.coordinates is None else unbound.coordinates(table.params)
-        return sigma(jnp.asarray(origin, float), table.params), within
+        within = self.unbound.coordinates
+        slope = self._sigma(jnp.asarray(self.origin, float), table.params)
+        return slope, () if within is None else within(table.params)
 
-    moments = (log_stationary, sample_stationary)
-    return _Functions(prepare, drift, *moments, forward, inverse, coordinates)
+    def _model(self, table: _Table) -> Diffusion:
+        return self.unbound.with_params(table.params)
+
+    def _sigma(self, x: Float[Array, ""], params: PyTree) -> Float[Array, ""]:
+        """σ at one number: NaN, with derivative zero, outside the state space."""
+        model = self.unbound.with_params(params)
+        inside = jax.lax.stop_gradient(model.diffusion(x[None])[0, 0]) > 0
+        safe = jnp.where(inside, x, jnp.asarray(self.origin, x.dtype))
+        return jnp.where(inside, model.diffusion(safe[None])[0, 0], jnp.nan)
+
+    def _solve(self, direction: int, params: PyTree) -> Float[Array, " nodes"]:
+        """g' = σ(g) away from a."""
+        ys = np.linspace(0, direction * self.reach, self.num_nodes + 1)
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda y, x, params: self._sigma(x, params)),
+            diffrax.Tsit5(),
+            ys[0],
+            ys[-1],
+            None,
+            jnp.asarray(self.origin, float),
+            params,
+            saveat=diffrax.SaveAt(steps=True),
+            stepsize_controller=diffrax.StepTo(ys),
+            # Differentiable in both modes with respect to the parameters of σ.
+            adjoint=diffrax.DirectAdjoint(),
+            max_steps=self.num_nodes,
+        )
+        return jnp.asarray(solution.ys)
+
+
+# The same object for the same arguments, so that its functions compile once.
+_coordinates_of = functools.lru_cache(maxsize=256)(_Lamperti)

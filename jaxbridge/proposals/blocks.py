@@ -7,10 +7,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Int, Key
 
 from ..engine.devices import over_devices, share
+from ..engine.progress import metered_scan, metered_while_loop
 from ..models.bridge_problem import Intervals
 from .base import WeightedPaths
 
@@ -63,33 +63,35 @@ def in_blocks(
         return function(block_keys, block, None if active is None else active[chosen])
 
     num_rows, num_columns = rows.shape[0], columns.shape[0]
-    steps = jnp.arange(num_rows * num_columns)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    num_blocks = num_rows * num_columns
 
-    def step(state, i):
-        made = one_block(i // num_columns, i % num_columns)
-        progress = (i + 1).astype(jnp.float32) / len(steps)
-        return meter.step(state, progress), made
+    def numbered_block(i):
+        return one_block(i // num_columns, i % num_columns)
 
     if active is None:
-        state, made = lax.scan(step, meter.init(), steps)
+        _, made = metered_scan(
+            lambda _, i: (None, numbered_block(i)), None, jnp.arange(num_blocks), progress_meter
+        )
     else:
         shapes = eqx.filter_eval_shape(one_block, 0, 0)
         nothing = jax.tree.map(
-            lambda leaf: jnp.zeros((len(steps), *leaf.shape), leaf.dtype), shapes
+            lambda leaf: jnp.zeros((num_blocks, *leaf.shape), leaf.dtype), shapes
         )
 
-        def going_on(carry):
-            i, _, _ = carry
-            return (i < len(steps)) & (rows[i // num_columns, 0] < num_active)
+        def going_on(state):
+            i, _ = state
+            return (i < num_blocks) & (rows[i // num_columns, 0] < num_active)
 
-        def next_step(carry):
-            i, state, made = carry
-            state, block = step(state, i)
-            return i + 1, state, jax.tree.map(lambda all, one: all.at[i].set(one), made, block)
+        def next_block(state):
+            i, made = state
+            block = numbered_block(i)
+            return i + 1, jax.tree.map(lambda all, one: all.at[i].set(one), made, block)
 
-        _, state, made = lax.while_loop(going_on, next_step, (0, meter.init(), nothing))
-    meter.close(state)
+        def progress(state):
+            return state[0].astype(jnp.float32) / num_blocks
+
+        init = (jnp.int32(0), nothing)
+        _, made = metered_while_loop(going_on, next_block, init, progress, progress_meter)
 
     def join(leaf):
         leaf = leaf.reshape(num_rows, num_columns, *leaf.shape[1:])

@@ -30,8 +30,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import is_traced
+from ..engine.keys import key_for
 from ..engine.pareto import pareto_k
-from ..engine.rejection import key_for
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..schemes.step_error import of_log_mean

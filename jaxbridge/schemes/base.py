@@ -8,12 +8,15 @@ reversed path would be wrong by O(δ) per step, which adds up to the drift itsel
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import ClassVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..engine.lanes import over_lanes
 from ..models.dynamics import Dynamics
 from .frame import Frame
 
@@ -72,3 +75,16 @@ def fitted_in_lanes(
 ) -> AbstractScheme:
     """The scheme of each lane: arrays get a trailing axis."""
     return jax.vmap(lambda dt: scheme.fitted(dynamics, like, dt), out_axes=-1)(dt)
+
+
+def steps_in_lanes(
+    scheme: AbstractScheme, dynamics: Dynamics, like: Float[Array, " d"], dt: Float[Array, " lanes"]
+) -> Callable[[Float[Array, "d lanes"], Float[Array, "d lanes"]], Float[Array, "d lanes"]]:
+    """The step of all lanes, a function of their points and N(0, I) noise."""
+    fitted, root_dt = fitted_in_lanes(scheme, dynamics, like, dt), jnp.sqrt(dt)
+
+    @over_lanes(-1, -1, -1, -1, -1)
+    def step(x, normal, dt, root_dt, scheme):
+        return scheme.step(dynamics, x, dt, root_dt * normal)
+
+    return lambda x, normal: step(x, normal, dt, root_dt, fitted)

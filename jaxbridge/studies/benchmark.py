@@ -25,8 +25,8 @@ from jaxtyping import Array, Key
 
 from ..coupling.bridges import Bridges, sample_bridges
 from ..coupling.gamma import Coupling
+from ..coupling.join import propose
 from ..coupling.meeting import SignTest
-from ..coupling.pair import propose
 from ..schemes.base import AbstractScheme
 from ..schemes.euler import Euler
 from ..schemes.heun import Heun

@@ -22,7 +22,7 @@ from ..coupling.hitting import hitting_counts
 from ..coupling.start_laws import AnyStartLaw
 from ..engine.averages import normalised
 from ..engine.checks import check_count, check_key
-from ..engine.rejection import key_for
+from ..engine.keys import key_for
 from ..exact.exact_bridges import AbstractExactBridges
 from ..exact.importance import WeightedBridges
 from ..exact.kernels import Chain

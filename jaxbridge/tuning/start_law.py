@@ -23,7 +23,8 @@ from ..coupling.burn_in import measure_burn_in
 from ..coupling.gamma import Coupling
 from ..coupling.start_laws import AnyStartLaw, Stationary, draw_starts, needs_burn_in
 from ..engine.checks import Numbers, check_count, check_key, is_traced
-from ..engine.rejection import key_for, most_lanes
+from ..engine.keys import key_for
+from ..engine.rejection import most_lanes
 from ..exact.importance import weigh_bridges
 from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion, check_diffusion

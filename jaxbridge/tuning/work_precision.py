@@ -26,7 +26,8 @@ from jaxtyping import Array, Float, Key
 
 from ..coupling.gamma import Coupling
 from ..engine.checks import Numbers, check_count, check_key
-from ..engine.rejection import key_for
+from ..engine.keys import key_for
+from ..engine.progress import as_meter
 from ..models.bridge_problem import bridge_problem
 from ..models.diffusion import Diffusion
 from ..models.dynamics import is_linear
@@ -169,7 +170,7 @@ def work_precision(
     alone = all(m != "approximate" and given_values[m == "density"] for m in methods)
     check_precisions(scene, dtypes if alone else ("float32", "float64"))
     exact, limits = _references(key_for("reference", key), scene, runs, finest_run, given_values)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    meter = as_meter(progress_meter)
     state = meter.init()
     settings = []
     for done, run in enumerate(runs, 1):

@@ -8,8 +8,8 @@ from helpers import assert_moments
 from scipy.stats import norm
 
 import jaxbridge as jb
-from jaxbridge.coupling.base import see
 from jaxbridge.coupling.meeting import PairStep
+from jaxbridge.coupling.pair import relative_frame
 from jaxbridge.schemes.frame import frame
 
 NUM = 200_000
@@ -111,7 +111,7 @@ def joined_steps(meeting, scheme, gamma, dt=0.5, num=200_000):
         dw = jnp.sqrt(dt) * jax.random.normal(keys[0], (2,))
         du = jnp.sqrt(dt) * jax.random.normal(keys[1]) if coupling.independent_noise else None
         x_next = fitted.step(dynamics, x, dt, dw)
-        seen = see(coupling, fitted, dynamics, x, driven, dt)
+        seen = relative_frame(coupling, fitted, dynamics, x, driven, dt)
         driven_next = fitted.step(dynamics, driven, dt, coupling.driven_noise(seen, dw, du))
         pair = PairStep(seen, x, x_next, driven, driven_next, dt, coupling.gap_variance(seen))
         met = meeting.met(pair, dynamics, jax.random.uniform(keys[2]))

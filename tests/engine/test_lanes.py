@@ -9,7 +9,7 @@ import pytest
 from jax import lax
 
 import jaxbridge as jb
-from jaxbridge.coupling.pair import propose
+from jaxbridge.coupling.join import propose
 from jaxbridge.engine.lanes import join_rows, over_lanes, split_rows
 from jaxbridge.engine.linalg import cholesky, inverse, polar_factor, safe_norm
 

@@ -1,4 +1,4 @@
-"""`noisy_scan` is a plain loop, whatever the number of stretches it is cut into."""
+"""`noisy_scan` is a plain loop, whatever the number of chunks it is cut into."""
 
 import jax
 import jax.numpy as jnp

@@ -1,11 +1,11 @@
-"""The search: lanes, numbers and bounds, on trials whose outcomes are known."""
+"""Rejection sampling: lanes, numbers and bounds, on attempts whose outcomes are known."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge.engine.rejection import Trials, _assign_lanes, default_num_lanes, search
+from jaxbridge.engine.rejection import Attempts, _assign_lanes, default_num_lanes, rejection_sample
 
 
 def test_lanes_of_each_problem_carry_consecutive_numbers():
@@ -33,33 +33,35 @@ def test_lanes_of_each_problem_carry_consecutive_numbers():
         np.testing.assert_array_equal(first[problem], np.arange(num_lanes) - expected)
 
 
-def table_search(table, active, wanted, max_trials, num_lanes):
-    """Trials whose successes are read off a table (problem, number)."""
+def table_sample(table, active, wanted, max_attempts, num_lanes):
+    """Attempts whose successes are read off a table (problem, number)."""
     table = jnp.asarray(table)
 
-    def trial(problem, number):
+    def attempt(problem, number):
         inside = number < table.shape[1]
         success = table[problem, jnp.minimum(number, table.shape[1] - 1)] & inside
-        return Trials(success, ~(number % 7 == 3), {"square": number**2})
+        return Attempts(success, ~(number % 7 == 3), {"square": number**2})
 
     rows = {"square": jnp.full(len(table) * wanted, -5, jnp.int32)}
-    run = jax.jit(lambda: search(trial, rows, active, wanted, jnp.int32(max_trials), num_lanes))
+    run = jax.jit(
+        lambda: rejection_sample(attempt, rows, active, wanted, jnp.int32(max_attempts), num_lanes)
+    )
     return run()
 
 
 @pytest.mark.parametrize("num_lanes", [1, 7, 64])
-def test_search_finds_the_first_successes(num_lanes):
-    """Recomputed one trial at a time."""
+def test_it_finds_the_first_successes(num_lanes):
+    """Recomputed one attempt at a time."""
     rng = np.random.default_rng(0)
-    wanted, max_trials = 3, 40
+    wanted, max_attempts = 3, 40
     table = rng.uniform(size=(9, 60)) < rng.uniform(0, 0.5, size=(9, 1))
     active = np.arange(9) != 8
-    found = table_search(table, jnp.asarray(active), wanted, max_trials, num_lanes)
+    found = table_sample(table, jnp.asarray(active), wanted, max_attempts, num_lanes)
     number = np.asarray(found.number).reshape(9, wanted)
     assert (np.asarray(found.num_found) < wanted).any()
     for p in range(9):
-        successes = np.flatnonzero(table[p, :max_trials])[:wanted] if active[p] else []
-        spent = successes[-1] + 1 if len(successes) == wanted else max_trials * active[p]
+        successes = np.flatnonzero(table[p, :max_attempts])[:wanted] if active[p] else []
+        spent = successes[-1] + 1 if len(successes) == wanted else max_attempts * active[p]
         assert list(number[p]) == [*successes, *[-1] * (wanted - len(successes))]
         assert found.num_found[p] == len(successes) and found.num_trials[p] == spent
         assert found.num_nonfinite[p] == (np.arange(spent) % 7 == 3).sum()

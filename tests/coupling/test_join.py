@@ -8,7 +8,7 @@ import pytest
 from helpers import assert_moments, paper_model, swirl, unswirl, warped_model
 
 import jaxbridge as jb
-from jaxbridge.coupling.pair import propose
+from jaxbridge.coupling.join import propose
 
 NUM_STEPS = 40
 NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
