@@ -1,4 +1,4 @@
-"""Many weighted paths in blocks that fit in memory, over devices, and of the active intervals only."""
+"""Weighted paths in blocks that fit in memory, over devices, of active intervals only."""
 
 import math
 from collections.abc import Callable
