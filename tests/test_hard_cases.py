@@ -1,6 +1,6 @@
 """Hard cases stay numerically stable, each against an oracle or an invariant.
 
-`hard` keeps what the README's table says of a case beside the test that shows it.
+`hard` keeps what the table in notebooks/hard_cases.md says of a case beside the test that shows it.
 """
 
 import pathlib
@@ -16,7 +16,7 @@ from helpers import PAPER_B, paper_model, run_program
 import jaxbridge as jb
 from jaxbridge.coupling.join import propose
 
-README = pathlib.Path(__file__).parent.parent / "README.md"
+PAGE = pathlib.Path(__file__).parent.parent / "notebooks" / "hard_cases.md"
 ROWS: list[tuple[str, str, str, str]] = []
 
 
@@ -37,8 +37,8 @@ def table():
     return "\n".join(lines)
 
 
-def test_readme_has_the_table():
-    assert table() in README.read_text(encoding="utf-8")
+def test_the_page_has_the_table():
+    assert table() in PAGE.read_text(encoding="utf-8")
 
 
 def all_finite(*trees):

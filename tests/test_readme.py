@@ -1,15 +1,18 @@
-"""The code in the README runs as it stands."""
+"""The README and the pages beside the notebooks: their code runs as it stands, their tables are
+those of the stored run, and their links lead somewhere."""
 
 import pathlib
 import re
 
 import pytest
 
-from jaxbridge.studies.benchmark import load, markdown
+from jaxbridge.studies.benchmark import in_markdown, load
 
 ROOT = pathlib.Path(__file__).parent.parent
-README = ROOT / "README.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+README, CONTRIBUTING = ROOT / "README.md", ROOT / "CONTRIBUTING.md"
+PAGES = [README, *sorted((ROOT / "notebooks").glob("*.md")), CONTRIBUTING]
+TEXT = {page: page.read_text(encoding="utf-8") for page in PAGES}
+BLOCKS = re.findall(r"```python\n(.*?)```", "".join(TEXT.values()), re.DOTALL)
 
 
 def test_quickstart_runs():
@@ -21,7 +24,8 @@ def test_quickstart_runs():
 
 
 @pytest.mark.slow
-def test_readme_code_runs():
+def test_code_runs():
+    """The blocks of the pages go on from those of the README."""
     assert len(BLOCKS) == 13
     namespace = {}
     for block in BLOCKS:
@@ -45,12 +49,30 @@ def test_readme_code_runs():
     assert (namespace["densities"].standard_error < 0.5).mean() > 0.95
 
 
-def test_readme_names_the_two_commands():
-    text = README.read_text(encoding="utf-8")
-    assert 'pip install ".[plot]" && python -m jaxbridge' in text
-    assert 'pip install ".[test]" && pytest' in text
+def test_readme_is_short_and_names_the_two_commands():
+    assert len(TEXT[README].splitlines()) <= 250
+    assert 'pip install ".[plot]" && python -m jaxbridge' in TEXT[README]
+    assert 'pip install ".[test]" && pytest' in TEXT[README]
 
 
 def test_tables_are_those_of_the_stored_run():
-    table = markdown(load(ROOT / "notebooks" / "benchmark.json"))
-    assert table in README.read_text(encoding="utf-8")
+    stored = in_markdown(load(ROOT / "notebooks" / "benchmark.json"))
+    for table in stored.split("\n\n"):
+        assert table in TEXT[ROOT / "notebooks" / "costs.md"]
+    rows = re.findall(r"\| process \|.*?\n\n", TEXT[README], re.DOTALL)[0].strip().splitlines()
+    assert len(rows) == 10 and "\n".join(rows[:2]) in stored and "\n".join(rows[2:]) in stored
+
+
+def anchors(page):
+    """The headings of a page as links name them."""
+    titles = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", TEXT[page], flags=re.DOTALL), re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_somewhere(page):
+    for link in re.findall(r"\]\((?!https?:)([^)]*)\)", TEXT[page]):
+        name, _, anchor = link.partition("#")
+        target = (page.parent / name).resolve() if name else page
+        assert target.exists(), link
+        assert not anchor or anchor in anchors(target), link

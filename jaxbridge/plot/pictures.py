@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jax.scipy.special import ndtr, ndtri
 from jaxtyping import Float
+from scipy.special import ndtr, ndtri
 
-from ..models.gaussian_bridge import GaussianBridge
-from ..tuning.settings import WorkPrecision
+import jaxbridge as jb
+
 from .copula import empirical_copula, gaussian_copula
 from .style import (
     COLOURS,
@@ -27,7 +27,7 @@ from .style import (
 )
 
 LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
-SCORES = np.asarray(ndtri(LEVELS), float)
+SCORES = ndtri(LEVELS)
 
 
 def paths_in_space(
@@ -75,7 +75,7 @@ def bridge_fan(
     ax: Axes | None = None,
     coordinate: int = 0,
     num_paths: int = 5,
-    exact: GaussianBridge | None = None,
+    exact: jb.GaussianBridge | None = None,
     weights: Float[Reals, " n"] | None = None,
 ) -> Axes:
     """One coordinate of many bridges: median, 50 % and 90 % bands, and the first few paths.
@@ -147,8 +147,7 @@ def qq(
     ax.plot(reach, reach, color=EXACT, linewidth=0.8, label="exact")
     for i, (name, values) in enumerate(kept.items()):
         scores = _scores(len(values))
-        levels = np.asarray(ndtr(scores), float)
-        quantiles = np.quantile(values, levels, method="hazen")
+        quantiles = np.quantile(values, ndtr(scores), method="hazen")
         colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
         style = {"color": colour, "markersize": 3.5, "markeredgewidth": 0.8, "fillstyle": "none"}
         ax.plot(mean + sd * scores, quantiles, marker, label=name, **style)
@@ -198,7 +197,7 @@ def copula_levels(
     return finish(ax, handles=handles, loc="lower left")
 
 
-def work_precision(result: WorkPrecision, ax: Axes | None = None) -> Axes:
+def work_precision(result: jb.WorkPrecision, ax: Axes | None = None) -> Axes:
     """Error against time, a curve for each proposal and method, its points labelled with their
     numbers of steps.
 
@@ -315,5 +314,5 @@ def trace(
 
 def _scores(n: int, num_points: int = 61) -> Float[np.ndarray, " num_points"]:
     """Evenly spaced normal scores, out to those of the extremes of n draws."""
-    last = -float(ndtri(0.5 / n))
+    last = -ndtri(0.5 / n)
     return np.linspace(-last, last, num_points)

@@ -11,7 +11,6 @@ import json
 import math
 import os
 import platform
-import time
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -23,22 +22,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Key
 
-from ..coupling.bridges import Bridges, sample_bridges
-from ..coupling.gamma import Coupling
+import jaxbridge as jb
+
 from ..coupling.join import propose
-from ..coupling.meeting import SignTest
-from ..schemes.base import AbstractScheme
-from ..schemes.euler import Euler
-from ..schemes.heun import Heun
-from ..tuning.work_precision import work_precision
-from .accuracy import run_sigma_costs
-from .crossover import Process, Rate, run_crossover, share_of_best, thousands
+from .accuracy import run_sigma_costs, sigma_table
+from .clock import in_turns
+from .crossover import DURATIONS, LONG, Process, Rate, crossover_table, processes, run_crossover
 from .exact import UNLIKELY
-from .numpy_bridges import approximate_bridges
+from .numpy_reference import approximate_bridges
 from .paper import study_model
+from .report import Say, Study, Table, markdown, silent, table
 
 _NUM_STEPS = 50
-DURATIONS = (0.05, 0.25, 1.0, 5.0, 20.0, 50.0)
 # A divisor of the number of proposals, about as many as the package runs side by side.
 _LANES = 6_250
 _TARGETS = (0.1, 0.05)
@@ -77,27 +72,27 @@ def run_benchmark(
     durations: Sequence[float] = DURATIONS,
     chosen: Sequence[Process] | None = None,
     dimensions: Sequence[int] = (2, 5, 10),
-    on_start: Callable[[str], None] = lambda what: None,
+    say: Say = silent,
 ) -> Benchmark:
     """All parts; `scale` shortens them."""
     num_proposals = max(_LANES, round(50_000 * scale / _LANES) * _LANES)
     ratios = []
     for gamma in (-1.0, 0.5):
-        for scheme, target in ((Euler(), 1.3), (Heun(), 1.6)):
-            on_start(f"proposals, gamma {gamma:g}, {type(scheme).__name__}")
+        for scheme, target in ((jb.Euler(), 1.3), (jb.Heun(), 1.6)):
+            say(f"proposals, gamma {gamma:g}, {type(scheme).__name__}")
             ratios.append(_proposals(key, gamma, scheme, num_proposals, target))
     for gamma in (-1.0, 0.5):
-        on_start(f"sample_bridges, gamma {gamma:g}")
+        say(f"sample_bridges, gamma {gamma:g}")
         ratios.append(_whole_call(key, gamma, num_proposals))
-    on_start("a batch of intervals")
+    say("a batch of intervals")
     ratios.append(_batch(key, max(50, round(1_000 * scale))))
-    on_start("NumPy")
+    say("NumPy")
     ratios.append(_against_numpy(key, num_proposals))
-    on_start("the paper's discretisation at equal accuracy")
+    say("the paper's discretisation at equal accuracy")
     ratios += _against_published(key, round(100_000 * scale))
     num_bridges = max(1_000, round(20_000 * scale))
-    sigmas = run_sigma_costs(key, num_bridges, dimensions, on_start)
-    rates = run_crossover(key, round(1e7 * scale), durations, chosen, on_start)
+    sigmas = run_sigma_costs(key, num_bridges, dimensions, say)
+    rates = run_crossover(key, round(1e7 * scale), durations, chosen, say)
     packages = ("jaxbridge", "jax", "jaxlib", "diffrax", "equinox", "numpy")
     return Benchmark(
         jax.devices()[0].device_kind,
@@ -108,19 +103,6 @@ def run_benchmark(
         sigmas,
         rates,
     )
-
-
-def in_turns(
-    first: Callable[[], Any], second: Callable[[], Any], repeats: int = 9
-) -> tuple[float, float]:
-    """The median times of two functions, run in turns, once compiled."""
-    times: tuple[list[float], list[float]] = ([], [])
-    for _ in range(repeats + 1):
-        for function, taken in zip((first, second), times, strict=True):
-            begin = time.perf_counter()
-            jax.block_until_ready(function())
-            taken.append(time.perf_counter() - begin)
-    return float(np.median(times[0][1:])), float(np.median(times[1][1:]))
 
 
 def draw_floor(own_noise: bool, num_proposals: int) -> Callable[[Key[Array, ""]], Any]:
@@ -140,10 +122,10 @@ def draw_floor(own_noise: bool, num_proposals: int) -> Callable[[Key[Array, ""]]
 
 
 def _proposals(
-    key: Key[Array, ""], gamma: float, scheme: AbstractScheme, num_proposals: int, target: float
+    key: Key[Array, ""], gamma: float, scheme: jb.AbstractScheme, num_proposals: int, target: float
 ) -> Ratio:
     """Joined paths of all proposals, met or not, against their random numbers."""
-    model, coupling = study_model(), Coupling(gamma, scheme=scheme)
+    model, coupling = study_model(), jb.Coupling(gamma, scheme=scheme)
 
     @jax.jit
     def simulate(key):
@@ -169,8 +151,8 @@ def _proposals(
     )
 
 
-def _likely_bridges(key: Key[Array, ""], coupling: Coupling, num_bridges: int) -> Bridges:
-    return sample_bridges(
+def _likely_bridges(key: Key[Array, ""], coupling: jb.Coupling, num_bridges: int) -> jb.Bridges:
+    return jb.sample_bridges(
         key,
         study_model(),
         [0.0, 0.0],
@@ -187,7 +169,7 @@ def _whole_call(key: Key[Array, ""], gamma: float, num_bridges: int) -> Ratio:
     proposals that it takes."""
 
     def sample():
-        return _likely_bridges(key, Coupling(gamma, scheme=Euler()), num_bridges)
+        return _likely_bridges(key, jb.Coupling(gamma, scheme=jb.Euler()), num_bridges)
 
     num_proposals = int(sample().num_proposals)
     draw = draw_floor(gamma > -1, num_proposals)
@@ -202,13 +184,13 @@ def _whole_call(key: Key[Array, ""], gamma: float, num_bridges: int) -> Ratio:
 def _batch(key: Key[Array, ""], num_intervals: int) -> Ratio:
     """One bridge for each of many pairs of end points, against the proposals' ideal cost: the sum
     of 1/p_i proposals at the price of one among very many."""
-    model, coupling, trials = study_model(), Coupling(0.5, scheme=Euler()), 200
+    model, coupling, trials = study_model(), jb.Coupling(0.5, scheme=jb.Euler()), 200
     start_keys, end_keys = jax.random.split(jax.random.key(1), (2, num_intervals))
     draws = jax.jit(jax.vmap(model.sample_stationary))
     start, end = draws(start_keys), draws(end_keys)
 
     def sample(num_bridges=1):
-        return sample_bridges(
+        return jb.sample_bridges(
             key,
             model,
             start,
@@ -248,14 +230,14 @@ def _against_numpy(key: Key[Array, ""], num_proposals: int) -> Ratio:
     wanted = in_numpy().shape[-1]
 
     def sample():
-        return sample_bridges(
+        return jb.sample_bridges(
             key,
             model,
             *UNLIKELY,
             1.0,
             num_bridges=wanted,
             num_steps=_NUM_STEPS,
-            coupling=Coupling(0.5, scheme=Euler()),
+            coupling=jb.Coupling(0.5, scheme=jb.Euler()),
         )
 
     return Ratio(
@@ -269,9 +251,9 @@ def _against_numpy(key: Key[Array, ""], num_proposals: int) -> Ratio:
 def _against_published(key: Key[Array, ""], num_bridges: int) -> list[Ratio]:
     """Exact bridges by weights: Heun and the Brownian crossing against Euler and the sign test in
     radius 0.05 (from ν, without which no accuracy can be had), for some accuracies."""
-    ours, published = Coupling(0.5), Coupling(0.5, SignTest(0.05), Euler())
+    ours, published = jb.Coupling(0.5), jb.Coupling(0.5, jb.SignTest(0.05), jb.Euler())
     found = [
-        work_precision(
+        jb.work_precision(
             key,
             study_model(),
             *UNLIKELY,
@@ -313,56 +295,63 @@ def load(path: Path) -> Benchmark:
     return Benchmark(**content)
 
 
-def format_ratios(benchmark: Benchmark) -> str:
-    """The ratios in plain characters."""
-    lines = []
-    for r in benchmark.ratios:
-        goal = "" if r.target is None else f"  (at most {r.target:g})"
-        lines += [f"{r.what}\n    against {r.against}: {_times(r)}{goal}"]
-    return "\n".join(lines)
+def tables(benchmark: Benchmark) -> list[Table]:
+    """Calls, a full σ(x), and proposals over durations: titles and rows."""
+    calls = [
+        (
+            r.what,
+            r.against,
+            _seconds(r.seconds),
+            _ratio(r),
+            "" if r.target is None else f"{r.target:g}",
+        )
+        for r in benchmark.ratios
+    ]
+    return [
+        (("call", "against", "takes", "ratio", "aim"), calls),
+        sigma_table(benchmark.sigmas),
+        crossover_table(benchmark.rates),
+    ]
 
 
-def _times(r: Ratio) -> str:
-    if not (math.isfinite(r.seconds) and math.isfinite(r.reference_seconds)):
-        return f"{_seconds(r.seconds)} / {_seconds(r.reference_seconds)}"
-    return f"{r.seconds:.3g} s / {r.reference_seconds:.3g} s = {r.ratio:.3g}"
+def _ratio(r: Ratio) -> str:
+    if math.isfinite(r.seconds) and math.isfinite(r.reference_seconds):
+        return f"{r.ratio:.2g}"
+    return "-" if math.isfinite(r.reference_seconds) else "not reached"
 
 
 def _seconds(value: float) -> str:
     return f"{value:.2g} s" if math.isfinite(value) else "not reached"
 
 
-def markdown(benchmark: Benchmark) -> str:
-    """The README's tables."""
-    versions = benchmark.versions
-    lines = [
-        f"{benchmark.device}, {benchmark.processor}, JAX {versions['jax']}, {benchmark.date}:",
-        "",
-        "| call | takes | against | ratio |",
-        "|---|---|---|---|",
-    ]
-    for r in benchmark.ratios:
-        both = math.isfinite(r.seconds) and math.isfinite(r.reference_seconds)
-        ratio = f"{r.ratio:.2g}" if both else "-"
-        against = r.against if both else f"{r.against}: {_seconds(r.reference_seconds)}"
-        lines.append(f"| {r.what} | {_seconds(r.seconds)} | {against} | {ratio} |")
-    lines += [
-        "",
-        "| σ(x), d = | ns a path and step, σ = I | full σ(x) | ratio |",
-        "|---|---|---|---|",
-    ]
-    for d, one, full in benchmark.sigmas:
-        lines.append(f"| {d} | {one:.0f} | {full:.0f} | {full / one:.1f} |")
-    durations = list(dict.fromkeys(rate.duration for rate in benchmark.rates))
-    head = " | ".join(f"T = {t:g}" if i == 0 else f"{t:g}" for i, t in enumerate(durations))
-    lines += ["", f"| process | proposal | {head} |", "|---|---" + "|---" * len(durations) + "|"]
-    for process in dict.fromkeys(rate.process for rate in benchmark.rates):
-        group = [rate for rate in benchmark.rates if rate.process == process]
-        table = {(rate.proposal, rate.duration): rate for rate in group}
-        for i, proposal in enumerate(dict.fromkeys(rate.proposal for rate in group)):
-            values = " | ".join(thousands(table[proposal, t]) for t in durations)
-            name = proposal.strip('"')
-            lines.append(f"| {process if i == 0 else ''} | {name} | {values} |")
-        shares = " | ".join(f"{share_of_best(group, t):.2f}" for t in durations)
-        lines.append(f"| | *auto / best* | {shares} |")
-    return "\n".join(lines)
+def in_plain_characters(benchmark: Benchmark) -> str:
+    """The tables as they are printed."""
+    return "\n\n".join(table(*each, words=2) for each in tables(benchmark))
+
+
+def in_markdown(benchmark: Benchmark) -> str:
+    """Device, versions and date, and the tables, as the pages show them."""
+    head = (benchmark.device, benchmark.processor, f"JAX {benchmark.versions['jax']}")
+    return "\n\n".join(
+        [f"{', '.join(head)}, {benchmark.date}:", *(markdown(*each) for each in tables(benchmark))]
+    )
+
+
+def _run(key, quick, say) -> Benchmark:
+    if quick:
+        return run_benchmark(key, 0.04, (0.05, 5.0), processes()[:1], (2,), say)
+    return run_benchmark(key, say=say)
+
+
+BENCHMARK = Study(
+    "How fast it is",
+    _run,
+    in_plain_characters,
+    """\
+"ratio" is that of the times of both; nanoseconds are of a path and step with sigma = I and with a
+full sigma(x). Below, thousands of effective samples per second, compile time left out, of a run of
+200,000 proposals in 50 steps (T up to 1) or 20,000 in 1,000 (from T = 5 on); fewer for couplings
+alone. The step error is of second order for all: Heun for couplings, the Itô–Taylor density for the
+others. "auto" includes its pilot runs.""",
+    lambda figures, made: {"crossover.png": figures.crossover(made.rates, LONG)},
+)

@@ -2,12 +2,12 @@
 
 An Ornstein–Uhlenbeck process, for which guided proposals are exact; the hyperbolic diffusion,
 which is a Brownian motion with a bounded drift; and a double well, whose bridges must cross.
-Each from a point to another, in times from a hundredth to fifty.
+Each from a point to another, in times from a twentieth to fifty.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -15,18 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ..coupling.gamma import Coupling
-from ..exact.density import TransitionLogDensity, transition_log_density
-from ..models.diffusion import Diffusion
-from ..models.hyperbolic import hyperbolic
-from ..proposals.auto import Budget, as_proposal, default_candidates
-from ..proposals.choice import Choice
-from .exact import fastest
-from .paper import Point, study_model
+import jaxbridge as jb
 
-DURATIONS = (0.01, 0.05, 0.25, 1.0, 5.0, 20.0, 50.0)
+from ..proposals.auto import Budget, as_proposal, default_candidates
+from .clock import timed
+from .paper import Point, study_model
+from .report import Row, Say, Table, silent
+
+DURATIONS = (0.05, 0.25, 1.0, 5.0, 20.0, 50.0)
 # Durations from which on there are more steps, and twice as many of them in all.
-_LONG = 5.0
+LONG = 5.0
 # Couplings are slower: a share of the proposals will do, the more so on short intervals.
 _COUPLED_SHARE, _LONG_COUPLED_SHARE = 0.04, 0.25
 _MOST_TRIALS = 1_000
@@ -37,7 +35,7 @@ class Process(NamedTuple):
     """A process of the study, and its bridge."""
 
     name: str
-    model: Diffusion
+    model: jb.Diffusion
     start: Point
     end: Point
 
@@ -62,7 +60,7 @@ def processes() -> list[Process]:
     """The three processes."""
     return [
         Process("Ornstein-Uhlenbeck", study_model(), (0.785, 0.785), (1.091, 1.091)),
-        Process("hyperbolic", hyperbolic(0.8, 2), (0.0, 0.0), (2.0, 1.0)),
+        Process("hyperbolic", jb.hyperbolic(0.8, 2), (0.0, 0.0), (2.0, 1.0)),
         Process("double well", double_well(), (-1.0, 0.0), (0.8, 0.3)),
     ]
 
@@ -78,10 +76,10 @@ class _Well(NamedTuple):
 _GRID = np.linspace(-4, 4, 2001)
 
 
-def double_well(barrier: float = 1.7) -> Diffusion:
+def double_well(barrier: float = 1.7) -> jb.Diffusion:
     """dX = ½∇log ν dt + dW with log ν = -barrier [(x_1² - 1)² + x_2²] + constant: two wells, and
     a barrier between them. Normalised, with a sampler, both by quadrature of x_1 on a grid."""
-    return Diffusion(
+    return jb.Diffusion(
         _well_drift,
         None,
         _log_well,
@@ -122,7 +120,7 @@ def run_crossover(
     work: int,
     durations: Sequence[float] = DURATIONS,
     chosen: Sequence[Process] | None = None,
-    on_start: Callable[[str], None] = lambda what: None,
+    say: Say = silent,
 ) -> list[Rate]:
     """Each candidate of "auto", and "auto" itself, for each process and duration, in about `work`
     simulated steps of each run."""
@@ -134,8 +132,8 @@ def run_crossover(
             seconds = [math.inf] * len(runs)
             for turn in range(1 + _REPEATS):  # in turns, for clocks drift; the first compiles
                 for i, (name, run) in enumerate(runs):
-                    on_start(f"{process.name}, T = {duration:g}, {name}, run {turn}")
-                    took, _ = fastest(run, repeats=1)
+                    say(f"{process.name}, T = {duration:g}, {name}, run {turn}")
+                    _, took = timed(run)
                     seconds[i] = min(seconds[i], took if turn > 0 else math.inf)
             for (name, run), took in zip(runs, seconds, strict=True):
                 rates.append(_rate(process, duration, name, run(), took))
@@ -144,40 +142,38 @@ def run_crossover(
 
 def _run(
     key: Key[Array, ""], process: Process, duration: float, candidate: Any, work: int
-) -> tuple[str, Callable[[], TransitionLogDensity]]:
+) -> tuple[str, Callable[[], jb.TransitionLogDensity]]:
     """The name of a proposal, and its run."""
-    coupled = isinstance(candidate, Coupling)
+    coupled = isinstance(candidate, jb.Coupling)
     bound = _MOST_TRIALS if coupled else None
     start = jnp.asarray(process.start)
     budget = Budget(max_trials=bound)
     proposal = as_proposal(candidate, process.model, start, budget, for_density=True)
-    num_steps, share = (50, _COUPLED_SHARE) if duration < _LONG else (1_000, _LONG_COUPLED_SHARE)
-    work = work if duration < _LONG else 2 * work
+    num_steps, share = (50, _COUPLED_SHARE) if duration < LONG else (1_000, _LONG_COUPLED_SHARE)
+    work = work if duration < LONG else 2 * work
     num_proposals = round(work / num_steps * (share if coupled else 1))
 
     def run():
-        return jax.block_until_ready(
-            transition_log_density(
-                key,
-                process.model,
-                process.start,
-                process.end,
-                duration,
-                num_steps=num_steps,
-                num_proposals=num_proposals,
-                proposal=proposal,
-            )
+        return jb.transition_log_density(
+            key,
+            process.model,
+            process.start,
+            process.end,
+            duration,
+            num_steps=num_steps,
+            num_proposals=num_proposals,
+            proposal=proposal,
         )
 
     return ('"auto"' if isinstance(candidate, str) else proposal.describe()), run
 
 
 def _rate(
-    process: Process, duration: float, name: str, estimate: TransitionLogDensity, seconds: float
+    process: Process, duration: float, name: str, estimate: jb.TransitionLogDensity, seconds: float
 ) -> Rate:
     effective = float(estimate.effective_sample_size)
     chosen, made = "", estimate.proposal
-    if isinstance(made, Choice):
+    if isinstance(made, jb.Choice):
         chosen = made.candidates[int(made.chosen[0])].describe()
     return Rate(
         process.name,
@@ -192,29 +188,28 @@ def _rate(
     )
 
 
-def format_crossover(rates: Sequence[Rate]) -> str:
+def crossover_table(rates: Sequence[Rate]) -> Table:
     """Thousands of effective samples per second, by proposal and duration; "auto" also as a share
-    of the best of the others."""
-    lines = []
-    for process, group in _by_process(rates):
-        durations = list(dict.fromkeys(r.duration for r in group))
-        lines.append(f"{process:<26}" + "".join(f"{f'T = {t:g}':>12}" for t in durations))
-        table = {(r.proposal, r.duration): r for r in group}
+    of the best of the others, and what it took."""
+    durations = list(dict.fromkeys(rate.duration for rate in rates))
+    rows: list[Row] = []
+    for process, of_process in groupby(rates, key=lambda rate: rate.process):
+        group = list(of_process)
+        rate = {(r.proposal, r.duration): r for r in group}
         for proposal in dict.fromkeys(r.proposal for r in group):
-            row = [table[proposal, t] for t in durations]
-            lines.append(f"  {proposal:<24}" + "".join(f"{thousands(r):>12}" for r in row))
-        shares = [share_of_best(group, t) for t in durations]
-        lines.append(f"  {'auto / best':<24}" + "".join(f"{share:>12.2f}" for share in shares))
-        chosen = [table['"auto"', t].chosen for t in durations]
-        lines += [f"  {'auto took':<24}" + "".join(f"{_short(c):>12}" for c in chosen), ""]
-    return "\n".join(lines).rstrip()
+            found = [thousands(rate[proposal, t]) for t in durations]
+            rows.append((process, proposal.strip('"'), *found))
+        shares = [f"{share_of_best(group, t):.2f}" for t in durations]
+        rows.append((process, "auto / best", *shares))
+        rows.append((process, "auto took", *(_short(rate['"auto"', t].chosen) for t in durations)))
+    return ("process", "proposal", *(f"T = {t:g}" for t in durations)), rows
 
 
 def share_of_best(rates: Sequence[Rate], duration: float) -> float:
     """Effective samples per second of "auto" beside the best single proposal."""
-    here = [r for r in rates if r.duration == duration]
-    (auto,) = [r.per_second for r in here if r.proposal == '"auto"']
-    return auto / max(r.per_second for r in here if r.proposal != '"auto"')
+    here = {r.proposal: r.per_second for r in rates if r.duration == duration}
+    auto = here.pop('"auto"')
+    return auto / max(here.values())
 
 
 def thousands(rate: Rate) -> str:
@@ -225,21 +220,4 @@ def thousands(rate: Rate) -> str:
 
 def _short(name: str) -> str:
     kind, _, rest = name.partition("(")
-    return {"ModifiedDiffusionBridge": "MDB", "Coupling": f"c({rest}"}.get(kind, f"G({rest}")
-
-
-def _by_process(rates: Sequence[Rate]) -> Iterator[tuple[str, list[Rate]]]:
-    for process in dict.fromkeys(r.process for r in rates):
-        yield process, [r for r in rates if r.process == process]
-
-
-def write_crossover_figure(rates: Sequence[Rate], directory: Path) -> list[Path]:
-    """Effective samples per second against the duration, a panel for each process.
-
-    **Raises:** `ImportError` without matplotlib.
-    """
-    from . import figures as study_figures
-
-    path = directory / "crossover.png"
-    study_figures.crossover(rates, _LONG).savefig(path, dpi=150)
-    return [path]
+    return {"ModifiedDiffusionBridge": "MDB", "Coupling": f"C({rest}"}.get(kind, f"G({rest}")

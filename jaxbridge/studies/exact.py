@@ -5,9 +5,8 @@ algorithm with the start law that it prints; how much the hitting probabilities 
 an exact bridge costs as its duration grows.
 """
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -16,17 +15,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key
 
-from ..coupling.bridges import sample_bridges
-from ..coupling.gamma import Coupling
-from ..coupling.start_laws import AnyStartLaw, Reversed, Stationary
-from ..engine.diagnostics import effective_sample_size
-from ..exact.chains import sample_exact_bridges
-from ..exact.importance import weigh_bridges
-from ..models.gaussian_bridge import gaussian_bridge
-from ..models.gaussian_law import GaussianLaw
-from ..tuning.hitting_variation import HittingVariation, hitting_variation
-from ..tuning.start_law import fit_start_law
-from .paper import CASES, Fit, Point, compare, study_model
+import jaxbridge as jb
+
+from .clock import fastest, timed
+from .paper import CASES, Fit, Point, compare, law_half_way, study_model
+from .report import Say, Study, silent, table
 
 Ends = tuple[Point, Point]
 UNLIKELY: Ends = ((0.785, 0.785), (1.091, 1.091))
@@ -49,7 +42,7 @@ class ExactResult(NamedTuple):
     method: str
     iterations: int
     samples: Float[np.ndarray, "m 2"]
-    law: GaussianLaw
+    law: jb.GaussianLaw
     bias: Float[np.ndarray, " 2"]
     error: Float[np.ndarray, " 2"]
     sd_bias: Float[np.ndarray, " 2"]
@@ -65,8 +58,8 @@ class Variation(NamedTuple):
 
     bridge: str
     gamma: float
-    right: HittingVariation
-    published: HittingVariation
+    right: jb.HittingVariation
+    published: jb.HittingVariation
 
 
 class Cost(NamedTuple):
@@ -85,63 +78,58 @@ class Floor(NamedTuple):
     seconds: float
 
 
-def run_exact(
-    key: Key[Array, ""], scale: float, on_start: Callable[[str], None] = lambda what: None
-) -> list[ExactResult]:
+def run_exact(key: Key[Array, ""], scale: float, say: Say = silent) -> list[ExactResult]:
     """All methods on the unlikely and the very unlikely bridge; `scale` shortens the runs."""
-    model = study_model()
-    on_start("fitting a start law to the very unlikely bridge")
-    fitted = fit_start_law(
-        key, model, *VERY_UNLIKELY, 1.0, num_steps=_NUM_STEPS, coupling=Coupling(_GAMMA)
-    )
-    published = Coupling.as_published(_GAMMA)
-    runs: list[tuple[Ends, str, int, Coupling, str]] = [
-        (UNLIKELY, "pseudo-marginal", 50_000, Coupling(_GAMMA), "44"),
-        (UNLIKELY, "renewal", 500_000, Coupling(_GAMMA), "32"),
-        (UNLIKELY, "weights", 50_000, Coupling(_GAMMA), ""),
+    model, coupling = study_model(), jb.Coupling(_GAMMA)
+    say("fitting a start law to the very unlikely bridge")
+    law = jb.fit_start_law(key, model, *VERY_UNLIKELY, 1.0, num_steps=_NUM_STEPS, coupling=coupling)
+    fitted = jb.Coupling(_GAMMA, start_law=law)
+    published = jb.Coupling.as_published(_GAMMA)
+    runs = [
+        (UNLIKELY, "pseudo-marginal", 50_000, coupling, "44"),
+        (UNLIKELY, "renewal", 500_000, coupling, "32"),
+        (UNLIKELY, "weights", 50_000, coupling, ""),
         (UNLIKELY, "as published", 50_000, published, "44"),
-        (VERY_UNLIKELY, "pseudo-marginal", 50_000, Coupling(_GAMMA, start_law=fitted), ""),
-        (VERY_UNLIKELY, "weights", 50_000, Coupling(_GAMMA, start_law=fitted), ""),
+        (VERY_UNLIKELY, "pseudo-marginal", 50_000, fitted, ""),
+        (VERY_UNLIKELY, "weights", 50_000, fitted, ""),
         (VERY_UNLIKELY, "as published", 50_000, published, ""),
     ]
     results = []
     for i, (ends, method, iterations, coupling, paper_seconds) in enumerate(runs):
-        on_start(f"{_words(ends)}, {method}")
-        iterations = round(iterations * scale)
-        run = _weights if method == "weights" else _chain
-        name = "renewal" if method == "renewal" else "pseudo_marginal"
-        arguments = (model, ends, iterations, coupling, name)
-        begin = time.perf_counter()
-        run(jax.random.fold_in(key, 2 * i), *arguments)
-        first = time.perf_counter() - begin
-        begin = time.perf_counter()
-        middle, weights, simulated = run(jax.random.fold_in(key, 2 * i + 1), *arguments)
-        seconds = time.perf_counter() - begin
-        exact = gaussian_bridge(model, *ends, 1.0, times=[0.5])
-        law = GaussianLaw(exact.mean[0], exact.covariance[0])
-        samples, fit, error, effective = _judge(middle, weights, law)
-        results.append(
-            ExactResult(
-                _words(ends),
-                method,
-                iterations,
-                samples,
-                law,
-                fit.mean_bias,
-                error,
-                fit.sd_bias,
-                effective,
-                simulated / iterations,
-                seconds,
-                max(first - seconds, 0.0),
-                paper_seconds,
-            )
-        )
+        say(f"{_words(ends)}, {method}")
+        size = round(iterations * scale)
+        results.append(_run(key, i, ends, method, size, coupling, paper_seconds))
     return results
 
 
-def _chain(key, model, ends: Ends, iterations, coupling, method):
-    chain = sample_exact_bridges(
+def _run(key, i, ends: Ends, method, iterations, coupling, paper_seconds) -> ExactResult:
+    simulate = {"weights": _weights, "renewal": _renewal}.get(method, _chain)
+    arguments = (study_model(), ends, iterations, coupling)
+    _, first = timed(lambda: simulate(jax.random.fold_in(key, 2 * i), *arguments))
+    (middle, weights, simulated), seconds = timed(
+        lambda: simulate(jax.random.fold_in(key, 2 * i + 1), *arguments)
+    )
+    law = law_half_way(*ends)
+    samples, fit, error, effective = _judge(middle, weights, law)
+    return ExactResult(
+        _words(ends),
+        method,
+        iterations,
+        samples,
+        law,
+        fit.mean_bias,
+        error,
+        fit.sd_bias,
+        effective,
+        simulated / iterations,
+        seconds,
+        max(first - seconds, 0.0),
+        paper_seconds,
+    )
+
+
+def _chain(key, model, ends: Ends, iterations, coupling, method: Any = "pseudo_marginal"):
+    chain = jb.sample_exact_bridges(
         key,
         model,
         *ends,
@@ -155,22 +143,26 @@ def _chain(key, model, ends: Ends, iterations, coupling, method):
     return np.asarray(chain.paths[:, 0]), None, float(chain.num_simulated)
 
 
-def _weights(key, model, ends: Ends, iterations, coupling, method):
-    bridges = sample_bridges(
+def _renewal(*arguments):
+    return _chain(*arguments, method="renewal")
+
+
+def _weights(key, model, ends: Ends, iterations, coupling):
+    bridges = jb.sample_bridges(
         key, model, *ends, 1.0, num_bridges=iterations, num_steps=_NUM_STEPS, coupling=coupling
     )
-    weighted = weigh_bridges(key, model, bridges)
+    weighted = jb.weigh_bridges(key, model, bridges)
     middle = np.asarray(weighted.paths[:, _NUM_STEPS // 2])
     weights = np.asarray(weighted.weights, float)
     return middle, weights / weights.sum(), float(weighted.num_simulated)
 
 
-def _judge(middle, weights, law: GaussianLaw) -> tuple[Any, Fit, Any, float]:
+def _judge(middle, weights, law: jb.GaussianLaw) -> tuple[Any, Fit, Any, float]:
     """Equally weighted samples, their fit, the error of the bias and the effective size."""
     sd = np.sqrt(np.diag(np.asarray(law.covariance, float)))
     deviations = (middle - np.asarray(law.mean)) / sd
     if weights is None:
-        fit, sizes = compare(middle, law), np.asarray(effective_sample_size(middle))
+        fit, sizes = compare(middle, law), np.asarray(jb.effective_sample_size(middle))
         return middle, fit, deviations.std(0) / np.sqrt(sizes), float(sizes.min())
     mean = weights @ deviations
     spread = np.sqrt(weights @ (deviations - mean) ** 2)
@@ -184,26 +176,26 @@ def run_variation(
     key: Key[Array, ""],
     num_bridges: int,
     gammas: Sequence[float] = (0.0, 0.5, 0.9, 0.99),
-    on_start: Callable[[str], None] = lambda what: None,
+    say: Say = silent,
 ) -> list[Variation]:
     """The regression of section 3.2 for the three bridges of the paper."""
     model, results = study_model(), []
     bridges = {case.bridge: (case.start, case.end) for case in CASES}
     for name, ends in bridges.items():
         for gamma in gammas:
-            on_start(f"{name}, variation of 1/pi for gamma {gamma:g}")
-            laws: list[tuple[Coupling, AnyStartLaw]] = [
-                (Coupling(gamma), Stationary()),
-                (Coupling.as_published(gamma), Reversed()),
-            ]
+            say(f"{name}, variation of 1/pi for gamma {gamma:g}")
+            laws = (
+                (jb.Coupling(gamma), jb.Stationary()),
+                (jb.Coupling.as_published(gamma), jb.Reversed()),
+            )
             both = [_variation(key, model, ends, *law, num_bridges) for law in laws]
             results.append(Variation(name, gamma, *both))
     return results
 
 
-def _variation(key, model, ends: Ends, coupling, law, num_bridges) -> HittingVariation:
+def _variation(key, model, ends: Ends, coupling, law, num_bridges) -> jb.HittingVariation:
     bridge_key, weigh_key, count_key = jax.random.split(key, 3)
-    bridges = sample_bridges(
+    bridges = jb.sample_bridges(
         bridge_key,
         model,
         *ends,
@@ -213,8 +205,8 @@ def _variation(key, model, ends: Ends, coupling, law, num_bridges) -> HittingVar
         coupling=coupling,
     )
     bound = 200_000  # no count of the study comes near it
-    weighted = weigh_bridges(weigh_key, model, bridges, max_trials=bound)
-    return hitting_variation(
+    weighted = jb.weigh_bridges(weigh_key, model, bridges, max_trials=bound)
+    return jb.hitting_variation(
         count_key, model, weighted, (5, 10, 20), start_law=law, max_trials=bound
     )
 
@@ -223,31 +215,29 @@ def run_cost(
     key: Key[Array, ""],
     work: int,
     durations: Sequence[float] = (1.0, 3.0, 10.0, 30.0, 100.0),
-    on_start: Callable[[str], None] = lambda what: None,
+    say: Say = silent,
 ) -> list[Cost]:
     """Seconds per effective bridge against the duration, at a fixed step of 0.02; each duration
     has as many bridges as make `work` units of time, 50,000 at most."""
     model, costs = study_model(), []
     for duration in durations:
-        on_start(f"cost of an exact bridge of duration {duration:g}")
+        say(f"cost of an exact bridge of duration {duration:g}")
         num_bridges = min(round(work / duration), 50_000)
 
-        def run(key, duration=duration, num_bridges=num_bridges):
-            return jax.block_until_ready(
-                sample_exact_bridges(
-                    key,
-                    model,
-                    *UNLIKELY,
-                    duration,
-                    num_bridges=num_bridges,
-                    num_steps=round(duration / 0.02),
-                    proposal=Coupling(_GAMMA),
-                    save_at=[duration / 2],
-                )
+        def run(duration=duration, num_bridges=num_bridges):
+            return jb.sample_exact_bridges(
+                key,
+                model,
+                *UNLIKELY,
+                duration,
+                num_bridges=num_bridges,
+                num_steps=round(duration / 0.02),
+                proposal=jb.Coupling(_GAMMA),
+                save_at=[duration / 2],
             )
 
-        run(key)
-        seconds, chain = fastest(lambda key=key, run=run: run(key))
+        timed(run)
+        chain, seconds = fastest(run)
         acceptance = float(chain.acceptance_rate)
         # Of a chain that moves with probability p in each step, whatever it looks at.
         effective = num_bridges * acceptance / (2 - acceptance)
@@ -287,84 +277,74 @@ def draw_as_many(key: Key[Array, ""], result: ExactResult) -> Floor:
             )
         return total
 
-    run(key).block_until_ready()
-    seconds, _ = fastest(lambda: run(key).block_until_ready())
+    timed(lambda: run(key))
+    _, seconds = fastest(lambda: run(key))
     return Floor(_NUM_STEPS * lanes * (4 * rounds[0] + 2 * rounds[1]), seconds)
 
 
 def format_exact(results: Sequence[ExactResult]) -> str:
     """The results as a table, in plain characters."""
-    lines = [
-        f"{'bridge':<32}  {'method':<15}  {'n':>7}  {'seconds':>7}  {'paper, s':>8}  "
-        f"{'paths/n':>7}  {'worth':>6}  {'bias of mean, with error':^31}  {'bias of sd':^15}",
-        "-" * 144,
-    ]
-    for r in results:
-        biases = "  ".join(f"{b:+.4f} +- {e:.4f}" for b, e in zip(r.bias, r.error, strict=True))
-        spread = " ".join(f"{b:+.4f}" for b in r.sd_bias)
-        lines.append(
-            f"{r.bridge:<32}  {r.method:<15}  {r.iterations:>7}  {r.seconds:>7.2f}  "
-            f"{r.paper_seconds:>8}  {r.simulated:>7.2f}  {r.effective:>6.0f}  {biases:>31}  "
-            f"{spread:>15}"
+    titles = ("bridge", "method", "n", "seconds", "paper, s", "paths/n", "worth")
+    rows = [
+        (
+            r.bridge,
+            r.method,
+            str(r.iterations),
+            f"{r.seconds:.2f}",
+            r.paper_seconds,
+            f"{r.simulated:.2f}",
+            f"{r.effective:.0f}",
+            "  ".join(f"{b:+.4f} +- {e:.4f}" for b, e in zip(r.bias, r.error, strict=True)),
+            " ".join(f"{b:+.4f}" for b in r.sd_bias),
         )
-    return "\n".join(lines)
+        for r in results
+    ]
+    return table((*titles, "bias of mean, with error", "bias of sd"), rows, words=2)
+
+
+def format_floor(first: ExactResult, floor: Floor) -> str:
+    """The time of a chain beside that of its random numbers."""
+    return (
+        f"Drawing the {floor.numbers / 1e6:.0f} million random numbers of the first row alone "
+        f"takes {floor.seconds:.2f} s:\nthe chain takes {first.seconds / floor.seconds:.1f} times "
+        "that."
+    )
 
 
 def format_variation(results: Sequence[Variation]) -> str:
     """std/mean of 1/π_T and its mean, from ν and from the printed start law."""
-    lines = [
-        f"{'bridge':<32}  {'gamma':>5}  {'nu: std/mean':>16}  {'mean 1/pi':>9}  "
-        f"{'printed: std/mean':>17}  {'mean 1/pi':>9}",
-        "-" * 98,
-    ]
-    for r in results:
-        (a, b), (c, d) = ((v.ratio, v.ratio_error) for v in (r.right, r.published))
-        lines.append(
-            f"{r.bridge:<32}  {r.gamma:>5g}  {a:>7.3f} +- {b:.3f}  {r.right.mean:>9.2f}  "
-            f"{c:>8.3f} +- {d:.3f}  {r.published.mean:>9.2f}"
+    titles = ("bridge", "gamma", "nu: std/mean", "mean 1/pi", "printed: std/mean", "mean 1/pi")
+    rows = [
+        (
+            r.bridge,
+            f"{r.gamma:g}",
+            f"{r.right.ratio:.3f} +- {r.right.ratio_error:.3f}",
+            f"{r.right.mean:.2f}",
+            f"{r.published.ratio:.3f} +- {r.published.ratio_error:.3f}",
+            f"{r.published.mean:.2f}",
         )
-    return "\n".join(lines)
+        for r in results
+    ]
+    return table(titles, rows)
 
 
 def format_cost(costs: Sequence[Cost]) -> str:
-    """Milliseconds per effective bridge, by duration."""
-    lines = [f"{'duration':>8}  {'ms per effective bridge':>23}  {'accepted':>8}", "-" * 43]
-    lines += [f"{c.duration:>8g}  {1e3 * c.seconds:>23.4f}  {c.acceptance:>8.1%}" for c in costs]
-    return "\n".join(lines)
+    """Milliseconds per effective bridge, by duration, and how they grow."""
+    rows = [(f"{c.duration:g}", f"{1e3 * c.seconds:.4f}", f"{c.acceptance:.1%}") for c in costs]
+    text = table(("duration", "ms per effective bridge", "accepted"), rows, words=0)
+    return f"{text}\nFrom T = 10 on, seconds grow as T to the power {slope(costs):.2f}."
 
 
-def write_exact_figures(
-    results: Sequence[ExactResult],
-    variation: Sequence[Variation],
-    costs: Sequence[Cost],
-    directory: Path,
-) -> list[Path]:
-    """Q-Q plots and copulas of the exact methods, and the figures of variation and cost.
-
-    **Raises:** `ImportError` without matplotlib.
-    """
-    from . import figures as study_figures
-
-    paths = []
-
-    def save(figure, name):
-        paths.append(directory / name)
-        figure.savefig(paths[-1], dpi=150)
-
-    for bridge, group in _by_bridge(results):
+def draw(figures: Any, results: Sequence[ExactResult]) -> dict[str, Any]:
+    """Q-Q plots and copulas of the exact methods."""
+    drawn = {}
+    for bridge, by_method in groupby(results, key=lambda result: result.bridge):
+        group = list(by_method)
         samples = {r.method: r.samples for r in group}
-        title = f"{bridge.replace('->', '→')} in time 1, at time ½: exact methods, γ = {_GAMMA:g}"
-        name = "very_unlikely" if group[0].bridge == _words(VERY_UNLIKELY) else "unlikely"
-        figure = study_figures.margins_and_copula(samples, group[0].law, title.replace("-", "−"))
-        save(figure, f"exact_{name}.png")
-    save(study_figures.variation(variation), "variation.png")
-    save(study_figures.cost(costs, slope(costs)), "cost.png")
-    return paths
-
-
-def _by_bridge(results: Sequence[ExactResult]) -> Iterator[tuple[str, list[ExactResult]]]:
-    for bridge in dict.fromkeys(r.bridge for r in results):
-        yield bridge, [r for r in results if r.bridge == bridge]
+        title = f"{bridge} in time 1, at time ½: exact methods, γ = {_GAMMA:g}"
+        name = "very_unlikely" if bridge == _words(VERY_UNLIKELY) else "unlikely"
+        drawn[f"exact_{name}.png"] = figures.margins_and_copula(samples, group[0].law, title)
+    return drawn
 
 
 def _words(ends: Ends) -> str:
@@ -372,11 +352,42 @@ def _words(ends: Ends) -> str:
     return f"{start} -> {end}"
 
 
-def fastest(function: Callable[[], Any], repeats: int = 3) -> tuple[float, Any]:
-    """The shortest of some runs in seconds, and the last result."""
-    times, result = [], None
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        result = function()
-        times.append(time.perf_counter() - begin)
-    return min(times), result
+def _with_floor(key, quick, say) -> tuple[list[ExactResult], Floor]:
+    results = run_exact(key, 0.04 if quick else 1.0, say)
+    return results, draw_as_many(key, results[0])
+
+
+EXACT = Study(
+    "Exact bridges, gamma = 0.5, at time 1/2, N = 50 steps",
+    _with_floor,
+    lambda made: f"{format_exact(made[0])}\n\n{format_floor(made[0][0], made[1])}",
+    """\
+"paths/n" is the number of simulated paths, "worth" that of the independent exact bridges which
+the n are worth. "as published" is the paper's pseudo-marginal chain with the start law that it
+prints, which leaves most of the bias; started from the stationary law, or from any other that is
+paid for, it is gone. The very unlikely bridge has a start law fitted by a pilot run. The paper's
+seconds are those of its authors' computer and program, given for the same bridge and number of
+iterations: only their order of magnitude can be compared.""",
+    lambda figures, made: draw(figures, made[0]),
+)
+VARIATION = Study(
+    "How much hitting probabilities vary",
+    lambda key, quick, say: run_variation(key, 50 if quick else 300, say=say),
+    format_variation,
+    """\
+An approximate bridge is exact if the probability pi that its associated diffusion hits it does
+not vary. std/mean of 1/pi shrinks as gamma -> 1 with either start law, while 1/pi grows:
+approximate bridges become exact as they become rare.""",
+    lambda figures, results: {"variation.png": figures.variation(results)},
+)
+COST = Study(
+    "What duration costs",
+    lambda key, quick, say: (
+        run_cost(key, 5_000, (1.0, 10.0, 30.0), say) if quick else run_cost(key, 200_000, say=say)
+    ),
+    format_cost,
+    """\
+"ms" are those of a run once compiled, for each of the independent bridges that its chain is worth;
+"accepted" is the share of its steps that move.""",
+    lambda figures, costs: {"cost.png": figures.cost(costs, slope(costs))},
+)

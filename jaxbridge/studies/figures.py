@@ -1,5 +1,6 @@
 """The figures of the studies, made of the pictures of `plot`. Needs the extra `plot`."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -7,39 +8,39 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ..coupling.bridges import Bridges
-from ..models.gaussian_bridge import GaussianBridge
-from ..models.gaussian_law import GaussianLaw
-from ..plot.pictures import bridge_fan, copula_levels, paths_in_space, qq, work_precision
-from ..plot.style import COLOURS, EXACT, MARKERS, Axes, Figure, Reals, axes_or_new, finish
+import jaxbridge as jb
+
+from .. import plot
+from ..plot.style import COLOURS, EXACT, MARKERS, Figure, Reals, finish
+from .bayes import PRIOR_MEAN, PRIOR_VARIANCE, Example
 
 
 def margins_and_copula(
-    samples: Mapping[str, Float[Reals, "n 2"]], law: GaussianLaw, title: str
+    samples: Mapping[str, Float[Reals, "n 2"]], law: jb.GaussianLaw, title: str
 ) -> Figure:
     """The figures of section 3: Q-Q plots of both margins and the copula, in one row."""
     figure = Figure(figsize=(11, 4.1), layout="constrained")
     *margins, dependence = figure.subplots(1, 3)
     for i, ax in enumerate(margins):
         margin = {name: values[:, i] for name, values in samples.items()}
-        qq(margin, float(law.mean[i]), float(jnp.sqrt(law.covariance[i, i])), ax)
+        plot.qq(margin, float(law.mean[i]), float(jnp.sqrt(law.covariance[i, i])), ax)
         ax.set_title(f"coordinate {i + 1}", fontsize="medium")
         ax.set_box_aspect(1)
-    copula_levels(samples, law.covariance, ax=dependence)
+    plot.copula_levels(samples, law.covariance, ax=dependence)
     dependence.set_title("copula, level curves", fontsize="medium")
     dependence.set_box_aspect(1)
-    figure.suptitle(title)
+    figure.suptitle(_typeset(title))
     return figure
 
 
-def bridges_overview(bridges: Bridges, exact: GaussianBridge) -> Figure:
+def bridges_overview(bridges: jb.Bridges, exact: jb.GaussianBridge) -> Figure:
     """Two-dimensional bridges: paths with time upwards, and each coordinate's bands with those
     of the exact law dashed over them."""
     figure = Figure(figsize=(11, 3.8), layout="constrained")
-    paths_in_space(bridges.times, bridges.paths, figure.add_subplot(1, 3, 1, projection="3d"))
+    plot.paths_in_space(bridges.times, bridges.paths, figure.add_subplot(1, 3, 1, projection="3d"))
     for i in range(2):
         panel = figure.add_subplot(1, 3, i + 2)
-        ax = bridge_fan(bridges.times, bridges.paths, panel, coordinate=i, exact=exact)
+        ax = plot.bridge_fan(bridges.times, bridges.paths, panel, coordinate=i, exact=exact)
         bottom, top = ax.get_ylim()
         ax.set_ylim(bottom - 0.2 * (top - bottom), top)  # room for the legend
         ax.legend(frameon=False, fontsize="x-small", ncols=2, loc="lower center")
@@ -47,7 +48,7 @@ def bridges_overview(bridges: Bridges, exact: GaussianBridge) -> Figure:
 
 
 def variation(results: Sequence[Any]) -> Figure:
-    """std/mean of 1/π_T against γ for each bridge: results of `exact_study.run_variation`."""
+    """std/mean of 1/π_T against γ for each bridge: results of `exact.run_variation`."""
     bridges = list(dict.fromkeys(result.bridge for result in results))
     figure = Figure(figsize=(3.6 * len(bridges), 3.4), layout="constrained")
     for ax, bridge in zip(figure.subplots(1, len(bridges), squeeze=False)[0], bridges, strict=True):
@@ -61,14 +62,14 @@ def variation(results: Sequence[Any]) -> Figure:
             ax.errorbar(place + 0.08 * i, ratio, error, label=label, **style)
         ax.set(xticks=place, xticklabels=[f"{result.gamma:g}" for result in group], xlabel="γ")
         ax.set(ylim=(-0.02, 0.8))
-        ax.set_title(bridge.replace("->", "→").replace("-", "−"), fontsize="medium")
+        ax.set_title(_typeset(bridge), fontsize="medium")
         finish(ax, title="start law")
     figure.axes[0].set_ylabel("std / mean of $1/\\pi_T$, ± 2 s.e.")
     return figure
 
 
 def cost(costs: Sequence[Any], slope: float) -> Figure:
-    """Seconds per effective bridge against the duration: results of `exact_study.run_cost`."""
+    """Seconds per effective bridge against the duration: results of `exact.run_cost`."""
     figure = Figure(figsize=(7.6, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     duration = np.array([c.duration for c in costs])
@@ -88,7 +89,7 @@ def cost(costs: Sequence[Any], slope: float) -> Figure:
 
 def crossover(rates: Sequence[Any], long: float) -> Figure:
     """Effective samples per second against the duration, a panel for each process: results of
-    `crossover_study.run_crossover`. Durations from `long` on, with more steps, are shaded."""
+    `crossover.run_crossover`. Durations from `long` on, with more steps, are shaded."""
     names = list(dict.fromkeys(rate.process for rate in rates))
     figure = Figure(figsize=(4.1 * len(names), 3.8), layout="constrained")
     panels = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
@@ -123,27 +124,45 @@ def crossover(rates: Sequence[Any], long: float) -> Figure:
 
 def accuracy(results: Mapping[str, Any]) -> Figure:
     """Error against time for the paper's process and for a full σ(x): results of
-    `accuracy_study.run_accuracy`."""
+    `accuracy.run_accuracy`."""
     chosen = [results[title] for title in ("the paper's process", "a full σ(x)")]
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     for ax, result in zip(figure.subplots(1, 2, sharey=True), chosen, strict=True):
-        work_precision(result, ax)
+        plot.work_precision(result, ax)
         ax.legend(frameon=False, fontsize="x-small", loc="lower left")
         ax.set_ylim(1e-3, 1)
     figure.axes[1].set_ylabel("")
     return figure
 
 
-def effect_costs(costs: Sequence[Any], ax: Axes | None = None) -> Axes:
+def effect_costs(costs: Sequence[Any]) -> Figure:
     """What each effect adds to the time of a path and step: results of
-    `accuracy_study.run_effect_costs`."""
-    ax = axes_or_new(ax)
-    names = [cost.scene for cost in costs]
-    nanoseconds = [cost.nanoseconds for cost in costs]
-    place = np.arange(len(costs))[::-1]
-    ax.barh(place, nanoseconds, color=COLOURS[0], height=0.6)
-    for y, value in zip(place, nanoseconds, strict=True):
-        ax.annotate(f" {value:.0f}", (value, y), va="center", fontsize="small")
-    ax.set(yticks=place, yticklabels=names, xlabel="nanoseconds a path and step")
+    `accuracy.run_effect_costs`."""
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    ax, place = figure.subplots(), np.arange(len(costs))[::-1]
+    bars = ax.barh(place, [cost.nanoseconds for cost in costs], color=COLOURS[0], height=0.6)
+    ax.bar_label(bars, fmt=" {:.0f}", fontsize="small")
+    ax.set(yticks=place, yticklabels=[cost.scene for cost in costs])
+    ax.set_xlabel("nanoseconds a path and step")
     ax.spines[["top", "right"]].set_visible(False)
-    return ax
+    return figure
+
+
+def bayes(example: Example) -> dict[str, Figure]:
+    """Posterior, prior and likelihood, and the traces of the chains."""
+    exact = example.exact
+    prior = np.exp(-((exact.grid - PRIOR_MEAN) ** 2) / (2 * PRIOR_VARIANCE))
+    curves = {
+        "exact posterior": exact.density,
+        "likelihood": exact.likelihood,
+        "prior": prior / math.sqrt(2 * math.pi * PRIOR_VARIANCE),
+    }
+    shown = {each.name: each.draws for each in example.sampled if "N = 12" not in each.name}
+    density, trace = Figure(layout="constrained"), Figure(layout="constrained")
+    plot.posterior(shown, exact.grid, curves, "α", density.subplots())
+    plot.trace(shown, exact.mean, "α", trace.subplots())
+    return {"bayes_posterior.png": density, "bayes_trace.png": trace}
+
+
+def _typeset(title: str) -> str:
+    return title.replace("->", "→").replace("-", "−")

@@ -21,7 +21,7 @@ from helpers import (
 import jaxbridge as jb
 import jaxbridge.coupling.bridges
 from jaxbridge.coupling.join import propose
-from jaxbridge.studies.numpy_bridges import approximate_bridges
+from jaxbridge.studies.numpy_reference import approximate_bridges
 
 NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
 

@@ -4,19 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_work_precision import made_up, table
 
 import jaxbridge as jb
-from jaxbridge.studies import figures as study_figures
+from jaxbridge.studies import figures
 from jaxbridge.studies.accuracy import (
+    ACCURACY,
     EffectCost,
     curves,
-    format_accuracy,
-    format_effects,
-    format_sigmas,
+    sigma_table,
     sinh_model,
     time_of_step,
-    write_accuracy_figures,
 )
 from jaxbridge.studies.paper import study_model
 
@@ -43,18 +40,30 @@ def test_its_bridge_is_that_of_the_gaussian_one():
     np.testing.assert_allclose(end, mixing @ np.sinh(ends[1]), rtol=1e-6)
 
 
+def made_up(num_steps, error, per_second):
+    words = ("weights", "Coupling(0)", "Heun", "BrownianCrossing", 0.0, "float32", num_steps)
+    errors = (error, 1e-4, error, 1e-4, 0.0, 1e-4)
+    return jb.Setting(*words, *errors, 1.0, 2.0, 100, per_second, per_second)
+
+
 def test_tables_and_figures_render(tmp_path):
-    one = table(made_up(10, 0.08, 10.0), made_up(80, 0.01, 2.0), target=0.03)
-    euler = [s._replace(scheme="Euler", error=3 * s.error) for s in one.settings]
+    heun = made_up(10, 0.08, 10.0), made_up(80, 0.01, 2.0)
+    euler = tuple(s._replace(scheme="Euler", error=3 * s.error) for s in heun)
+    one = jb.WorkPrecision(heun, "exact", 0.03)
     results = {f"order of {curve.name}": one for curve in curves()}
-    results |= {"the paper's process": table(*one.settings, *euler), "a full σ(x)": one}
-    text = format_accuracy(results)
+    results["the paper's process"] = jb.WorkPrecision(heun + euler, "exact", None)
+    results["a full σ(x)"] = one
+    costs = [EffectCost("one", 10.0), EffectCost("two", 25.0)]
+    text = ACCURACY.tables((results, costs))
     assert "Heun with 10 steps: error 0.0800" in text and "accuracy 0.1 costs" in text
     assert "crossing, Heun" in text and "none of these settings" in text
-    costs = [EffectCost("one", 10.0), EffectCost("two", 25.0)]
-    assert "25" in format_effects(costs) and "2.5" in format_sigmas([(2, 10.0, 25.0)])
-    assert all(path.exists() for path in write_accuracy_figures(results, costs, tmp_path))
-    assert len(study_figures.effect_costs(costs).patches) == 2
+    assert text.splitlines()[-1].split() == ["two", "25"]
+    assert sigma_table([(2, 10.0, 25.0)])[1] == [("2", "10", "25", "2.5")]
+    drawn = ACCURACY.draw(figures, (results, costs))
+    assert list(drawn) == ["accuracy.png", "effects.png"]
+    assert len(drawn["effects.png"].axes[0].patches) == 2
+    for name, figure in drawn.items():
+        figure.savefig(tmp_path / name)
 
 
 @pytest.mark.slow

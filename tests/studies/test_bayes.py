@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
+from jaxbridge.studies import figures
 from jaxbridge.studies.bayes import (
     brownian_posterior,
     format_bayes,
     hyperbolic_data,
     run_bayes,
     stationary_posterior,
-    write_bayes_figures,
 )
 
 
@@ -55,4 +55,7 @@ def test_study_runs_and_renders(tmp_path):
     examples = run_bayes(jax.random.key(0), 0.04)
     text = format_bayes(examples)
     assert "exact, coupling" in text and "far apart" in text
-    assert len(write_bayes_figures(examples, tmp_path)) == 2
+    drawn = figures.bayes(examples[0])
+    assert list(drawn) == ["bayes_posterior.png", "bayes_trace.png"]
+    for name, figure in drawn.items():
+        figure.savefig(tmp_path / name)

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from jaxbridge.studies import figures as study_figures
+from jaxbridge.studies import figures
 from jaxbridge.studies.crossover import (
     Rate,
+    crossover_table,
     double_well,
-    format_crossover,
     processes,
     share_of_best,
 )
@@ -57,8 +57,10 @@ def rates():
 
 def test_table_and_figure_show_the_share_of_the_best():
     assert share_of_best(rates(), 0.05) == 0.75 and share_of_best(rates(), 20.0) == 0.8
-    table = format_crossover(rates())
-    assert "0.75" in table and "0.80" in table and "c(0)" in table and "T = 20" in table
-    (ax,) = study_figures.crossover(rates(), 5.0).axes
+    titles, (*_, shares, taken) = crossover_table(rates())
+    assert titles == ("process", "proposal", "T = 0.05", "T = 20")
+    assert shares == ("double well", "auto / best", "0.75", "0.80")
+    assert taken == ("double well", "auto took", "C(0)", "C(0)")
+    (ax,) = figures.crossover(rates(), 5.0).axes
     assert ax.get_title() == "double well" and len(ax.get_lines()) == 3
     assert len({process.name for process in processes()}) == 3

@@ -10,16 +10,20 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
+from jaxbridge.studies import figures
 from jaxbridge.studies.exact import (
+    COST,
+    EXACT,
+    VARIATION,
     Cost,
     ExactResult,
+    Floor,
     Variation,
     _judge,
     format_cost,
     format_exact,
     format_variation,
     slope,
-    write_exact_figures,
 )
 
 LAW = jb.GaussianLaw([1.0, -1.0], [[4.0, 1.0], [1.0, 1.0]])
@@ -62,14 +66,16 @@ def made_up_results():
 
 def test_tables_are_aligned_and_say_everything():
     results, variation, costs = made_up_results()
-    for table, rows in [
-        (format_exact(results), 4),
-        (format_variation(variation), 4),
-        (format_cost(costs), 3),
+    *table, grows = format_cost(costs).splitlines()
+    assert "grow as T to the power 0.90" in grows
+    for lines, rows in [
+        (format_exact(results).splitlines(), 4),
+        (format_variation(variation).splitlines(), 4),
+        (table, 3),
     ]:
-        lines = table.splitlines()
         assert len(lines) == 2 + rows
-        assert len({len(line) for line in lines[2:]}) == 1
+        assert len(set(map(len, lines))) == 1
+    assert "the chain takes 2.0 times that" in EXACT.tables((results, Floor(10**8, 0.25)))
     assert "+0.0100 +- 0.0100" in format_exact(results)
     assert "0.400 +- 0.100" in format_variation(variation)
 
@@ -96,13 +102,12 @@ def test_weighted_and_chain_samples_are_judged_alike():
 
 
 def test_pictures_are_drawn(tmp_path):
-    paths = write_exact_figures(*made_up_results(), tmp_path)
-    assert [path.name for path in paths] == [
-        "exact_unlikely.png",
-        "exact_very_unlikely.png",
-        "variation.png",
-        "cost.png",
-    ]
-    for path in paths:
-        picture = plt.imread(path)
+    results, variation, costs = made_up_results()
+    pictures = EXACT.draw(figures, (results, Floor(10**8, 0.25)))
+    assert list(pictures) == ["exact_unlikely.png", "exact_very_unlikely.png"]
+    pictures |= VARIATION.draw(figures, variation) | COST.draw(figures, costs)
+    assert list(pictures)[2:] == ["variation.png", "cost.png"]
+    for name, figure in pictures.items():
+        figure.savefig(tmp_path / name)
+        picture = plt.imread(tmp_path / name)
         assert picture.shape[0] > 200 and np.ptp(picture[..., :3]) > 0.5
