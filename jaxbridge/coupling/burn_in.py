@@ -55,12 +55,9 @@ def with_burn_in(
     found, by which `run_is_cut` knows it."""
     if not needs_burn_in(coupling.start_law, model):
         return coupling
-    key = key_for("burn-in", key)
-    pairs = jnp.arange(_NUM_PAIRS) * end.shape[0] // _NUM_PAIRS
     usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
     end = jnp.where(usable, end, end[jnp.argmax(usable)])  # bridges that were not found are NaN
-    dt = duration[pairs] / num_steps
-    time = _measure(key, model, coupling, end[pairs].T, dt, num_steps)
+    time = _measure(key, model, coupling, end, duration, num_steps)
     # Not by the constructor, which takes no infinite time from a user.
     law = eqx.tree_at(lambda law: law.burn_in, Stationary(1.0), time)
     return eqx.tree_at(lambda c: c.start_law, coupling, law)
@@ -106,9 +103,7 @@ def measure_burn_in(
     coupling = Coupling() if coupling is None else coupling
     check_model(model, intervals, coupling.scheme)
     model.check_reversal()
-    pairs = jnp.arange(_NUM_PAIRS) * len(intervals.end) // _NUM_PAIRS
-    end, dt = intervals.end[pairs].T, intervals.duration[pairs] / num_steps
-    time = _measure(key_for("burn-in", key), model, coupling, end, dt, num_steps)
+    time = _measure(key, model, coupling, intervals.end, intervals.duration, num_steps)
     if not is_traced(time) and not np.isfinite(time):
         raise ValueError(
             "two copies of the reversed diffusion have not all met after 2¹⁷ steps, so it has "
@@ -125,11 +120,14 @@ def _measure(
     key: Key[Array, ""],
     model: Diffusion,
     coupling: AbstractCoupling,
-    end: Float[Array, "d pairs"],
-    dt: Float[Array, " pairs"],
+    end: Float[Array, "P d"],
+    duration: Float[Array, " P"],
     num_steps: int,
 ) -> Float[Array, ""]:
     """2s for the first s = 1, 2, 4, ... times `num_steps` steps within which all pairs meet."""
+    key = key_for("burn-in", key)
+    mine = jnp.arange(_NUM_PAIRS) * len(end) // _NUM_PAIRS
+    end, dt = end[mine].T, duration[mine] / num_steps
     dynamics = model.prepared().backward(end[:, 0])
     reflection = Coupling(-1.0, scheme=coupling.scheme, rotation=coupling.rotation)
     pairs = in_lanes(reflection, dynamics, end[:, 0], jax.random.split(key, _NUM_PAIRS), dt)

@@ -9,9 +9,10 @@ boundary becomes all of R^d, in which no step leads out of it; bridges are simul
 there, and their paths mapped back.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -23,6 +24,7 @@ from jaxtyping import Array, Float
 from ..engine.checks import Numbers, as_floating
 from ..engine.linalg import log_abs_det
 from .diffusion import Diffusion, check_diffusion, check_value
+from .dynamics import Dynamics
 
 Map = Callable[[Array], Any]
 _Result = TypeVar("_Result")
@@ -122,7 +124,7 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
     for name, function in [("forward", forward), ("inverse", inverse)]:
         if not callable(function):
             raise TypeError(f"`{name}` must be a function of a point; got {function!r}.")
-    functions = _functions(model.unbound(), forward, inverse)
+    functions = _moved(model.unbound(), forward, inverse)
     moved = Diffusion(
         functions.drift,
         functions.diffusion,
@@ -138,60 +140,58 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
     return Transformed(moved, of_points(forward), of_points(inverse))
 
 
-class _Functions(NamedTuple):
-    """Those of the model of Y, of one point and the parameters."""
+@dataclasses.dataclass(frozen=True)
+class _Moved:
+    """The functions of the model of Y, of one point and the parameters."""
 
-    drift: Callable
-    diffusion: Callable
-    reverse_drift: Callable
-    log_stationary: Callable
-    sample_stationary: Callable
+    unbound: Diffusion
+    forward: Map
+    inverse: Map
 
+    def drift(self, y, params):
+        x, model = self._at(y, params)
+        return self._ito(x, model.forward(x))
 
-@functools.lru_cache(maxsize=256)
-def _functions(unbound: Diffusion, forward: Map, inverse: Map) -> _Functions:
-    """The same functions for the same arguments, so that they compile once."""
+    def reverse_drift(self, y, params):
+        x, model = self._at(y, params)
+        return self._ito(x, model.backward(x))
 
-    def at(y, params):
-        x = check_value("inverse", inverse(y), y.shape, y)
-        return x, unbound.with_params(params).forward(x)
-
-    def f(x):
-        return check_value("forward", forward(x), x.shape, x)
-
-    def along(x, direction):
-        """∇f v."""
-        return jax.jvp(f, (x,), (direction,))[1]
-
-    def columns(x, dynamics):
-        sigma, units = dynamics.sigma(x), np.eye(x.shape[0])
-        return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in units]
-
-    def drift(y, params):
-        return moved_drift(*at(y, params))
-
-    def reverse_drift(y, params):
-        x, _ = at(y, params)
-        return moved_drift(x, unbound.with_params(params).backward(x))
-
-    def moved_drift(x, dynamics):
-        """Itô's formula: ∇f α + ½ Σ_k ∂²f(σ_k, σ_k), with the columns σ_k of σ."""
-        moved = along(x, dynamics.drift(x))
-        for column in columns(x, dynamics):
-            moved += jax.jvp(lambda x, v=column: along(x, v), (x,), (column,))[1] / 2
-        return moved
-
-    def diffusion(y, params):
-        x, dynamics = at(y, params)
-        moved = [along(x, column) for column in columns(x, dynamics)]
+    def diffusion(self, y, params):
+        x, model = self._at(y, params)
+        moved = [self._along(x, column) for column in _columns(x, model.forward(x))]
         # In one dimension a matrix is its diagonal.
         return moved[0] if len(moved) == 1 else jnp.stack(moved, axis=1)
 
-    def log_stationary(y, params):
-        x, _ = at(y, params)
-        return unbound.with_params(params).log_stationary(x) + log_abs_det(jax.jacfwd(inverse)(y))
+    def log_stationary(self, y, params):
+        x, model = self._at(y, params)
+        return model.log_stationary(x) + log_abs_det(jax.jacfwd(self.inverse)(y))
 
-    def sample_stationary(key, params):
-        return f(unbound.with_params(params).sample_stationary(key))
+    def sample_stationary(self, key, params):
+        return self._f(self.unbound.with_params(params).sample_stationary(key))
 
-    return _Functions(drift, diffusion, reverse_drift, log_stationary, sample_stationary)
+    def _at(self, y, params) -> tuple[Array, Diffusion]:
+        x = check_value("inverse", self.inverse(y), y.shape, y)
+        return x, self.unbound.with_params(params)
+
+    def _f(self, x):
+        return check_value("forward", self.forward(x), x.shape, x)
+
+    def _along(self, x, direction):
+        """∇f v."""
+        return jax.jvp(self._f, (x,), (direction,))[1]
+
+    def _ito(self, x, dynamics):
+        """∇f α + ½ Σ_k ∂²f(σ_k, σ_k), with the columns σ_k of σ."""
+        moved = self._along(x, dynamics.drift(x))
+        for column in _columns(x, dynamics):
+            moved += jax.jvp(lambda x, v=column: self._along(x, v), (x,), (column,))[1] / 2
+        return moved
+
+
+def _columns(x: Float[Array, " d"], dynamics: Dynamics) -> list[Float[Array, " d"]]:
+    sigma = dynamics.sigma(x)
+    return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(x.shape[0])]
+
+
+# The same object for the same arguments, so that its functions compile once.
+_moved = functools.lru_cache(maxsize=256)(_Moved)

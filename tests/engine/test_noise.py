@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge.engine.noise import Store, noisy_scan
+from jaxbridge.engine.noise import Store, noisy_scan, noisy_scan_until
 
 LANES = 3
 
@@ -55,3 +55,13 @@ def test_numbers_of_a_lane_do_not_depend_on_its_neighbours():
         return noisy_scan(step, init, keys, draw, jnp.arange(100), 100)[1]
 
     np.testing.assert_array_equal(noise(keys)[:, 1:2], noise(keys[1:2]))
+
+
+@pytest.mark.parametrize("num_steps", [5, 150])
+def test_scan_ends_with_the_chunk_in_which_all_lanes_are_over(num_steps):
+    keys = jax.random.split(jax.random.key(0), LANES)
+    counted = lambda over: noisy_scan_until(
+        over, lambda i, inputs: (i + 1, None), jnp.zeros(LANES), keys, draw, None, num_steps
+    )
+    np.testing.assert_array_equal(counted(lambda i: i < 0), num_steps)
+    np.testing.assert_array_equal(counted(lambda i: i >= 3), min(num_steps, 50))
