@@ -19,8 +19,10 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..models.diffusion import Diffusion
 from ..schemes.path_likelihood import Form
-from .completion import Completion, Paths, complete
-from .parameter_steps import (
+from .augmentation import Completion, Paths, complete
+from .blocks import target_forms
+from .data import as_problem, first_chain
+from .parameter_kernels import (
     AbstractParameterKernel,
     CompleteData,
     NormalDraw,
@@ -28,17 +30,9 @@ from .parameter_steps import (
     choose_kernel,
     quadratic_form,
 )
-from .parts import target_forms
-from .posterior import AbstractPosterior
-from .problem import as_problem, first_chain, starting_points
-from .unknowns import (
-    Constraint,
-    GivenDensity,
-    NormalDensity,
-    Prior,
-    Unknowns,
-    as_log_prior,
-)
+from .parameters import Constraint, Unknowns
+from .posterior import AbstractPosterior, starting_points
+from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 
 # Of about so many of the draws the step error is worked out.
 _STEP_ERRORS = 256

@@ -33,10 +33,16 @@ from ..engine.pareto import is_reliable
 from ..models.diffusion import Diffusion
 from ..schemes.path_likelihood import Form
 from ..schemes.step_error import StepError, dominates
-from .completion import Completion, Paths, complete
-from .parameter_steps import CompleteData, quadratic_form
-from .parts import target_forms
-from .problem import Problem, as_problem
+from .augmentation import Completion, Paths, complete
+from .blocks import target_forms
+from .data import Problem, as_problem
+from .parameter_kernels import CompleteData, quadratic_form
+from .parameters import (
+    Constraint,
+    Unknowns,
+    allowed,
+    check_allowed,
+)
 from .score import Score, score
 from .simulated_likelihood import (
     Lost,
@@ -47,12 +53,6 @@ from .simulated_likelihood import (
     sigma_is_unknown,
     step_error_of_score,
     wander,
-)
-from .unknowns import (
-    Constraint,
-    Unknowns,
-    allowed,
-    check_allowed,
 )
 
 # Made once, for optimisers are compared by identity.

@@ -27,20 +27,11 @@ from ..exact.density import check_for_density, estimate_log_density
 from ..exact.kernels import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..proposals.base import AbstractWeightedProposal
-from .parts import Part, make_parts, part_of
-from .posterior import AbstractPosterior
-from .problem import Problem, as_problem, starting_points
-from .unknowns import (
-    Constraint,
-    GivenDensity,
-    NormalDensity,
-    NormalPrior,
-    Prior,
-    Unknowns,
-    allowed,
-    as_log_prior,
-    as_normal,
-)
+from .blocks import Part, make_parts, part_of
+from .data import Problem, as_problem
+from .parameters import Constraint, Unknowns, allowed
+from .posterior import AbstractPosterior, starting_points
+from .priors import GivenDensity, NormalDensity, NormalPrior, Prior, as_log_prior, as_normal
 
 # Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
 _TARGET = 0.2

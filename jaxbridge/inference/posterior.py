@@ -1,5 +1,6 @@
 """Draws from a posterior, and how far to trust them."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -7,8 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ..engine.checks import check_count, is_traced
 from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
 from ..schemes.step_error import StepError, dominates
+from .data import Problem
+from .parameters import Constraint, check_allowed, init_vectors
 
 # Of fewer draws a covariance tells nothing.
 _FEWEST = 10
@@ -95,3 +99,40 @@ class AbstractPosterior(eqx.Module):
         if int(arviz.__version__.split(".")[0]) >= 1:
             return arviz.from_dict({"posterior": posterior})
         return arviz.from_dict(posterior=posterior)
+
+
+def starting_points(
+    problem: Problem,
+    init: PyTree,
+    num_chains: int | None,
+    constraint: Constraint | None,
+    log_prior: Callable[[Array], Array],
+    state_type: type,
+) -> tuple[Float[Array, "*chains p"], Any]:
+    """θ of each chain, and the state to go on from, if `init` is one."""
+    chains = () if num_chains is None else (check_count("num_chains", num_chains),)
+    state = init if isinstance(init, state_type) else None
+    theta = problem.theta
+    if state is not None:
+        theta = state.theta
+        if theta.shape[-1] != problem.theta.shape[0]:
+            raise ValueError(
+                f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are "
+                f"{problem.theta.shape[0]}."
+            )
+        if theta.shape[:-1] != chains and num_chains is not None:
+            raise ValueError(
+                f"`init` is a state of chains {theta.shape[:-1]}, but `num_chains` is {num_chains}."
+            )
+    elif init is not None:
+        theta = init_vectors(problem.unknowns, init, chains).astype(theta.dtype)
+    if theta.ndim == 1:
+        theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
+    check_allowed(constraint, problem.unknowns, theta)
+    for row in theta.reshape(-1, theta.shape[-1]):
+        if not is_traced(value := log_prior(row)) and not jnp.isfinite(value):
+            raise ValueError(
+                f"`prior` is {value} at the parameters to start from, "
+                f"{problem.unknowns.pick(row)}: start where its density is positive, by `init=`."
+            )
+    return theta, state

@@ -25,9 +25,9 @@ from ..models.diffusion import Diffusion
 from ..schemes.halving import num_looked
 from ..schemes.path_likelihood import Form, log_likelihoods
 from ..schemes.step_error import StepError, of_mean
-from .parts import Part, log_halvings, make_parts, step_shares, target_forms
-from .problem import as_problem
-from .unknowns import Unknowns
+from .blocks import Part, log_halvings, make_parts, step_shares, target_forms
+from .data import as_problem
+from .parameters import Unknowns
 
 # Bridges of all intervals that are made at a time.
 _PATHS = 8_192

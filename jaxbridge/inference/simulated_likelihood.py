@@ -41,9 +41,9 @@ from ..proposals.choice import (
     uses_couplings,
 )
 from ..schemes.step_error import StepError
-from .parts import Bounds, Part, make_parts
-from .problem import Problem
-from .unknowns import Constraint, Unknowns, allowed
+from .blocks import Bounds, Part, make_parts
+from .data import Problem
+from .parameters import Constraint, Unknowns, allowed
 
 # Paths of each interval for a noisy gradient.
 _FEW = 8

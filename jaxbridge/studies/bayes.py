@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Key
 from ..coupling.gamma import Coupling
 from ..engine.diagnostics import effective_sample_size
 from ..inference.gibbs import GibbsPosterior, gibbs
-from ..inference.unknowns import NormalPrior
+from ..inference.priors import NormalPrior
 from ..models.hyperbolic import hyperbolic
 from ..models.simulate import simulate
 from ..schemes.euler import Euler

@@ -7,7 +7,8 @@ import pytest
 from inference_oracles import grid_moments, multivariate_ou, ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
-from jaxbridge.inference.unknowns import as_normal, as_unknowns
+from jaxbridge.inference.parameters import as_unknowns
+from jaxbridge.inference.priors import as_normal
 
 TIMES = np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 20, 1.0)])
 DATA = ou_data(3, TIMES)

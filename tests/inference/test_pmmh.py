@@ -7,7 +7,7 @@ import pytest
 from inference_oracles import ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
-from jaxbridge.inference.unknowns import Unknowns
+from jaxbridge.inference.parameters import Unknowns
 
 TIMES = np.arange(0, 12, 0.5)
 DATA = ou_data(7, TIMES, rate=0.8, sigma=0.7)

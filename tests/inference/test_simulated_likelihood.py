@@ -12,7 +12,7 @@ from scipy import optimize, stats
 
 import jaxbridge as jb
 from jaxbridge.inference import simulated_likelihood
-from jaxbridge.inference.problem import as_problem
+from jaxbridge.inference.data import as_problem
 from jaxbridge.proposals.choice import guided_candidates, undecided_between
 
 POSITIVE = lambda params: jnp.all(jnp.stack(params) > 0)

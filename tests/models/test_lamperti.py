@@ -8,7 +8,7 @@ from helpers import count_compilations
 from test_transform import MEAN, NOISE, RATE, cir, cir_density
 
 import jaxbridge as jb
-from jaxbridge.inference.problem import as_problem
+from jaxbridge.inference.data import as_problem
 
 AT = 0.5
 

@@ -1,16 +1,19 @@
-"""Discrete observations of a diffusion, and the steps of the intervals between them."""
+"""Discrete observations of a diffusion, the steps of the intervals between them, and what is to be
+inferred from them."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int, Key, PyTree
 
-from ..engine.checks import Numbers, as_floating, check_count, is_traced, time_steps
-from ..models.diffusion import Diffusion
+from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced, time_steps
+from ..models.diffusion import Diffusion, check_diffusion
 from ..models.intervals import Intervals, as_intervals
+from .parameters import Unknowns, as_unknowns, check_coordinates_known, check_sigma_known
 
 # Numbers of steps are rounded up to one of so few per factor of two, for each is compiled.
 _STEPS_PER_OCTAVE = 2
@@ -135,3 +138,53 @@ def step_groups(
         index = np.flatnonzero(numbers == number)
         groups.append(Group(index, math.ceil(wanted[index].max())))
     return tuple(groups)
+
+
+class Problem(NamedTuple):
+    """The intervals between observations, in groups of one number of steps, and the unknown
+    parameters, with θ as it is in the model."""
+
+    intervals: Intervals
+    groups: tuple[Group, ...]
+    unknowns: Unknowns
+    theta: Float[Array, " p"]
+
+    @property
+    def like(self) -> Float[Array, " d"]:
+        """A point of the state space."""
+        return self.intervals.start[0]
+
+    def pilot_model(self, theta: Float[Array, "*chains p"]) -> Diffusion:
+        """The model at which proposals are chosen: that of the first chain."""
+        return self.unknowns.at(first_chain(theta))
+
+
+def as_problem(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    where: Callable[[PyTree], PyTree] | None,
+    num_steps: int | None,
+    step_size: float | None,
+    sigma_unknown: str | None = None,
+) -> Problem:
+    """What the arguments that all ways of inference share say. `sigma_unknown` is what to do
+    instead where σ depends on the unknown parameters, if it must not.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    """
+    check_key(key)
+    check_diffusion(model)
+    intervals = as_observations(model, times, observations)
+    unknowns, theta = as_unknowns(model, where, intervals.start[0])
+    check_coordinates_known(unknowns, theta)
+    if sigma_unknown is not None:
+        check_sigma_known(unknowns, theta, intervals.start[0], sigma_unknown)
+    groups = step_groups(intervals.duration, num_steps, step_size)
+    return Problem(intervals, groups, unknowns, theta)
+
+
+def first_chain(theta: Float[Array, "*chains p"]) -> Float[Array, " p"]:
+    """θ of the first chain."""
+    return theta.reshape(-1, theta.shape[-1])[0]

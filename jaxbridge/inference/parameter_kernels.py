@@ -30,8 +30,9 @@ from ..engine.lanes import over_lanes
 from ..engine.linalg import any_cholesky, any_solve, dot, matvec
 from ..models.tracing import uses_argument
 from ..schemes.path_likelihood import Form, log_likelihoods
-from .completion import Completion, Paths
-from .unknowns import Constraint, NormalDensity, Unknowns, allowed
+from .augmentation import Completion, Paths
+from .parameters import Constraint, Unknowns, allowed
+from .priors import NormalDensity
 
 # Draws from a normal law until one satisfies the constraint: if none does, θ stays, which leaves
 # the law invariant too.

@@ -28,7 +28,7 @@ from ..proposals.coupled import CoupledPairs
 from ..schemes.halving import log_halving_of_paths
 from ..schemes.path_likelihood import Form, density_of_form, forms_of_target
 from ..schemes.step_error import share_of_order
-from .observations import Group
+from .data import Group
 
 _NO_SAMPLER = (
     "the parameters move, and with them the time that replaces a sampler of the stationary law "

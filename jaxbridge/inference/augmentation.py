@@ -30,8 +30,8 @@ from ..proposals.base import AbstractWeightedProposal
 from ..proposals.coupled import CoupledPairs
 from ..proposals.modified_bridge import ModifiedDiffusionBridge
 from ..schemes.path_likelihood import Form, log_likelihoods
-from .observations import Group
-from .parts import Bounds, Part, log_halvings, make_parts, step_shares
+from .blocks import Bounds, Part, log_halvings, make_parts, step_shares
+from .data import Group
 
 # One array of shape (I, N+1, d) for each part.
 Paths = tuple[Float[Array, "_ _ d"], ...]
