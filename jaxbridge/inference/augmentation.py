@@ -30,14 +30,14 @@ from ..proposals.base import AbstractWeightedProposal
 from ..proposals.coupled import CoupledPairs
 from ..proposals.modified_bridge import ModifiedDiffusionBridge
 from ..schemes.path_likelihood import Form, log_likelihoods
-from .blocks import Bounds, Part, log_halvings, make_parts, step_shares
+from .blocks import Block, Bounds, log_halvings, make_blocks, step_shares
 from .data import Group
 
-# One array of shape (I, N+1, d) for each part.
+# One array of shape (I, N+1, d) for each block.
 Paths = tuple[Float[Array, "_ _ d"], ...]
 
 
-class Renewed(NamedTuple):
+class BridgeInfo(NamedTuple):
     """Of one step on all intervals: whether the path of each was replaced; how many paths were
     simulated, or weighed, for it; whether no proposal was found though one was called for. Then
     the path stays, which leaves the exact law invariant, for whether one is found does not
@@ -66,7 +66,7 @@ class AbstractBridgeKernel(eqx.Module):
         model: Diffusion,
         intervals: Intervals,
         paths: Float[Array, "I points d"],
-    ) -> tuple[Float[Array, "I points d"], Renewed]:
+    ) -> tuple[Float[Array, "I points d"], BridgeInfo]:
         """One step of each."""
 
 
@@ -84,7 +84,7 @@ class ByRenewal(AbstractBridgeKernel):
         num_steps = paths.shape[1] - 1
         law, dt = self.pairs.coupling.start_law, intervals.duration / num_steps
         cut = run_is_cut(law, model, dt, num_steps)
-        return paths, Renewed(info.is_accepted, info.num_simulated, info.is_missing, cut)
+        return paths, BridgeInfo(info.is_accepted, info.num_simulated, info.is_missing, cut)
 
 
 class ByWeights(AbstractBridgeKernel):
@@ -108,7 +108,7 @@ class ByWeights(AbstractBridgeKernel):
         num_simulated = old.num_simulated[:, 0] + new.num_simulated[:, 0]
         paths = jnp.where(accepted[:, None, None], new.paths[:, 0], paths)
         truncated = old.truncated[:, 0] | new.truncated[:, 0]
-        return paths, Renewed(accepted, num_simulated, ~new.found[:, 0], truncated)
+        return paths, BridgeInfo(accepted, num_simulated, ~new.found[:, 0], truncated)
 
 
 class Unweighted(AbstractBridgeKernel):
@@ -124,25 +124,25 @@ class Unweighted(AbstractBridgeKernel):
         proposed = propose_paths(keys, model, self.pairs, intervals, None, num_steps)
         found = proposed.num_found > 0
         paths = jnp.where(found[:, None, None], proposed.outputs.paths, paths)
-        return paths, Renewed(found, proposed.num_trials, ~found, jnp.zeros_like(found))
+        return paths, BridgeInfo(found, proposed.num_trials, ~found, jnp.zeros_like(found))
 
 
-class Completion(eqx.Module):
-    """How the observations are completed: by bridges of all intervals, in parts of one number of
-    steps each, with a kernel for each part."""
+class Augmentation(eqx.Module):
+    """How the observations are completed: by bridges of all intervals, in blocks of one number of
+    steps each, with a kernel for each block."""
 
-    parts: tuple[Part, ...]
+    blocks: tuple[Block, ...]
     kernels: tuple[AbstractBridgeKernel, ...]
 
     @property
     def num_intervals(self) -> int:
-        return sum(len(part.index) for part in self.parts)
+        return sum(len(block.index) for block in self.blocks)
 
     def check_paths(self, paths: tuple[Float[Array, "..."], ...], chains: tuple[int, ...]) -> None:
         """Raise `ValueError` where these are no paths between the observations."""
         wanted = [
-            (*chains, len(part.index), part.num_steps + 1, part.intervals.start.shape[1])
-            for part in self.parts
+            (*chains, len(block.index), block.num_steps + 1, block.intervals.start.shape[1])
+            for block in self.blocks
         ]
         shapes = [mine.shape for mine in paths]
         if shapes != wanted:
@@ -150,8 +150,8 @@ class Completion(eqx.Module):
                 f"`init` is a state with paths of shapes {shapes}, but these observations and "
                 f"numbers of steps call for {wanted}."
             )
-        for part, mine in zip(self.parts, paths, strict=True):
-            ends = (part.intervals.start, part.intervals.end)
+        for block, mine in zip(self.blocks, paths, strict=True):
+            ends = (block.intervals.start, block.intervals.end)
             for end, found in zip(ends, (mine[..., 0, :], mine[..., -1, :]), strict=True):
                 if not is_traced(end, found) and not np.allclose(found, end, atol=1e-6, rtol=1e-4):
                     raise ValueError(
@@ -166,46 +166,47 @@ class Completion(eqx.Module):
     def first_and_found(
         self, key: Key[Array, ""], model: Diffusion
     ) -> tuple[Paths, Bool[Array, " I"]]:
-        """The same, and which of them the proposal itself has found, in the order of the parts."""
+        """The same, and which of them the proposal itself has found, in the order of the blocks."""
         model = model.prepared()
 
-        def of_part(part, kernel, keys):
-            intervals, num_steps = part.intervals, part.num_steps
+        def of_block(block, kernel, keys):
+            intervals, num_steps = block.intervals, block.num_steps
             found_keys, other_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
             found = kernel.first(found_keys, model, intervals, num_steps)
             other = ModifiedDiffusionBridge().draw(
                 other_keys[:, None], model, intervals, num_steps, None, False
             )
-            done = jnp.concatenate([jnp.zeros(1), jnp.cumsum(part.fractions)]).astype(found.dtype)
+            done = jnp.concatenate([jnp.zeros(1), jnp.cumsum(block.fractions)]).astype(found.dtype)
             start, end = intervals.start[:, None], intervals.end[:, None]
             path = start + done[:, None] * (end - start)
             for better in (other.paths[:, 0], found):
                 path = jnp.where(is_there(better)[:, None, None], better, path)
             return path, is_there(found)
 
-        made = list(map(of_part, self.parts, self.kernels, self._keys(key)))
+        made = list(map(of_block, self.blocks, self.kernels, self._keys(key)))
         return tuple(path for path, _ in made), jnp.concatenate([found for _, found in made])
 
-    def renew(self, key: Key[Array, ""], model: Diffusion, paths: Paths) -> tuple[Paths, Renewed]:
+    def renew(
+        self, key: Key[Array, ""], model: Diffusion, paths: Paths
+    ) -> tuple[Paths, BridgeInfo]:
         """One step of every bridge, at the parameters of this model."""
         model = model.prepared()
         made = [
-            kernel.renew(keys, model, part.intervals, mine)
-            for part, kernel, keys, mine in zip(
-                self.parts, self.kernels, self._keys(key), paths, strict=True
+            kernel.renew(keys, model, block.intervals, mine)
+            for block, kernel, keys, mine in zip(
+                self.blocks, self.kernels, self._keys(key), paths, strict=True
             )
         ]
-        renewed = [each for _, each in made]
-        together = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *renewed)
-        return tuple(each for each, _ in made), together
+        paths, infos = zip(*made, strict=True)
+        return paths, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *infos)
 
     def log_likelihoods(
         self, model: Diffusion, paths: Paths, form: Form
     ) -> Float[Array, " intervals"]:
-        """Those of the paths, part by part."""
+        """Those of the paths, block by block."""
         values = [
-            log_likelihoods(model, part.steps, mine, form)
-            for part, mine in zip(self.parts, paths, strict=True)
+            log_likelihoods(model, block.steps, mine, form)
+            for block, mine in zip(self.blocks, paths, strict=True)
         ]
         return jnp.concatenate(values)
 
@@ -215,8 +216,8 @@ class Completion(eqx.Module):
         model = model.prepared()
         return sum(
             (
-                jnp.sum(step_shares(part, model, form) * log_halvings(part, model, mine, form))
-                for part, mine in zip(self.parts, paths, strict=True)
+                jnp.sum(step_shares(block, model, form) * log_halvings(block, model, mine, form))
+                for block, mine in zip(self.blocks, paths, strict=True)
             ),
             start=jnp.zeros((), paths[0].dtype),
         )
@@ -224,14 +225,14 @@ class Completion(eqx.Module):
     def points(self, paths: Paths) -> tuple[Float[Array, "points d"], Float[Array, " points"]]:
         """All points of the paths but their ends, and the steps that begin there."""
         points = [mine[:, :-1].reshape(-1, mine.shape[-1]) for mine in paths]
-        steps = [part.steps.T.reshape(-1) for part in self.parts]
+        steps = [block.steps.T.reshape(-1) for block in self.blocks]
         return jnp.concatenate(points), jnp.concatenate(steps)
 
     def _keys(self, key: Key[Array, ""]) -> list[Key[Array, " I"]]:
-        keys = jax.random.split(key, len(self.parts))
+        keys = jax.random.split(key, len(self.blocks))
         return [
-            jax.random.split(key, len(part.intervals.duration))
-            for key, part in zip(keys, self.parts, strict=True)
+            jax.random.split(key, len(block.intervals.duration))
+            for key, block in zip(keys, self.blocks, strict=True)
         ]
 
 
@@ -240,7 +241,7 @@ def is_there(paths: Float[Array, "I points d"]) -> Bool[Array, " I"]:
     return jnp.all(jnp.isfinite(paths), axis=(1, 2))
 
 
-def complete(
+def augment(
     key: Key[Array, ""],
     model: Diffusion,
     intervals: Intervals,
@@ -249,8 +250,8 @@ def complete(
     bridges: Literal["exact", "approximate"],
     method: Literal["pseudo_marginal", "renewal"] | None,
     bounds: Bounds,
-) -> Completion:
-    """The completion that the user asked for; pilot runs and burn-ins are at the parameters of
+) -> Augmentation:
+    """The augmentation that the user asked for; pilot runs and burn-ins are at the parameters of
     this model.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
@@ -267,8 +268,8 @@ def complete(
     only_couplings = bridges == "approximate" or method == "renewal"
     exact = bridges == "exact"
     couplings = {"only_couplings": only_couplings, "weighted": exact}
-    parts = make_parts(key, model, intervals, groups, given, bounds, **couplings)
-    return Completion(parts, tuple(_kernel(part.proposal, bridges, method) for part in parts))
+    blocks = make_blocks(key, model, intervals, groups, given, bounds, **couplings)
+    return Augmentation(blocks, tuple(_kernel(block.proposal, bridges, method) for block in blocks))
 
 
 def _kernel(

@@ -1,4 +1,4 @@
-"""The proposals of all intervals, in parts of one number of steps each."""
+"""The proposals of all intervals, in blocks of one number of steps each."""
 
 from typing import Any
 
@@ -40,7 +40,7 @@ _FOR_APPROXIMATE = ('bridges="approximate"', 'bridges="exact"')
 Bounds = tuple[int | None, int | None, int | None]
 
 
-class Part(eqx.Module):
+class Block(eqx.Module):
     """Intervals with one number of steps, which are these fractions of their durations; which of
     all intervals they are; and their proposal."""
 
@@ -58,7 +58,7 @@ class Part(eqx.Module):
         return self.fractions[:, None] * self.intervals.duration
 
 
-def make_parts(
+def make_blocks(
     key: Key[Array, ""],
     model: Diffusion,
     intervals: Intervals,
@@ -70,8 +70,8 @@ def make_parts(
     only_couplings: bool = False,
     moving: bool = True,
     weighted: bool = True,
-) -> tuple[Part, ...]:
-    """The proposal that the user gave, checked, and settled and prepared for each part at this
+) -> tuple[Block, ...]:
+    """The proposal that the user gave, checked, and settled and prepared for each block at this
     model: parameters that are `moving` leave from there.
 
     **Raises:** `ValueError` and `TypeError` for a proposal that does not fit.
@@ -91,47 +91,47 @@ def make_parts(
         _check_for_moving(given, model)
     if only_couplings:
         given = as_pairs(given) if weighted else as_pairs(given, *_FOR_APPROXIMATE)
-    parts = []
-    for part_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
+    blocks = []
+    for block_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
         mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
         chosen = given
         if isinstance(given, Choice) and given.chosen is not None:
             chosen = given.of(group.which)
-        chosen = settled(chosen, part_key, model, mine, group.num_steps)
+        chosen = settled(chosen, block_key, model, mine, group.num_steps)
         if weighted:
-            chosen = chosen.prepared(part_key, model, mine, group.num_steps)
-        parts.append(part_of(intervals, group, chosen))
-    return tuple(parts)
+            chosen = chosen.prepared(block_key, model, mine, group.num_steps)
+        blocks.append(block_of(intervals, group, chosen))
+    return tuple(blocks)
 
 
-def part_of(intervals: Intervals, group: Group, proposal: AbstractWeightedProposal) -> Part:
+def block_of(intervals: Intervals, group: Group, proposal: AbstractWeightedProposal) -> Block:
     """The intervals of one group, of all, with a proposal that is settled for them."""
     mine = jax.tree.map(lambda leaf: leaf[group.which], intervals)
     fractions = jnp.asarray(np.diff(proposal.fractions(group.num_steps)), mine.duration.dtype)
-    return Part(mine, jnp.asarray(group.which), fractions, proposal)
+    return Block(mine, jnp.asarray(group.which), fractions, proposal)
 
 
 def log_halvings(
-    part: Part, model: Diffusion, paths: Float[Array, "P points d"], form: Form, repeats: int = 1
+    block: Block, model: Diffusion, paths: Float[Array, "P points d"], form: Form, repeats: int = 1
 ) -> Float[Array, " P"]:
     """D of `halving` under the step law of this form of the likelihood, of so many paths for each
     interval."""
-    steps = jnp.repeat(part.steps, repeats, axis=1)
-    dynamics = model.forward(part.intervals.start[0])
+    steps = jnp.repeat(block.steps, repeats, axis=1)
+    dynamics = model.forward(block.intervals.start[0])
     return log_halving_of_paths(density_of_form(form), dynamics, steps, paths)
 
 
-def step_shares(part: Part, model: Diffusion, form: Form) -> Float[Array, " I"]:
+def step_shares(block: Block, model: Diffusion, form: Form) -> Float[Array, " I"]:
     """The step error of each interval, of its bridges or of this form, as a share of what half as
     many steps change."""
     share = share_of_order(density_of_form(form).order)
-    return jnp.maximum(part.proposal.step_share(model, part.intervals), share)
+    return jnp.maximum(block.proposal.step_share(model, block.intervals), share)
 
 
-def target_forms(parts: tuple[Part, ...], model: Diffusion) -> tuple[Form, ...]:
-    """Those of the path likelihood that go with the bridges of all parts."""
-    proposals = [singles(part.proposal) for part in parts]
-    return forms_of_target(proposals, model, parts[0].intervals.start[0])
+def target_forms(blocks: tuple[Block, ...], model: Diffusion) -> tuple[Form, ...]:
+    """Those of the path likelihood that go with the bridges of all blocks."""
+    proposals = [singles(block.proposal) for block in blocks]
+    return forms_of_target(proposals, model, blocks[0].intervals.start[0])
 
 
 def _check_for_moving(proposal: AbstractWeightedProposal, model: Diffusion) -> None:

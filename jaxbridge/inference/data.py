@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int, Key, PyTree
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced, time_steps
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.intervals import Intervals, as_intervals
-from .parameters import Unknowns, as_unknowns, check_coordinates_known, check_sigma_known
+from .parameters import Parameters, as_parameters, check_coordinates_known, check_sigma_known
 
 # Numbers of steps are rounded up to one of so few per factor of two, for each is compiled.
 _STEPS_PER_OCTAVE = 2
@@ -146,7 +146,7 @@ class Problem(NamedTuple):
 
     intervals: Intervals
     groups: tuple[Group, ...]
-    unknowns: Unknowns
+    parameters: Parameters
     theta: Float[Array, " p"]
 
     @property
@@ -156,7 +156,7 @@ class Problem(NamedTuple):
 
     def pilot_model(self, theta: Float[Array, "*chains p"]) -> Diffusion:
         """The model at which proposals are chosen: that of the first chain."""
-        return self.unknowns.at(first_chain(theta))
+        return self.parameters.bind(first_chain(theta))
 
 
 def as_problem(
@@ -177,12 +177,12 @@ def as_problem(
     check_key(key)
     check_diffusion(model)
     intervals = as_observations(model, times, observations)
-    unknowns, theta = as_unknowns(model, where, intervals.start[0])
-    check_coordinates_known(unknowns, theta)
+    parameters, theta = as_parameters(model, where, intervals.start[0])
+    check_coordinates_known(parameters, theta)
     if sigma_unknown is not None:
-        check_sigma_known(unknowns, theta, intervals.start[0], sigma_unknown)
+        check_sigma_known(parameters, theta, intervals.start[0], sigma_unknown)
     groups = step_groups(intervals.duration, num_steps, step_size)
-    return Problem(intervals, groups, unknowns, theta)
+    return Problem(intervals, groups, parameters, theta)
 
 
 def first_chain(theta: Float[Array, "*chains p"]) -> Float[Array, " p"]:

@@ -1,7 +1,7 @@
 """Bayesian inference by Gibbs sampling (section 4 of the paper, for any model).
 
 The path between the observations is part of the state: bridges of all intervals given θ and the
-data (`completion`), and θ given the whole path (`parameter_steps`), in turn. With exact bridges
+data (`augmentation`), and θ given the whole path (`parameter_kernels`), in turn. With exact bridges
 the posterior is exact up to the step error; with approximate ones, as in the paper, it is
 shifted by the error of the bridges.
 """
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..models.diffusion import Diffusion
 from ..schemes.path_likelihood import Form
-from .augmentation import Completion, Paths, complete
+from .augmentation import Augmentation, Paths, augment
 from .blocks import target_forms
 from .data import as_problem, first_chain
 from .parameter_kernels import (
@@ -30,7 +30,7 @@ from .parameter_kernels import (
     choose_kernel,
     quadratic_form,
 )
-from .parameters import Constraint, Unknowns
+from .parameters import Constraint, Parameters
 from .posterior import AbstractPosterior, starting_points
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 
@@ -42,7 +42,7 @@ class GibbsState(NamedTuple):
     """Where a chain of `gibbs` is, with chains in a leading axis if there are several.
 
     - `theta`: θ, shape (p,).
-    - `paths`: those of all intervals, in parts of one number of steps.
+    - `paths`: those of all intervals, in blocks of one number of steps.
     - `found`: which of them the proposal has found, shape (I,), in the same order. The others are
         stand-ins, for a chain must start somewhere.
     """
@@ -88,7 +88,7 @@ class GibbsPosterior(AbstractPosterior):
     num_truncated: Int[Array, "*chains n"]
     log_step_error: Float[Array, "*chains n"]
     state: GibbsState
-    completion: Completion
+    completion: Augmentation
     exact_parameters: bool = eqx.field(static=True)
 
 
@@ -177,32 +177,32 @@ def gibbs(
         step_size,
         "use `pmmh`, which needs no path, or pick the others with `where=`.",
     )
-    unknowns, like = problem.unknowns, problem.like
+    parameters, like = problem.parameters, problem.like
     check_kernel(parameter_kernel)
-    log_prior = as_log_prior(prior, unknowns, problem.theta)
+    log_prior = as_log_prior(prior, parameters, problem.theta)
     theta, state = starting_points(problem, init, num_chains, constraint, log_prior, GibbsState)
-    complete_key, run_key = jax.random.split(key)
+    augment_key, run_key = jax.random.split(key)
     bounds = (num_counts, max_proposals, max_trials)
     arguments = (problem.intervals, problem.groups, proposal, bridges, method, bounds)
-    completion = complete(complete_key, problem.pilot_model(theta), *arguments)
-    forms = target_forms(completion.parts, model)
-    form = quadratic_form(unknowns, first_chain(theta), like, forms)
+    augmentation = augment(augment_key, problem.pilot_model(theta), *arguments)
+    forms = target_forms(augmentation.blocks, model)
+    form = quadratic_form(parameters, first_chain(theta), like, forms)
     kernel = choose_kernel(parameter_kernel, form is not None, log_prior)
     form = forms[0] if form is None else form
-    setting = _Setting(unknowns, completion, log_prior, constraint, kernel, form)
+    setting = _Setting(parameters, augmentation, log_prior, constraint, kernel, form)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     if state is None:
         state = _start(run_key, setting, theta)
     else:
-        completion.check_paths(state.paths, theta.shape[:-1])
+        augmentation.check_paths(state.paths, theta.shape[:-1])
     return _run(run_key, setting, state, num_iterations, thin, meter)
 
 
 class _Setting(eqx.Module):
     """What does not change from iteration to iteration."""
 
-    unknowns: Unknowns
-    completion: Completion
+    parameters: Parameters
+    augmentation: Augmentation
     log_prior: NormalDensity | GivenDensity
     constraint: Constraint | None = eqx.field(static=True)
     kernel: AbstractParameterKernel
@@ -210,11 +210,11 @@ class _Setting(eqx.Module):
 
     def data(self, paths: Paths) -> CompleteData:
         return CompleteData(
-            self.unknowns, self.completion, paths, self.log_prior, self.constraint, self.form
+            self.parameters, self.augmentation, paths, self.log_prior, self.constraint, self.form
         )
 
 
-class _Sweep(NamedTuple):
+class GibbsInfo(NamedTuple):
     """What is told of one iteration."""
 
     parameters_moved: Bool[Array, "*chains"]
@@ -227,8 +227,8 @@ class _Sweep(NamedTuple):
 @eqx.filter_jit
 def _start(key: Key[Array, ""], setting: _Setting, theta: Float[Array, "*chains p"]) -> GibbsState:
     def first(key, theta):
-        model = nondifferentiable(setting.unknowns.at(theta))
-        return setting.completion.first_and_found(key, model)
+        model = nondifferentiable(setting.parameters.bind(theta))
+        return setting.augmentation.first_and_found(key, model)
 
     key = jax.random.fold_in(key, 0)
     if theta.ndim == 1:
@@ -238,21 +238,21 @@ def _start(key: Key[Array, ""], setting: _Setting, theta: Float[Array, "*chains 
 
 def _iterate(
     key: Key[Array, ""], setting: _Setting, state: GibbsState
-) -> tuple[GibbsState, _Sweep]:
+) -> tuple[GibbsState, GibbsInfo]:
     """Bridges given θ, then θ given bridges."""
     bridge_key, parameter_key = jax.random.split(key)
-    model = setting.unknowns.at(state.theta)
-    paths, renewed = setting.completion.renew(bridge_key, model, state.paths)
-    found = state.found | renewed.moved
+    model = setting.parameters.bind(state.theta)
+    paths, bridges = setting.augmentation.renew(bridge_key, model, state.paths)
+    found = state.found | bridges.moved
     step = setting.kernel.step(parameter_key, state.theta, setting.data(paths))
-    sweep = _Sweep(
+    info = GibbsInfo(
         step.accepted,
-        jnp.mean(renewed.moved.astype(state.theta.dtype)),
-        jnp.sum(renewed.num_simulated, dtype=jnp.int32),
-        jnp.sum(renewed.missing | ~found, dtype=jnp.int32),
-        jnp.sum(renewed.truncated, dtype=jnp.int32),
+        jnp.mean(bridges.moved.astype(state.theta.dtype)),
+        jnp.sum(bridges.num_simulated, dtype=jnp.int32),
+        jnp.sum(bridges.missing | ~found, dtype=jnp.int32),
+        jnp.sum(bridges.truncated, dtype=jnp.int32),
     )
-    return GibbsState(step.theta, paths, found), sweep
+    return GibbsState(step.theta, paths, found), info
 
 
 @eqx.filter_jit
@@ -276,8 +276,8 @@ def _run(
     every = max(1, num_iterations // _STEP_ERRORS)
 
     def step_error(state):
-        model = setting.unknowns.at(state.theta)
-        return setting.completion.log_step_error(model, state.paths, setting.form)
+        model = setting.parameters.bind(state.theta)
+        return setting.augmentation.log_step_error(model, state.paths, setting.form)
 
     def step_errors(i, state):
         each = step_error if state.theta.ndim == 1 else jax.vmap(step_error)
@@ -288,39 +288,39 @@ def _run(
         state, meter = carry
         # Number 0 made the first paths.
         keys = jax.random.split(jax.random.fold_in(key, i + 1), thin)
-        state, sweeps = lax.scan(iterate, state, keys)
+        state, infos = lax.scan(iterate, state, keys)
         meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / num_iterations)
         error = step_errors(i, state)
-        told = _Sweep(
-            jnp.any(sweeps.parameters_moved, axis=0),
-            jnp.mean(sweeps.bridges_moved, axis=0),
-            jnp.sum(sweeps.num_simulated, axis=0, dtype=jnp.int32),
-            jnp.sum(sweeps.num_missing, axis=0, dtype=jnp.int32),
-            jnp.sum(sweeps.num_truncated, axis=0, dtype=jnp.int32),
+        info = GibbsInfo(
+            jnp.any(infos.parameters_moved, axis=0),
+            jnp.mean(infos.bridges_moved, axis=0),
+            jnp.sum(infos.num_simulated, axis=0, dtype=jnp.int32),
+            jnp.sum(infos.num_missing, axis=0, dtype=jnp.int32),
+            jnp.sum(infos.num_truncated, axis=0, dtype=jnp.int32),
         )
-        return (state, meter), (state.theta, told, error)
+        return (state, meter), (state.theta, info, error)
 
     carry = (state, progress_meter.init())
-    (state, meter), (theta, told, error) = lax.scan(kept, carry, jnp.arange(num_iterations))
+    (state, meter), (theta, info, error) = lax.scan(kept, carry, jnp.arange(num_iterations))
     progress_meter.close(meter)
     if theta.ndim == 3:
-        theta, told, error = jax.tree.map(
-            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, told, error)
+        theta, info, error = jax.tree.map(
+            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, info, error)
         )
-    as_params = jax.vmap(setting.unknowns.all)
+    as_params = jax.vmap(setting.parameters.full)
     params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
     exact = isinstance(setting.kernel, NormalDraw)
     return GibbsPosterior(
         params,
         theta,
-        setting.unknowns.names,
-        told.parameters_moved,
-        told.bridges_moved,
-        told.num_simulated,
-        told.num_missing,
-        told.num_truncated,
+        setting.parameters.names,
+        info.parameters_moved,
+        info.bridges_moved,
+        info.num_simulated,
+        info.num_missing,
+        info.num_truncated,
         error,
         state,
-        setting.completion,
+        setting.augmentation,
         exact,
     )

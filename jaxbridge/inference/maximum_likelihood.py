@@ -33,26 +33,26 @@ from ..engine.pareto import is_reliable
 from ..models.diffusion import Diffusion
 from ..schemes.path_likelihood import Form
 from ..schemes.step_error import StepError, dominates
-from .augmentation import Completion, Paths, complete
+from .augmentation import Augmentation, Paths, augment
 from .blocks import target_forms
 from .data import Problem, as_problem
 from .parameter_kernels import CompleteData, quadratic_form
 from .parameters import (
     Constraint,
-    Unknowns,
+    Parameters,
     allowed,
     check_allowed,
 )
 from .score import Score, score
 from .simulated_likelihood import (
-    Lost,
+    SearchInfo,
     as_pulled,
-    climb,
     guarded,
-    pulled_parts,
+    newton_ascent,
+    pulled_blocks,
     sigma_is_unknown,
     step_error_of_score,
-    wander,
+    stochastic_ascent,
 )
 
 # Made once, for optimisers are compared by identity.
@@ -193,8 +193,8 @@ def maximum_likelihood(
     if method == "em" and optimizer is not None:
         raise ValueError('`method="em"` takes no `optimizer`.')
     problem = as_problem(key, model, times, observations, where, num_steps, step_size)
-    unknowns, theta = problem.unknowns, problem.theta
-    check_allowed(constraint, unknowns, theta)
+    parameters, theta = problem.parameters, problem.theta
+    check_allowed(constraint, parameters, theta)
     proposal = "auto" if proposal is None else proposal
     bounds = (num_counts, max_proposals, max_trials)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
@@ -209,18 +209,18 @@ def maximum_likelihood(
         proposal = as_pulled(proposal, model, problem.like, bounds)
         search = (problem, proposal, constraint, optimizer, num_iterations, num_bridges, meter)
         return _by_simulation(key, *search)
-    complete_key, run_key, score_key = jax.random.split(key, 3)
+    augment_key, run_key, score_key = jax.random.split(key, 3)
     arguments = (problem.intervals, problem.groups, proposal, "exact", None, bounds)
-    completion = complete(complete_key, model, *arguments)
-    forms = target_forms(completion.parts, model)
-    form = quadratic_form(unknowns, theta, problem.like, forms) or forms[0]
+    augmentation = augment(augment_key, model, *arguments)
+    forms = target_forms(augmentation.blocks, model)
+    form = quadratic_form(parameters, theta, problem.like, forms) or forms[0]
     rule = _EM() if method == "em" else _Gradient(optimizer)
-    setting = _Setting(unknowns, completion, constraint, rule, form)
-    iterates, lost = _approximate(run_key, setting, theta, num_iterations, meter)
+    setting = _Setting(parameters, augmentation, constraint, rule, form)
+    iterates, info = _approximate(run_key, setting, theta, num_iterations, meter)
     rough = iterates[-1] if method == "em" else jnp.mean(iterates[num_iterations // 2 :], axis=0)
     at_rough = score(
         score_key,
-        unknowns.at(rough),
+        parameters.bind(rough),
         times,
         observations,
         num_bridges=num_bridges,
@@ -238,17 +238,17 @@ def maximum_likelihood(
     # Further off the likelihood need not be near its quadratic approximation.
     near = at_rough.gradient @ step < theta.shape[0]
     newton = rough + step
-    ok = definite & near & allowed(constraint, unknowns, newton)
+    ok = definite & near & allowed(constraint, parameters, newton)
     estimate = jnp.where(ok, newton, rough)
-    return _summary(unknowns, estimate, iterates, at_rough, lost, ok)
+    return _summary(parameters, estimate, iterates, at_rough, info, ok)
 
 
 def _summary(
-    unknowns: Unknowns,
+    parameters: Parameters,
     estimate: Float[Array, " p"],
     iterates: Float[Array, "n p"],
     score: Score,
-    lost: Lost,
+    info: SearchInfo,
     ok: Bool[Array, ""],
 ) -> MaximumLikelihood:
     """The estimate with its errors, which are those of the score times the inverse information."""
@@ -257,10 +257,10 @@ def _summary(
     # Where the score is too large by this, so is its zero by that times the inverse information.
     step_doubt = jnp.sqrt(covariance**2 @ score.step_uncertainty**2)
     standard, monte_carlo = (
-        unknowns.pick(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
+        parameters.select(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
     )
     return MaximumLikelihood(
-        unknowns.all(estimate),
+        parameters.full(estimate),
         standard,
         monte_carlo,
         estimate,
@@ -269,9 +269,9 @@ def _summary(
         step_doubt,
         iterates,
         score,
-        lost.missing,
-        lost.truncated + score.num_truncated,
-        lost.refused,
+        info.missing,
+        info.truncated + score.num_truncated,
+        info.refused,
         ok,
     )
 
@@ -287,30 +287,30 @@ def _by_simulation(
     meter: diffrax.AbstractProgressMeter,
 ) -> MaximumLikelihood:
     """The maximum of the simulated likelihood."""
-    unknowns, theta = problem.unknowns, problem.theta
+    parameters, theta = problem.parameters, problem.theta
     pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
-    parts = pulled_parts(pilot_key, unknowns.at(theta), problem, proposal)
-    search = (unknowns, parts, constraint, optimizer, theta, num_iterations, meter)
-    iterates, lost = wander(run_key, *search)
+    blocks = pulled_blocks(pilot_key, parameters.bind(theta), problem, proposal)
+    search = (parameters, blocks, constraint, optimizer, theta, num_iterations, meter)
+    iterates, info = stochastic_ascent(run_key, *search)
     last, mean = iterates[-1], jnp.mean(iterates[num_iterations // 2 :], axis=0)
     # What suits the data at the first θ need not do so at the last.
-    parts = pulled_parts(last_pilot_key, unknowns.at(last), problem, proposal)
+    blocks = pulled_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
     starts = jnp.stack([theta, last, mean])
-    maximum = climb(last_key, unknowns, parts, constraint, starts, num_bridges)
+    maximum = newton_ascent(last_key, parameters, blocks, constraint, starts, num_bridges)
     made = maximum.simulated
     at_maximum = Score(
-        unknowns.pick(made.gradient),
-        unknowns.pick(jnp.sqrt(jnp.diagonal(made.covariance))),
+        parameters.select(made.gradient),
+        parameters.select(jnp.sqrt(jnp.diagonal(made.covariance))),
         made.gradient,
         made.covariance,
         made.information,
         made.effective_sample_size,
         made.pareto_k,
-        *step_error_of_score(last_key, unknowns, parts, maximum, num_bridges),
+        *step_error_of_score(last_key, parameters, blocks, maximum, num_bridges),
         made.num_missing,
         jnp.int32(0),
     )
-    return _summary(unknowns, maximum.theta, iterates, at_maximum, lost, maximum.found)
+    return _summary(parameters, maximum.theta, iterates, at_maximum, info, maximum.found)
 
 
 class _Gradient(eqx.Module):
@@ -347,8 +347,8 @@ class _EM(eqx.Module):
 class _Setting(eqx.Module):
     """What does not change from iteration to iteration."""
 
-    unknowns: Unknowns
-    completion: Completion
+    parameters: Parameters
+    augmentation: Augmentation
     constraint: Constraint | None = eqx.field(static=True)
     rule: _Gradient | _EM
     form: Form = eqx.field(static=True)
@@ -368,30 +368,30 @@ def _approximate(
     theta: Float[Array, " p"],
     num_iterations: int,
     meter: diffrax.AbstractProgressMeter,
-) -> tuple[Float[Array, "n p"], Lost]:
+) -> tuple[Float[Array, "n p"], SearchInfo]:
     """The iterates, and what was lost on the way."""
     setting = nondifferentiable(setting)
-    unknowns, completion = setting.unknowns, setting.completion
+    parameters, augmentation = setting.parameters, setting.augmentation
     first_key, run_key = jax.random.split(key)
-    num_intervals = completion.num_intervals
+    num_intervals = augmentation.num_intervals
 
     def iterate(state, i):
-        paths, renewed = completion.renew(
-            jax.random.fold_in(run_key, i), unknowns.at(state.theta), state.paths
+        paths, bridges = augmentation.renew(
+            jax.random.fold_in(run_key, i), parameters.bind(state.theta), state.paths
         )
         data = CompleteData(
-            unknowns, completion, paths, jnp.zeros_like, setting.constraint, setting.form
+            parameters, augmentation, paths, jnp.zeros_like, setting.constraint, setting.form
         )
         moved, rule = setting.rule.update(i, state.theta, state.rule, data, num_intervals)
         old = state.theta, state.rule
-        theta, rule, ok = guarded(setting.constraint, unknowns, old, (moved, rule))
+        theta, rule, ok = guarded(setting.constraint, parameters, old, (moved, rule))
         progress = meter.step(state.meter, (i + 1).astype(jnp.float32) / num_iterations)
-        lost = Lost(renewed.missing, renewed.truncated, ~ok)
-        lost = jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)
-        return _State(theta, paths, rule, progress), (theta, lost)
+        info = SearchInfo(bridges.missing, bridges.truncated, ~ok)
+        info = jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), info)
+        return _State(theta, paths, rule, progress), (theta, info)
 
-    first = completion.first(first_key, unknowns.at(theta))
+    first = augmentation.first(first_key, parameters.bind(theta))
     state = _State(theta, first, setting.rule.init(theta), meter.init())
-    state, (iterates, lost) = lax.scan(iterate, state, jnp.arange(num_iterations))
+    state, (iterates, info) = lax.scan(iterate, state, jnp.arange(num_iterations))
     meter.close(state.meter)
-    return iterates, jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)
+    return iterates, jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), info)

@@ -30,8 +30,8 @@ from ..engine.lanes import over_lanes
 from ..engine.linalg import any_cholesky, any_solve, dot, matvec
 from ..models.tracing import uses_argument
 from ..schemes.path_likelihood import Form, log_likelihoods
-from .augmentation import Completion, Paths
-from .parameters import Constraint, Unknowns, allowed
+from .augmentation import Augmentation, Paths
+from .parameters import Constraint, Parameters, allowed
 from .priors import NormalDensity
 
 # Draws from a normal law until one satisfies the constraint: if none does, θ stays, which leaves
@@ -51,16 +51,16 @@ class ParameterStep(NamedTuple):
 class CompleteData(NamedTuple):
     """What a step of θ is made from: the completed observations, and the prior."""
 
-    unknowns: Unknowns
-    completion: Completion
+    parameters: Parameters
+    augmentation: Augmentation
     paths: Paths
     log_prior: Callable[[Array], Array]
     constraint: Constraint | None
     form: Form
 
     def log_likelihood(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
-        model = self.unknowns.at(theta)
-        return jnp.sum(self.completion.log_likelihoods(model, self.paths, self.form))
+        model = self.parameters.bind(theta)
+        return jnp.sum(self.augmentation.log_likelihoods(model, self.paths, self.form))
 
     def log_posterior_inside(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
         """log of likelihood times prior, as if there were no constraint."""
@@ -68,16 +68,16 @@ class CompleteData(NamedTuple):
 
     def log_posterior(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
         """-inf where the constraint is not satisfied."""
-        inside = allowed(self.constraint, self.unknowns, theta)
+        inside = allowed(self.constraint, self.parameters, theta)
         return jnp.where(inside, self.log_posterior_inside(theta), -jnp.inf)
 
     def information(self, theta: Float[Array, " p"]) -> Float[Array, "p p"]:
         """G(θ), with the prior's precision where it is normal."""
-        points, steps = self.completion.points(self.paths)
+        points, steps = self.augmentation.points(self.paths)
 
         def of_point(x, dt):
             def beta(theta):
-                dynamics = self.unknowns.at(theta).prepared().forward(x)
+                dynamics = self.parameters.bind(theta).prepared().forward(x)
                 return dynamics.sigma(x).solve(dynamics.drift(x))
 
             J = jax.jacfwd(beta)(theta)
@@ -90,7 +90,7 @@ class CompleteData(NamedTuple):
 
 
 def quadratic_form(
-    unknowns: Unknowns,
+    parameters: Parameters,
     theta: Float[Array, " p"],
     like: Float[Array, " d"],
     forms: Sequence[Form],
@@ -100,7 +100,7 @@ def quadratic_form(
     for form in forms:
 
         def log_likelihood(theta, form: Form = form):
-            return log_likelihoods(unknowns.at(theta), steps, paths, form)[0]
+            return log_likelihoods(parameters.bind(theta), steps, paths, form)[0]
 
         if not uses_argument(jax.jacfwd(jax.jacfwd(log_likelihood)), theta):
             return form
@@ -128,7 +128,7 @@ class NormalDraw(AbstractParameterKernel):
             i, _, _ = carry
             noise = jax.random.normal(jax.random.fold_in(key, i), theta.shape, theta.dtype)
             drawn = mean + any_solve(root.T, noise)
-            return i + 1, drawn, allowed(data.constraint, data.unknowns, drawn)
+            return i + 1, drawn, allowed(data.constraint, data.parameters, drawn)
 
         def missed(carry):
             i, _, ok = carry
@@ -145,7 +145,7 @@ class NewtonStep(AbstractParameterKernel):
         scale_key, noise_key, accept_key = jax.random.split(key, 3)
         tau = jax.random.choice(scale_key, jnp.asarray(_SCALES, theta.dtype))
 
-        def look(theta):
+        def evaluate(theta):
             """The log density at θ, and mean and root of the proposals from it."""
             value, gradient = jax.value_and_grad(data.log_posterior_inside)(theta)
             root = any_cholesky(data.information(theta))
@@ -156,12 +156,12 @@ class NewtonStep(AbstractParameterKernel):
             noise = matvec(root.T, place - mean) / tau
             return jnp.sum(jnp.log(jnp.diagonal(root))) - dot(noise, noise) / 2
 
-        value, mean, root = look(theta)
+        value, mean, root = evaluate(theta)
         noise = jax.random.normal(noise_key, theta.shape, theta.dtype)
         proposed = mean + tau * any_solve(root.T, noise)
-        ok = allowed(data.constraint, data.unknowns, proposed)
+        ok = allowed(data.constraint, data.parameters, proposed)
         proposed = jnp.where(ok, proposed, theta)
-        other_value, other_mean, other_root = look(proposed)
+        other_value, other_mean, other_root = evaluate(proposed)
         log_ratio = other_value - value + log_density(theta, other_mean, other_root)
         log_ratio -= log_density(proposed, mean, root)
         # A comparison with NaN is false, and refuses.
@@ -177,12 +177,12 @@ class GivenKernel(AbstractParameterKernel):
 
     def step(self, key, theta, data):
         def log_density(params):
-            return data.log_posterior(data.unknowns.vector(params))
+            return data.log_posterior(data.parameters.vector(params))
 
         kernel = self.build(log_density)
-        state, _ = kernel.step(key, kernel.init(data.unknowns.pick(theta)))
-        moved = data.unknowns.vector(state.position)
-        ok = allowed(data.constraint, data.unknowns, moved)
+        state, _ = kernel.step(key, kernel.init(data.parameters.select(theta)))
+        moved = data.parameters.vector(state.position)
+        ok = allowed(data.constraint, data.parameters, moved)
         moved = jnp.where(ok, moved, theta)
         return ParameterStep(moved, jnp.any(moved != theta))
 

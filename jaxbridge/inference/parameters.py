@@ -36,7 +36,7 @@ class _Named:
         return [f"{self.name}[{place}]" if place else self.name for place in places]
 
 
-class Unknowns(eqx.Module):
+class Parameters(eqx.Module):
     """The model, and which of its parameters are unknown."""
 
     model: Diffusion
@@ -64,59 +64,61 @@ class Unknowns(eqx.Module):
         """θ of these unknown parameters."""
         return ravel_pytree(eqx.filter(params, eqx.is_inexact_array))[0]
 
-    def pick(self, theta: Float[Array, " p"]) -> PyTree:
+    def select(self, theta: Float[Array, " p"]) -> PyTree:
         """The unknown parameters of θ, in its dtype."""
         floats, others = eqx.partition(self.params, eqx.is_inexact_array)
         _, unravel = ravel_pytree(cast_floats(floats, theta.dtype))
         return eqx.combine(unravel(theta), others)
 
-    def all(self, theta: Float[Array, " p"]) -> PyTree:
+    def full(self, theta: Float[Array, " p"]) -> PyTree:
         """All parameters of the model, the unknown ones from θ."""
         if self.where is None:
-            return self.pick(theta)
-        return eqx.tree_at(self.where, self.model.params, self.pick(theta))
+            return self.select(theta)
+        return eqx.tree_at(self.where, self.model.params, self.select(theta))
 
-    def at(self, theta: Float[Array, " p"]) -> Diffusion:
+    def bind(self, theta: Float[Array, " p"]) -> Diffusion:
         """The model at θ."""
-        return self.model.with_params(self.all(theta))
+        return self.model.with_params(self.full(theta))
 
 
 Constraint = Callable[[PyTree], Any]
 
 
-def as_unknowns(
+def as_parameters(
     model: Diffusion, where: Callable[[PyTree], PyTree] | None, like: Float[Array, " d"]
-) -> tuple[Unknowns, Float[Array, " p"]]:
+) -> tuple[Parameters, Float[Array, " p"]]:
     """The unknown parameters and θ as it is in the model, in the dtype of the points."""
     if where is not None and not callable(where):
         raise TypeError(
             f"`where` must be a function that picks from `model.params`; got {where!r}."
         )
-    unknowns = Unknowns(model, where)
-    theta = unknowns.vector(cast_floats(unknowns.params, like.dtype))
+    parameters = Parameters(model, where)
+    theta = parameters.vector(cast_floats(parameters.params, like.dtype))
     if theta.size == 0:
         raise ValueError(
             "this model has no parameters to be inferred: give `Diffusion` its unknown numbers as "
             "`params=`."
         )
     if not is_traced(theta) and not np.all(np.isfinite(theta)):
-        raise ValueError(f"the unknown parameters must be finite; the model has {unknowns.params}.")
-    return unknowns, theta
+        raise ValueError(
+            f"the unknown parameters must be finite; the model has {parameters.params}."
+        )
+    return parameters, theta
 
 
 def check_sigma_known(
-    unknowns: Unknowns, theta: Float[Array, " p"], like: Float[Array, " d"], instead: str
+    parameters: Parameters, theta: Float[Array, " p"], like: Float[Array, " d"], instead: str
 ) -> None:
     """Raise `ValueError` where σ depends on the unknown parameters."""
-    if uses_argument(lambda theta: unknowns.at(theta).diffusion(like), theta):
+    if uses_argument(lambda theta: parameters.bind(theta).diffusion(like), theta):
         raise ValueError(
             "σ depends on the unknown parameters, and given a whole path σ is known: " + instead
         )
 
 
-def check_coordinates_known(unknowns: Unknowns, theta: Float[Array, " p"]) -> None:
+def check_coordinates_known(parameters: Parameters, theta: Float[Array, " p"]) -> None:
     """Raise `ValueError` where the coordinates of the model depend on the unknown parameters."""
-    if uses_argument(lambda theta: unknowns.at(theta).coordinate_values(), theta):
+    if uses_argument(lambda theta: parameters.bind(theta).coordinate_values(), theta):
         raise ValueError(
             "the coordinates of `lamperti` depend on the unknown parameters, those of σ, but the "
             "observations were mapped to them at fixed ones: infer in the original coordinates, "
@@ -127,13 +129,13 @@ def check_coordinates_known(unknowns: Unknowns, theta: Float[Array, " p"]) -> No
 
 
 def allowed(
-    constraint: Constraint | None, unknowns: Unknowns, theta: Float[Array, " p"]
+    constraint: Constraint | None, parameters: Parameters, theta: Float[Array, " p"]
 ) -> Bool[Array, ""]:
     """Whether θ is finite and satisfies the constraint."""
     finite = jnp.all(jnp.isfinite(theta))
     if constraint is None:
         return finite
-    value = jnp.asarray(constraint(unknowns.pick(theta)))
+    value = jnp.asarray(constraint(parameters.select(theta)))
     if value.shape != () or value.dtype != bool:
         raise ValueError(
             "`constraint` must map the unknown parameters to one truth value; it returned shape "
@@ -143,7 +145,7 @@ def allowed(
 
 
 def check_allowed(
-    constraint: Constraint | None, unknowns: Unknowns, theta: Float[Array, "*chains p"]
+    constraint: Constraint | None, parameters: Parameters, theta: Float[Array, "*chains p"]
 ) -> None:
     """Raise `ValueError` where a visible θ does not satisfy the constraint."""
     if constraint is not None and not callable(constraint):
@@ -152,19 +154,19 @@ def check_allowed(
             f"got {constraint!r}."
         )
     for row in theta.reshape(-1, theta.shape[-1]):
-        ok = allowed(constraint, unknowns, row)
+        ok = allowed(constraint, parameters, row)
         if not is_traced(ok) and not bool(ok):
             why = "are not finite" if constraint is None else "do not satisfy `constraint`"
-            raise ValueError(f"the parameters to start from, {unknowns.pick(row)}, {why}.")
+            raise ValueError(f"the parameters to start from, {parameters.select(row)}, {why}.")
 
 
 def init_vectors(
-    unknowns: Unknowns, init: PyTree, chains: tuple[int, ...]
+    parameters: Parameters, init: PyTree, chains: tuple[int, ...]
 ) -> Float[Array, "*chains p"]:
     """θ of the unknown parameters that the user wants to start from, for each chain its own if
     they have such an axis."""
     init = jax.tree.map(lambda leaf: as_floating("init", leaf), init)
-    known = unknowns.params
+    known = parameters.params
     if jax.tree.structure(init) != jax.tree.structure(known):
         raise ValueError(
             "`init` must be the `state` of earlier draws, or have the structure of the unknown "
@@ -175,9 +177,9 @@ def init_vectors(
         for given, leaf in zip(jax.tree.leaves(init), jax.tree.leaves(known), strict=True)
     ]
     if all(given == leaf for given, leaf in shapes):
-        return unknowns.vector(init)
+        return parameters.vector(init)
     if chains and all(given == (*chains, *leaf) for given, leaf in shapes):
-        return jax.vmap(unknowns.vector)(init)
+        return jax.vmap(parameters.vector)(init)
     raise ValueError(
         f"`init` must have leaves of the shapes of the unknown parameters, {[s for _, s in shapes]}"
         f", with a leading axis of {chains[0] if chains else 'no'} chains if they differ; got "

@@ -27,9 +27,9 @@ from ..exact.density import check_for_density, estimate_log_density
 from ..exact.kernels import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..proposals.base import AbstractWeightedProposal
-from .blocks import Part, make_parts, part_of
+from .blocks import Block, block_of, make_blocks
 from .data import Problem, as_problem
-from .parameters import Constraint, Unknowns, allowed
+from .parameters import Constraint, Parameters, allowed
 from .posterior import AbstractPosterior, starting_points
 from .priors import GivenDensity, NormalDensity, NormalPrior, Prior, as_log_prior, as_normal
 
@@ -173,19 +173,19 @@ def pmmh(
     num_warmup = check_count("num_warmup", num_warmup, 0)
     num_proposals = check_count("num_proposals", num_proposals)
     problem = as_problem(key, model, times, observations, where, num_steps, step_size)
-    unknowns = problem.unknowns
-    log_prior = as_log_prior(prior, unknowns, problem.theta)
-    root = _first_root(covariance, prior, unknowns, problem.theta)
+    parameters = problem.parameters
+    log_prior = as_log_prior(prior, parameters, problem.theta)
+    root = _first_root(covariance, prior, parameters, problem.theta)
     theta, state = starting_points(problem, init, num_chains, constraint, log_prior, PMMHState)
     if state is not None and covariance is not None:
         raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
     pilot_key, run_key = jax.random.split(key)
     if state is not None and isinstance(proposal, str) and proposal == "auto":
-        parts = _parts_of_state(state, problem)
+        blocks = _blocks_of_state(state, problem)
     else:
         arguments = (problem.intervals, problem.groups, proposal, (num_counts, None, max_trials))
-        parts = make_parts(pilot_key, problem.pilot_model(theta), *arguments, for_density=True)
-    setting = _Setting(unknowns, parts, log_prior, constraint, num_proposals)
+        blocks = make_blocks(pilot_key, problem.pilot_model(theta), *arguments, for_density=True)
+    setting = _Setting(parameters, blocks, log_prior, constraint, num_proposals)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     num_done = jnp.int32(0)
     if state is None:
@@ -196,11 +196,11 @@ def pmmh(
         chain = _Chain(*state[: len(_Chain._fields)])
     made, chain = _run(run_key, setting, chain, num_done, num_warmup, num_iterations, thin, meter)
     num_done = num_done + num_warmup + num_iterations * thin
-    state = PMMHState(*chain, num_done, tuple(part.proposal for part in parts))
-    return PMMHPosterior(**made, state=state, names=unknowns.names)
+    state = PMMHState(*chain, num_done, tuple(block.proposal for block in blocks))
+    return PMMHPosterior(**made, state=state, names=parameters.names)
 
 
-def _parts_of_state(state: PMMHState, problem: Problem) -> tuple[Part, ...]:
+def _blocks_of_state(state: PMMHState, problem: Problem) -> tuple[Block, ...]:
     """The intervals with the proposals of earlier draws.
 
     **Raises:** `ValueError` where these were for other intervals.
@@ -213,20 +213,20 @@ def _parts_of_state(state: PMMHState, problem: Problem) -> tuple[Part, ...]:
             "and `step_size`, or start anew from `init=` unknown parameters."
         )
     model = problem.pilot_model(state.theta)
-    parts = []
+    blocks = []
     for group, proposal in zip(groups, state.proposals, strict=True):
-        part = part_of(problem.intervals, group, proposal)
-        proposal.check(model, part.intervals)
+        block = block_of(problem.intervals, group, proposal)
+        proposal.check(model, block.intervals)
         check_for_density(proposal, model)
-        parts.append(part)
-    return tuple(parts)
+        blocks.append(block)
+    return tuple(blocks)
 
 
 class _Setting(eqx.Module):
     """What does not change from iteration to iteration."""
 
-    unknowns: Unknowns
-    parts: tuple[Part, ...]
+    parameters: Parameters
+    blocks: tuple[Block, ...]
     log_prior: NormalDensity | GivenDensity
     constraint: Constraint | None = eqx.field(static=True)
     num_proposals: int = eqx.field(static=True)
@@ -236,12 +236,14 @@ class _Setting(eqx.Module):
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
         """log of an unbiased estimate of the likelihood, -inf where there is none, with its
         variance and its step error; and how many of its weights were cut off."""
-        model = self.unknowns.at(theta).prepared()
+        model = self.parameters.bind(theta).prepared()
         log_likelihood = variance = step_error = jnp.zeros((), theta.dtype)
         num_truncated = jnp.int32(0)
-        for part_key, part in zip(jax.random.split(key, len(self.parts)), self.parts, strict=True):
-            size = (self.num_proposals, part.num_steps)
-            made = estimate_log_density(part_key, model, part.proposal, part.intervals, *size)
+        for block_key, block in zip(
+            jax.random.split(key, len(self.blocks)), self.blocks, strict=True
+        ):
+            size = (self.num_proposals, block.num_steps)
+            made = estimate_log_density(block_key, model, block.proposal, block.intervals, *size)
             log_likelihood += jnp.sum(made.value)
             variance += jnp.sum(made.standard_error**2)
             step_error += jnp.sum(made.step_error)
@@ -251,7 +253,7 @@ class _Setting(eqx.Module):
 
 
 def _first_root(
-    covariance: Numbers | None, prior: Prior, unknowns: Unknowns, theta: Float[Array, " p"]
+    covariance: Numbers | None, prior: Prior, parameters: Parameters, theta: Float[Array, " p"]
 ) -> Float[Array, "p p"]:
     p = theta.shape[0]
     if covariance is not None:
@@ -271,7 +273,7 @@ def _first_root(
                 )
         return any_cholesky(matrix)
     if isinstance(prior, NormalPrior):
-        variance = any_inverse(as_normal(prior, unknowns, theta).precision)
+        variance = any_inverse(as_normal(prior, parameters, theta).precision)
         return 0.1 * jnp.diag(jnp.sqrt(jnp.diagonal(variance)))
     return 0.1 * jnp.diag(jnp.maximum(jnp.abs(theta), 0.1))
 
@@ -289,7 +291,7 @@ def _start(key, setting: _Setting, theta, root) -> _Chain:
     return _Chain(theta, *jax.vmap(estimate)(keys, theta), root)
 
 
-class _Told(NamedTuple):
+class PMMHInfo(NamedTuple):
     """Of one step: whether it was accepted, was refused because no estimate was to be had, and
     how many weights of the estimate were cut off."""
 
@@ -303,7 +305,7 @@ def _iterate(key, setting: _Setting, state: _Chain, gain: Float[Array, ""]):
     walk_key, estimate_key, accept_key = jax.random.split(key, 3)
     noise = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
     proposed = state.theta + state.root @ noise
-    inside = allowed(setting.constraint, setting.unknowns, proposed)
+    inside = allowed(setting.constraint, setting.parameters, proposed)
     # Outside the constraint the model may not be simulated: θ stands in, and is refused.
     proposed = jnp.where(inside, proposed, state.theta)
     estimated, variance, step_error, num_truncated = setting.estimate(estimate_key, proposed)
@@ -323,7 +325,7 @@ def _iterate(key, setting: _Setting, state: _Chain, gain: Float[Array, ""]):
         jnp.where(accepted, step_error, state.log_step_error),
         root,
     )
-    return state, _Told(accepted, unknown.astype(jnp.int32), num_truncated)
+    return state, PMMHInfo(accepted, unknown.astype(jnp.int32), num_truncated)
 
 
 @eqx.filter_jit
@@ -348,34 +350,34 @@ def _run(
         gain = jnp.where(i < num_warmup, learning, 0)
         mine = jax.random.fold_in(key, num_done + i + 1)  # number 0 made the first estimate
         if state.theta.ndim == 1:
-            state, told = _iterate(mine, setting, state, gain)
+            state, info = _iterate(mine, setting, state, gain)
         else:
             keys = jax.random.split(mine, len(state.theta))
-            state, told = jax.vmap(lambda key, state: _iterate(key, setting, state, gain))(
+            state, info = jax.vmap(lambda key, state: _iterate(key, setting, state, gain))(
                 keys, state
             )
         meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / total)
-        return (state, meter), told
+        return (state, meter), info
 
     def kept(carry, i):
         steps = num_warmup + i * thin + jnp.arange(thin)
-        carry, told = lax.scan(iterate, carry, steps)
+        carry, info = lax.scan(iterate, carry, steps)
         state, _ = carry
-        told = _add_up(told)._replace(accepted=jnp.any(told.accepted, axis=0))
+        info = _summed(info)._replace(accepted=jnp.any(info.accepted, axis=0))
         held = (state.log_likelihood, state.variance, state.log_step_error)
-        return carry, (state.theta, *held, told)
+        return carry, (state.theta, *held, info)
 
     carry = (state, progress_meter.init())
-    carry, lost = lax.scan(iterate, carry, jnp.arange(num_warmup))
+    carry, warmup = lax.scan(iterate, carry, jnp.arange(num_warmup))
     (state, meter), made = lax.scan(kept, carry, jnp.arange(num_iterations))
-    theta, log_likelihood, variance, step_error, told = made
+    theta, log_likelihood, variance, step_error, info = made
     progress_meter.close(meter)
-    sums, accepted = jax.tree.map(jnp.add, _add_up(lost), _add_up(told)), told.accepted
+    sums, accepted = jax.tree.map(jnp.add, _summed(warmup), _summed(info)), info.accepted
     if theta.ndim == 3:
         theta, log_likelihood, step_error, accepted = jax.tree.map(
             lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, log_likelihood, step_error, accepted)
         )
-    as_params = jax.vmap(setting.unknowns.all)
+    as_params = jax.vmap(setting.parameters.full)
     params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
     fields = {
         "params": params,
@@ -390,5 +392,5 @@ def _run(
     return fields, state
 
 
-def _add_up(told: _Told) -> _Told:
-    return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0, dtype=jnp.int32), told)
+def _summed(info: PMMHInfo) -> PMMHInfo:
+    return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0, dtype=jnp.int32), info)

@@ -125,14 +125,15 @@ def starting_points(
                 f"`init` is a state of chains {theta.shape[:-1]}, but `num_chains` is {num_chains}."
             )
     elif init is not None:
-        theta = init_vectors(problem.unknowns, init, chains).astype(theta.dtype)
+        theta = init_vectors(problem.parameters, init, chains).astype(theta.dtype)
     if theta.ndim == 1:
         theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
-    check_allowed(constraint, problem.unknowns, theta)
+    check_allowed(constraint, problem.parameters, theta)
     for row in theta.reshape(-1, theta.shape[-1]):
         if not is_traced(value := log_prior(row)) and not jnp.isfinite(value):
+            params = problem.parameters.select(row)
             raise ValueError(
-                f"`prior` is {value} at the parameters to start from, "
-                f"{problem.unknowns.pick(row)}: start where its density is positive, by `init=`."
+                f"`prior` is {value} at the parameters to start from, {params}: start where its "
+                "density is positive, by `init=`."
             )
     return theta, state

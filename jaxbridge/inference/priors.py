@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import any_inverse, dot, matvec
-from .parameters import Unknowns
+from .parameters import Parameters
 
 
 class NormalPrior(eqx.Module):
@@ -51,11 +51,11 @@ class NormalDensity(eqx.Module):
 class GivenDensity(eqx.Module):
     """The user's log density of the unknown parameters, as a function of θ."""
 
-    unknowns: Unknowns
+    parameters: Parameters
     function: Callable[[PyTree], Any] = eqx.field(static=True)
 
     def __call__(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
-        value = jnp.asarray(self.function(self.unknowns.pick(theta)))
+        value = jnp.asarray(self.function(self.parameters.select(theta)))
         if value.shape != ():
             raise ValueError(f"`prior` must return a number; it returned shape {value.shape}.")
         return value.astype(theta.dtype)
@@ -64,12 +64,14 @@ class GivenDensity(eqx.Module):
 Prior = NormalPrior | Callable[[PyTree], Any]
 
 
-def as_normal(prior: NormalPrior, unknowns: Unknowns, theta: Float[Array, " p"]) -> NormalDensity:
+def as_normal(
+    prior: NormalPrior, parameters: Parameters, theta: Float[Array, " p"]
+) -> NormalDensity:
     """The prior of θ, with its shapes checked."""
     p = theta.shape[0]
 
     def as_vector(name, value):
-        structure, like = jax.tree.structure(unknowns.params), jax.tree.leaves(unknowns.params)
+        structure, like = jax.tree.structure(parameters.params), jax.tree.leaves(parameters.params)
         is_array = hasattr(value, "ndim")
         alike = is_array and len(like) == 1 and value.shape == like[0].shape
         if alike and (name == "mean" or value.shape != (p, p)):
@@ -83,7 +85,7 @@ def as_normal(prior: NormalPrior, unknowns: Unknowns, theta: Float[Array, " p"])
                         f"{known.shape}."
                     )
             full = [jnp.broadcast_to(a, b.shape) for a, b in zip(leaves, like, strict=True)]
-            value = unknowns.vector(jax.tree.unflatten(structure, full))
+            value = parameters.vector(jax.tree.unflatten(structure, full))
         return as_floating(f"prior.{name}", value).astype(theta.dtype)
 
     mean, variance = as_vector("mean", prior.mean), as_vector("variance", prior.variance)
@@ -113,15 +115,15 @@ def as_normal(prior: NormalPrior, unknowns: Unknowns, theta: Float[Array, " p"])
 
 
 def as_log_prior(
-    prior: Prior, unknowns: Unknowns, theta: Float[Array, " p"]
+    prior: Prior, parameters: Parameters, theta: Float[Array, " p"]
 ) -> NormalDensity | GivenDensity:
     """The prior's log density, a function of θ."""
     if isinstance(prior, NormalPrior):
-        return as_normal(prior, unknowns, theta)
+        return as_normal(prior, parameters, theta)
     if not callable(prior):
         raise TypeError(
             "`prior` must be a `NormalPrior`, or a function that maps the unknown parameters to "
             f"the log of a density; got {prior!r}."
         )
 
-    return GivenDensity(unknowns, prior)
+    return GivenDensity(parameters, prior)

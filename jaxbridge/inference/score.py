@@ -25,9 +25,9 @@ from ..models.diffusion import Diffusion
 from ..schemes.halving import num_looked
 from ..schemes.path_likelihood import Form, log_likelihoods
 from ..schemes.step_error import StepError, of_mean
-from .blocks import Part, log_halvings, make_parts, step_shares, target_forms
+from .blocks import Block, log_halvings, make_blocks, step_shares, target_forms
 from .data import as_problem
-from .parameters import Unknowns
+from .parameters import Parameters
 
 # Bridges of all intervals that are made at a time.
 _PATHS = 8_192
@@ -115,26 +115,26 @@ def score(
         "differentiate `transition_log_density` with a proposal that is pulled to the end point, "
         "or pick the others with `where=`.",
     )
-    unknowns, theta = problem.unknowns, problem.theta
+    parameters, theta = problem.parameters, problem.theta
     bounds = (num_counts, max_proposals, max_trials)
     arguments = (problem.intervals, problem.groups, proposal, bounds)
-    parts = make_parts(key, model, *arguments, moving=False)
-    form = target_forms(parts, model)[0]
-    keys = jax.random.split(key, len(parts))
+    blocks = make_blocks(key, model, *arguments, moving=False)
+    form = target_forms(blocks, model)[0]
+    keys = jax.random.split(key, len(blocks))
     made = [
-        _interval_moments(part_key, unknowns, theta, part, form, num_bridges, progress_meter)
-        for part_key, part in zip(keys, parts, strict=True)
+        _interval_moments(block_key, parameters, theta, block, form, num_bridges, progress_meter)
+        for block_key, block in zip(keys, blocks, strict=True)
     ]
     moments, sizes, shapes, step_errors, truncated = zip(*made, strict=True)
-    gradient, covariance, information = jax.tree.map(lambda *parts: sum(parts), *moments)
-    order = jnp.argsort(jnp.concatenate([part.index for part in parts]))
+    gradient, covariance, information = jax.tree.map(lambda *blocks: sum(blocks), *moments)
+    order = jnp.argsort(jnp.concatenate([block.index for block in blocks]))
     size, shape = jnp.concatenate(sizes)[order], jnp.concatenate(shapes)[order]
     step_error = sum(error.value for error in step_errors)
     step_variance = sum(error.uncertainty**2 for error in step_errors)
     error = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
     return Score(
-        unknowns.pick(gradient),
-        unknowns.pick(error),
+        parameters.select(gradient),
+        parameters.select(error),
         gradient,
         covariance,
         information,
@@ -150,9 +150,9 @@ def score(
 @eqx.filter_jit
 def _interval_moments(
     key: Key[Array, ""],
-    unknowns: Unknowns,
+    parameters: Parameters,
     theta: Float[Array, " p"],
-    part: Part,
+    block: Block,
     form: Form,
     num_bridges: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
@@ -162,25 +162,25 @@ def _interval_moments(
     """Σ over intervals of the score, of the covariance of its error, and of the information; the
     effective number of bridges of each, and k̂; the step error of the score; and how many weights
     were cut off."""
-    unknowns, intervals = nondifferentiable((unknowns, part.intervals))
-    model = unknowns.at(theta).prepared()
-    num_intervals, num_steps = intervals.start.shape[0], part.num_steps
+    parameters, intervals = nondifferentiable((parameters, block.intervals))
+    model = parameters.bind(theta).prepared()
+    num_intervals, num_steps = intervals.start.shape[0], block.num_steps
     at_once = min(num_bridges, max(1, _PATHS // num_intervals))
     num_batches = -(-num_bridges // at_once)
     varies = model.forward(intervals.start[0]).sigma_varies
     num_some = num_looked(at_once, varies)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    steps = jnp.repeat(part.steps, at_once, axis=1)
+    steps = jnp.repeat(block.steps, at_once, axis=1)
 
     def batch(state, i):
         keys = jax.random.split(jax.random.fold_in(key, i), (num_intervals, at_once))
-        drawn = part.proposal.draw(keys, model, intervals, num_steps, None, False)
+        drawn = block.proposal.draw(keys, model, intervals, num_steps, None, False)
         start = intervals.start[:, None, None]
         paths = jnp.where(drawn.found[..., None, None], drawn.paths, start)
         paths = paths.reshape(-1, *paths.shape[2:])
 
         def log_f(theta):
-            return log_likelihoods(unknowns.at(theta), steps, paths, form)
+            return log_likelihoods(parameters.bind(theta), steps, paths, form)
 
         gradient = jax.jacfwd(log_f)
         g, H = (
@@ -191,7 +191,7 @@ def _interval_moments(
         some = some.reshape(-1, *paths.shape[1:])
 
         def log_halving(theta):
-            return log_halvings(part, unknowns.at(theta).prepared(), some, form, num_some)
+            return log_halvings(block, parameters.bind(theta).prepared(), some, form, num_some)
 
         D, slope = (
             leaf.reshape(num_intervals, num_some, *leaf.shape[1:])
@@ -209,7 +209,7 @@ def _interval_moments(
 
     *made, D, slope = made
     some_weights, some_g = (join(leaf[:, :, :num_some]) for leaf in made[:2])
-    share = step_shares(part, model, form)
+    share = step_shares(block, model, form)
     halves = (some_g, some_g + join(slope))
     error = of_mean(some_weights, join(D), share, *halves)
     step_error = StepError(
