@@ -1,138 +1,45 @@
-"""The observations completed by bridges, and the Markov kernels that renew them.
+"""Data augmentation: the observations completed by bridges.
 
-Given θ the bridges of all intervals are independent. A kernel moves each of them once, leaving its
-exact law invariant whatever θ it was made with (section 2.3 of the paper):
-
-* `ByRenewal` keeps a bridge until a diffusion associated with it hits it, for couplings. It
-  keeps nothing but the path.
-* `ByWeights` accepts a new weighted proposal with the ratio of the weights, which for the path
-  at hand is drawn anew from its law given θ and the path: for the counts of a coupling that is
-  the size-biased law, for proposals that are pulled to the end point a function of the path.
-* `Unweighted` takes each new proposal of a coupling: approximate, as in section 4 of the paper.
+Given θ the bridges of all intervals are independent, and each is renewed by a Markov kernel of its
+own (`bridge_kernels`). Given the bridges the log likelihood of θ is that of the completed path:
+where the drift is linear in θ it is quadratic, which is read off the program that computes its
+Hessian: there θ does not occur.
 """
 
-from abc import abstractmethod
-from typing import Any, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Key
 
-from ..coupling.start_laws import run_is_cut
 from ..engine.checks import is_traced
-from ..exact.kernels import acceptance_rate
-from ..exact.renewal import as_pairs, first_paths, propose_paths, renew
+from ..exact.renewal import as_pairs
 from ..models.diffusion import Diffusion
-from ..models.intervals import Intervals
+from ..models.tracing import uses_argument
 from ..proposals.base import AbstractWeightedProposal
 from ..proposals.coupled import CoupledPairs
 from ..proposals.modified_bridge import ModifiedDiffusionBridge
 from ..schemes.path_likelihood import Form, log_likelihoods
-from .blocks import Block, Bounds, log_halvings, make_blocks, step_shares
-from .data import Group
+from .blocks import Block, Bounds, Use, make_blocks, target_forms, with_keys
+from .bridge_kernels import AbstractBridgeKernel, BridgeInfo, ByRenewal, ByWeights, Unweighted
+from .data import Problem
 
 # One array of shape (I, N+1, d) for each block.
 Paths = tuple[Float[Array, "_ _ d"], ...]
 
 
-class BridgeInfo(NamedTuple):
-    """Of one step on all intervals: whether the path of each was replaced; how many paths were
-    simulated, or weighed, for it; whether no proposal was found though one was called for. Then
-    the path stays, which leaves the exact law invariant, for whether one is found does not
-    depend on the path. Last, whether a weight was cut off by a bound on its trials, or the run
-    that replaces a sampler of the stationary law by one on its steps."""
-
-    moved: Bool[Array, " I"]
-    num_simulated: Int[Array, " I"]
-    missing: Bool[Array, " I"]
-    truncated: Bool[Array, " I"]
-
-
-class AbstractBridgeKernel(eqx.Module):
-    """A Markov kernel on the bridges of many intervals."""
-
-    @abstractmethod
-    def first(
-        self, keys: Key[Array, " I"], model: Diffusion, intervals: Intervals, num_steps: int
-    ) -> Float[Array, "I points d"]:
-        """Paths to start from, NaN where none was found."""
-
-    @abstractmethod
-    def renew(
-        self,
-        keys: Key[Array, " I"],
-        model: Diffusion,
-        intervals: Intervals,
-        paths: Float[Array, "I points d"],
-    ) -> tuple[Float[Array, "I points d"], BridgeInfo]:
-        """One step of each."""
-
-
-class ByRenewal(AbstractBridgeKernel):
-    """The renewal kernel."""
-
-    pairs: CoupledPairs
-
-    def first(self, keys, model, intervals, num_steps):
-        return first_paths(keys, model, self.pairs, intervals, num_steps)[0]
-
-    def renew(self, keys, model, intervals, paths):
-        everything = jnp.ones(len(keys), bool)
-        paths, info = renew(keys, model, self.pairs, intervals, paths, everything)
-        num_steps = paths.shape[1] - 1
-        law, dt = self.pairs.coupling.start_law, intervals.duration / num_steps
-        cut = run_is_cut(law, model, dt, num_steps)
-        return paths, BridgeInfo(info.is_accepted, info.num_simulated, info.is_missing, cut)
-
-
-class ByWeights(AbstractBridgeKernel):
-    """The pseudo-marginal kernel."""
-
-    proposal: AbstractWeightedProposal
-
-    def first(self, keys, model, intervals, num_steps):
-        drawn = self.proposal.draw(keys[:, None], model, intervals, num_steps, None, False)
-        return drawn.paths[:, 0]
-
-    def renew(self, keys, model, intervals, paths):
-        weigh_keys, draw_keys, accept_keys = jax.vmap(
-            lambda key: jax.random.split(key, 3), out_axes=1
-        )(keys)
-        num_steps = paths.shape[1] - 1
-        old = self.proposal.reweigh(weigh_keys, model, intervals, paths)
-        new = self.proposal.draw(draw_keys[:, None], model, intervals, num_steps, None, False)
-        uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=paths.dtype))(accept_keys)
-        accepted = uniform < acceptance_rate(old.log_weights[:, 0], new.log_weights[:, 0])
-        num_simulated = old.num_simulated[:, 0] + new.num_simulated[:, 0]
-        paths = jnp.where(accepted[:, None, None], new.paths[:, 0], paths)
-        truncated = old.truncated[:, 0] | new.truncated[:, 0]
-        return paths, BridgeInfo(accepted, num_simulated, ~new.found[:, 0], truncated)
-
-
-class Unweighted(AbstractBridgeKernel):
-    """A new approximate bridge each time."""
-
-    pairs: CoupledPairs
-
-    def first(self, keys, model, intervals, num_steps):
-        return first_paths(keys, model, self.pairs, intervals, num_steps)[0]
-
-    def renew(self, keys, model, intervals, paths):
-        num_steps = paths.shape[1] - 1
-        proposed = propose_paths(keys, model, self.pairs, intervals, None, num_steps)
-        found = proposed.num_found > 0
-        paths = jnp.where(found[:, None, None], proposed.outputs.paths, paths)
-        return paths, BridgeInfo(found, proposed.num_trials, ~found, jnp.zeros_like(found))
-
-
 class Augmentation(eqx.Module):
     """How the observations are completed: by bridges of all intervals, in blocks of one number of
-    steps each, with a kernel for each block."""
+    steps each, with a kernel for each block; the form of the likelihood of their paths, and
+    whether it is quadratic in θ."""
 
     blocks: tuple[Block, ...]
     kernels: tuple[AbstractBridgeKernel, ...]
+    form: Form = eqx.field(static=True)
+    is_quadratic: bool = eqx.field(static=True)
 
     @property
     def num_intervals(self) -> int:
@@ -158,15 +65,10 @@ class Augmentation(eqx.Module):
                         "`init` is a state whose paths do not join these observations."
                     )
 
-    def first(self, key: Key[Array, ""], model: Diffusion) -> Paths:
-        """Paths to start from. Where the proposal finds none, whatever its weight, a modified
-        diffusion bridge serves, or a straight line: a chain may start anywhere."""
-        return self.first_and_found(key, model)[0]
-
-    def first_and_found(
-        self, key: Key[Array, ""], model: Diffusion
-    ) -> tuple[Paths, Bool[Array, " I"]]:
-        """The same, and which of them the proposal itself has found, in the order of the blocks."""
+    def first(self, key: Key[Array, ""], model: Diffusion) -> tuple[Paths, Bool[Array, " I"]]:
+        """Paths to start from, and which of them the proposal itself has found, in the order of the
+        blocks. Where it finds none, whatever its weight, a modified diffusion bridge serves, or a
+        straight line: a chain may start anywhere."""
         model = model.prepared()
 
         def of_block(block, kernel, keys):
@@ -183,44 +85,40 @@ class Augmentation(eqx.Module):
                 path = jnp.where(is_there(better)[:, None, None], better, path)
             return path, is_there(found)
 
-        made = list(map(of_block, self.blocks, self.kernels, self._keys(key)))
-        return tuple(path for path, _ in made), jnp.concatenate([found for _, found in made])
+        paths, found = zip(*map(of_block, self.blocks, self.kernels, self._keys(key)), strict=True)
+        return paths, jnp.concatenate(found)
 
     def renew(
         self, key: Key[Array, ""], model: Diffusion, paths: Paths
     ) -> tuple[Paths, BridgeInfo]:
         """One step of every bridge, at the parameters of this model."""
         model = model.prepared()
-        made = [
-            kernel.renew(keys, model, block.intervals, mine)
-            for block, kernel, keys, mine in zip(
-                self.blocks, self.kernels, self._keys(key), paths, strict=True
-            )
-        ]
+
+        def of_block(block, kernel, keys, mine):
+            return kernel.renew(keys, model, block.intervals, mine)
+
+        made = map(of_block, self.blocks, self.kernels, self._keys(key), paths)
         paths, infos = zip(*made, strict=True)
         return paths, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *infos)
 
-    def log_likelihoods(
-        self, model: Diffusion, paths: Paths, form: Form
-    ) -> Float[Array, " intervals"]:
-        """Those of the paths, block by block."""
-        values = [
-            log_likelihoods(model, block.steps, mine, form)
-            for block, mine in zip(self.blocks, paths, strict=True)
-        ]
-        return jnp.concatenate(values)
+    def log_likelihood(self, model: Diffusion, paths: Paths) -> Float[Array, ""]:
+        """That of all paths."""
 
-    def log_step_error(self, model: Diffusion, paths: Paths, form: Form) -> Float[Array, ""]:
+        def of_block(block, mine):
+            return log_likelihoods(model, block.steps, mine, self.form)
+
+        return jnp.sum(jnp.concatenate(list(map(of_block, self.blocks, paths))))
+
+    def log_step_error(self, model: Diffusion, paths: Paths) -> Float[Array, ""]:
         """The step error of the log density of these paths, summed over the intervals: D of
         `halving`, times the share of it that is the error."""
-        model = model.prepared()
-        return sum(
-            (
-                jnp.sum(step_shares(block, model, form) * log_halvings(block, model, mine, form))
-                for block, mine in zip(self.blocks, paths, strict=True)
-            ),
-            start=jnp.zeros((), paths[0].dtype),
-        )
+        model, form = model.prepared(), self.form
+
+        def of_block(block, mine):
+            halvings = block.log_halvings(model, mine, form)
+            return jnp.sum(block.step_shares(model, form) * halvings)
+
+        return sum(map(of_block, self.blocks, paths), start=jnp.zeros((), paths[0].dtype))
 
     def points(self, paths: Paths) -> tuple[Float[Array, "points d"], Float[Array, " points"]]:
         """All points of the paths but their ends, and the steps that begin there."""
@@ -229,10 +127,8 @@ class Augmentation(eqx.Module):
         return jnp.concatenate(points), jnp.concatenate(steps)
 
     def _keys(self, key: Key[Array, ""]) -> list[Key[Array, " I"]]:
-        keys = jax.random.split(key, len(self.blocks))
         return [
-            jax.random.split(key, len(block.intervals.duration))
-            for key, block in zip(keys, self.blocks, strict=True)
+            jax.random.split(key, len(block.index)) for key, block in with_keys(key, self.blocks)
         ]
 
 
@@ -243,16 +139,14 @@ def is_there(paths: Float[Array, "I points d"]) -> Bool[Array, " I"]:
 
 def augment(
     key: Key[Array, ""],
-    model: Diffusion,
-    intervals: Intervals,
-    groups: tuple[Group, ...],
+    problem: Problem,
+    theta: Float[Array, " p"],
     proposal: Any,
     bridges: Literal["exact", "approximate"],
     method: Literal["pseudo_marginal", "renewal"] | None,
     bounds: Bounds,
 ) -> Augmentation:
-    """The augmentation that the user asked for; pilot runs and burn-ins are at the parameters of
-    this model.
+    """The augmentation that the user asked for; pilot runs and burn-ins are at this θ.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
     """
@@ -262,21 +156,40 @@ def augment(
         raise ValueError(f'`method` must be "pseudo_marginal" or "renewal"; got {method!r}.')
     if bridges == "approximate" and method is not None:
         raise ValueError("`method` is for exact bridges: approximate ones need none.")
-    given = proposal
-    if proposal is None and bridges == "exact" and method is None:
-        given = "auto"
-    only_couplings = bridges == "approximate" or method == "renewal"
-    exact = bridges == "exact"
-    couplings = {"only_couplings": only_couplings, "weighted": exact}
-    blocks = make_blocks(key, model, intervals, groups, given, bounds, **couplings)
-    return Augmentation(blocks, tuple(_kernel(block.proposal, bridges, method) for block in blocks))
+    use = "weights" if bridges == "exact" else "approximate"
+    if method == "renewal":
+        use = "renewal"
+    if proposal is None and use == "weights" and method is None:
+        proposal = "auto"
+    model = problem.parameters.bind(theta)
+    blocks = make_blocks(key, model, problem, proposal, bounds, use)
+    kernels = tuple(_kernel(block.proposal, use, method) for block in blocks)
+    forms = target_forms(blocks, model)
+    quadratic = _quadratic_form(problem, theta, forms)
+    return Augmentation(blocks, kernels, quadratic or forms[0], quadratic is not None)
 
 
 def _kernel(
-    proposal: AbstractWeightedProposal, bridges: str, method: str | None
+    proposal: AbstractWeightedProposal, use: Use, method: str | None
 ) -> AbstractBridgeKernel:
-    if bridges == "approximate":
+    if use == "approximate":
         return Unweighted(as_pairs(proposal))
-    if method == "renewal" or (method is None and isinstance(proposal, CoupledPairs)):
+    if use == "renewal" or (method is None and isinstance(proposal, CoupledPairs)):
         return ByRenewal(as_pairs(proposal))
     return ByWeights(proposal)
+
+
+def _quadratic_form(
+    problem: Problem, theta: Float[Array, " p"], forms: Sequence[Form]
+) -> Form | None:
+    """The first of these forms in which the log likelihood is quadratic in θ, if there is one."""
+    like, parameters = problem.like, problem.parameters
+    steps, paths = jnp.ones((1, 1), like.dtype), jnp.stack([like, like])[None]
+    for form in forms:
+
+        def log_likelihood(theta, form: Form = form):
+            return log_likelihoods(parameters.bind(theta), steps, paths, form)[0]
+
+        if not uses_argument(jax.jacfwd(jax.jacfwd(log_likelihood)), theta):
+            return form
+    return None

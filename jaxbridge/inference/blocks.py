@@ -1,6 +1,7 @@
 """The proposals of all intervals, in blocks of one number of steps each."""
 
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -28,7 +29,7 @@ from ..proposals.coupled import CoupledPairs
 from ..schemes.halving import log_halving_of_paths
 from ..schemes.path_likelihood import Form, density_of_form, forms_of_target
 from ..schemes.step_error import share_of_order
-from .data import Group
+from .data import Group, Problem
 
 _NO_SAMPLER = (
     "the parameters move, and with them the time that replaces a sampler of the stationary law "
@@ -38,6 +39,9 @@ _FOR_APPROXIMATE = ('bridges="approximate"', 'bridges="exact"')
 
 # num_counts, max_proposals, max_trials
 Bounds = tuple[int | None, int | None, int | None]
+# What bridges are for: means at this θ alone; where θ moves, their weights, estimates of the
+# density, or the renewal kernel of a coupling; or, approximate, pairs of a coupling as they are.
+Use = Literal["means", "weights", "density", "renewal", "approximate"]
 
 
 class Block(eqx.Module):
@@ -57,75 +61,85 @@ class Block(eqx.Module):
     def steps(self) -> Float[Array, "N I"]:
         return self.fractions[:, None] * self.intervals.duration
 
+    def log_halvings(
+        self, model: Diffusion, paths: Float[Array, "P points d"], form: Form
+    ) -> Float[Array, " P"]:
+        """D of `halving` under the step law of this form of the likelihood, of paths that are as
+        many for each interval."""
+        steps = jnp.repeat(self.steps, paths.shape[0] // len(self.index), axis=1)
+        dynamics = model.forward(self.intervals.start[0])
+        return log_halving_of_paths(density_of_form(form), dynamics, steps, paths)
+
+    def step_shares(self, model: Diffusion, form: Form) -> Float[Array, " I"]:
+        """The step error of each interval, of its bridges or of this form, as a share of what half
+        as many steps change."""
+        share = share_of_order(density_of_form(form).order)
+        return jnp.maximum(self.proposal.step_share(model, self.intervals), share)
+
 
 def make_blocks(
     key: Key[Array, ""],
     model: Diffusion,
-    intervals: Intervals,
-    groups: tuple[Group, ...],
+    problem: Problem,
     proposal: Any,
     bounds: Bounds,
-    *,
-    for_density: bool = False,
-    only_couplings: bool = False,
-    moving: bool = True,
-    weighted: bool = True,
+    use: Use,
 ) -> tuple[Block, ...]:
     """The proposal that the user gave, checked, and settled and prepared for each block at this
-    model: parameters that are `moving` leave from there.
+    model, from which θ moves unless means are wanted.
 
     **Raises:** `ValueError` and `TypeError` for a proposal that does not fit.
     """
-    like = intervals.start[0]
-    if moving and weighted and proposal == "auto" and needs_burn_in(Stationary(), model):
+    like, groups = problem.like, problem.groups
+    for_density, weighted = use == "density", use != "approximate"
+    moving = use in ("weights", "density", "renewal")
+    if moving and proposal == "auto" and needs_burn_in(Stationary(), model):
         candidates = default_candidates(model, like, for_density)
         candidates = [each for each in candidates if not isinstance(each, AbstractCoupling)]
         left_out = why_left_out(model, for_density) or _NO_SAMPLER
         proposal = undecided_between(candidates, model, like, None, *bounds, left_out=left_out)
         bounds = (None, None, None)
     given = as_proposal(proposal, model, like, *bounds, for_density=for_density)
-    given.check(model, intervals)
+    given.check(model, problem.intervals)
     if for_density:
         check_for_density(given, model)
-    if moving and weighted:
+    if moving:
         _check_for_moving(given, model)
-    if only_couplings:
+    if use in ("renewal", "approximate"):
         given = as_pairs(given) if weighted else as_pairs(given, *_FOR_APPROXIMATE)
     blocks = []
     for block_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
-        mine = jax.tree.map(lambda leaf, which=group.which: leaf[which], intervals)
         chosen = given
         if isinstance(given, Choice) and given.chosen is not None:
             chosen = given.of(group.which)
-        chosen = settled(chosen, block_key, model, mine, group.num_steps)
-        if weighted:
-            chosen = chosen.prepared(block_key, model, mine, group.num_steps)
-        blocks.append(block_of(intervals, group, chosen))
+        at = (block_key, model, group.intervals, group.num_steps)
+        chosen = settled(chosen, *at)
+        blocks.append(block_of(group, chosen.prepared(*at) if weighted else chosen))
     return tuple(blocks)
 
 
-def block_of(intervals: Intervals, group: Group, proposal: AbstractWeightedProposal) -> Block:
-    """The intervals of one group, of all, with a proposal that is settled for them."""
-    mine = jax.tree.map(lambda leaf: leaf[group.which], intervals)
-    fractions = jnp.asarray(np.diff(proposal.fractions(group.num_steps)), mine.duration.dtype)
-    return Block(mine, jnp.asarray(group.which), fractions, proposal)
+def block_of(group: Group, proposal: AbstractWeightedProposal) -> Block:
+    """The intervals of a group with a proposal that is settled for them."""
+    fractions = np.diff(proposal.fractions(group.num_steps))
+    fractions = jnp.asarray(fractions, group.intervals.duration.dtype)
+    return Block(group.intervals, jnp.asarray(group.which), fractions, proposal)
 
 
-def log_halvings(
-    block: Block, model: Diffusion, paths: Float[Array, "P points d"], form: Form, repeats: int = 1
-) -> Float[Array, " P"]:
-    """D of `halving` under the step law of this form of the likelihood, of so many paths for each
-    interval."""
-    steps = jnp.repeat(block.steps, repeats, axis=1)
-    dynamics = model.forward(block.intervals.start[0])
-    return log_halving_of_paths(density_of_form(form), dynamics, steps, paths)
+def with_keys(
+    key: Key[Array, ""], blocks: tuple[Block, ...]
+) -> Iterator[tuple[Key[Array, ""], Block]]:
+    """Each block with a key of its own."""
+    return zip(jax.random.split(key, len(blocks)), blocks, strict=True)
 
 
-def step_shares(block: Block, model: Diffusion, form: Form) -> Float[Array, " I"]:
-    """The step error of each interval, of its bridges or of this form, as a share of what half as
-    many steps change."""
-    share = share_of_order(density_of_form(form).order)
-    return jnp.maximum(block.proposal.step_share(model, block.intervals), share)
+def over_intervals(blocks: tuple[Block, ...], made: Sequence[Any]) -> Any:
+    """What was made of each block, named tuples, for all intervals: sums, and of the effective
+    number of paths and k̂ of each interval those of all, in their order."""
+    order = jnp.argsort(jnp.concatenate([block.index for block in blocks]))
+    fields = ("effective_sample_size", "pareto_k")
+    each = {f: jnp.concatenate([getattr(one, f) for one in made])[order] for f in fields}
+    sums = [one._replace(**dict.fromkeys(fields, 0)) for one in made]
+    return jax.tree.map(lambda *leaves: sum(leaves), *sums)._replace(**each)
 
 
 def target_forms(blocks: tuple[Block, ...], model: Diffusion) -> tuple[Form, ...]:

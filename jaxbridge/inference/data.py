@@ -2,26 +2,27 @@
 inferred from them."""
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Float, Int, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced, time_steps
-from ..models.diffusion import Diffusion, check_diffusion
+from ..models.diffusion import Diffusion
 from ..models.intervals import Intervals, as_intervals
-from .parameters import Parameters, as_parameters, check_coordinates_known, check_sigma_known
+from ..models.tracing import uses_argument
+from .parameters import Parameters, theta_of_model
 
 # Numbers of steps are rounded up to one of so few per factor of two, for each is compiled.
 _STEPS_PER_OCTAVE = 2
 
 
 class Group(NamedTuple):
-    """Intervals with the same number of steps, and which of the intervals they are."""
+    """Intervals with the same number of steps, and which of all intervals they are."""
 
+    intervals: Intervals
     which: Int[np.ndarray, " I"]
     num_steps: int
 
@@ -43,37 +44,42 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
     if times.shape[0] < 2:
         raise ValueError(f"`observations` must be two or more; got {times.shape[0]}.")
     if not is_traced(times):
-        known = np.asarray(times)
-        missing = np.flatnonzero(~np.isfinite(known))
-        if missing.size:
-            raise ValueError(f"`times[{missing[0]}]` = {known[missing[0]]} is missing.")
-        back = np.flatnonzero(np.asarray(duration) <= 0)
-        if back.size:
-            i = back[0]
-            raise ValueError(
-                f"`times` must increase, but `times[{i}]` = {known[i]} and `times[{i + 1}]` = "
-                f"{known[i + 1]}: sort them, with their observations."
-            )
+        _check_increasing(np.asarray(times), np.asarray(duration))
     if not is_traced(observations):
-        missing = np.flatnonzero(~np.all(np.isfinite(observations), axis=1))
-        if missing.size:
-            i = missing[0]
-            row = np.asarray(observations[i])
-            lacking = np.flatnonzero(~np.isfinite(row))
-            if lacking.size < row.size:
-                which = ", ".join(map(str, lacking))
-                raise ValueError(
-                    f"`observations[{i}]` = {row} has no finite number for coordinate {which}, but "
-                    "observations must be complete, all coordinates at a time: leave out this row, "
-                    "with its time."
-                )
-            raise ValueError(
-                f"`observations[{i}]` = {row} is not finite: leave out observations that are "
-                "missing, with their times."
-            )
+        _check_finite(np.asarray(observations))
         _check_state_space(model, observations)
     intervals, _, _ = as_intervals(observations[:-1], observations[1:], duration)
     return intervals
+
+
+def _check_increasing(times: np.ndarray, duration: np.ndarray) -> None:
+    missing = np.flatnonzero(~np.isfinite(times))
+    if missing.size:
+        raise ValueError(f"`times[{missing[0]}]` = {times[missing[0]]} is missing.")
+    back = np.flatnonzero(duration <= 0)
+    if back.size:
+        i = back[0]
+        raise ValueError(
+            f"`times` must increase, but `times[{i}]` = {times[i]} and `times[{i + 1}]` = "
+            f"{times[i + 1]}: sort them, with their observations."
+        )
+
+
+def _check_finite(observations: np.ndarray) -> None:
+    finite = np.isfinite(observations)
+    for i in np.flatnonzero(~finite.all(axis=1))[:1]:
+        row = observations[i]
+        if finite[i].any():
+            which = ", ".join(map(str, np.flatnonzero(~finite[i])))
+            raise ValueError(
+                f"`observations[{i}]` = {row} has no finite number for coordinate {which}, but "
+                "observations must be complete, all coordinates at a time: leave out this row, "
+                "with its time."
+            )
+        raise ValueError(
+            f"`observations[{i}]` = {row} is not finite: leave out observations that are "
+            "missing, with their times."
+        )
 
 
 def _unmasked(name: str, values: Numbers) -> Numbers:
@@ -112,15 +118,18 @@ def _check_state_space(model: Diffusion, observations: Array) -> None:
 
 
 def step_groups(
-    durations: Array, num_steps: int | None, step_size: float | None
+    intervals: Intervals, num_steps: int | None, step_size: float | None
 ) -> tuple[Group, ...]:
     """All intervals with `num_steps` steps; or each with so many that none is longer than about
     `step_size`, in few groups."""
-    everything = np.arange(durations.shape[0])
+
+    def group(which: Int[np.ndarray, " I"], num_steps: int) -> Group:
+        return Group(jax.tree.map(lambda leaf: leaf[which], intervals), which, num_steps)
+
+    durations = intervals.duration
     if step_size is None:
-        return (
-            Group(everything, check_count("num_steps", 50 if num_steps is None else num_steps)),
-        )
+        num_steps = check_count("num_steps", 50 if num_steps is None else num_steps)
+        return (group(np.arange(len(durations)), num_steps),)
     if num_steps is not None:
         raise ValueError("pass `num_steps` or `step_size`, not both.")
     if is_traced(durations):
@@ -133,58 +142,51 @@ def step_groups(
     wanted = np.maximum(np.asarray(durations, float) / step_size * (1 - 1e-4), 1)
     levels = np.ceil(np.log2(wanted) * _STEPS_PER_OCTAVE) / _STEPS_PER_OCTAVE
     numbers = np.ceil(2**levels * (1 - 1e-9)).astype(int)
-    groups = []
-    for number in np.unique(numbers):
-        index = np.flatnonzero(numbers == number)
-        groups.append(Group(index, math.ceil(wanted[index].max())))
-    return tuple(groups)
+    alike = [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
+    return tuple(group(which, math.ceil(wanted[which].max())) for which in alike)
 
 
 class Problem(NamedTuple):
-    """The intervals between observations, in groups of one number of steps, and the unknown
-    parameters, with θ as it is in the model."""
+    """The unknown parameters, with θ as it is in the model, and the intervals between the
+    observations, in groups of one number of steps."""
 
-    intervals: Intervals
-    groups: tuple[Group, ...]
     parameters: Parameters
     theta: Float[Array, " p"]
+    intervals: Intervals
+    groups: tuple[Group, ...]
 
     @property
     def like(self) -> Float[Array, " d"]:
         """A point of the state space."""
         return self.intervals.start[0]
 
-    def pilot_model(self, theta: Float[Array, "*chains p"]) -> Diffusion:
-        """The model at which proposals are chosen: that of the first chain."""
-        return self.parameters.bind(first_chain(theta))
+    @property
+    def sigma_is_unknown(self) -> bool:
+        """Whether σ depends on the unknown parameters."""
+        like, parameters = self.like, self.parameters
+        return uses_argument(lambda theta: parameters.bind(theta).diffusion(like), self.theta)
+
+    def check_sigma_known(self, instead: str) -> None:
+        """Raise `ValueError` where σ depends on the unknown parameters, that says what to do."""
+        if self.sigma_is_unknown:
+            raise ValueError(
+                "σ depends on the unknown parameters, and given a whole path σ is known: " + instead
+            )
 
 
 def as_problem(
     key: Key[Array, ""],
-    model: Diffusion,
+    parameters: Parameters,
     times: Numbers,
     observations: Numbers,
-    where: Callable[[PyTree], PyTree] | None,
     num_steps: int | None,
     step_size: float | None,
-    sigma_unknown: str | None = None,
 ) -> Problem:
-    """What the arguments that all ways of inference share say. `sigma_unknown` is what to do
-    instead where σ depends on the unknown parameters, if it must not.
+    """What the arguments that all ways of inference share say.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
     """
     check_key(key)
-    check_diffusion(model)
-    intervals = as_observations(model, times, observations)
-    parameters, theta = as_parameters(model, where, intervals.start[0])
-    check_coordinates_known(parameters, theta)
-    if sigma_unknown is not None:
-        check_sigma_known(parameters, theta, intervals.start[0], sigma_unknown)
-    groups = step_groups(intervals.duration, num_steps, step_size)
-    return Problem(intervals, groups, parameters, theta)
-
-
-def first_chain(theta: Float[Array, "*chains p"]) -> Float[Array, " p"]:
-    """θ of the first chain."""
-    return theta.reshape(-1, theta.shape[-1])[0]
+    intervals = as_observations(parameters.model, times, observations)
+    theta = theta_of_model(parameters, intervals.start.dtype)
+    return Problem(parameters, theta, intervals, step_groups(intervals, num_steps, step_size))

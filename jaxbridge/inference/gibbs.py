@@ -18,20 +18,25 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..models.diffusion import Diffusion
-from ..schemes.path_likelihood import Form
-from .augmentation import Augmentation, Paths, augment
-from .blocks import target_forms
-from .data import as_problem, first_chain
+from .augmentation import Augmentation, augment
+from .data import as_problem
 from .parameter_kernels import (
     AbstractParameterKernel,
     CompleteData,
     NormalDraw,
     check_kernel,
     choose_kernel,
-    quadratic_form,
 )
-from .parameters import Constraint, Parameters
-from .posterior import AbstractPosterior, starting_points
+from .parameters import Constraint, Parameters, as_parameters
+from .posterior import (
+    AbstractPosterior,
+    chains_first,
+    first_chain,
+    of_draws,
+    over_chains,
+    starting_points,
+    summed,
+)
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 
 # Of about so many of the draws the step error is worked out.
@@ -167,160 +172,113 @@ def gibbs(
     ```
     """
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
-    problem = as_problem(
-        key,
-        model,
-        times,
-        observations,
-        where,
-        num_steps,
-        step_size,
-        "use `pmmh`, which needs no path, or pick the others with `where=`.",
-    )
-    parameters, like = problem.parameters, problem.like
+    parameters = as_parameters(model, where, constraint)
+    problem = as_problem(key, parameters, times, observations, num_steps, step_size)
+    problem.check_sigma_known("use `pmmh`, which needs no path, or pick the others with `where=`.")
     check_kernel(parameter_kernel)
     log_prior = as_log_prior(prior, parameters, problem.theta)
-    theta, state = starting_points(problem, init, num_chains, constraint, log_prior, GibbsState)
+    theta, state = starting_points(problem, init, num_chains, log_prior, GibbsState)
     augment_key, run_key = jax.random.split(key)
     bounds = (num_counts, max_proposals, max_trials)
-    arguments = (problem.intervals, problem.groups, proposal, bridges, method, bounds)
-    augmentation = augment(augment_key, problem.pilot_model(theta), *arguments)
-    forms = target_forms(augmentation.blocks, model)
-    form = quadratic_form(parameters, first_chain(theta), like, forms)
-    kernel = choose_kernel(parameter_kernel, form is not None, log_prior)
-    form = forms[0] if form is None else form
-    setting = _Setting(parameters, augmentation, log_prior, constraint, kernel, form)
+    how = (proposal, bridges, method, bounds)
+    augmentation = augment(augment_key, problem, first_chain(theta), *how)
+    kernel = choose_kernel(parameter_kernel, augmentation.is_quadratic, log_prior)
+    sampler = _Sampler(parameters, augmentation, log_prior, kernel)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     if state is None:
-        state = _start(run_key, setting, theta)
+        state = _start(run_key, sampler, theta)
     else:
         augmentation.check_paths(state.paths, theta.shape[:-1])
-    return _run(run_key, setting, state, num_iterations, thin, meter)
-
-
-class _Setting(eqx.Module):
-    """What does not change from iteration to iteration."""
-
-    parameters: Parameters
-    augmentation: Augmentation
-    log_prior: NormalDensity | GivenDensity
-    constraint: Constraint | None = eqx.field(static=True)
-    kernel: AbstractParameterKernel
-    form: Form = eqx.field(static=True)
-
-    def data(self, paths: Paths) -> CompleteData:
-        return CompleteData(
-            self.parameters, self.augmentation, paths, self.log_prior, self.constraint, self.form
-        )
+    return _run(run_key, sampler, state, num_iterations, thin, meter)
 
 
 class GibbsInfo(NamedTuple):
-    """What is told of one iteration."""
+    """Counted in one iteration: θ's moves, bridges that were replaced, and as in the posterior."""
 
-    parameters_moved: Bool[Array, "*chains"]
-    bridges_moved: Float[Array, "*chains"]
+    parameters_moved: Int[Array, "*chains"]
+    bridges_moved: Int[Array, "*chains"]
     num_simulated: Int[Array, "*chains"]
     num_missing: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
 
 
+class _Sampler(eqx.Module):
+    """What does not change from iteration to iteration, and the steps of one chain."""
+
+    parameters: Parameters
+    augmentation: Augmentation
+    log_prior: NormalDensity | GivenDensity
+    kernel: AbstractParameterKernel
+
+    def start(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> GibbsState:
+        model = nondifferentiable(self.parameters.bind(theta))
+        return GibbsState(theta, *self.augmentation.first(key, model))
+
+    def step(self, key: Key[Array, ""], state: GibbsState) -> tuple[GibbsState, GibbsInfo]:
+        """Bridges given θ, then θ given bridges."""
+        bridge_key, parameter_key = jax.random.split(key)
+        model = self.parameters.bind(state.theta)
+        paths, bridges = self.augmentation.renew(bridge_key, model, state.paths)
+        found = state.found | bridges.moved
+        data = CompleteData(self.parameters, self.augmentation, paths, self.log_prior)
+        theta, accepted = self.kernel.step(parameter_key, state.theta, data)
+        counted = bridges._replace(missing=bridges.missing | ~found)
+        return GibbsState(theta, paths, found), GibbsInfo(accepted, *summed(counted))
+
+    def log_step_error(self, state: GibbsState) -> Float[Array, ""]:
+        model = self.parameters.bind(state.theta)
+        return self.augmentation.log_step_error(model, state.paths)
+
+
 @eqx.filter_jit
-def _start(key: Key[Array, ""], setting: _Setting, theta: Float[Array, "*chains p"]) -> GibbsState:
-    def first(key, theta):
-        model = nondifferentiable(setting.parameters.bind(theta))
-        return setting.augmentation.first_and_found(key, model)
-
-    key = jax.random.fold_in(key, 0)
-    if theta.ndim == 1:
-        return GibbsState(theta, *first(key, theta))
-    return GibbsState(theta, *jax.vmap(first)(jax.random.split(key, len(theta)), theta))
-
-
-def _iterate(
-    key: Key[Array, ""], setting: _Setting, state: GibbsState
-) -> tuple[GibbsState, GibbsInfo]:
-    """Bridges given θ, then θ given bridges."""
-    bridge_key, parameter_key = jax.random.split(key)
-    model = setting.parameters.bind(state.theta)
-    paths, bridges = setting.augmentation.renew(bridge_key, model, state.paths)
-    found = state.found | bridges.moved
-    step = setting.kernel.step(parameter_key, state.theta, setting.data(paths))
-    info = GibbsInfo(
-        step.accepted,
-        jnp.mean(bridges.moved.astype(state.theta.dtype)),
-        jnp.sum(bridges.num_simulated, dtype=jnp.int32),
-        jnp.sum(bridges.missing | ~found, dtype=jnp.int32),
-        jnp.sum(bridges.truncated, dtype=jnp.int32),
-    )
-    return GibbsState(step.theta, paths, found), info
+def _start(key: Key[Array, ""], sampler: _Sampler, theta: Float[Array, "*chains p"]) -> GibbsState:
+    return over_chains(sampler.start, jax.random.fold_in(key, 0), theta)
 
 
 @eqx.filter_jit
 def _run(
     key: Key[Array, ""],
-    setting: _Setting,
+    sampler: _Sampler,
     state: GibbsState,
     num_iterations: int,
     thin: int,
-    progress_meter: diffrax.AbstractProgressMeter,
+    meter: diffrax.AbstractProgressMeter,
 ) -> GibbsPosterior:
-    setting, state = nondifferentiable((setting, state))
-
-    def iterate(state, key):
-        if state.theta.ndim == 1:
-            return _iterate(key, setting, state)
-        keys = jax.random.split(key, len(state.theta))
-        return jax.vmap(lambda key, state: _iterate(key, setting, state))(keys, state)
-
+    sampler, state = nondifferentiable((sampler, state))
+    chains, dtype = state.theta.shape[:-1], state.theta.dtype
     # As many draws as tell a covariance, for D takes a good part of the time of an iteration.
     every = max(1, num_iterations // _STEP_ERRORS)
 
-    def step_error(state):
-        model = setting.parameters.bind(state.theta)
-        return setting.augmentation.log_step_error(model, state.paths, setting.form)
-
     def step_errors(i, state):
-        each = step_error if state.theta.ndim == 1 else jax.vmap(step_error)
-        unknown = jnp.full(state.theta.shape[:-1], jnp.nan, state.theta.dtype)
+        each = jax.vmap(sampler.log_step_error) if chains else sampler.log_step_error
+        unknown = jnp.full(chains, jnp.nan, dtype)
         return lax.cond(i % every == every - 1, each, lambda _: unknown, state)
 
-    def kept(carry, i):
-        state, meter = carry
+    def draw(carry, i):
+        state, progress = carry
         # Number 0 made the first paths.
         keys = jax.random.split(jax.random.fold_in(key, i + 1), thin)
-        state, infos = lax.scan(iterate, state, keys)
-        meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / num_iterations)
-        error = step_errors(i, state)
-        info = GibbsInfo(
-            jnp.any(infos.parameters_moved, axis=0),
-            jnp.mean(infos.bridges_moved, axis=0),
-            jnp.sum(infos.num_simulated, axis=0, dtype=jnp.int32),
-            jnp.sum(infos.num_missing, axis=0, dtype=jnp.int32),
-            jnp.sum(infos.num_truncated, axis=0, dtype=jnp.int32),
-        )
-        return (state, meter), (state.theta, info, error)
+        step = lambda state, key: over_chains(sampler.step, key, state)
+        state, infos = lax.scan(step, state, keys)
+        progress = meter.step(progress, (i + 1).astype(jnp.float32) / num_iterations)
+        return (state, progress), (state.theta, summed(infos), step_errors(i, state))
 
-    carry = (state, progress_meter.init())
-    (state, meter), (theta, info, error) = lax.scan(kept, carry, jnp.arange(num_iterations))
-    progress_meter.close(meter)
-    if theta.ndim == 3:
-        theta, info, error = jax.tree.map(
-            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, info, error)
-        )
-    as_params = jax.vmap(setting.parameters.full)
-    params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
-    exact = isinstance(setting.kernel, NormalDraw)
+    carry, draws = lax.scan(draw, (state, meter.init()), jnp.arange(num_iterations))
+    state, progress = carry
+    meter.close(progress)
+    theta, info, log_step_error = chains_first(*draws)
+    num_bridges = thin * sampler.augmentation.num_intervals
+    info = info._replace(
+        parameters_moved=info.parameters_moved > 0,
+        bridges_moved=info.bridges_moved.astype(dtype) / num_bridges,
+    )
     return GibbsPosterior(
-        params,
-        theta,
-        setting.parameters.names,
-        info.parameters_moved,
-        info.bridges_moved,
-        info.num_simulated,
-        info.num_missing,
-        info.num_truncated,
-        error,
-        state,
-        setting.augmentation,
-        exact,
+        params=of_draws(sampler.parameters.full, theta),
+        theta=theta,
+        names=sampler.parameters.names,
+        **info._asdict(),
+        log_step_error=log_step_error,
+        state=state,
+        completion=sampler.augmentation,
+        exact_parameters=isinstance(sampler.kernel, NormalDraw),
     )

@@ -1,59 +1,45 @@
 """Maximum likelihood: by stochastic approximation over bridges, or of a simulated likelihood.
 
-Where σ is known, bridges are moved by their exact kernel at the current θ, once an iteration
-(Gu & Kong 1998), and θ by what the completed path says:
-
-* "gradient": a step of an optimiser along ∇ log f_θ(Z), whose mean over bridges is the score;
-  the estimate is the average of the second half of the iterates.
-* "em": with c and P of the expansion of log f at θ, cᵀθ - ½ θᵀPθ, averaged over iterations, θ
-  becomes P⁻¹c. For a drift that is linear in θ this is the EM algorithm with averaged
-  statistics (Delyon, Lavielle & Moulines 1999); in any case a fixed point has score zero.
-
-Then, at the estimate, `score` with independent bridges gives the observed information I, one step
-of Newton's method, θ + I⁻¹ ∇ log L(θ), and the Monte Carlo error that is left.
+Where σ is known, the search is by `stochastic_approximation` over bridges: with an optimiser it
+ends in the average of the second half of the iterates, by EM in the last. There `score` with
+independent bridges gives the observed information I, one step of Newton's method,
+θ + I⁻¹ ∇ log L(θ), and the Monte Carlo error that is left.
 
 Where σ depends on the unknown parameters paths are of no use, and the maximum is that of the
 likelihood by simulation (`simulated_likelihood`).
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.checks import Numbers, check_count, nondifferentiable
-from ..engine.linalg import any_solve
+from ..engine.checks import Numbers, check_count
 from ..engine.pareto import is_reliable
 from ..models.diffusion import Diffusion
-from ..schemes.path_likelihood import Form
 from ..schemes.step_error import StepError, dominates
-from .augmentation import Augmentation, Paths, augment
-from .blocks import target_forms
+from .augmentation import augment
+from .blocks import Bounds
 from .data import Problem, as_problem
-from .parameter_kernels import CompleteData, quadratic_form
 from .parameters import (
     Constraint,
     Parameters,
-    allowed,
-    check_allowed,
+    as_parameters,
 )
-from .score import Score, score
+from .score import Score, as_score, score_at
 from .simulated_likelihood import (
-    SearchInfo,
     as_pulled,
-    guarded,
     newton_ascent,
     pulled_blocks,
-    sigma_is_unknown,
     step_error_of_score,
     stochastic_ascent,
 )
+from .stochastic_approximation import EM, Gradient, SearchInfo, approximate
 
 # Made once, for optimisers are compared by identity.
 _ADAM = optax.adam(1e-2)
@@ -192,55 +178,80 @@ def maximum_likelihood(
         )
     if method == "em" and optimizer is not None:
         raise ValueError('`method="em"` takes no `optimizer`.')
-    problem = as_problem(key, model, times, observations, where, num_steps, step_size)
-    parameters, theta = problem.parameters, problem.theta
-    check_allowed(constraint, parameters, theta)
+    parameters = as_parameters(model, where, constraint)
+    problem = as_problem(key, parameters, times, observations, num_steps, step_size)
+    parameters.check_allowed(problem.theta)
+    rule = EM() if method == "em" else Gradient(_ADAM if optimizer is None else optimizer)
+    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     proposal = "auto" if proposal is None else proposal
     bounds = (num_counts, max_proposals, max_trials)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    optimizer = _ADAM if optimizer is None else optimizer
-    if sigma_is_unknown(problem):
-        if method == "em":
-            raise ValueError(
-                "σ depends on the unknown parameters, and given a whole path σ is known, so that "
-                'EM would never leave it: use `method="gradient"`, or pick the other parameters '
-                "with `where=`."
-            )
-        proposal = as_pulled(proposal, model, problem.like, bounds)
-        search = (problem, proposal, constraint, optimizer, num_iterations, num_bridges, meter)
-        return _by_simulation(key, *search)
+    search = (num_iterations, num_bridges, meter)
+    if not problem.sigma_is_unknown:
+        return _by_bridges(key, problem, proposal, bounds, rule, *search)
+    if isinstance(rule, EM):
+        raise ValueError(
+            "σ depends on the unknown parameters, and given a whole path σ is known, so that "
+            'EM would never leave it: use `method="gradient"`, or pick the other parameters '
+            "with `where=`."
+        )
+    return _by_simulation(key, problem, proposal, bounds, rule, *search)
+
+
+def _by_bridges(
+    key: Key[Array, ""],
+    problem: Problem,
+    proposal: Any,
+    bounds: Bounds,
+    rule: Gradient | EM,
+    num_iterations: int,
+    num_bridges: int,
+    meter: diffrax.AbstractProgressMeter,
+) -> MaximumLikelihood:
+    """Stochastic approximation, and one step of Newton's method."""
+    parameters, theta = problem.parameters, problem.theta
     augment_key, run_key, score_key = jax.random.split(key, 3)
-    arguments = (problem.intervals, problem.groups, proposal, "exact", None, bounds)
-    augmentation = augment(augment_key, model, *arguments)
-    forms = target_forms(augmentation.blocks, model)
-    form = quadratic_form(parameters, theta, problem.like, forms) or forms[0]
-    rule = _EM() if method == "em" else _Gradient(optimizer)
-    setting = _Setting(parameters, augmentation, constraint, rule, form)
-    iterates, info = _approximate(run_key, setting, theta, num_iterations, meter)
-    rough = iterates[-1] if method == "em" else jnp.mean(iterates[num_iterations // 2 :], axis=0)
-    at_rough = score(
-        score_key,
-        parameters.bind(rough),
-        times,
-        observations,
-        num_bridges=num_bridges,
-        num_steps=num_steps,
-        step_size=step_size,
-        proposal=proposal,
-        where=where,
-        num_counts=num_counts,
-        max_proposals=max_proposals,
-        max_trials=max_trials,
-    )
-    covariance = jnp.linalg.inv(at_rough.information)
-    step = covariance @ at_rough.gradient
+    augmentation = augment(augment_key, problem, theta, proposal, "exact", None, bounds)
+    search = (parameters, augmentation, rule, theta, num_iterations, meter)
+    iterates, info = approximate(run_key, *search)
+    later = iterates[num_iterations // 2 :]
+    rough = iterates[-1] if isinstance(rule, EM) else jnp.mean(later, axis=0)
+    no_meter = diffrax.NoProgressMeter()
+    at_rough = score_at(score_key, problem, rough, proposal, bounds, num_bridges, no_meter)
+    step = jnp.linalg.inv(at_rough.information) @ at_rough.gradient
     definite = jnp.all(jnp.linalg.eigvalsh(at_rough.information) > 0)
     # Further off the likelihood need not be near its quadratic approximation.
     near = at_rough.gradient @ step < theta.shape[0]
-    newton = rough + step
-    ok = definite & near & allowed(constraint, parameters, newton)
-    estimate = jnp.where(ok, newton, rough)
+    ok = definite & near & parameters.allowed(rough + step)
+    estimate = jnp.where(ok, rough + step, rough)
     return _summary(parameters, estimate, iterates, at_rough, info, ok)
+
+
+def _by_simulation(
+    key: Key[Array, ""],
+    problem: Problem,
+    proposal: Any,
+    bounds: Bounds,
+    rule: Gradient,
+    num_iterations: int,
+    num_bridges: int,
+    meter: diffrax.AbstractProgressMeter,
+) -> MaximumLikelihood:
+    """The maximum of the simulated likelihood."""
+    parameters, theta = problem.parameters, problem.theta
+    proposal = as_pulled(proposal, parameters.model, problem.like, bounds)
+    pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
+    blocks = pulled_blocks(pilot_key, parameters.bind(theta), problem, proposal)
+    search = (parameters, blocks, rule, theta, num_iterations, meter)
+    iterates, info = stochastic_ascent(run_key, *search)
+    last, mean = iterates[-1], jnp.mean(iterates[num_iterations // 2 :], axis=0)
+    # What suits the data at the first θ need not do so at the last.
+    blocks = pulled_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
+    starts = jnp.stack([theta, last, mean])
+    maximum = newton_ascent(last_key, parameters, blocks, starts, num_bridges)
+    made = maximum.simulated
+    step_error = step_error_of_score(last_key, parameters, blocks, maximum, num_bridges)
+    at_maximum = as_score(parameters, made, step_error, made.num_missing, jnp.int32(0))
+    return _summary(parameters, maximum.theta, iterates, at_maximum, info, maximum.found)
 
 
 def _summary(
@@ -274,124 +285,3 @@ def _summary(
         info.refused,
         ok,
     )
-
-
-def _by_simulation(
-    key: Key[Array, ""],
-    problem: Problem,
-    proposal: Any,
-    constraint: Constraint | None,
-    optimizer: optax.GradientTransformation,
-    num_iterations: int,
-    num_bridges: int,
-    meter: diffrax.AbstractProgressMeter,
-) -> MaximumLikelihood:
-    """The maximum of the simulated likelihood."""
-    parameters, theta = problem.parameters, problem.theta
-    pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
-    blocks = pulled_blocks(pilot_key, parameters.bind(theta), problem, proposal)
-    search = (parameters, blocks, constraint, optimizer, theta, num_iterations, meter)
-    iterates, info = stochastic_ascent(run_key, *search)
-    last, mean = iterates[-1], jnp.mean(iterates[num_iterations // 2 :], axis=0)
-    # What suits the data at the first θ need not do so at the last.
-    blocks = pulled_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
-    starts = jnp.stack([theta, last, mean])
-    maximum = newton_ascent(last_key, parameters, blocks, constraint, starts, num_bridges)
-    made = maximum.simulated
-    at_maximum = Score(
-        parameters.select(made.gradient),
-        parameters.select(jnp.sqrt(jnp.diagonal(made.covariance))),
-        made.gradient,
-        made.covariance,
-        made.information,
-        made.effective_sample_size,
-        made.pareto_k,
-        *step_error_of_score(last_key, parameters, blocks, maximum, num_bridges),
-        made.num_missing,
-        jnp.int32(0),
-    )
-    return _summary(parameters, maximum.theta, iterates, at_maximum, info, maximum.found)
-
-
-class _Gradient(eqx.Module):
-    """Steps of an optimiser."""
-
-    optimizer: optax.GradientTransformation = eqx.field(static=True)
-
-    def init(self, theta):
-        return self.optimizer.init(theta)
-
-    def update(self, i, theta, state, data: CompleteData, num_intervals):
-        gradient = jax.grad(data.log_likelihood)(theta) / num_intervals
-        updates, state = self.optimizer.update(-gradient, state, theta)
-        return theta + jnp.asarray(updates), state
-
-
-class _EM(eqx.Module):
-    """The maximum of the averaged expansions of the log likelihood; they are averaged over the
-    later half of the iterations so far, about."""
-
-    def init(self, theta):
-        return theta, jnp.zeros((*theta.shape, *theta.shape), theta.dtype)
-
-    def update(self, i, theta, state, data: CompleteData, num_intervals):
-        gradient = jax.grad(data.log_likelihood)(theta)
-        P = data.information(theta)
-        made = gradient + P @ theta, P
-        gain = jnp.minimum(1.0, 2.0 / (i + 1).astype(theta.dtype))
-        state = jax.tree.map(lambda old, new: old + gain * (new - old), state, made)
-        c, P = state
-        return any_solve(P, c), state
-
-
-class _Setting(eqx.Module):
-    """What does not change from iteration to iteration."""
-
-    parameters: Parameters
-    augmentation: Augmentation
-    constraint: Constraint | None = eqx.field(static=True)
-    rule: _Gradient | _EM
-    form: Form = eqx.field(static=True)
-
-
-class _State(NamedTuple):
-    theta: Float[Array, " p"]
-    paths: Paths
-    rule: PyTree
-    meter: Any
-
-
-@eqx.filter_jit
-def _approximate(
-    key: Key[Array, ""],
-    setting: _Setting,
-    theta: Float[Array, " p"],
-    num_iterations: int,
-    meter: diffrax.AbstractProgressMeter,
-) -> tuple[Float[Array, "n p"], SearchInfo]:
-    """The iterates, and what was lost on the way."""
-    setting = nondifferentiable(setting)
-    parameters, augmentation = setting.parameters, setting.augmentation
-    first_key, run_key = jax.random.split(key)
-    num_intervals = augmentation.num_intervals
-
-    def iterate(state, i):
-        paths, bridges = augmentation.renew(
-            jax.random.fold_in(run_key, i), parameters.bind(state.theta), state.paths
-        )
-        data = CompleteData(
-            parameters, augmentation, paths, jnp.zeros_like, setting.constraint, setting.form
-        )
-        moved, rule = setting.rule.update(i, state.theta, state.rule, data, num_intervals)
-        old = state.theta, state.rule
-        theta, rule, ok = guarded(setting.constraint, parameters, old, (moved, rule))
-        progress = meter.step(state.meter, (i + 1).astype(jnp.float32) / num_iterations)
-        info = SearchInfo(bridges.missing, bridges.truncated, ~ok)
-        info = jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), info)
-        return _State(theta, paths, rule, progress), (theta, info)
-
-    first = augmentation.first(first_key, parameters.bind(theta))
-    state = _State(theta, first, setting.rule.init(theta), meter.init())
-    state, (iterates, info) = lax.scan(iterate, state, jnp.arange(num_iterations))
-    meter.close(state.meter)
-    return iterates, jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), info)

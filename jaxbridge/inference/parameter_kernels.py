@@ -5,8 +5,7 @@ normal, θ given the paths is normal, and is drawn:
 
     N(θ_0 + P⁻¹ g, P⁻¹),    g = ∇(ℓ + log π)(θ_0),    P = -∇²(ℓ + log π),
 
-by autodiff, at any θ_0; drawn again until it satisfies the constraint. Whether it is quadratic is
-read off the program that computes the Hessian: there θ does not occur.
+by autodiff, at any θ_0; drawn again until it satisfies the constraint.
 
 Otherwise by Metropolis–Hastings with normal proposals that would be exact for a quadratic,
 
@@ -17,7 +16,7 @@ With τ = 1 and constant G this is the draw above, always accepted.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,10 +27,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..engine.lanes import over_lanes
 from ..engine.linalg import any_cholesky, any_solve, dot, matvec
-from ..models.tracing import uses_argument
-from ..schemes.path_likelihood import Form, log_likelihoods
 from .augmentation import Augmentation, Paths
-from .parameters import Constraint, Parameters, allowed
+from .parameters import Parameters
 from .priors import NormalDensity
 
 # Draws from a normal law until one satisfies the constraint: if none does, θ stays, which leaves
@@ -49,18 +46,15 @@ class ParameterStep(NamedTuple):
 
 
 class CompleteData(NamedTuple):
-    """What a step of θ is made from: the completed observations, and the prior."""
+    """What a step of θ is made from: the augmented observations, and the prior."""
 
     parameters: Parameters
     augmentation: Augmentation
     paths: Paths
     log_prior: Callable[[Array], Array]
-    constraint: Constraint | None
-    form: Form
 
     def log_likelihood(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
-        model = self.parameters.bind(theta)
-        return jnp.sum(self.augmentation.log_likelihoods(model, self.paths, self.form))
+        return self.augmentation.log_likelihood(self.parameters.bind(theta), self.paths)
 
     def log_posterior_inside(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
         """log of likelihood times prior, as if there were no constraint."""
@@ -68,7 +62,7 @@ class CompleteData(NamedTuple):
 
     def log_posterior(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
         """-inf where the constraint is not satisfied."""
-        inside = allowed(self.constraint, self.parameters, theta)
+        inside = self.parameters.allowed(theta)
         return jnp.where(inside, self.log_posterior_inside(theta), -jnp.inf)
 
     def information(self, theta: Float[Array, " p"]) -> Float[Array, "p p"]:
@@ -89,24 +83,6 @@ class CompleteData(NamedTuple):
         return G
 
 
-def quadratic_form(
-    parameters: Parameters,
-    theta: Float[Array, " p"],
-    like: Float[Array, " d"],
-    forms: Sequence[Form],
-) -> Form | None:
-    """The first of these forms in which the log likelihood is quadratic in θ, if there is one."""
-    steps, paths = jnp.ones((1, 1), like.dtype), jnp.stack([like, like])[None]
-    for form in forms:
-
-        def log_likelihood(theta, form: Form = form):
-            return log_likelihoods(parameters.bind(theta), steps, paths, form)[0]
-
-        if not uses_argument(jax.jacfwd(jax.jacfwd(log_likelihood)), theta):
-            return form
-    return None
-
-
 class AbstractParameterKernel(eqx.Module):
     """A Markov kernel on θ, given the paths."""
 
@@ -121,14 +97,15 @@ class NormalDraw(AbstractParameterKernel):
     """θ from its normal law given the paths."""
 
     def step(self, key, theta, data):
-        gradient, root = _gradient_and_root(data, theta)
+        gradient, hessian = _derivatives(data.log_posterior_inside, theta)
+        root = any_cholesky(-hessian)
         mean = theta + _solve_root(root, gradient)
 
         def draw(carry):
             i, _, _ = carry
             noise = jax.random.normal(jax.random.fold_in(key, i), theta.shape, theta.dtype)
             drawn = mean + any_solve(root.T, noise)
-            return i + 1, drawn, allowed(data.constraint, data.parameters, drawn)
+            return i + 1, drawn, data.parameters.allowed(drawn)
 
         def missed(carry):
             i, _, ok = carry
@@ -159,7 +136,7 @@ class NewtonStep(AbstractParameterKernel):
         value, mean, root = evaluate(theta)
         noise = jax.random.normal(noise_key, theta.shape, theta.dtype)
         proposed = mean + tau * any_solve(root.T, noise)
-        ok = allowed(data.constraint, data.parameters, proposed)
+        ok = data.parameters.allowed(proposed)
         proposed = jnp.where(ok, proposed, theta)
         other_value, other_mean, other_root = evaluate(proposed)
         log_ratio = other_value - value + log_density(theta, other_mean, other_root)
@@ -182,7 +159,7 @@ class GivenKernel(AbstractParameterKernel):
         kernel = self.build(log_density)
         state, _ = kernel.step(key, kernel.init(data.parameters.select(theta)))
         moved = data.parameters.vector(state.position)
-        ok = allowed(data.constraint, data.parameters, moved)
+        ok = data.parameters.allowed(moved)
         moved = jnp.where(ok, moved, theta)
         return ParameterStep(moved, jnp.any(moved != theta))
 
@@ -212,14 +189,6 @@ def _derivatives(
     """Gradient and Hessian; forward over reverse where there are many parameters."""
     gradient = jax.jacfwd(function) if theta.shape[0] < 3 else jax.grad(function)
     return gradient(theta), jax.jacfwd(gradient)(theta)
-
-
-def _gradient_and_root(
-    data: CompleteData, theta: Float[Array, " p"]
-) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
-    """g, and the root of P."""
-    gradient, hessian = _derivatives(data.log_posterior_inside, theta)
-    return gradient, any_cholesky(-hessian)
 
 
 def _solve_root(root: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:

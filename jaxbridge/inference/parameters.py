@@ -1,4 +1,4 @@
-"""What is not known: the parameters to be inferred, as a vector θ in R^p, and their prior.
+"""What is not known: the parameters to be inferred, as a vector θ in R^p.
 
 All parameters of the model are unknown, or those that a function `where(params)` picks, as in
 `equinox.tree_at`. What is observed in between is a path in the coordinates of the model, so σ must
@@ -17,30 +17,18 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.checks import as_floating, cast_floats, is_traced
-from ..models.diffusion import Diffusion
+from ..models.diffusion import Diffusion, check_diffusion
 from ..models.tracing import uses_argument
 
-
-class _Named:
-    """A parameter's name in its place, and its shape, if it is of floating point numbers."""
-
-    def __init__(self, name: str, shape: tuple[int, ...] | None):
-        self.name, self.shape = name, shape
-
-    @property
-    def entries(self) -> list[str]:
-        """The names of its entries, in the order of `ravel`."""
-        if self.shape is None:
-            return []
-        places = [",".join(map(str, place)) for place in np.ndindex(self.shape)]
-        return [f"{self.name}[{place}]" if place else self.name for place in places]
+Constraint = Callable[[PyTree], Any]
 
 
 class Parameters(eqx.Module):
-    """The model, and which of its parameters are unknown."""
+    """The model, which of its parameters are unknown, and which values of these are allowed."""
 
     model: Diffusion
     where: Callable[[PyTree], PyTree] | None = eqx.field(static=True)
+    constraint: Constraint | None = eqx.field(static=True, default=None)
 
     @property
     def params(self) -> PyTree:
@@ -52,13 +40,14 @@ class Parameters(eqx.Module):
         """The names of θ's entries, as the model's parameters have them: "alpha", "B[0,1]"; "0" and
         "1" for those of a tuple, and "theta" where the parameters are one array without a name."""
 
-        def named(path, leaf):
+        def entries(path, leaf):
             name = jax.tree_util.keystr(path, simple=True, separator=".") or "theta"
-            return _Named(name, np.shape(leaf) if eqx.is_inexact_array(leaf) else None)
+            shape = [leaf.shape] if eqx.is_inexact_array(leaf) else []
+            places = [",".join(map(str, place)) for each in shape for place in np.ndindex(each)]
+            return [f"{name}[{place}]" if place else name for place in places]
 
-        leaves = jax.tree_util.tree_map_with_path(named, self.model.params)
-        leaves = jax.tree.leaves(leaves if self.where is None else self.where(leaves))
-        return tuple(name for leaf in leaves for name in leaf.entries)
+        named = jax.tree_util.tree_map_with_path(entries, self.model.params)
+        return tuple(jax.tree.leaves(named if self.where is None else self.where(named)))
 
     def vector(self, params: PyTree) -> Float[Array, " p"]:
         """θ of these unknown parameters."""
@@ -80,20 +69,50 @@ class Parameters(eqx.Module):
         """The model at θ."""
         return self.model.with_params(self.full(theta))
 
+    def allowed(self, theta: Float[Array, " p"]) -> Bool[Array, ""]:
+        """Whether θ is finite and satisfies the constraint."""
+        finite = jnp.all(jnp.isfinite(theta))
+        if self.constraint is None:
+            return finite
+        value = jnp.asarray(self.constraint(self.select(theta)))
+        if value.shape != () or value.dtype != bool:
+            raise ValueError(
+                "`constraint` must map the unknown parameters to one truth value; it returned "
+                f"shape {value.shape} and dtype {value.dtype}."
+            )
+        return finite & value
 
-Constraint = Callable[[PyTree], Any]
+    def check_allowed(self, theta: Float[Array, "*chains p"]) -> None:
+        """Raise `ValueError` where a visible θ does not satisfy the constraint."""
+        for row in theta.reshape(-1, theta.shape[-1]):
+            ok = self.allowed(row)
+            if not is_traced(ok) and not bool(ok):
+                why = "are not finite" if self.constraint is None else "do not satisfy `constraint`"
+                raise ValueError(f"the parameters to start from, {self.select(row)}, {why}.")
 
 
 def as_parameters(
-    model: Diffusion, where: Callable[[PyTree], PyTree] | None, like: Float[Array, " d"]
-) -> tuple[Parameters, Float[Array, " p"]]:
-    """The unknown parameters and θ as it is in the model, in the dtype of the points."""
+    model: Diffusion,
+    where: Callable[[PyTree], PyTree] | None,
+    constraint: Constraint | None = None,
+) -> Parameters:
+    """The parameters that the user wants to know, checked as far as can be without data."""
+    check_diffusion(model)
     if where is not None and not callable(where):
         raise TypeError(
             f"`where` must be a function that picks from `model.params`; got {where!r}."
         )
-    parameters = Parameters(model, where)
-    theta = parameters.vector(cast_floats(parameters.params, like.dtype))
+    if constraint is not None and not callable(constraint):
+        raise TypeError(
+            "`constraint` must be a function that maps the unknown parameters to a truth value; "
+            f"got {constraint!r}."
+        )
+    return Parameters(model, where, constraint)
+
+
+def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p"]:
+    """θ as it is in the model, in this dtype, checked."""
+    theta = parameters.vector(cast_floats(parameters.params, dtype))
     if theta.size == 0:
         raise ValueError(
             "this model has no parameters to be inferred: give `Diffusion` its unknown numbers as "
@@ -103,21 +122,6 @@ def as_parameters(
         raise ValueError(
             f"the unknown parameters must be finite; the model has {parameters.params}."
         )
-    return parameters, theta
-
-
-def check_sigma_known(
-    parameters: Parameters, theta: Float[Array, " p"], like: Float[Array, " d"], instead: str
-) -> None:
-    """Raise `ValueError` where σ depends on the unknown parameters."""
-    if uses_argument(lambda theta: parameters.bind(theta).diffusion(like), theta):
-        raise ValueError(
-            "σ depends on the unknown parameters, and given a whole path σ is known: " + instead
-        )
-
-
-def check_coordinates_known(parameters: Parameters, theta: Float[Array, " p"]) -> None:
-    """Raise `ValueError` where the coordinates of the model depend on the unknown parameters."""
     if uses_argument(lambda theta: parameters.bind(theta).coordinate_values(), theta):
         raise ValueError(
             "the coordinates of `lamperti` depend on the unknown parameters, those of σ, but the "
@@ -126,38 +130,7 @@ def check_coordinates_known(parameters: Parameters, theta: Float[Array, " p"]) -
             "parameters, by `pmmh` or `maximum_likelihood`; or hold the parameters of σ fixed by "
             "`where=`."
         )
-
-
-def allowed(
-    constraint: Constraint | None, parameters: Parameters, theta: Float[Array, " p"]
-) -> Bool[Array, ""]:
-    """Whether θ is finite and satisfies the constraint."""
-    finite = jnp.all(jnp.isfinite(theta))
-    if constraint is None:
-        return finite
-    value = jnp.asarray(constraint(parameters.select(theta)))
-    if value.shape != () or value.dtype != bool:
-        raise ValueError(
-            "`constraint` must map the unknown parameters to one truth value; it returned shape "
-            f"{value.shape} and dtype {value.dtype}."
-        )
-    return finite & value
-
-
-def check_allowed(
-    constraint: Constraint | None, parameters: Parameters, theta: Float[Array, "*chains p"]
-) -> None:
-    """Raise `ValueError` where a visible θ does not satisfy the constraint."""
-    if constraint is not None and not callable(constraint):
-        raise TypeError(
-            "`constraint` must be a function that maps the unknown parameters to a truth value; "
-            f"got {constraint!r}."
-        )
-    for row in theta.reshape(-1, theta.shape[-1]):
-        ok = allowed(constraint, parameters, row)
-        if not is_traced(ok) and not bool(ok):
-            why = "are not finite" if constraint is None else "do not satisfy `constraint`"
-            raise ValueError(f"the parameters to start from, {parameters.select(row)}, {why}.")
+    return theta
 
 
 def init_vectors(

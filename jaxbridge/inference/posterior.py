@@ -6,13 +6,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ..engine.checks import check_count, is_traced
 from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
 from ..schemes.step_error import StepError, dominates
 from .data import Problem
-from .parameters import Constraint, check_allowed, init_vectors
+from .parameters import init_vectors
 
 # Of fewer draws a covariance tells nothing.
 _FEWEST = 10
@@ -105,35 +105,63 @@ def starting_points(
     problem: Problem,
     init: PyTree,
     num_chains: int | None,
-    constraint: Constraint | None,
     log_prior: Callable[[Array], Array],
     state_type: type,
 ) -> tuple[Float[Array, "*chains p"], Any]:
     """θ of each chain, and the state to go on from, if `init` is one."""
+    parameters, theta = problem.parameters, problem.theta
     chains = () if num_chains is None else (check_count("num_chains", num_chains),)
     state = init if isinstance(init, state_type) else None
-    theta = problem.theta
     if state is not None:
-        theta = state.theta
-        if theta.shape[-1] != problem.theta.shape[0]:
+        p, theta = theta.shape[0], state.theta
+        if theta.shape[-1] != p:
             raise ValueError(
-                f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are "
-                f"{problem.theta.shape[0]}."
+                f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are {p}."
             )
         if theta.shape[:-1] != chains and num_chains is not None:
             raise ValueError(
                 f"`init` is a state of chains {theta.shape[:-1]}, but `num_chains` is {num_chains}."
             )
     elif init is not None:
-        theta = init_vectors(problem.parameters, init, chains).astype(theta.dtype)
+        theta = init_vectors(parameters, init, chains).astype(theta.dtype)
     if theta.ndim == 1:
         theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
-    check_allowed(constraint, problem.parameters, theta)
+    parameters.check_allowed(theta)
     for row in theta.reshape(-1, theta.shape[-1]):
         if not is_traced(value := log_prior(row)) and not jnp.isfinite(value):
-            params = problem.parameters.select(row)
             raise ValueError(
-                f"`prior` is {value} at the parameters to start from, {params}: start where its "
-                "density is positive, by `init=`."
+                f"`prior` is {value} at the parameters to start from, {parameters.select(row)}: "
+                "start where its density is positive, by `init=`."
             )
     return theta, state
+
+
+def first_chain(theta: Float[Array, "*chains p"]) -> Float[Array, " p"]:
+    """θ of the first chain, at which proposals are chosen."""
+    return theta.reshape(-1, theta.shape[-1])[0]
+
+
+def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
+    """`function(key, state)` of each chain, with keys of their own if there are several; θ is the
+    first leaf of the state."""
+    theta = jax.tree.leaves(state)[0]
+    if theta.ndim == 1:
+        return function(key, state)
+    return jax.vmap(function)(jax.random.split(key, len(theta)), state)
+
+
+def chains_first(theta: Float[Array, "n *chains p"], *draws: PyTree) -> tuple:
+    """θ and what else was kept of each draw, with axes (*chains, n) in front."""
+    kept = (theta, *draws)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), kept) if theta.ndim == 3 else kept
+
+
+def of_draws(function: Callable, theta: Float[Array, "*chains n p"]) -> PyTree:
+    """The function of θ of each draw."""
+    function = jax.vmap(function)
+    return (function if theta.ndim == 2 else jax.vmap(function))(theta)
+
+
+def summed(infos: PyTree) -> PyTree:
+    """What was counted, over the first axis."""
+    return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0, dtype=jnp.int32), infos)

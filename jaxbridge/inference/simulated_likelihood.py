@@ -17,6 +17,7 @@ with Newton's steps at fixed noise. All derivatives are forward ones, so that me
 with the number of steps: that takes p² of them, for p unknown parameters.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import diffrax
@@ -24,15 +25,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
 from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
-from ..models.tracing import uses_argument
 from ..proposals.choice import (
     Choice,
     as_proposal,
@@ -41,9 +40,10 @@ from ..proposals.choice import (
     uses_couplings,
 )
 from ..schemes.step_error import StepError
-from .blocks import Block, Bounds, make_blocks
+from .blocks import Block, Bounds, make_blocks, over_intervals, with_keys
 from .data import Problem
-from .parameters import Constraint, Parameters, allowed
+from .parameters import Parameters
+from .stochastic_approximation import Gradient, SearchInfo, iterate
 
 # Paths of each interval for a noisy gradient.
 _FEW = 8
@@ -84,12 +84,6 @@ class Maximum(NamedTuple):
     found: Bool[Array, ""]
 
 
-def sigma_is_unknown(problem: Problem) -> bool:
-    """Whether σ depends on the unknown parameters."""
-    parameters, like = problem.parameters, problem.like
-    return uses_argument(lambda theta: parameters.bind(theta).diffusion(like), problem.theta)
-
-
 def as_pulled(proposal: Any, model: Diffusion, like: Float[Array, " d"], bounds: Bounds) -> Any:
     """The proposal that the user gave, "auto" without couplings.
 
@@ -114,9 +108,8 @@ def pulled_blocks(
     """The blocks with one proposal each, for a choice between several has no derivative: that
     which leaves the least variance in all at this model, or, where the user has chosen interval by
     interval, a block for each."""
-    groups, intervals = problem.groups, problem.intervals
     chosen = isinstance(proposal, Choice) and proposal.chosen is not None
-    blocks = make_blocks(key, model, intervals, groups, proposal, (None, None, None))
+    blocks = make_blocks(key, model, problem, proposal, (None, None, None), "weights")
     return tuple(
         single for block in blocks for single in (_split(block) if chosen else (_decided(block),))
     )
@@ -137,7 +130,7 @@ def _decided(block: Block) -> Block:
     efficiency = np.nan_to_num(np.asarray(choice.efficiency), nan=1.0)
     cost = np.asarray(choice.seconds) / np.maximum(efficiency, 1e-6)
     best = choice.candidates[int(np.argmin(cost.sum(axis=1)))]
-    return Block(block.intervals, block.index, block.fractions, best)
+    return replace(block, proposal=best)
 
 
 def _split(block: Block) -> tuple[Block, ...]:
@@ -145,8 +138,7 @@ def _split(block: Block) -> tuple[Block, ...]:
     choice = block.proposal
     assert isinstance(choice, Choice) and choice.chosen is not None
     if len(choice.used) == 1:
-        single = choice.candidates[choice.used[0]]
-        return (Block(block.intervals, block.index, block.fractions, single),)
+        return (replace(block, proposal=choice.candidates[choice.used[0]]),)
     made = []
     for i in choice.used:
         which = np.flatnonzero(np.asarray(choice.chosen) == i)
@@ -202,14 +194,9 @@ def simulated(
     """ℓ̂ at θ with the noise of this key, and all that is to be known of it."""
     made = [
         _of_block(block_key, parameters, block, theta, num_paths)
-        for block_key, block in zip(jax.random.split(key, len(blocks)), blocks, strict=True)
+        for block_key, block in with_keys(key, blocks)
     ]
-    sizes = jnp.concatenate([each.effective_sample_size for each in made])
-    shapes = jnp.concatenate([each.pareto_k for each in made])
-    order = jnp.argsort(jnp.concatenate([block.index for block in blocks]))
-    sums = (each._replace(effective_sample_size=0, pareto_k=0) for each in made)
-    total = jax.tree.map(lambda *leaves: sum(leaves), *sums)
-    return total._replace(effective_sample_size=sizes[order], pareto_k=shapes[order])
+    return over_intervals(blocks, made)
 
 
 @eqx.filter_jit
@@ -225,14 +212,14 @@ def step_error_of_score(
     parameters, blocks = nondifferentiable((parameters, blocks))
     model = parameters.bind(maximum.theta)
     error, variance = jnp.zeros_like(maximum.theta), jnp.zeros_like(maximum.theta)
-    for block_key, block in zip(jax.random.split(key, len(blocks)), blocks, strict=True):
+    for block_key, block in with_keys(key, blocks):
         if block.num_steps < 2:
             unknown = jnp.full_like(error, jnp.nan)
             return StepError(unknown, unknown)
         fractions = jnp.asarray(
             np.diff(block.proposal.fractions(block.num_steps // 2)), error.dtype
         )
-        half = Block(block.intervals, block.index, fractions, block.proposal)
+        half = replace(block, fractions=fractions)
         # Of all that are pulled each has one order for all intervals.
         share = block.proposal.step_share(model, block.intervals)[0]
 
@@ -319,7 +306,6 @@ def newton_ascent(
     key: Key[Array, ""],
     parameters: Parameters,
     blocks: tuple[Block, ...],
-    constraint: Constraint | None,
     starts: Float[Array, "starts p"],
     num_paths: int,
 ) -> Maximum:
@@ -339,7 +325,7 @@ def newton_ascent(
         start = starts[jnp.minimum(state.i, at_start - 1)]
         starting = state.i < at_start
         tried = jnp.where(starting, start, state.theta + state.fraction * state.step)
-        inside = allowed(constraint, parameters, tried)
+        inside = parameters.allowed(tried)
         # Outside the constraint the model may not be simulated.
         made, old = at(jnp.where(inside, tried, starts[0])), state.simulated
         expected = jnp.where(starting, 0, 1e-4 * state.fraction * (old.gradient @ state.step))
@@ -377,64 +363,33 @@ def newton_ascent(
     return Maximum(last.theta, made, found)
 
 
-class SearchInfo(NamedTuple):
-    """Bridges that were not found, weights that were cut off, and steps that were not made."""
-
-    missing: Shaped[Array, "..."]
-    truncated: Shaped[Array, "..."]
-    refused: Shaped[Array, "..."]
-
-
-def guarded(
-    constraint: Constraint | None,
-    parameters: Parameters,
-    old: tuple[Float[Array, " p"], PyTree],
-    new: tuple[Float[Array, " p"], PyTree],
-) -> tuple[Float[Array, " p"], PyTree, Bool[Array, ""]]:
-    """θ and the state of an optimiser after a step, or as they were where it leads out of the
-    constraint or to what is not finite; and whether it was made."""
-    finite = all_finite_leaves(new[1])
-    ok = allowed(constraint, parameters, new[0]) & finite
-    theta = jnp.where(ok, new[0], old[0])
-    # What an optimiser remembers must not be spoilt for all steps to come.
-    rule = jax.tree.map(lambda new, old: jnp.where(finite, new, old), new[1], old[1])
-    return theta, rule, ok
-
-
 @eqx.filter_jit
 def stochastic_ascent(
     key: Key[Array, ""],
     parameters: Parameters,
     blocks: tuple[Block, ...],
-    constraint: Constraint | None,
-    optimizer: optax.GradientTransformation,
+    rule: Gradient,
     theta: Float[Array, " p"],
     num_iterations: int,
     meter: diffrax.AbstractProgressMeter,
 ) -> tuple[Float[Array, "n p"], SearchInfo]:
     """The optimiser's iterates along ∇ℓ̂ with new noise in each, and what was lost on the way."""
     parameters, blocks, theta = nondifferentiable((parameters, blocks, theta))
-    num_intervals = sum(block.intervals.start.shape[0] for block in blocks)
+    num_intervals = sum(len(block.index) for block in blocks)
 
-    def loss(theta, key):
+    def mean_log_likelihood(theta, key):
         value, missing = jnp.zeros((), theta.dtype), jnp.int32(0)
-        for block_key, block in zip(jax.random.split(key, len(blocks)), blocks, strict=True):
+        for block_key, block in with_keys(key, blocks):
             made, found = _log_weights(block_key, parameters, block, _FEW, theta)
             value += jnp.sum(_log_densities(made, found))
             missing += jnp.sum(~jnp.any(found, axis=1), dtype=jnp.int32)
-        return -value / num_intervals, missing
+        return value / num_intervals, missing
 
-    def iterate(state, i):
-        theta, rule, progress = state
-        gradient, missing = jax.jacfwd(loss, has_aux=True)(theta, jax.random.fold_in(key, i))
-        updates, moved = optimizer.update(gradient, rule, theta)
-        new = theta + jnp.asarray(updates), moved
-        theta, rule, ok = guarded(constraint, parameters, (theta, rule), new)
-        progress = meter.step(progress, (i + 1).astype(jnp.float32) / num_iterations)
-        return (theta, rule, progress), (theta, missing, ~ok)
+    def propose(i, theta, memory, _):
+        gradient, missing = jax.jacfwd(mean_log_likelihood, has_aux=True)(
+            theta, jax.random.fold_in(key, i)
+        )
+        return rule.ascend(theta, memory, gradient), None, (missing, jnp.int32(0))
 
-    state = theta, optimizer.init(theta), meter.init()
-    state, (iterates, missing, refused) = lax.scan(iterate, state, jnp.arange(num_iterations))
-    meter.close(state[2])
-    missing, refused = (jnp.sum(leaf, dtype=jnp.int32) for leaf in (missing, refused))
-    return iterates, SearchInfo(missing, jnp.int32(0), refused)
+    start = (theta, rule.init(theta), None)
+    return iterate(propose, parameters, start, num_iterations, meter)

@@ -7,7 +7,7 @@ import pytest
 from inference_oracles import grid_moments, multivariate_ou, ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
-from jaxbridge.inference.parameters import as_parameters
+from jaxbridge.inference.parameters import as_parameters, theta_of_model
 from jaxbridge.inference.priors import as_normal
 
 TIMES = np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 20, 1.0)])
@@ -382,7 +382,8 @@ def test_other_types_are_refused(unchecked):
 
 def test_a_prior_may_have_the_shape_of_the_parameters():
     model = multivariate_ou()[0]
-    parameters, theta = as_parameters(model, lambda p: p.B, jnp.zeros(2))
+    parameters = as_parameters(model, lambda p: p.B)
+    theta = theta_of_model(parameters, jnp.dtype("float32"))
     variance = jnp.array([[1.0, 2.0], [3.0, 4.0]])
     prior = as_normal(jb.NormalPrior(jnp.eye(2), variance), parameters, theta)
     np.testing.assert_allclose(prior.mean, [1, 0, 0, 1])

@@ -13,6 +13,7 @@ from scipy import optimize, stats
 import jaxbridge as jb
 from jaxbridge.inference import simulated_likelihood
 from jaxbridge.inference.data import as_problem
+from jaxbridge.inference.parameters import as_parameters
 from jaxbridge.proposals.choice import guided_candidates, undecided_between
 
 POSITIVE = lambda params: jnp.all(jnp.stack(params) > 0)
@@ -92,7 +93,7 @@ def test_monte_carlo_errors_and_bias():
     times, data, exact, sd = ou_problem()
     parameters, blocks, theta = few(times, data, 20, ou_1d())
     made = [
-        simulated_likelihood.newton_ascent(key, parameters, blocks, POSITIVE, theta[None], 6)
+        simulated_likelihood.newton_ascent(key, parameters, blocks, theta[None], 6)
         for key in jax.random.split(jax.random.key(0), 60)
     ]
     assert all(bool(each.found) for each in made)
@@ -111,9 +112,10 @@ def test_monte_carlo_errors_and_bias():
 def few(times, data, num_steps, model):
     """The unknown parameters, blocks and θ, as the search has them."""
     key = jax.random.key(0)
-    problem = as_problem(key, model, times, data, None, num_steps, None)
+    parameters = as_parameters(model, None, POSITIVE)
+    problem = as_problem(key, parameters, times, data, num_steps, None)
     blocks = simulated_likelihood.pulled_blocks(key, model, problem, BRIDGE)
-    return problem.parameters, blocks, problem.theta
+    return parameters, blocks, problem.theta
 
 
 @pytest.mark.slow
@@ -222,7 +224,7 @@ def test_a_choice_is_made_once_or_kept(unchecked):
     has made is kept."""
     times, data, *_ = ou_problem()
     model, key = ou_1d(), jax.random.key(0)
-    problem = as_problem(key, model, times[:5], data[:5], None, 5, None)
+    problem = as_problem(key, as_parameters(model, None), times[:5], data[:5], 5, None)
     auto = simulated_likelihood.as_pulled("auto", model, problem.like, (None, None, None))
     (block,) = simulated_likelihood.pulled_blocks(key, model, problem, auto)
     assert isinstance(block.proposal, jb.Guided | jb.ModifiedDiffusionBridge)
