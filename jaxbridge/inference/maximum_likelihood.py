@@ -39,7 +39,7 @@ from .simulated_likelihood import (
     step_error_of_score,
     stochastic_ascent,
 )
-from .stochastic_approximation import EM, Gradient, SearchInfo, approximate
+from .stochastic_approximation import EM, Gradient, Search, SearchInfo, approximate
 
 # Made once, for optimisers are compared by identity.
 _ADAM = optax.adam(1e-2)
@@ -185,16 +185,16 @@ def maximum_likelihood(
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     proposal = "auto" if proposal is None else proposal
     bounds = (num_counts, max_proposals, max_trials)
-    search = (num_iterations, num_bridges, meter)
+    search = Search(rule, num_iterations, meter)
     if not problem.sigma_is_unknown:
-        return _by_bridges(key, problem, proposal, bounds, rule, *search)
-    if isinstance(rule, EM):
+        return _by_bridges(key, problem, proposal, bounds, search, num_bridges)
+    if method == "em":
         raise ValueError(
             "σ depends on the unknown parameters, and given a whole path σ is known, so that "
             'EM would never leave it: use `method="gradient"`, or pick the other parameters '
             "with `where=`."
         )
-    return _by_simulation(key, problem, proposal, bounds, rule, *search)
+    return _by_simulation(key, problem, proposal, bounds, search, num_bridges)
 
 
 def _by_bridges(
@@ -202,21 +202,17 @@ def _by_bridges(
     problem: Problem,
     proposal: Any,
     bounds: Bounds,
-    rule: Gradient | EM,
-    num_iterations: int,
+    search: Search,
     num_bridges: int,
-    meter: diffrax.AbstractProgressMeter,
 ) -> MaximumLikelihood:
     """Stochastic approximation, and one step of Newton's method."""
     parameters, theta = problem.parameters, problem.theta
     augment_key, run_key, score_key = jax.random.split(key, 3)
     augmentation = augment(augment_key, problem, theta, proposal, "exact", None, bounds)
-    search = (parameters, augmentation, rule, theta, num_iterations, meter)
-    iterates, info = approximate(run_key, *search)
-    later = iterates[num_iterations // 2 :]
-    rough = iterates[-1] if isinstance(rule, EM) else jnp.mean(later, axis=0)
-    no_meter = diffrax.NoProgressMeter()
-    at_rough = score_at(score_key, problem, rough, proposal, bounds, num_bridges, no_meter)
+    iterates, info = approximate(run_key, parameters, augmentation, search, theta)
+    rough = iterates[-1] if isinstance(search.rule, EM) else _mean_of_later(iterates)
+    meter = diffrax.NoProgressMeter()
+    at_rough = score_at(score_key, problem, rough, proposal, bounds, num_bridges, meter)
     step = jnp.linalg.inv(at_rough.information) @ at_rough.gradient
     definite = jnp.all(jnp.linalg.eigvalsh(at_rough.information) > 0)
     # Further off the likelihood need not be near its quadratic approximation.
@@ -231,27 +227,28 @@ def _by_simulation(
     problem: Problem,
     proposal: Any,
     bounds: Bounds,
-    rule: Gradient,
-    num_iterations: int,
+    search: Search,
     num_bridges: int,
-    meter: diffrax.AbstractProgressMeter,
 ) -> MaximumLikelihood:
     """The maximum of the simulated likelihood."""
     parameters, theta = problem.parameters, problem.theta
     proposal = as_pulled(proposal, parameters.model, problem.like, bounds)
     pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
     blocks = pulled_blocks(pilot_key, parameters.bind(theta), problem, proposal)
-    search = (parameters, blocks, rule, theta, num_iterations, meter)
-    iterates, info = stochastic_ascent(run_key, *search)
-    last, mean = iterates[-1], jnp.mean(iterates[num_iterations // 2 :], axis=0)
+    iterates, info = stochastic_ascent(run_key, parameters, blocks, search, theta)
+    last = iterates[-1]
     # What suits the data at the first θ need not do so at the last.
     blocks = pulled_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
-    starts = jnp.stack([theta, last, mean])
+    starts = jnp.stack([theta, last, _mean_of_later(iterates)])
     maximum = newton_ascent(last_key, parameters, blocks, starts, num_bridges)
     made = maximum.simulated
     step_error = step_error_of_score(last_key, parameters, blocks, maximum, num_bridges)
     at_maximum = as_score(parameters, made, step_error, made.num_missing, jnp.int32(0))
     return _summary(parameters, maximum.theta, iterates, at_maximum, info, maximum.found)
+
+
+def _mean_of_later(iterates: Float[Array, "n p"]) -> Float[Array, " p"]:
+    return jnp.mean(iterates[len(iterates) // 2 :], axis=0)
 
 
 def _summary(

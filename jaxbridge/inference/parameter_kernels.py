@@ -97,9 +97,10 @@ class NormalDraw(AbstractParameterKernel):
     """θ from its normal law given the paths."""
 
     def step(self, key, theta, data):
-        gradient, hessian = _derivatives(data.log_posterior_inside, theta)
-        root = any_cholesky(-hessian)
-        mean = theta + _solve_root(root, gradient)
+        # Forward over reverse where there are many parameters.
+        gradient = (jax.jacfwd if len(theta) < 3 else jax.grad)(data.log_posterior_inside)
+        root = any_cholesky(-jax.jacfwd(gradient)(theta))
+        mean = theta + _solve_root(root, gradient(theta))
 
         def draw(carry):
             i, _, _ = carry
@@ -181,14 +182,6 @@ def choose_kernel(
         return GivenKernel(kernel)
     exact = is_quadratic and isinstance(log_prior, NormalDensity)
     return NormalDraw() if exact else NewtonStep()
-
-
-def _derivatives(
-    function: Callable[[Array], Array], theta: Float[Array, " p"]
-) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
-    """Gradient and Hessian; forward over reverse where there are many parameters."""
-    gradient = jax.jacfwd(function) if theta.shape[0] < 3 else jax.grad(function)
-    return gradient(theta), jax.jacfwd(gradient)(theta)
 
 
 def _solve_root(root: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:

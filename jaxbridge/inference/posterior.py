@@ -19,7 +19,16 @@ _FEWEST = 10
 
 
 class AbstractPosterior(eqx.Module):
-    """Draws of unknown parameters; arrays have a leading axis of chains if there are several."""
+    """Draws of unknown parameters; arrays have a leading axis of chains if there are several.
+
+    - `params`: all parameters of the model, each with leading axes (*chains, n).
+    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
+        the keys are in alphabetical order.
+    - `log_step_error`: an estimate of the step error of the log density at each draw, NaN where
+        none was worked out, shape (*chains, n): what `step_error`, that of the posterior mean, is
+        made of.
+    """
 
     params: eqx.AbstractVar[PyTree]
     theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
@@ -147,7 +156,8 @@ def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
     theta = jax.tree.leaves(state)[0]
     if theta.ndim == 1:
         return function(key, state)
-    return jax.vmap(function)(jax.random.split(key, len(theta)), state)
+    keys = jax.random.split(key, len(theta))
+    return jax.vmap(lambda *each: function(*each))(keys, state)
 
 
 def chains_first(theta: Float[Array, "n *chains p"], *draws: PyTree) -> tuple:

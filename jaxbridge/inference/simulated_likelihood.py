@@ -20,7 +20,6 @@ with the number of steps: that takes p² of them, for p unknown parameters.
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -43,7 +42,7 @@ from ..schemes.step_error import StepError
 from .blocks import Block, Bounds, make_blocks, over_intervals, with_keys
 from .data import Problem
 from .parameters import Parameters
-from .stochastic_approximation import Gradient, SearchInfo, iterate
+from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 
 # Paths of each interval for a noisy gradient.
 _FEW = 8
@@ -368,12 +367,12 @@ def stochastic_ascent(
     key: Key[Array, ""],
     parameters: Parameters,
     blocks: tuple[Block, ...],
-    rule: Gradient,
+    search: Search,
     theta: Float[Array, " p"],
-    num_iterations: int,
-    meter: diffrax.AbstractProgressMeter,
 ) -> tuple[Float[Array, "n p"], SearchInfo]:
     """The optimiser's iterates along ∇ℓ̂ with new noise in each, and what was lost on the way."""
+    rule = search.rule
+    assert isinstance(rule, Gradient)
     parameters, blocks, theta = nondifferentiable((parameters, blocks, theta))
     num_intervals = sum(len(block.index) for block in blocks)
 
@@ -391,5 +390,4 @@ def stochastic_ascent(
         )
         return rule.ascend(theta, memory, gradient), None, (missing, jnp.int32(0))
 
-    start = (theta, rule.init(theta), None)
-    return iterate(propose, parameters, start, num_iterations, meter)
+    return iterate(propose, parameters, search, theta, None)

@@ -76,15 +76,21 @@ class EM(eqx.Module):
         return any_solve(P, c), memory
 
 
+class Search(NamedTuple):
+    """How θ is moved, how often, and who is told."""
+
+    rule: Gradient | EM
+    num_iterations: int
+    meter: diffrax.AbstractProgressMeter
+
+
 @eqx.filter_jit
 def approximate(
     key: Key[Array, ""],
     parameters: Parameters,
     augmentation: Augmentation,
-    rule: Gradient | EM,
+    search: Search,
     theta: Float[Array, " p"],
-    num_iterations: int,
-    meter: diffrax.AbstractProgressMeter,
 ) -> tuple[Float[Array, "n p"], SearchInfo]:
     """The iterates by a rule over bridges, and what was lost on the way."""
     parameters, augmentation = nondifferentiable((parameters, augmentation))
@@ -94,23 +100,24 @@ def approximate(
         bridge_key = jax.random.fold_in(run_key, i)
         paths, bridges = augmentation.renew(bridge_key, parameters.bind(theta), paths)
         data = CompleteData(parameters, augmentation, paths, jnp.zeros_like)
-        return rule.update(i, theta, memory, data), paths, (bridges.missing, bridges.truncated)
+        moved = search.rule.update(i, theta, memory, data)
+        return moved, paths, (bridges.missing, bridges.truncated)
 
     first, _ = augmentation.first(first_key, parameters.bind(theta))
-    start = (theta, rule.init(theta), first)
-    return iterate(propose, parameters, start, num_iterations, meter)
+    return iterate(propose, parameters, search, theta, first)
 
 
 def iterate(
     propose: Callable,
     parameters: Parameters,
-    start: tuple[Float[Array, " p"], PyTree, PyTree],
-    num_iterations: int,
-    meter: diffrax.AbstractProgressMeter,
+    search: Search,
+    theta: Float[Array, " p"],
+    paths: PyTree,
 ) -> tuple[Float[Array, "n p"], SearchInfo]:
-    """The iterates of θ, from θ, what an optimiser remembers, and paths. `propose(i, θ, memory,
-    paths)` makes ((θ, memory), paths, what was missing and truncated); θ stays where that leads
-    out of the constraint, or to what is not finite."""
+    """The iterates from θ and paths. `propose(i, θ, memory, paths)` makes ((θ, memory), paths, what
+    was missing and truncated), with what the rule remembers; θ stays where that leads out of the
+    constraint, or to what is not finite."""
+    rule, num_iterations, meter = search
 
     def step(state, i):
         theta, memory, paths, progress = state
@@ -124,7 +131,8 @@ def iterate(
         info = _counted(SearchInfo(missing, truncated, ~ok))
         return (theta, memory, paths, progress), (theta, info)
 
-    state, (iterates, info) = lax.scan(step, (*start, meter.init()), jnp.arange(num_iterations))
+    start = (theta, rule.init(theta), paths, meter.init())
+    state, (iterates, info) = lax.scan(step, start, jnp.arange(num_iterations))
     meter.close(state[-1])
     return iterates, _counted(info)
 
