@@ -30,9 +30,9 @@ from .parameter_kernels import (
 from .parameters import Constraint, Parameters, as_parameters
 from .posterior import (
     AbstractPosterior,
-    chains_first,
+    drawn,
     first_chain,
-    of_draws,
+    first_states,
     over_chains,
     starting_points,
     summed,
@@ -179,7 +179,7 @@ def gibbs(
     sampler = _Sampler(parameters, augmentation, log_prior, kernel)
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     if state is None:
-        state = _start(run_key, sampler, theta)
+        state = first_states(sampler.start, run_key, theta)
     else:
         augmentation.check_paths(state.paths, theta.shape[:-1])
     return _run(run_key, sampler, state, num_iterations, thin, meter)
@@ -224,11 +224,6 @@ class _Sampler(eqx.Module):
 
 
 @eqx.filter_jit
-def _start(key: Key[Array, ""], sampler: _Sampler, theta: Float[Array, "*chains p"]) -> GibbsState:
-    return over_chains(sampler.start, jax.random.fold_in(key, 0), theta)
-
-
-@eqx.filter_jit
 def _run(
     key: Key[Array, ""],
     sampler: _Sampler,
@@ -260,16 +255,14 @@ def _run(
     carry, draws = lax.scan(draw, (state, meter.init()), jnp.arange(num_iterations))
     state, progress = carry
     meter.close(progress)
-    theta, info, log_step_error = chains_first(*draws)
+    fields, (info, log_step_error) = drawn(sampler.parameters, *draws)
     num_bridges = thin * sampler.augmentation.num_intervals
     info = info._replace(
         parameters_moved=info.parameters_moved > 0,
         bridges_moved=info.bridges_moved.astype(dtype) / num_bridges,
     )
     return GibbsPosterior(
-        params=of_draws(sampler.parameters.full, theta),
-        theta=theta,
-        names=sampler.parameters.names,
+        **fields,
         **info._asdict(),
         log_step_error=log_step_error,
         state=state,

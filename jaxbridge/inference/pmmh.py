@@ -11,6 +11,7 @@ from the acceptance rates α_i (Vihola 2012), and fixed thereafter.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import diffrax
@@ -32,9 +33,9 @@ from .data import Problem, as_problem
 from .parameters import Constraint, Parameters, as_parameters
 from .posterior import (
     AbstractPosterior,
-    chains_first,
+    drawn,
     first_chain,
-    of_draws,
+    first_states,
     over_chains,
     starting_points,
     summed,
@@ -192,14 +193,13 @@ def pmmh(
     meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
     if state is None:
         root = jnp.broadcast_to(root, (*theta.shape[:-1], *root.shape))
-        chain, num_done = _start(run_key, sampler, theta, root), jnp.int32(0)
+        chain, num_done = first_states(sampler.start, run_key, (theta, root)), jnp.int32(0)
     else:
         chain, num_done = _Chain(*state[: len(_Chain._fields)]), state.num_done
     size = (num_warmup, num_iterations, thin)
-    made, chain = _run(run_key, sampler, chain, num_done, size, meter)
-    num_done = num_done + num_warmup + num_iterations * thin
-    state = PMMHState(*chain, num_done, tuple(block.proposal for block in blocks))
-    return PMMHPosterior(**made, state=state, names=parameters.names)
+    made = _run(run_key, sampler, chain, num_done, size, meter)
+    proposals = tuple(block.proposal for block in blocks)
+    return replace(made, state=made.state._replace(proposals=proposals))
 
 
 def _blocks_of_state(
@@ -331,16 +331,6 @@ def _adapted(
 
 
 @eqx.filter_jit
-def _start(
-    key: Key[Array, ""],
-    sampler: _Sampler,
-    theta: Float[Array, "*chains p"],
-    root: Float[Array, "*chains p p"],
-) -> _Chain:
-    return over_chains(sampler.start, jax.random.fold_in(key, 0), (theta, root))
-
-
-@eqx.filter_jit
 def _run(
     key: Key[Array, ""],
     sampler: _Sampler,
@@ -348,9 +338,8 @@ def _run(
     num_done: Int[Array, ""],
     size: tuple[int, int, int],
     meter: diffrax.AbstractProgressMeter,
-) -> tuple[dict[str, Any], _Chain]:
-    """The fields of the posterior, and where the chains are, after so many iterations of the
-    warm-up, and so many draws, with so many iterations each."""
+) -> PMMHPosterior:
+    """After so many iterations of the warm-up, so many draws, with so many iterations each."""
     sampler, chain = nondifferentiable((sampler, chain))
     p, dtype = chain.theta.shape[-1], chain.theta.dtype
     num_warmup, num_iterations, thin = size
@@ -375,16 +364,16 @@ def _run(
     meter.close(progress)
     held, info = draws
     counted = jax.tree.map(jnp.add, summed(warmup), summed(info))
-    arrays = (held.log_likelihood, held.log_step_error, info.accepted > 0)
-    theta, log_likelihood, step_error, accepted = chains_first(held.theta, *arrays)
-    fields = {
-        "params": of_draws(sampler.parameters.full, theta),
-        "theta": theta,
-        "log_likelihood": log_likelihood,
-        "log_likelihood_variance": jnp.median(held.variance, axis=0),
-        "log_step_error": step_error,
-        "accepted": accepted,
-        "num_without_estimate": counted.num_without_estimate,
-        "num_truncated": counted.num_truncated,
-    }
-    return fields, chain
+    others = (held.log_likelihood, held.log_step_error, info.accepted > 0)
+    fields, others = drawn(sampler.parameters, held.theta, *others)
+    log_likelihood, log_step_error, accepted = others
+    return PMMHPosterior(
+        **fields,
+        log_likelihood=log_likelihood,
+        log_likelihood_variance=jnp.median(held.variance, axis=0),
+        log_step_error=log_step_error,
+        accepted=accepted,
+        num_without_estimate=counted.num_without_estimate,
+        num_truncated=counted.num_truncated,
+        state=PMMHState(**chain._asdict(), num_done=num_done + total, proposals=()),
+    )

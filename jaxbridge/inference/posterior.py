@@ -12,7 +12,7 @@ from ..engine.checks import check_count, is_traced
 from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
 from ..schemes.step_error import StepError, dominates
 from .data import Problem
-from .parameters import init_vectors
+from .parameters import Parameters, init_vectors
 
 # Of fewer draws a covariance tells nothing.
 _FEWEST = 10
@@ -160,16 +160,22 @@ def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
     return jax.vmap(lambda *each: function(*each))(keys, state)
 
 
-def chains_first(theta: Float[Array, "n *chains p"], *draws: PyTree) -> tuple:
-    """θ and what else was kept of each draw, with axes (*chains, n) in front."""
-    kept = (theta, *draws)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), kept) if theta.ndim == 3 else kept
+@eqx.filter_jit
+def first_states(start: Callable, key: Key[Array, ""], state: PyTree) -> Any:
+    """The states that chains start from: key number 0 is theirs, and iterations have the others."""
+    return over_chains(start, jax.random.fold_in(key, 0), state)
 
 
-def of_draws(function: Callable, theta: Float[Array, "*chains n p"]) -> PyTree:
-    """The function of θ of each draw."""
-    function = jax.vmap(function)
-    return (function if theta.ndim == 2 else jax.vmap(function))(theta)
+def drawn(
+    parameters: Parameters, theta: Float[Array, "n *chains p"], *others: PyTree
+) -> tuple[dict[str, Any], PyTree]:
+    """The fields of a posterior that θ makes, and what else was kept of each draw, with axes
+    (*chains, n) in front."""
+    full = jax.vmap(parameters.full)
+    if theta.ndim == 3:
+        full = jax.vmap(full)
+        theta, others = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, others))
+    return {"params": full(theta), "theta": theta, "names": parameters.names}, others
 
 
 def summed(infos: PyTree) -> PyTree:
