@@ -67,19 +67,21 @@ def _check_increasing(times: np.ndarray, duration: np.ndarray) -> None:
 
 def _check_finite(observations: np.ndarray) -> None:
     finite = np.isfinite(observations)
-    for i in np.flatnonzero(~finite.all(axis=1))[:1]:
-        row = observations[i]
-        if finite[i].any():
-            which = ", ".join(map(str, np.flatnonzero(~finite[i])))
-            raise ValueError(
-                f"`observations[{i}]` = {row} has no finite number for coordinate {which}, but "
-                "observations must be complete, all coordinates at a time: leave out this row, "
-                "with its time."
-            )
+    missing = np.flatnonzero(~finite.all(axis=1))
+    if not missing.size:
+        return
+    i = missing[0]
+    if finite[i].any():
+        which = ", ".join(map(str, np.flatnonzero(~finite[i])))
         raise ValueError(
-            f"`observations[{i}]` = {row} is not finite: leave out observations that are "
-            "missing, with their times."
+            f"`observations[{i}]` = {observations[i]} has no finite number for coordinate {which}, "
+            "but observations must be complete, all coordinates at a time: leave out this row, "
+            "with its time."
         )
+    raise ValueError(
+        f"`observations[{i}]` = {observations[i]} is not finite: leave out observations that are "
+        "missing, with their times."
+    )
 
 
 def _unmasked(name: str, values: Numbers) -> Numbers:

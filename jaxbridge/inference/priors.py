@@ -69,26 +69,8 @@ def as_normal(
 ) -> NormalDensity:
     """The prior of θ, with its shapes checked."""
     p = theta.shape[0]
-
-    def as_vector(name, value):
-        structure, like = jax.tree.structure(parameters.params), jax.tree.leaves(parameters.params)
-        is_array = hasattr(value, "ndim")
-        alike = is_array and len(like) == 1 and value.shape == like[0].shape
-        if alike and (name == "mean" or value.shape != (p, p)):
-            value = jnp.ravel(value)
-        if jax.tree.structure(value) == structure and not is_array:
-            leaves = [as_floating(f"prior.{name}", leaf) for leaf in jax.tree.leaves(value)]
-            for leaf, known in zip(leaves, like, strict=True):
-                if leaf.shape not in ((), known.shape):
-                    raise ValueError(
-                        f"`prior.{name}` has a leaf of shape {leaf.shape} for parameters of shape "
-                        f"{known.shape}."
-                    )
-            full = [jnp.broadcast_to(a, b.shape) for a, b in zip(leaves, like, strict=True)]
-            value = parameters.vector(jax.tree.unflatten(structure, full))
-        return as_floating(f"prior.{name}", value).astype(theta.dtype)
-
-    mean, variance = as_vector("mean", prior.mean), as_vector("variance", prior.variance)
+    mean = _as_array("mean", prior.mean, parameters, theta)
+    variance = _as_array("variance", prior.variance, parameters, theta)
     if mean.shape not in ((), (p,)):
         raise ValueError(
             f"`prior.mean` must be a number, a vector of shape ({p},) or a pytree like the unknown "
@@ -114,6 +96,28 @@ def as_normal(
     return NormalDensity(jnp.broadcast_to(mean, (p,)), precision)
 
 
+def _as_array(
+    name: str, value: PyTree, parameters: Parameters, theta: Float[Array, " p"]
+) -> Float[Array, "..."]:
+    """What the user gave as an array, pytrees like the parameters as a vector."""
+    like, structure = jax.tree.flatten(parameters.params)
+    if hasattr(value, "ndim"):
+        is_matrix = name == "variance" and value.shape == (len(theta), len(theta))
+        if len(like) == 1 and value.shape == like[0].shape and not is_matrix:
+            value = jnp.ravel(value)
+    elif jax.tree.structure(value) == structure:
+        leaves = [as_floating(f"prior.{name}", leaf) for leaf in jax.tree.leaves(value)]
+        for leaf, known in zip(leaves, like, strict=True):
+            if leaf.shape not in ((), known.shape):
+                raise ValueError(
+                    f"`prior.{name}` has a leaf of shape {leaf.shape} for parameters of shape "
+                    f"{known.shape}."
+                )
+        full = [jnp.broadcast_to(a, b.shape) for a, b in zip(leaves, like, strict=True)]
+        value = parameters.vector(jax.tree.unflatten(structure, full))
+    return as_floating(f"prior.{name}", value).astype(theta.dtype)
+
+
 def as_log_prior(
     prior: Prior, parameters: Parameters, theta: Float[Array, " p"]
 ) -> NormalDensity | GivenDensity:
@@ -125,5 +129,4 @@ def as_log_prior(
             "`prior` must be a `NormalPrior`, or a function that maps the unknown parameters to "
             f"the log of a density; got {prior!r}."
         )
-
     return GivenDensity(parameters, prior)
