@@ -83,8 +83,8 @@ from .inference.maximum_likelihood import (
 )
 from .inference.pmmh import PMMHPosterior, PMMHState, pmmh
 from .inference.posterior import AbstractPosterior
+from .inference.priors import NormalPrior
 from .inference.score import Score, score
-from .inference.unknowns import NormalPrior
 from .models.diffusion import Diffusion
 from .models.gaussian_bridge import GaussianBridge, gaussian_bridge
 from .models.gaussian_law import GaussianLaw

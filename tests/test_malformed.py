@@ -8,7 +8,7 @@ import pytest
 from helpers import paper_model
 
 import jaxbridge as jb
-from jaxbridge.inference.observations import as_observations
+from jaxbridge.inference.data import as_observations
 
 KEY, A, B = jax.random.key(0), [0.0, 0.0], [1.0, 0.0]
 LAW = jb.GaussianLaw([0.0, 0.0], jnp.eye(2))

@@ -1,7 +1,7 @@
 """Bayesian inference by Gibbs sampling (section 4 of the paper, for any model).
 
 The path between the observations is part of the state: bridges of all intervals given θ and the
-data (`completion`), and θ given the whole path (`parameter_steps`), in turn. With exact bridges
+data (`augmentation`), and θ given the whole path (`parameter_kernels`), in turn. With exact bridges
 the posterior is exact up to the step error; with approximate ones, as in the paper, it is
 shifted by the error of the bridges.
 """
@@ -17,29 +17,29 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, nondifferentiable
+from ..engine.progress import as_meter
 from ..models.diffusion import Diffusion
 from ..proposals.auto import Budget
-from ..schemes.path_likelihood import Form
-from .completion import Completion, Paths, complete
-from .parameter_steps import (
+from .augmentation import Augmentation, augment
+from .data import as_problem
+from .parameter_kernels import (
     AbstractParameterKernel,
     CompleteData,
     NormalDraw,
     check_kernel,
     choose_kernel,
-    quadratic_form,
 )
-from .parts import target_forms
-from .posterior import AbstractPosterior
-from .problem import as_problem, first_chain, starting_points
-from .unknowns import (
-    Constraint,
-    GivenDensity,
-    NormalDensity,
-    Prior,
-    Unknowns,
-    as_log_prior,
+from .parameters import Constraint, Parameters, as_parameters
+from .posterior import (
+    AbstractPosterior,
+    drawn,
+    first_chain,
+    first_states,
+    over_chains,
+    starting_points,
+    summed,
 )
+from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 
 # Of about so many of the draws the step error is worked out.
 _STEP_ERRORS = 256
@@ -49,7 +49,7 @@ class GibbsState(NamedTuple):
     """Where a chain of `gibbs` is, with chains in a leading axis if there are several.
 
     - `theta`: θ, shape (p,).
-    - `paths`: those of all intervals, in parts of one number of steps.
+    - `paths`: those of all intervals, in blocks of one number of steps.
     - `found`: which of them the proposal has found, shape (I,), in the same order. The others are
         stand-ins, for a chain must start somewhere.
     """
@@ -60,13 +60,8 @@ class GibbsState(NamedTuple):
 
 
 class GibbsPosterior(AbstractPosterior):
-    """What `gibbs` returns: draws of the unknown parameters. Arrays have a leading axis of chains
-    if there are several.
+    """What `gibbs` returns: beside what every `AbstractPosterior` has,
 
-    - `params`: all parameters of the model, each with leading axes (*chains, n).
-    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
-    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
-        the keys are in alphabetical order.
     - `parameters_moved`: whether θ moved, shape (*chains, n).
     - `bridges_moved`: the share of bridges that were replaced, shape (*chains, n).
     - `num_simulated`: paths simulated or weighed, shape (*chains, n).
@@ -77,9 +72,7 @@ class GibbsPosterior(AbstractPosterior):
         that path. Where this does not go to zero choose another proposal for such intervals.
     - `num_truncated`: weights that `max_trials` cut off, shape (*chains, n): where there are many
         the law is not exact.
-    - `log_step_error`: an estimate of the step error of the log density of the completed data at
-        each draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
-        `step_error`, that of the posterior mean, is made of.
+    - `log_step_error`: that of the log density of the completed data, up to a constant.
     - `state`: where it ended; pass it as `init` to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.
@@ -95,7 +88,7 @@ class GibbsPosterior(AbstractPosterior):
     num_truncated: Int[Array, "*chains n"]
     log_step_error: Float[Array, "*chains n"]
     state: GibbsState
-    completion: Completion
+    completion: Augmentation
     exact_parameters: bool = eqx.field(static=True)
 
 
@@ -174,160 +167,107 @@ def gibbs(
     ```
     """
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
-    problem = as_problem(
-        key,
-        model,
-        times,
-        observations,
-        where,
-        num_steps,
-        step_size,
-        "use `pmmh`, which needs no path, or pick the others with `where=`.",
-    )
-    unknowns, like = problem.unknowns, problem.like
+    parameters = as_parameters(model, where, constraint)
+    problem = as_problem(key, parameters, times, observations, num_steps, step_size)
+    problem.check_sigma_known("use `pmmh`, which needs no path, or pick the others with `where=`.")
     check_kernel(parameter_kernel)
-    log_prior = as_log_prior(prior, unknowns, problem.theta)
-    theta, state = starting_points(problem, init, num_chains, constraint, log_prior, GibbsState)
-    complete_key, run_key = jax.random.split(key)
-    bounds = Budget(num_counts, max_proposals, max_trials)
-    arguments = (problem.intervals, problem.groups, proposal, bridges, method, bounds)
-    completion = complete(complete_key, problem.pilot_model(theta), *arguments)
-    forms = target_forms(completion.parts, model)
-    form = quadratic_form(unknowns, first_chain(theta), like, forms)
-    kernel = choose_kernel(parameter_kernel, form is not None, log_prior)
-    form = forms[0] if form is None else form
-    setting = _Setting(unknowns, completion, log_prior, constraint, kernel, form)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    log_prior = as_log_prior(prior, parameters, problem.theta)
+    theta, state = starting_points(problem, init, num_chains, log_prior, GibbsState)
+    augment_key, run_key = jax.random.split(key)
+    budget = Budget(num_counts, max_proposals, max_trials)
+    how = (proposal, bridges, method, budget)
+    augmentation = augment(augment_key, problem, first_chain(theta), *how)
+    kernel = choose_kernel(parameter_kernel, augmentation.is_quadratic, log_prior)
+    sampler = _Sampler(parameters, augmentation, log_prior, kernel)
+    meter = as_meter(progress_meter)
     if state is None:
-        state = _start(run_key, setting, theta)
+        state = first_states(sampler.start, run_key, theta)
     else:
-        completion.check_paths(state.paths, theta.shape[:-1])
-    return _run(run_key, setting, state, num_iterations, thin, meter)
+        augmentation.check_paths(state.paths, theta.shape[:-1])
+    return _run(run_key, sampler, state, num_iterations, thin, meter)
 
 
-class _Setting(eqx.Module):
-    """What does not change from iteration to iteration."""
+class GibbsInfo(NamedTuple):
+    """Counted in one iteration: θ's moves, bridges that were replaced, and as in the posterior."""
 
-    unknowns: Unknowns
-    completion: Completion
-    log_prior: NormalDensity | GivenDensity
-    constraint: Constraint | None = eqx.field(static=True)
-    kernel: AbstractParameterKernel
-    form: Form = eqx.field(static=True)
-
-    def data(self, paths: Paths) -> CompleteData:
-        return CompleteData(
-            self.unknowns, self.completion, paths, self.log_prior, self.constraint, self.form
-        )
-
-
-class _Sweep(NamedTuple):
-    """What is told of one iteration."""
-
-    parameters_moved: Bool[Array, "*chains"]
-    bridges_moved: Float[Array, "*chains"]
+    parameters_moved: Int[Array, "*chains"]
+    bridges_moved: Int[Array, "*chains"]
     num_simulated: Int[Array, "*chains"]
     num_missing: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
 
 
-@eqx.filter_jit
-def _start(key: Key[Array, ""], setting: _Setting, theta: Float[Array, "*chains p"]) -> GibbsState:
-    def first(key, theta):
-        model = nondifferentiable(setting.unknowns.at(theta))
-        return setting.completion.first_and_found(key, model)
+class _Sampler(eqx.Module):
+    """What does not change from iteration to iteration, and the steps of one chain."""
 
-    key = jax.random.fold_in(key, 0)
-    if theta.ndim == 1:
-        return GibbsState(theta, *first(key, theta))
-    return GibbsState(theta, *jax.vmap(first)(jax.random.split(key, len(theta)), theta))
+    parameters: Parameters
+    augmentation: Augmentation
+    log_prior: NormalDensity | GivenDensity
+    kernel: AbstractParameterKernel
 
+    def start(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> GibbsState:
+        model = nondifferentiable(self.parameters.bind(theta))
+        return GibbsState(theta, *self.augmentation.first(key, model))
 
-def _iterate(
-    key: Key[Array, ""], setting: _Setting, state: GibbsState
-) -> tuple[GibbsState, _Sweep]:
-    """Bridges given θ, then θ given bridges."""
-    bridge_key, parameter_key = jax.random.split(key)
-    model = setting.unknowns.at(state.theta)
-    paths, renewed = setting.completion.renew(bridge_key, model, state.paths)
-    found = state.found | renewed.moved
-    step = setting.kernel.step(parameter_key, state.theta, setting.data(paths))
-    sweep = _Sweep(
-        step.accepted,
-        jnp.mean(renewed.moved.astype(state.theta.dtype)),
-        jnp.sum(renewed.num_simulated, dtype=jnp.int32),
-        jnp.sum(renewed.missing | ~found, dtype=jnp.int32),
-        jnp.sum(renewed.truncated, dtype=jnp.int32),
-    )
-    return GibbsState(step.theta, paths, found), sweep
+    def step(self, key: Key[Array, ""], state: GibbsState) -> tuple[GibbsState, GibbsInfo]:
+        """Bridges given θ, then θ given bridges."""
+        bridge_key, parameter_key = jax.random.split(key)
+        model = self.parameters.bind(state.theta)
+        paths, bridges = self.augmentation.renew(bridge_key, model, state.paths)
+        found = state.found | bridges.moved
+        data = CompleteData(self.parameters, self.augmentation, paths, self.log_prior)
+        theta, accepted = self.kernel.step(parameter_key, state.theta, data)
+        counted = bridges._replace(missing=bridges.missing | ~found)
+        return GibbsState(theta, paths, found), GibbsInfo(accepted, *summed(counted))
+
+    def log_step_error(self, state: GibbsState) -> Float[Array, ""]:
+        model = self.parameters.bind(state.theta)
+        return self.augmentation.log_step_error(model, state.paths)
 
 
 @eqx.filter_jit
 def _run(
     key: Key[Array, ""],
-    setting: _Setting,
+    sampler: _Sampler,
     state: GibbsState,
     num_iterations: int,
     thin: int,
-    progress_meter: diffrax.AbstractProgressMeter,
+    meter: diffrax.AbstractProgressMeter,
 ) -> GibbsPosterior:
-    setting, state = nondifferentiable((setting, state))
-
-    def iterate(state, key):
-        if state.theta.ndim == 1:
-            return _iterate(key, setting, state)
-        keys = jax.random.split(key, len(state.theta))
-        return jax.vmap(lambda key, state: _iterate(key, setting, state))(keys, state)
-
+    sampler, state = nondifferentiable((sampler, state))
+    chains, dtype = state.theta.shape[:-1], state.theta.dtype
     # As many draws as tell a covariance, for D takes a good part of the time of an iteration.
     every = max(1, num_iterations // _STEP_ERRORS)
 
-    def step_error(state):
-        model = setting.unknowns.at(state.theta)
-        return setting.completion.log_step_error(model, state.paths, setting.form)
-
     def step_errors(i, state):
-        each = step_error if state.theta.ndim == 1 else jax.vmap(step_error)
-        unknown = jnp.full(state.theta.shape[:-1], jnp.nan, state.theta.dtype)
+        one = lambda state: sampler.log_step_error(state)  # `cond` hashes it
+        each = jax.vmap(one) if chains else one
+        unknown = jnp.full(chains, jnp.nan, dtype)
         return lax.cond(i % every == every - 1, each, lambda _: unknown, state)
 
-    def kept(carry, i):
-        state, meter = carry
+    def draw(carry, i):
+        state, progress = carry
         # Number 0 made the first paths.
         keys = jax.random.split(jax.random.fold_in(key, i + 1), thin)
-        state, sweeps = lax.scan(iterate, state, keys)
-        meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / num_iterations)
-        error = step_errors(i, state)
-        told = _Sweep(
-            jnp.any(sweeps.parameters_moved, axis=0),
-            jnp.mean(sweeps.bridges_moved, axis=0),
-            jnp.sum(sweeps.num_simulated, axis=0, dtype=jnp.int32),
-            jnp.sum(sweeps.num_missing, axis=0, dtype=jnp.int32),
-            jnp.sum(sweeps.num_truncated, axis=0, dtype=jnp.int32),
-        )
-        return (state, meter), (state.theta, told, error)
+        step = lambda state, key: over_chains(sampler.step, key, state)
+        state, infos = lax.scan(step, state, keys)
+        progress = meter.step(progress, (i + 1).astype(jnp.float32) / num_iterations)
+        return (state, progress), (state.theta, summed(infos), step_errors(i, state))
 
-    carry = (state, progress_meter.init())
-    (state, meter), (theta, told, error) = lax.scan(kept, carry, jnp.arange(num_iterations))
-    progress_meter.close(meter)
-    if theta.ndim == 3:
-        theta, told, error = jax.tree.map(
-            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, told, error)
-        )
-    as_params = jax.vmap(setting.unknowns.all)
-    params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
-    exact = isinstance(setting.kernel, NormalDraw)
+    carry, draws = lax.scan(draw, (state, meter.init()), jnp.arange(num_iterations))
+    state, progress = carry
+    meter.close(progress)
+    fields, (info, log_step_error) = drawn(sampler.parameters, *draws)
+    num_bridges = thin * sampler.augmentation.num_intervals
+    info = info._replace(
+        parameters_moved=info.parameters_moved > 0,
+        bridges_moved=info.bridges_moved.astype(dtype) / num_bridges,
+    )
     return GibbsPosterior(
-        params,
-        theta,
-        setting.unknowns.names,
-        told.parameters_moved,
-        told.bridges_moved,
-        told.num_simulated,
-        told.num_missing,
-        told.num_truncated,
-        error,
-        state,
-        setting.completion,
-        exact,
+        **fields,
+        **info._asdict(),
+        log_step_error=log_step_error,
+        state=state,
+        completion=sampler.augmentation,
+        exact_parameters=isinstance(sampler.kernel, NormalDraw),
     )

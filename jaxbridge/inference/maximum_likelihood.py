@@ -1,60 +1,46 @@
 """Maximum likelihood: by stochastic approximation over bridges, or of a simulated likelihood.
 
-Where σ is known, bridges are moved by their exact kernel at the current θ, once an iteration
-(Gu & Kong 1998), and θ by what the completed path says:
-
-* "gradient": a step of an optimiser along ∇ log f_θ(Z), whose mean over bridges is the score;
-  the estimate is the average of the second half of the iterates.
-* "em": with c and P of the expansion of log f at θ, cᵀθ - ½ θᵀPθ, averaged over iterations, θ
-  becomes P⁻¹c. For a drift that is linear in θ this is the EM algorithm with averaged
-  statistics (Delyon, Lavielle & Moulines 1999); in any case a fixed point has score zero.
-
-Then, at the estimate, `score` with independent bridges gives the observed information I, one step
-of Newton's method, θ + I⁻¹ ∇ log L(θ), and the Monte Carlo error that is left.
+Where σ is known, the search is by `stochastic_approximation` over bridges: with an optimiser it
+ends in the average of the second half of the iterates, by EM in the last. There `score` with
+independent bridges gives the observed information I, one step of Newton's method,
+θ + I⁻¹ ∇ log L(θ), and the Monte Carlo error that is left.
 
 Where σ depends on the unknown parameters paths are of no use, and the maximum is that of the
 likelihood by simulation (`simulated_likelihood`).
 """
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.checks import Numbers, check_count, nondifferentiable
-from ..engine.linalg import any_solve
+from ..engine.checks import Numbers, check_count
 from ..engine.pareto import is_reliable
+from ..engine.progress import as_meter
 from ..models.diffusion import Diffusion
 from ..proposals.auto import Budget
-from ..schemes.path_likelihood import Form
 from ..schemes.step_error import StepError, dominates
-from .completion import Completion, Paths, complete
-from .parameter_steps import CompleteData, quadratic_form
-from .parts import target_forms
-from .problem import Problem, as_problem
-from .score import Score, score
-from .simulated_likelihood import (
-    Lost,
-    as_pulled,
-    climb,
-    guarded,
-    pulled_parts,
-    sigma_is_unknown,
-    step_error_of_score,
-    wander,
-)
-from .unknowns import (
+from .augmentation import augment
+from .data import Problem, as_problem
+from .parameters import (
     Constraint,
-    Unknowns,
-    allowed,
-    check_allowed,
+    Parameters,
+    as_parameters,
 )
+from .score import Score, as_score, score_at
+from .simulated_likelihood import (
+    as_pulled,
+    newton_ascent,
+    pulled_blocks,
+    step_error_of_score,
+    stochastic_ascent,
+)
+from .stochastic_approximation import EM, Gradient, Search, SearchInfo, approximate
 
 # Made once, for optimisers are compared by identity.
 _ADAM = optax.adam(1e-2)
@@ -193,63 +179,85 @@ def maximum_likelihood(
         )
     if method == "em" and optimizer is not None:
         raise ValueError('`method="em"` takes no `optimizer`.')
-    problem = as_problem(key, model, times, observations, where, num_steps, step_size)
-    unknowns, theta = problem.unknowns, problem.theta
-    check_allowed(constraint, unknowns, theta)
+    parameters = as_parameters(model, where, constraint)
+    problem = as_problem(key, parameters, times, observations, num_steps, step_size)
+    parameters.check_allowed(problem.theta)
+    rule = EM() if method == "em" else Gradient(_ADAM if optimizer is None else optimizer)
+    meter = as_meter(progress_meter)
     proposal = "auto" if proposal is None else proposal
-    bounds = Budget(num_counts, max_proposals, max_trials)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    optimizer = _ADAM if optimizer is None else optimizer
-    if sigma_is_unknown(problem):
-        if method == "em":
-            raise ValueError(
-                "σ depends on the unknown parameters, and given a whole path σ is known, so that "
-                'EM would never leave it: use `method="gradient"`, or pick the other parameters '
-                "with `where=`."
-            )
-        proposal = as_pulled(proposal, model, problem.like, bounds)
-        search = (problem, proposal, constraint, optimizer, num_iterations, num_bridges, meter)
-        return _by_simulation(key, *search)
-    complete_key, run_key, score_key = jax.random.split(key, 3)
-    arguments = (problem.intervals, problem.groups, proposal, "exact", None, bounds)
-    completion = complete(complete_key, model, *arguments)
-    forms = target_forms(completion.parts, model)
-    form = quadratic_form(unknowns, theta, problem.like, forms) or forms[0]
-    rule = _EM() if method == "em" else _Gradient(optimizer)
-    setting = _Setting(unknowns, completion, constraint, rule, form)
-    iterates, lost = _approximate(run_key, setting, theta, num_iterations, meter)
-    rough = iterates[-1] if method == "em" else jnp.mean(iterates[num_iterations // 2 :], axis=0)
-    at_rough = score(
-        score_key,
-        unknowns.at(rough),
-        times,
-        observations,
-        num_bridges=num_bridges,
-        num_steps=num_steps,
-        step_size=step_size,
-        proposal=proposal,
-        where=where,
-        num_counts=num_counts,
-        max_proposals=max_proposals,
-        max_trials=max_trials,
-    )
-    covariance = jnp.linalg.inv(at_rough.information)
-    step = covariance @ at_rough.gradient
+    budget = Budget(num_counts, max_proposals, max_trials)
+    search = Search(rule, num_iterations, meter)
+    if not problem.sigma_is_unknown:
+        return _by_bridges(key, problem, proposal, budget, search, num_bridges)
+    if method == "em":
+        raise ValueError(
+            "σ depends on the unknown parameters, and given a whole path σ is known, so that "
+            'EM would never leave it: use `method="gradient"`, or pick the other parameters '
+            "with `where=`."
+        )
+    return _by_simulation(key, problem, proposal, budget, search, num_bridges)
+
+
+def _by_bridges(
+    key: Key[Array, ""],
+    problem: Problem,
+    proposal: Any,
+    budget: Budget,
+    search: Search,
+    num_bridges: int,
+) -> MaximumLikelihood:
+    """Stochastic approximation, and one step of Newton's method."""
+    parameters, theta = problem.parameters, problem.theta
+    augment_key, run_key, score_key = jax.random.split(key, 3)
+    augmentation = augment(augment_key, problem, theta, proposal, "exact", None, budget)
+    iterates, info = approximate(run_key, parameters, augmentation, search, theta)
+    rough = iterates[-1] if isinstance(search.rule, EM) else _mean_of_later(iterates)
+    meter = diffrax.NoProgressMeter()
+    at_rough = score_at(score_key, problem, rough, proposal, budget, num_bridges, meter)
+    step = jnp.linalg.inv(at_rough.information) @ at_rough.gradient
     definite = jnp.all(jnp.linalg.eigvalsh(at_rough.information) > 0)
     # Further off the likelihood need not be near its quadratic approximation.
     near = at_rough.gradient @ step < theta.shape[0]
-    newton = rough + step
-    ok = definite & near & allowed(constraint, unknowns, newton)
-    estimate = jnp.where(ok, newton, rough)
-    return _summary(unknowns, estimate, iterates, at_rough, lost, ok)
+    ok = definite & near & parameters.allowed(rough + step)
+    estimate = jnp.where(ok, rough + step, rough)
+    return _summary(parameters, estimate, iterates, at_rough, info, ok)
+
+
+def _by_simulation(
+    key: Key[Array, ""],
+    problem: Problem,
+    proposal: Any,
+    budget: Budget,
+    search: Search,
+    num_bridges: int,
+) -> MaximumLikelihood:
+    """The maximum of the simulated likelihood."""
+    parameters, theta = problem.parameters, problem.theta
+    proposal = as_pulled(proposal, parameters.model, problem.like, budget)
+    pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
+    blocks = pulled_blocks(pilot_key, parameters.bind(theta), problem, proposal)
+    iterates, info = stochastic_ascent(run_key, parameters, blocks, search, theta)
+    last = iterates[-1]
+    # What suits the data at the first θ need not do so at the last.
+    blocks = pulled_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
+    starts = jnp.stack([theta, last, _mean_of_later(iterates)])
+    maximum = newton_ascent(last_key, parameters, blocks, starts, num_bridges)
+    made = maximum.simulated
+    step_error = step_error_of_score(last_key, parameters, blocks, maximum, num_bridges)
+    at_maximum = as_score(parameters, made, step_error, made.num_missing, jnp.int32(0))
+    return _summary(parameters, maximum.theta, iterates, at_maximum, info, maximum.found)
+
+
+def _mean_of_later(iterates: Float[Array, "n p"]) -> Float[Array, " p"]:
+    return jnp.mean(iterates[len(iterates) // 2 :], axis=0)
 
 
 def _summary(
-    unknowns: Unknowns,
+    parameters: Parameters,
     estimate: Float[Array, " p"],
     iterates: Float[Array, "n p"],
     score: Score,
-    lost: Lost,
+    info: SearchInfo,
     ok: Bool[Array, ""],
 ) -> MaximumLikelihood:
     """The estimate with its errors, which are those of the score times the inverse information."""
@@ -258,10 +266,10 @@ def _summary(
     # Where the score is too large by this, so is its zero by that times the inverse information.
     step_doubt = jnp.sqrt(covariance**2 @ score.step_uncertainty**2)
     standard, monte_carlo = (
-        unknowns.pick(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
+        parameters.select(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
     )
     return MaximumLikelihood(
-        unknowns.all(estimate),
+        parameters.full(estimate),
         standard,
         monte_carlo,
         estimate,
@@ -270,129 +278,8 @@ def _summary(
         step_doubt,
         iterates,
         score,
-        lost.missing,
-        lost.truncated + score.num_truncated,
-        lost.refused,
+        info.missing,
+        info.truncated + score.num_truncated,
+        info.refused,
         ok,
     )
-
-
-def _by_simulation(
-    key: Key[Array, ""],
-    problem: Problem,
-    proposal: Any,
-    constraint: Constraint | None,
-    optimizer: optax.GradientTransformation,
-    num_iterations: int,
-    num_bridges: int,
-    meter: diffrax.AbstractProgressMeter,
-) -> MaximumLikelihood:
-    """The maximum of the simulated likelihood."""
-    unknowns, theta = problem.unknowns, problem.theta
-    pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
-    parts = pulled_parts(pilot_key, unknowns.at(theta), problem, proposal)
-    search = (unknowns, parts, constraint, optimizer, theta, num_iterations, meter)
-    iterates, lost = wander(run_key, *search)
-    last, mean = iterates[-1], jnp.mean(iterates[num_iterations // 2 :], axis=0)
-    # What suits the data at the first θ need not do so at the last.
-    parts = pulled_parts(last_pilot_key, unknowns.at(last), problem, proposal)
-    starts = jnp.stack([theta, last, mean])
-    maximum = climb(last_key, unknowns, parts, constraint, starts, num_bridges)
-    made = maximum.simulated
-    at_maximum = Score(
-        unknowns.pick(made.gradient),
-        unknowns.pick(jnp.sqrt(jnp.diagonal(made.covariance))),
-        made.gradient,
-        made.covariance,
-        made.information,
-        made.effective_sample_size,
-        made.pareto_k,
-        *step_error_of_score(last_key, unknowns, parts, maximum, num_bridges),
-        made.num_missing,
-        jnp.int32(0),
-    )
-    return _summary(unknowns, maximum.theta, iterates, at_maximum, lost, maximum.found)
-
-
-class _Gradient(eqx.Module):
-    """Steps of an optimiser."""
-
-    optimizer: optax.GradientTransformation = eqx.field(static=True)
-
-    def init(self, theta):
-        return self.optimizer.init(theta)
-
-    def update(self, i, theta, state, data: CompleteData, num_intervals):
-        gradient = jax.grad(data.log_likelihood)(theta) / num_intervals
-        updates, state = self.optimizer.update(-gradient, state, theta)
-        return theta + jnp.asarray(updates), state
-
-
-class _EM(eqx.Module):
-    """The maximum of the averaged expansions of the log likelihood; they are averaged over the
-    later half of the iterations so far, about."""
-
-    def init(self, theta):
-        return theta, jnp.zeros((*theta.shape, *theta.shape), theta.dtype)
-
-    def update(self, i, theta, state, data: CompleteData, num_intervals):
-        gradient = jax.grad(data.log_likelihood)(theta)
-        P = data.information(theta)
-        made = gradient + P @ theta, P
-        gain = jnp.minimum(1.0, 2.0 / (i + 1).astype(theta.dtype))
-        state = jax.tree.map(lambda old, new: old + gain * (new - old), state, made)
-        c, P = state
-        return any_solve(P, c), state
-
-
-class _Setting(eqx.Module):
-    """What does not change from iteration to iteration."""
-
-    unknowns: Unknowns
-    completion: Completion
-    constraint: Constraint | None = eqx.field(static=True)
-    rule: _Gradient | _EM
-    form: Form = eqx.field(static=True)
-
-
-class _State(NamedTuple):
-    theta: Float[Array, " p"]
-    paths: Paths
-    rule: PyTree
-    meter: Any
-
-
-@eqx.filter_jit
-def _approximate(
-    key: Key[Array, ""],
-    setting: _Setting,
-    theta: Float[Array, " p"],
-    num_iterations: int,
-    meter: diffrax.AbstractProgressMeter,
-) -> tuple[Float[Array, "n p"], Lost]:
-    """The iterates, and what was lost on the way."""
-    setting = nondifferentiable(setting)
-    unknowns, completion = setting.unknowns, setting.completion
-    first_key, run_key = jax.random.split(key)
-    num_intervals = completion.num_intervals
-
-    def iterate(state, i):
-        paths, renewed = completion.renew(
-            jax.random.fold_in(run_key, i), unknowns.at(state.theta), state.paths
-        )
-        data = CompleteData(
-            unknowns, completion, paths, jnp.zeros_like, setting.constraint, setting.form
-        )
-        moved, rule = setting.rule.update(i, state.theta, state.rule, data, num_intervals)
-        old = state.theta, state.rule
-        theta, rule, ok = guarded(setting.constraint, unknowns, old, (moved, rule))
-        progress = meter.step(state.meter, (i + 1).astype(jnp.float32) / num_iterations)
-        lost = Lost(renewed.missing, renewed.truncated, ~ok)
-        lost = jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)
-        return _State(theta, paths, rule, progress), (theta, lost)
-
-    first = completion.first(first_key, unknowns.at(theta))
-    state = _State(theta, first, setting.rule.init(theta), meter.init())
-    state, (iterates, lost) = lax.scan(iterate, state, jnp.arange(num_iterations))
-    meter.close(state.meter)
-    return iterates, jax.tree.map(lambda leaf: jnp.sum(leaf, dtype=jnp.int32), lost)

@@ -11,6 +11,7 @@ from the acceptance rates α_i (Vihola 2012), and fixed thereafter.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import diffrax
@@ -23,26 +24,25 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced, nondifferentiable
 from ..engine.linalg import any_cholesky, any_inverse
+from ..engine.progress import as_meter
 from ..exact.density import estimate_log_density
 from ..exact.kernels import acceptance_rate
-from ..models.bridge_problem import BridgeProblem
 from ..models.diffusion import Diffusion
 from ..proposals.auto import Budget
 from ..proposals.base import AbstractWeightedProposal
-from .parts import Part, make_parts, part_of
-from .posterior import AbstractPosterior
-from .problem import Problem, as_problem, starting_points
-from .unknowns import (
-    Constraint,
-    GivenDensity,
-    NormalDensity,
-    NormalPrior,
-    Prior,
-    Unknowns,
-    allowed,
-    as_log_prior,
-    as_normal,
+from .blocks import Block, block_of, make_blocks, with_keys
+from .data import Problem, as_problem
+from .parameters import Constraint, Parameters, as_parameters
+from .posterior import (
+    AbstractPosterior,
+    drawn,
+    first_chain,
+    first_states,
+    over_chains,
+    starting_points,
+    summed,
 )
+from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 
 # Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
 _TARGET = 0.2
@@ -80,13 +80,8 @@ class PMMHState(NamedTuple):
 
 
 class PMMHPosterior(AbstractPosterior):
-    """What `pmmh` returns: draws of the unknown parameters. Arrays have a leading axis of chains
-    if there are several.
+    """What `pmmh` returns: beside what every `AbstractPosterior` has,
 
-    - `params`: all parameters of the model, each with leading axes (*chains, n).
-    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
-    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
-        the keys are in alphabetical order.
     - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
     - `log_likelihood_variance`: the variance of these estimates given θ, the median over the draws,
         shape (*chains,): that of log p̂ by the delta method, summed over the intervals, which with
@@ -94,8 +89,7 @@ class PMMHPosterior(AbstractPosterior):
         than three, the chain holds on to lucky estimates and hardly moves: take as many times more
         `num_proposals`, or a better `proposal`; far below, fewer make iterations cheaper. Infinite
         where weights were cut off (`num_truncated`), and with one proposal.
-    - `log_step_error`: an estimate of the step error of each of these estimates, shape
-        (*chains, n): what `step_error`, that of the posterior mean, is made of.
+    - `log_step_error`: that of each of these estimates.
     - `accepted`: shape (*chains, n).
     - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
         parameters were refused because no estimate was to be had, shape (*chains,). With couplings
@@ -183,40 +177,36 @@ def pmmh(
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
     num_warmup = check_count("num_warmup", num_warmup, 0)
     num_proposals = check_count("num_proposals", num_proposals)
-    problem = as_problem(key, model, times, observations, where, num_steps, step_size)
-    unknowns = problem.unknowns
-    log_prior = as_log_prior(prior, unknowns, problem.theta)
-    root = _first_root(covariance, prior, unknowns, problem.theta)
-    theta, state = starting_points(problem, init, num_chains, constraint, log_prior, PMMHState)
+    parameters = as_parameters(model, where, constraint)
+    problem = as_problem(key, parameters, times, observations, num_steps, step_size)
+    log_prior = as_log_prior(prior, parameters, problem.theta)
+    root = _first_root(covariance, log_prior, problem.theta)
+    theta, state = starting_points(problem, init, num_chains, log_prior, PMMHState)
     if state is not None and covariance is not None:
         raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
     pilot_key, run_key = jax.random.split(key)
+    pilot_model = parameters.bind(first_chain(theta))
     if state is not None and isinstance(proposal, str) and proposal == "auto":
-        parts = _parts_of_state(state, problem)
+        blocks = _blocks_of_state(state, problem, pilot_model)
     else:
-        arguments = (
-            problem.intervals,
-            problem.groups,
-            proposal,
-            Budget(num_counts, None, max_trials),
-        )
-        parts = make_parts(pilot_key, problem.pilot_model(theta), *arguments, for_density=True)
-    setting = _Setting(unknowns, parts, log_prior, constraint, num_proposals)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    num_done = jnp.int32(0)
+        budget = Budget(num_counts, None, max_trials)
+        blocks = make_blocks(pilot_key, pilot_model, problem, proposal, budget, "density")
+    sampler = _Sampler(parameters, blocks, log_prior, num_proposals)
+    meter = as_meter(progress_meter)
     if state is None:
         root = jnp.broadcast_to(root, (*theta.shape[:-1], *root.shape))
-        chain = _start(run_key, setting, theta, root)
+        chain, num_done = first_states(sampler.start, run_key, (theta, root)), jnp.int32(0)
     else:
-        num_done = state.num_done
-        chain = _Chain(*state[: len(_Chain._fields)])
-    made, chain = _run(run_key, setting, chain, num_done, num_warmup, num_iterations, thin, meter)
-    num_done = num_done + num_warmup + num_iterations * thin
-    state = PMMHState(*chain, num_done, tuple(part.proposal for part in parts))
-    return PMMHPosterior(**made, state=state, names=unknowns.names)
+        chain, num_done = _Chain(*state[: len(_Chain._fields)]), state.num_done
+    size = (num_warmup, num_iterations, thin)
+    made = _run(run_key, sampler, chain, num_done, size, meter)
+    proposals = tuple(block.proposal for block in blocks)
+    return replace(made, state=made.state._replace(proposals=proposals))
 
 
-def _parts_of_state(state: PMMHState, problem: Problem) -> tuple[Part, ...]:
+def _blocks_of_state(
+    state: PMMHState, problem: Problem, pilot_model: Diffusion
+) -> tuple[Block, ...]:
     """The intervals with the proposals of earlier draws.
 
     **Raises:** `ValueError` where these were for other intervals.
@@ -228,47 +218,16 @@ def _parts_of_state(state: PMMHState, problem: Problem) -> tuple[Part, ...]:
             f"steps, but here they have {len(groups)}: go on with the same `times`, `num_steps` "
             "and `step_size`, or start anew from `init=` unknown parameters."
         )
-    model = problem.pilot_model(state.theta)
-    parts = []
     for group, proposal in zip(groups, state.proposals, strict=True):
-        part = part_of(problem.intervals, group, proposal)
-        proposal.check(model, part.intervals)
-        proposal.check_for_density(model)
-        parts.append(part)
-    return tuple(parts)
-
-
-class _Setting(eqx.Module):
-    """What does not change from iteration to iteration."""
-
-    unknowns: Unknowns
-    parts: tuple[Part, ...]
-    log_prior: NormalDensity | GivenDensity
-    constraint: Constraint | None = eqx.field(static=True)
-    num_proposals: int = eqx.field(static=True)
-
-    def estimate(
-        self, key: Key[Array, ""], theta: Float[Array, " p"]
-    ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Int[Array, ""]]:
-        """log of an unbiased estimate of the likelihood, -inf where there is none, with its
-        variance and its step error; and how many of its weights were cut off."""
-        model = self.unknowns.at(theta).prepared()
-        log_likelihood = variance = step_error = jnp.zeros((), theta.dtype)
-        num_truncated = jnp.int32(0)
-        for part_key, part in zip(jax.random.split(key, len(self.parts)), self.parts, strict=True):
-            problem = BridgeProblem(part.intervals, None, part.num_steps, True, True)
-            arguments = (model, part.proposal, problem, self.num_proposals)
-            made = estimate_log_density(part_key, *arguments)
-            log_likelihood += jnp.sum(made.value)
-            variance += jnp.sum(made.standard_error**2)
-            step_error += jnp.sum(made.step_error)
-            num_truncated += jnp.sum(made.num_truncated, dtype=jnp.int32)
-        log_likelihood = jnp.where(jnp.isnan(log_likelihood), -jnp.inf, log_likelihood)
-        return log_likelihood, variance, step_error, num_truncated
+        proposal.check(pilot_model, group.intervals)
+        proposal.check_for_density(pilot_model)
+    return tuple(map(block_of, groups, state.proposals))
 
 
 def _first_root(
-    covariance: Numbers | None, prior: Prior, unknowns: Unknowns, theta: Float[Array, " p"]
+    covariance: Numbers | None,
+    log_prior: NormalDensity | GivenDensity,
+    theta: Float[Array, " p"],
 ) -> Float[Array, "p p"]:
     p = theta.shape[0]
     if covariance is not None:
@@ -287,125 +246,136 @@ def _first_root(
                     f"{covariance}."
                 )
         return any_cholesky(matrix)
-    if isinstance(prior, NormalPrior):
-        variance = any_inverse(as_normal(prior, unknowns, theta).precision)
+    if isinstance(log_prior, NormalDensity):
+        variance = any_inverse(log_prior.precision)
         return 0.1 * jnp.diag(jnp.sqrt(jnp.diagonal(variance)))
     return 0.1 * jnp.diag(jnp.maximum(jnp.abs(theta), 0.1))
 
 
-@eqx.filter_jit
-def _start(key, setting: _Setting, theta, root) -> _Chain:
-    key = jax.random.fold_in(key, 0)
+class _Estimate(NamedTuple):
+    """log of an unbiased estimate of the likelihood, -inf where there is none, with its variance
+    and its step error; and how many of its weights were cut off."""
 
-    def estimate(key, theta):
-        return setting.estimate(key, theta)[:3]
-
-    if theta.ndim == 1:
-        return _Chain(theta, *estimate(key, theta), root)
-    keys = jax.random.split(key, len(theta))
-    return _Chain(theta, *jax.vmap(estimate)(keys, theta), root)
+    log_likelihood: Float[Array, ""]
+    variance: Float[Array, ""]
+    log_step_error: Float[Array, ""]
+    num_truncated: Int[Array, ""]
 
 
-class _Told(NamedTuple):
-    """Of one step: whether it was accepted, was refused because no estimate was to be had, and
-    how many weights of the estimate were cut off."""
+class PMMHInfo(NamedTuple):
+    """Counted in one step: whether it was accepted; was refused because no estimate was to be had;
+    and how many weights of the estimate were cut off."""
 
-    accepted: Bool[Array, "*chains"]
-    unknown: Int[Array, "*chains"]
+    accepted: Int[Array, "*chains"]
+    num_without_estimate: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
 
 
-def _iterate(key, setting: _Setting, state: _Chain, gain: Float[Array, ""]):
-    """One step, and what is told of it; S moves by `gain`."""
-    walk_key, estimate_key, accept_key = jax.random.split(key, 3)
-    noise = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
-    proposed = state.theta + state.root @ noise
-    inside = allowed(setting.constraint, setting.unknowns, proposed)
-    # Outside the constraint the model may not be simulated: θ stands in, and is refused.
-    proposed = jnp.where(inside, proposed, state.theta)
-    estimated, variance, step_error, num_truncated = setting.estimate(estimate_key, proposed)
-    new = jnp.where(inside, estimated + setting.log_prior(proposed), -jnp.inf)
-    rate = acceptance_rate(state.log_likelihood + setting.log_prior(state.theta), new)
-    accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
-    direction = noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6)
-    moved = state.root @ direction
-    change = gain * (jnp.where(jnp.isnan(rate), 0, rate) - _TARGET)
-    root = any_cholesky(state.root @ state.root.T + change * jnp.outer(moved, moved))
-    root = jnp.where((gain > 0) & jnp.all(jnp.isfinite(root)), root, state.root)
-    unknown = inside & (estimated == -jnp.inf)
-    state = _Chain(
-        jnp.where(accepted, proposed, state.theta),
-        jnp.where(accepted, estimated, state.log_likelihood),
-        jnp.where(accepted, variance, state.variance),
-        jnp.where(accepted, step_error, state.log_step_error),
-        root,
-    )
-    return state, _Told(accepted, unknown.astype(jnp.int32), num_truncated)
+class _Sampler(eqx.Module):
+    """What does not change from iteration to iteration, and the steps of one chain."""
+
+    parameters: Parameters
+    blocks: tuple[Block, ...]
+    log_prior: NormalDensity | GivenDensity
+    num_proposals: int = eqx.field(static=True)
+
+    def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> _Estimate:
+        model = self.parameters.bind(theta).prepared()
+        zero = jnp.zeros((), theta.dtype)
+        total = _Estimate(zero, zero, zero, jnp.int32(0))
+        for block_key, block in with_keys(key, self.blocks):
+            arguments = (model, block.proposal, block.problem, self.num_proposals)
+            made = estimate_log_density(block_key, *arguments)
+            mine = _Estimate(
+                jnp.sum(made.value),
+                jnp.sum(made.standard_error**2),
+                jnp.sum(made.step_error),
+                jnp.sum(made.num_truncated, dtype=jnp.int32),
+            )
+            total = jax.tree.map(jnp.add, total, mine)
+        known = ~jnp.isnan(total.log_likelihood)
+        return total._replace(log_likelihood=jnp.where(known, total.log_likelihood, -jnp.inf))
+
+    def start(
+        self, key: Key[Array, ""], start: tuple[Float[Array, " p"], Float[Array, "p p"]]
+    ) -> _Chain:
+        theta, root = start
+        return _Chain(theta, *self.estimate(key, theta)[:3], root)
+
+    def step(
+        self, key: Key[Array, ""], state: _Chain, gain: Float[Array, ""]
+    ) -> tuple[_Chain, PMMHInfo]:
+        """One step, in which S moves by `gain`."""
+        walk_key, estimate_key, accept_key = jax.random.split(key, 3)
+        noise = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
+        proposed = state.theta + state.root @ noise
+        inside = self.parameters.allowed(proposed)
+        # Outside the constraint the model may not be simulated: θ stands in, and is refused.
+        proposed = jnp.where(inside, proposed, state.theta)
+        made = self.estimate(estimate_key, proposed)
+        new = jnp.where(inside, made.log_likelihood + self.log_prior(proposed), -jnp.inf)
+        rate = acceptance_rate(state.log_likelihood + self.log_prior(state.theta), new)
+        accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
+        root = _adapted(state.root, noise, gain * (jnp.where(jnp.isnan(rate), 0, rate) - _TARGET))
+        root = jnp.where((gain > 0) & jnp.all(jnp.isfinite(root)), root, state.root)
+        moved = _Chain(proposed, *made[:3], root)
+        without = inside & (made.log_likelihood == -jnp.inf)
+        chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), moved, state)
+        return chain._replace(root=root), PMMHInfo(accepted, without, made.num_truncated)
+
+
+def _adapted(
+    root: Float[Array, "p p"], noise: Float[Array, " p"], change: Float[Array, ""]
+) -> Float[Array, "p p"]:
+    """S after one step of Vihola's."""
+    moved = root @ (noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6))
+    return any_cholesky(root @ root.T + change * jnp.outer(moved, moved))
 
 
 @eqx.filter_jit
 def _run(
     key: Key[Array, ""],
-    setting: _Setting,
-    state: _Chain,
+    sampler: _Sampler,
+    chain: _Chain,
     num_done: Int[Array, ""],
-    num_warmup: int,
-    num_iterations: int,
-    thin: int,
-    progress_meter: diffrax.AbstractProgressMeter,
-) -> tuple[dict[str, Any], _Chain]:
-    """The fields of the posterior, and where the chains are."""
-    setting, state = nondifferentiable((setting, state))
-    p, dtype = state.theta.shape[-1], state.theta.dtype
+    size: tuple[int, int, int],
+    meter: diffrax.AbstractProgressMeter,
+) -> PMMHPosterior:
+    """After so many iterations of the warm-up, so many draws, with so many iterations each."""
+    sampler, chain = nondifferentiable((sampler, chain))
+    p, dtype = chain.theta.shape[-1], chain.theta.dtype
+    num_warmup, num_iterations, thin = size
     total = num_warmup + num_iterations * thin
 
     def iterate(carry, i):
-        state, meter = carry
+        chain, progress = carry
         learning = jnp.minimum(1.0, p * (i + 1).astype(dtype) ** (-2 / 3))
         gain = jnp.where(i < num_warmup, learning, 0)
         mine = jax.random.fold_in(key, num_done + i + 1)  # number 0 made the first estimate
-        if state.theta.ndim == 1:
-            state, told = _iterate(mine, setting, state, gain)
-        else:
-            keys = jax.random.split(mine, len(state.theta))
-            state, told = jax.vmap(lambda key, state: _iterate(key, setting, state, gain))(
-                keys, state
-            )
-        meter = progress_meter.step(meter, (i + 1).astype(jnp.float32) / total)
-        return (state, meter), told
+        step = lambda key, chain: sampler.step(key, chain, gain)
+        chain, info = over_chains(step, mine, chain)
+        progress = meter.step(progress, (i + 1).astype(jnp.float32) / total)
+        return (chain, progress), info
 
-    def kept(carry, i):
-        steps = num_warmup + i * thin + jnp.arange(thin)
-        carry, told = lax.scan(iterate, carry, steps)
-        state, _ = carry
-        told = _add_up(told)._replace(accepted=jnp.any(told.accepted, axis=0))
-        held = (state.log_likelihood, state.variance, state.log_step_error)
-        return carry, (state.theta, *held, told)
+    def draw(carry, i):
+        carry, infos = lax.scan(iterate, carry, num_warmup + i * thin + jnp.arange(thin))
+        return carry, (carry[0]._replace(root=None), summed(infos))
 
-    carry = (state, progress_meter.init())
-    carry, lost = lax.scan(iterate, carry, jnp.arange(num_warmup))
-    (state, meter), made = lax.scan(kept, carry, jnp.arange(num_iterations))
-    theta, log_likelihood, variance, step_error, told = made
-    progress_meter.close(meter)
-    sums, accepted = jax.tree.map(jnp.add, _add_up(lost), _add_up(told)), told.accepted
-    if theta.ndim == 3:
-        theta, log_likelihood, step_error, accepted = jax.tree.map(
-            lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, log_likelihood, step_error, accepted)
-        )
-    as_params = jax.vmap(setting.unknowns.all)
-    params = (as_params if theta.ndim == 2 else jax.vmap(as_params))(theta)
-    fields = {
-        "params": params,
-        "theta": theta,
-        "log_likelihood": log_likelihood,
-        "log_likelihood_variance": jnp.median(variance, axis=0),
-        "log_step_error": step_error,
-        "accepted": accepted,
-        "num_without_estimate": sums.unknown,
-        "num_truncated": sums.num_truncated,
-    }
-    return fields, state
-
-
-def _add_up(told: _Told) -> _Told:
-    return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0, dtype=jnp.int32), told)
+    carry, warmup = lax.scan(iterate, (chain, meter.init()), jnp.arange(num_warmup))
+    (chain, progress), draws = lax.scan(draw, carry, jnp.arange(num_iterations))
+    meter.close(progress)
+    held, info = draws
+    counted = jax.tree.map(jnp.add, summed(warmup), summed(info))
+    others = (held.log_likelihood, held.log_step_error, info.accepted > 0)
+    fields, others = drawn(sampler.parameters, held.theta, *others)
+    log_likelihood, log_step_error, accepted = others
+    return PMMHPosterior(
+        **fields,
+        log_likelihood=log_likelihood,
+        log_likelihood_variance=jnp.median(held.variance, axis=0),
+        log_step_error=log_step_error,
+        accepted=accepted,
+        num_without_estimate=counted.num_without_estimate,
+        num_truncated=counted.num_truncated,
+        state=PMMHState(**chain._asdict(), num_done=num_done + total, proposals=()),
+    )

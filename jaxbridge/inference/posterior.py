@@ -1,21 +1,34 @@
 """Draws from a posterior, and how far to trust them."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from ..engine.checks import check_count, is_traced
 from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
 from ..schemes.step_error import StepError, dominates
+from .data import Problem
+from .parameters import Parameters, init_vectors
 
 # Of fewer draws a covariance tells nothing.
 _FEWEST = 10
 
 
 class AbstractPosterior(eqx.Module):
-    """Draws of unknown parameters; arrays have a leading axis of chains if there are several."""
+    """Draws of unknown parameters; arrays have a leading axis of chains if there are several.
+
+    - `params`: all parameters of the model, each with leading axes (*chains, n).
+    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
+        the keys are in alphabetical order.
+    - `log_step_error`: an estimate of the step error of the log density at each draw, NaN where
+        none was worked out, shape (*chains, n): what `step_error`, that of the posterior mean, is
+        made of.
+    """
 
     params: eqx.AbstractVar[PyTree]
     theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
@@ -95,3 +108,76 @@ class AbstractPosterior(eqx.Module):
         if int(arviz.__version__.split(".")[0]) >= 1:
             return arviz.from_dict({"posterior": posterior})
         return arviz.from_dict(posterior=posterior)
+
+
+def starting_points(
+    problem: Problem,
+    init: PyTree,
+    num_chains: int | None,
+    log_prior: Callable[[Array], Array],
+    state_type: type,
+) -> tuple[Float[Array, "*chains p"], Any]:
+    """θ of each chain, and the state to go on from, if `init` is one."""
+    parameters, theta = problem.parameters, problem.theta
+    chains = () if num_chains is None else (check_count("num_chains", num_chains),)
+    state = init if isinstance(init, state_type) else None
+    if state is not None:
+        p, theta = theta.shape[0], state.theta
+        if theta.shape[-1] != p:
+            raise ValueError(
+                f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are {p}."
+            )
+        if theta.shape[:-1] != chains and num_chains is not None:
+            raise ValueError(
+                f"`init` is a state of chains {theta.shape[:-1]}, but `num_chains` is {num_chains}."
+            )
+    elif init is not None:
+        theta = init_vectors(parameters, init, chains).astype(theta.dtype)
+    if theta.ndim == 1:
+        theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
+    parameters.check_allowed(theta)
+    for row in theta.reshape(-1, theta.shape[-1]):
+        if not is_traced(value := log_prior(row)) and not jnp.isfinite(value):
+            raise ValueError(
+                f"`prior` is {value} at the parameters to start from, {parameters.select(row)}: "
+                "start where its density is positive, by `init=`."
+            )
+    return theta, state
+
+
+def first_chain(theta: Float[Array, "*chains p"]) -> Float[Array, " p"]:
+    """θ of the first chain, at which proposals are chosen."""
+    return theta.reshape(-1, theta.shape[-1])[0]
+
+
+def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
+    """`function(key, state)` of each chain, with keys of their own if there are several; θ is the
+    first leaf of the state."""
+    theta = jax.tree.leaves(state)[0]
+    if theta.ndim == 1:
+        return function(key, state)
+    keys = jax.random.split(key, len(theta))
+    return jax.vmap(lambda *each: function(*each))(keys, state)
+
+
+@eqx.filter_jit
+def first_states(start: Callable, key: Key[Array, ""], state: PyTree) -> Any:
+    """The states that chains start from: key number 0 is theirs, and iterations have the others."""
+    return over_chains(start, jax.random.fold_in(key, 0), state)
+
+
+def drawn(
+    parameters: Parameters, theta: Float[Array, "n *chains p"], *others: PyTree
+) -> tuple[dict[str, Any], PyTree]:
+    """The fields of a posterior that θ makes, and what else was kept of each draw, with axes
+    (*chains, n) in front."""
+    full = jax.vmap(parameters.full)
+    if theta.ndim == 3:
+        full = jax.vmap(full)
+        theta, others = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, others))
+    return {"params": full(theta), "theta": theta, "names": parameters.names}, others
+
+
+def summed(infos: PyTree) -> PyTree:
+    """What was counted, over the first axis."""
+    return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0, dtype=jnp.int32), infos)

@@ -9,26 +9,27 @@ the latter by Louis (1982); both are sums over the intervals. Means are over wei
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..engine.pareto import pareto_k
+from ..engine.progress import as_meter
 from ..models.diffusion import Diffusion
 from ..proposals.auto import Budget
 from ..schemes.halving import num_looked
 from ..schemes.path_likelihood import Form, log_likelihoods
 from ..schemes.step_error import StepError, of_mean
-from .parts import Part, log_halvings, make_parts, step_shares, target_forms
-from .problem import as_problem
-from .unknowns import Unknowns
+from .blocks import Block, make_blocks, over_intervals, target_forms, with_keys
+from .data import Problem, as_problem
+from .parameters import Parameters, as_parameters
 
 # Bridges of all intervals that are made at a time.
 _PATHS = 8_192
@@ -105,118 +106,157 @@ def score(
     ```
     """
     num_bridges = check_count("num_bridges", num_bridges, 2)
-    problem = as_problem(
-        key,
-        model,
-        times,
-        observations,
-        where,
-        num_steps,
-        step_size,
+    parameters = as_parameters(model, where)
+    problem = as_problem(key, parameters, times, observations, num_steps, step_size)
+    problem.check_sigma_known(
         "differentiate `transition_log_density` with a proposal that is pulled to the end point, "
-        "or pick the others with `where=`.",
+        "or pick the others with `where=`."
     )
-    unknowns, theta = problem.unknowns, problem.theta
-    bounds = Budget(num_counts, max_proposals, max_trials)
-    arguments = (problem.intervals, problem.groups, proposal, bounds)
-    parts = make_parts(key, model, *arguments, moving=False)
-    form = target_forms(parts, model)[0]
-    keys = jax.random.split(key, len(parts))
+    meter = as_meter(progress_meter)
+    budget = Budget(num_counts, max_proposals, max_trials)
+    return score_at(key, problem, problem.theta, proposal, budget, num_bridges, meter)
+
+
+def score_at(
+    key: Key[Array, ""],
+    problem: Problem,
+    theta: Float[Array, " p"],
+    proposal: Any,
+    budget: Budget,
+    num_bridges: int,
+    meter: diffrax.AbstractProgressMeter,
+) -> Score:
+    """The score at any θ."""
+    model = problem.parameters.bind(theta)
+    blocks = make_blocks(key, model, problem, proposal, budget, "means")
+    form = target_forms(blocks, model)[0]
     made = [
-        _interval_moments(part_key, unknowns, theta, part, form, num_bridges, progress_meter)
-        for part_key, part in zip(keys, parts, strict=True)
+        _of_block(block_key, problem.parameters, theta, block, form, num_bridges, meter)
+        for block_key, block in with_keys(key, blocks)
     ]
-    moments, sizes, shapes, step_errors, truncated = zip(*made, strict=True)
-    gradient, covariance, information = jax.tree.map(lambda *parts: sum(parts), *moments)
-    order = jnp.argsort(jnp.concatenate([part.index for part in parts]))
-    size, shape = jnp.concatenate(sizes)[order], jnp.concatenate(shapes)[order]
-    step_error = sum(error.value for error in step_errors)
-    step_variance = sum(error.uncertainty**2 for error in step_errors)
-    error = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
+    sums = over_intervals(blocks, made)
+    step_error = StepError(sums.step_error, jnp.sqrt(sums.step_variance))
+    num_missing = jnp.sum(sums.effective_sample_size == 0, dtype=jnp.int32)
+    return as_score(problem.parameters, sums, step_error, num_missing, sums.num_truncated)
+
+
+def as_score(
+    parameters: Parameters,
+    sums: Any,
+    step_error: StepError,
+    num_missing: Int[Array, ""],
+    num_truncated: Int[Array, ""],
+) -> Score:
+    """Of sums over the intervals."""
+    error = jnp.sqrt(jnp.maximum(jnp.diagonal(sums.covariance), 0))
     return Score(
-        unknowns.pick(gradient),
-        unknowns.pick(error),
-        gradient,
-        covariance,
-        information,
-        size,
-        shape,
-        jnp.asarray(step_error),
-        jnp.sqrt(step_variance),
-        jnp.sum(size == 0, dtype=jnp.int32),
-        jnp.sum(jnp.stack(truncated), dtype=jnp.int32),
+        parameters.select(sums.gradient),
+        parameters.select(error),
+        sums.gradient,
+        sums.covariance,
+        sums.information,
+        sums.effective_sample_size,
+        sums.pareto_k,
+        *step_error,
+        num_missing,
+        num_truncated,
     )
+
+
+class _Sums(NamedTuple):
+    """Σ over intervals of the score, of the covariance of its error, and of the information; the
+    effective number of bridges of each, and k̂; the step error of the score, with the square of
+    its uncertainty; and how many weights were cut off."""
+
+    gradient: Float[Array, " p"]
+    covariance: Float[Array, "p p"]
+    information: Float[Array, "p p"]
+    effective_sample_size: Float[Array, " I"]
+    pareto_k: Float[Array, " I"]
+    step_error: Float[Array, " p"]
+    step_variance: Float[Array, " p"]
+    num_truncated: Int[Array, ""]
+
+
+class _Bridges(NamedTuple):
+    """n weighted bridges of each interval, with the derivatives of the log density of their paths;
+    and, of the first m, D of `halving` with its gradient."""
+
+    log_weights: Float[Array, "I n"]
+    truncated: Bool[Array, "I n"]
+    gradient: Float[Array, "I n p"]
+    hessian: Float[Array, "I n p p"]
+    log_halving: Float[Array, "I m"]
+    slope: Float[Array, "I m p"]
+
+
+def _draw(
+    key: Key[Array, ""],
+    parameters: Parameters,
+    theta: Float[Array, " p"],
+    model: Diffusion,
+    block: Block,
+    form: Form,
+    n: int,
+) -> _Bridges:
+    """Bridges of this model, prepared at θ."""
+    intervals, num_steps = block.intervals, block.num_steps
+    m = num_looked(n, model.forward(intervals.start[0]).sigma_varies)
+    keys = jax.random.split(key, (len(block.index), n))
+    drawn = block.proposal.draw(keys, model, intervals, num_steps, None, False)
+    start = intervals.start[:, None, None]
+    paths = jnp.where(drawn.found[..., None, None], drawn.paths, start)
+    steps = jnp.repeat(block.steps, n, axis=1)
+
+    def log_f(theta):
+        every = paths.reshape(-1, *paths.shape[2:])
+        return log_likelihoods(parameters.bind(theta), steps, every, form).reshape(-1, n)
+
+    def log_halving(theta):
+        some = paths[:, :m].reshape(-1, *paths.shape[2:])
+        return block.log_halvings(parameters.bind(theta).prepared(), some, form).reshape(-1, m)
+
+    gradient = jax.jacfwd(log_f)
+    derivatives = (gradient(theta), jax.jacfwd(gradient)(theta))
+    halvings = (log_halving(theta), jax.jacfwd(log_halving)(theta))
+    return _Bridges(drawn.log_weights, drawn.truncated, *derivatives, *halvings)
 
 
 @eqx.filter_jit
-def _interval_moments(
+def _of_block(
     key: Key[Array, ""],
-    unknowns: Unknowns,
+    parameters: Parameters,
     theta: Float[Array, " p"],
-    part: Part,
+    block: Block,
     form: Form,
     num_bridges: int,
-    progress_meter: diffrax.AbstractProgressMeter | None,
-) -> tuple[
-    tuple[Array, Array, Array], Float[Array, " I"], Float[Array, " I"], StepError, Int[Array, ""]
-]:
-    """Σ over intervals of the score, of the covariance of its error, and of the information; the
-    effective number of bridges of each, and k̂; the step error of the score; and how many weights
-    were cut off."""
-    unknowns, intervals = nondifferentiable((unknowns, part.intervals))
-    model = unknowns.at(theta).prepared()
-    num_intervals, num_steps = intervals.start.shape[0], part.num_steps
+    meter: diffrax.AbstractProgressMeter,
+) -> _Sums:
+    parameters, block = nondifferentiable((parameters, block))
+    model = parameters.bind(theta).prepared()
+    num_intervals = len(block.index)
     at_once = min(num_bridges, max(1, _PATHS // num_intervals))
     num_batches = -(-num_bridges // at_once)
-    varies = model.forward(intervals.start[0]).sigma_varies
-    num_some = num_looked(at_once, varies)
-    meter = diffrax.NoProgressMeter() if progress_meter is None else progress_meter
-    steps = jnp.repeat(part.steps, at_once, axis=1)
 
     def batch(state, i):
-        keys = jax.random.split(jax.random.fold_in(key, i), (num_intervals, at_once))
-        drawn = part.proposal.draw(keys, model, intervals, num_steps, None, False)
-        start = intervals.start[:, None, None]
-        paths = jnp.where(drawn.found[..., None, None], drawn.paths, start)
-        paths = paths.reshape(-1, *paths.shape[2:])
-
-        def log_f(theta):
-            return log_likelihoods(unknowns.at(theta), steps, paths, form)
-
-        gradient = jax.jacfwd(log_f)
-        g, H = (
-            derivative.reshape(num_intervals, at_once, *derivative.shape[1:])
-            for derivative in (gradient(theta), jax.jacfwd(gradient)(theta))
-        )
-        some = paths.reshape(num_intervals, at_once, *paths.shape[1:])[:, :num_some]
-        some = some.reshape(-1, *paths.shape[1:])
-
-        def log_halving(theta):
-            return log_halvings(part, unknowns.at(theta).prepared(), some, form, num_some)
-
-        D, slope = (
-            leaf.reshape(num_intervals, num_some, *leaf.shape[1:])
-            for leaf in (log_halving(theta), jax.jacfwd(log_halving)(theta))
-        )
-        state = meter.step(state, (i + 1).astype(jnp.float32) / num_batches)
-        return state, (drawn.log_weights, g, H, drawn.truncated, D, slope)
+        mine = jax.random.fold_in(key, i)
+        made = _draw(mine, parameters, theta, model, block, form, at_once)
+        return meter.step(state, (i + 1).astype(jnp.float32) / num_batches), made
 
     state, made = lax.scan(batch, meter.init(), jnp.arange(num_batches))
     meter.close(state)
 
-    def join(leaf):
-        leaf = jnp.moveaxis(leaf, 0, 1)
+    def join(leaf, number: int):
+        """The first so many of each batch, of all batches."""
+        leaf = jnp.moveaxis(leaf[:, :, :number], 0, 1)
         return leaf.reshape(num_intervals, -1, *leaf.shape[3:])
 
-    *made, D, slope = made
-    some_weights, some_g = (join(leaf[:, :, :num_some]) for leaf in made[:2])
-    share = step_shares(part, model, form)
-    halves = (some_g, some_g + join(slope))
-    error = of_mean(some_weights, join(D), share, *halves)
-    step_error = StepError(
-        jnp.sum(error.value, axis=0), jnp.sqrt(jnp.sum(error.uncertainty**2, axis=0))
-    )
-    log_weights, g, H, truncated = (join(leaf)[:, :num_bridges] for leaf in made)
+    m = made.log_halving.shape[2]
+    some = _Bridges(*(join(leaf, m) for leaf in made))
+    share = block.step_shares(model, form)
+    halves = (some.gradient, some.gradient + some.slope)
+    error = of_mean(some.log_weights, some.log_halving, share, *halves)
+    log_weights, truncated, g, H = (join(leaf, at_once)[:, :num_bridges] for leaf in made[:4])
     weights = normalised(log_weights)
     mean = jnp.sum(weights[..., None] * g, axis=1)
     deviation = g - mean[:, None]
@@ -227,7 +267,13 @@ def _interval_moments(
     spread = jnp.sum(weights[..., None, None] * products, axis=1) / less
     covariance = jnp.sum(weights[..., None, None] ** 2 * products, axis=1)
     information = -jnp.sum(weights[..., None, None] * H, axis=1) - spread
-    num_truncated = jnp.sum(truncated, dtype=jnp.int32)
-    moments = (mean.sum(axis=0), covariance.sum(axis=0), information.sum(axis=0))
-    shape = pareto_k(log_weights)
-    return moments, effective_size(weights), shape, step_error, num_truncated
+    return _Sums(
+        jnp.sum(mean, axis=0),
+        jnp.sum(covariance, axis=0),
+        jnp.sum(information, axis=0),
+        effective_size(weights),
+        pareto_k(log_weights),
+        jnp.sum(error.value, axis=0),
+        jnp.sum(error.uncertainty**2, axis=0),
+        jnp.sum(truncated, dtype=jnp.int32),
+    )

@@ -17,27 +17,27 @@ with Newton's steps at fixed noise. All derivatives are forward ones, so that me
 with the number of steps: that takes p² of them, for p unknown parameters.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
 from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
-from ..models.tracing import uses_argument
 from ..proposals.auto import Budget, as_proposal, choice_between, guided_candidates
+from ..proposals.base import AbstractProposal
 from ..schemes.step_error import StepError
-from .parts import Part, make_parts
-from .problem import Problem
-from .unknowns import Constraint, Unknowns, allowed
+from .blocks import Block, make_blocks, over_intervals, with_keys
+from .data import Problem
+from .parameters import Parameters
+from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 
 # Paths of each interval for a noisy gradient.
 _FEW = 8
@@ -78,20 +78,16 @@ class Maximum(NamedTuple):
     found: Bool[Array, ""]
 
 
-def sigma_is_unknown(problem: Problem) -> bool:
-    """Whether σ depends on the unknown parameters."""
-    unknowns, like = problem.unknowns, problem.like
-    return uses_argument(lambda theta: unknowns.at(theta).diffusion(like), problem.theta)
-
-
-def as_pulled(proposal: Any, model: Diffusion, like: Float[Array, " d"], bounds: Budget) -> Any:
+def as_pulled(
+    proposal: Any, model: Diffusion, like: Float[Array, " d"], budget: Budget
+) -> AbstractProposal:
     """The proposal that the user gave, "auto" without couplings.
 
     **Raises:** `ValueError` and `TypeError` for one whose weights have no derivatives.
     """
     if isinstance(proposal, str) and proposal == "auto":
         proposal = choice_between(guided_candidates(model, like))
-    given = as_proposal(proposal, model, like, bounds)
+    given = as_proposal(proposal, model, like, budget)
     if given.coupled:
         raise ValueError(
             "σ depends on the unknown parameters, and given a whole path σ is known: the "
@@ -102,47 +98,50 @@ def as_pulled(proposal: Any, model: Diffusion, like: Float[Array, " d"], bounds:
     return given
 
 
-def pulled_parts(
-    key: Key[Array, ""], model: Diffusion, problem: Problem, proposal: Any
-) -> tuple[Part, ...]:
-    """The parts with one proposal each, for a choice between several has no derivative: that
+def pulled_blocks(
+    key: Key[Array, ""], model: Diffusion, problem: Problem, proposal: AbstractProposal
+) -> tuple[Block, ...]:
+    """The blocks with one proposal each, for a choice between several has no derivative: that
     which leaves the least variance in all at this model, or, where the user has chosen interval by
-    interval, a part for each."""
-    groups, intervals = problem.groups, problem.intervals
-    parts = make_parts(key, model, intervals, groups, proposal, Budget())
+    interval, a block for each."""
+    blocks = make_blocks(key, model, problem, proposal, Budget(), "weights")
     if proposal.is_open:
-        return tuple(_decided(part) for part in parts)
-    return tuple(single for part in parts for single in _split(part))
+        return tuple(_decided(block) for block in blocks)
+    return tuple(single for block in blocks for single in _split(block))
 
 
-def _decided(part: Part) -> Part:
+def _decided(block: Block) -> Block:
     """One candidate for all intervals. The error of ℓ̂ is Σ 1/(effective paths) over them."""
-    if is_traced(part.proposal):
+    if is_traced(block.proposal):
         raise ValueError(
             '`proposal="auto"` decides by a pilot run, which cannot be looked at inside `jit`: '
             "name a proposal that is pulled to the end point, such as `Guided()`."
         )
-    return Part(part.intervals, part.index, part.fractions, part.proposal.for_all())
+    return replace(block, proposal=block.proposal.for_all())
 
 
-def _split(part: Part) -> tuple[Part, ...]:
-    """A part for each candidate that was chosen."""
+def _split(block: Block) -> list[Block]:
+    """A block for each candidate that was chosen."""
     made = []
-    for which, single in part.proposal.split():
-        mine = jax.tree.map(lambda leaf, which=which: leaf[which], part.intervals)
-        made.append(Part(mine, part.index[which], part.fractions, single))
-    return tuple(made)
+    for which, single in block.proposal.split():
+        mine = jax.tree.map(lambda leaf, which=which: leaf[which], block.intervals)
+        made.append(Block(mine, block.index[which], block.fractions, single))
+    return made
 
 
 def _log_weights(
-    key: Key[Array, ""], unknowns: Unknowns, part: Part, num_paths: int, theta: Float[Array, " p"]
+    key: Key[Array, ""],
+    parameters: Parameters,
+    block: Block,
+    num_paths: int,
+    theta: Float[Array, " p"],
 ) -> tuple[Float[Array, "I n"], Bool[Array, "I n"]]:
     """log w at θ of the paths with this noise, zero for those that were lost, or have no weight
     beside others, for where a path nearly overflows its derivatives do; and which are not."""
-    keys = jax.random.split(key, (part.intervals.start.shape[0], num_paths))
+    keys = jax.random.split(key, (block.intervals.start.shape[0], num_paths))
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
-    model = unknowns.at(theta).prepared()
-    drawn = part.proposal.draw(keys, model, part.intervals, part.num_steps, nothing, True)
+    model = parameters.bind(theta).prepared()
+    drawn = block.proposal.draw(keys, model, block.intervals, block.num_steps, nothing, True)
     largest = jnp.max(drawn.log_weights, axis=1, keepdims=True)
     found = drawn.found & (drawn.log_weights > largest + _NO_WEIGHT)
     return jnp.where(found, drawn.log_weights, 0), found
@@ -168,50 +167,47 @@ def _log_densities(
 
 def simulated(
     key: Key[Array, ""],
-    unknowns: Unknowns,
-    parts: tuple[Part, ...],
+    parameters: Parameters,
+    blocks: tuple[Block, ...],
     theta: Float[Array, " p"],
     num_paths: int,
 ) -> Simulated:
     """ℓ̂ at θ with the noise of this key, and all that is to be known of it."""
     made = [
-        _of_part(part_key, unknowns, part, theta, num_paths)
-        for part_key, part in zip(jax.random.split(key, len(parts)), parts, strict=True)
+        _of_block(block_key, parameters, block, theta, num_paths)
+        for block_key, block in with_keys(key, blocks)
     ]
-    sizes = jnp.concatenate([each.effective_sample_size for each in made])
-    shapes = jnp.concatenate([each.pareto_k for each in made])
-    order = jnp.argsort(jnp.concatenate([part.index for part in parts]))
-    sums = (each._replace(effective_sample_size=0, pareto_k=0) for each in made)
-    total = jax.tree.map(lambda *leaves: sum(leaves), *sums)
-    return total._replace(effective_sample_size=sizes[order], pareto_k=shapes[order])
+    return over_intervals(blocks, made)
 
 
 @eqx.filter_jit
 def step_error_of_score(
     key: Key[Array, ""],
-    unknowns: Unknowns,
-    parts: tuple[Part, ...],
+    parameters: Parameters,
+    blocks: tuple[Block, ...],
     maximum: Maximum,
     num_paths: int,
 ) -> StepError:
     """That of ∇ℓ̂ at the maximum, by as many paths of half as many steps; NaN where a path has one
     step only."""
-    unknowns, parts = nondifferentiable((unknowns, parts))
-    model = unknowns.at(maximum.theta)
+    parameters, blocks = nondifferentiable((parameters, blocks))
+    model = parameters.bind(maximum.theta)
     error, variance = jnp.zeros_like(maximum.theta), jnp.zeros_like(maximum.theta)
-    for part_key, part in zip(jax.random.split(key, len(parts)), parts, strict=True):
-        if part.num_steps < 2:
+    for block_key, block in with_keys(key, blocks):
+        if block.num_steps < 2:
             unknown = jnp.full_like(error, jnp.nan)
             return StepError(unknown, unknown)
-        fractions = jnp.asarray(np.diff(part.proposal.fractions(part.num_steps // 2)), error.dtype)
-        half = Part(part.intervals, part.index, fractions, part.proposal)
+        fractions = jnp.asarray(
+            np.diff(block.proposal.fractions(block.num_steps // 2)), error.dtype
+        )
+        half = replace(block, fractions=fractions)
         # Of all that are pulled each has one order for all intervals.
-        share = part.proposal.step_share(model, part.intervals)[0]
+        share = block.proposal.step_share(model, block.intervals)[0]
 
-        def difference(theta, key=part_key, part=part, half=half):
+        def difference(theta, key=block_key, block=block, half=half):
             values = (
-                jnp.sum(_log_densities(*_log_weights(key, unknowns, each, num_paths, theta)))
-                for each in (part, half)
+                jnp.sum(_log_densities(*_log_weights(key, parameters, each, num_paths, theta)))
+                for each in (block, half)
             )
             fine, coarse = values
             return coarse - fine
@@ -222,9 +218,11 @@ def step_error_of_score(
     return StepError(error, jnp.sqrt(variance * noise))
 
 
-def _of_part(key, unknowns, part: Part, theta: Float[Array, " p"], num_paths: int) -> Simulated:
+def _of_block(
+    key, parameters, block: Block, theta: Float[Array, " p"], num_paths: int
+) -> Simulated:
     def log_weights(theta):
-        made, found = _log_weights(key, unknowns, part, num_paths, theta)
+        made, found = _log_weights(key, parameters, block, num_paths, theta)
         return made, (made, found)
 
     def first(theta):
@@ -256,7 +254,9 @@ def _of_part(key, unknowns, part: Part, theta: Float[Array, " p"], num_paths: in
     )
 
 
-def ascent(gradient: Float[Array, " p"], information: Float[Array, "p p"]) -> Float[Array, " p"]:
+def ascent_direction(
+    gradient: Float[Array, " p"], information: Float[Array, "p p"]
+) -> Float[Array, " p"]:
     """Newton's step where ℓ̂ is concave; elsewhere that with curvatures of the other sign turned
     round, in units in which those along the axes are ±1: uphill in any case."""
     scale = jnp.sqrt(jnp.abs(jnp.diagonal(information)))
@@ -271,7 +271,7 @@ def ascent(gradient: Float[Array, " p"], information: Float[Array, "p p"]) -> Fl
     return axes @ ((axes.T @ (gradient / scale)) / curvature) / scale
 
 
-class _Climb(NamedTuple):
+class _Ascent(NamedTuple):
     """The best point so far, the step from there, and the fraction of it to be tried next."""
 
     i: Int[Array, ""]
@@ -283,11 +283,10 @@ class _Climb(NamedTuple):
 
 
 @eqx.filter_jit
-def climb(
+def newton_ascent(
     key: Key[Array, ""],
-    unknowns: Unknowns,
-    parts: tuple[Part, ...],
-    constraint: Constraint | None,
+    parameters: Parameters,
+    blocks: tuple[Block, ...],
     starts: Float[Array, "starts p"],
     num_paths: int,
 ) -> Maximum:
@@ -297,17 +296,17 @@ def climb(
     A step that leads down, out of the constraint, or to where more intervals have no path, is
     shortened.
     """
-    unknowns, parts, starts = nondifferentiable((unknowns, parts, starts))
+    parameters, blocks, starts = nondifferentiable((parameters, blocks, starts))
     at_start = len(starts)
 
     def at(theta):
-        return simulated(key, unknowns, parts, theta, num_paths)
+        return simulated(key, parameters, blocks, theta, num_paths)
 
     def next_point(state):
         start = starts[jnp.minimum(state.i, at_start - 1)]
         starting = state.i < at_start
         tried = jnp.where(starting, start, state.theta + state.fraction * state.step)
-        inside = allowed(constraint, unknowns, tried)
+        inside = parameters.allowed(tried)
         # Outside the constraint the model may not be simulated.
         made, old = at(jnp.where(inside, tried, starts[0])), state.simulated
         expected = jnp.where(starting, 0, 1e-4 * state.fraction * (old.gradient @ state.step))
@@ -318,14 +317,14 @@ def climb(
         theta, made = jax.tree.map(
             lambda new, old: jnp.where(better, new, old), (tried, made), (state.theta, old)
         )
-        step = ascent(made.gradient, made.information)
+        step = ascent_direction(made.gradient, made.information)
         gain = made.gradient @ step
         # A leap could end where weights are so uneven that ℓ̂ has maxima of its own.
         longest = _LONGEST / jnp.sqrt(jnp.maximum(gain, _LONGEST**2))
         fraction = jnp.where(better | starting, longest, state.fraction / 3).astype(theta.dtype)
         # The last point that was tried is better, or no shorter step would do.
         done = (state.i + 1 >= at_start) & ((gain < _GAIN) | (fraction < _SHORTEST * longest))
-        return _Climb(state.i + 1, theta, made, step, fraction, done)
+        return _Ascent(state.i + 1, theta, made, step, fraction, done)
 
     nowhere = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(at, starts[0])
@@ -335,7 +334,7 @@ def climb(
         value=jnp.full_like(nowhere.value, -jnp.inf), num_missing=num_intervals
     )
     one, no = jnp.ones_like(starts[0, 0]), jnp.array(False)
-    first = _Climb(jnp.int32(0), starts[0], nowhere, jnp.zeros_like(starts[0]), one, no)
+    first = _Ascent(jnp.int32(0), starts[0], nowhere, jnp.zeros_like(starts[0]), one, no)
     last = lax.while_loop(lambda state: ~state.done & (state.i < _MOST_POINTS), next_point, first)
     made = last.simulated
     # Positive definite, and by far: where weights are very uneven ℓ̂ has maxima of its own.
@@ -345,64 +344,32 @@ def climb(
     return Maximum(last.theta, made, found)
 
 
-class Lost(NamedTuple):
-    """Bridges that were not found, weights that were cut off, and steps that were not made."""
-
-    missing: Shaped[Array, "..."]
-    truncated: Shaped[Array, "..."]
-    refused: Shaped[Array, "..."]
-
-
-def guarded(
-    constraint: Constraint | None,
-    unknowns: Unknowns,
-    old: tuple[Float[Array, " p"], PyTree],
-    new: tuple[Float[Array, " p"], PyTree],
-) -> tuple[Float[Array, " p"], PyTree, Bool[Array, ""]]:
-    """θ and the state of an optimiser after a step, or as they were where it leads out of the
-    constraint or to what is not finite; and whether it was made."""
-    finite = all_finite_leaves(new[1])
-    ok = allowed(constraint, unknowns, new[0]) & finite
-    theta = jnp.where(ok, new[0], old[0])
-    # What an optimiser remembers must not be spoilt for all steps to come.
-    rule = jax.tree.map(lambda new, old: jnp.where(finite, new, old), new[1], old[1])
-    return theta, rule, ok
-
-
 @eqx.filter_jit
-def wander(
+def stochastic_ascent(
     key: Key[Array, ""],
-    unknowns: Unknowns,
-    parts: tuple[Part, ...],
-    constraint: Constraint | None,
-    optimizer: optax.GradientTransformation,
+    parameters: Parameters,
+    blocks: tuple[Block, ...],
+    search: Search,
     theta: Float[Array, " p"],
-    num_iterations: int,
-    meter: diffrax.AbstractProgressMeter,
-) -> tuple[Float[Array, "n p"], Lost]:
+) -> tuple[Float[Array, "n p"], SearchInfo]:
     """The optimiser's iterates along ∇ℓ̂ with new noise in each, and what was lost on the way."""
-    unknowns, parts, theta = nondifferentiable((unknowns, parts, theta))
-    num_intervals = sum(part.intervals.start.shape[0] for part in parts)
+    rule = search.rule
+    assert isinstance(rule, Gradient)
+    parameters, blocks, theta = nondifferentiable((parameters, blocks, theta))
+    num_intervals = sum(len(block.index) for block in blocks)
 
-    def loss(theta, key):
+    def mean_log_likelihood(theta, key):
         value, missing = jnp.zeros((), theta.dtype), jnp.int32(0)
-        for part_key, part in zip(jax.random.split(key, len(parts)), parts, strict=True):
-            made, found = _log_weights(part_key, unknowns, part, _FEW, theta)
+        for block_key, block in with_keys(key, blocks):
+            made, found = _log_weights(block_key, parameters, block, _FEW, theta)
             value += jnp.sum(_log_densities(made, found))
             missing += jnp.sum(~jnp.any(found, axis=1), dtype=jnp.int32)
-        return -value / num_intervals, missing
+        return value / num_intervals, missing
 
-    def iterate(state, i):
-        theta, rule, progress = state
-        gradient, missing = jax.jacfwd(loss, has_aux=True)(theta, jax.random.fold_in(key, i))
-        updates, moved = optimizer.update(gradient, rule, theta)
-        new = theta + jnp.asarray(updates), moved
-        theta, rule, ok = guarded(constraint, unknowns, (theta, rule), new)
-        progress = meter.step(progress, (i + 1).astype(jnp.float32) / num_iterations)
-        return (theta, rule, progress), (theta, missing, ~ok)
+    def propose(i, theta, memory, _):
+        gradient, missing = jax.jacfwd(mean_log_likelihood, has_aux=True)(
+            theta, jax.random.fold_in(key, i)
+        )
+        return rule.ascend(theta, memory, gradient), None, (missing, jnp.int32(0))
 
-    state = theta, optimizer.init(theta), meter.init()
-    state, (iterates, missing, refused) = lax.scan(iterate, state, jnp.arange(num_iterations))
-    meter.close(state[2])
-    missing, refused = (jnp.sum(leaf, dtype=jnp.int32) for leaf in (missing, refused))
-    return iterates, Lost(missing, jnp.int32(0), refused)
+    return iterate(propose, parameters, search, theta, None)

@@ -7,7 +7,8 @@ import pytest
 from inference_oracles import grid_moments, multivariate_ou, ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
-from jaxbridge.inference.unknowns import as_normal, as_unknowns
+from jaxbridge.inference.parameters import as_parameters, theta_of_model
+from jaxbridge.inference.priors import as_normal
 
 TIMES = np.concatenate([np.arange(0, 10, 0.5), np.arange(10, 20, 1.0)])
 DATA = ou_data(3, TIMES)
@@ -163,11 +164,11 @@ def test_intervals_of_many_lengths():
         step_size=0.1,
         **OPTIONS,
     )
-    steps = {part.num_steps for part in made.completion.parts}
+    steps = {block.num_steps for block in made.completion.blocks}
     assert len(steps) == 3 and max(steps) == 40
     durations = np.diff(times)
-    for part in made.completion.parts:
-        assert (durations[np.asarray(part.index)] / part.num_steps < 0.1001).all()
+    for block in made.completion.blocks:
+        assert (durations[np.asarray(block.index)] / block.num_steps < 0.1001).all()
 
 
 @pytest.mark.slow
@@ -381,9 +382,10 @@ def test_other_types_are_refused(unchecked):
 
 def test_a_prior_may_have_the_shape_of_the_parameters():
     model = multivariate_ou()[0]
-    unknowns, theta = as_unknowns(model, lambda p: p.B, jnp.zeros(2))
+    parameters = as_parameters(model, lambda p: p.B)
+    theta = theta_of_model(parameters, jnp.dtype("float32"))
     variance = jnp.array([[1.0, 2.0], [3.0, 4.0]])
-    prior = as_normal(jb.NormalPrior(jnp.eye(2), variance), unknowns, theta)
+    prior = as_normal(jb.NormalPrior(jnp.eye(2), variance), parameters, theta)
     np.testing.assert_allclose(prior.mean, [1, 0, 0, 1])
     np.testing.assert_allclose(prior.precision @ np.diag([1.0, 2.0, 3.0, 4.0]), np.eye(4))
 

@@ -7,7 +7,7 @@ import pytest
 from inference_oracles import ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
-from jaxbridge.inference.unknowns import Unknowns
+from jaxbridge.inference.parameters import Parameters
 
 TIMES = np.arange(0, 12, 0.5)
 DATA = ou_data(7, TIMES, rate=0.8, sigma=0.7)
@@ -143,15 +143,15 @@ def test_unknown_parameters_have_names():
         lambda x, p: p["noise"][0],
         params={"rate": 1.0, "noise": jnp.ones(2), "count": jnp.arange(2)},
     )
-    assert Unknowns(model, None).names == ("noise[0]", "noise[1]", "rate")
-    assert Unknowns(model, lambda p: p["rate"]).names == ("rate",)
+    assert Parameters(model, None).names == ("noise[0]", "noise[1]", "rate")
+    assert Parameters(model, lambda p: p["rate"]).names == ("rate",)
     ou = jb.ornstein_uhlenbeck(jnp.eye(2), sigma=jnp.eye(2))
-    names = Unknowns(ou, lambda p: (p.sigma, p.B)).names
+    names = Parameters(ou, lambda p: (p.sigma, p.B)).names
     assert names == tuple(f"{n}[{i},{j}]" for n in ("sigma", "B") for i in (0, 1) for j in (0, 1))
-    assert Unknowns(jb.Diffusion(lambda x, p: -p * x, params=1.0), None).names == ("theta",)
+    assert Parameters(jb.Diffusion(lambda x, p: -p * x, params=1.0), None).names == ("theta",)
     # In the order of the vector.
-    unknowns = Unknowns(model, None)
-    picked = unknowns.pick(jnp.array([1.0, 2.0, 3.0]))
+    parameters = Parameters(model, None)
+    picked = parameters.select(jnp.array([1.0, 2.0, 3.0]))
     assert picked["rate"] == 3 and list(picked["noise"]) == [1, 2]
 
 

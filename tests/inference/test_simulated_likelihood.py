@@ -12,7 +12,8 @@ from scipy import optimize, stats
 
 import jaxbridge as jb
 from jaxbridge.inference import simulated_likelihood
-from jaxbridge.inference.problem import as_problem
+from jaxbridge.inference.data import as_problem
+from jaxbridge.inference.parameters import as_parameters
 from jaxbridge.proposals.auto import choice_between, guided_candidates
 
 POSITIVE = lambda params: jnp.all(jnp.stack(params) > 0)
@@ -90,9 +91,9 @@ def test_monte_carlo_errors_and_bias():
     """With few paths, over many keys: the errors are as large as is said, and there is less bias
     than without a correction."""
     times, data, exact, sd = ou_problem()
-    unknowns, parts, theta = few(times, data, 20, ou_1d())
+    parameters, blocks, theta = few(times, data, 20, ou_1d())
     made = [
-        simulated_likelihood.climb(key, unknowns, parts, POSITIVE, theta[None], 6)
+        simulated_likelihood.newton_ascent(key, parameters, blocks, theta[None], 6)
         for key in jax.random.split(jax.random.key(0), 60)
     ]
     assert all(bool(each.found) for each in made)
@@ -109,11 +110,12 @@ def test_monte_carlo_errors_and_bias():
 
 
 def few(times, data, num_steps, model):
-    """The unknown parameters, parts and θ, as the search has them."""
+    """The unknown parameters, blocks and θ, as the search has them."""
     key = jax.random.key(0)
-    problem = as_problem(key, model, times, data, None, num_steps, None)
-    parts = simulated_likelihood.pulled_parts(key, model, problem, BRIDGE)
-    return problem.unknowns, parts, problem.theta
+    parameters = as_parameters(model, None, POSITIVE)
+    problem = as_problem(key, parameters, times, data, num_steps, None)
+    blocks = simulated_likelihood.pulled_blocks(key, model, problem, BRIDGE)
+    return parameters, blocks, problem.theta
 
 
 @pytest.mark.slow
@@ -148,11 +150,11 @@ def test_noise_that_varies_with_the_state():
 
 def test_derivatives_are_those_of_the_value(x64):
     times, data, *_ = ou_problem()
-    unknowns, parts, theta = few(times[:5], data[:5], 5, ou_1d(4.0))
+    parameters, blocks, theta = few(times[:5], data[:5], 5, ou_1d(4.0))
 
     @jax.jit
     def at(theta):
-        return simulated_likelihood.simulated(jax.random.key(1), unknowns, parts, theta, 4)
+        return simulated_likelihood.simulated(jax.random.key(1), parameters, blocks, theta, 4)
 
     h = 1e-5
     beside = [(at(theta + h * axis), at(theta - h * axis)) for axis in jnp.eye(2)]
@@ -182,10 +184,10 @@ def test_lost_paths_have_no_weight_and_no_derivative():
 def test_steps_lead_uphill_whatever_the_curvature():
     gradient = jnp.array([1.0, -2.0])
     definite = jnp.array([[2.0, 0.3], [0.3, 400.0]])
-    step = simulated_likelihood.ascent(gradient, definite)
+    step = simulated_likelihood.ascent_direction(gradient, definite)
     np.testing.assert_allclose(step, np.linalg.solve(definite, gradient), rtol=1e-4)
     for information in (-definite, jnp.diag(jnp.array([3.0, -1.0])), jnp.zeros((2, 2))):
-        assert gradient @ simulated_likelihood.ascent(gradient, information) > 0
+        assert gradient @ simulated_likelihood.ascent_direction(gradient, information) > 0
 
 
 def test_a_maximum_that_is_not_allowed_is_not_found():
@@ -222,17 +224,17 @@ def test_a_choice_is_made_once_or_kept(unchecked):
     has made is kept."""
     times, data, *_ = ou_problem()
     model, key = ou_1d(), jax.random.key(0)
-    problem = as_problem(key, model, times[:5], data[:5], None, 5, None)
+    problem = as_problem(key, as_parameters(model, None), times[:5], data[:5], 5, None)
     auto = simulated_likelihood.as_pulled("auto", model, problem.like, (None, None, None))
-    (part,) = simulated_likelihood.pulled_parts(key, model, problem, auto)
-    assert isinstance(part.proposal, jb.Guided | jb.ModifiedDiffusionBridge)
+    (block,) = simulated_likelihood.pulled_blocks(key, model, problem, auto)
+    assert isinstance(block.proposal, jb.Guided | jb.ModifiedDiffusionBridge)
     candidates = guided_candidates(model, problem.like)
     made = jb.choose_proposal(
         key, model, *problem.intervals, candidates=candidates, num_steps=5, num_pilot=32
     )
-    parts = simulated_likelihood.pulled_parts(key, model, problem, made)
-    assert len(parts) == len(made.used)
-    for part in parts:
-        for i in part.index.tolist():
-            assert part.proposal is made.candidates[int(made.chosen[i])]
-    assert sorted(i for part in parts for i in part.index.tolist()) == [0, 1, 2, 3]
+    blocks = simulated_likelihood.pulled_blocks(key, model, problem, made)
+    assert len(blocks) == len(made.used)
+    for block in blocks:
+        for i in block.index.tolist():
+            assert block.proposal is made.candidates[int(made.chosen[i])]
+    assert sorted(i for block in blocks for i in block.index.tolist()) == [0, 1, 2, 3]

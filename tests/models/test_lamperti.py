@@ -8,7 +8,8 @@ from helpers import count_compilations
 from test_transform import MEAN, NOISE, RATE, cir, cir_density
 
 import jaxbridge as jb
-from jaxbridge.inference.problem import as_problem
+from jaxbridge.inference.data import as_problem
+from jaxbridge.inference.parameters import as_parameters
 
 AT = 0.5
 
@@ -170,11 +171,12 @@ def test_unknown_parameters_of_the_drift_are_not_refused():
         (further, forward(points)),
         (prepared.model, prepared.forward(OBSERVATIONS)),
     ]:
-        arguments = (jax.random.key(0), model, TIMES, data)
-        problem = as_problem(*arguments, lambda p: p[0], 4, None, "")
+        arguments = (TIMES, data, 4, None)
+        problem = as_problem(jax.random.key(0), as_parameters(model, lambda p: p[0]), *arguments)
+        problem.check_sigma_known("")
         assert problem.theta.shape == (1,)
         with pytest.raises(ValueError, match="coordinates of `lamperti` depend"):
-            as_problem(*arguments, lambda p: p[1:], 4, None, "")
+            as_problem(jax.random.key(0), as_parameters(model, lambda p: p[1:]), *arguments)
 
 
 @pytest.mark.slow

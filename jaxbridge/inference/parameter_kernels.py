@@ -5,8 +5,7 @@ normal, θ given the paths is normal, and is drawn:
 
     N(θ_0 + P⁻¹ g, P⁻¹),    g = ∇(ℓ + log π)(θ_0),    P = -∇²(ℓ + log π),
 
-by autodiff, at any θ_0; drawn again until it satisfies the constraint. Whether it is quadratic is
-read off the program that computes the Hessian: there θ does not occur.
+by autodiff, at any θ_0; drawn again until it satisfies the constraint.
 
 Otherwise by Metropolis–Hastings with normal proposals that would be exact for a quadratic,
 
@@ -17,7 +16,7 @@ With τ = 1 and constant G this is the draw above, always accepted.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -28,10 +27,9 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..engine.lanes import over_lanes
 from ..engine.linalg import any_cholesky, any_solve, dot, matvec
-from ..models.tracing import uses_argument
-from ..schemes.path_likelihood import Form, log_likelihoods
-from .completion import Completion, Paths
-from .unknowns import Constraint, NormalDensity, Unknowns, allowed
+from .augmentation import Augmentation, Paths
+from .parameters import Parameters
+from .priors import NormalDensity
 
 # Draws from a normal law until one satisfies the constraint: if none does, θ stays, which leaves
 # the law invariant too.
@@ -48,18 +46,15 @@ class ParameterStep(NamedTuple):
 
 
 class CompleteData(NamedTuple):
-    """What a step of θ is made from: the completed observations, and the prior."""
+    """What a step of θ is made from: the augmented observations, and the prior."""
 
-    unknowns: Unknowns
-    completion: Completion
+    parameters: Parameters
+    augmentation: Augmentation
     paths: Paths
     log_prior: Callable[[Array], Array]
-    constraint: Constraint | None
-    form: Form
 
     def log_likelihood(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
-        model = self.unknowns.at(theta)
-        return jnp.sum(self.completion.log_likelihoods(model, self.paths, self.form))
+        return self.augmentation.log_likelihood(self.parameters.bind(theta), self.paths)
 
     def log_posterior_inside(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
         """log of likelihood times prior, as if there were no constraint."""
@@ -67,16 +62,16 @@ class CompleteData(NamedTuple):
 
     def log_posterior(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
         """-inf where the constraint is not satisfied."""
-        inside = allowed(self.constraint, self.unknowns, theta)
+        inside = self.parameters.allowed(theta)
         return jnp.where(inside, self.log_posterior_inside(theta), -jnp.inf)
 
     def information(self, theta: Float[Array, " p"]) -> Float[Array, "p p"]:
         """G(θ), with the prior's precision where it is normal."""
-        points, steps = self.completion.points(self.paths)
+        points, steps = self.augmentation.points(self.paths)
 
         def of_point(x, dt):
             def beta(theta):
-                dynamics = self.unknowns.at(theta).prepared().forward(x)
+                dynamics = self.parameters.bind(theta).prepared().forward(x)
                 return dynamics.sigma(x).solve(dynamics.drift(x))
 
             J = jax.jacfwd(beta)(theta)
@@ -86,24 +81,6 @@ class CompleteData(NamedTuple):
         if isinstance(self.log_prior, NormalDensity):
             G = G + self.log_prior.precision
         return G
-
-
-def quadratic_form(
-    unknowns: Unknowns,
-    theta: Float[Array, " p"],
-    like: Float[Array, " d"],
-    forms: Sequence[Form],
-) -> Form | None:
-    """The first of these forms in which the log likelihood is quadratic in θ, if there is one."""
-    steps, paths = jnp.ones((1, 1), like.dtype), jnp.stack([like, like])[None]
-    for form in forms:
-
-        def log_likelihood(theta, form: Form = form):
-            return log_likelihoods(unknowns.at(theta), steps, paths, form)[0]
-
-        if not uses_argument(jax.jacfwd(jax.jacfwd(log_likelihood)), theta):
-            return form
-    return None
 
 
 class AbstractParameterKernel(eqx.Module):
@@ -120,14 +97,16 @@ class NormalDraw(AbstractParameterKernel):
     """θ from its normal law given the paths."""
 
     def step(self, key, theta, data):
-        gradient, root = _gradient_and_root(data, theta)
-        mean = theta + _solve_root(root, gradient)
+        # Forward over reverse where there are many parameters.
+        gradient = (jax.jacfwd if len(theta) < 3 else jax.grad)(data.log_posterior_inside)
+        root = any_cholesky(-jax.jacfwd(gradient)(theta))
+        mean = theta + _solve_root(root, gradient(theta))
 
         def draw(carry):
             i, _, _ = carry
             noise = jax.random.normal(jax.random.fold_in(key, i), theta.shape, theta.dtype)
             drawn = mean + any_solve(root.T, noise)
-            return i + 1, drawn, allowed(data.constraint, data.unknowns, drawn)
+            return i + 1, drawn, data.parameters.allowed(drawn)
 
         def missed(carry):
             i, _, ok = carry
@@ -144,7 +123,7 @@ class NewtonStep(AbstractParameterKernel):
         scale_key, noise_key, accept_key = jax.random.split(key, 3)
         tau = jax.random.choice(scale_key, jnp.asarray(_SCALES, theta.dtype))
 
-        def look(theta):
+        def evaluate(theta):
             """The log density at θ, and mean and root of the proposals from it."""
             value, gradient = jax.value_and_grad(data.log_posterior_inside)(theta)
             root = any_cholesky(data.information(theta))
@@ -155,12 +134,12 @@ class NewtonStep(AbstractParameterKernel):
             noise = matvec(root.T, place - mean) / tau
             return jnp.sum(jnp.log(jnp.diagonal(root))) - dot(noise, noise) / 2
 
-        value, mean, root = look(theta)
+        value, mean, root = evaluate(theta)
         noise = jax.random.normal(noise_key, theta.shape, theta.dtype)
         proposed = mean + tau * any_solve(root.T, noise)
-        ok = allowed(data.constraint, data.unknowns, proposed)
+        ok = data.parameters.allowed(proposed)
         proposed = jnp.where(ok, proposed, theta)
-        other_value, other_mean, other_root = look(proposed)
+        other_value, other_mean, other_root = evaluate(proposed)
         log_ratio = other_value - value + log_density(theta, other_mean, other_root)
         log_ratio -= log_density(proposed, mean, root)
         # A comparison with NaN is false, and refuses.
@@ -176,12 +155,12 @@ class GivenKernel(AbstractParameterKernel):
 
     def step(self, key, theta, data):
         def log_density(params):
-            return data.log_posterior(data.unknowns.vector(params))
+            return data.log_posterior(data.parameters.vector(params))
 
         kernel = self.build(log_density)
-        state, _ = kernel.step(key, kernel.init(data.unknowns.pick(theta)))
-        moved = data.unknowns.vector(state.position)
-        ok = allowed(data.constraint, data.unknowns, moved)
+        state, _ = kernel.step(key, kernel.init(data.parameters.select(theta)))
+        moved = data.parameters.vector(state.position)
+        ok = data.parameters.allowed(moved)
         moved = jnp.where(ok, moved, theta)
         return ParameterStep(moved, jnp.any(moved != theta))
 
@@ -203,22 +182,6 @@ def choose_kernel(
         return GivenKernel(kernel)
     exact = is_quadratic and isinstance(log_prior, NormalDensity)
     return NormalDraw() if exact else NewtonStep()
-
-
-def _derivatives(
-    function: Callable[[Array], Array], theta: Float[Array, " p"]
-) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
-    """Gradient and Hessian; forward over reverse where there are many parameters."""
-    gradient = jax.jacfwd(function) if theta.shape[0] < 3 else jax.grad(function)
-    return gradient(theta), jax.jacfwd(gradient)(theta)
-
-
-def _gradient_and_root(
-    data: CompleteData, theta: Float[Array, " p"]
-) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
-    """g, and the root of P."""
-    gradient, hessian = _derivatives(data.log_posterior_inside, theta)
-    return gradient, any_cholesky(-hessian)
 
 
 def _solve_root(root: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:

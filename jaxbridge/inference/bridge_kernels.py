@@ -1,0 +1,118 @@
+"""The bridges given the parameters: one step of a Markov kernel on the path of each interval.
+
+A kernel leaves the exact law of a bridge invariant whatever θ it was made with (section 2.3 of the
+paper):
+
+* `ByRenewal` keeps a bridge until a diffusion associated with it hits it, for couplings. It
+  keeps nothing but the path.
+* `ByWeights` accepts a new weighted proposal with the ratio of the weights, which for the path
+  at hand is drawn anew from its law given θ and the path: for the counts of a coupling that is
+  the size-biased law, for proposals that are pulled to the end point a function of the path.
+* `Unweighted` takes each new proposal of a coupling: approximate, as in section 4 of the paper.
+"""
+
+from abc import abstractmethod
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..coupling.start_laws import run_is_cut
+from ..exact.kernels import acceptance_rate
+from ..exact.renewal import first_paths, propose_paths, renew
+from ..models.bridge_problem import Intervals
+from ..models.diffusion import Diffusion
+from ..proposals.base import AbstractWeightedProposal
+from ..proposals.coupled import CoupledPairs
+
+
+class BridgeInfo(NamedTuple):
+    """Of one step on all intervals: whether the path of each was replaced; how many paths were
+    simulated, or weighed, for it; whether no proposal was found though one was called for. Then
+    the path stays, which leaves the exact law invariant, for whether one is found does not
+    depend on the path. Last, whether a weight was cut off by a bound on its trials, or the run
+    that replaces a sampler of the stationary law by one on its steps."""
+
+    moved: Bool[Array, " I"]
+    num_simulated: Int[Array, " I"]
+    missing: Bool[Array, " I"]
+    truncated: Bool[Array, " I"]
+
+
+class AbstractBridgeKernel(eqx.Module):
+    """A Markov kernel on the bridges of many intervals."""
+
+    @abstractmethod
+    def first(
+        self, keys: Key[Array, " I"], model: Diffusion, intervals: Intervals, num_steps: int
+    ) -> Float[Array, "I points d"]:
+        """Paths to start from, NaN where none was found."""
+
+    @abstractmethod
+    def renew(
+        self,
+        keys: Key[Array, " I"],
+        model: Diffusion,
+        intervals: Intervals,
+        paths: Float[Array, "I points d"],
+    ) -> tuple[Float[Array, "I points d"], BridgeInfo]:
+        """One step of each."""
+
+
+class ByRenewal(AbstractBridgeKernel):
+    """The renewal kernel."""
+
+    pairs: CoupledPairs
+
+    def first(self, keys, model, intervals, num_steps):
+        return first_paths(keys, model, self.pairs, intervals, num_steps)[0]
+
+    def renew(self, keys, model, intervals, paths):
+        everything = jnp.ones(len(keys), bool)
+        paths, info = renew(keys, model, self.pairs, intervals, paths, everything)
+        num_steps = paths.shape[1] - 1
+        law, dt = self.pairs.coupling.start_law, intervals.duration / num_steps
+        cut = run_is_cut(law, model, dt, num_steps)
+        return paths, BridgeInfo(info.is_accepted, info.num_simulated, info.is_missing, cut)
+
+
+class ByWeights(AbstractBridgeKernel):
+    """The pseudo-marginal kernel."""
+
+    proposal: AbstractWeightedProposal
+
+    def first(self, keys, model, intervals, num_steps):
+        drawn = self.proposal.draw(keys[:, None], model, intervals, num_steps, None, False)
+        return drawn.paths[:, 0]
+
+    def renew(self, keys, model, intervals, paths):
+        weigh_keys, draw_keys, accept_keys = jax.vmap(
+            lambda key: jax.random.split(key, 3), out_axes=1
+        )(keys)
+        num_steps = paths.shape[1] - 1
+        old = self.proposal.reweigh(weigh_keys, model, intervals, paths)
+        new = self.proposal.draw(draw_keys[:, None], model, intervals, num_steps, None, False)
+        uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=paths.dtype))(accept_keys)
+        accepted = uniform < acceptance_rate(old.log_weights[:, 0], new.log_weights[:, 0])
+        num_simulated = old.num_simulated[:, 0] + new.num_simulated[:, 0]
+        paths = jnp.where(accepted[:, None, None], new.paths[:, 0], paths)
+        truncated = old.truncated[:, 0] | new.truncated[:, 0]
+        return paths, BridgeInfo(accepted, num_simulated, ~new.found[:, 0], truncated)
+
+
+class Unweighted(AbstractBridgeKernel):
+    """A new approximate bridge each time."""
+
+    pairs: CoupledPairs
+
+    def first(self, keys, model, intervals, num_steps):
+        return first_paths(keys, model, self.pairs, intervals, num_steps)[0]
+
+    def renew(self, keys, model, intervals, paths):
+        num_steps = paths.shape[1] - 1
+        proposed = propose_paths(keys, model, self.pairs, intervals, None, num_steps)
+        found = proposed.num_found > 0
+        paths = jnp.where(found[:, None, None], proposed.outputs.paths, paths)
+        return paths, BridgeInfo(found, proposed.num_trials, ~found, jnp.zeros_like(found))

@@ -1,0 +1,194 @@
+"""Discrete observations of a diffusion, the steps of the intervals between them, and what is to be
+inferred from them."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced, time_steps
+from ..models.bridge_problem import Intervals, as_intervals
+from ..models.diffusion import Diffusion
+from ..models.tracing import uses_argument
+from .parameters import Parameters, theta_of_model
+
+# Numbers of steps are rounded up to one of so few per factor of two, for each is compiled.
+_STEPS_PER_OCTAVE = 2
+
+
+class Group(NamedTuple):
+    """Intervals with the same number of steps, and which of all intervals they are."""
+
+    intervals: Intervals
+    which: Int[np.ndarray, " I"]
+    num_steps: int
+
+
+def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> Intervals:
+    """The intervals between n + 1 observations.
+
+    **Raises:** `ValueError` that says what is wrong with which time or observation.
+    """
+    times, duration = time_steps("times", _unmasked("times", times))
+    observations = as_floating("observations", _unmasked("observations", observations))
+    if times.ndim != 1:
+        raise ValueError(f"`times` must have shape (n + 1,); got {times.shape}.")
+    if observations.ndim != 2 or observations.shape[0] != times.shape[0]:
+        raise ValueError(
+            f"`observations` must have shape ({times.shape[0]}, d), a row for each of `times`; got "
+            f"{observations.shape}."
+        )
+    if times.shape[0] < 2:
+        raise ValueError(f"`observations` must be two or more; got {times.shape[0]}.")
+    if not is_traced(times):
+        _check_increasing(np.asarray(times), np.asarray(duration))
+    if not is_traced(observations):
+        _check_finite(np.asarray(observations))
+        _check_state_space(model, observations)
+    intervals, _, _ = as_intervals(observations[:-1], observations[1:], duration)
+    return intervals
+
+
+def _check_increasing(times: np.ndarray, duration: np.ndarray) -> None:
+    missing = np.flatnonzero(~np.isfinite(times))
+    if missing.size:
+        raise ValueError(f"`times[{missing[0]}]` = {times[missing[0]]} is missing.")
+    back = np.flatnonzero(duration <= 0)
+    if back.size:
+        i = back[0]
+        raise ValueError(
+            f"`times` must increase, but `times[{i}]` = {times[i]} and `times[{i + 1}]` = "
+            f"{times[i + 1]}: sort them, with their observations."
+        )
+
+
+def _check_finite(observations: np.ndarray) -> None:
+    finite = np.isfinite(observations)
+    missing = np.flatnonzero(~finite.all(axis=1))
+    if not missing.size:
+        return
+    i = missing[0]
+    if finite[i].any():
+        which = ", ".join(map(str, np.flatnonzero(~finite[i])))
+        raise ValueError(
+            f"`observations[{i}]` = {observations[i]} has no finite number for coordinate {which}, "
+            "but observations must be complete, all coordinates at a time: leave out this row, "
+            "with its time."
+        )
+    raise ValueError(
+        f"`observations[{i}]` = {observations[i]} is not finite: leave out observations that are "
+        "missing, with their times."
+    )
+
+
+def _unmasked(name: str, values: Numbers) -> Numbers:
+    """What a masked array of NumPy holds, if nothing in it is masked."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    mask = np.ma.getmaskarray(values)
+    if mask.any():
+        place = np.argwhere(mask)[0]
+        which = f"`{name}[{place[0]}]`" if place.size else f"`{name}`"
+        whole = place.size < 2 or mask[place[0]].all()
+        coordinate = "" if whole else f", in coordinate {place[1]},"
+        raise ValueError(
+            f"{which} is masked{coordinate} but observations must be complete: leave out what is "
+            "masked, the whole row with its time."
+        )
+    return values.data
+
+
+def _check_state_space(model: Diffusion, observations: Array) -> None:
+    if is_traced(model):
+        return
+
+    def finite(x):
+        values = [model.drift(x), model.diffusion(x)]
+        values += [model.log_stationary(x)] if model.has_density else []
+        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(value)) for value in values]))
+
+    good = jax.vmap(finite)(observations)
+    if not is_traced(good) and not np.all(good):
+        i = int(np.argmin(good))
+        raise ValueError(
+            f"`observations[{i}]` = {np.asarray(observations[i])} is outside the state space: the "
+            "coefficients or the stationary density of the model are not finite there."
+        )
+
+
+def step_groups(
+    intervals: Intervals, num_steps: int | None, step_size: float | None
+) -> tuple[Group, ...]:
+    """All intervals with `num_steps` steps; or each with so many that none is longer than about
+    `step_size`, in few groups."""
+
+    def group(which: Int[np.ndarray, " I"], num_steps: int) -> Group:
+        return Group(jax.tree.map(lambda leaf: leaf[which], intervals), which, num_steps)
+
+    durations = intervals.duration
+    if step_size is None:
+        num_steps = check_count("num_steps", 50 if num_steps is None else num_steps)
+        return (group(np.arange(len(durations)), num_steps),)
+    if num_steps is not None:
+        raise ValueError("pass `num_steps` or `step_size`, not both.")
+    if is_traced(durations):
+        raise ValueError(
+            "`step_size` divides intervals of known length; while `times` are traced pass "
+            "`num_steps`."
+        )
+    if isinstance(step_size, bool) or not isinstance(step_size, int | float) or not step_size > 0:
+        raise ValueError(f"`step_size` must be a positive number; got {step_size!r}.")
+    wanted = np.maximum(np.asarray(durations, float) / step_size * (1 - 1e-4), 1)
+    levels = np.ceil(np.log2(wanted) * _STEPS_PER_OCTAVE) / _STEPS_PER_OCTAVE
+    numbers = np.ceil(2**levels * (1 - 1e-9)).astype(int)
+    alike = [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
+    return tuple(group(which, math.ceil(wanted[which].max())) for which in alike)
+
+
+class Problem(NamedTuple):
+    """The unknown parameters, with θ as it is in the model, and the intervals between the
+    observations, in groups of one number of steps."""
+
+    parameters: Parameters
+    theta: Float[Array, " p"]
+    intervals: Intervals
+    groups: tuple[Group, ...]
+
+    @property
+    def like(self) -> Float[Array, " d"]:
+        """A point of the state space."""
+        return self.intervals.start[0]
+
+    @property
+    def sigma_is_unknown(self) -> bool:
+        """Whether σ depends on the unknown parameters."""
+        like, parameters = self.like, self.parameters
+        return uses_argument(lambda theta: parameters.bind(theta).diffusion(like), self.theta)
+
+    def check_sigma_known(self, instead: str) -> None:
+        """Raise `ValueError` where σ depends on the unknown parameters, that says what to do."""
+        if self.sigma_is_unknown:
+            raise ValueError(
+                "σ depends on the unknown parameters, and given a whole path σ is known: " + instead
+            )
+
+
+def as_problem(
+    key: Key[Array, ""],
+    parameters: Parameters,
+    times: Numbers,
+    observations: Numbers,
+    num_steps: int | None,
+    step_size: float | None,
+) -> Problem:
+    """What the arguments that all ways of inference share say.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    """
+    check_key(key)
+    intervals = as_observations(parameters.model, times, observations)
+    theta = theta_of_model(parameters, intervals.start.dtype)
+    return Problem(parameters, theta, intervals, step_groups(intervals, num_steps, step_size))

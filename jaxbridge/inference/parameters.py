@@ -1,0 +1,160 @@
+"""What is not known: the parameters to be inferred, as a vector θ in R^p.
+
+All parameters of the model are unknown, or those that a function `where(params)` picks, as in
+`equinox.tree_at`. What is observed in between is a path in the coordinates of the model, so σ must
+not depend on θ wherever paths are part of the state: two σ's give singular laws of paths, and a
+path would never let go of the θ it was made with.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ..engine.checks import as_floating, cast_floats, is_traced
+from ..models.diffusion import Diffusion, check_diffusion
+from ..models.tracing import uses_argument
+
+Constraint = Callable[[PyTree], Any]
+
+
+class Parameters(eqx.Module):
+    """The model, which of its parameters are unknown, and which values of these are allowed."""
+
+    model: Diffusion
+    where: Callable[[PyTree], PyTree] | None = eqx.field(static=True)
+    constraint: Constraint | None = eqx.field(static=True, default=None)
+
+    @property
+    def params(self) -> PyTree:
+        """The unknown parameters, as they are in the model."""
+        return self.model.params if self.where is None else self.where(self.model.params)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of θ's entries, as the model's parameters have them: "alpha", "B[0,1]"; "0" and
+        "1" for those of a tuple, and "theta" where the parameters are one array without a name."""
+
+        def entries(path, leaf):
+            name = jax.tree_util.keystr(path, simple=True, separator=".") or "theta"
+            shape = [leaf.shape] if eqx.is_inexact_array(leaf) else []
+            places = [",".join(map(str, place)) for each in shape for place in np.ndindex(each)]
+            return [f"{name}[{place}]" if place else name for place in places]
+
+        named = jax.tree_util.tree_map_with_path(entries, self.model.params)
+        return tuple(jax.tree.leaves(named if self.where is None else self.where(named)))
+
+    def vector(self, params: PyTree) -> Float[Array, " p"]:
+        """θ of these unknown parameters."""
+        return ravel_pytree(eqx.filter(params, eqx.is_inexact_array))[0]
+
+    def select(self, theta: Float[Array, " p"]) -> PyTree:
+        """The unknown parameters of θ, in its dtype."""
+        floats, others = eqx.partition(self.params, eqx.is_inexact_array)
+        _, unravel = ravel_pytree(cast_floats(floats, theta.dtype))
+        return eqx.combine(unravel(theta), others)
+
+    def full(self, theta: Float[Array, " p"]) -> PyTree:
+        """All parameters of the model, the unknown ones from θ."""
+        if self.where is None:
+            return self.select(theta)
+        return eqx.tree_at(self.where, self.model.params, self.select(theta))
+
+    def bind(self, theta: Float[Array, " p"]) -> Diffusion:
+        """The model at θ."""
+        return self.model.with_params(self.full(theta))
+
+    def allowed(self, theta: Float[Array, " p"]) -> Bool[Array, ""]:
+        """Whether θ is finite and satisfies the constraint."""
+        finite = jnp.all(jnp.isfinite(theta))
+        if self.constraint is None:
+            return finite
+        value = jnp.asarray(self.constraint(self.select(theta)))
+        if value.shape != () or value.dtype != bool:
+            raise ValueError(
+                "`constraint` must map the unknown parameters to one truth value; it returned "
+                f"shape {value.shape} and dtype {value.dtype}."
+            )
+        return finite & value
+
+    def check_allowed(self, theta: Float[Array, "*chains p"]) -> None:
+        """Raise `ValueError` where a visible θ does not satisfy the constraint."""
+        for row in theta.reshape(-1, theta.shape[-1]):
+            ok = self.allowed(row)
+            if not is_traced(ok) and not bool(ok):
+                why = "are not finite" if self.constraint is None else "do not satisfy `constraint`"
+                raise ValueError(f"the parameters to start from, {self.select(row)}, {why}.")
+
+
+def as_parameters(
+    model: Diffusion,
+    where: Callable[[PyTree], PyTree] | None,
+    constraint: Constraint | None = None,
+) -> Parameters:
+    """The parameters that the user wants to know, checked as far as can be without data."""
+    check_diffusion(model)
+    if where is not None and not callable(where):
+        raise TypeError(
+            f"`where` must be a function that picks from `model.params`; got {where!r}."
+        )
+    if constraint is not None and not callable(constraint):
+        raise TypeError(
+            "`constraint` must be a function that maps the unknown parameters to a truth value; "
+            f"got {constraint!r}."
+        )
+    return Parameters(model, where, constraint)
+
+
+def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p"]:
+    """θ as it is in the model, in this dtype, checked."""
+    theta = parameters.vector(cast_floats(parameters.params, dtype))
+    if theta.size == 0:
+        raise ValueError(
+            "this model has no parameters to be inferred: give `Diffusion` its unknown numbers as "
+            "`params=`."
+        )
+    if not is_traced(theta) and not np.all(np.isfinite(theta)):
+        raise ValueError(
+            f"the unknown parameters must be finite; the model has {parameters.params}."
+        )
+    if uses_argument(lambda theta: parameters.bind(theta).coordinate_values(), theta):
+        raise ValueError(
+            "the coordinates of `lamperti` depend on the unknown parameters, those of σ, but the "
+            "observations were mapped to them at fixed ones: infer in the original coordinates, "
+            "or in those of `jb.transform(model, jnp.log, jnp.exp)`, which depend on no "
+            "parameters, by `pmmh` or `maximum_likelihood`; or hold the parameters of σ fixed by "
+            "`where=`."
+        )
+    return theta
+
+
+def init_vectors(
+    parameters: Parameters, init: PyTree, chains: tuple[int, ...]
+) -> Float[Array, "*chains p"]:
+    """θ of the unknown parameters that the user wants to start from, for each chain its own if
+    they have such an axis."""
+    init = jax.tree.map(lambda leaf: as_floating("init", leaf), init)
+    known = parameters.params
+    if jax.tree.structure(init) != jax.tree.structure(known):
+        raise ValueError(
+            "`init` must be the `state` of earlier draws, or have the structure of the unknown "
+            f"parameters, {jax.tree.structure(known)}; got {jax.tree.structure(init)}."
+        )
+    shapes = [
+        (given.shape, leaf.shape)
+        for given, leaf in zip(jax.tree.leaves(init), jax.tree.leaves(known), strict=True)
+    ]
+    if all(given == leaf for given, leaf in shapes):
+        return parameters.vector(init)
+    if chains and all(given == (*chains, *leaf) for given, leaf in shapes):
+        return jax.vmap(parameters.vector)(init)
+    raise ValueError(
+        f"`init` must have leaves of the shapes of the unknown parameters, {[s for _, s in shapes]}"
+        f", with a leading axis of {chains[0] if chains else 'no'} chains if they differ; got "
+        f"{[s for s, _ in shapes]}."
+    )

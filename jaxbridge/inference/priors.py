@@ -1,0 +1,132 @@
+"""The prior of the parameters."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from ..engine.checks import as_floating, is_traced
+from ..engine.linalg import any_inverse, dot, matvec
+from .parameters import Parameters
+
+
+class NormalPrior(eqx.Module):
+    """A normal prior of the unknown parameters.
+
+    **Arguments:**
+
+    - `mean`: a number for all of them, a vector of shape (p,), or a pytree like the parameters.
+    - `variance`: likewise; or a covariance matrix of shape (p, p). A vector has the parameters in
+        the order of `jax.flatten_util.ravel_pytree`.
+
+    **Raises:** `ValueError`, by the function it is passed to, if shapes do not fit the parameters.
+
+    **Example:**
+
+    ```python
+    jb.NormalPrior(1.0, 1.0)
+    jb.NormalPrior(jnp.zeros(4), 0.5 * jnp.eye(4))
+    ```
+    """
+
+    mean: PyTree
+    variance: PyTree
+
+
+class NormalDensity(eqx.Module):
+    """N(mean, precision⁻¹), up to the constant."""
+
+    mean: Float[Array, " p"]
+    precision: Float[Array, "p p"]
+
+    def __call__(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
+        deviation = theta - self.mean
+        return -dot(deviation, matvec(self.precision, deviation)) / 2
+
+
+class GivenDensity(eqx.Module):
+    """The user's log density of the unknown parameters, as a function of θ."""
+
+    parameters: Parameters
+    function: Callable[[PyTree], Any] = eqx.field(static=True)
+
+    def __call__(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
+        value = jnp.asarray(self.function(self.parameters.select(theta)))
+        if value.shape != ():
+            raise ValueError(f"`prior` must return a number; it returned shape {value.shape}.")
+        return value.astype(theta.dtype)
+
+
+Prior = NormalPrior | Callable[[PyTree], Any]
+
+
+def as_normal(
+    prior: NormalPrior, parameters: Parameters, theta: Float[Array, " p"]
+) -> NormalDensity:
+    """The prior of θ, with its shapes checked."""
+    p = theta.shape[0]
+    mean = _as_array("mean", prior.mean, parameters, theta)
+    variance = _as_array("variance", prior.variance, parameters, theta)
+    if mean.shape not in ((), (p,)):
+        raise ValueError(
+            f"`prior.mean` must be a number, a vector of shape ({p},) or a pytree like the unknown "
+            f"parameters; got shape {mean.shape}."
+        )
+    if variance.shape not in ((), (p,), (p, p)):
+        raise ValueError(
+            f"`prior.variance` must be a number, a vector of shape ({p},), a matrix of shape "
+            f"({p}, {p}) or a pytree like the unknown parameters; got shape {variance.shape}."
+        )
+    if not is_traced(mean, variance):
+        least = np.linalg.eigvalsh(variance).min() if variance.ndim == 2 else np.min(variance)
+        if not (np.all(np.isfinite(mean)) and np.isfinite(least) and least > 0):
+            raise ValueError(
+                "`prior` must have a finite mean and a positive (definite) variance; got "
+                f"{prior.mean} and {prior.variance}."
+            )
+    if variance.ndim == 2:
+        precision = any_inverse(variance)
+        precision = (precision + precision.T) / 2
+    else:
+        precision = jnp.diag(jnp.broadcast_to(1 / variance, (p,)))
+    return NormalDensity(jnp.broadcast_to(mean, (p,)), precision)
+
+
+def _as_array(
+    name: str, value: PyTree, parameters: Parameters, theta: Float[Array, " p"]
+) -> Float[Array, "..."]:
+    """What the user gave as an array, pytrees like the parameters as a vector."""
+    like, structure = jax.tree.flatten(parameters.params)
+    if hasattr(value, "ndim"):
+        is_matrix = name == "variance" and value.shape == (len(theta), len(theta))
+        if len(like) == 1 and value.shape == like[0].shape and not is_matrix:
+            value = jnp.ravel(value)
+    elif jax.tree.structure(value) == structure:
+        leaves = [as_floating(f"prior.{name}", leaf) for leaf in jax.tree.leaves(value)]
+        for leaf, known in zip(leaves, like, strict=True):
+            if leaf.shape not in ((), known.shape):
+                raise ValueError(
+                    f"`prior.{name}` has a leaf of shape {leaf.shape} for parameters of shape "
+                    f"{known.shape}."
+                )
+        full = [jnp.broadcast_to(a, b.shape) for a, b in zip(leaves, like, strict=True)]
+        value = parameters.vector(jax.tree.unflatten(structure, full))
+    return as_floating(f"prior.{name}", value).astype(theta.dtype)
+
+
+def as_log_prior(
+    prior: Prior, parameters: Parameters, theta: Float[Array, " p"]
+) -> NormalDensity | GivenDensity:
+    """The prior's log density, a function of θ."""
+    if isinstance(prior, NormalPrior):
+        return as_normal(prior, parameters, theta)
+    if not callable(prior):
+        raise TypeError(
+            "`prior` must be a `NormalPrior`, or a function that maps the unknown parameters to "
+            f"the log of a density; got {prior!r}."
+        )
+    return GivenDensity(parameters, prior)
