@@ -1,29 +1,20 @@
 """Diffusion bridges by coupling, in JAX.
 
-Data flows one way: a model (`diffusion`, `models`, `gaussian`) and a scheme (`schemes`) make steps;
-a coupling (`coupling`) with a meeting rule (`meeting`) makes pairs of paths and joins them
-(`proposals`); a search (`search`), on one device or several (`devices`), keeps the pairs that met
-(`bridges`), on a `grid` of times. The diffusion associated with a bridge (`associated`), started
-from some law (`start_laws`, `burn_in`), hits it or not (`hitting`), which makes a weight
-(`coupled_pairs`). Proposals that are pulled to the end point (`guided`) have a weight made of the
-densities of their steps (`step_density`), and pilot runs choose (`choice`, `tuning`). On weighted
-proposals (`weighted`) are built importance sampling (`importance`), transition densities
-(`transition`) and Markov chains (`chains`, one method a module), with their `averages`
-(`exact_bridges`) and `diagnostics`, and what makes them hard (`hitting_variation`). They say how
-far to trust them: by what half as many steps would have given (`halving`, `step_error`), and by the
-tails of their weights (`pareto`); what was not found raises an error where that is asked for
-(`throwing`). The likelihood of a path (`likelihood`) and what is not known (`unknowns`,
-`observations`, `problem`) make inference: bridges complete the observations (`parts`,
-`completion`), and parameters follow from complete paths (`parameter_steps`), in turn (`gibbs`), or
-from densities (`pmmh`), or as maximum likelihood estimates (`score`, `maximum_likelihood`,
-`simulated_likelihood`); `expectation` has derivatives that are right. What a program simulates is
-decided in one table (`decisions`, `scene`), and its loops run over many lanes of small points
-(`lanes`, `noise`). Other coordinates are for state spaces with a boundary (`transform`), or for a σ
-of one (`lamperti`). Exact laws stand beside (`gaussian`, `linear`), what accuracy costs above
-(`work_precision`), and the studies above all (`study`, `exact_study`, `accuracy_study`,
-`bayes_study`, `crossover_study`, `benchmark`), with their pictures (`plot`, `copula`,
-`study_figures`). References to equations and sections are to Bladt, Finch & Sørensen, *Simulation
-of multivariate diffusion bridges*; equations go by their labels in its source.
+Data flows one way, from folder to folder; each begins with its mathematics.
+
+- `engine`: how programs run; it knows no diffusion.
+- `models`: what diffuses, and its time reversal.
+- `schemes`: one step, made, inverted, and its density; the likelihood of a path, and how far so
+  many steps are from the limit.
+- `coupling`: pairs of paths that meet, the bridges joined of them, and how often these are hit.
+- `proposals`: a path with an unbiased weight, by a coupling or pulled to the end point.
+- `exact`: what is made of weights: means, chains, transition densities.
+- `tuning`: which proposal, and what accuracy costs.
+- `inference`: parameters from observations.
+- `plot`, `studies`: pictures; the paper's study and the measurements, clients of all this.
+
+References to equations and sections are to Bladt, Finch & Sørensen, *Simulation of multivariate
+diffusion bridges*; equations go by their labels in its source.
 
 What examples take for granted:
 
