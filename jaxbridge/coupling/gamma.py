@@ -143,3 +143,32 @@ class Coupling(AbstractCoupling):
 def _in_range(gamma: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
     """NaN where γ is not in [-1, 1): such pairs never meet, and are counted as not finite."""
     return jnp.where((gamma >= -1) & (gamma < 1), gamma, jnp.nan)
+
+
+def described(coupling: AbstractCoupling) -> str:
+    """A coupling in a few words."""
+    words = type(coupling).__name__
+    if isinstance(coupling, Coupling) and not is_traced(coupling.gamma):
+        words += f"({float(coupling.gamma):.3g})"
+    if not isinstance(coupling.start_law, Stationary):
+        words += f" from {type(coupling.start_law).__name__}"
+    return words
+
+
+def ingredients(coupling: AbstractCoupling) -> tuple[str, str, float]:
+    """Its scheme and its meeting rule, and γ."""
+    meeting = coupling.meeting
+    radius = meeting.radius if isinstance(meeting, SignTest) else None
+    words = type(meeting).__name__ + ("" if radius is None else f"({float(radius):g})")
+    gamma = float(coupling.gamma) if isinstance(coupling, Coupling) else np.nan
+    return type(coupling.scheme).__name__, words, gamma
+
+
+def most_accurate(coupling: AbstractCoupling) -> AbstractCoupling:
+    """The same with the scheme and the meeting rule that have the smallest step error."""
+    return eqx.tree_at(
+        lambda c: (c.meeting, c.scheme),
+        coupling,
+        (BrownianCrossing(), Heun()),
+        is_leaf=lambda leaf: isinstance(leaf, AbstractMeeting | AbstractScheme),
+    )

@@ -9,30 +9,21 @@ starts: `start_laws` has the derivation.
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Inputs, find_bridges
 from ..coupling.burn_in import with_burn_in
-from ..coupling.gamma import Coupling
+from ..coupling.gamma import described, ingredients, most_accurate
 from ..coupling.hitting import HittingCounts, count_hits
-from ..coupling.meeting import AbstractMeeting, BrownianCrossing, SignTest
 from ..coupling.start_laws import AnyStartLaw, Reversed, Stationary, log_ratio, needs_burn_in
-from ..engine.checks import is_traced, nondifferentiable
+from ..engine.checks import nondifferentiable
 from ..engine.rejection import default_num_lanes
 from ..models.bridge_problem import Intervals, uniform_fractions
 from ..models.diffusion import Diffusion
-from ..models.dynamics import Dynamics
-from ..schemes.base import AbstractScheme
-from ..schemes.euler import Euler
 from ..schemes.fit import check_model
-from ..schemes.gaussian_transition import GaussianTransition
 from ..schemes.halving import log_halving_of_paths, num_looked
-from ..schemes.heun import Heun
-from ..schemes.milstein import Milstein
-from ..schemes.step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
-from ..schemes.step_error import share_of_order
+from ..schemes.nearest_law import step_law_of
 from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
 from .blocks import in_blocks
 
@@ -76,12 +67,7 @@ class CoupledPairs(AbstractSingleProposal):
         return 1 / (1 + self.num_counts)
 
     def describe(self):
-        coupling, words = self.coupling, type(self.coupling).__name__
-        if isinstance(coupling, Coupling) and not is_traced(coupling.gamma):
-            words += f"({float(coupling.gamma):.3g})"
-        if not isinstance(coupling.start_law, Stationary):
-            words += f" from {type(coupling.start_law).__name__}"
-        return words
+        return described(self.coupling)
 
     def relative_seconds(self, model, intervals):
         seconds, law = jnp.full_like(intervals.duration, _SECONDS), self.coupling.start_law
@@ -92,19 +78,10 @@ class CoupledPairs(AbstractSingleProposal):
         return seconds
 
     def ingredients(self):
-        coupling, meeting = self.coupling, self.coupling.meeting
-        gamma = float(coupling.gamma) if isinstance(coupling, Coupling) else np.nan
-        radius = meeting.radius if isinstance(meeting, SignTest) else None
-        words = type(meeting).__name__ + ("" if radius is None else f"({float(radius):g})")
-        return type(coupling.scheme).__name__, words, gamma
+        return ingredients(self.coupling)
 
     def most_accurate(self, sigma_varies):
-        return eqx.tree_at(
-            lambda p: (p.coupling.meeting, p.coupling.scheme),
-            self,
-            (BrownianCrossing(), Heun()),
-            is_leaf=lambda leaf: isinstance(leaf, AbstractMeeting | AbstractScheme),
-        )
+        return eqx.tree_at(lambda p: p.coupling, self, most_accurate(self.coupling))
 
     def for_pilot(self):
         bound = jnp.minimum(self.max_trials, _PILOT_TRIALS * self.num_counts)
@@ -268,19 +245,6 @@ class CoupledPairs(AbstractSingleProposal):
             self.max_trials,
             progress_meter=progress_meter,
         )
-
-
-def step_law_of(scheme: AbstractScheme, dynamics: Dynamics) -> tuple[AbstractStepDensity, float]:
-    """The normal law of a step that comes nearest to that of the scheme, and the step error of the
-    scheme as a share of what half as many steps change with that law."""
-    if isinstance(scheme, GaussianTransition):
-        return EulerDensity(), 0.0  # there is no step error
-    if isinstance(scheme, Euler | Milstein):
-        return EulerDensity(), share_of_order(EulerDensity.order)
-    if dynamics.sigma_varies:
-        # Of first order like Euler's, and two to four times as large where it was measured.
-        return EulerDensity(), 3 * share_of_order(EulerDensity.order)
-    return ItoTaylorDensity(), share_of_order(ItoTaylorDensity.order)
 
 
 def pair_log_weights(
