@@ -163,7 +163,7 @@ def run_pseudo_marginal(
 
 
 def accept_reject(
-    log_weights: Float[Array, "I n+1"], uniform: Float[Array, "I n"]
+    log_weights: Float[Array, "I weights"], uniform: Float[Array, "I n"]
 ) -> tuple[Int[Array, "I n"], Bool[Array, "I n"]]:
     """The chain on the weights alone: from the first of them n steps, each to the next one or not.
     The number of the weight at which each step leaves the chain, and whether it moved."""

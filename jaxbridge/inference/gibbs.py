@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, nondifferentiable
-from ..engine.progress import as_meter
+from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
 from ..proposals.auto import Budget
 from .augmentation import Augmentation, augment
@@ -179,12 +179,11 @@ def gibbs(
     augmentation = augment(augment_key, problem, first_chain(theta), *how)
     kernel = choose_kernel(parameter_kernel, augmentation.is_quadratic, log_prior)
     sampler = _Sampler(parameters, augmentation, log_prior, kernel)
-    meter = as_meter(progress_meter)
     if state is None:
         state = first_states(sampler.start, run_key, theta)
     else:
         augmentation.check_paths(state.paths, theta.shape[:-1])
-    return _run(run_key, sampler, state, num_iterations, thin, meter)
+    return _run(run_key, sampler, state, num_iterations, thin, progress_meter)
 
 
 class GibbsInfo(NamedTuple):
@@ -232,7 +231,7 @@ def _run(
     state: GibbsState,
     num_iterations: int,
     thin: int,
-    meter: diffrax.AbstractProgressMeter,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> GibbsPosterior:
     sampler, state = nondifferentiable((sampler, state))
     chains, dtype = state.theta.shape[:-1], state.theta.dtype
@@ -245,18 +244,14 @@ def _run(
         unknown = jnp.full(chains, jnp.nan, dtype)
         return lax.cond(i % every == every - 1, each, lambda _: unknown, state)
 
-    def draw(carry, i):
-        state, progress = carry
+    def draw(state, i):
         # Number 0 made the first paths.
         keys = jax.random.split(jax.random.fold_in(key, i + 1), thin)
         step = lambda state, key: over_chains(sampler.step, key, state)
         state, infos = lax.scan(step, state, keys)
-        progress = meter.step(progress, (i + 1).astype(jnp.float32) / num_iterations)
-        return (state, progress), (state.theta, summed(infos), step_errors(i, state))
+        return state, (state.theta, summed(infos), step_errors(i, state))
 
-    carry, draws = lax.scan(draw, (state, meter.init()), jnp.arange(num_iterations))
-    state, progress = carry
-    meter.close(progress)
+    state, draws = metered_scan(draw, state, jnp.arange(num_iterations), progress_meter)
     fields, (info, log_step_error) = drawn(sampler.parameters, *draws)
     num_bridges = thin * sampler.augmentation.num_intervals
     info = info._replace(

@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count
 from ..engine.pareto import is_reliable
-from ..engine.progress import as_meter
 from ..models.diffusion import Diffusion
 from ..proposals.auto import Budget
 from ..schemes.step_error import StepError, dominates
@@ -183,10 +182,9 @@ def maximum_likelihood(
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
     parameters.check_allowed(problem.theta)
     rule = EM() if method == "em" else Gradient(_ADAM if optimizer is None else optimizer)
-    meter = as_meter(progress_meter)
     proposal = "auto" if proposal is None else proposal
     budget = Budget(num_counts, max_proposals, max_trials)
-    search = Search(rule, num_iterations, meter)
+    search = Search(rule, num_iterations, progress_meter)
     if not problem.sigma_is_unknown:
         return _by_bridges(key, problem, proposal, budget, search, num_bridges)
     if method == "em":
@@ -212,8 +210,7 @@ def _by_bridges(
     augmentation = augment(augment_key, problem, theta, proposal, "exact", None, budget)
     iterates, info = approximate(run_key, parameters, augmentation, search, theta)
     rough = iterates[-1] if isinstance(search.rule, EM) else _mean_of_later(iterates)
-    meter = diffrax.NoProgressMeter()
-    at_rough = score_at(score_key, problem, rough, proposal, budget, num_bridges, meter)
+    at_rough = score_at(score_key, problem, rough, proposal, budget, num_bridges, None)
     step = jnp.linalg.inv(at_rough.information) @ at_rough.gradient
     definite = jnp.all(jnp.linalg.eigvalsh(at_rough.information) > 0)
     # Further off the likelihood need not be near its quadratic approximation.

@@ -15,13 +15,12 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..engine.pareto import pareto_k
-from ..engine.progress import as_meter
+from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
 from ..proposals.auto import Budget
 from ..schemes.halving import num_looked
@@ -112,9 +111,8 @@ def score(
         "differentiate `transition_log_density` with a proposal that is pulled to the end point, "
         "or pick the others with `where=`."
     )
-    meter = as_meter(progress_meter)
     budget = Budget(num_counts, max_proposals, max_trials)
-    return score_at(key, problem, problem.theta, proposal, budget, num_bridges, meter)
+    return score_at(key, problem, problem.theta, proposal, budget, num_bridges, progress_meter)
 
 
 def score_at(
@@ -124,14 +122,14 @@ def score_at(
     proposal: Any,
     budget: Budget,
     num_bridges: int,
-    meter: diffrax.AbstractProgressMeter,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Score:
     """The score at any θ."""
     model = problem.parameters.bind(theta)
     blocks = make_blocks(key, model, problem, proposal, budget, "means")
     form = target_forms(blocks, model)[0]
     made = [
-        _of_block(block_key, problem.parameters, theta, block, form, num_bridges, meter)
+        _of_block(block_key, problem.parameters, theta, block, form, num_bridges, progress_meter)
         for block_key, block in with_keys(key, blocks)
     ]
     sums = over_intervals(blocks, made)
@@ -230,7 +228,7 @@ def _of_block(
     block: Block,
     form: Form,
     num_bridges: int,
-    meter: diffrax.AbstractProgressMeter,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> _Sums:
     parameters, block = nondifferentiable((parameters, block))
     model = parameters.bind(theta).prepared()
@@ -238,13 +236,11 @@ def _of_block(
     at_once = min(num_bridges, max(1, _PATHS // num_intervals))
     num_batches = -(-num_bridges // at_once)
 
-    def batch(state, i):
+    def batch(_, i):
         mine = jax.random.fold_in(key, i)
-        made = _draw(mine, parameters, theta, model, block, form, at_once)
-        return meter.step(state, (i + 1).astype(jnp.float32) / num_batches), made
+        return None, _draw(mine, parameters, theta, model, block, form, at_once)
 
-    state, made = lax.scan(batch, meter.init(), jnp.arange(num_batches))
-    meter.close(state)
+    _, made = metered_scan(batch, None, jnp.arange(num_batches), progress_meter)
 
     def join(leaf, number: int):
         """The first so many of each batch, of all batches."""

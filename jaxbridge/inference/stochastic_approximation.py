@@ -17,11 +17,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jax import lax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from ..engine.checks import all_finite_leaves, nondifferentiable
 from ..engine.linalg import any_solve
+from ..engine.progress import metered_scan
 from .augmentation import Augmentation
 from .parameter_kernels import CompleteData
 from .parameters import Parameters
@@ -81,7 +81,7 @@ class Search(NamedTuple):
 
     rule: Gradient | EM
     num_iterations: int
-    meter: diffrax.AbstractProgressMeter
+    progress_meter: diffrax.AbstractProgressMeter | None
 
 
 @eqx.filter_jit
@@ -117,23 +117,20 @@ def iterate(
     """The iterates from θ and paths. `propose(i, θ, memory, paths)` makes ((θ, memory), paths, what
     was missing and truncated), with what the rule remembers; θ stays where that leads out of the
     constraint, or to what is not finite."""
-    rule, num_iterations, meter = search
 
     def step(state, i):
-        theta, memory, paths, progress = state
+        theta, memory, paths = state
         (new_theta, new_memory), paths, (missing, truncated) = propose(i, theta, memory, paths)
         finite = all_finite_leaves(new_memory)
         ok = parameters.allowed(new_theta) & finite
         theta = jnp.where(ok, new_theta, theta)
         # What an optimiser remembers must not be spoilt for all steps to come.
         memory = jax.tree.map(lambda new, old: jnp.where(finite, new, old), new_memory, memory)
-        progress = meter.step(progress, (i + 1).astype(jnp.float32) / num_iterations)
         info = _counted(SearchInfo(missing, truncated, ~ok))
-        return (theta, memory, paths, progress), (theta, info)
+        return (theta, memory, paths), (theta, info)
 
-    start = (theta, rule.init(theta), paths, meter.init())
-    state, (iterates, info) = lax.scan(step, start, jnp.arange(num_iterations))
-    meter.close(state[-1])
+    start, steps = (theta, search.rule.init(theta), paths), jnp.arange(search.num_iterations)
+    _, (iterates, info) = metered_scan(step, start, steps, search.progress_meter)
     return iterates, _counted(info)
 
 

@@ -9,6 +9,6 @@ those of a given ν (`langevin`), `hyperbolic`, and `ornstein_uhlenbeck` with it
 (`gaussian_law`), its transitions (`linear`, for any linear drift) and its bridges
 (`gaussian_bridge`). The same model in other coordinates, Y = f(X), has Itô's drift
 ∇f α + ½ Σ_k ∂²f(σ_k, σ_k) (`transform`); where Y = ∫ du/σ(u) its σ is one (`lamperti`). Paths that
-are free at their end are simulated (`simulate`); of bridges the end points and durations are given, on
-a grid of times (`bridge_problem`).
+are free at their end are simulated (`simulate`); of bridges the end points and durations are given,
+on a grid of times (`bridge_problem`).
 """
