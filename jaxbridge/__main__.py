@@ -24,6 +24,7 @@ _PARTS = {
     "bayes": (BAYES,),
     "bench": (BENCHMARK,),
 }
+_QUICK = " (--quick: expect larger errors, and times of little meaning)"
 _GROUPS = {"paper": ("approximate", "exact"), "all": tuple(_PARTS)}
 
 
@@ -86,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _run(study: Study, options: argparse.Namespace) -> None:
-    print(study.title + (" (--quick: expect larger errors)" if options.quick else "") + "\n")
+    print(f"{study.title}{_QUICK if options.quick else ''}\n")
     results = study.run(jax.random.key(options.seed), options.quick, _say)
     _end_progress()
     print(f"{study.tables(results)}\n\n{study.what_to_see}\n")

@@ -326,7 +326,9 @@ def _seconds(value: float) -> str:
 
 def in_plain_characters(benchmark: Benchmark) -> str:
     """The tables as they are printed."""
-    return "\n\n".join(table(*each, words=2) for each in tables(benchmark))
+    return "\n\n".join(
+        table(*each, words) for each, words in zip(tables(benchmark), (2, 0, 2), strict=True)
+    )
 
 
 def in_markdown(benchmark: Benchmark) -> str:

@@ -17,7 +17,7 @@ def run(*arguments, cwd):
 def test_quick_run_prints_a_table_and_writes_pictures(tmp_path):
     done = run("approximate", "--quick", "--out", "pictures", "--seed", "3", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "(--quick: expect larger errors)" in done.stdout
+    assert "(--quick: expect larger errors" in done.stdout
     assert "2,000 bridges a case" in done.stdout
     assert done.stdout.count("as published") >= 8
     assert "[16/16]" in done.stderr
