@@ -27,6 +27,7 @@ from ..engine.checks import (
     is_traced,
     nondifferentiable,
 )
+from ..engine.keys import split_each
 from ..engine.progress import metered_scan
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
@@ -142,7 +143,7 @@ def _move(
     beta: Float[Array, ""],
 ) -> tuple[CrankNicolsonState, CrankNicolsonInfo]:
     """One move of each of I chains."""
-    noise_keys, accept_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    noise_keys, accept_keys = split_each(keys, 2)
     dtype = state.noise.dtype
     beta = beta.astype(dtype)
     fresh = _normal(noise_keys, state.noise.shape[1] + 1, intervals)

@@ -20,6 +20,7 @@ from ..engine.averages import (
 )
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.diagnostics import effective_sample_size
+from ..engine.keys import split_each
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals.base import AbstractWeightedProposal
@@ -120,7 +121,7 @@ def chain_keys(
 ) -> tuple[Key[Array, "I n"], Key[Array, " I"]]:
     """The keys of the steps and of the first state of each interval's chain."""
     keys = problem.keys(key, 1)[:, 0] if problem.batched else key[None]
-    run_keys, init_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+    run_keys, init_keys = split_each(keys, 2)
     return jax.vmap(lambda key: jax.random.split(key, num_bridges))(run_keys), init_keys
 
 

@@ -23,6 +23,7 @@ from ..coupling.base import AbstractCoupling
 from ..coupling.bridges import Inputs, Joined, find_bridges
 from ..coupling.start_laws import log_ratio, run_is_cut
 from ..engine.checks import Numbers, check_key, nondifferentiable
+from ..engine.keys import split_each
 from ..engine.progress import metered_while_loop
 from ..engine.rejection import Accepted, default_num_lanes, most_lanes
 from ..models.bridge_problem import BridgeProblem, Intervals
@@ -287,9 +288,7 @@ def renew(
 ) -> tuple[Float[Array, "S points d"], RenewalInfo]:
     """One renewal step of each of S chains that is active: hit first, propose only then."""
     num_steps = paths.shape[1] - 1
-    trial_keys, propose_keys, accept_keys = jax.vmap(
-        lambda key: jax.random.split(key, 3), out_axes=1
-    )(keys)
+    trial_keys, propose_keys, accept_keys = split_each(keys, 3)
     dt = intervals.duration / num_steps
     lanes = jnp.moveaxis(paths, 0, -1)
     associated = run_associated(model, pairs.coupling, trial_keys, lanes, dt)

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from ..engine.checks import is_traced
+from ..engine.keys import split_each
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
 from ..proposals.auto import Budget
@@ -73,7 +74,7 @@ class Augmentation(eqx.Module):
 
         def of_block(block, kernel, keys):
             intervals, num_steps = block.intervals, block.num_steps
-            found_keys, other_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+            found_keys, other_keys = split_each(keys, 2)
             found = kernel.first(found_keys, model, intervals, num_steps)
             other = ModifiedDiffusionBridge().draw(
                 other_keys[:, None], model, intervals, num_steps, None, False

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..coupling.start_laws import run_is_cut
+from ..engine.keys import split_each
 from ..exact.kernels import acceptance_rate
 from ..exact.renewal import first_paths, propose_paths, renew
 from ..models.bridge_problem import Intervals
@@ -88,9 +89,7 @@ class ByWeights(AbstractBridgeKernel):
         return drawn.paths[:, 0]
 
     def renew(self, keys, model, intervals, paths):
-        weigh_keys, draw_keys, accept_keys = jax.vmap(
-            lambda key: jax.random.split(key, 3), out_axes=1
-        )(keys)
+        weigh_keys, draw_keys, accept_keys = split_each(keys, 3)
         num_steps = paths.shape[1] - 1
         old = self.proposal.reweigh(weigh_keys, model, intervals, paths)
         new = self.proposal.draw(draw_keys[:, None], model, intervals, num_steps, None, False)

@@ -18,6 +18,7 @@ from ..coupling.gamma import described, ingredients, most_accurate
 from ..coupling.hitting import HittingCounts, count_hits
 from ..coupling.start_laws import AnyStartLaw, Reversed, Stationary, log_ratio, needs_burn_in
 from ..engine.checks import nondifferentiable
+from ..engine.keys import split_each
 from ..engine.rejection import default_num_lanes
 from ..models.bridge_problem import Intervals, uniform_fractions
 from ..models.diffusion import Diffusion
@@ -160,7 +161,7 @@ class CoupledPairs(AbstractSingleProposal):
             active = jnp.repeat(active, num_draws)
             intervals = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=0), intervals)
             num_lanes = default_num_lanes(len(keys), num_steps, intervals.start)
-            propose_keys, count_keys = jax.vmap(jax.random.split, out_axes=1)(keys)
+            propose_keys, count_keys = split_each(keys, 2)
             inputs = Inputs(model, self.coupling, intervals)
             proposed = find_bridges(
                 propose_keys, inputs, active, 1, max_proposals, num_steps, None, num_lanes
