@@ -60,8 +60,13 @@ class GibbsState(NamedTuple):
 
 
 class GibbsPosterior(AbstractPosterior):
-    """What `gibbs` returns: beside what every `AbstractPosterior` has,
+    """What `gibbs` returns: draws of the unknown parameters. Arrays have a leading axis of chains
+    if there are several.
 
+    - `params`: all parameters of the model, each with leading axes (*chains, n).
+    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
+        the keys are in alphabetical order.
     - `parameters_moved`: whether θ moved, shape (*chains, n).
     - `bridges_moved`: the share of bridges that were replaced, shape (*chains, n).
     - `num_simulated`: paths simulated or weighed, shape (*chains, n).
@@ -72,7 +77,9 @@ class GibbsPosterior(AbstractPosterior):
         that path. Where this does not go to zero choose another proposal for such intervals.
     - `num_truncated`: weights that `max_trials` cut off, shape (*chains, n): where there are many
         the law is not exact.
-    - `log_step_error`: that of the log density of the completed data, up to a constant.
+    - `log_step_error`: an estimate of the step error of the log density of the completed data at
+        each draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
+        `step_error`, that of the posterior mean, is made of.
     - `state`: where it ended; pass it as `init` to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.

@@ -80,8 +80,13 @@ class PMMHState(NamedTuple):
 
 
 class PMMHPosterior(AbstractPosterior):
-    """What `pmmh` returns: beside what every `AbstractPosterior` has,
+    """What `pmmh` returns: draws of the unknown parameters. Arrays have a leading axis of chains
+    if there are several.
 
+    - `params`: all parameters of the model, each with leading axes (*chains, n).
+    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
+    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
+        the keys are in alphabetical order.
     - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
     - `log_likelihood_variance`: the variance of these estimates given θ, the median over the draws,
         shape (*chains,): that of log p̂ by the delta method, summed over the intervals, which with
@@ -89,7 +94,8 @@ class PMMHPosterior(AbstractPosterior):
         than three, the chain holds on to lucky estimates and hardly moves: take as many times more
         `num_proposals`, or a better `proposal`; far below, fewer make iterations cheaper. Infinite
         where weights were cut off (`num_truncated`), and with one proposal.
-    - `log_step_error`: that of each of these estimates.
+    - `log_step_error`: an estimate of the step error of each of these, shape (*chains, n): what
+        `step_error`, that of the posterior mean, is made of.
     - `accepted`: shape (*chains, n).
     - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
         parameters were refused because no estimate was to be had, shape (*chains,). With couplings

@@ -19,16 +19,7 @@ _FEWEST = 10
 
 
 class AbstractPosterior(eqx.Module):
-    """Draws of unknown parameters; arrays have a leading axis of chains if there are several.
-
-    - `params`: all parameters of the model, each with leading axes (*chains, n).
-    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
-    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
-        the keys are in alphabetical order.
-    - `log_step_error`: an estimate of the step error of the log density at each draw, NaN where
-        none was worked out, shape (*chains, n): what `step_error`, that of the posterior mean, is
-        made of.
-    """
+    """Draws of unknown parameters, and their errors by their number and by the steps."""
 
     params: eqx.AbstractVar[PyTree]
     theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
