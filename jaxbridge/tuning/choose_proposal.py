@@ -8,7 +8,7 @@ from jaxtyping import Array, Key
 
 from ..coupling.gamma import Coupling
 from ..engine.checks import Numbers, check_count, check_key, is_traced
-from ..models.bridge_problem import Intervals, bridge_problem
+from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals.auto import choice_between, default_candidates, why_left_out
 from ..proposals.choice import Choice
@@ -97,8 +97,7 @@ def choose_proposal(
     choice = choose_between(given, left_out)
     possible = model.has_reversal and (model.has_density or not for_density)
     if candidates is None and not batched and possible and _worth_tuning(choice):
-        arguments = (key, model, start, end, duration, num_steps, intervals, for_density)
-        tuned = _tuned_coupling(*arguments)
+        tuned = _tuned_coupling(key, model, problem, for_density)
         choice = choice if tuned is None else choose_between([*given, tuned])
     return choice
 
@@ -116,21 +115,13 @@ def _worth_tuning(choice: Choice) -> bool:
 
 
 def _tuned_coupling(
-    key: Key[Array, ""],
-    model: Diffusion,
-    start: Numbers,
-    end: Numbers,
-    duration: Numbers,
-    num_steps: int,
-    intervals: Intervals,
-    for_density: bool,
+    key: Key[Array, ""], model: Diffusion, problem: BridgeProblem, for_density: bool
 ) -> Coupling | None:
     """The best of a few couplings, `None` where no pilot run succeeded."""
-    num_pilot = max(_TUNING_PILOT, 20 * intervals.start.shape[1])
+    num_pilot = max(_TUNING_PILOT, 20 * len(problem.like))
     pilots = []
     for coupling in (Coupling(0.0), Coupling(0.5)):
-        sizes = (num_steps, num_pilot, for_density)
-        pilots += coupling_pilots(key, model, start, end, duration, coupling, *sizes)
+        pilots += coupling_pilots(key, model, problem, coupling, num_pilot, for_density)
     if all(np.isnan(pilot.efficiency) for pilot in pilots):
         return None
     return best_pilot(pilots).coupling

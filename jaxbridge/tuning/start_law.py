@@ -26,8 +26,8 @@ from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.keys import key_for
 from ..engine.rejection import most_lanes
 from ..exact.importance import weigh_bridges
-from ..models.bridge_problem import Intervals, as_intervals
-from ..models.diffusion import Diffusion, check_diffusion
+from ..models.bridge_problem import BridgeProblem, Intervals, bridge_problem
+from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
 
 _SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -118,8 +118,8 @@ def fit_start_law(
     ```
     """
     coupling = Coupling() if coupling is None else coupling
-    sizes = (num_steps, num_pilot, for_density)
-    pilots = coupling_pilots(key, model, start, end, duration, coupling, *sizes)
+    problem = bridge_problem(model, start, end, duration, num_steps)
+    pilots = coupling_pilots(key, model, problem, coupling, num_pilot, for_density)
     return best_pilot(pilots).coupling.start_law
 
 
@@ -161,9 +161,9 @@ def tune_coupling(
         couplings = [Coupling(gamma) for gamma in (-1.0, 0.0, 0.5, 0.9)]
     if len(couplings) == 0:
         raise ValueError("`couplings` must have at least one candidate.")
-    sizes = (num_steps, num_pilot, for_density)
+    problem = bridge_problem(model, start, end, duration, num_steps)
     runs = (
-        coupling_pilots(key, model, start, end, duration, coupling, *sizes)
+        coupling_pilots(key, model, problem, coupling, num_pilot, for_density)
         for coupling in couplings
     )
     pilots = list(itertools.chain.from_iterable(runs))
@@ -173,16 +173,12 @@ def tune_coupling(
 def coupling_pilots(
     key: Key[Array, ""],
     model: Diffusion,
-    start: Numbers,
-    end: Numbers,
-    duration: Numbers,
+    problem: BridgeProblem,
     coupling: Coupling,
-    num_steps: int,
     num_pilot: int,
     for_density: bool,
 ) -> list[Pilot]:
     check_key(key)
-    check_diffusion(model)
     if for_density and not model.has_density:
         raise ValueError(
             "densities by couplings need the stationary one, with any start law: give `Diffusion` "
@@ -191,15 +187,15 @@ def coupling_pilots(
         )
     if not isinstance(coupling, Coupling):
         raise TypeError(f"a start law is chosen for a `Coupling`; got {coupling!r}.")
-    if is_traced(key, model, coupling, start, end, duration):
+    if is_traced(key, model, coupling, problem):
         raise TypeError(
             "a start law is chosen by looking at numbers, which `jit` and `vmap` hide: choose it "
             "before, and pass the coupling that has it."
         )
-    intervals, batched, _ = as_intervals(start, end, duration)
-    if batched:
+    if problem.batched:
         raise ValueError("a start law is chosen for one interval: `start` of shape (d,).")
-    d = intervals.start.shape[1]
+    (start,), (end,), (duration,) = problem.intervals
+    intervals, num_steps, d = problem.intervals, problem.num_steps, start.shape[0]
     num_pilot = check_count("num_pilot", num_pilot, 20 * d)
     bridge_key, law_key, weigh_key = jax.random.split(key, 3)
     bridges = sample_bridges(
