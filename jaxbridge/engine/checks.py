@@ -1,4 +1,4 @@
-"""What counts as numbers, and how they become arrays."""
+"""What is given: numbers, which become arrays, keys and counts; and what has no derivative."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,11 +1,11 @@
 """Markov chains whose law is that of the exact bridge: very many steps in one call.
 
-* Pseudo-marginal Metropolis–Hastings (`pseudo_marginal_chain`), for every proposal.
-* Renewal (`renewal_chain`), for couplings.
-* Preconditioned Crank–Nicolson moves of the noise (`crank_nicolson_chain`), for proposals that
-  are pulled to the end point.
+* Pseudo-marginal Metropolis–Hastings (`pseudo_marginal`), for every proposal.
+* Renewal (`renewal`), for couplings.
+* Preconditioned Crank–Nicolson moves of the noise (`crank_nicolson`), for proposals that are
+  pulled to the end point.
 
-Each comes as a kernel of two functions, `init` and `step`, too.
+Each comes as a kernel of two functions, `init` and `step`, too (`kernels`).
 """
 
 import functools

@@ -271,8 +271,8 @@ def sample_weighted_bridges(
     **Gradients.** From proposals that are pulled to the end point (`ModifiedDiffusionBridge`,
     `ResidualBridge`, `Guided`) paths and weights are smooth functions of `params`, `start`, `end`
     and `duration`, so derivatives of weighted means, forward and reverse, are estimates of the
-    derivatives of expectations. Those of couplings, and of a choice that uses several
-    proposals, raise `TypeError`.
+    derivatives of expectations; a choice between such proposals has them, too. Those of
+    couplings, and of a choice that may take them, raise `TypeError`.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 

@@ -1,7 +1,7 @@
 """Particle-marginal Metropolis–Hastings over any parameters, those of σ included.
 
 The likelihood of the observations is a product of transition densities, of which weighted
-proposals give unbiased estimates (`transition`). A chain that accepts with the ratio of
+proposals give unbiased estimates (`exact.density`). A chain that accepts with the ratio of
 estimates, and keeps that of its state, has the exact posterior (Andrieu & Roberts 2009), up to
 the step error. Proposals are normal random walks, whose covariance S Sᵀ is learnt in a warm-up
 

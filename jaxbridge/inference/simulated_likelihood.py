@@ -101,9 +101,9 @@ def as_pulled(
 def pulled_blocks(
     key: Key[Array, ""], model: Diffusion, problem: Problem, proposal: AbstractProposal
 ) -> tuple[Block, ...]:
-    """The blocks with one proposal each, for a choice between several has no derivative: that
-    which leaves the least variance in all at this model, or, where the user has chosen interval by
-    interval, a block for each."""
+    """The blocks with one proposal each, for derivatives of a choice between several run each for
+    all intervals: that which leaves the least variance in all at this model, or, where the user has
+    chosen interval by interval, a block for each."""
     blocks = make_blocks(key, model, problem, proposal, Budget(), "weights")
     if proposal.is_open:
         return tuple(_decided(block) for block in blocks)

@@ -14,7 +14,7 @@ import functools
 from collections.abc import Callable
 
 import equinox as eqx
-import jax.extend
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Key, PyTree

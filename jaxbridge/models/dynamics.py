@@ -40,7 +40,7 @@ def weighted_divergence(
     product: Callable[[Array, Array], Array],
     log_nu: Callable[[Array], Array],
     x: Float[Array, " d"],
-    varies: bool = True,
+    varies: bool,
 ) -> Float[Array, " d"]:
     """ν⁻¹ Σ_j ∂_j(ν M_ij) = M ∇log ν + div M, for a matrix field given by `product(x, v)` =
     M(x) v; div M is left out where M does not vary."""

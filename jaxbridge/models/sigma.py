@@ -1,8 +1,8 @@
 """The diffusion coefficient σ(x) at one point, as the operator its form calls for.
 
 Four forms: the identity, a constant matrix (inverted outside the loop over time), a
-diagonal and a full matrix. Whoever holds a `Sigma` multiplies and solves without knowing
-which; what a form does not need is never computed.
+diagonal and a full matrix. Whoever holds an `AbstractSigma` multiplies and solves without
+knowing which; what a form does not need is never computed.
 """
 
 from abc import abstractmethod

@@ -312,7 +312,7 @@ def trace(
     return finish(ax)
 
 
-def _scores(n: int, num_points: int = 61) -> Float[np.ndarray, " num_points"]:
+def _scores(n: int) -> Float[np.ndarray, " scores"]:
     """Evenly spaced normal scores, out to those of the extremes of n draws."""
     last = -ndtri(0.5 / n)
-    return np.linspace(-last, last, num_points)
+    return np.linspace(-last, last, 61)

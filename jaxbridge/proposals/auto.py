@@ -7,6 +7,8 @@ by interval (`pilots`).
 
 Their paths are not used again, so weights stay what they are whatever is chosen; but a pilot
 of finite size can be deceived, by a second way to the end point that it never saw for instance.
+
+What a user may give as `proposal` is told apart here, too (`as_proposal`).
 """
 
 import dataclasses

@@ -4,7 +4,7 @@
 
 Chains, importance means and transition densities are written on this alone. A coupling gives
 random weights (`coupled`), proposals that are pulled to the end point weights that are functions of
-the path (`guided`), and each interval may have its own (`auto`).
+the path (`guided`), and each interval may have its own (`choice`).
 """
 
 from abc import abstractmethod

@@ -35,7 +35,7 @@ def in_blocks(
     keys: Key[Array, "I n"],
     intervals: Intervals,
     most_rows: int,
-    active: Bool[Array, " I"] | None = None,
+    active: Bool[Array, " I"] | None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> WeightedPaths:
     """`function`, row by row of its arguments, on blocks of at most `most_rows` rows.
@@ -126,7 +126,7 @@ def masked(made: WeightedPaths, active: Bool[Array, " I"]) -> WeightedPaths:
 _VECTOR, _WORTH_FILLING = 16, 256
 
 
-def _even_blocks(size: int, most: int, unit: int = 1) -> Int[Array, "blocks length"]:
+def _even_blocks(size: int, most: int, unit: int) -> Int[Array, "blocks length"]:
     """0, ..., size - 1 in blocks of one length, a multiple of `unit`, the last of them repeated to
     fill up."""
     num_blocks = -(-size // max(most, 1))

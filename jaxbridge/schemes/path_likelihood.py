@@ -108,7 +108,7 @@ def log_likelihood_of_steps(
     model: Diffusion,
     steps: Float[Array, "*I K"],
     path: Float[Array, "*batch points d"],
-    form: Form | None = None,
+    form: Form | None,
 ) -> Float[Array, "*batch"]:
     """`path_log_likelihood`, given the steps of the grid: one for all paths, or one for each
     interval."""
@@ -141,7 +141,7 @@ def log_likelihoods(
     model: Diffusion,
     steps: Float[Array, "K P"],
     paths: Float[Array, "P points d"],
-    form: Form | None = None,
+    form: Form | None,
 ) -> Float[Array, " P"]:
     """Those of P paths, with steps δ in the columns of `steps`."""
     like = paths[0, 0]

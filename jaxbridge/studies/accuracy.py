@@ -21,7 +21,7 @@ from ..engine.linalg import matvec, solve
 from .clock import fastest, timed
 from .exact import UNLIKELY
 from .paper import law_half_way, study_model
-from .report import Say, Study, Table, silent, table
+from .report import Say, Study, Table, table
 
 _GAMMA = 0.5
 TARGETS = (0.1, 0.03, 0.01)
@@ -52,7 +52,7 @@ def curves() -> list[Curve]:
 
 
 def run_accuracy(
-    key: Key[Array, ""], num_bridges: int, say: Say = silent, brief: bool = False
+    key: Key[Array, ""], num_bridges: int, say: Say, brief: bool
 ) -> dict[str, jb.WorkPrecision]:
     """The parts of the study, by their titles; a `brief` one has the fewest settings."""
     of_the_paper = functools.partial(jb.work_precision, key, study_model(), *UNLIKELY, 1.0)
@@ -194,7 +194,7 @@ class EffectCost(NamedTuple):
     nanoseconds: float
 
 
-def run_effect_costs(key: Key[Array, ""], num_bridges: int, say: Say = silent) -> list[EffectCost]:
+def run_effect_costs(key: Key[Array, ""], num_bridges: int, say: Say) -> list[EffectCost]:
     """Time for each path and step of approximate bridges, one effect after another."""
     plain = jb.hyperbolic(0.8, 2)
     scenes = {
@@ -230,10 +230,7 @@ def run_effect_costs(key: Key[Array, ""], num_bridges: int, say: Say = silent) -
 
 
 def run_sigma_costs(
-    key: Key[Array, ""],
-    num_bridges: int,
-    dimensions: Sequence[int] = (2, 5, 10),
-    say: Say = silent,
+    key: Key[Array, ""], num_bridges: int, dimensions: Sequence[int], say: Say
 ) -> list[tuple[int, float, float]]:
     """For each dimension, nanoseconds of a path and step with σ = I and with a full σ(x)."""
     rows = []

@@ -30,7 +30,7 @@ from .report import Say, Study, silent, table
 ALPHA = 0.8
 PRIOR_MEAN, PRIOR_VARIANCE = 1.0, 1.0
 _GRID = np.linspace(0.3, 1.5, 241)
-_BRIDGE_STEPS = 50
+_BRIDGE_STEPS, _BATCH = 50, 50
 # Of the chain, before the draws that are used.
 _BURN_IN = 100
 
@@ -87,12 +87,10 @@ def hyperbolic_data(key: Key[Array, ""], num_intervals: int, duration: float) ->
     return Data(times, jb.simulate(path_key, model, start, times, num_paths=1)[0])
 
 
-def brownian_posterior(
-    key: Key[Array, ""], data: Data, num_bridges: int = 4_000, batch: int = 50
-) -> ExactPosterior:
+def brownian_posterior(key: Key[Array, ""], data: Data, num_bridges: int) -> ExactPosterior:
     """By Monte Carlo over Brownian bridges, the same for all α; the error from two halves."""
     halves = [
-        _brownian_log_likelihood(half_key, data, num_bridges // 2, batch)
+        _brownian_log_likelihood(half_key, data, num_bridges // 2)
         for half_key in jax.random.split(key)
     ]
     both = logsumexp(jnp.stack(halves), axis=0) - math.log(2)
@@ -101,9 +99,9 @@ def brownian_posterior(
     return exact._replace(error=abs(means[0] - means[1]) / 2)
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
+@functools.partial(jax.jit, static_argnums=2)
 def _brownian_log_likelihood(
-    key: Key[Array, ""], data: Data, num_bridges: int, batch: int
+    key: Key[Array, ""], data: Data, num_bridges: int
 ) -> Float[Array, "intervals m"]:
     """log p_T(a, b) for each α on the grid, up to what does not depend on it.
 
@@ -115,7 +113,7 @@ def _brownian_log_likelihood(
     fractions = jnp.linspace(0, 1, _BRIDGE_STEPS + 1)
 
     def integrals(key):
-        shape = (_BRIDGE_STEPS, batch, *start.shape)
+        shape = (_BRIDGE_STEPS, _BATCH, *start.shape)
         steps = jax.random.normal(key, shape) * jnp.sqrt(duration / _BRIDGE_STEPS)
         walk = jnp.concatenate([jnp.zeros((1, *shape[1:])), jnp.cumsum(steps, axis=0)])
         t = fractions[:, None, None, None]
@@ -132,9 +130,9 @@ def _brownian_log_likelihood(
         return jnp.logaddexp(total, logsumexp(exponents, axis=1)), None
 
     total = jnp.full((len(alpha), len(start)), -jnp.inf)
-    total, _ = lax.scan(one_batch, total, jax.random.split(key, num_bridges // batch))
+    total, _ = lax.scan(one_batch, total, jax.random.split(key, num_bridges // _BATCH))
     F = jnp.sqrt(1 + jnp.sum(data.observations**2, axis=1))
-    return (total - alpha[:, None] * jnp.diff(F)).T - math.log(num_bridges // batch * batch)
+    return (total - alpha[:, None] * jnp.diff(F)).T - math.log(num_bridges // _BATCH * _BATCH)
 
 
 def stationary_posterior(data: Data) -> ExactPosterior:

@@ -20,7 +20,7 @@ import jaxbridge as jb
 from ..proposals.auto import Budget, as_proposal, default_candidates
 from .clock import timed
 from .paper import Point, study_model
-from .report import Row, Say, Table, silent
+from .report import Row, Say, Table
 
 DURATIONS = (0.05, 0.25, 1.0, 5.0, 20.0, 50.0)
 # Durations from which on there are more steps, and twice as many of them in all.
@@ -118,9 +118,9 @@ def _sample_well(key: Key[Array, ""], p: _Well) -> Float[Array, " d"]:
 def run_crossover(
     key: Key[Array, ""],
     work: int,
-    durations: Sequence[float] = DURATIONS,
-    chosen: Sequence[Process] | None = None,
-    say: Say = silent,
+    durations: Sequence[float],
+    chosen: Sequence[Process] | None,
+    say: Say,
 ) -> list[Rate]:
     """Each candidate of "auto", and "auto" itself, for each process and duration, in about `work`
     simulated steps of each run."""

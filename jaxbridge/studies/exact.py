@@ -78,7 +78,7 @@ class Floor(NamedTuple):
     seconds: float
 
 
-def run_exact(key: Key[Array, ""], scale: float, say: Say = silent) -> list[ExactResult]:
+def run_exact(key: Key[Array, ""], scale: float, say: Say) -> list[ExactResult]:
     """All methods on the unlikely and the very unlikely bridge; `scale` shortens the runs."""
     model, coupling = study_model(), jb.Coupling(_GAMMA)
     say("fitting a start law to the very unlikely bridge")
@@ -172,17 +172,12 @@ def _judge(middle, weights, law: jb.GaussianLaw) -> tuple[Any, Fit, Any, float]:
     return middle[drawn], fit, error, float(1 / (weights**2).sum())
 
 
-def run_variation(
-    key: Key[Array, ""],
-    num_bridges: int,
-    gammas: Sequence[float] = (0.0, 0.5, 0.9, 0.99),
-    say: Say = silent,
-) -> list[Variation]:
+def run_variation(key: Key[Array, ""], num_bridges: int, say: Say) -> list[Variation]:
     """The regression of section 3.2 for the three bridges of the paper."""
     model, results = study_model(), []
     bridges = {case.bridge: (case.start, case.end) for case in CASES}
     for name, ends in bridges.items():
-        for gamma in gammas:
+        for gamma in (0.0, 0.5, 0.9, 0.99):
             say(f"{name}, variation of 1/pi for gamma {gamma:g}")
             laws = (
                 (jb.Coupling(gamma), jb.Stationary()),
@@ -245,9 +240,9 @@ def run_cost(
     return costs
 
 
-def slope(costs: Sequence[Cost], shortest: float = 10.0) -> float:
-    """The exponent p of seconds ∝ T^p, from `shortest` on."""
-    long = np.array([(c.duration, c.seconds) for c in costs if c.duration >= shortest])
+def slope(costs: Sequence[Cost]) -> float:
+    """The exponent p of seconds ∝ T^p, from T = 10 on."""
+    long = np.array([(c.duration, c.seconds) for c in costs if c.duration >= 10])
     duration, seconds = np.log(long).T
     return float(np.polyfit(duration, seconds, 1)[0])
 
@@ -372,7 +367,7 @@ iterations: only their order of magnitude can be compared.""",
 )
 VARIATION = Study(
     "How much hitting probabilities vary",
-    lambda key, quick, say: run_variation(key, 50 if quick else 300, say=say),
+    lambda key, quick, say: run_variation(key, 50 if quick else 300, say),
     format_variation,
     """\
 An approximate bridge is exact if the probability pi that its associated diffusion hits it does

@@ -95,7 +95,7 @@ def study_model() -> jb.Diffusion:
 
 def run_study(
     key: Key[Array, ""],
-    num_bridges: int = 50_000,
+    num_bridges: int,
     cases: Sequence[Case] = CASES,
     say: Say = silent,
 ) -> list[Result]:

@@ -14,7 +14,7 @@ Table = tuple[Row, Sequence[Row]]  # titles, and rows
 class Study(NamedTuple):
     """A part of the study: `run(key, quick, say)` gives its results, and `say`s what it is at;
     `tables` of them are printed above `what_to_see`; `draw(figures, results)` makes pictures, by
-    their names, by the module of that name."""
+    their names, with the functions of the module `figures`."""
 
     title: str
     run: Callable[[Key[Array, ""], bool, Say], Any]

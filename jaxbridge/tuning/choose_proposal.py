@@ -105,7 +105,6 @@ def choose_proposal(
 def _worth_tuning(choice: Choice) -> bool:
     """Whether a coupling comes near the best proposal, so that a start law might put it first; or,
     where none was tried, whether the best one at all might be put behind."""
-    assert choice.efficiency is not None and choice.seconds is not None
     rates = np.asarray(choice.efficiency / choice.seconds)[:, 0]
     coupled = [candidate.coupled for candidate in choice.candidates]
     rates = np.where(np.isnan(rates), 0, rates)

@@ -1,6 +1,6 @@
 """Which start law, and which γ? By pilot runs: the one with most effective samples per
 simulated path, proposals and trials alike (end of section 3 of the paper: an open question).
-And which proposal at all? The one with most effective samples per second (`choice`).
+And which proposal at all? The one with most effective samples per second (`choose_proposal`).
 
 Start laws are sought between ν, the best one for likely end points, and the Gaussian fit G to
 the starts X*_T of the reversed paths that met, which hits an unlikely bridge far more often:
