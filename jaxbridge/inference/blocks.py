@@ -92,7 +92,8 @@ def make_blocks(
     like, groups = problem.like, problem.groups
     for_density, weighted = use == "density", use != "approximate"
     moving = use in ("weights", "density", "renewal")
-    if moving and proposal == "auto" and needs_burn_in(Stationary(), model):
+    is_auto = isinstance(proposal, str) and proposal == "auto"
+    if moving and is_auto and needs_burn_in(Stationary(), model):
         left_out = why_left_out(model, for_density) or _NO_SAMPLER
         proposal = choice_between(guided_candidates(model, like), left_out=left_out)
         budget = Budget()

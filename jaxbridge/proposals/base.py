@@ -185,7 +185,7 @@ class AbstractSingleProposal(AbstractWeightedProposal):
         """The scheme, or the law of the target's steps, the meeting rule, and γ."""
 
     @abstractmethod
-    def most_accurate(self, sigma_varies: bool) -> "AbstractSingleProposal":
+    def most_accurate(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractSingleProposal":
         """The same with the smallest step error that it can have."""
 
     @abstractmethod

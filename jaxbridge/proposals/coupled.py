@@ -81,7 +81,7 @@ class CoupledPairs(AbstractSingleProposal):
     def ingredients(self):
         return ingredients(self.coupling)
 
-    def most_accurate(self, sigma_varies):
+    def most_accurate(self, model, like):
         return eqx.tree_at(lambda p: p.coupling, self, most_accurate(self.coupling))
 
     def for_pilot(self):

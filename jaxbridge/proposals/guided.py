@@ -86,8 +86,8 @@ class AbstractGuidedProposal(AbstractSingleProposal):
     def ingredients(self):
         return type(self.density).__name__, "", np.nan
 
-    def most_accurate(self, sigma_varies):
-        if sigma_varies:
+    def most_accurate(self, model, like):
+        if model.forward(like).sigma_varies:
             return self
         is_density = lambda leaf: isinstance(leaf, AbstractStepDensity)
         return eqx.tree_at(lambda p: p.density, self, ItoTaylorDensity(), is_leaf=is_density)

@@ -184,8 +184,8 @@ def closed_form(
 
 def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
     """A fine run by the best scheme there is; to its error belongs what half the steps change."""
-    varies = scene.model.forward(jnp.asarray(scene.start)).sigma_varies
-    limit = run._replace(proposal=run.proposal.most_accurate(varies))
+    best = run.proposal.most_accurate(scene.model, jnp.asarray(scene.start))
+    limit = run._replace(proposal=best)
     half = limit._replace(num_steps=max(run.num_steps // 2, 1))
     fine = _estimate(scene, run.method, limit.result(key, scene))
     coarse = _estimate(scene, run.method, half.result(jax.random.fold_in(key, 1), scene))
