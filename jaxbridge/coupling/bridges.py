@@ -8,12 +8,10 @@ from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.checks import Numbers, check_bound, check_count, check_key
+from ..engine.checks import Numbers, check_bound, check_count, check_key, without_derivatives
 from ..engine.devices import over_devices
 from ..engine.keys import numbered_keys
 from ..engine.rejection import Accepted, Attempts, default_num_lanes, rejection_sample
@@ -160,13 +158,10 @@ def _sample_bridges(
     num_intervals, num_steps, stored = problem.num_intervals, problem.num_steps, problem.stored
     keys = problem.keys(key, 1)[:, 0]
     inputs = Inputs(model.prepared(), coupling, problem.intervals)
-    fixed = jax.tree.map(
-        lambda leaf: lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, inputs
-    )
     everything = jnp.ones(num_intervals, bool)
     found = find_bridges(
         keys,
-        fixed,
+        without_derivatives(inputs),
         everything,
         num_bridges,
         max_proposals,

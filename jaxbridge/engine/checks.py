@@ -8,6 +8,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 # Anything `jnp.asarray` takes: an array, a number, a (nested) list of numbers.
@@ -61,6 +62,13 @@ def all_finite_leaves(tree: PyTree) -> Bool[Array, ""]:
     """Whether all numbers in the tree are finite."""
     leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves] or [True]))
+
+
+def without_derivatives(tree: PyTree) -> PyTree:
+    """The tree as numbers, of which nothing is a function."""
+    return jax.tree.map(
+        lambda leaf: lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree
+    )
 
 
 @eqx.filter_custom_jvp

@@ -119,8 +119,8 @@ def sample_exact_bridges(
         raise ValueError(
             f'`method` must be "pseudo_marginal", "renewal" or "crank_nicolson"; got {method!r}.'
         )
-    proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
+    proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     chain = run(key, model, proposal, problem, num_bridges, progress_meter)
     if not throw:
         return chain

@@ -208,9 +208,10 @@ def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
 def _weigh_bridges(key, model, pairs, bridges, budget):
     counts, coupling = counts_of(key, model, pairs.coupling, bridges, *budget)
     d, shape = bridges.paths.shape[-1], bridges.met.shape
+    model = model.prepared()
     log_weights = pair_log_weights(
         coupling.start_law,
-        model.prepared(),
+        model,
         bridges.paths[..., -1, :].reshape(-1, d),
         bridges.reverse_start.reshape(-1, d),
         counts.mean.reshape(-1),
@@ -218,9 +219,8 @@ def _weigh_bridges(key, model, pairs, bridges, budget):
     log_weights, unusable = usable(log_weights, bridges.met)
     paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
     intervals = Intervals(paths[:, 0], paths[:, -1], durations_of(bridges))
-    prepared = model.prepared()
-    log_halving = pairs.log_halving(prepared, intervals, paths, shape[-1]).reshape(shape)
-    share = pairs.step_share(prepared, intervals).reshape(shape)[..., 0]
+    log_halving = pairs.log_halving(model, intervals, paths, shape[-1]).reshape(shape)
+    share = pairs.step_share(model, intervals).reshape(shape)[..., 0]
     num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)
     num_nonfinite = jnp.sum(counts.num_nonfinite, axis=-1, dtype=jnp.int32)
     return WeightedBridges(
@@ -290,8 +290,8 @@ def sample_weighted_bridges(
     budget = Budget(num_counts, max_proposals, max_trials)
     proposal = as_proposal(proposal, model, problem.like, budget)
     proposal.check(model, problem.intervals)
-    proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
+    proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     weighted = _sample_weighted(key, model, proposal, problem, num_bridges, progress_meter)
     return _or_throw(weighted, model) if throw else weighted
 

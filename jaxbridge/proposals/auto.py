@@ -16,14 +16,18 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
-from jax import lax
 from jaxtyping import Array, Float, Key
 
 from ..coupling.base import AbstractCoupling
 from ..coupling.gamma import Coupling
 from ..coupling.hitting import check_max_trials
-from ..engine.checks import check_bound, check_count, is_traced, nondifferentiable_choice
+from ..engine.checks import (
+    check_bound,
+    check_count,
+    is_traced,
+    nondifferentiable_choice,
+    without_derivatives,
+)
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..schemes.step_density import EulerDensity, ItoTaylorDensity
@@ -95,19 +99,13 @@ class Auto(AbstractProposal):
         if self.coupled:
             model, intervals = nondifferentiable_choice((model, intervals))
         else:
-            model, intervals = _without_derivatives((model, intervals))
+            model, intervals = without_derivatives((model, intervals))
         arguments = (self.candidates, intervals, num_steps, self.num_pilot)
         choice = run_pilots(key, model, *arguments, timed)
         return dataclasses.replace(choice, left_out=self.left_out)
 
     def __str__(self) -> str:
         return self.describe()
-
-
-def _without_derivatives(tree):
-    return jax.tree.map(
-        lambda leaf: lax.stop_gradient(leaf) if eqx.is_inexact_array(leaf) else leaf, tree
-    )
 
 
 def resolve(
@@ -122,7 +120,7 @@ def resolve(
     if not isinstance(proposal, Auto):
         return proposal
     if not proposal.coupled:
-        model, intervals = _without_derivatives((model, intervals))  # known under `grad`
+        model, intervals = without_derivatives((model, intervals))  # known under `grad`
     if is_traced(key, model, proposal, intervals):
         return proposal
     return proposal.choose(key, model, intervals, num_steps)
