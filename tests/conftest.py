@@ -8,6 +8,12 @@ import tempfile
 
 from jaxtyping import config as jaxtyping_config, install_import_hook
 
+# Nearly all of the time goes into compilation, of which optimisation is two thirds. What
+# `helpers.run_program` runs is compiled as it is for users. (A release of XLA that no longer knows
+# a flag stops: then `XLA_FLAGS= pytest`.)
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+)
 install_import_hook("jaxbridge", "beartype.beartype")
 
 import jax  # noqa: E402
@@ -29,9 +35,9 @@ def pytest_unconfigure():
         shutil.rmtree(os.environ[_CACHE], ignore_errors=True)
 
 
-@pytest.fixture(params=["float32", "float64"])
+@pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.slow)])
 def precision(request):
-    """Run a test in both precisions."""
+    """Run a test in both precisions, in double among the slow ones."""
     with jax.enable_x64(request.param == "float64"):
         yield request.param
 

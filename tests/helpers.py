@@ -242,8 +242,31 @@ def assert_weighted_moments(values, weights, mean, covariance, num_sigma=5.0, al
     return size
 
 
+def assert_chain_moments(values, mean, covariance):
+    """5 standard errors of batch means; batches are many times longer than the chain's memory."""
+    values = np.asarray(values, float)
+    sd = np.sqrt(np.diag(covariance))
+    deviations = (values - mean) / sd
+    products = deviations[:, :, None] * deviations[:, None]
+    correlation = covariance / np.outer(sd, sd)
+    for samples, exact in [(deviations, np.zeros(len(sd))), (products, correlation)]:
+        batches = samples[: len(samples) // 50 * 50].reshape(50, -1, *samples.shape[1:]).mean(1)
+        error = batches.std(0, ddof=1) / np.sqrt(50)
+        np.testing.assert_array_less(np.abs(batches.mean(0) - exact), 5 * error)
+        assert error.max() < 0.1
+
+
 def slow_cases(cases, everywhere):
     """Names of cases, of which those not in `everywhere` are marked as slow."""
     return [
         name if name in everywhere else pytest.param(name, marks=pytest.mark.slow) for name in cases
+    ]
+
+
+def slow_beyond(num, cases):
+    """Cases of which those after the first `num` are marked as slow."""
+    cases = [case if isinstance(case, tuple) else (case,) for case in cases]
+    return [
+        pytest.param(*case, marks=[pytest.mark.slow] if i >= num else [])
+        for i, case in enumerate(cases)
     ]

@@ -22,6 +22,7 @@ from jaxbridge.coupling.burn_in import with_burn_in
 from jaxbridge.schemes.step_error import of_log_mean
 
 slow = pytest.mark.slow
+RANDOM = random_models.random_models()
 
 
 class Told(NamedTuple):
@@ -150,10 +151,9 @@ def density_of(weighted):
     )
 
 
-def each_random_model(everywhere):
+def each_random_model():
     return [
-        pytest.param(i, id=random.name, marks=() if i in everywhere else slow)
-        for i, random in enumerate(random_models.random_models())
+        pytest.param(i, id=random.name) for i, random in enumerate(random_models.random_models())
     ]
 
 
@@ -164,11 +164,12 @@ def forgets():
     jax.clear_caches()
 
 
+@slow
 @pytest.mark.usefixtures("forgets")
-@pytest.mark.parametrize("index", each_random_model({0}))
+@pytest.mark.parametrize("index", range(len(RANDOM)), ids=[each.name for each in RANDOM])
 def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):
     """Densities and mid-points by proposals of all kinds, where none has a warning."""
-    random = random_models.random_models()[index]
+    random = RANDOM[index]
     model = normalised(random)
     told = {
         name: tell(jax.random.key(index), model, random, proposal, 50)
@@ -257,6 +258,7 @@ class Own(jb.AbstractScheme):
         return jb.Euler().frame(dynamics, x, driven, dt)
 
 
+@pytest.mark.slow
 def test_no_scheme_is_taken_for_more_accurate_than_it_is():
     """Where the drift is not linear the mean of a linearly implicit step is of first order."""
     z = math.log(2 * math.gamma(1.25) * 0.5**-0.25)
@@ -278,15 +280,16 @@ def test_no_scheme_is_taken_for_more_accurate_than_it_is():
 # Rotation.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "rate, speed, duration, num_steps",
     [
         (1.0, 2 * np.pi, 2.0, 50),
         (0.1, 20.0, 2.0, 50),
-        pytest.param(0.5, 3.0, 5.0, 50, marks=slow),
-        pytest.param(1.0, 2 * np.pi, 5.0, 50, marks=slow),
-        pytest.param(0.5, 3.0, 10.0, 50, marks=slow),
-        pytest.param(0.1, 20.0, 2.0, 200, marks=slow),
+        (0.5, 3.0, 5.0, 50),
+        (1.0, 2 * np.pi, 5.0, 50),
+        (0.5, 3.0, 10.0, 50),
+        (0.1, 20.0, 2.0, 200),
     ],
 )
 def test_rotation_by_auto(rate, speed, duration, num_steps):

@@ -512,7 +512,8 @@ def test_params_may_hold_a_neural_network():
     assert all(jnp.isfinite(leaf).all() for leaf in leaves)
 
 
-@pytest.mark.parametrize("scheme", [pytest.param("Heun", marks=pytest.mark.slow), "Euler"])
+@pytest.mark.slow
+@pytest.mark.parametrize("scheme", ["Heun", "Euler"])
 def test_sixty_thousand_lanes_with_full_sigma_finish(scheme):
     """Batched LAPACK calls in such a scan can hang XLA's thread pool on CPU for ever."""
     program = f"""

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import NON_REVERSIBLE, assert_moments, paper_model, slow_cases
+from helpers import NON_REVERSIBLE, assert_moments, paper_model
 
 import jaxbridge as jb
 from jaxbridge.coupling import burn_in, start_laws
@@ -175,7 +175,8 @@ LAWS = {
 }
 
 
-@pytest.mark.parametrize("name", slow_cases(LAWS, ["unknown"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", LAWS)
 def test_counts_and_weights_from_a_run_that_was_cut_are_marked(name, short_runs):
     """Whether it was measured in vain or given too long, 32 units of time are not enough."""
     law, trusted = LAWS[name]

@@ -61,6 +61,7 @@ assert not np.allclose(alone[0].paths, approximate(jax.random.key(1)).paths, ato
 """)
 
 
+@pytest.mark.slow
 def test_every_device_simulates_its_share():
     """Paths in the lowered program are those of 40 / 2 and 40 / 8 lanes. Where the caller has
     split the intervals already, the lanes of a device stay there."""

@@ -4,33 +4,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import PAPER_CASES, chosen_of, count_compilations, exact_cases, paper_model, slow_cases
+from helpers import PAPER_CASES, chosen_of, count_compilations, exact_cases, paper_model
 
 import jaxbridge as jb
 from jaxbridge.proposals.auto import as_proposal
 
 CASES = exact_cases()
-EVERYWHERE = {"unlikely, gamma 0.5"}
-SIZES = {"swirled": 20_000, "five dimensions": 40_000}
 
 
-@pytest.mark.parametrize("name", slow_cases(CASES, EVERYWHERE))
-def test_density_is_that_of_the_closed_form(name):
-    case = CASES[name]()
+def test_density_is_that_of_the_closed_form():
+    case = CASES["unlikely, gamma 0.5"]()
     estimate = jb.transition_log_density(
         jax.random.key(1),
         case.model,
         case.start,
         case.end,
         case.duration,
-        num_proposals=SIZES.get(name, 50_000),
+        num_proposals=50_000,
         num_steps=case.num_steps,
         proposal=case.coupling,
     )
     error = float(estimate.standard_error)
     assert error < 0.03 and estimate.num_truncated == 0
     assert abs(float(estimate.value) - case.log_density) < 5 * error + case.allowance
-    print(f"{name}: {np.exp(float(estimate.value) - case.log_density):.4f} +- {error:.4f}")
 
 
 @pytest.mark.slow

@@ -79,6 +79,7 @@ def test_derivative_of_the_paths_is_not():
     assert np.abs(naive - exact).max() > 0.05
 
 
+@pytest.mark.slow
 def test_function_may_depend_on_parameters(bridges):
     B = multivariate_ou()[0].params.B
 
@@ -123,10 +124,9 @@ def test_what_cannot_be_differentiated_is_refused(bridges, unchecked):
         jb.expectation(lambda path: path, sparse, model)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "density",
-    [jb.EulerDensity(), pytest.param(jb.ItoTaylorDensity(), marks=pytest.mark.slow)],
-    ids=["euler", "trapezoid"],
+    "density", [jb.EulerDensity(), jb.ItoTaylorDensity()], ids=["euler", "trapezoid"]
 )
 def test_on_a_grid_with_short_last_steps(density):
     """Steps that rounding of the times in float32 would have spoilt; the derivative is that of the

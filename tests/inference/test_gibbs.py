@@ -316,7 +316,8 @@ def test_what_is_cut_off_is_counted():
     assert made.num_truncated.shape == (5,) and made.num_truncated.sum() > 0
 
 
-@pytest.mark.parametrize("num_chains", [None, pytest.param(2, marks=SLOW)])
+@pytest.mark.slow
+@pytest.mark.parametrize("num_chains", [None, 2])
 def test_paths_that_stand_in_for_bridges_count_as_missing(num_chains):
     """On the short interval with the far jump pairs never meet. Its first path is hardly ever hit,
     so no proposal is called for, and a chain that looked only at calls would tell nothing."""
@@ -358,6 +359,7 @@ def test_a_state_must_fit_the_observations(unchecked):
             jb.gibbs(key, ou_1d(), times, data, num_steps=num_steps, init=state, **options)
 
 
+@pytest.mark.slow
 def test_a_run_that_replaces_a_sampler_would_depend_on_the_parameters(unchecked):
     model = jb.Diffusion(lambda x, p: -p * x, None, lambda x, p: -p * x @ x, 1.0, reversible=True)
     arguments = (jax.random.key(0), model, TIMES[:4], DATA[:4])

@@ -27,11 +27,12 @@ def exact_moments():
     return np.array(means), np.sqrt([(weights * (each - m) ** 2).sum() for each, m in pairs])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "proposal",
     [
         jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
-        pytest.param(jb.Coupling(0.0), marks=pytest.mark.slow),
+        jb.Coupling(0.0),
     ],
     ids=["bridge", "coupling"],
 )

@@ -66,6 +66,7 @@ def check_maximum(made, exact, sd):
     assert np.abs(made.score.gradient * sd).max() < 0.05
 
 
+@pytest.mark.slow
 def test_rate_and_noise():
     """From parameters that are many standard errors off, further than the optimiser goes."""
     times, data, exact, sd = ou_problem()
@@ -190,6 +191,7 @@ def test_steps_lead_uphill_whatever_the_curvature():
         assert gradient @ simulated_likelihood.ascent_direction(gradient, information) > 0
 
 
+@pytest.mark.slow
 def test_a_maximum_that_is_not_allowed_is_not_found():
     """Nor is the model simulated there; and numbers that change compile nothing anew."""
     times, data, exact, _ = ou_problem()

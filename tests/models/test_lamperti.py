@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import count_compilations
+from helpers import count_compilations, slow_beyond
 from test_transform import MEAN, NOISE, RATE, cir, cir_density
 
 import jaxbridge as jb
@@ -48,10 +48,11 @@ def test_the_reversal_follows_from_the_density(x64):
     assert abs(mean - MEAN) < 5 * NOISE * np.sqrt(MEAN / (2 * RATE) / 4000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "proposal",
     [
-        pytest.param(jb.Coupling(0.0, scheme=jb.Heun()), marks=pytest.mark.slow),
+        jb.Coupling(0.0, scheme=jb.Heun()),
         jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
     ],
     ids=["coupling", "modified diffusion bridge"],
@@ -138,7 +139,7 @@ def shifted(model):
 
 
 @pytest.mark.parametrize("name", INFERENCE)
-@pytest.mark.parametrize("where", [None, lambda p: p[2]], ids=["all", "noise"])
+@pytest.mark.parametrize("where", slow_beyond(1, [None, lambda p: p[2]]), ids=["all", "noise"])
 def test_unknown_parameters_of_sigma_are_refused(name, where):
     """The coordinates would move with them, and the observations would not."""
     moved = jb.lamperti(cir(), at=AT, reach=8.0)

@@ -89,7 +89,7 @@ def assert_sinh_law(paths, start):
         (None, 40),
         pytest.param(diffrax.ItoMilstein(), 200, marks=pytest.mark.slow),
         pytest.param(diffrax.StratonovichMilstein(), 200, marks=pytest.mark.slow),
-        (diffrax.EulerHeun(), 200),
+        pytest.param(diffrax.EulerHeun(), 200, marks=pytest.mark.slow),
         pytest.param(diffrax.Euler(), 200, marks=pytest.mark.slow),
     ],
     ids=["default", "ItoMilstein", "StratonovichMilstein", "EulerHeun", "Euler"],

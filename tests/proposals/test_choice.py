@@ -209,6 +209,11 @@ def test_errors_say_what_to_change(unchecked):
         jb.sample_exact_bridges(*arguments, proposal="auto", method="crank_nicolson")
     with pytest.raises(ValueError, match="`num_pilot` must be at least 2"):
         jb.choose_proposal(*arguments, num_pilot=1)
+
+
+@slow
+def test_no_derivative_is_taken_of_a_choice_with_couplings(unchecked):
+    key, model = jax.random.key(0), paper_model()
     for proposal in (mixed_choice(model, 3), "auto"):
         with pytest.raises(TypeError, match=r"`choice = choose_proposal\(..., candidates="):
             jax.grad(
@@ -298,6 +303,7 @@ def test_the_score_by_a_choice_is_that_of_the_closed_form():
         np.testing.assert_array_less(np.abs(found.mean(0) - exact), 5 * error + 0.01)
 
 
+@pytest.mark.slow
 def test_what_a_proposal_makes_of_another_ones_interval_does_not_spoil_derivatives():
     """Where the explicit path of a guide overflows its derivative is not a number, times zero as
     well."""

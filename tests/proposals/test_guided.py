@@ -12,6 +12,7 @@ from helpers import (
     exact_case,
     loglog_slope,
     paper_model,
+    slow_beyond,
     swirl,
     unswirl,
 )
@@ -66,7 +67,7 @@ def euler_bridge_1d(model, start, end, times, middle):
     return np.log(joint.sum() * width), (grid * joint).sum() / joint.sum()
 
 
-@pytest.mark.parametrize("name", PROPOSALS)
+@pytest.mark.parametrize("name", slow_beyond(3, PROPOSALS))
 def test_weights_make_the_euler_scheme_exact(name):
     """Density and mean of the mid-point, state-dependent σ, five coarse steps: no step error."""
     proposal = PROPOSALS[name]
@@ -105,7 +106,7 @@ def test_one_step_is_the_euler_density(name):
     assert float(estimate.value) == pytest.approx(-(z**2) / 2 - np.log(sd * np.sqrt(2 * np.pi)))
 
 
-@pytest.mark.parametrize("refinement", [1.0, 2.0])
+@pytest.mark.parametrize("refinement", slow_beyond(1, [1.0, 2.0]))
 @pytest.mark.parametrize("linearisation", ["end", "path", -NON_REVERSIBLE])
 def test_linear_drift_is_guided_without_error(x64, linearisation, refinement):
     """Every weight is the density of the Euler chain, a Gaussian recursion."""
@@ -131,7 +132,7 @@ def test_linear_drift_is_guided_without_error(x64, linearisation, refinement):
     np.testing.assert_array_equal(weighted.paths[:, -1], jnp.broadcast_to(end, (8, 2)))
 
 
-@pytest.mark.parametrize("duration, num_steps", [(0.01, 10), (0.1, 50), (1.0, 800)])
+@pytest.mark.parametrize("duration, num_steps", slow_beyond(1, [(0.1, 50), (0.01, 10), (1.0, 800)]))
 @pytest.mark.parametrize(
     "name",
     [
@@ -310,7 +311,7 @@ def test_without_drift_a_guess_has_the_mean_of_both_covariances(diagonal, x64):
     np.testing.assert_allclose(units @ units.T, covariance, atol=1e-12)
 
 
-@pytest.mark.parametrize("linearisation", ["end", "path"])
+@pytest.mark.parametrize("linearisation", slow_beyond(1, ["path", "end"]))
 def test_sigma_may_turn_and_a_guess_does_not_see_it(linearisation, x64):
     """The law depends on V alone."""
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FULL_SIGMA, NON_REVERSIBLE
+from helpers import FULL_SIGMA, NON_REVERSIBLE, slow_beyond
 from scipy.stats import multivariate_normal
 from test_step_density import DENSITIES, FROM, TO, log_density_of_chain, quadrature
 
@@ -61,7 +61,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
-@pytest.mark.parametrize("refinement", [1.0, 1.5])
+@pytest.mark.parametrize("refinement", slow_beyond(1, [1.0, 1.5]))
 def test_mean_is_that_of_half_as_many_steps(case, refinement):
     """Of the weight, and of the mid-point, against paths of half as many steps."""
     model, density, spread = case
@@ -84,6 +84,7 @@ def test_mean_is_that_of_half_as_many_steps(case, refinement):
     assert abs(mean - other_mean) < 5 * error < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_factor_is_that_of_quadrature(case, x64):
     """The weighted mean of e^D, which is the quotient of the densities of the two chains."""
@@ -99,7 +100,7 @@ def test_factor_is_that_of_quadrature(case, x64):
 
 
 @pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
-@pytest.mark.parametrize("num_steps", [1, 2, 7])
+@pytest.mark.parametrize("num_steps", slow_beyond(1, [7, 2, 1]))
 def test_one_d_for_each_path(density, num_steps, x64):
     """The loop that draws, the maps between noise and paths, and `log_halving_of_paths` agree; of
     an odd number of steps the rest counts for all, and of one step nothing is known."""

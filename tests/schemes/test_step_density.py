@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, loglog_slope
+from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, loglog_slope, slow_beyond
 from scipy.stats import multivariate_normal
 
 import jaxbridge as jb
@@ -91,7 +91,7 @@ def test_steps_integrate_to_one(density, dt, d, x64):
     assert abs(values.sum() * volume - 1) < 1e-8
 
 
-@pytest.mark.parametrize("d", [1, 2, 3, 5])
+@pytest.mark.parametrize("d", slow_beyond(1, [2, 1, 3, 5]))
 def test_covariance_is_never_near_singular(d, x64):
     """S ≥ ¼ I, however long the step: equality where A is symmetric and δ = 3/2 of its rate."""
     rng = np.random.default_rng(10 + d)
@@ -173,7 +173,14 @@ def rotating(decay, speed):
 
 @pytest.mark.parametrize(
     "decay, speed, duration, at_50, at_100",
-    [(1.0, 2 * np.pi, 5.0, 0.10, 0.02), (0.5, 3.0, 10.0, 0.10, 0.02), (0.5, 3.0, 5.0, 0.02, 0.005)],
+    slow_beyond(
+        1,
+        [
+            (1.0, 2 * np.pi, 5.0, 0.10, 0.02),
+            (0.5, 3.0, 10.0, 0.10, 0.02),
+            (0.5, 3.0, 5.0, 0.02, 0.005),
+        ],
+    ),
 )
 def test_long_bridges_of_fast_rotation(decay, speed, duration, at_50, at_100, x64):
     """Where a density that does not integrate to one gives infinity, or a factor of two: log p̂ of

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B
+from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, slow_beyond
 from test_step_density import DENSITIES, FROM, TO
 
 import jaxbridge as jb
@@ -19,8 +19,8 @@ from jaxbridge.schemes.step_error import (
 
 
 @pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
-@pytest.mark.parametrize("refinement", [1.0, 1.5])
-@pytest.mark.parametrize("curl", [False, True], ids=["gradient", "curl"])
+@pytest.mark.parametrize("refinement", slow_beyond(1, [1.0, 1.5]))
+@pytest.mark.parametrize("curl", slow_beyond(1, [False, True]), ids=["gradient", "curl"])
 def test_error_of_a_log_density(density, refinement, curl, x64):
     """Within a quarter of the true one, and its uncertainty. Of second order and with a curl the
     leading term is seen at 64 steps only: at 16 a half of the error is told."""
@@ -42,7 +42,7 @@ def test_error_of_a_log_density(density, refinement, curl, x64):
 
 
 @pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
-@pytest.mark.parametrize("method", ["weighted", "chain"])
+@pytest.mark.parametrize("method", slow_beyond(1, ["weighted", "chain"]))
 def test_error_of_a_mean(density, method, x64):
     """That of the mid-point, against the closed form."""
     model = jb.ornstein_uhlenbeck(2 * NON_REVERSIBLE, sigma=FULL_SIGMA)
