@@ -99,11 +99,11 @@ from .proposals.modified_bridge import ModifiedDiffusionBridge
 from .proposals.residual_bridge import ResidualBridge
 from .schemes.base import AbstractScheme
 from .schemes.euler import Euler
-from .schemes.frame import Frame
 from .schemes.gaussian_transition import GaussianTransition
 from .schemes.heun import Heun
 from .schemes.milstein import Milstein
 from .schemes.path_likelihood import path_log_likelihood
+from .schemes.relative_frame import Frame
 from .schemes.semi_implicit import SemiImplicit
 from .schemes.step_density import (
     AbstractStepDensity,

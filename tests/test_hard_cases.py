@@ -14,7 +14,8 @@ import scipy.stats
 from helpers import PAPER_B, paper_model, run_program
 
 import jaxbridge as jb
-from jaxbridge.coupling.join import propose
+from jaxbridge.coupling.join import Inputs, propose
+from jaxbridge.models.bridge_problem import Intervals
 
 PAGE = pathlib.Path(__file__).parent.parent / "notebooks" / "hard_cases.md"
 ROWS: list[tuple[str, str, str, str]] = []
@@ -73,10 +74,14 @@ def test_pairs_that_have_met_before_they_start(precision):
     model, dtype = paper_model(), jnp.dtype(precision)
     coupling = jb.Coupling(0.5)
     end = jnp.zeros((2, 1), dtype)
-    keys, dt = jax.random.split(jax.random.key(0), 1), jnp.full(1, 0.05, dtype)
-    first = propose(model, coupling, keys, end, end, dt, 20)
+    keys, duration = jax.random.split(jax.random.key(0), 1), jnp.ones(1, dtype)
+
+    def joined(start):
+        return propose(Inputs(model, coupling, Intervals(start, end, duration)), keys, 20)
+
+    first = joined(end)
     for away in (0.0, 1e-7):
-        again = propose(model, coupling, keys, first.reverse_start + away, end, dt, 20)
+        again = joined(first.reverse_start + away)
         assert int(again.meeting_step[0]) == 1 and all_finite(again)
 
     def total(scale, start):
@@ -500,9 +505,9 @@ def check_meetings(model, d, dtype):
     key, keys = jax.random.key(3), jax.random.split(jax.random.key(4), n)
     end = jax.random.normal(key, (d, n), dtype) * 0.5**0.5
     num_steps = 40
-    dt = jnp.full(n, duration / num_steps, dtype)
+    intervals = Intervals(jnp.zeros((d, n), dtype), end, jnp.full(n, duration, dtype))
     coupling = jb.Coupling(-1.0, scheme=jb.Heun())
-    found = propose(model, coupling, keys, jnp.zeros((d, n), dtype), end, dt, num_steps)
+    found = propose(Inputs(model, coupling, intervals), keys, num_steps)
     distance = scipy.stats.chi(d, scale=0.5**0.5)
     exact = distance.expect(
         lambda r: 2 * scipy.stats.norm.cdf(-r / np.sqrt(2 * np.expm1(2 * duration)))

@@ -19,7 +19,7 @@ from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
 from jaxbridge.coupling.burn_in import with_burn_in
-from jaxbridge.schemes.step_error import of_log_mean
+from jaxbridge.schemes.step_error import error_of_log_mean
 
 slow = pytest.mark.slow
 RANDOM = random_models.random_models()
@@ -134,7 +134,7 @@ def density_of(weighted):
     value = logsumexp(log_weights) - math.log(num)
     error = jnp.std(jnp.exp(log_weights - value)) / math.sqrt(num)
     truncated = jnp.sum(weighted.truncated)
-    step_error = of_log_mean(log_weights, weighted.log_halving, weighted.step_share)
+    step_error = error_of_log_mean(log_weights, weighted.log_halving, weighted.step_share)
     return density(
         jb.TransitionLogDensity(
             value,
@@ -373,7 +373,7 @@ def test_one_path_beyond_all_others_does_not_hide_the_uncertainty():
     """A path of next to no weight, which half as many steps make e⁶⁰ times as likely."""
     log_weights = jnp.zeros(200).at[0].set(-60.0)
     log_halving = jnp.linspace(-0.3, 0.3, 200).at[0].set(60.0)
-    made = of_log_mean(log_weights, log_halving, jnp.float32(1.0))
+    made = error_of_log_mean(log_weights, log_halving, jnp.float32(1.0))
     change = np.exp(np.asarray(log_halving[1:], float)).sum() / 199 + 1 / 199
     np.testing.assert_allclose(made.value, np.log(change), rtol=1e-3)
     assert 0.01 < made.uncertainty < 0.03

@@ -12,3 +12,50 @@ associated with z (`associated`), which starts from ν or another law (`start_la
 have to be known when the past is forgotten: `burn_in`), hits z; it is counted how many it takes
 (`hitting`). `effects` is a table of what such a program simulates, and why.
 """
+
+# What the folders above use of this one.
+from .associated import (
+    run_associated as run_associated,
+)
+from .base import (
+    AbstractCoupling as AbstractCoupling,
+)
+from .bridges import (
+    Bridges as Bridges,
+    Joined as Joined,
+    find_bridges as find_bridges,
+    sample_bridges as sample_bridges,
+)
+from .burn_in import (
+    measure_burn_in as measure_burn_in,
+    with_burn_in as with_burn_in,
+)
+from .gamma import (
+    Coupling as Coupling,
+    described as described,
+    ingredients as ingredients,
+    most_accurate as most_accurate,
+)
+from .hitting import (
+    HittingCounts as HittingCounts,
+    check_max_trials as check_max_trials,
+    count_hits as count_hits,
+    counts_of as counts_of,
+    coupling_of as coupling_of,
+    default_lanes as default_lanes,
+    durations_of as durations_of,
+    hitting_counts as hitting_counts,
+    search_for_hits as search_for_hits,
+)
+from .join import (
+    Inputs as Inputs,
+)
+from .start_laws import (
+    AnyStartLaw as AnyStartLaw,
+    Reversed as Reversed,
+    Stationary as Stationary,
+    draw_starts as draw_starts,
+    log_ratio as log_ratio,
+    needs_burn_in as needs_burn_in,
+    run_is_cut as run_is_cut,
+)

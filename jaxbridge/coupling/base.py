@@ -12,8 +12,7 @@ from collections.abc import Callable
 import equinox as eqx
 from jaxtyping import Array, Float, Key
 
-from ..schemes.base import AbstractScheme
-from ..schemes.frame import Frame
+from ..schemes import AbstractScheme, Frame
 from .meeting import AbstractMeeting
 from .start_laws import AnyStartLaw
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.checks import Numbers, check_bound, check_count, check_key, without_derivatives
 from ..engine.devices import over_devices
 from ..engine.keys import numbered_keys
-from ..engine.rejection import Accepted, Attempts, default_num_lanes, rejection_sample
+from ..engine.rejection import Accepted, Attempts, Search, default_num_lanes, rejection_sample
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import (
     BridgeProblem,
@@ -23,10 +23,10 @@ from ..models.bridge_problem import (
     uniform_fractions,
 )
 from ..models.diffusion import Diffusion
-from ..schemes.fit import check_model
+from ..schemes import check_model
 from .base import AbstractCoupling, check_coupling
 from .gamma import Coupling
-from .join import Proposals, propose
+from .join import Inputs, Proposals, propose
 
 
 class Bridges(eqx.Module):
@@ -131,17 +131,9 @@ def sample_bridges(
         num_wanted = num_bridges * problem.num_intervals
         batch_size = default_num_lanes(num_wanted, num_steps, problem.intervals.start)
     batch_size = check_count("batch_size", batch_size)
-    sizes = (num_bridges, batch_size)
-    bridges = _sample_bridges(key, model, coupling, problem, max_proposals, *sizes, progress_meter)
+    search = Search(num_bridges, max_proposals, batch_size, progress_meter)
+    bridges = _sample_bridges(key, model, coupling, problem, search)
     return throw_where_incomplete(bridges, "paths", model, ~bridges.met) if throw else bridges
-
-
-class Inputs(NamedTuple):
-    """Everything a path may be differentiated with respect to."""
-
-    model: Diffusion
-    coupling: AbstractCoupling
-    intervals: Intervals
 
 
 @eqx.filter_jit
@@ -150,26 +142,14 @@ def _sample_bridges(
     model: Diffusion,
     coupling: AbstractCoupling,
     problem: BridgeProblem,
-    max_proposals: Int[Array, ""],
-    num_bridges: int,
-    num_lanes: int,
-    progress_meter: diffrax.AbstractProgressMeter | None,
+    search: Search,
 ) -> Bridges:
     num_intervals, num_steps, stored = problem.num_intervals, problem.num_steps, problem.stored
+    num_bridges = search.wanted
     keys = problem.keys(key, 1)[:, 0]
     inputs = Inputs(model.prepared(), coupling, problem.intervals)
     everything = jnp.ones(num_intervals, bool)
-    found = find_bridges(
-        keys,
-        without_derivatives(inputs),
-        everything,
-        num_bridges,
-        max_proposals,
-        num_steps,
-        stored,
-        num_lanes,
-        progress_meter,
-    )
+    found = find_bridges(keys, without_derivatives(inputs), everything, num_steps, stored, search)
     paths, reverse_start, rho = found.outputs
     met = rho <= num_steps
     interval = jnp.repeat(jnp.arange(num_intervals), num_bridges)
@@ -205,27 +185,22 @@ def find_bridges(
     keys: Key[Array, " P"],
     inputs: Inputs,
     active: Bool[Array, " P"],
-    num_bridges: int,
-    max_proposals: Int[Array, ""],
     num_steps: int,
     stored: Int[Array, " K"] | None,
-    num_lanes: int,
-    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    search: Search,
 ) -> Accepted:
     """Propose for each of P active problems, one interval and one key each, until it has its
     bridges. The outputs are `Joined`."""
     attempt = eqx.Partial(_attempt, inputs, keys, num_steps, stored)
     (num_problems, d), dtype = inputs.intervals.start.shape, inputs.intervals.start.dtype
-    num_rows = num_problems * num_bridges
+    num_rows = num_problems * search.wanted
     num_stored = num_steps + 1 if stored is None else stored.shape[0]
     rows = Joined(
         jnp.zeros((num_rows, num_stored, d), dtype),
         jnp.full((num_rows, d), jnp.nan, dtype),
         jnp.full(num_rows, num_steps + 1, jnp.int32),
     )
-    return rejection_sample(
-        attempt, rows, active, num_bridges, max_proposals, num_lanes, progress_meter
-    )
+    return rejection_sample(attempt, rows, active, search)
 
 
 def _attempt(
@@ -253,17 +228,9 @@ def _propose_numbered(
 ) -> Proposals:
     """The proposals with these numbers, of these intervals: a function of nothing else."""
     start, end, duration = inputs.intervals
-    return propose(
-        inputs.model,
-        inputs.coupling,
-        numbered_keys(keys, interval, number),
-        start[interval].T,
-        end[interval].T,
-        duration[interval] * time_scale / num_steps,
-        num_steps,
-        stored,
-        meeting_step,
-    )
+    lanes = Intervals(start[interval].T, end[interval].T, duration[interval] * time_scale)
+    lane_keys = numbered_keys(keys, interval, number)
+    return propose(inputs._replace(intervals=lanes), lane_keys, num_steps, stored, meeting_step)
 
 
 @eqx.filter_custom_jvp

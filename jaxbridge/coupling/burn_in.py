@@ -32,7 +32,7 @@ from ..engine.noise import noisy_scan
 from ..models.bridge_problem import as_intervals
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.dynamics import Dynamics
-from ..schemes.fit import check_model
+from ..schemes import check_model
 from .base import AbstractCoupling
 from .gamma import Coupling
 from .pair import Lane, PairNoise, drive, have_met, in_lanes

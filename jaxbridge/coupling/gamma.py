@@ -18,10 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import dot
-from ..schemes.base import AbstractScheme
-from ..schemes.euler import Euler
-from ..schemes.frame import Frame
-from ..schemes.heun import Heun
+from ..schemes import AbstractScheme, Euler, Frame, Heun
 from .base import AbstractCoupling, Rotation
 from .meeting import AbstractMeeting, BrownianCrossing, ReflectionPlane, SignTest
 from .rotation import published_rotation

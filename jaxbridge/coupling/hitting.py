@@ -7,6 +7,7 @@ counts of one bridge are the gaps between the hits in one sequence of independen
 mean of N counts is the number of trials up to the N-th hit, divided by N.
 """
 
+import math
 from typing import Protocol, runtime_checkable
 
 import diffrax
@@ -17,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import check_bound, check_count, check_key, nondifferentiable
 from ..engine.keys import key_for, numbered_keys
-from ..engine.rejection import Attempts, default_num_lanes, rejection_sample
+from ..engine.rejection import Attempts, Search, default_num_lanes, rejection_sample
 from ..models.diffusion import Diffusion, check_diffusion
 from .associated import run_associated
 from .base import AbstractCoupling
@@ -145,16 +146,34 @@ def hitting_counts(
     check_key(key)
     check_diffusion(model)
     coupling = coupling_of(bridges, start_law)
-    num_counts = check_count("num_counts", num_counts)
-    bound = check_max_trials(max_trials, num_counts)
-    batch_size = None if batch_size is None else check_count("batch_size", batch_size)
-    budget = (num_counts, bound, batch_size, progress_meter)
-    return _hitting_counts(key_for("hitting counts", key), model, coupling, bridges, budget)
+    search = search_for_hits(bridges, num_counts, max_trials, batch_size, progress_meter)
+    return _hitting_counts(key_for("hitting counts", key), model, coupling, bridges, search)
 
 
 @eqx.filter_jit
-def _hitting_counts(key, model, coupling, bridges, budget):
-    return counts_of(key, model, coupling, bridges, *budget)[0]
+def _hitting_counts(key, model, coupling, bridges, search):
+    return counts_of(key, model, coupling, bridges, search)[0]
+
+
+def search_for_hits(
+    bridges: BridgePaths,
+    num_counts: int,
+    max_trials: int | None,
+    batch_size: int | None,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> Search:
+    """What was asked for, checked, with what was not told."""
+    num_counts = check_count("num_counts", num_counts)
+    bound = check_max_trials(max_trials, num_counts)
+    if batch_size is None:
+        batch_size = default_lanes(bridges.paths, num_counts)
+    return Search(num_counts, bound, check_count("batch_size", batch_size), progress_meter)
+
+
+def default_lanes(paths: Float[Array, "*P points d"], num_counts: int) -> int:
+    """Trials side by side, for so many counts of each of the paths."""
+    *leading, points, _ = paths.shape
+    return default_num_lanes(math.prod(leading) * num_counts, points - 1, paths)
 
 
 def counts_of(
@@ -162,10 +181,7 @@ def counts_of(
     model: Diffusion,
     coupling: AbstractCoupling,
     bridges: BridgePaths,
-    num_counts: int,
-    max_trials: Int[Array, ""],
-    num_lanes: int | None,
-    progress_meter: diffrax.AbstractProgressMeter | None,
+    search: Search,
 ) -> tuple[HittingCounts, AbstractCoupling]:
     """Counts for all the bridges, and the coupling with its burn-in measured."""
     model, coupling, bridges = nondifferentiable((model.prepared(), coupling, bridges))
@@ -180,10 +196,7 @@ def counts_of(
         paths,
         duration,
         bridges.met.reshape(-1),
-        num_counts,
-        max_trials,
-        num_lanes,
-        progress_meter,
+        search,
     )
     counts = jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[1:]), counts)
     return counts, coupling
@@ -196,20 +209,14 @@ def count_hits(
     paths: Float[Array, "P points d"],
     duration: Float[Array, " P"],
     active: Bool[Array, " P"],
-    num_counts: int,
-    max_trials: Int[Array, ""],
-    num_lanes: int | None = None,
-    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    search: Search,
 ) -> HittingCounts:
     """Counts for each of P bridges that is active, from trials that share the lanes."""
-    num_steps = paths.shape[1] - 1
-    if num_lanes is None:
-        num_lanes = default_num_lanes(paths.shape[0] * num_counts, num_steps, paths[:, 0])
-
+    num_steps, num_counts = paths.shape[1] - 1, search.wanted
     trial = eqx.Partial(_trial, keys, model, coupling, paths, duration)
     num_rows = paths.shape[0] * num_counts
     rows = jnp.full((num_rows, paths.shape[2]), jnp.nan, paths.dtype)
-    found = rejection_sample(trial, rows, active, num_counts, max_trials, num_lanes, progress_meter)
+    found = rejection_sample(trial, rows, active, search)
     number = found.number.reshape(-1, num_counts)
     before = jnp.concatenate([jnp.full_like(number[:, :1], -1), number[:, :-1]], axis=1)
     last = jnp.maximum(found.num_found - 1, 0)

@@ -20,11 +20,20 @@ from ..engine.lanes import over_lanes
 from ..engine.linalg import is_finite
 from ..engine.noise import Store, noisy_scan
 from ..models import decisions
+from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..models.dynamics import Dynamics
-from ..schemes.base import AbstractScheme, steps_in_lanes
+from ..schemes import AbstractScheme, steps_in_lanes
 from .base import AbstractCoupling
 from .pair import Lane, drive, have_met, in_lanes, pair_noise
+
+
+class Inputs(NamedTuple):
+    """Everything a path may be differentiated with respect to."""
+
+    model: Diffusion
+    coupling: AbstractCoupling
+    intervals: Intervals
 
 
 class Proposals(NamedTuple):
@@ -42,22 +51,20 @@ class Proposals(NamedTuple):
 
 
 def propose(
-    model: Diffusion,
-    coupling: AbstractCoupling,
+    inputs: Inputs,
     keys: Key[Array, " lanes"],
-    start: Float[Array, "d lanes"],
-    end: Float[Array, "d lanes"],
-    dt: Float[Array, " lanes"],
     num_steps: int,
     stored: Int[Array, " K"] | None = None,
     meeting_step: Int[Array, " lanes"] | None = None,
 ) -> Proposals:
     """One proposal in each lane, whose random numbers depend on the lane's key alone.
 
-    `stored` are the steps among 0, ..., N at which the joined path is kept, by default all.
+    The intervals of `inputs` have lanes in the last axis. `stored` are the steps among 0, ..., N
+    at which the joined path is kept, by default all.
     With `meeting_step` the pair is joined there, not where the coupling's rule says: a replay.
     """
-    like = start[:, 0]
+    model, coupling, (start, end, duration) = inputs
+    like, dt = start[:, 0], duration / num_steps
     reverse_keys, driven_keys, coupling_keys = split_each(keys, 3)
     backward, forward = model.backward(like), model.forward(like)
     x_start, x_path = reverse_path(backward, coupling.scheme, reverse_keys, end, dt, num_steps)

@@ -33,7 +33,7 @@ from jaxtyping import Array, Bool, Float
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import dot, safe_norm
 from ..models.dynamics import Dynamics
-from ..schemes.frame import Frame
+from ..schemes import Frame
 
 
 class PairStep(NamedTuple):

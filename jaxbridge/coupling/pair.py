@@ -18,8 +18,7 @@ from ..engine.checks import cast_floats
 from ..engine.linalg import all_finite
 from ..models import decisions
 from ..models.dynamics import Dynamics
-from ..schemes.base import AbstractScheme, fitted_in_lanes
-from ..schemes.frame import Frame, frame
+from ..schemes import AbstractScheme, Frame, fitted_in_lanes, frame
 from .base import AbstractCoupling
 from .meeting import PairStep
 from .rotation import rotate, rotate_back, rotation_between

@@ -30,7 +30,7 @@ from ..engine.noise import noisy_scan
 from ..models.diffusion import Diffusion, check_value
 from ..models.dynamics import Dynamics
 from ..models.gaussian_law import GaussianLaw
-from ..schemes.base import AbstractScheme, steps_in_lanes
+from ..schemes import AbstractScheme, steps_in_lanes
 
 # No run that replaces a sampler of ν takes more steps than this.
 MOST_STEPS = 2**18

@@ -47,6 +47,16 @@ class Accepted(NamedTuple):
     num_nonfinite: Int[Array, " P"]
 
 
+class Search(NamedTuple):
+    """How many successes each problem wants, the bound on its attempts, how many of them run side
+    by side, and what shows progress."""
+
+    wanted: int
+    max_attempts: Int[Array, ""]
+    num_lanes: int
+    progress_meter: diffrax.AbstractProgressMeter | None = None
+
+
 class _State(NamedTuple):
     accepted: Accepted
     num_tried: Int[Array, " P"]  # with the attempts that turned out not to be needed
@@ -56,14 +66,12 @@ def rejection_sample(
     attempt: Callable[[Int[Array, " lanes"], Int[Array, " lanes"]], Attempts],
     rows: PyTree,
     active: Bool[Array, " P"],
-    wanted: int,
-    max_attempts: Int[Array, ""],
-    num_lanes: int,
-    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    search: Search,
 ) -> Accepted:
-    """Run `attempt(problem, number)` until each active problem has `wanted` successes, or has
-    run out of tries. `rows`: arrays with leading axis P × wanted, to be filled. Lanes are split
+    """Run `attempt(problem, number)` until each active problem has the successes that it wants, or
+    has run out of tries. `rows`: arrays with leading axis P × wanted, to be filled. Lanes are split
     over devices: see `over_devices` for the arrays that `attempt` needs."""
+    wanted, max_attempts, num_lanes, progress_meter = search
     num_rows = active.shape[0] * wanted
     attempts = over_devices(attempt, (0, 0))
 
@@ -163,14 +171,14 @@ _MOST_NUMBERS = 2**15
 _ENOUGH_LANES = 256
 
 
-def default_num_lanes(num_wanted: int, num_steps: int, point: Float[Array, "P d"]) -> int:
+def default_num_lanes(num_wanted: int, num_steps: int, points: Float[Array, "*axes d"]) -> int:
     """As many lanes as successes are wanted, within a bound on the memory of their paths on each
     device: 16 MiB, or what `_ENOUGH_LANES` need, up to 512 MiB.
 
     A lane holds two paths and their noise.
     """
-    d = point.shape[1]
-    bytes_per_lane = 3 * d * (num_steps + 1) * point.dtype.itemsize
+    d = points.shape[-1]
+    bytes_per_lane = 3 * d * (num_steps + 1) * points.dtype.itemsize
     fitting = max(2**24 // bytes_per_lane, min(_ENOUGH_LANES, 2**29 // bytes_per_lane), 1)
     return min(num_devices() * min(fitting, most_lanes(d)), max(num_wanted, 64))
 

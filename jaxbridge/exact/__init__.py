@@ -6,3 +6,29 @@ by importance sampling (`importance`) and by Markov chains (`chains`), which are
 (`kernels`): `pseudo_marginal`, `renewal` and `crank_nicolson`, a method a module. Transition
 densities are means of weights (`density`), and `expectation` has derivatives that are right.
 """
+
+# What the folders above use of this one.
+from .chains import (
+    sample_exact_bridges as sample_exact_bridges,
+)
+from .density import (
+    estimate_log_density as estimate_log_density,
+    transition_log_density as transition_log_density,
+)
+from .exact_bridges import (
+    AbstractExactBridges as AbstractExactBridges,
+)
+from .importance import (
+    WeightedBridges as WeightedBridges,
+    sample_weighted_bridges as sample_weighted_bridges,
+    weigh_bridges as weigh_bridges,
+)
+from .kernels import (
+    Chain as Chain,
+    acceptance_rate as acceptance_rate,
+)
+from .renewal import (
+    first_paths as first_paths,
+    propose_paths as propose_paths,
+    renew as renew,
+)

@@ -19,11 +19,8 @@ from ..engine.pareto import is_reliable
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import bridge_problem
 from ..models.diffusion import Diffusion
-from ..proposals.auto import Budget, as_proposal, resolve
-from ..proposals.coupled import as_pairs
-from ..proposals.guided import as_guided
-from ..proposals.linear_guide import Guided
-from ..schemes.step_error import is_gross
+from ..proposals import Budget, Guided, as_guided, as_pairs, as_proposal, resolve
+from ..schemes import is_gross
 from .crank_nicolson import check_step_size, run_crank_nicolson
 from .kernels import Chain
 from .pseudo_marginal import run_pseudo_marginal

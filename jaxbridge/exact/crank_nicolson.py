@@ -31,9 +31,7 @@ from ..engine.keys import split_each
 from ..engine.progress import metered_scan
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
-from ..proposals.auto import as_proposal
-from ..proposals.guided import AbstractGuidedProposal, as_guided, noise_of, path_of
-from ..proposals.linear_guide import Guided
+from ..proposals import AbstractGuidedProposal, Guided, as_guided, as_proposal, noise_of, path_of
 from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_path, one_interval
 
 

@@ -19,9 +19,8 @@ from ..engine.pareto import is_reliable, pareto_k
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
-from ..proposals.auto import Budget, as_proposal, resolve
-from ..proposals.base import AbstractProposal, AbstractWeightedProposal
-from ..schemes.step_error import StepError, dominates, is_gross, of_log_mean
+from ..proposals import AbstractProposal, AbstractWeightedProposal, Budget, as_proposal, resolve
+from ..schemes import StepError, dominates, error_of_log_mean, is_gross
 
 
 class TransitionLogDensity(eqx.Module):
@@ -172,7 +171,7 @@ def estimate_log_density(
     log_mean, error, size = log_mean_and_error(drawn.log_weights)
     cut = jnp.any(drawn.truncated, axis=1)
     share = proposal.step_share(model, intervals)
-    step_error = of_log_mean(drawn.log_weights, drawn.log_halving, share)
+    step_error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
     value, error, size, shape, step_error = problem.result(
         (
             log_mean,

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ..coupling.base import AbstractCoupling
+from ..coupling import AbstractCoupling
 from ..engine.averages import (
     PathFunction,
     filled,
@@ -16,8 +16,8 @@ from ..engine.averages import (
     values_of,
     weighted_mean,
 )
-from ..proposals.base import AbstractWeightedProposal
-from ..schemes.step_error import StepError, dominates, of_mean
+from ..proposals import AbstractWeightedProposal
+from ..schemes import StepError, dominates, error_of_mean
 
 
 class AbstractExactBridges(eqx.Module):
@@ -95,7 +95,7 @@ class AbstractExactBridges(eqx.Module):
 
     def _step_errors(self, fn: PathFunction) -> PyTree:
         def error(value):
-            return of_mean(self.log_mean_weights, self.log_halving, self.step_share, value)
+            return error_of_mean(self.log_mean_weights, self.log_halving, self.step_share, value)
 
         return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
 

@@ -20,7 +20,7 @@ from jaxtyping import PyTree
 
 from ..engine.averages import PathFunction, filled, values_of, weighted_mean
 from ..models.diffusion import Diffusion, check_diffusion
-from ..schemes.path_likelihood import forms_of_targets, log_likelihood_of_steps
+from ..schemes import forms_of_targets, log_likelihood_of_steps
 from .exact_bridges import AbstractExactBridges
 from .importance import WeightedBridges
 from .kernels import Chain

@@ -13,9 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..coupling.bridges import Bridges
-from ..coupling.hitting import check_max_trials, counts_of, coupling_of, durations_of
-from ..coupling.start_laws import AnyStartLaw
+from ..coupling import AnyStartLaw, Bridges, counts_of, coupling_of, durations_of, search_for_hits
 from ..engine.averages import (
     PathFunction,
     effective_size,
@@ -31,10 +29,17 @@ from ..engine.pareto import is_reliable, pareto_k
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import BridgeProblem, Intervals, bridge_problem
 from ..models.diffusion import Diffusion, check_diffusion
-from ..proposals.auto import Budget, as_proposal, resolve
-from ..proposals.base import AbstractProposal, AbstractWeightedProposal
-from ..proposals.coupled import check_density, pair_log_weights, usable
-from ..schemes.step_error import is_gross
+from ..proposals import (
+    AbstractProposal,
+    AbstractWeightedProposal,
+    Budget,
+    as_proposal,
+    check_density,
+    pair_log_weights,
+    resolve,
+    usable,
+)
+from ..schemes import is_gross
 from .exact_bridges import AbstractExactBridges
 
 
@@ -180,14 +185,11 @@ def weigh_bridges(
             "`sample_exact_bridges` and `weigh_bridges` are exact already.)"
         )
     coupling = coupling_of(bridges, start_law)
-    num_counts = check_count("num_counts", num_counts)
-    bound = check_max_trials(max_trials, num_counts)
+    search = search_for_hits(bridges, num_counts, max_trials, batch_size, progress_meter)
     check_density(coupling.start_law, model)
-    batch_size = None if batch_size is None else check_count("batch_size", batch_size)
-    budget = (num_counts, bound, batch_size, progress_meter)
     like = bridges.reverse_start.reshape(-1, bridges.paths.shape[-1])[0]
-    pairs = as_proposal(coupling, model, like, Budget(num_counts, None, max_trials))
-    weighted = _weigh_bridges(key_for("weights", key), model, pairs, bridges, budget)
+    pairs = as_proposal(coupling, model, like, Budget(search.wanted, None, max_trials))
+    weighted = _weigh_bridges(key_for("weights", key), model, pairs, bridges, search)
     return _or_throw(weighted, model) if throw else weighted
 
 
@@ -205,8 +207,8 @@ def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
 
 
 @eqx.filter_jit
-def _weigh_bridges(key, model, pairs, bridges, budget):
-    counts, coupling = counts_of(key, model, pairs.coupling, bridges, *budget)
+def _weigh_bridges(key, model, pairs, bridges, search):
+    counts, coupling = counts_of(key, model, pairs.coupling, bridges, search)
     d, shape = bridges.paths.shape[-1], bridges.met.shape
     model = model.prepared()
     log_weights = pair_log_weights(

@@ -23,7 +23,7 @@ from ..engine.diagnostics import effective_sample_size
 from ..engine.keys import split_each
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
-from ..proposals.base import AbstractWeightedProposal
+from ..proposals import AbstractWeightedProposal
 from .exact_bridges import AbstractExactBridges
 
 

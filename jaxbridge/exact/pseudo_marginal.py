@@ -19,8 +19,7 @@ from ..engine.keys import split_each
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import BridgeProblem
 from ..models.diffusion import Diffusion
-from ..proposals.auto import Budget, as_proposal
-from ..proposals.base import AbstractProposal, WeightedPaths
+from ..proposals import AbstractProposal, Budget, WeightedPaths, as_proposal
 from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_path, one_interval
 
 

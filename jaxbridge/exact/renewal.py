@@ -18,18 +18,22 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..coupling.associated import run_associated
-from ..coupling.base import AbstractCoupling
-from ..coupling.bridges import Inputs, Joined, find_bridges
-from ..coupling.start_laws import log_ratio, run_is_cut
+from ..coupling import (
+    AbstractCoupling,
+    Inputs,
+    Joined,
+    find_bridges,
+    log_ratio,
+    run_associated,
+    run_is_cut,
+)
 from ..engine.checks import Numbers, check_key, nondifferentiable
 from ..engine.keys import split_each
 from ..engine.progress import metered_while_loop
-from ..engine.rejection import Accepted, default_num_lanes, most_lanes
+from ..engine.rejection import Accepted, Search, default_num_lanes, most_lanes
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
-from ..proposals.auto import Budget, as_proposal
-from ..proposals.coupled import CoupledPairs, as_pairs
+from ..proposals import Budget, CoupledPairs, as_pairs, as_proposal
 from .kernels import Chain, Kernel, chain_keys, check_path, one_interval
 
 
@@ -327,7 +331,8 @@ def propose_paths(
     active = jnp.ones(len(keys), bool) if active is None else active
     num_lanes = default_num_lanes(num_wanted, num_steps, intervals.start)
     inputs = Inputs(model, pairs.coupling, intervals)
-    return find_bridges(keys, inputs, active, 1, pairs.max_proposals, num_steps, None, num_lanes)
+    search = Search(1, pairs.max_proposals, num_lanes)
+    return find_bridges(keys, inputs, active, num_steps, None, search)
 
 
 @eqx.filter_jit

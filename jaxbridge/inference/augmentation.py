@@ -19,11 +19,8 @@ from ..engine.checks import is_traced
 from ..engine.keys import split_each
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
-from ..proposals.auto import Budget
-from ..proposals.base import AbstractWeightedProposal
-from ..proposals.coupled import as_pairs
-from ..proposals.modified_bridge import ModifiedDiffusionBridge
-from ..schemes.path_likelihood import Form, log_likelihoods
+from ..proposals import AbstractWeightedProposal, Budget, ModifiedDiffusionBridge, as_pairs
+from ..schemes import Form, log_likelihoods
 from .blocks import Block, Use, make_blocks, target_forms, with_keys
 from .bridge_kernels import AbstractBridgeKernel, BridgeInfo, ByRenewal, ByWeights, Unweighted
 from .data import Problem

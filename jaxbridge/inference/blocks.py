@@ -9,22 +9,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from ..coupling.start_laws import Stationary, needs_burn_in
+from ..coupling import Stationary, needs_burn_in
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
-from ..proposals.auto import (
+from ..proposals import (
+    AbstractProposal,
+    AbstractWeightedProposal,
     Budget,
+    as_pairs,
     as_proposal,
     choice_between,
     guided_candidates,
     resolve,
     why_left_out,
 )
-from ..proposals.base import AbstractProposal, AbstractWeightedProposal
-from ..proposals.coupled import as_pairs
-from ..schemes.halving import log_halving_of_paths
-from ..schemes.path_likelihood import Form, density_of_form, forms_of_targets
-from ..schemes.step_error import share_of_order
+from ..schemes import Form, density_of_form, forms_of_targets, log_halving_of_paths, share_of_order
 from .data import Group, Problem
 
 _NO_SAMPLER = (

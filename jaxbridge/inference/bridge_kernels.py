@@ -19,14 +19,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..coupling.start_laws import run_is_cut
+from ..coupling import run_is_cut
 from ..engine.keys import split_each
-from ..exact.kernels import acceptance_rate
-from ..exact.renewal import first_paths, propose_paths, renew
+from ..exact import acceptance_rate, first_paths, propose_paths, renew
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..proposals.base import AbstractWeightedProposal
-from ..proposals.coupled import CoupledPairs
+from ..proposals import AbstractWeightedProposal, CoupledPairs
 
 
 class BridgeInfo(NamedTuple):

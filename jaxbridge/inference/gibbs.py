@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
-from ..proposals.auto import Budget
+from ..proposals import Budget
 from .augmentation import Augmentation, augment
 from .data import as_problem
 from .parameter_kernels import (

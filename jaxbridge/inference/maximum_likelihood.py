@@ -22,8 +22,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.checks import Numbers, check_count
 from ..engine.pareto import is_reliable
 from ..models.diffusion import Diffusion
-from ..proposals.auto import Budget
-from ..schemes.step_error import StepError, dominates
+from ..proposals import Budget
+from ..schemes import StepError, dominates
 from .augmentation import augment
 from .data import Problem, as_problem
 from .parameters import (

@@ -25,11 +25,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.checks import Numbers, as_floating, check_count, is_traced, nondifferentiable
 from ..engine.linalg import any_cholesky, any_inverse
 from ..engine.progress import as_meter
-from ..exact.density import estimate_log_density
-from ..exact.kernels import acceptance_rate
+from ..exact import acceptance_rate, estimate_log_density
 from ..models.diffusion import Diffusion
-from ..proposals.auto import Budget
-from ..proposals.base import AbstractWeightedProposal
+from ..proposals import AbstractWeightedProposal, Budget
 from .blocks import Block, block_of, make_blocks, with_keys
 from .data import Problem, as_problem
 from .parameters import Constraint, Parameters, as_parameters

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ..engine.checks import check_count, is_traced
 from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
-from ..schemes.step_error import StepError, dominates
+from ..schemes import StepError, dominates
 from .data import Problem
 from .parameters import Parameters, init_vectors
 

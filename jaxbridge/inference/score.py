@@ -22,10 +22,8 @@ from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..engine.pareto import pareto_k
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
-from ..proposals.auto import Budget
-from ..schemes.halving import num_looked
-from ..schemes.path_likelihood import Form, log_likelihoods
-from ..schemes.step_error import StepError, of_mean
+from ..proposals import Budget
+from ..schemes import Form, StepError, error_of_mean, log_likelihoods, num_looked
 from .blocks import Block, make_blocks, over_intervals, target_forms, with_keys
 from .data import Problem, as_problem
 from .parameters import Parameters, as_parameters
@@ -251,7 +249,7 @@ def _of_block(
     some = _Bridges(*(join(leaf, m) for leaf in made))
     share = block.step_shares(model, form)
     halves = (some.gradient, some.gradient + some.slope)
-    error = of_mean(some.log_weights, some.log_halving, share, *halves)
+    error = error_of_mean(some.log_weights, some.log_halving, share, *halves)
     log_weights, truncated, g, H = (join(leaf, at_once)[:, :num_bridges] for leaf in made[:4])
     weights = normalised(log_weights)
     mean = jnp.sum(weights[..., None] * g, axis=1)

@@ -31,9 +31,8 @@ from ..engine.averages import effective_size, normalised
 from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
 from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
-from ..proposals.auto import Budget, as_proposal, choice_between, guided_candidates
-from ..proposals.base import AbstractProposal
-from ..schemes.step_error import StepError
+from ..proposals import AbstractProposal, Budget, as_proposal, choice_between, guided_candidates
+from ..schemes import StepError
 from .blocks import Block, make_blocks, over_intervals, with_keys
 from .data import Problem
 from .parameters import Parameters

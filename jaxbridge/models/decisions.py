@@ -127,5 +127,5 @@ def stored_times(num_stored: int | None) -> Effect:
 def early_stop(num_chunks: int) -> Effect:
     """Looking on the way whether all associated paths have hit."""
     if num_chunks == 1:
-        return Effect(False, "the path is one stretch of noise, drawn at once")
-    return Effect(True, f"after each of {num_chunks} stretches of noise")
+        return Effect(False, "the noise of the path is one chunk, drawn at once")
+    return Effect(True, f"after each of {num_chunks} chunks of noise")

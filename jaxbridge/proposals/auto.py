@@ -18,9 +18,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 from jaxtyping import Array, Float, Key
 
-from ..coupling.base import AbstractCoupling
-from ..coupling.gamma import Coupling
-from ..coupling.hitting import check_max_trials
+from ..coupling import AbstractCoupling, Coupling, check_max_trials
 from ..engine.checks import (
     check_bound,
     check_count,
@@ -30,7 +28,7 @@ from ..engine.checks import (
 )
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..schemes.step_density import EulerDensity, ItoTaylorDensity
+from ..schemes import EulerDensity, ItoTaylorDensity
 from .base import AbstractProposal, AbstractSingleProposal
 from .choice import Choice
 from .coupled import CoupledPairs

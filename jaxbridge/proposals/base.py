@@ -16,10 +16,10 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..coupling.base import AbstractCoupling
+from ..coupling import AbstractCoupling
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..schemes.step_density import AbstractStepDensity
+from ..schemes import AbstractStepDensity
 
 
 class WeightedPaths(NamedTuple):

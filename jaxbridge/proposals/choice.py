@@ -110,10 +110,10 @@ class Choice(AbstractWeightedProposal):
     ):
         draws = (keys, num_steps, stored, misses_count, active, progress_meter)
         if len(self.used) == 1:
-            return _draw_each(self, model, intervals, *draws)
+            return _draw_each((self, model, intervals), *draws)
         if self.coupled:
-            model, intervals = nondifferentiable_choice((model, intervals))
-            return _draw_each(self, model, intervals, *draws)
+            fixed = nondifferentiable_choice((model, intervals))
+            return _draw_each((self, *fixed), *draws)
         return _draw_pulled((self, model, intervals), *draws)
 
     def reweigh(self, keys, model, intervals, paths, active=None):
@@ -180,9 +180,7 @@ class Choice(AbstractWeightedProposal):
 
 
 def _draw_each(
-    choice: Choice,
-    model: Diffusion,
-    intervals: Intervals,
+    inputs: tuple[Choice, Diffusion, Intervals],
     keys: Key[Array, "I n"],
     num_steps: int,
     stored: Int[Array, " K"] | None,
@@ -191,6 +189,7 @@ def _draw_each(
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> WeightedPaths:
     """Each interval by its candidate, which is run for no other."""
+    choice, model, intervals = inputs
 
     def draw(candidate, active):
         arguments = (keys, model, intervals, num_steps, stored, misses_count, active)
@@ -202,7 +201,7 @@ def _draw_each(
 @eqx.filter_custom_jvp
 def _draw_pulled(inputs: tuple[Choice, Diffusion, Intervals], *draws) -> WeightedPaths:
     """`_draw_each` between proposals that are pulled to the end point, with derivatives."""
-    return _draw_each(*inputs, *draws)
+    return _draw_each(inputs, *draws)
 
 
 @_draw_pulled.def_jvp

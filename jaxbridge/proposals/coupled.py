@@ -11,22 +11,31 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..coupling.base import AbstractCoupling
-from ..coupling.bridges import Inputs, find_bridges
-from ..coupling.burn_in import with_burn_in
-from ..coupling.gamma import described, ingredients, most_accurate
-from ..coupling.hitting import HittingCounts, count_hits
-from ..coupling.start_laws import AnyStartLaw, Reversed, Stationary, log_ratio, needs_burn_in
+from ..coupling import (
+    AbstractCoupling,
+    AnyStartLaw,
+    HittingCounts,
+    Inputs,
+    Reversed,
+    Stationary,
+    count_hits,
+    default_lanes,
+    described,
+    find_bridges,
+    ingredients,
+    log_ratio,
+    most_accurate,
+    needs_burn_in,
+    with_burn_in,
+)
 from ..engine.checks import nondifferentiable
 from ..engine.keys import split_each
-from ..engine.rejection import default_num_lanes
+from ..engine.rejection import Search, default_num_lanes
 from ..models.bridge_problem import Intervals, uniform_fractions
 from ..models.diffusion import Diffusion
-from ..schemes.fit import check_model
-from ..schemes.halving import log_halving_of_paths, num_looked
-from ..schemes.nearest_law import step_law_of
+from ..schemes import check_model, log_halving_of_paths, num_looked, step_law_of
 from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
-from .blocks import in_blocks
+from .memory_blocks import in_blocks
 
 # Whole paths are kept only until they are weighed: at most this many bytes of them at a time.
 _BLOCK_BYTES = 2**28
@@ -163,9 +172,8 @@ class CoupledPairs(AbstractSingleProposal):
             num_lanes = default_num_lanes(len(keys), num_steps, intervals.start)
             propose_keys, count_keys = split_each(keys, 2)
             inputs = Inputs(model, self.coupling, intervals)
-            proposed = find_bridges(
-                propose_keys, inputs, active, 1, max_proposals, num_steps, None, num_lanes
-            )
+            search = Search(1, max_proposals, num_lanes)
+            proposed = find_bridges(propose_keys, inputs, active, num_steps, None, search)
             paths, reverse_start, _ = proposed.outputs
             found = proposed.num_found > 0
             counts = self._counts(
@@ -235,17 +243,9 @@ class CoupledPairs(AbstractSingleProposal):
     def _counts(
         self, keys, model, intervals, paths, found, num_counts, progress_meter=None
     ) -> HittingCounts:
-        return count_hits(
-            keys,
-            model,
-            self.coupling,
-            paths,
-            intervals.duration,
-            found,
-            num_counts,
-            self.max_trials,
-            progress_meter=progress_meter,
-        )
+        num_lanes = default_lanes(paths, num_counts)
+        search = Search(num_counts, self.max_trials, num_lanes, progress_meter)
+        return count_hits(keys, model, self.coupling, paths, intervals.duration, found, search)
 
 
 def pair_log_weights(

@@ -33,13 +33,20 @@ from ..engine.rejection import most_lanes
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..models.dynamics import Dynamics
-from ..schemes.euler import Euler
-from ..schemes.fit import check_model
-from ..schemes.halving import num_looked, of_all_steps, of_pair
-from ..schemes.step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity, StepLaw
-from ..schemes.step_error import share_of_order
+from ..schemes import (
+    AbstractStepDensity,
+    Euler,
+    EulerDensity,
+    ItoTaylorDensity,
+    StepLaw,
+    check_model,
+    log_halving_of_all_steps,
+    log_halving_of_pair,
+    num_looked,
+    share_of_order,
+)
 from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
-from .blocks import block_over_devices, in_blocks, masked
+from .memory_blocks import block_over_devices, in_blocks, masked
 
 # Of the duration: shorter steps are lost in the rounding of points.
 _SHORTEST_STEP = 1e-10
@@ -272,7 +279,7 @@ class _Lanes:
         log_density = over_lanes(-1, self._of_lane)(one)(state.x, last)
         end = self.spread(self.end)
         state = self._moved(state, end, (log_density, jnp.zeros_like(log_density)), self._last)
-        log_halving = of_all_steps(state.log_halving, self._num_steps)
+        log_halving = log_halving_of_all_steps(state.log_halving, self._num_steps)
         log_weights = state.log_target - state.log_proposal
         return log_weights, log_halving.reshape(-1, self._num_looked)
 
@@ -300,7 +307,7 @@ class _Lanes:
 
         def one(before, x, x_next, dt_before, dt):
             points, both = (before, x, x_next), (dt_before, dt)
-            return of_pair(self._density, self._dynamics, points, both)
+            return log_halving_of_pair(self._density, self._dynamics, points, both)
 
         def of_pairs():
             if self._of_lane is None:

@@ -32,7 +32,7 @@ from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import inverse, matmul, matvec
 from ..models.dynamics import Dynamics
 from ..models.sigma import AbstractSigma, root_of
-from ..schemes.step_density import AbstractStepDensity, StepLaw
+from ..schemes import AbstractStepDensity, StepLaw
 from .guided import AbstractGuidedProposal, check_refinement, check_step_density, deterministic_path
 
 # δ |F| of a step that has nothing in common with the diffusion: where long steps threw ξ far out.

@@ -34,7 +34,7 @@ from ..engine.keys import key_for
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..schemes.step_error import of_log_mean
+from ..schemes import error_of_log_mean
 from .base import AbstractSingleProposal
 from .choice import Choice, value_rates
 
@@ -157,7 +157,7 @@ def _look(
     size = _extrapolated_size(jnp.where(drawn.truncated, -jnp.inf, drawn.log_weights))
     efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
     share = candidate.step_share(model, intervals)
-    error = of_log_mean(drawn.log_weights, drawn.log_halving, share)
+    error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
     seen_error = jnp.maximum(jnp.abs(error.value) - 2 * error.uncertainty, 0)
     seen_error = jnp.where(jnp.isnan(seen_error), 0, seen_error)  # nothing is known of one step
     told = (efficiency, seen_error, pareto_k(drawn.log_weights))

@@ -3,7 +3,7 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..schemes.step_density import AbstractStepDensity
+from ..schemes import AbstractStepDensity
 from .guided import (
     AbstractGuidedProposal,
     bridge_law,

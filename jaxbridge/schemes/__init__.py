@@ -1,11 +1,64 @@
 """One step, x' = step(x, ΔW) with ΔW ~ N(0, δ I): made, inverted, and its density.
 
 A scheme (`base`) makes the step, says which noise made it, ΔW = noise(x, x'), and how a pair of
-points lies for that noise, by the direction u and the length of σ(x')⁻¹(x - x') (`frame`). Schemes
-are `euler` and `milstein`, `heun` of second order for constant σ, `semi_implicit` for stiff drift,
-and for a linear one its own transition (`gaussian_transition`); whether scheme, model and points
-fit is checked (`fit`). The density of a step, N(μ(x), δ σ S σᵀ) (`step_density`), makes the
+points lies for that noise, by the direction u and the length of σ(x')⁻¹(x - x') (`relative_frame`).
+Schemes are `euler` and `milstein`, `heun` of second order for constant σ, `semi_implicit` for stiff
+drift, and for a linear one its own transition (`gaussian_transition`); whether scheme, model and
+points fit is checked (`fit`). The density of a step, N(μ(x), δ σ S σᵀ) (`step_density`), makes the
 likelihood of a path, Σ log q(x_i, x_{i+1}) (`path_likelihood`). The same of every other point says
 what half as many steps would give (`halving`), and so how far N steps are from the limit
 (`step_error`).
 """
+
+# What the folders above use of this one.
+from .base import (
+    AbstractScheme as AbstractScheme,
+    fitted_in_lanes as fitted_in_lanes,
+    steps_in_lanes as steps_in_lanes,
+)
+from .euler import (
+    Euler as Euler,
+)
+from .fit import (
+    check_model as check_model,
+)
+from .gaussian_transition import (
+    GaussianTransition as GaussianTransition,
+)
+from .halving import (
+    log_halving_of_all_steps as log_halving_of_all_steps,
+    log_halving_of_pair as log_halving_of_pair,
+    log_halving_of_paths as log_halving_of_paths,
+    num_looked as num_looked,
+)
+from .heun import (
+    Heun as Heun,
+)
+from .nearest_law import (
+    step_law_of as step_law_of,
+)
+from .path_likelihood import (
+    Form as Form,
+    density_of_form as density_of_form,
+    forms_of_targets as forms_of_targets,
+    log_likelihood_of_steps as log_likelihood_of_steps,
+    log_likelihoods as log_likelihoods,
+)
+from .relative_frame import (
+    Frame as Frame,
+    frame as frame,
+)
+from .step_density import (
+    AbstractStepDensity as AbstractStepDensity,
+    EulerDensity as EulerDensity,
+    ItoTaylorDensity as ItoTaylorDensity,
+    StepLaw as StepLaw,
+)
+from .step_error import (
+    StepError as StepError,
+    dominates as dominates,
+    error_of_log_mean as error_of_log_mean,
+    error_of_mean as error_of_mean,
+    is_gross as is_gross,
+    share_of_order as share_of_order,
+)

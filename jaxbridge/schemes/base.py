@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from ..engine.lanes import over_lanes
 from ..models.dynamics import Dynamics
-from .frame import Frame
+from .relative_frame import Frame
 
 
 class AbstractScheme(eqx.Module):

@@ -3,7 +3,7 @@
 from typing import ClassVar
 
 from .base import AbstractScheme
-from .frame import frame_after_drift
+from .relative_frame import frame_after_drift
 
 
 class Euler(AbstractScheme):

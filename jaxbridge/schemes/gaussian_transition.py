@@ -10,7 +10,7 @@ from ..models.dynamics import is_linear
 from ..models.linear import linear_transition
 from ..models.sigma import Constant
 from .base import AbstractScheme
-from .frame import frame_of
+from .relative_frame import frame_of
 
 
 class GaussianTransition(AbstractScheme):

@@ -35,7 +35,7 @@ from .step_density import AbstractStepDensity, StepLaw
 _LOOKED_SHARE, _LOOKED_SHARE_WHERE_SIGMA_VARIES, _FEWEST_LOOKED = 32, 2, 64
 
 
-def of_pair(
+def log_halving_of_pair(
     density: AbstractStepDensity,
     dynamics: Dynamics,
     points: tuple[Float[Array, " d"], Float[Array, " d"], Float[Array, " d"]],
@@ -62,7 +62,9 @@ def of_pair(
     return value
 
 
-def of_all_steps(log_halving: Float[Array, "*rows"], num_steps: int) -> Float[Array, "*rows"]:
+def log_halving_of_all_steps(
+    log_halving: Float[Array, "*rows"], num_steps: int
+) -> Float[Array, "*rows"]:
     """D as if all steps had been in pairs; NaN of a single step. What overflowed was of steps out
     of all proportion, and the other density is taken to be zero."""
     paired = num_steps - num_steps % 2
@@ -84,7 +86,7 @@ def log_halving_of_paths(
     points = lax.optimization_barrier(jnp.moveaxis(paths, (0, 1), (-1, -2)))
 
     def one(x, middle, x_next, first, second):
-        return of_pair(density, dynamics, (x, middle, x_next), (first, second))
+        return log_halving_of_pair(density, dynamics, (x, middle, x_next), (first, second))
 
     def every_other(leaf, shift):
         leaf = leaf[..., shift : shift + 2 * num_pairs : 2, :][..., :num_pairs, :]
@@ -95,7 +97,7 @@ def log_halving_of_paths(
     steps = [every_other(dt, shift) for shift in (0, 1)]
     parts = over_lanes(-1, -1, -1, -1, -1)(one)(*pairs, *steps)
     log_halving = jnp.sum(parts.reshape(num_pairs, -1), axis=0)
-    return of_all_steps(log_halving, num_steps)
+    return log_halving_of_all_steps(log_halving, num_steps)
 
 
 def num_looked(num_draws: int, sigma_varies: bool) -> int:

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from ..models import decisions
 from ..models.dynamics import Dynamics, ito_correction
 from .base import AbstractScheme
-from .frame import frame, frame_after_drift
+from .relative_frame import frame, frame_after_drift
 
 
 class Heun(AbstractScheme):

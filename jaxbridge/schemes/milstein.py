@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from ..models.dynamics import Dynamics
 from ..models.sigma import Diagonal
 from .base import AbstractScheme
-from .frame import frame_after_drift
+from .relative_frame import frame_after_drift
 
 
 class Milstein(AbstractScheme):

@@ -11,7 +11,7 @@ from ..engine.linalg import matvec, solve
 from ..models.dynamics import Dynamics
 from ..models.sigma import Constant
 from .base import AbstractScheme
-from .frame import frame_of
+from .relative_frame import frame_of
 
 
 class SemiImplicit(AbstractScheme):

@@ -32,7 +32,7 @@ class StepError(NamedTuple):
     uncertainty: Inexact[Array, "..."]
 
 
-def of_log_mean(
+def error_of_log_mean(
     log_weights: Float[Array, "*I n"],
     log_halving: Float[Array, "*I n"],
     share: Float[Array, "*I"],
@@ -55,7 +55,7 @@ def of_log_mean(
     return StepError(_told(share, change, some), _told(share, spread, some))
 
 
-def of_mean(
+def error_of_mean(
     log_weights: Float[Array, "*I n"],
     log_halving: Float[Array, "*I n"],
     share: Float[Array, "*I"],

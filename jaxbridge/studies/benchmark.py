@@ -24,7 +24,8 @@ from jaxtyping import Array, Key
 
 import jaxbridge as jb
 
-from ..coupling.join import propose
+from ..coupling.join import Inputs, propose
+from ..models.bridge_problem import Intervals
 from .accuracy import run_sigma_costs, sigma_table
 from .clock import in_turns
 from .crossover import DURATIONS, LONG, Process, Rate, crossover_table, processes, run_crossover
@@ -133,11 +134,11 @@ def _proposals(
         start, end = (
             jnp.broadcast_to(jnp.asarray(point)[:, None], (2, _LANES)) for point in UNLIKELY
         )
-        dt = jnp.full(_LANES, 1 / _NUM_STEPS)
+        intervals = Intervals(start, end, jnp.ones(_LANES))
 
         def block(_, number):
             keys = jax.random.split(jax.random.fold_in(key, number), _LANES)
-            made = propose(prepared, coupling, keys, start, end, dt, _NUM_STEPS)
+            made = propose(Inputs(prepared, coupling, intervals), keys, _NUM_STEPS)
             return None, (made.paths, made.meeting_step)
 
         return lax.scan(block, None, jnp.arange(num_proposals // _LANES))[1]

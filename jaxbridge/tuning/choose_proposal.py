@@ -6,12 +6,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Key
 
-from ..coupling.gamma import Coupling
+from ..coupling import Coupling
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
-from ..proposals.auto import choice_between, default_candidates, why_left_out
-from ..proposals.choice import Choice
+from ..proposals import Choice, choice_between, default_candidates, why_left_out
 from .start_law import best_pilot, coupling_pilots
 
 # Bridges of a pilot run that looks for the coupling to compare with other proposals.

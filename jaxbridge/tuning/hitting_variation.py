@@ -18,14 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
-from ..coupling.hitting import hitting_counts
-from ..coupling.start_laws import AnyStartLaw
+from ..coupling import AnyStartLaw, hitting_counts
 from ..engine.averages import normalised
 from ..engine.checks import check_count, check_key
 from ..engine.keys import key_for
-from ..exact.exact_bridges import AbstractExactBridges
-from ..exact.importance import WeightedBridges
-from ..exact.kernels import Chain
+from ..exact import AbstractExactBridges, Chain, WeightedBridges
 from ..models.diffusion import Diffusion
 
 

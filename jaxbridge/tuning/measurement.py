@@ -10,12 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ..coupling.bridges import sample_bridges
+from ..coupling import sample_bridges
 from ..engine.checks import Numbers, cast_floats
 from ..engine.diagnostics import effective_sample_size
-from ..exact.chains import sample_exact_bridges
-from ..exact.density import transition_log_density
-from ..exact.importance import sample_weighted_bridges
+from ..exact import sample_exact_bridges, sample_weighted_bridges, transition_log_density
 from ..models.diffusion import Diffusion
 from ..models.gaussian_bridge import gaussian_bridge
 from ..models.ornstein_uhlenbeck import OrnsteinUhlenbeckParams, ou_transition

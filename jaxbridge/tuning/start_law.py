@@ -18,14 +18,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ..coupling.bridges import sample_bridges
-from ..coupling.burn_in import measure_burn_in
-from ..coupling.gamma import Coupling
-from ..coupling.start_laws import AnyStartLaw, Stationary, draw_starts, needs_burn_in
+from ..coupling import (
+    AnyStartLaw,
+    Coupling,
+    Stationary,
+    draw_starts,
+    measure_burn_in,
+    needs_burn_in,
+    sample_bridges,
+)
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.keys import key_for
 from ..engine.rejection import most_lanes
-from ..exact.importance import weigh_bridges
+from ..exact import weigh_bridges
 from ..models.bridge_problem import BridgeProblem, Intervals, bridge_problem
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw

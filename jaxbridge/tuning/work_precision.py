@@ -24,18 +24,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ..coupling.gamma import Coupling
+from ..coupling import Coupling
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.keys import key_for
 from ..engine.progress import as_meter
 from ..models.bridge_problem import bridge_problem
 from ..models.diffusion import Diffusion
 from ..models.dynamics import is_linear
-from ..proposals.auto import as_proposal
-from ..proposals.base import AbstractProposal
-from ..schemes.euler import Euler
-from ..schemes.gaussian_transition import GaussianTransition
-from ..schemes.heun import Heun
+from ..proposals import AbstractProposal, as_proposal
+from ..schemes import Euler, GaussianTransition, Heun
 from .measurement import (
     Estimate,
     Run,

@@ -13,7 +13,7 @@ import jaxbridge as jb
 from jaxbridge.coupling.base import AbstractCoupling
 from jaxbridge.coupling.rotation import polar_rotation, published_rotation
 from jaxbridge.models.sigma import Full
-from jaxbridge.schemes.frame import frame
+from jaxbridge.schemes.relative_frame import frame
 
 # The example of the documentation, as it is printed there.
 _EXAMPLE = re.search(r"```python\n(.*?)```", inspect.cleandoc(AbstractCoupling.__doc__), re.DOTALL)

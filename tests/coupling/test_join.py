@@ -8,7 +8,8 @@ import pytest
 from helpers import assert_moments, paper_model, slow_beyond, swirl, unswirl, warped_model
 
 import jaxbridge as jb
-from jaxbridge.coupling.join import propose
+from jaxbridge.coupling.join import Inputs, propose
+from jaxbridge.models.bridge_problem import Intervals
 
 NUM_STEPS = 40
 NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
@@ -20,13 +21,11 @@ def make(model, coupling, start, end, duration, num_lanes, num_steps=NUM_STEPS, 
 
     @jax.jit
     def run(key):
+        points = [jnp.broadcast_to(jnp.asarray(point), (num_lanes, 2)).T for point in (start, end)]
+        intervals = Intervals(*points, jnp.full(num_lanes, duration))
         return propose(
-            model,
-            coupling,
+            Inputs(model, coupling, intervals),
             jax.random.split(key, num_lanes),
-            jnp.broadcast_to(jnp.asarray(start), (num_lanes, 2)).T,
-            jnp.broadcast_to(jnp.asarray(end), (num_lanes, 2)).T,
-            jnp.full(num_lanes, duration / num_steps),
             num_steps,
             meeting_step=None if rho is None else jnp.full(num_lanes, rho, jnp.int32),
         )
@@ -92,9 +91,10 @@ def test_stored_steps_are_those_of_the_whole_path():
     lanes = lambda value: jnp.full((2, 50), value)
     for num_steps in (20, 130):
         stored = np.array([0, 3, num_steps // 2, num_steps])
-        arguments = (model, jb.Coupling(), keys, lanes(0.2), lanes(-0.1), jnp.full(50, 0.02))
-        whole = propose(*arguments, num_steps)
-        some = propose(*arguments, num_steps, jnp.asarray(stored))
+        intervals = Intervals(lanes(0.2), lanes(-0.1), jnp.full(50, 0.02 * num_steps))
+        arguments = (Inputs(model, jb.Coupling(), intervals), keys, num_steps)
+        whole = propose(*arguments)
+        some = propose(*arguments, jnp.asarray(stored))
         np.testing.assert_allclose(some.paths, whole.paths[stored], atol=1e-6)
 
 

@@ -10,7 +10,7 @@ from scipy.stats import norm
 import jaxbridge as jb
 from jaxbridge.coupling.meeting import PairStep
 from jaxbridge.coupling.pair import relative_frame
-from jaxbridge.schemes.frame import frame
+from jaxbridge.schemes.relative_frame import frame
 
 NUM = 200_000
 DT = 0.02

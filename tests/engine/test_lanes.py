@@ -9,9 +9,10 @@ import pytest
 from jax import lax
 
 import jaxbridge as jb
-from jaxbridge.coupling.join import propose
+from jaxbridge.coupling.join import Inputs, propose
 from jaxbridge.engine.lanes import join_rows, over_lanes, split_rows
 from jaxbridge.engine.linalg import cholesky, inverse, polar_factor, safe_norm
+from jaxbridge.models.bridge_problem import Intervals
 
 B = np.array([[1.5, 1.0, 0.2], [0.3, -1.0, 1.5], [0.0, 0.5, 2.0]])
 
@@ -173,10 +174,12 @@ def test_steps_of_a_proposal_are_not_interleaved(scheme):
     model = jb.Diffusion(
         lambda x, p: -B @ x, log_stationary=lambda x, p: -x @ B @ x, reversible=True
     )
-    coupling, points = jb.Coupling(0.5, scheme=scheme), jnp.zeros((2, lanes))
+    points = jnp.zeros((2, lanes))
+    intervals = Intervals(points, points, jnp.ones(lanes))
+    inputs = Inputs(model, jb.Coupling(0.5, scheme=scheme), intervals)
 
     def run(keys):
-        return propose(model, coupling, keys, points, points, jnp.full(lanes, 0.1), 10)
+        return propose(inputs, keys, 10)
 
     keys = jax.random.split(jax.random.key(0), lanes)
     text = jax.jit(run).lower(keys).compile().as_text()

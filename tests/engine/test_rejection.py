@@ -5,7 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge.engine.rejection import Attempts, _assign_lanes, default_num_lanes, rejection_sample
+from jaxbridge.engine.rejection import (
+    Attempts,
+    Search,
+    _assign_lanes,
+    default_num_lanes,
+    rejection_sample,
+)
 
 
 def test_lanes_of_each_problem_carry_consecutive_numbers():
@@ -43,10 +49,8 @@ def table_sample(table, active, wanted, max_attempts, num_lanes):
         return Attempts(success, ~(number % 7 == 3), {"square": number**2})
 
     rows = {"square": jnp.full(len(table) * wanted, -5, jnp.int32)}
-    run = jax.jit(
-        lambda: rejection_sample(attempt, rows, active, wanted, jnp.int32(max_attempts), num_lanes)
-    )
-    return run()
+    search = Search(wanted, jnp.int32(max_attempts), num_lanes)
+    return jax.jit(lambda: rejection_sample(attempt, rows, active, search))()
 
 
 @pytest.mark.parametrize("num_lanes", [1, 7, 64])

@@ -11,9 +11,9 @@ import jaxbridge as jb
 from jaxbridge.schemes.step_error import (
     StepError,
     dominates,
+    error_of_log_mean,
+    error_of_mean,
     is_gross,
-    of_log_mean,
-    of_mean,
     share_of_order,
 )
 
@@ -88,13 +88,13 @@ def test_changes_are_those_of_weights_and_factors():
     D = D.at[40:].set(jnp.nan)
     w, factors = np.exp(log_w[:40]), np.exp(D[:40])
     share, one = jnp.asarray(1 / 3), jnp.asarray(1.0)
-    error = of_log_mean(log_w, D, share)
+    error = error_of_log_mean(log_w, D, share)
     np.testing.assert_allclose(error.value, np.log((w * factors).sum() / w.sum()) / 3, atol=1e-5)
-    error = of_mean(log_w, D, one, h)
+    error = error_of_mean(log_w, D, one, h)
     change = np.average(h[:40], weights=w * factors) - np.average(h[:40], weights=w)
     np.testing.assert_allclose(error.value, change, atol=1e-5)
-    assert np.isnan(of_log_mean(log_w, jnp.full(50, jnp.nan), share).value)
-    assert of_log_mean(log_w, D, 0 * share).value == 0
+    assert np.isnan(error_of_log_mean(log_w, jnp.full(50, jnp.nan), share).value)
+    assert error_of_log_mean(log_w, D, 0 * share).value == 0
 
 
 def test_uncertainty_is_the_spread_of_repetitions():
@@ -103,7 +103,7 @@ def test_uncertainty_is_the_spread_of_repetitions():
     h = jnp.asarray(rng.normal(size=(4000, 200))) + log_w
     D = 0.2 * h + 0.1 * jnp.asarray(rng.normal(size=h.shape))
     one = jnp.ones(4000)
-    for error in (of_log_mean(log_w, D, one), of_mean(log_w, D, one, h)):
+    for error in (error_of_log_mean(log_w, D, one), error_of_mean(log_w, D, one, h)):
         spread = float(np.std(error.value))
         assert float(np.mean(error.uncertainty)) == pytest.approx(spread, rel=0.1)
 
