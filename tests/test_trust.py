@@ -157,15 +157,7 @@ def each_random_model():
     ]
 
 
-@pytest.fixture
-def forgets():
-    """So many models' programs have more memory maps than a process may have."""
-    yield
-    jax.clear_caches()
-
-
 @slow
-@pytest.mark.usefixtures("forgets")
 @pytest.mark.parametrize("index", range(len(RANDOM)), ids=[each.name for each in RANDOM])
 def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):
     """Densities and mid-points by proposals of all kinds, where none has a warning."""

@@ -126,7 +126,7 @@ def test_what_cannot_be_differentiated_is_refused(bridges, unchecked):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "density", [jb.EulerDensity(), jb.ItoTaylorDensity()], ids=["euler", "trapezoid"]
+    "density", [jb.EulerDensity(), jb.ItoTaylorDensity()], ids=["euler", "ito_taylor"]
 )
 def test_on_a_grid_with_short_last_steps(density):
     """Steps that rounding of the times in float32 would have spoilt; the derivative is that of the
@@ -151,6 +151,6 @@ def test_on_a_grid_with_short_last_steps(density):
     # Both are unbiased for the derivative, with noise √(V(h) V(∇ log f) / n), about .005.
     np.testing.assert_allclose(gradient, direct, atol=5 * 0.005)
     assert np.abs(direct).max() > 0.05
-    form = "girsanov" if isinstance(density, jb.EulerDensity) else "trapezoid"
+    form = "girsanov" if isinstance(density, jb.EulerDensity) else "ito_taylor"
     targets = [single.target for single in bridges.proposal.singles]
     assert forms_of_targets(targets, model, bridges.paths[0, 0])[0] == form
