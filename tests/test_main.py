@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+from helpers import slow_beyond
 
 from jaxbridge.studies.benchmark import load
 
@@ -55,7 +56,10 @@ def test_quick_run_of_the_accuracy_part(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "arguments", [["--sed", "1"], ["--seed", "-1"], ["--seed", "x"], ["--out", "a-file"]]
+    "arguments",
+    slow_beyond(
+        1, [(["--out", "a-file"],), (["--sed", "1"],), (["--seed", "-1"],), (["--seed", "x"],)]
+    ),
 )
 def test_bad_arguments_end_with_one_line(arguments, tmp_path):
     (tmp_path / "a-file").touch()

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings, strategies as st
 
 import jaxbridge as jb
@@ -54,6 +55,7 @@ def test_bridges_join_their_ends(rates, start, end, duration, gamma):
     assert np.isnan(np.asarray(bridges.paths)[~np.asarray(bridges.met)]).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(**SCENE)
 def test_densities_and_means_are_those_of_the_closed_form(rates, start, end, duration, gamma):

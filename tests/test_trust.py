@@ -395,6 +395,7 @@ def cir_log_densities(coordinates, params, proposal, num_steps=100, num_proposal
 _ITO_TAYLOR, _EULER = jb.ItoTaylorDensity(), jb.EulerDensity()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "coordinates, proposal, which",
     [
@@ -493,6 +494,7 @@ def test_unknown_sigma_of_cox_ingersoll_and_ross():
     np.testing.assert_allclose(np.array(made.standard_errors), fit.sd, rtol=0.08)
 
 
+@pytest.mark.slow
 def test_unknown_sigma_is_refused_in_coordinates_that_move_with_it():
     """Observations were mapped by a σ that is fixed."""
     times, observations = cir.data()

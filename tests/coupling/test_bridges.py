@@ -216,6 +216,7 @@ def test_result_does_not_depend_on_the_batch_size():
             np.testing.assert_array_equal(getattr(other, field), getattr(first, field))
 
 
+@pytest.mark.slow
 def test_many_intervals_share_one_search():
     num_intervals, n, num_steps = 200, 3, 20
     keys = jax.random.split(jax.random.key(4), 2 * num_intervals)

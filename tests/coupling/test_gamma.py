@@ -32,7 +32,7 @@ def random_frame(d):
     return frame(sigma, *jax.random.normal(keys[1], (2, d)))
 
 
-@pytest.mark.parametrize("d", [1, 2, 5])
+@pytest.mark.parametrize("d", slow_beyond(1, [2, 1, 5]))
 @pytest.mark.parametrize("coupling", COUPLINGS)
 def test_both_maps_read_one_joint_law(coupling, d, x64):
     """Each map is linear in Gaussian noise, so its Jacobians tell its law: the noise made is

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import slow_beyond
 
 from jaxbridge.engine.noise import Store, noisy_scan, noisy_scan_until
 
@@ -15,7 +16,7 @@ def draw(key, k):
 
 
 @pytest.mark.parametrize("reverse", [False, True])
-@pytest.mark.parametrize("num_steps", [1, 5, 64, 65, 128, 150])
+@pytest.mark.parametrize("num_steps", slow_beyond(3, [1, 65, 150, 5, 64, 128]))
 def test_scan_equals_a_loop_over_the_noise_it_reports(num_steps, reverse):
     keys = jax.random.split(jax.random.key(0), LANES)
     xs = jnp.arange(num_steps, dtype=jnp.float32)

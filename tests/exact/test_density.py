@@ -12,6 +12,7 @@ from jaxbridge.proposals.auto import as_proposal
 CASES = exact_cases()
 
 
+@pytest.mark.slow
 def test_density_is_that_of_the_closed_form():
     case = CASES["unlikely, gamma 0.5"]()
     estimate = jb.transition_log_density(

@@ -36,6 +36,7 @@ def of_drift(bridges, fn):
     return lambda B: jb.expectation(fn, bridges, model.with_params(model.params._replace(B=B)))
 
 
+@pytest.mark.slow
 def test_derivative_is_that_of_the_expectation(bridges):
     """Cov(h, ∇ log f) to five standard errors, about √(V(h) V(∇ log f) / n)."""
     B = multivariate_ou()[0].params.B
@@ -104,6 +105,7 @@ def test_chains_and_several_intervals():
     np.testing.assert_allclose(value, chain.paths[:, :, 5].mean(1), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_differentiated_is_refused(bridges, unchecked):
     model = multivariate_ou()[0]
     with pytest.raises(TypeError, match="σ depends on parameters"):

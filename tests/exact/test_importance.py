@@ -32,6 +32,7 @@ def weighted_bridges(case, num_bridges, seed=0, **options):
     return jb.weigh_bridges(jax.random.key(seed), case.model, bridges, **options)
 
 
+@pytest.mark.slow
 def test_weighted_midpoints_have_the_exact_law():
     """Of bridges that were made before."""
     case = CASES["unlikely, gamma 0.5"]()

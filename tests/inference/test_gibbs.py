@@ -250,6 +250,7 @@ def test_observations_outside_the_state_space_are_named(unchecked):
         jb.gibbs(jax.random.key(0), root, [0.0, 1.0, 2.0], [[1.0], [0.5], [-0.1]], prior=PRIOR)
 
 
+@pytest.mark.slow
 def test_parameters_in_which_the_drift_is_not_linear():
     """Rate e^θ: the information at θ is not that at θ', and Metropolis–Hastings must know."""
     model = jb.Diffusion(
@@ -346,6 +347,7 @@ def test_paths_that_stand_in_for_bridges_count_as_missing(num_chains):
     assert on.state.found.all() and (on.num_missing[..., -1] == 0).all()
 
 
+@pytest.mark.slow
 def test_a_state_must_fit_the_observations(unchecked):
     options = dict(OPTIONS, num_iterations=2, proposal=jb.ModifiedDiffusionBridge())
     key = jax.random.key(0)

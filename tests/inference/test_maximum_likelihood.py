@@ -39,6 +39,7 @@ def exact_maximum():
     return b, jnp.linalg.inv(-hessian)
 
 
+@pytest.mark.slow
 def test_one_unknown_rate():
     """The maximum, or, where the search has only begun, no claim to have found it."""
     times = np.arange(0.0, 30.0)

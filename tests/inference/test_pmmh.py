@@ -76,6 +76,7 @@ def test_goes_on_from_its_state_and_may_start_anywhere():
     assert made.names == ("0", "1") and made.log_likelihood_variance.shape == (2,)
 
 
+@pytest.mark.slow
 def test_going_on_is_one_run():
     """Ten iterations and ten more, by the proposals that "auto" had decided on, are twenty."""
     options = dict(OPTIONS, num_proposals=5, num_chains=2, num_warmup=0)

@@ -221,6 +221,7 @@ def test_proposals_that_are_not_pulled_are_refused(unchecked):
         estimate(*arguments, method="em", **SHORT)
 
 
+@pytest.mark.slow
 def test_a_choice_is_made_once_or_kept(unchecked):
     """ "auto" comes to one proposal for all intervals of a number of steps; a choice that the user
     has made is kept."""

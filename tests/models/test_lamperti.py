@@ -18,6 +18,7 @@ def root(x, noise=NOISE):
     return 2 * (np.sqrt(x) - np.sqrt(AT)) / noise
 
 
+@pytest.mark.slow
 def test_coordinates_are_those_of_the_closed_form(precision):
     dtype = jnp.dtype(precision)
     tolerance = 1e-7 if dtype == "float64" else 2e-6
@@ -112,6 +113,7 @@ def test_parameters_of_sigma_may_change_and_have_derivatives(x64):
     np.testing.assert_allclose(jax.grad(drift)(0.6), slope, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_maps_take_many_points():
     moved = jb.lamperti(cir(), at=AT, reach=8.0)
     points = np.linspace(0.05, 2, 12).reshape(3, 4, 1).astype(np.float32)
@@ -138,6 +140,7 @@ def shifted(model):
     return moved.model, moved.forward
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", INFERENCE)
 @pytest.mark.parametrize("where", slow_beyond(1, [None, lambda p: p[2]]), ids=["all", "noise"])
 def test_unknown_parameters_of_sigma_are_refused(name, where):
@@ -156,6 +159,7 @@ def test_unknown_parameters_of_sigma_are_refused(name, where):
             INFERENCE[name](jax.random.key(0), model, TIMES, data, where=where, num_steps=4)
 
 
+@pytest.mark.slow
 def test_unknown_parameters_of_the_drift_are_not_refused():
     moved = jb.lamperti(cir(), at=AT, reach=8.0)
     points = moved.forward(OBSERVATIONS)

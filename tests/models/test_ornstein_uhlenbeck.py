@@ -223,6 +223,7 @@ def test_bridge_moments_are_those_of_dense_conditioning(name, precision):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["swirling", "five-dimensional"])
 def test_bridge_samples_have_the_joint_law_of_all_times(name):
     start, end = end_points(name)

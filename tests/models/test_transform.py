@@ -78,6 +78,7 @@ def test_a_planar_model_is_that_of_the_closed_form(x64):
     np.testing.assert_allclose(ours.sample_stationary(key), swirl(ou.sample_stationary(key)))
 
 
+@pytest.mark.slow
 def test_a_reversal_that_was_given_comes_along(x64):
     """dX = -(I + J) X dt + dW turns, and backwards the other way: known by its two drifts alone,
     it has the reversal that the stationary density of the transformed process gives."""

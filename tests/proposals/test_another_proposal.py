@@ -52,6 +52,7 @@ def test_densities_and_choices_take_it():
     assert ours.effective_sample_size < theirs.effective_sample_size
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["pseudo_marginal", "crank_nicolson"])
 def test_chains_take_it(method):
     chain = jb.sample_exact_bridges(

@@ -344,6 +344,7 @@ def test_auto_is_differentiable_where_it_tries_no_couplings():
     assert np.isfinite(slope)
 
 
+@pytest.mark.slow
 def test_what_auto_leaves_out_is_said():
     """An undeclared normaliser, for densities only; and an unknown time reversal."""
     key, ends, model = jax.random.key(0), ([0.0], [0.3], 0.1), jb.langevin(lambda x, p: -x @ x)

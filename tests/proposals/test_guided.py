@@ -67,7 +67,7 @@ def euler_bridge_1d(model, start, end, times, middle):
     return np.log(joint.sum() * width), (grid * joint).sum() / joint.sum()
 
 
-@pytest.mark.parametrize("name", slow_beyond(3, PROPOSALS))
+@pytest.mark.parametrize("name", slow_beyond(1, PROPOSALS))
 def test_weights_make_the_euler_scheme_exact(name):
     """Density and mean of the mid-point, state-dependent σ, five coarse steps: no step error."""
     proposal = PROPOSALS[name]
@@ -107,7 +107,7 @@ def test_one_step_is_the_euler_density(name):
 
 
 @pytest.mark.parametrize("refinement", slow_beyond(1, [1.0, 2.0]))
-@pytest.mark.parametrize("linearisation", ["end", "path", -NON_REVERSIBLE])
+@pytest.mark.parametrize("linearisation", slow_beyond(1, ["end", "path", -NON_REVERSIBLE]))
 def test_linear_drift_is_guided_without_error(x64, linearisation, refinement):
     """Every weight is the density of the Euler chain, a Gaussian recursion."""
     model = jb.ornstein_uhlenbeck(NON_REVERSIBLE, [0.2, -0.1], FULL_SIGMA)
@@ -214,6 +214,7 @@ def two_wells_in_numpy(barrier):
     return functions
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, duration, num_steps",
     [
@@ -260,6 +261,7 @@ def test_couplings_agree(duration):
     assert abs(float(coupled.value - guided.value)) < 5 * error + 0.015
 
 
+@pytest.mark.slow
 def test_noise_makes_the_path_and_the_path_gives_the_noise(precision):
     """The maps are inverse to each other, and a path's weight is a function of the path."""
     model = jb.Diffusion(
@@ -311,6 +313,7 @@ def test_without_drift_a_guess_has_the_mean_of_both_covariances(diagonal, x64):
     np.testing.assert_allclose(units @ units.T, covariance, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("linearisation", slow_beyond(1, ["path", "end"]))
 def test_sigma_may_turn_and_a_guess_does_not_see_it(linearisation, x64):
     """The law depends on V alone."""

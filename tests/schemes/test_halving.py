@@ -24,7 +24,7 @@ def weighted_paths(model, start, end, num_bridges, num_steps, density, key=0, **
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+@pytest.mark.parametrize("density", slow_beyond(1, DENSITIES.values()), ids=DENSITIES)
 def test_linear_drift_is_known(density, x64):
     """Every D is log [q_2δ / n_2] of the points two steps apart, n_2 being two steps of the
     chain; and e^D has the quotient of the two closed forms as its mean."""
@@ -60,11 +60,11 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+@pytest.mark.parametrize("case", slow_beyond(1, CASES))
 @pytest.mark.parametrize("refinement", slow_beyond(1, [1.0, 1.5]))
 def test_mean_is_that_of_half_as_many_steps(case, refinement):
     """Of the weight, and of the mid-point, against paths of half as many steps."""
-    model, density, spread = case
+    model, density, spread = CASES[case]
     start, end = [-0.3], [1.0]
     size = 40_000 if model is VARYING else 320_000
     fine, coarse = (
@@ -99,7 +99,7 @@ def test_factor_is_that_of_quadrature(case, x64):
     assert abs(w @ factor - 1) < 5 * error < 0.04
 
 
-@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+@pytest.mark.parametrize("density", slow_beyond(1, DENSITIES.values()), ids=DENSITIES)
 @pytest.mark.parametrize("num_steps", slow_beyond(1, [7, 2, 1]))
 def test_one_d_for_each_path(density, num_steps, x64):
     """The loop that draws, the maps between noise and paths, and `log_halving_of_paths` agree; of

@@ -75,6 +75,7 @@ def test_derivatives_are_the_papers_H_and_B(precision):
         np.testing.assert_allclose(jax.hessian(log_likelihood)(0.7), -integral_B, rtol=tolerance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "form, curl, order",
     slow_beyond(

@@ -171,6 +171,7 @@ def rotating(decay, speed):
     return decay * np.eye(2) + speed * J
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "decay, speed, duration, at_50, at_100",
     slow_beyond(
@@ -322,6 +323,7 @@ def test_superlinear_rotation_is_finite_and_converges(name):
         assert abs(limit) < 5 * noise + 0.5 * abs(coarse.step_error)
 
 
+@pytest.mark.slow
 def test_guides_along_a_path_that_explodes_are_finite(precision):
     """In four steps the deterministic path of the superlinear rotation is off by 1e8."""
     estimate = jb.transition_log_density(

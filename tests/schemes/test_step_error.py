@@ -18,7 +18,7 @@ from jaxbridge.schemes.step_error import (
 )
 
 
-@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+@pytest.mark.parametrize("density", slow_beyond(1, DENSITIES.values()), ids=DENSITIES)
 @pytest.mark.parametrize("refinement", slow_beyond(1, [1.0, 1.5]))
 @pytest.mark.parametrize("curl", slow_beyond(1, [False, True]), ids=["gradient", "curl"])
 def test_error_of_a_log_density(density, refinement, curl, x64):
@@ -41,7 +41,8 @@ def test_error_of_a_log_density(density, refinement, curl, x64):
     assert estimate.step_error_dominates and not estimate.trustworthy
 
 
-@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+@pytest.mark.slow
+@pytest.mark.parametrize("density", slow_beyond(1, DENSITIES.values()), ids=DENSITIES)
 @pytest.mark.parametrize("method", slow_beyond(1, ["weighted", "chain"]))
 def test_error_of_a_mean(density, method, x64):
     """That of the mid-point, against the closed form."""
@@ -57,6 +58,7 @@ def test_error_of_a_mean(density, method, x64):
     assert np.all(np.abs(error - told) < 5 * noise + 0.5 * np.abs(told))
 
 
+@pytest.mark.slow
 def test_exact_transitions_have_none():
     model = jb.ornstein_uhlenbeck(PAPER_B)
     pairs = jb.Coupling(0.5, scheme=jb.GaussianTransition())

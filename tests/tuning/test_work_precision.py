@@ -188,6 +188,7 @@ def test_errors_say_what_to_change(changes, message, unchecked):
         jb.work_precision(KEY, paper_model(), **arguments)
 
 
+@pytest.mark.slow
 def test_constants_of_one_precision_are_refused_before_anything_runs(unchecked):
     """NumPy's, which JAX takes for those of the precision in which it sees them first."""
     height = np.array([-2.0, -1.0])
