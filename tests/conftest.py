@@ -9,9 +9,6 @@ import tempfile
 
 from jaxtyping import config as jaxtyping_config, install_import_hook
 
-# Nearly all of the time goes into compilation, of which optimisation is half. What
-# `helpers.run_program` runs is compiled as it is for users.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 install_import_hook("jaxbridge", "beartype.beartype")
 
 import jax  # noqa: E402
@@ -28,6 +25,13 @@ if _OWNS_CACHE:
 jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def pytest_configure(config):
+    """Nearly all of the time of tests that are not slow goes into compilation, of which
+    optimisation is half. What `helpers.run_program` runs is compiled as it is for users."""
+    if config.option.markexpr == "not slow":
+        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 
 def pytest_unconfigure():
