@@ -13,7 +13,7 @@ from jaxbridge.exact.density import log_mean_and_error
 from jaxbridge.exact.pseudo_marginal import accept_reject
 
 CASES = exact_cases()
-FEW = ("very unlikely", "swirled", "very unlikely, law off centre")
+SIZES = {"very unlikely": 30_000, "swirled": 20_000}
 
 
 @pytest.mark.parametrize("name", slow_cases(CASES, {"unlikely, gamma 0.5"}))
@@ -24,7 +24,7 @@ def test_weighted_proposals_have_the_exact_law(name):
     case = CASES[name]()
     weighted = jb.sample_weighted_bridges(
         jax.random.key(1), case.model, case.start, case.end, case.duration,
-        num_bridges=30_000 if name in FEW else 60_000, num_steps=case.num_steps,
+        num_bridges=SIZES.get(name, 60_000), num_steps=case.num_steps,
         proposal=case.coupling, save_at=[case.duration / 2], max_proposals=1,
     )  # fmt: skip
     assert not weighted.truncated.any()
