@@ -3,7 +3,6 @@
 `hard` keeps what the table in notebooks/hard_cases.md says of a case beside the test that shows it.
 """
 
-import os
 import pathlib
 
 import jax
@@ -476,16 +475,6 @@ def test_unusual_stationary_densities(log_density, precision):
 @pytest.mark.slow
 @pytest.mark.parametrize("d", [1, 2, 10, 50])
 def test_dimensions(d, precision):
-    if d == 50:  # what is written out for so many takes a compiler that optimises
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setenv("PYTHONPATH", os.path.dirname(__file__))
-            patched.setenv("JAX_ENABLE_X64", str(int(precision == "float64")))
-            run_program(f"from test_hard_cases import check_dimensions as c; c(50, '{precision}')")
-    else:
-        check_dimensions(d, precision)
-
-
-def check_dimensions(d, precision):
     model, dtype = jb.ornstein_uhlenbeck(jnp.eye(d)), jnp.dtype(precision)
     check_meetings(model, d, dtype)
     check_memory(model, d, dtype)
