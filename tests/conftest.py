@@ -28,8 +28,8 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def pytest_configure(config):
-    """Nearly all of the time of tests that are not slow goes into compilation, of which
-    optimisation is half. What `helpers.run_program` runs is compiled as it is for users."""
+    """Most of the time of tests that are not slow goes into compilation, of which optimisation
+    is half. What `helpers.run_program` runs is compiled as it is for users."""
     if config.option.markexpr == "not slow":
         os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 

@@ -57,9 +57,7 @@ def test_quick_run_of_the_accuracy_part(tmp_path):
 
 @pytest.mark.parametrize(
     "arguments",
-    slow_beyond(
-        1, [(["--out", "a-file"],), (["--sed", "1"],), (["--seed", "-1"],), (["--seed", "x"],)]
-    ),
+    slow_beyond(1, [["--out", "a-file"], ["--sed", "1"], ["--seed", "-1"], ["--seed", "x"]]),
 )
 def test_bad_arguments_end_with_one_line(arguments, tmp_path):
     (tmp_path / "a-file").touch()

@@ -151,12 +151,6 @@ def density_of(weighted):
     )
 
 
-def each_random_model():
-    return [
-        pytest.param(i, id=random.name) for i, random in enumerate(random_models.random_models())
-    ]
-
-
 @slow
 @pytest.mark.parametrize("index", range(len(RANDOM)), ids=[each.name for each in RANDOM])
 def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):

@@ -14,12 +14,8 @@ have to be known when the past is forgotten: `burn_in`), hits z; it is counted h
 """
 
 # What the folders above use of this one.
-from .associated import (
-    run_associated as run_associated,
-)
-from .base import (
-    AbstractCoupling as AbstractCoupling,
-)
+from .associated import run_associated as run_associated
+from .base import AbstractCoupling as AbstractCoupling
 from .bridges import (
     Bridges as Bridges,
     Joined as Joined,
@@ -47,9 +43,7 @@ from .hitting import (
     hitting_counts as hitting_counts,
     search_for_hits as search_for_hits,
 )
-from .join import (
-    Inputs as Inputs,
-)
+from .join import Inputs as Inputs
 from .start_laws import (
     AnyStartLaw as AnyStartLaw,
     Reversed as Reversed,

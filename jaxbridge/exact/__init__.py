@@ -8,16 +8,12 @@ densities are means of weights (`density`), and `expectation` has derivatives th
 """
 
 # What the folders above use of this one.
-from .chains import (
-    sample_exact_bridges as sample_exact_bridges,
-)
+from .chains import sample_exact_bridges as sample_exact_bridges
 from .density import (
     estimate_log_density as estimate_log_density,
     transition_log_density as transition_log_density,
 )
-from .exact_bridges import (
-    AbstractExactBridges as AbstractExactBridges,
-)
+from .exact_bridges import AbstractExactBridges as AbstractExactBridges
 from .importance import (
     WeightedBridges as WeightedBridges,
     sample_weighted_bridges as sample_weighted_bridges,

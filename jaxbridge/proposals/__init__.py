@@ -28,9 +28,7 @@ from .base import (
     AbstractWeightedProposal as AbstractWeightedProposal,
     WeightedPaths as WeightedPaths,
 )
-from .choice import (
-    Choice as Choice,
-)
+from .choice import Choice as Choice
 from .coupled import (
     CoupledPairs as CoupledPairs,
     as_pairs as as_pairs,
@@ -44,9 +42,5 @@ from .guided import (
     noise_of as noise_of,
     path_of as path_of,
 )
-from .linear_guide import (
-    Guided as Guided,
-)
-from .modified_bridge import (
-    ModifiedDiffusionBridge as ModifiedDiffusionBridge,
-)
+from .linear_guide import Guided as Guided
+from .modified_bridge import ModifiedDiffusionBridge as ModifiedDiffusionBridge

@@ -16,27 +16,17 @@ from .base import (
     fitted_in_lanes as fitted_in_lanes,
     steps_in_lanes as steps_in_lanes,
 )
-from .euler import (
-    Euler as Euler,
-)
-from .fit import (
-    check_model as check_model,
-)
-from .gaussian_transition import (
-    GaussianTransition as GaussianTransition,
-)
+from .euler import Euler as Euler
+from .fit import check_model as check_model
+from .gaussian_transition import GaussianTransition as GaussianTransition
 from .halving import (
     log_halving_of_all_steps as log_halving_of_all_steps,
     log_halving_of_pair as log_halving_of_pair,
     log_halving_of_paths as log_halving_of_paths,
     num_looked as num_looked,
 )
-from .heun import (
-    Heun as Heun,
-)
-from .nearest_law import (
-    step_law_of as step_law_of,
-)
+from .heun import Heun as Heun
+from .nearest_law import step_law_of as step_law_of
 from .path_likelihood import (
     Form as Form,
     density_of_form as density_of_form,

@@ -3,5 +3,3 @@
 results are `settings`). `hitting_variation` tells what makes weights unequal: how much the
 probability varies that a bridge is hit.
 """
-
-# What the folders above use of this one.

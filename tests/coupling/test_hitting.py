@@ -135,7 +135,7 @@ def eqx_repeat(bridges, num):
 
 @pytest.mark.slow
 def test_results_do_not_depend_on_lanes_and_paths_stop_when_they_have_hit():
-    """200 steps make four stretches, of which most trials need one or two."""
+    """200 steps make four chunks, of which most trials need one or two."""
     bridges = some_bridges(40, num_steps=200)
     arguments = (jax.random.key(1), paper_model(), bridges, 5)
     many = jb.hitting_counts(*arguments)

@@ -38,6 +38,7 @@ def test_weighted_proposals_have_the_exact_law(name):
     size = assert_weighted_moments(middle, np.exp(log_weights), case.mean, case.covariance)
     assert size == pytest.approx(float(weighted.effective_sample_size), rel=1e-3)
     assert size > 800
+    assert case.start_law is None or np.ptp(log_weights) > 0
 
     uniform = jax.random.uniform(jax.random.key(2), (1, len(log_weights) - 1))
     row, accepted = accept_reject(log_weights[None], uniform)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import count_compilations, slow_beyond
+from helpers import count_compilations
 from test_transform import MEAN, NOISE, RATE, cir, cir_density
 
 import jaxbridge as jb
@@ -142,7 +142,7 @@ def shifted(model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", INFERENCE)
-@pytest.mark.parametrize("where", slow_beyond(1, [None, lambda p: p[2]]), ids=["all", "noise"])
+@pytest.mark.parametrize("where", [None, lambda p: p[2]], ids=["all", "noise"])
 def test_unknown_parameters_of_sigma_are_refused(name, where):
     """The coordinates would move with them, and the observations would not."""
     moved = jb.lamperti(cir(), at=AT, reach=8.0)

@@ -314,7 +314,7 @@ def test_without_drift_a_guess_has_the_mean_of_both_covariances(diagonal, x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("linearisation", slow_beyond(1, ["path", "end"]))
+@pytest.mark.parametrize("linearisation", ["end", "path"])
 def test_sigma_may_turn_and_a_guess_does_not_see_it(linearisation, x64):
     """The law depends on V alone."""
 
