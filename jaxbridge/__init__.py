@@ -101,6 +101,7 @@ from .schemes.base import AbstractScheme
 from .schemes.euler import Euler
 from .schemes.gaussian_transition import GaussianTransition
 from .schemes.heun import Heun
+from .schemes.heun_or_euler import HeunOrEuler
 from .schemes.milstein import Milstein
 from .schemes.path_likelihood import path_log_likelihood
 from .schemes.relative_frame import Frame
@@ -137,6 +138,7 @@ __all__ = [
     "Coupling",
     # How a pair is stepped, joined and turned.
     "Heun",
+    "HeunOrEuler",
     "Euler",
     "Milstein",
     "SemiImplicit",

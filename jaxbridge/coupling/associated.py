@@ -21,6 +21,7 @@ from ..engine.noise import noisy_scan_until
 from ..models.diffusion import Diffusion
 from .base import AbstractCoupling
 from .pair import drive_back, have_met, in_lanes, pair_noise
+from .rotation import driven_through_root
 from .start_laws import draw_starts
 
 
@@ -46,7 +47,7 @@ def run_associated(
     """One path associated with the bridge in each lane, whose random numbers depend on the
     lane's key alone. Simulation ends when all lanes have hit."""
     num_steps, like = len(path) - 1, path[0, :, 0]
-    forward = model.forward(like)
+    forward = driven_through_root(coupling, model.forward(like), like)
     start_keys, path_keys, coupling_keys = split_each(keys, 3)
     lanes, axes = in_lanes(coupling, forward, like, coupling_keys, dt)
     law, scheme = lanes.coupling.start_law, lanes.coupling.scheme

@@ -39,7 +39,7 @@ class AbstractCoupling(eqx.Module):
     class SynchronousThenReflection(jb.AbstractCoupling):
         distance: float = 1.0
         meeting: jb.AbstractMeeting = jb.BrownianCrossing()
-        scheme: jb.AbstractScheme = jb.Heun()
+        scheme: jb.AbstractScheme = jb.HeunOrEuler()
         start_law: jb.Stationary = jb.Stationary()
         rotation: object = eqx.field(default=None, static=True)
         independent_noise = False

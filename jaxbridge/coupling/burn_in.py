@@ -36,6 +36,7 @@ from ..schemes import check_model
 from .base import AbstractCoupling
 from .gamma import Coupling
 from .pair import Lane, PairNoise, drive, have_met, in_lanes
+from .rotation import driven_through_root
 from .start_laws import MOST_STEPS, Stationary, needs_burn_in, run_for
 
 _NUM_PAIRS = 512
@@ -128,8 +129,9 @@ def _measure(
     key = key_for("burn-in", key)
     mine = jnp.arange(_NUM_PAIRS) * len(end) // _NUM_PAIRS
     end, dt = end[mine].T, duration[mine] / num_steps
-    dynamics = model.prepared().backward(end[:, 0])
     reflection = Coupling(-1.0, scheme=coupling.scheme, rotation=coupling.rotation)
+    backward = model.prepared().backward(end[:, 0])
+    dynamics = driven_through_root(reflection, backward, end[:, 0])
     pairs = in_lanes(reflection, dynamics, end[:, 0], jax.random.split(key, _NUM_PAIRS), dt)
     most = max(0, (MOST_STEPS // 2 // num_steps).bit_length() - 1)
 

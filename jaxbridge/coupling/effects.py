@@ -10,9 +10,10 @@ from ..engine.noise import chunks
 from ..models import decisions
 from ..models.decisions import Effects
 from ..models.diffusion import Diffusion, check_diffusion
+from ..schemes import Heun, HeunOrEuler, scheme_for
 from .base import AbstractCoupling, check_coupling
 from .gamma import Coupling
-from .rotation import rotation_effect
+from .rotation import driven_through_root, root_effect, rotation_effect
 
 # Dimensions tried for a model that does not say its own; most that fit two fit them all.
 _DIMENSIONS = (2, 1, *range(3, 65))
@@ -57,16 +58,22 @@ def effects(
     if like.ndim != 1:
         raise ValueError(f"`at` must be one point, shape (d,); got {like.shape}.")
     forward = model.forward(like)
-    sigma = type(eqx.filter_eval_shape(forward.sigma, like))
+    own_sigma, sigma = (
+        type(eqx.filter_eval_shape(dynamics.sigma, like))
+        for dynamics in (forward, driven_through_root(coupling, forward, like))
+    )
+    scheme = scheme_for(coupling.scheme, forward)
     reverse_drift = model.reverse_drift_effect
     return Effects(
         reverse_drift,
         decisions.divergence(reverse_drift, forward.sigma_varies),
         decisions.solves(sigma),
-        rotation_effect(coupling, sigma, sigma),
+        root_effect(coupling, own_sigma),
+        rotation_effect(coupling, sigma),
         decisions.independent_noise(coupling.independent_noise),
         decisions.crossing_uniforms(coupling.meeting.draws_uniform),
-        decisions.stratonovich(coupling.scheme.stratonovich, forward.sigma_varies),
+        _corrector(coupling.scheme, scheme, forward),
+        decisions.stratonovich(scheme.stratonovich, forward.sigma_varies),
         decisions.stored_times(None if save_at is None else as_floating("save_at", save_at).size),
         decisions.early_stop(chunks(num_steps)[0]),
     )
@@ -81,3 +88,12 @@ def _find_point(model: Diffusion) -> Float[Array, " d"]:
             continue
         return like
     raise ValueError("the dimension of this model is not visible: pass a point, `at=`, shape (d,).")
+
+
+def _corrector(asked_for, scheme, forward) -> decisions.Effect:
+    """Of the coupling's scheme, which is `scheme` for this equation."""
+    if isinstance(asked_for, HeunOrEuler):
+        return decisions.corrector(forward.sigma_varies)
+    return decisions.Effect(
+        isinstance(scheme, Heun), f"the coupling's choice, `{type(scheme).__name__}`"
+    )

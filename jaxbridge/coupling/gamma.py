@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import dot
-from ..schemes import AbstractScheme, Euler, Frame, Heun
+from ..schemes import AbstractScheme, Euler, Frame, HeunOrEuler
 from .base import AbstractCoupling, Rotation
 from .meeting import AbstractMeeting, BrownianCrossing, ReflectionPlane, SignTest
 from .rotation import published_rotation
@@ -39,10 +39,12 @@ class Coupling(AbstractCoupling):
         its own. Pairs whose γ is out of that range, which only a law or a traced value can be,
         never meet, and are counted in `num_nonfinite`.
     - `meeting`: `BrownianCrossing()`, `SignTest(radius)` or, for γ = -1, `ReflectionPlane()`.
-    - `scheme`: `Heun()`, `Euler()`, `Milstein()`, for stiff or superlinear drift
+    - `scheme`: by default `HeunOrEuler()`, Heun's scheme for constant σ and Euler's where it
+        depends on the state; or `Heun()`, `Euler()`, `Milstein()`, for stiff or superlinear drift
         `SemiImplicit()`, for linear drift `GaussianTransition()`.
-    - `rotation`: O(x, x') from the matrices σ(x), σ(x'); `None` is `polar_rotation` where σ is
-        a full matrix that depends on the state, and nothing elsewhere.
+    - `rotation`: O(x, x') from the matrices σ(x), σ(x'), where these are full and depend on the
+        state. `None` drives the pair through the triangular root of V = σσᵀ, which calls for none;
+        with `Heun()` it is `polar_rotation`.
     - `start_law`: μ, where the associated diffusion starts, which only what corrects bridges to
         their exact law makes use of: `Stationary()`, `GaussianLaw(mean, covariance)`, or any
         object with `sample(key, model)` and a normalised `log_density(x)`; see `fit_start_law`.
@@ -77,7 +79,7 @@ class Coupling(AbstractCoupling):
         law, gamma = (gamma, jnp.nan) if callable(gamma) else (None, gamma)
         self.gamma = as_floating("gamma", gamma)
         self.meeting = BrownianCrossing() if meeting is None else meeting
-        self.scheme = Heun() if scheme is None else scheme
+        self.scheme = HeunOrEuler() if scheme is None else scheme
         self.start_law = as_start_law(Stationary() if start_law is None else start_law)
         for name, given, kind in [
             ("meeting", self.meeting, AbstractMeeting),
@@ -166,6 +168,6 @@ def most_accurate(coupling: AbstractCoupling) -> AbstractCoupling:
     return eqx.tree_at(
         lambda c: (c.meeting, c.scheme),
         coupling,
-        (BrownianCrossing(), Heun()),
+        (BrownianCrossing(), HeunOrEuler()),
         is_leaf=lambda leaf: isinstance(leaf, AbstractMeeting | AbstractScheme),
     )

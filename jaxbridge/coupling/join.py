@@ -26,6 +26,7 @@ from ..models.dynamics import Dynamics
 from ..schemes import AbstractScheme, steps_in_lanes
 from .base import AbstractCoupling
 from .pair import Lane, drive, have_met, in_lanes, pair_noise
+from .rotation import driven_through_root
 
 
 class Inputs(NamedTuple):
@@ -66,7 +67,8 @@ def propose(
     model, coupling, (start, end, duration) = inputs
     like, dt = start[:, 0], duration / num_steps
     reverse_keys, driven_keys, coupling_keys = split_each(keys, 3)
-    backward, forward = model.backward(like), model.forward(like)
+    backward = model.backward(like)
+    forward = driven_through_root(coupling, model.forward(like), like)
     x_start, x_path = reverse_path(backward, coupling.scheme, reverse_keys, end, dt, num_steps)
     pairs = in_lanes(coupling, forward, like, coupling_keys, dt)
     # A whole path is written next to its start; but not by a replay, which is there to be

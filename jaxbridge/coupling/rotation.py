@@ -2,11 +2,13 @@
 where σ(x) does.
 """
 
+import equinox as eqx
 from jaxtyping import Array, Float
 
 from ..engine.linalg import matmul, matvec, polar_factor
 from ..models import decisions
-from ..models.sigma import AbstractSigma, Full
+from ..models.dynamics import Dynamics
+from ..models.sigma import AbstractSigma, Full, Triangular
 from .base import AbstractCoupling
 
 
@@ -58,18 +60,33 @@ def rotation_between(
     coupling: AbstractCoupling, sigma: AbstractSigma, driven_sigma: AbstractSigma
 ) -> Float[Array, "d d"] | None:
     """O(x, x'), or `None` where σ calls for no rotation."""
-    if not rotation_effect(coupling, type(sigma), type(driven_sigma)).simulated:
+    if not rotation_effect(coupling, type(sigma)).simulated:
         return None
-    assert isinstance(sigma, Full) and isinstance(driven_sigma, Full)
+    assert isinstance(sigma, Full | Triangular) and isinstance(driven_sigma, Full | Triangular)
     rotation = polar_rotation if coupling.rotation is None else coupling.rotation
     return rotation(sigma.matrix, driven_sigma.matrix)
 
 
-def rotation_effect(
-    coupling: AbstractCoupling, sigma: type[AbstractSigma], driven_sigma: type[AbstractSigma]
-) -> decisions.Effect:
+def rotation_effect(coupling: AbstractCoupling, sigma: type[AbstractSigma]) -> decisions.Effect:
     """Whether the pair calls for a rotation."""
-    return decisions.rotation(sigma, driven_sigma, coupling.rotation is no_rotation)
+    rotation = coupling.rotation
+    return decisions.rotation(sigma, rotation is not None, rotation is no_rotation)
+
+
+def root_effect(coupling: AbstractCoupling, sigma: type[AbstractSigma]) -> decisions.Effect:
+    """Whether the pair is driven through the triangular root of V."""
+    rotation_given, stratonovich = coupling.rotation is not None, coupling.scheme.stratonovich
+    return decisions.triangular_root(sigma, rotation_given, stratonovich)
+
+
+def driven_through_root(
+    coupling: AbstractCoupling, dynamics: Dynamics, like: Float[Array, " d"]
+) -> Dynamics:
+    """The same diffusion as the pair sees it: with σ = L Q driven by Q W through L, where that is
+    called for. This is the rotation O(x, x') = Q(x')ᵀQ(x), done once for each of the two."""
+    if not root_effect(coupling, type(eqx.filter_eval_shape(dynamics.sigma, like))).simulated:
+        return dynamics
+    return dynamics._replace(sigma=lambda x: dynamics.sigma(x).root())
 
 
 def rotate(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Float[Array, " d"]:

@@ -106,13 +106,57 @@ def inverse(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
 
 
 def cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """The lower triangular L with `L Lᵀ = matrix`, column by column; NaN where there is none."""
-    d, rest, columns = matrix.shape[0], matrix, []
+    """The lower triangular L with `L Lᵀ = matrix`; NaN where there is none.
+
+    Number by number, which fuses; in many dimensions, where that takes long to compile, column by
+    column."""
+    d = matrix.shape[0]
+    if d > _UNROLLED:
+        rest, columns = matrix, []
+        for k in range(d):
+            column = jnp.where(np.arange(d) < k, 0, rest[:, k] * lax.rsqrt(rest[k, k]))
+            columns.append(column)
+            rest = rest - column[:, None] * column
+        return jnp.stack(columns, axis=1)
+    L: list[list[Array]] = [[] for _ in range(d)]
     for k in range(d):
-        column = jnp.where(np.arange(d) < k, 0, rest[:, k] * lax.rsqrt(rest[k, k]))
-        columns.append(column)
-        rest = rest - column[:, None] * column
-    return jnp.stack(columns, axis=1)
+        rest = [_minus(matrix[i, k], [L[i][j] * L[k][j] for j in range(k)]) for i in range(k, d)]
+        root = lax.rsqrt(rest[0])
+        for i in range(k, d):
+            L[i].append(rest[i - k] * root)
+    return _lower(L)
+
+
+def lower_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """L of `matrix = L Q`, lower triangular with a positive diagonal, Q orthogonal: the root of
+    `matrix matrixᵀ`, without squaring the condition number. By Gram and Schmidt's procedure on the
+    rows, modified, which is as stable for L as any; non-finite numbers where `matrix` is singular.
+    """
+    d = matrix.shape[0]
+    if d > _UNROLLED:
+        return cholesky(matmul(matrix, matrix.T))
+    L: list[list[Array]] = []
+    directions: list[Array] = []
+    for i in range(d):
+        row, along = matrix[i], []
+        for direction in directions:
+            along.append(dot(row, direction))
+            row = row - along[-1] * direction
+        square = dot(row, row)
+        root = lax.rsqrt(square)
+        directions.append(row * root)
+        L.append([*along, square * root])
+    return _lower(L)
+
+
+def _minus(number: Float[Array, ""], terms: list[Float[Array, ""]]) -> Float[Array, ""]:
+    return number - _sum(terms) if terms else number
+
+
+def _lower(rows: list[list[Float[Array, ""]]]) -> Float[Array, "d d"]:
+    """The lower triangular matrix of these numbers."""
+    zero = jnp.zeros_like(rows[0][0])
+    return jnp.stack([jnp.stack(row + [zero] * (len(rows) - len(row))) for row in rows])
 
 
 def quadratic_form(
@@ -139,8 +183,8 @@ def solve_lower(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float
     """`L⁻¹ right` for a lower triangular L, by forward substitution."""
     solved = []
     for i in range(matrix.shape[0]):
-        known = [matrix[i, j] * solved[j] for j in range(i)]
-        solved.append((right[i] - _sum(known) if known else right[i]) / matrix[i, i])
+        rest = _minus(right[i], [matrix[i, j] * solved[j] for j in range(i)])
+        solved.append(rest / matrix[i, i])
     return jnp.stack(solved)
 
 

@@ -9,7 +9,7 @@ the same rules and prints their answers, so what it says is what is simulated.
 
 from typing import NamedTuple
 
-from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
+from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity, Triangular
 
 
 class Effect(NamedTuple):
@@ -25,9 +25,11 @@ class Effects(NamedTuple):
     - `reverse_drift`: α* by automatic differentiation of log ν, in each step of the reversed path.
     - `divergence`: div V in α*.
     - `solves`: elimination with a matrix σ in each step.
+    - `triangular_root`: the root of V = σσᵀ in the place of σ, in each step of the pair.
     - `rotation`: O(x, x') in each step of the pair.
     - `independent_noise`: dU, one normal number a step.
     - `crossing_uniforms`: one uniform number a step, for the meeting rule.
+    - `corrector`: Heun's second look at the drift, at the point that it predicts.
     - `stratonovich`: the correction of the drift by which Itô's form exceeds Stratonovich's.
     - `stored_times`: whole paths kept, rather than the times asked for.
     - `early_stop`: associated paths looked at on the way, and stopped where all have hit.
@@ -36,9 +38,11 @@ class Effects(NamedTuple):
     reverse_drift: Effect
     divergence: Effect
     solves: Effect
+    triangular_root: Effect
     rotation: Effect
     independent_noise: Effect
     crossing_uniforms: Effect
+    corrector: Effect
     stratonovich: Effect
     stored_times: Effect
     early_stop: Effect
@@ -75,20 +79,32 @@ def solves(sigma: type[AbstractSigma]) -> Effect:
         Identity: "σ is the identity",
         Constant: "σ is constant: inverted once, before the steps",
         Diagonal: "σ is diagonal: a division",
+        Triangular: "its root is triangular: one substitution",
     }
     if sigma is Full:
         return Effect(True, "σ is a full matrix that depends on the state")
     return Effect(False, reasons[sigma])
 
 
-def rotation(
-    sigma: type[AbstractSigma], driven_sigma: type[AbstractSigma], left_out: bool
-) -> Effect:
+def triangular_root(sigma: type[AbstractSigma], rotation_given: bool, stratonovich: bool) -> Effect:
+    """L of σ = L Q, L Lᵀ = V."""
+    if sigma is not Full:
+        return Effect(False, "σ is no full matrix that depends on the state, or triangular already")
+    if rotation_given:
+        return Effect(False, "the coupling turns σ(x) itself, by its `rotation`")
+    if stratonovich:
+        return Effect(False, "the scheme differentiates σ(x) itself")
+    return Effect(True, "V = σσᵀ is all that counts, and its root solves without elimination")
+
+
+def rotation(sigma: type[AbstractSigma], rotation_given: bool, left_out: bool) -> Effect:
     """O(x, x')."""
-    if not (sigma is Full and driven_sigma is Full):
-        return Effect(False, "σ is not a full matrix that depends on the state: O = I")
+    if sigma not in (Full, Triangular):
+        return Effect(False, "σ is no matrix that depends on the state: O = I")
     if left_out:
         return Effect(False, "the coupling's choice, `no_rotation`")
+    if sigma is Triangular and not rotation_given:
+        return Effect(False, "triangular roots of V = σσᵀ do not turn: O = I")
     return Effect(True, "so that σ(x')O points where σ(x) does")
 
 
@@ -106,6 +122,13 @@ def crossing_uniforms(draws: bool, replayed: bool = False) -> Effect:
     if draws:
         return Effect(True, "whether the gap closed inside a step is drawn")
     return Effect(False, "the meeting rule looks at the grid points only")
+
+
+def corrector(sigma_varies: bool) -> Effect:
+    """α at the predicted point, where the scheme is left to the scene."""
+    if sigma_varies:
+        return Effect(False, "σ depends on the state: it would not raise the order")
+    return Effect(True, "σ is constant: it raises the weak order from 1 to 2")
 
 
 def stratonovich(asked_for: bool, sigma_varies: bool) -> Effect:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Inexact, Key, PyTree
 
-from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
 from . import decisions
 from .dynamics import Dynamics, stationary_flux
 from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
@@ -335,11 +335,14 @@ class Diffusion(eqx.Module):
 
 
 def _as_sigma(
-    values: Numbers | None, x: Float[Array, " d"], constant: bool = True
+    values: Numbers | AbstractSigma | None, x: Float[Array, " d"], constant: bool = True
 ) -> AbstractSigma:
     if values is None:
         return Identity()
     d = x.shape[0]
+    if isinstance(values, AbstractSigma):  # of a model that knows the form of its σ
+        values = cast_floats(values, x.dtype)
+        return Constant(values.as_matrix(d, x.dtype)) if constant else values
     values = jnp.asarray(values)
     if values.shape not in ((d,), (d, d)):
         raise ValueError(

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..engine.linalg import total
 from .sigma import AbstractSigma
 from .tracing import uses_argument
 
@@ -46,9 +47,11 @@ def weighted_divergence(
     M(x) v; div M is left out where M does not vary."""
     flux = product(x, jax.grad(log_nu)(x))
     if varies:
-        for direction in jnp.eye(x.shape[0], dtype=x.dtype):
-            _, tangent = jax.jvp(product, (x, direction), (direction, jnp.zeros_like(x)))
-            flux += tangent
+
+        def column(direction):
+            return jax.jvp(lambda y: product(y, direction), (x,), (direction,))[1]
+
+        flux += total(jax.vmap(column)(jnp.eye(x.shape[0], dtype=x.dtype)))
     return flux
 
 

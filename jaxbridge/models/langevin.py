@@ -6,9 +6,10 @@ from collections.abc import Callable
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..engine.linalg import cholesky, matvec
+from ..engine.linalg import matvec
 from .diffusion import Diffusion
 from .dynamics import weighted_divergence
+from .sigma import Triangular, root_of
 
 
 def stationary_diffusion(
@@ -101,9 +102,9 @@ class _Root:
 
     V: Callable
 
-    def __call__(self, x: Float[Array, " d"], params: PyTree) -> Float[Array, "..."]:
+    def __call__(self, x: Float[Array, " d"], params: PyTree) -> Float[Array, " d"] | Triangular:
         V = jnp.asarray(self.V(x, params))
-        return jnp.sqrt(V) if V.ndim == 1 else cholesky(V)
+        return jnp.sqrt(V) if V.ndim == 1 else root_of(V)
 
 
 def _multiply(matrix: Array, vector: Float[Array, " d"]) -> Float[Array, " d"]:

@@ -1,8 +1,13 @@
 """The diffusion coefficient σ(x) at one point, as the operator its form calls for.
 
-Four forms: the identity, a constant matrix (inverted outside the loop over time), a
-diagonal and a full matrix. Whoever holds an `AbstractSigma` multiplies and solves without
-knowing which; what a form does not need is never computed.
+Five forms: the identity, a constant matrix (inverted outside the loop over time), a diagonal, a
+full matrix that changes with the state, and its lower triangular root. Whoever holds an
+`AbstractSigma` multiplies and solves without knowing which; what a form does not need is never
+computed.
+
+The law of the diffusion is that of V = σσᵀ. So where only the law counts, and there is anything
+to solve, a full σ(x) = L Q gives way to its root L, which solves without elimination or pivots and
+does not turn: L(x) → L(x') as V(x) → V(x'), whatever Q does.
 """
 
 from abc import abstractmethod
@@ -15,7 +20,8 @@ from ..engine.linalg import (
     any_inverse,
     cholesky,
     log_abs_det,
-    matmul,
+    log_of_product,
+    lower_factor,
     matvec,
     solve,
     solve_lower,
@@ -141,11 +147,9 @@ class Diagonal(AbstractSigma):
 
 
 class Full(AbstractSigma):
-    """A full matrix that changes with the state; `lower` says that it is triangular, for which less
-    need be solved."""
+    """A full matrix that changes with the state."""
 
     matrix: Float[Array, "d d"]
-    lower: bool = eqx.field(static=True, default=False)
 
     def mv(self, noise):
         return matvec(self.matrix, noise)
@@ -154,11 +158,11 @@ class Full(AbstractSigma):
         return matvec(self.matrix.T, vector)
 
     def solve(self, vector):
-        return (solve_lower if self.lower else solve)(self.matrix, vector)
+        return solve(self.matrix, vector)
 
     def average(self, other):
         assert isinstance(other, Full)
-        return Full((self.matrix + other.matrix) / 2, self.lower and other.lower)
+        return Full((self.matrix + other.matrix) / 2)
 
     def log_abs_det(self):
         return log_abs_det(self.matrix)
@@ -167,9 +171,37 @@ class Full(AbstractSigma):
         return self.matrix
 
     def root(self):
-        return root_of(matmul(self.matrix, self.matrix.T))
+        return Triangular(lower_factor(self.matrix))
 
 
-def root_of(V: Float[Array, "d d"]) -> Full:
+class Triangular(AbstractSigma):
+    """A lower triangular matrix with a positive diagonal."""
+
+    matrix: Float[Array, "d d"]
+
+    def mv(self, noise):
+        return matvec(self.matrix, noise)
+
+    def mv_transpose(self, vector):
+        return matvec(self.matrix.T, vector)
+
+    def solve(self, vector):
+        return solve_lower(self.matrix, vector)
+
+    def average(self, other):
+        assert isinstance(other, Triangular)
+        return Triangular((self.matrix + other.matrix) / 2)
+
+    def log_abs_det(self):
+        return log_of_product([self.matrix[i, i] for i in range(self.matrix.shape[0])])
+
+    def as_matrix(self, dim, dtype):
+        return self.matrix
+
+    def root(self):
+        return self
+
+
+def root_of(V: Float[Array, "d d"]) -> Triangular:
     """The lower triangular root of V."""
-    return Full(cholesky(V), lower=True)
+    return Triangular(cholesky(V))

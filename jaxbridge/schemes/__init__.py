@@ -4,7 +4,8 @@ A scheme (`base`) makes the step, says which noise made it, ΔW = noise(x, x'), 
 points lies for that noise, by the direction u and the length of σ(x')⁻¹(x - x') (`relative_frame`).
 Schemes are `euler` and `milstein`, `heun` of second order for constant σ, `semi_implicit` for stiff
 drift, and for a linear one its own transition (`gaussian_transition`); whether scheme, model and
-points fit is checked (`fit`). The density of a step, N(μ(x), δ σ S σᵀ) (`step_density`), makes the
+points fit is checked (`fit`); by default it is the one that the scene calls for
+(`heun_or_euler`). The density of a step, N(μ(x), δ σ S σᵀ) (`step_density`), makes the
 likelihood of a path, Σ log q(x_i, x_{i+1}) (`path_likelihood`). The same of every other point says
 what half as many steps would give (`halving`), and so how far N steps are from the limit
 (`step_error`).
@@ -26,6 +27,10 @@ from .halving import (
     num_looked as num_looked,
 )
 from .heun import Heun as Heun
+from .heun_or_euler import (
+    HeunOrEuler as HeunOrEuler,
+    scheme_for as scheme_for,
+)
 from .nearest_law import step_law_of as step_law_of
 from .path_likelihood import (
     Form as Form,

@@ -43,7 +43,7 @@ class GaussianTransition(AbstractScheme):
             raise ValueError(
                 "`GaussianTransition` is for linear drift and constant σ; this model has "
                 f"{'a σ that depends on the state' if dynamics.sigma_varies else 'another drift'}. "
-                "Choose `Heun()`."
+                "Leave `scheme=` out."
             )
         sigma = dynamics.sigma(like).as_matrix(like.shape[0], like.dtype)
         moments = linear_transition(jax.jacfwd(dynamics.drift)(like), matmul(sigma, sigma.T), dt)

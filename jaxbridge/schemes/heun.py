@@ -24,7 +24,7 @@ class Heun(AbstractScheme):
     **Example:**
 
     ```python
-    coupling = jb.Coupling(0.5, scheme=jb.Heun())  # the default
+    coupling = jb.Coupling(0.5, scheme=jb.Heun())
     ```
     """
 

@@ -5,6 +5,7 @@ from .base import AbstractScheme
 from .euler import Euler
 from .gaussian_transition import GaussianTransition
 from .heun import Heun
+from .heun_or_euler import scheme_for
 from .milstein import Milstein
 from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
 from .step_error import share_of_order
@@ -18,6 +19,7 @@ def step_law_of(scheme: AbstractScheme, dynamics: Dynamics) -> tuple[AbstractSte
     drift only, is taken to be of first order: its error is then told too large rather than too
     small.
     """
+    scheme = scheme_for(scheme, dynamics)
     if isinstance(scheme, GaussianTransition):
         return EulerDensity(), 0.0  # there is no step error
     if isinstance(scheme, Heun) and not dynamics.sigma_varies:

@@ -180,7 +180,7 @@ def _ito(model: Diffusion, dynamics: Dynamics, steps, points) -> Float[Array, " 
         alpha, slope = jax.linearize(dynamics.drift, x)
         directions = [jnp.asarray(direction, x.dtype) for direction in np.eye(x.shape[0])]
         divergence = total(jnp.stack([slope(e)[i] for i, e in enumerate(directions)]))
-        beta = dynamics.sigma(x).solve(alpha)
+        beta = dynamics.sigma(x).root().solve(alpha)
         return (divergence + dot(beta, beta)) / 2
 
     values = over_lanes(-1)(integrand)(points.reshape(points.shape[0], -1))
@@ -192,7 +192,7 @@ def _ito(model: Diffusion, dynamics: Dynamics, steps, points) -> Float[Array, " 
 
 def _girsanov(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
     """αᵀ V⁻¹ Δx - ½ αᵀ V⁻¹ α δ."""
-    sigma = dynamics.sigma(x)
+    sigma = dynamics.sigma(x).root()
     beta = sigma.solve(dynamics.drift(x))
     return dot(beta, sigma.solve(x_next - x) - dt / 2 * beta)
 
@@ -218,7 +218,7 @@ def _ito_taylor(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
 
 def _driftless(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
     """log N(x'; x, V(x) δ)."""
-    sigma, d = dynamics.sigma(x), x.shape[0]
+    sigma, d = dynamics.sigma(x).root(), x.shape[0]
     dw = sigma.solve(x_next - x)
     return -dot(dw, dw) / (2 * dt) - sigma.log_abs_det() - d / 2 * jnp.log(2 * math.pi * dt)
 

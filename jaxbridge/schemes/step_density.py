@@ -141,7 +141,7 @@ class EulerDensity(AbstractStepDensity):
     order: ClassVar[int] = 1
 
     def steps_from(self, dynamics, x):
-        drift, sigma, d = dynamics.drift(x), dynamics.sigma(x), x.shape[0]
+        drift, sigma, d = dynamics.drift(x), dynamics.sigma(x).root(), x.shape[0]
 
         def law(dt):
             return StepLaw(x + drift * dt, sigma, jnp.ones((), x.dtype), dt)
