@@ -55,6 +55,7 @@ from .exact.density import (
     transition_log_density,
 )
 from .exact.expectation import expectation
+from .exact.extrapolation import ExtrapolatedBridges, ExtrapolatedLogDensity, extrapolate
 from .exact.importance import (
     WeightedBridges,
     sample_weighted_bridges,
@@ -162,6 +163,9 @@ __all__ = [
     "weigh_bridges",
     "WeightedBridges",
     "expectation",
+    "extrapolate",
+    "ExtrapolatedBridges",
+    "ExtrapolatedLogDensity",
     # The same chains as kernels.
     "pseudo_marginal",
     "renewal",

@@ -147,6 +147,8 @@ def density_of(weighted):
             weighted.proposal,
             weighted.pareto_k,
             *step_error,
+            weighted.step_share,
+            weighted.num_steps,
         )
     )
 

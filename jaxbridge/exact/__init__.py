@@ -4,7 +4,8 @@
 
 by importance sampling (`importance`) and by Markov chains (`chains`), which are kernels as well
 (`kernels`): `pseudo_marginal`, `renewal` and `crank_nicolson`, a method a module. Transition
-densities are means of weights (`density`), and `expectation` has derivatives that are right.
+densities are means of weights (`density`), and `expectation` has derivatives that are right. Two
+grids make one estimate without their leading step error (`extrapolation`).
 """
 
 # What the folders above use of this one.
@@ -14,6 +15,7 @@ from .density import (
     transition_log_density as transition_log_density,
 )
 from .exact_bridges import AbstractExactBridges as AbstractExactBridges
+from .extrapolation import extrapolate as extrapolate
 from .importance import (
     WeightedBridges as WeightedBridges,
     sample_weighted_bridges as sample_weighted_bridges,

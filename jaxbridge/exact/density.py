@@ -41,6 +41,7 @@ class TransitionLogDensity(eqx.Module):
     - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` can be trusted.
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, with
         a standard error of it, `step_uncertainty`. NaN where it is not known, as of one step.
+    - `step_share`: the step error as a share of what half as many steps change; `num_steps`: N.
     """
 
     value: Float[Array, "*I"]
@@ -54,6 +55,8 @@ class TransitionLogDensity(eqx.Module):
     pareto_k: Float[Array, "*I"]
     step_error: Float[Array, "*I"]
     step_uncertainty: Float[Array, "*I"]
+    step_share: Float[Array, "*I"]
+    num_steps: int = eqx.field(static=True)
 
     @property
     def step_error_dominates(self) -> Bool[Array, "*I"]:
@@ -172,13 +175,14 @@ def estimate_log_density(
     cut = jnp.any(drawn.truncated, axis=1)
     share = proposal.step_share(model, intervals)
     step_error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
-    value, error, size, shape, step_error = problem.result(
+    value, error, size, shape, step_error, share = problem.result(
         (
             log_mean,
             jnp.where(cut, jnp.inf, error),
             size,
             pareto_k(drawn.log_weights),
             lax.stop_gradient(step_error),
+            share,
         )
     )
     return TransitionLogDensity(
@@ -192,6 +196,8 @@ def estimate_log_density(
         proposal,
         shape,
         *step_error,
+        share,
+        num_steps,
     )
 
 

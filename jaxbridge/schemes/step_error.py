@@ -103,6 +103,11 @@ def share_of_order(order: int) -> float:
     return 1 / (2**order - 1)
 
 
+def share_of_known_order(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
+    """(2^p - 1)⁻¹ of a share that may be told too large, to be on the safe side."""
+    return jnp.minimum(share, 1)
+
+
 def _overlap(weights: Float[Array, "*I n"], coarse: Float[Array, "*I n"]) -> Bool[Array, "*I"]:
     """Whether many of the paths have weight under both laws, and there are many at all: one alone
     would have no uncertainty."""

@@ -13,11 +13,26 @@ from jaxtyping import Array, Float, Key
 from ..coupling import sample_bridges
 from ..engine.checks import Numbers, cast_floats
 from ..engine.diagnostics import effective_sample_size
-from ..exact import sample_exact_bridges, sample_weighted_bridges, transition_log_density
+from ..engine.keys import key_for
+from ..exact import (
+    extrapolate,
+    sample_exact_bridges,
+    sample_weighted_bridges,
+    transition_log_density,
+)
 from ..models.diffusion import Diffusion
 from ..models.gaussian_bridge import gaussian_bridge
 from ..models.ornstein_uhlenbeck import OrnsteinUhlenbeckParams, ou_transition
+from ..schemes import share_of_known_order
 from .settings import Setting
+
+# What is combined from two grids, and the method that is run on each.
+EXTRAPOLATED = {"extrapolated_weights": "weights", "extrapolated_density": "density"}
+
+
+def is_density(method: str) -> bool:
+    """Whether it estimates p_T(a, b)."""
+    return EXTRAPOLATED.get(method, method) == "density"
 
 
 class Estimate(NamedTuple):
@@ -98,6 +113,12 @@ class Run(NamedTuple):
 
     def result(self, key: Key[Array, ""], scene: Scene) -> Any:
         """The result of the call that is timed."""
+        if self.method in EXTRAPOLATED:
+            fine = self._replace(method=EXTRAPOLATED[self.method])
+            coarse = fine._replace(num_steps=self.num_steps // 2)
+            return extrapolate(
+                fine.result(key, scene), coarse.result(key_for("coarse", key), scene)
+            )
         arguments = (key, *scene.interval(self.dtype))
         proposal, num_steps = cast_floats(self.proposal, self.dtype), self.num_steps
         if self.method == "density":
@@ -114,6 +135,19 @@ class Run(NamedTuple):
 
 def _estimate(scene: Scene, method: str, result: Any) -> Estimate:
     """Means and their errors, in double precision, from what a run returned."""
+    if method in EXTRAPOLATED:
+        fine, coarse = (
+            _estimate(scene, EXTRAPOLATED[method], one) for one in (result.fine, result.coarse)
+        )
+        share = float(share_of_known_order(result.fine.step_share))
+        mean = fine.mean + share * (fine.mean - coarse.mean)
+        return Estimate(
+            mean,
+            np.hypot((1 + share) * fine.error, share * coarse.error),
+            fine.sd,
+            fine.num_simulated + coarse.num_simulated,
+            fine.num_missing + coarse.num_missing,
+        )
     if method == "density":
         found = np.isfinite(result.value)
         value = np.where(found, np.exp(np.asarray(result.value, float)), np.nan)[None]
@@ -213,7 +247,7 @@ def measure(
         result, first = timed()
         seconds = float(np.median([timed()[1] for _ in range(repeats)]))
         found = _estimate(scene, run.method, result)
-        shape = getattr(result, "pareto_k", None)
+        shape = getattr(getattr(result, "fine", result), "pareto_k", None)
 
     def size(difference):
         ratio = difference[exact.is_random] / exact.sd[exact.is_random]

@@ -34,6 +34,7 @@ from ..models.dynamics import is_linear
 from ..proposals import AbstractProposal, as_proposal
 from ..schemes import Euler, GaussianTransition, Heun
 from .measurement import (
+    EXTRAPOLATED,
     Estimate,
     Run,
     Scene,
@@ -42,11 +43,20 @@ from .measurement import (
     finest,
     given,
     given_density,
+    is_density,
     measure,
 )
 from .settings import WorkPrecision
 
-METHODS = ("approximate", "weights", "pseudo_marginal", "renewal", "crank_nicolson", "density")
+METHODS = (
+    "approximate",
+    "weights",
+    "pseudo_marginal",
+    "renewal",
+    "crank_nicolson",
+    "density",
+    *EXTRAPOLATED,
+)
 
 
 _FOR_COUPLINGS, _FOR_GUIDED = ("approximate", "renewal"), ("crank_nicolson",)
@@ -88,7 +98,9 @@ def work_precision(
         for linear drift and constant σ with `GaussianTransition()`.
     - `methods`: "approximate" for couplings; "weights", "pseudo_marginal", "renewal",
         "crank_nicolson" for exact bridges; "density" for p_T(a, b), whose error is relative. Where
-        a proposal does not fit a method the pair is left out.
+        a proposal does not fit a method the pair is left out. "extrapolated_weights" and
+        "extrapolated_density" add half as many steps to each number of steps, and combine the two
+        (`extrapolate`).
     - `dtypes`: "float32", "float64". The latter needs no configuration, but constants in the
         model's functions must be of the precision of the point, or in `params`: the reference is
         in double precision whatever is asked for here.
@@ -135,7 +147,10 @@ def work_precision(
                 "`num_steps` must be even where `save_at` is left to its default, half the "
                 f"duration; got {tuple(steps)}."
             )
-    for candidate, n in itertools.product(candidates, steps):
+    grids = [*steps, *(n // 2 for n in steps)] if set(methods) & set(EXTRAPOLATED) else steps
+    if len(grids) > len(steps) and any(n % 2 for n in steps):
+        raise ValueError(f"to extrapolate, `num_steps` must be even; got {tuple(steps)}.")
+    for candidate, n in itertools.product(candidates, grids):
         problem.keep(save_at, duration, candidate.fractions(n))
     runs = [
         Run(method, candidate, dtype, n, num_bridges)
@@ -145,7 +160,7 @@ def work_precision(
     ]
     if not runs:
         raise ValueError(f"none of `proposals` fits any of `methods`; got {tuple(methods)}.")
-    if "density" in methods:
+    if any(is_density(method) for method in methods):
         for candidate in candidates:
             candidate.check_for_density(model)
     finest_steps, most = reference_steps, reference_bridges
@@ -164,14 +179,14 @@ def work_precision(
     times = np.asarray(save_at, float)
     scene = Scene(model, start_point, end_point, length, times, whole, fn is None)
     given_values = {False: given(reference), True: given_density(log_density)}
-    alone = all(m != "approximate" and given_values[m == "density"] for m in methods)
+    alone = all(m != "approximate" and given_values[is_density(m)] for m in methods)
     check_precisions(scene, dtypes if alone else ("float32", "float64"))
     exact, limits = _references(key_for("reference", key), scene, runs, finest_run, given_values)
     meter = as_meter(progress_meter)
     state = meter.init()
     settings = []
     for done, run in enumerate(runs, 1):
-        truth = exact[run.method == "density"]
+        truth = exact[is_density(run.method)]
         limit = limits[id(run.proposal)] if run.method == "approximate" else truth
         settings.append(measure(key, scene, run, truth, limit, repeats))
         state = meter.step(state, jnp.asarray(done / len(runs)))
@@ -223,7 +238,7 @@ def _references(
             or closed_form(key, scene, density, num_draws)
             or finest(key, scene, finest_run._replace(method=name))
             for name, density in [("weights", False), ("density", True)]
-            if density in {run.method == "density" for run in runs}
+            if density in {is_density(run.method) for run in runs}
         }
         approximate = {id(r.proposal): r.proposal for r in runs if r.method == "approximate"}
         limits = {

@@ -1,0 +1,181 @@
+"""Richardson's extrapolation: two estimates, on N and on N/2 steps, without their leading error.
+
+Where an estimate E_N of something has an error c δ^p + O(δ^{p+1}) from its steps δ,
+
+    E_N + (E_N - E_{N/2}) / (2^p - 1)
+
+has one of O(δ^{p+1}) only. For densities this is done on the natural scale, on which both are
+unbiased but for their steps, and so is their combination. The price is noise: for p = 1 it has
+four times the variance of E_N, and that of E_{N/2}.
+
+`step_error` tells the same from the paths of one grid, which are a sample for both step laws; but
+what it knows of is the law of normal steps, of which a coupling's is not the same function. Here
+nothing is assumed but the order.
+"""
+
+from typing import overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ..engine.averages import PathFunction
+from ..engine.pareto import is_reliable
+from ..schemes import StepError, dominates, share_of_known_order
+from .density import TransitionLogDensity
+from .importance import WeightedBridges
+
+
+class ExtrapolatedLogDensity(eqx.Module):
+    """What `extrapolate` makes of two `TransitionLogDensity`.
+
+    - `value`: the log of the combination, unbiased on the natural scale but for an error of higher
+        order; -inf where noise made it negative.
+    - `standard_error`: that of `value`, by the delta method.
+    - `removed`: what `value` is smaller by than that of the finer grid.
+    - `fine`, `coarse`: the two.
+    """
+
+    value: Float[Array, "*I"]
+    standard_error: Float[Array, "*I"]
+    removed: Float[Array, "*I"]
+    fine: TransitionLogDensity
+    coarse: TransitionLogDensity
+
+    @property
+    def step_error_dominates(self) -> Bool[Array, "*I"]:
+        """Whether half of what was removed, taken for a bound of what is left, is beyond three
+        standard errors. Of the next order two grids tell nothing: a third does."""
+        left = StepError(jnp.zeros_like(self.removed), jnp.abs(self.removed) / 2)
+        return dominates(left, self.standard_error)
+
+    @property
+    def trustworthy(self) -> Bool[Array, "*I"]:
+        """Whether `value` and `standard_error` are to be trusted, as in `TransitionLogDensity`."""
+        trusted = ~self.step_error_dominates & jnp.isfinite(self.value)
+        for one in (self.fine, self.coarse):
+            trusted &= is_reliable(one.pareto_k, one.effective_sample_size)
+            trusted &= (one.num_truncated == 0) & (one.num_met > 0)
+        return trusted
+
+
+class ExtrapolatedBridges(eqx.Module):
+    """What `extrapolate` makes of two `WeightedBridges`, `fine` and `coarse`: their means,
+    combined."""
+
+    fine: WeightedBridges
+    coarse: WeightedBridges
+
+    def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """The mean of `fn(path)` over exact bridges, but for an error of higher order in the steps.
+        `fn` must return the same shapes for paths of both grids: keep both `save_at` some
+        times."""
+        return self._combined(fn, self.fine.mean(fn), self.coarse.mean(fn), _richardson)
+
+    def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """That of `mean(fn)`, entry by entry."""
+        errors = self.fine.standard_error(fn), self.coarse.standard_error(fn)
+        return self._combined(fn, *errors, _richardson_error)
+
+    def removed(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """What `mean(fn)` is smaller by than that of the finer grid."""
+        return jax.tree.map(jnp.subtract, self.fine.mean(fn), self.mean(fn))
+
+    def _combined(self, fn, fine, coarse, combine):
+        share = share_of_known_order(self.fine.step_share)
+
+        def of_entry(one, other):
+            if one.shape != other.shape:
+                raise ValueError(
+                    "`fn` must return the same shapes for paths of both grids, but it returned "
+                    f"{one.shape} and {other.shape}: keep both at the same times, `save_at=`."
+                )
+            each = share.reshape(*share.shape, *[1] * (one.ndim - share.ndim))
+            return combine(each, one, other)
+
+        return jax.tree.map(of_entry, fine, coarse)
+
+
+@overload
+def extrapolate(
+    fine: TransitionLogDensity, coarse: TransitionLogDensity
+) -> ExtrapolatedLogDensity: ...
+@overload
+def extrapolate(fine: WeightedBridges, coarse: WeightedBridges) -> ExtrapolatedBridges: ...
+def extrapolate(fine, coarse):
+    """Two estimates without the leading error of their steps: Richardson's extrapolation.
+
+    Worth its noise where steps, not draws, decide the error, as for a σ that depends on the state,
+    for which all schemes are of first order.
+
+    **Arguments:**
+
+    - `fine`, `coarse`: two results of `transition_log_density`, or two of
+        `sample_weighted_bridges` or `weigh_bridges`, that differ in two things only: `coarse` has
+        half as many steps, and a key of its own.
+
+    **Returns:** `ExtrapolatedLogDensity`, with `value` and `standard_error`, or
+    `ExtrapolatedBridges`, with `mean(fn)` and `standard_error(fn)`.
+
+    **Raises:** `TypeError` for other results; `ValueError` where `coarse` has not half as many
+    steps, or the two come of different proposals, whose errors do not cancel.
+
+    **Example:**
+
+    ```python
+    fine, coarse = (
+        jb.transition_log_density(key, model, start, end, 1.0, num_steps=n, proposal=jb.Guided())
+        for key, n in zip(jax.random.split(key), (20, 10))
+    )
+    jb.extrapolate(fine, coarse).value
+    ```
+    """
+    for kind in (TransitionLogDensity, WeightedBridges):
+        if isinstance(fine, kind) and isinstance(coarse, kind):
+            break
+    else:
+        raise TypeError(
+            "`fine` and `coarse` must both be what `transition_log_density` returned, or both what "
+            "`sample_weighted_bridges` or `weigh_bridges` did; got "
+            f"{type(fine).__name__} and {type(coarse).__name__}."
+        )
+    if fine.num_steps != 2 * coarse.num_steps:
+        raise ValueError(
+            f"`coarse` must have half as many steps as `fine`; got {fine.num_steps} and "
+            f"{coarse.num_steps}."
+        )
+    structures = [jax.tree.structure(one.proposal) for one in (fine, coarse)]
+    if structures[0] != structures[1] or len(fine.proposal.singles) > 1:
+        raise ValueError(
+            "both must come of the same single proposal, for the step errors of two do not cancel: "
+            f"got {fine.proposal.describe()} and {coarse.proposal.describe()}."
+        )
+    if isinstance(fine, WeightedBridges):
+        return ExtrapolatedBridges(fine, coarse)
+    share = share_of_known_order(fine.step_share)
+    # Both relative to the finer, which keeps their digits.
+    known = jnp.isfinite(fine.value) & (coarse.value < jnp.inf)
+    ratio = jnp.where(known, jnp.exp(coarse.value - jnp.where(known, fine.value, 0)), jnp.inf)
+    combined = _richardson(share, 1.0, ratio)
+    positive = known & (combined > 0)
+    safe = jnp.where(positive, combined, 1)
+    # A density of zero has no relative error; what it lacks, the finer has.
+    coarse_error = jnp.where(ratio > 0, ratio * coarse.standard_error, 0)
+    error = _richardson_error(share, fine.standard_error, coarse_error) / safe
+    return ExtrapolatedLogDensity(
+        jnp.where(positive, fine.value + jnp.log(safe), -jnp.inf),
+        jnp.where(positive, error, jnp.inf),
+        jnp.where(positive, -jnp.log(safe), jnp.inf),
+        fine,
+        coarse,
+    )
+
+
+def _richardson(share, fine, coarse):
+    return fine + share * (fine - coarse)
+
+
+def _richardson_error(share, fine, coarse):
+    """Of independent estimates."""
+    return jnp.hypot((1 + share) * fine, share * coarse)

@@ -1,0 +1,185 @@
+"""Seconds to the first result: each entry point called in a process of its own.
+
+Nearly all of a first call is compilation, so it is timed with and without the programs that an
+earlier process left on disk (`JAX_COMPILATION_CACHE_DIR`). The memory maps that it leaves behind
+are counted as well, for a process may have no more than so many (`vm.max_map_count` on Linux).
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+import jaxbridge as jb
+
+from .paper import study_model
+from .report import Say, Table, silent
+
+
+class FirstCall(NamedTuple):
+    """The first call of an entry point in a process, and the second, in seconds; the first in a
+    process that found its programs on disk; programs compiled; memory maps left behind."""
+
+    what: str
+    first: float
+    again: float
+    from_disk: float
+    programs: int
+    maps: int
+
+
+def _turned(x, p):
+    """A full σ(x) that turns with the state."""
+    c, s = jnp.cos(0.5 * x[0]), jnp.sin(0.5 * x[0])
+    scale = 1 + 0.2 * jnp.tanh(x[1])
+    return jnp.array([[c, -s], [s, c]]) * jnp.stack([jnp.ones_like(scale), scale])
+
+
+def _full_sigma() -> jb.Diffusion:
+    return jb.Diffusion(lambda x, p: -x, _turned, lambda x, p: -x @ x)
+
+
+def _interval(model: jb.Diffusion) -> tuple[Any, ...]:
+    return jax.random.key(0), model, [0.0, 0.0], [0.3, -0.2], 1.0
+
+
+def _weights(model: jb.Diffusion, proposal: Any) -> Any:
+    return jb.sample_weighted_bridges(*_interval(model), num_bridges=1_000, proposal=proposal)
+
+
+def _chain(method: Any, proposal: Any) -> Any:
+    interval = _interval(study_model())
+    return jb.sample_exact_bridges(*interval, num_bridges=1_000, method=method, proposal=proposal)
+
+
+def _density() -> Any:
+    return jb.transition_log_density(*_interval(study_model()), proposal="auto")
+
+
+def _gibbs() -> Any:
+    """200 intervals, 500 iterations."""
+    times = jnp.arange(201) * 0.5
+    record = jb.simulate(jax.random.key(1), _pulled(1.0), jnp.zeros(2), times)[0]
+    return jb.gibbs(
+        jax.random.key(0),
+        _pulled(0.8),
+        times,
+        record,
+        prior=lambda theta: -theta,
+        constraint=lambda theta: theta > 0,
+        num_iterations=500,
+        num_steps=10,
+        proposal="auto",
+    )
+
+
+def _pulled(theta: float) -> jb.Diffusion:
+    return jb.langevin(lambda x, theta: -theta * x @ x, params=theta)
+
+
+ENTRIES: Mapping[str, Callable[[], Any]] = {
+    "`sample_bridges`": lambda: jb.sample_bridges(*_interval(study_model()), num_bridges=1_000),
+    "weights, coupling": lambda: _weights(study_model(), jb.Coupling(0.5)),
+    'weights, "auto"': lambda: _weights(study_model(), "auto"),
+    "chain, pseudo-marginal": lambda: _chain("pseudo_marginal", jb.Coupling(0.5)),
+    "chain, renewal": lambda: _chain("renewal", jb.Coupling(0.5)),
+    'chain, "auto"': lambda: _chain("pseudo_marginal", "auto"),
+    'density, "auto"': _density,
+    "full σ(x): weights, coupling": lambda: _weights(_full_sigma(), jb.Coupling(0.5)),
+    'full σ(x): weights, "auto"': lambda: _weights(_full_sigma(), "auto"),
+    'gibbs, "auto"': _gibbs,
+}
+
+
+def run_first_calls(entries: Sequence[str] = tuple(ENTRIES), say: Say = silent) -> list[FirstCall]:
+    """Each in fresh processes: without programs on disk, and with those that one left."""
+    rows = []
+    for what in entries:
+        say(f"first call of {what}")
+        with tempfile.TemporaryDirectory() as folder:
+            alone = _in_process(what, None)
+            _in_process(what, folder)
+            from_disk = _in_process(what, folder)
+        rows.append(
+            FirstCall(
+                what,
+                alone["first"],
+                alone["again"],
+                from_disk["first"],
+                int(alone["programs"]),
+                int(alone["maps"]),
+            )
+        )
+    return rows
+
+
+def first_calls_table(rows: Sequence[FirstCall]) -> Table:
+    """Seconds, programs and maps."""
+    titles = ("first call of", "s", "again", "programs on disk", "programs", "maps left")
+    return titles, [
+        (
+            r.what,
+            f"{r.first:.1f}",
+            f"{r.again:.3f}",
+            f"{r.from_disk:.1f}",
+            f"{r.programs}",
+            f"{r.maps}",
+        )
+        for r in rows
+    ]
+
+
+def _in_process(what: str, cache: str | None) -> dict[str, float]:
+    environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    if cache is not None:
+        environment |= {
+            "JAX_COMPILATION_CACHE_DIR": cache,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "0",
+        }
+    command = [sys.executable, "-m", __name__, what]
+    made = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return json.loads(made.stdout.splitlines()[-1])
+
+
+def _num_maps() -> int:
+    maps = Path("/proc/self/maps")  # not on every system
+    return len(maps.read_text().splitlines()) if maps.exists() else 0
+
+
+def _measure(what: str) -> dict[str, float]:
+    """In this process, which has compiled nothing but a trifle."""
+    compiled = []
+
+    def listen(event, *_, **__):
+        if event.endswith("backend_compile_duration"):
+            compiled.append(event)
+
+    jax.block_until_ready(jnp.sum(jax.random.normal(jax.random.key(0), (3,))))
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    before, seconds = _num_maps(), []
+    for _ in range(2):
+        begin = time.perf_counter()
+        jax.block_until_ready(ENTRIES[what]())
+        seconds.append(time.perf_counter() - begin)
+        if len(seconds) == 1:
+            programs = len(compiled)
+    first, again = seconds
+    return {
+        "first": first,
+        "again": again,
+        "programs": programs,
+        "maps": _num_maps() - before,
+    }
+
+
+if __name__ == "__main__":
+    print(json.dumps(_measure(sys.argv[1])))
