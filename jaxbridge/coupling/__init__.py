@@ -24,7 +24,7 @@ from .bridges import (
 )
 from .burn_in import (
     measure_burn_in as measure_burn_in,
-    with_burn_in as with_burn_in,
+    with_start_law as with_start_law,
 )
 from .gamma import (
     Coupling as Coupling,

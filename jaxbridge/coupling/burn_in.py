@@ -37,7 +37,8 @@ from .base import AbstractCoupling
 from .gamma import Coupling
 from .pair import Lane, PairNoise, drive, have_met, in_lanes
 from .rotation import driven_through_root
-from .start_laws import MOST_STEPS, Stationary, needs_burn_in, run_for
+from .smoothed_draws import NUM_DRAWS, SmoothedDraws, smoothed_draws
+from .start_laws import MOST_STEPS, Stationary, draw_starts, needs_burn_in, run_for
 
 _NUM_PAIRS = 512
 # Pairs that explode are left out, as they are from bridges; but not if so many do.
@@ -62,6 +63,35 @@ def with_burn_in(
     # Not by the constructor, which takes no infinite time from a user.
     law = eqx.tree_at(lambda law: law.burn_in, Stationary(1.0), time)
     return eqx.tree_at(lambda c: c.start_law, coupling, law)
+
+
+def with_start_law(
+    key: Key[Array, ""],
+    model: Diffusion,
+    coupling: AbstractCoupling,
+    end: Float[Array, "P d"],
+    duration: Float[Array, " P"],
+    num_steps: int,
+) -> AbstractCoupling:
+    """The coupling for weights, of which a start law with a density is paid for: that of smoothed
+    draws where ν would call for a run for each trial."""
+    known = with_burn_in(key, model, coupling, end, duration, num_steps)
+    if not (needs_burn_in(coupling.start_law, model) and model.has_density):
+        return known
+    usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
+    end = jnp.where(usable, end, end[jnp.argmax(usable)])
+    law = _draw_law(key, model, known, end, duration, num_steps)
+    return eqx.tree_at(lambda c: c.start_law, known, law)
+
+
+@eqx.filter_jit
+def _draw_law(key, model, coupling, end, duration, num_steps) -> SmoothedDraws:
+    mine = jnp.arange(NUM_DRAWS) * len(end) // NUM_DRAWS
+    # If no burn-in was found it is infinite, and the longest run has to do.
+    keys = jax.random.split(key_for("smoothed draws", key), NUM_DRAWS)
+    dt, law = duration[mine] / num_steps, coupling.start_law
+    draws = draw_starts(law, model.prepared(), coupling.scheme, keys, end[mine].T, dt, num_steps)
+    return smoothed_draws(draws.T, end[0], model.prepared())
 
 
 def measure_burn_in(

@@ -142,7 +142,7 @@ def _driven_path(
         step,
         (x_start, start, meeting_step if replayed else never),
         keys,
-        pair_noise(lanes.coupling, start.dtype, replayed),
+        pair_noise(lanes.coupling, start.dtype),
         (jnp.arange(num_steps, dtype=jnp.int32), x_path),
         num_steps,
         store=store,

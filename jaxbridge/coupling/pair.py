@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from ..engine.checks import cast_floats
 from ..engine.linalg import all_finite
+from ..engine.noise import normals_and_uniforms
 from ..models import decisions
 from ..models.dynamics import Dynamics
 from ..schemes import AbstractScheme, Frame, fitted_in_lanes, frame
@@ -56,19 +57,14 @@ def in_lanes(
     return Lane(realised, scheme, dt, jnp.sqrt(dt)), Lane._make((axes, -1, -1, -1))
 
 
-def pair_noise(
-    coupling: AbstractCoupling, dtype, replayed: bool = False
-) -> Callable[[Key[Array, ""], int], PairNoise]:
+def pair_noise(coupling: AbstractCoupling, dtype) -> Callable[[Key[Array, ""], int], PairNoise]:
     """`PairNoise` of k steps of a lane."""
     own = decisions.independent_noise(coupling.independent_noise).simulated
-    crossing = decisions.crossing_uniforms(coupling.meeting.draws_uniform, replayed).simulated
+    crossing = decisions.crossing_uniforms(coupling.meeting.draws_uniform).simulated
 
     def draw(key, k):
-        normal_key, uniform_key = jax.random.split(key)
-        return PairNoise(
-            jax.random.normal(normal_key, (k,), dtype) if own else None,
-            jax.random.uniform(uniform_key, (k,), dtype) if crossing else None,
-        )
+        normals, uniforms = normals_and_uniforms(key, own, crossing, k, dtype)
+        return PairNoise(normals[0] if own else None, uniforms[0] if crossing else None)
 
     return draw
 

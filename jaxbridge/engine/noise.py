@@ -5,13 +5,15 @@ step only. So a result does not depend on how lanes are gathered into batches, a
 path can be replayed from its key alone.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Int, Key, PyTree, Shaped
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
 from .keys import folded
 from .lanes import Rows, join_rows, split_rows
@@ -32,6 +34,17 @@ def chunks(num_steps: int) -> tuple[int, int]:
     """How many chunks of steps there are, and how many steps each is for."""
     num_chunks = -(-num_steps // _LONGEST_CHUNK)
     return num_chunks, -(-num_steps // num_chunks)
+
+
+def normals_and_uniforms(
+    key: Key[Array, ""], num_normals: int, num_uniforms: int, num_steps: int, dtype
+) -> tuple[Float[Array, "normals steps"], Float[Array, "uniforms steps"]]:
+    """N(0, 1) and U(0, 1) numbers of so many steps, from one draw of bits."""
+    least = np.nextafter(np.asarray(-1, dtype), np.asarray(0, dtype))  # no number is infinite
+    shape = num_normals + num_uniforms, num_steps
+    both = jax.random.uniform(key, shape, dtype, least, 1)
+    normals = np.asarray(math.sqrt(2), dtype) * lax.erf_inv(both[:num_normals])
+    return normals, (1 + both[num_normals:]) / 2
 
 
 def noisy_scan(
@@ -149,7 +162,9 @@ def _chunk_of(step: Callable, keys: Key[Array, " lanes"], draw: Callable, cut: _
     def one_chunk(state, inputs):
         carry, rows = state
         index, active, slots, xs = inputs
-        noise = jax.vmap(lambda key: draw(key, cut.length), out_axes=-1)(folded(keys, index))
+        # Each derivation of keys is a generator in the program, so one chunk goes without.
+        mine = keys if cut.num_chunks == 1 else folded(keys, index)
+        noise = jax.vmap(lambda key: draw(key, cut.length), out_axes=-1)(mine)
         inputs = noise, active, slots, split_rows(xs, axis=1)
         init = split_rows(carry), rows
         (carry, rows), ys = lax.scan(one_step, init, inputs, reverse=cut.reverse)

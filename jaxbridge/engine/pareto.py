@@ -31,6 +31,7 @@ _MOST_RELIABLE = 0.7
 _FEWEST_EFFECTIVE = 5
 
 
+@jax.jit  # one program where it is called outside of any
 def is_reliable(
     k: Float[Array, "*I"], effective: Float[Array, "*I"] | float = math.inf
 ) -> Bool[Array, "*I"]:

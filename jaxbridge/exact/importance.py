@@ -13,7 +13,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..coupling import AnyStartLaw, Bridges, counts_of, coupling_of, durations_of, search_for_hits
+from ..coupling import (
+    AnyStartLaw,
+    Bridges,
+    counts_of,
+    coupling_of,
+    durations_of,
+    search_for_hits,
+    with_start_law,
+)
 from ..engine.averages import (
     PathFunction,
     effective_size,
@@ -208,7 +216,10 @@ def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
 
 @eqx.filter_jit
 def _weigh_bridges(key, model, pairs, bridges, search):
-    counts, coupling = counts_of(key, model, pairs.coupling, bridges, search)
+    paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
+    ends, durations = paths[:, -1], durations_of(bridges)
+    known = with_start_law(key, model, pairs.coupling, ends, durations, bridges.num_steps)
+    counts, coupling = counts_of(key, model, known, bridges, search)
     d, shape = bridges.paths.shape[-1], bridges.met.shape
     model = model.prepared()
     log_weights = pair_log_weights(
@@ -219,8 +230,7 @@ def _weigh_bridges(key, model, pairs, bridges, search):
         counts.mean.reshape(-1),
     ).reshape(shape)
     log_weights, unusable = usable(log_weights, bridges.met)
-    paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
-    intervals = Intervals(paths[:, 0], paths[:, -1], durations_of(bridges))
+    intervals = Intervals(paths[:, 0], ends, durations)
     log_halving = pairs.log_halving(model, intervals, paths, shape[-1]).reshape(shape)
     share = pairs.step_share(model, intervals).reshape(shape)[..., 0]
     num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)

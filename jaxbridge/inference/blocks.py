@@ -104,11 +104,15 @@ def make_blocks(
         _check_for_moving(given, model)
     if use in ("renewal", "approximate"):
         given = as_pairs(given) if weighted else as_pairs(given, *_FOR_APPROXIMATE)
+    # A choice is made for all intervals at once, in as many steps as the longest has, so that each
+    # candidate's pilot run is one program.
+    choice_key, key = jax.random.split(key)
+    most = max(group.num_steps for group in groups)
+    chosen = resolve(given, choice_key, model, problem.intervals, most)
     blocks = []
     for block_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
-        at = (block_key, model, group.intervals, group.num_steps)
-        chosen = resolve(given.of(group.which), *at)
-        blocks.append(block_of(group, chosen.prepared(*at) if weighted else as_pairs(chosen)))
+        mine, at = chosen.of(group.which), (block_key, model, group.intervals, group.num_steps)
+        blocks.append(block_of(group, mine.prepared(*at) if weighted else as_pairs(mine)))
     return tuple(blocks)
 
 

@@ -1,13 +1,13 @@
 """Discrete observations of a diffusion, the steps of the intervals between them, and what is to be
 inferred from them."""
 
-import math
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced, time_steps
 from ..models.bridge_problem import Intervals, as_intervals
@@ -15,8 +15,11 @@ from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
 from .parameters import Parameters, theta_of_model
 
-# Numbers of steps are rounded up to one of so few per factor of two, for each is compiled.
-_STEPS_PER_OCTAVE = 2
+# Numbers of steps are looked at as so many per factor of two.
+_LEVELS_PER_OCTAVE = 2
+# A number of steps of its own takes seconds to compile, as long as so many steps of paths take in
+# each of a thousand sweeps.
+_STEPS_PER_GROUP = 2**15
 
 
 class Group(NamedTuple):
@@ -105,12 +108,7 @@ def _check_state_space(model: Diffusion, observations: Array) -> None:
     if is_traced(model):
         return
 
-    def finite(x):
-        values = [model.drift(x), model.diffusion(x)]
-        values += [model.log_stationary(x)] if model.has_density else []
-        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(value)) for value in values]))
-
-    good = jax.vmap(finite)(observations)
+    good = _inside(model, observations)
     if not is_traced(good) and not np.all(good):
         i = int(np.argmin(good))
         raise ValueError(
@@ -119,11 +117,23 @@ def _check_state_space(model: Diffusion, observations: Array) -> None:
         )
 
 
+@eqx.filter_jit
+def _inside(model: Diffusion, observations: Float[Array, "n d"]) -> Bool[Array, " n"]:
+    """At which points coefficients and stationary density are finite."""
+
+    def finite(x):
+        values = [model.drift(x), model.diffusion(x)]
+        values += [model.log_stationary(x)] if model.has_density else []
+        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(value)) for value in values]))
+
+    return jax.vmap(finite)(observations)
+
+
 def step_groups(
     intervals: Intervals, num_steps: int | None, step_size: float | None
 ) -> tuple[Group, ...]:
     """All intervals with `num_steps` steps; or each with so many that none is longer than about
-    `step_size`, in few groups."""
+    `step_size`, in groups that are worth their compilation."""
 
     def group(which: Int[np.ndarray, " I"], num_steps: int) -> Group:
         return Group(jax.tree.map(lambda leaf: leaf[which], intervals), which, num_steps)
@@ -141,11 +151,29 @@ def step_groups(
         )
     if isinstance(step_size, bool) or not isinstance(step_size, int | float) or not step_size > 0:
         raise ValueError(f"`step_size` must be a positive number; got {step_size!r}.")
-    wanted = np.maximum(np.asarray(durations, float) / step_size * (1 - 1e-4), 1)
-    levels = np.ceil(np.log2(wanted) * _STEPS_PER_OCTAVE) / _STEPS_PER_OCTAVE
-    numbers = np.ceil(2**levels * (1 - 1e-9)).astype(int)
-    alike = [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
-    return tuple(group(which, math.ceil(wanted[which].max())) for which in alike)
+    wanted = np.ceil(np.asarray(durations, float) / step_size * (1 - 1e-4)).clip(1).astype(int)
+    levels = np.ceil(np.log2(wanted) * _LEVELS_PER_OCTAVE)
+    alike = [wanted[levels == level] for level in np.unique(levels)]
+    ends = _cheapest_groups([numbers.max() for numbers in alike], [len(each) for each in alike])
+    return tuple(
+        group(np.flatnonzero((wanted > below) & (wanted <= most)), most)
+        for below, most in zip([0, *ends[:-1]], ends, strict=True)
+    )
+
+
+def _cheapest_groups(numbers: list[int], counts: list[int]) -> list[int]:
+    """The numbers of steps of groups, each of which serves intervals that call for as many or for
+    fewer: those with the least sum of all steps and of what the groups cost. `numbers` increase,
+    and `counts` are of the intervals that call for so many."""
+    best: list[tuple[int, list[int]]] = [(0, [])]  # for the first 0, 1, ... of the numbers
+    for last, number in enumerate(numbers, 1):
+        ways = [
+            (best[first][0] + _STEPS_PER_GROUP + int(number) * sum(counts[first:last]), first)
+            for first in range(last)
+        ]
+        cost, first = min(ways)
+        best.append((cost, [*best[first][1], int(number)]))
+    return best[-1][1]
 
 
 class Problem(NamedTuple):

@@ -115,10 +115,8 @@ def independent_noise(has_own: bool) -> Effect:
     return Effect(False, "the noise of one path is a function of the other's")
 
 
-def crossing_uniforms(draws: bool, replayed: bool = False) -> Effect:
+def crossing_uniforms(draws: bool) -> Effect:
     """The meeting rule's own randomness."""
-    if replayed:
-        return Effect(False, "the meeting is known already")
     if draws:
         return Effect(True, "whether the gap closed inside a step is drawn")
     return Effect(False, "the meeting rule looks at the grid points only")

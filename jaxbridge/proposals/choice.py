@@ -75,7 +75,8 @@ class Choice(AbstractWeightedProposal):
             for leaf in (self.seconds, self.efficiency, self.step_error, self.pareto_k, self.chosen)
         )
         told = (seconds, efficiency, step_error, shape, chosen)
-        return Choice(self.candidates, *told, self.used, self.left_out)
+        used = self.used if is_traced(chosen) else tuple(np.unique(chosen).tolist())
+        return Choice(self.candidates, *told, used, self.left_out)
 
     def check(self, model, intervals):
         for candidate in self.candidates:
@@ -238,6 +239,7 @@ def _pick(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
     return lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
+@jax.jit  # one program where it is called outside of any
 def value_rates(
     efficiency: Float[Array, "*C I"],
     seconds: Float[Array, "*C I"],

@@ -26,7 +26,7 @@ from ..coupling import (
     log_ratio,
     most_accurate,
     needs_burn_in,
-    with_burn_in,
+    with_start_law,
 )
 from ..engine.checks import nondifferentiable
 from ..engine.keys import split_each
@@ -138,7 +138,7 @@ class CoupledPairs(AbstractSingleProposal):
 
     def prepared(self, key, model, intervals, num_steps):
         _, end, duration = nondifferentiable(intervals)
-        coupling = with_burn_in(key, model, self.coupling, end, duration, num_steps)
+        coupling = with_start_law(key, model, self.coupling, end, duration, num_steps)
         return eqx.tree_at(lambda p: p.coupling, self, coupling)
 
     def fractions(self, num_steps):

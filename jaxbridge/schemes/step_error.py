@@ -13,6 +13,7 @@ for anything, and the uncertainty is infinite.
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Inexact
 
@@ -85,6 +86,7 @@ def error_of_mean(
     )
 
 
+@jax.jit  # one program where it is called outside of any
 def dominates(error: StepError, standard_error: Inexact[Array, "..."]) -> Bool[Array, "..."]:
     """Whether the step error is beyond the standard error, or could be without being seen."""
     size, doubt = jnp.abs(error.value), error.uncertainty

@@ -43,8 +43,14 @@ def _turned(x, p):
     return jnp.array([[c, -s], [s, c]]) * jnp.stack([jnp.ones_like(scale), scale])
 
 
+def _normal(key, theta):
+    return jax.random.normal(key, (2,)) / jnp.sqrt(2 * theta)
+
+
 def _full_sigma() -> jb.Diffusion:
-    return jb.Diffusion(lambda x, p: -x, _turned, lambda x, p: -x @ x)
+    return jb.Diffusion(
+        lambda x, p: -x, _turned, lambda x, p: -x @ x, 1.0, sample_stationary=_normal
+    )
 
 
 def _interval(model: jb.Diffusion) -> tuple[Any, ...]:
@@ -82,7 +88,13 @@ def _gibbs() -> Any:
 
 
 def _pulled(theta: float) -> jb.Diffusion:
-    return jb.langevin(lambda x, theta: -theta * x @ x, params=theta)
+    return jb.Diffusion(
+        lambda x, theta: -theta * x,
+        log_stationary=lambda x, theta: -theta * x @ x,
+        sample_stationary=_normal,
+        params=theta,
+        reversible=True,
+    )
 
 
 ENTRIES: Mapping[str, Callable[[], Any]] = {

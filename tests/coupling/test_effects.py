@@ -97,6 +97,7 @@ def test_the_program_contains_what_the_table_says(name):
     in_loops = Counter(eqn.primitive.name for eqn, in_loop in program if in_loop)
     assert table.reverse_drift.simulated == (in_loops["digamma"] > 0)
     assert table.solves.simulated == (in_loops["argmax"] > 0)
+    assert table.triangular_root.simulated == (in_loops["rsqrt"] > 0)
     assert table.rotation.simulated == (in_loops["atan2"] > 0)
     derivative_of_sigma = table.divergence.simulated or table.stratonovich.simulated
     assert derivative_of_sigma == (in_loops["cosh"] > 0)
@@ -107,11 +108,17 @@ def test_the_program_contains_what_the_table_says(name):
 
 def drawn(program):
     """Normal and uniform numbers that each lane draws."""
-    shapes = [eqn.params["shape"] for eqn, _ in program if eqn.primitive.name == "random_bits"]
-    normal = sum(eqn.primitive.name == "erf_inv" for eqn, _ in program)
-    # Normal numbers of the reversed path are drawn first, then those of dU, then uniforms.
-    counts = [math.prod(shape) for shape in shapes]
-    return sum(counts[:normal]), sum(counts[normal:])
+    bits = [eqn.params["shape"] for eqn, _ in program if eqn.primitive.name == "random_bits"]
+    # All lanes of the normal ones; the rest of the bits is for uniform ones.
+    normals = [eqn.outvars[0].aval.size for eqn, _ in program if eqn.primitive.name == "erf_inv"]
+    num_lanes = num_lanes_of(program)
+    return sum(normals) // num_lanes, sum(map(math.prod, bits)) - sum(normals) // num_lanes
+
+
+def num_lanes_of(program):
+    """How many lanes the reversed path has, whose noise is the first to be drawn."""
+    first = next(eqn for eqn, _ in program if eqn.primitive.name == "erf_inv")
+    return first.outvars[0].aval.size // (N * D)
 
 
 def test_reflection_of_a_reversible_model_is_one_draw_a_step():
