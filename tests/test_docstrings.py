@@ -20,6 +20,8 @@ RESULTS = {
     "Chain": ["sample_exact_bridges"],
     "Choice": ["choose_proposal"],
     "CoupledPairs": ["sample_exact_bridges"],
+    "ExtrapolatedBridges": ["extrapolate"],
+    "ExtrapolatedLogDensity": ["extrapolate"],
     "GaussianBridge": ["gaussian_bridge"],
     "GibbsPosterior": ["gibbs"],
     "GibbsState": ["gibbs"],

@@ -44,6 +44,8 @@ def test_quick_run_of_the_benchmark(tmp_path):
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 1
     stored = load(tmp_path / "pictures" / "benchmark.json")
     assert stored.ratios and stored.sigmas and stored.rates
+    (first,) = stored.first_calls
+    assert 0 < first.again < first.from_disk < 2 * first.first and first.programs > 0
 
 
 @pytest.mark.slow

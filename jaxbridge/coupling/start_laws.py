@@ -57,13 +57,16 @@ class Stationary(eqx.Module):
     """The stationary density ν: the corrected theorem's own start law, and the best one where
     the end points are likely.
 
-    Draws come from the model's sampler. A model without one is run: the reversed diffusion
-    starts at b and is taken after `burn_in` units of time, afresh for every draw. By default
-    that time is measured, as `measure_burn_in` does, and the results that used it say what it
-    was: infinite where none was found. A run takes no more than 2¹⁸ steps; where it should have
-    taken more bridges are not exact, and what was counted or weighed is marked as `truncated`.
-    What the start weighs after the run is less than 1e-5 for a diffusion that forgets
-    exponentially fast, but may be 2e-3 for one with heavy tails: see `measure_burn_in`.
+    Draws come from the model's sampler. For a model without one, but with a density, weights and
+    chains start from 512 draws, smoothed: a law with a density of its own, near ν, with which
+    bridges are as exact. It is in their `proposal`.
+
+    With a `burn_in`, and where ν itself is called for, as in `hitting_counts`, such a model is run:
+    the reversed diffusion starts at b and is taken after so many units of time, afresh for every
+    draw. By default that time is measured, as `measure_burn_in` does, and infinite where none was
+    found. A run takes no more than 2¹⁸ steps; where it should have taken more what was counted or
+    weighed is marked as `truncated`. What the start weighs after the run is less than 1e-5 for a
+    diffusion that forgets exponentially fast, but may be 2e-3 for one with heavy tails.
 
     **Raises:** `ValueError` for a `burn_in` that is not a positive time, shape ().
 

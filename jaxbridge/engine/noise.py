@@ -43,7 +43,7 @@ def normals_and_uniforms(
     least = np.nextafter(np.asarray(-1, dtype), np.asarray(0, dtype))  # no number is infinite
     shape = num_normals + num_uniforms, num_steps
     both = jax.random.uniform(key, shape, dtype, least, 1)
-    normals = np.asarray(math.sqrt(2), dtype) * lax.erf_inv(both[:num_normals])
+    normals = math.sqrt(2) * lax.erf_inv(both[:num_normals])
     return normals, (1 + both[num_normals:]) / 2
 
 

@@ -195,7 +195,8 @@ def estimate_log_density(
         problem.total(drawn.num_nonfinite),
         proposal,
         shape,
-        *step_error,
+        step_error.value,
+        step_error.uncertainty,
         share,
         num_steps,
     )

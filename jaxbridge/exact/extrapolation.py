@@ -13,7 +13,7 @@ what it knows of is the law of normal steps, of which a coupling's is not the sa
 nothing is assumed but the order.
 """
 
-from typing import overload
+from typing import Any, overload
 
 import equinox as eqx
 import jax
@@ -103,7 +103,7 @@ def extrapolate(
 ) -> ExtrapolatedLogDensity: ...
 @overload
 def extrapolate(fine: WeightedBridges, coarse: WeightedBridges) -> ExtrapolatedBridges: ...
-def extrapolate(fine, coarse):
+def extrapolate(fine: Any, coarse: Any):
     """Two estimates without the leading error of their steps: Richardson's extrapolation.
 
     Worth its noise where steps, not draws, decide the error, as for a σ that depends on the state,
@@ -131,15 +131,20 @@ def extrapolate(fine, coarse):
     jb.extrapolate(fine, coarse).value
     ```
     """
-    for kind in (TransitionLogDensity, WeightedBridges):
-        if isinstance(fine, kind) and isinstance(coarse, kind):
-            break
-    else:
-        raise TypeError(
-            "`fine` and `coarse` must both be what `transition_log_density` returned, or both what "
-            "`sample_weighted_bridges` or `weigh_bridges` did; got "
-            f"{type(fine).__name__} and {type(coarse).__name__}."
-        )
+    if isinstance(fine, TransitionLogDensity) and isinstance(coarse, TransitionLogDensity):
+        _check_pair(fine, coarse)
+        return _log_density(fine, coarse)
+    if isinstance(fine, WeightedBridges) and isinstance(coarse, WeightedBridges):
+        _check_pair(fine, coarse)
+        return ExtrapolatedBridges(fine, coarse)
+    raise TypeError(
+        "`fine` and `coarse` must both be what `transition_log_density` returned, or both what "
+        "`sample_weighted_bridges` or `weigh_bridges` did; got "
+        f"{type(fine).__name__} and {type(coarse).__name__}."
+    )
+
+
+def _check_pair(fine: Any, coarse: Any) -> None:
     if fine.num_steps != 2 * coarse.num_steps:
         raise ValueError(
             f"`coarse` must have half as many steps as `fine`; got {fine.num_steps} and "
@@ -151,17 +156,19 @@ def extrapolate(fine, coarse):
             "both must come of the same single proposal, for the step errors of two do not cancel: "
             f"got {fine.proposal.describe()} and {coarse.proposal.describe()}."
         )
-    if isinstance(fine, WeightedBridges):
-        return ExtrapolatedBridges(fine, coarse)
+
+
+def _log_density(fine: TransitionLogDensity, coarse: TransitionLogDensity):
+    """Both relative to the finer, which keeps their digits."""
     share = share_of_known_order(fine.step_share)
-    # Both relative to the finer, which keeps their digits.
     known = jnp.isfinite(fine.value) & (coarse.value < jnp.inf)
     ratio = jnp.where(known, jnp.exp(coarse.value - jnp.where(known, fine.value, 0)), jnp.inf)
     combined = _richardson(share, 1.0, ratio)
     positive = known & (combined > 0)
     safe = jnp.where(positive, combined, 1)
-    # A density of zero has no relative error; what it lacks, the finer has.
-    coarse_error = jnp.where(ratio > 0, ratio * coarse.standard_error, 0)
+    coarse_error = jnp.where(
+        ratio > 0, ratio * coarse.standard_error, 0
+    )  # zero has no relative one
     error = _richardson_error(share, fine.standard_error, coarse_error) / safe
     return ExtrapolatedLogDensity(
         jnp.where(positive, fine.value + jnp.log(safe), -jnp.inf),

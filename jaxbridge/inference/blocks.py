@@ -92,7 +92,7 @@ def make_blocks(
     for_density, weighted = use == "density", use != "approximate"
     moving = use in ("weights", "density", "renewal")
     is_auto = isinstance(proposal, str) and proposal == "auto"
-    if moving and is_auto and needs_burn_in(Stationary(), model):
+    if moving and is_auto and needs_burn_in(Stationary(), model) and not model.has_density:
         left_out = why_left_out(model, for_density) or _NO_SAMPLER
         proposal = choice_between(guided_candidates(model, like), left_out=left_out)
         budget = Budget()
@@ -147,11 +147,13 @@ def target_forms(blocks: tuple[Block, ...], model: Diffusion) -> tuple[Form, ...
 
 
 def _check_for_moving(proposal: AbstractProposal, model: Diffusion) -> None:
-    """Raise `ValueError` where something is known at the first parameters only."""
-    if any(single.must_measure(model) for single in proposal.singles):
+    """Raise `ValueError` where something is known at the first parameters only. (A start law with a
+    density serves at all.)"""
+    if any(single.must_measure(model) for single in proposal.singles) and not model.has_density:
         raise ValueError(
             "this model has no sampler of its stationary law, and how long a run takes that "
-            "replaces it depends on the parameters: pass `sample_stationary=` to `Diffusion`, give "
-            "the coupling `Stationary(burn_in=...)` that is long enough for all parameters to "
-            "come, or choose proposals that are pulled to the end point."
+            "replaces it depends on the parameters: pass `sample_stationary=` or "
+            "`log_stationary=` to `Diffusion`, give the coupling `Stationary(burn_in=...)` that is "
+            "long enough for all parameters to come, or choose proposals that are pulled to the "
+            "end point."
         )

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced, time_steps
+from ..engine.memory_maps import warn_near_limit_of_maps
 from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
@@ -154,7 +155,9 @@ def step_groups(
     wanted = np.ceil(np.asarray(durations, float) / step_size * (1 - 1e-4)).clip(1).astype(int)
     levels = np.ceil(np.log2(wanted) * _LEVELS_PER_OCTAVE)
     alike = [wanted[levels == level] for level in np.unique(levels)]
-    ends = _cheapest_groups([numbers.max() for numbers in alike], [len(each) for each in alike])
+    ends = _cheapest_groups(
+        [int(numbers.max()) for numbers in alike], [len(each) for each in alike]
+    )
     return tuple(
         group(np.flatnonzero((wanted > below) & (wanted <= most)), most)
         for below, most in zip([0, *ends[:-1]], ends, strict=True)
@@ -168,11 +171,11 @@ def _cheapest_groups(numbers: list[int], counts: list[int]) -> list[int]:
     best: list[tuple[int, list[int]]] = [(0, [])]  # for the first 0, 1, ... of the numbers
     for last, number in enumerate(numbers, 1):
         ways = [
-            (best[first][0] + _STEPS_PER_GROUP + int(number) * sum(counts[first:last]), first)
+            (best[first][0] + _STEPS_PER_GROUP + number * sum(counts[first:last]), first)
             for first in range(last)
         ]
         cost, first = min(ways)
-        best.append((cost, [*best[first][1], int(number)]))
+        best.append((cost, [*best[first][1], number]))
     return best[-1][1]
 
 
@@ -216,6 +219,7 @@ def as_problem(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
     """
+    warn_near_limit_of_maps()
     check_key(key)
     intervals = as_observations(parameters.model, times, observations)
     theta = theta_of_model(parameters, intervals.start.dtype)

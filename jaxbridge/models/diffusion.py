@@ -341,8 +341,8 @@ def _as_sigma(
         return Identity()
     d = x.shape[0]
     if isinstance(values, AbstractSigma):  # of a model that knows the form of its σ
-        values = cast_floats(values, x.dtype)
-        return Constant(values.as_matrix(d, x.dtype)) if constant else values
+        sigma: AbstractSigma = cast_floats(values, x.dtype)
+        return Constant(sigma.as_matrix(d, x.dtype)) if constant else sigma
     values = jnp.asarray(values)
     if values.shape not in ((d,), (d, d)):
         raise ValueError(

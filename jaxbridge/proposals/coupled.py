@@ -125,7 +125,9 @@ class CoupledPairs(AbstractSingleProposal):
                 "a `log_stationary`, normalised if the start law is `Stationary()`; or choose a "
                 "proposal that does not need it, such as `ModifiedDiffusionBridge()` or `Guided()`."
             )
-        if isinstance(self.coupling.start_law, Stationary | Reversed) and not model.normalised:
+        law = self.coupling.start_law
+        smoothed = needs_burn_in(law, model)  # then it gives way to one with a density (`prepared`)
+        if isinstance(law, Stationary | Reversed) and not (model.normalised or smoothed):
             raise ValueError(
                 "a coupling from the stationary law gives densities in proportion to "
                 "`log_stationary`, which is not declared to be normalised, so that they may be "

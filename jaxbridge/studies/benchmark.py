@@ -2,7 +2,8 @@
 
 Against drawing the same random numbers with the same generator, which is the floor; against a
 vectorised NumPy version of the same method; against the paper's discretisation at equal
-accuracy; and the package's proposals against each other. Results are kept as JSON with the
+accuracy; the package's proposals against each other; and the first call of each entry point, in
+seconds, most of which is compilation. Results are kept as JSON with the
 device, the versions and the date, and the README's table is made from that file.
 """
 
@@ -30,6 +31,7 @@ from .accuracy import run_sigma_costs, sigma_table
 from .clock import in_turns
 from .crossover import DURATIONS, LONG, Process, Rate, crossover_table, processes, run_crossover
 from .exact import UNLIKELY
+from .first_calls import ENTRIES, FirstCall, first_calls_table, run_first_calls
 from .numpy_reference import approximate_bridges
 from .paper import study_model
 from .report import Say, Study, Table, markdown, silent, table
@@ -65,6 +67,7 @@ class Benchmark(NamedTuple):
     ratios: list[Ratio]
     sigmas: list[tuple[int, float, float]]
     rates: list[Rate]
+    first_calls: list[FirstCall]
 
 
 def run_benchmark(
@@ -73,6 +76,7 @@ def run_benchmark(
     durations: Sequence[float] = DURATIONS,
     chosen: Sequence[Process] | None = None,
     dimensions: Sequence[int] = (2, 5, 10),
+    entries: Sequence[str] = tuple(ENTRIES),
     say: Say = silent,
 ) -> Benchmark:
     """All parts; `scale` shortens them."""
@@ -94,6 +98,7 @@ def run_benchmark(
     num_bridges = max(1_000, round(20_000 * scale))
     sigmas = run_sigma_costs(key, num_bridges, dimensions, say)
     rates = run_crossover(key, round(1e7 * scale), durations, chosen, say)
+    first_calls = run_first_calls(entries, say)
     packages = ("jaxbridge", "jax", "jaxlib", "diffrax", "equinox", "numpy")
     return Benchmark(
         jax.devices()[0].device_kind,
@@ -103,6 +108,7 @@ def run_benchmark(
         ratios,
         sigmas,
         rates,
+        first_calls,
     )
 
 
@@ -282,7 +288,7 @@ def _num_cores() -> int:
 def save(benchmark: Benchmark, path: Path) -> None:
     """Everything as JSON."""
     content = benchmark._asdict()
-    for name in ("ratios", "rates"):
+    for name in ("ratios", "rates", "first_calls"):
         content[name] = [row._asdict() for row in content[name]]
     path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
 
@@ -292,12 +298,13 @@ def load(path: Path) -> Benchmark:
     content = json.loads(path.read_text())
     content["ratios"] = [Ratio(**row) for row in content["ratios"]]
     content["rates"] = [Rate(**row) for row in content["rates"]]
+    content["first_calls"] = [FirstCall(**row) for row in content["first_calls"]]
     content["sigmas"] = [tuple(row) for row in content["sigmas"]]
     return Benchmark(**content)
 
 
 def tables(benchmark: Benchmark) -> list[Table]:
-    """Calls, a full σ(x), and proposals over durations: titles and rows."""
+    """Calls, a full σ(x), proposals over durations, and first calls: titles and rows."""
     calls = [
         (
             r.what,
@@ -312,6 +319,7 @@ def tables(benchmark: Benchmark) -> list[Table]:
         (("call", "against", "takes", "ratio", "aim"), calls),
         sigma_table(benchmark.sigmas),
         crossover_table(benchmark.rates),
+        first_calls_table(benchmark.first_calls),
     ]
 
 
@@ -328,7 +336,7 @@ def _seconds(value: float) -> str:
 def in_plain_characters(benchmark: Benchmark) -> str:
     """The tables as they are printed."""
     return "\n\n".join(
-        table(*each, words) for each, words in zip(tables(benchmark), (2, 0, 2), strict=True)
+        table(*each, words) for each, words in zip(tables(benchmark), (2, 0, 2, 1), strict=True)
     )
 
 
@@ -342,7 +350,8 @@ def in_markdown(benchmark: Benchmark) -> str:
 
 def _run(key, quick, say) -> Benchmark:
     if quick:
-        return run_benchmark(key, 0.04, (0.05, 5.0), processes()[:1], (2,), say)
+        few = tuple(ENTRIES)[:1]
+        return run_benchmark(key, 0.04, (0.05, 5.0), processes()[:1], (2,), few, say)
     return run_benchmark(key, say=say)
 
 
@@ -355,6 +364,7 @@ BENCHMARK = Study(
 full sigma(x). Below, thousands of effective samples per second, compile time left out, of a run of
 200,000 proposals in 50 steps (T up to 1) or 20,000 in 1,000 (from T = 5 on); fewer for couplings
 alone. The step error is of second order for all: Heun for couplings, the Itô–Taylor density for the
-others. "auto" includes its pilot runs.""",
+others. "auto" includes its pilot runs. Last, the seconds of a first call in a process, of a second,
+and of a first that finds its programs on disk; programs compiled, and memory maps left.""",
     lambda figures, made: {"crossover.png": figures.crossover(made.rates, LONG)},
 )

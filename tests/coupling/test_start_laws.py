@@ -156,15 +156,16 @@ def short_runs(monkeypatch):
         monkeypatch.setattr(module, "MOST_STEPS", 2**8)
 
 
-def slow_model():
-    """An Ornstein–Uhlenbeck process that takes hundreds of units of time to forget, known by its
-    density only: N(0, 50)."""
+def slow_model(with_density=False):
+    """An Ornstein–Uhlenbeck process that takes hundreds of units of time to forget, N(0, 50), known
+    to be reversible, or by its density."""
+    log_nu = lambda x, p: jnp.sum(-0.01 * x**2 - jnp.log(100 * jnp.pi) / 2)
     return jb.Diffusion(
         lambda x, p: -0.01 * x,
         None,
-        lambda x, p: jnp.sum(-0.01 * x**2 - jnp.log(100 * jnp.pi) / 2),
+        log_nu if with_density else None,
         reversible=True,
-        normalised=True,
+        normalised=with_density,
     )
 
 
@@ -197,10 +198,13 @@ def test_counts_and_weights_from_a_run_that_was_cut_are_marked(name, short_runs)
 @pytest.mark.parametrize("name", LAWS)
 def test_densities_and_chains_from_a_run_that_was_cut_are_marked(name, short_runs):
     law, trusted = LAWS[name]
-    key, model, ends = jax.random.key(0), slow_model(), ([0.0], [0.3], 1.0)
+    key, ends = jax.random.key(0), ([0.0], [0.3], 1.0)
     options = dict(num_steps=8, proposal=jb.Coupling(0.0, start_law=law))
-    density = jb.transition_log_density(key, model, *ends, num_proposals=20, **options)
-    assert density.num_truncated == (0 if trusted else density.num_met)
+    if law.burn_in is not None:
+        model = slow_model(with_density=True)
+        density = jb.transition_log_density(key, model, *ends, num_proposals=20, **options)
+        assert density.num_truncated == (0 if trusted else density.num_met)
+    model = slow_model()
     for method in ("renewal", "pseudo_marginal"):
         chain = jb.sample_exact_bridges(key, model, *ends, num_bridges=4, method=method, **options)
         assert (chain.num_truncated == 0) == trusted
@@ -217,9 +221,19 @@ def test_a_burn_in_that_is_unknown_raises_for_those_who_ask(short_runs):
     for method in ("renewal", "pseudo_marginal"):
         with pytest.raises(RuntimeError, match="burn-in is unknown"):
             jb.sample_exact_bridges(key, model, *ends, proposal=coupling, method=method, **options)
-    options = dict(num_steps=8, proposal=coupling, throw=True)
-    with pytest.raises(RuntimeError, match="burn-in is unknown"):
-        jb.transition_log_density(key, model, *ends, num_proposals=20, **options)
+
+
+@pytest.mark.slow
+def test_a_density_is_exact_though_no_burn_in_is_found(short_runs):
+    """The draws of the start law are from a run that has forgotten nothing."""
+    model, (a, b, duration) = slow_model(with_density=True), ([0.0], [0.3], 1.0)
+    estimate = jb.transition_log_density(
+        jax.random.key(0), model, a, b, duration, num_proposals=20_000, proposal=jb.Coupling(0.0)
+    )
+    variance = 50 * (1 - np.exp(-0.02 * duration))
+    exact = -0.5 * (0.3**2 / variance + np.log(2 * np.pi * variance))
+    assert estimate.trustworthy and estimate.num_truncated == 0
+    assert abs(estimate.value - exact) < 4.5 * estimate.standard_error < 0.1
 
 
 def test_errors_say_what_to_change(unchecked):

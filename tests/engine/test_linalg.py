@@ -11,6 +11,7 @@ from jaxbridge.engine.linalg import (
     cholesky,
     dot,
     inverse,
+    lower_factor,
     matmul,
     matvec,
     polar_factor,
@@ -26,6 +27,7 @@ TOLERANCE = {"float32": 2e-4, "float64": 1e-11}
 many_solve = jax.jit(jax.vmap(solve))
 many_inverse = jax.jit(jax.vmap(inverse))
 many_cholesky = jax.jit(jax.vmap(cholesky))
+many_lower_factor = jax.jit(jax.vmap(lower_factor))
 many_polar_factor = jax.jit(jax.vmap(polar_factor))
 
 
@@ -129,6 +131,30 @@ def test_cholesky_equals_numpys(d, precision):
 def test_cholesky_of_an_indefinite_matrix_is_nan():
     indefinite = np.resize([[1.0, 2.0], [2.0, 1.0]], (COUNT, 2, 2)).astype(np.float32)
     assert np.isnan(many_cholesky(indefinite)).any((1, 2)).all()
+
+
+@pytest.mark.parametrize("d", [*DIMENSIONS, 20])
+def test_lower_factor_equals_that_of_numpys_qr(d, precision):
+    """A = L Q from Aᵀ = Qᵀ Lᵀ, with the signs that make the diagonal of L positive."""
+    rng = np.random.default_rng(d)
+    matrices = np.asarray(rng.standard_normal((COUNT, d, d)) + 2 * np.eye(d), precision)
+    upper = np.linalg.qr(np.swapaxes(matrices, 1, 2).astype(float))[1]
+    expected = np.swapaxes(upper * np.sign(np.diagonal(upper, axis1=1, axis2=2))[..., None], 1, 2)
+    found = many_lower_factor(matrices)
+    np.testing.assert_allclose(found, expected, atol=TOLERANCE[precision] * 20 * d)
+    assert np.all(np.triu(found, 1) == 0)
+
+
+def test_lower_factor_does_not_square_the_condition_number():
+    """Rows that are nearly parallel, in single precision: the last of the diagonal is known to a
+    part in a thousand, where the root of `A Aᵀ` has lost it."""
+    apart = 1e-4
+    matrix = np.array([[1.0, 1.0, 1.0], [1.0, 1.0 + apart, 1.0], [1.0, 1.0, 1.0 - apart]])
+    exact = np.abs(np.diagonal(np.linalg.qr(matrix.T)[1]))
+    single = jnp.asarray(matrix, jnp.float32)
+    np.testing.assert_allclose(jnp.diagonal(lower_factor(single)), exact, rtol=5e-3)
+    squared = jnp.diagonal(cholesky(matmul(single, single.T)))
+    assert not np.allclose(squared, exact, rtol=5e-2)
 
 
 @pytest.mark.parametrize("d", DIMENSIONS)

@@ -14,6 +14,7 @@ from helpers import (
 )
 
 import jaxbridge as jb
+from jaxbridge.coupling.smoothed_draws import SmoothedDraws
 
 CASES = exact_cases()
 
@@ -90,8 +91,8 @@ def test_random_gamma_and_more_counts_keep_the_law():
 
 
 @pytest.mark.slow
-def test_model_without_a_sampler_is_run_and_says_for_how_long():
-    """The same model with and without its sampler; the burn-in is in the result."""
+def test_model_without_a_sampler_has_a_start_law_from_draws():
+    """The same model with and without its sampler; the law is in the result."""
     with_sampler = jb.ornstein_uhlenbeck([[1.0, 0.5], [0.5, 1.0]])
     model = jb.Diffusion(
         lambda x, p: -p @ x, None, lambda x, p: -x @ p @ x, with_sampler.params.B, reversible=True
@@ -99,11 +100,16 @@ def test_model_without_a_sampler_is_run_and_says_for_how_long():
     ends = ([0.9, 0.9], [1.2, 1.2])
     case = exact_case(with_sampler, *ends, 1.0, 0.5, num_steps=20)._replace(model=model)
     weighted = weighted_bridges(case, 5_000)
-    burn_in = float(weighted.coupling.start_law.burn_in)
-    assert 8 <= burn_in <= 200 and burn_in == round(burn_in)  # in whole durations
+    assert isinstance(weighted.coupling.start_law, SmoothedDraws)
     assert_weighted_moments(
         case.middle(weighted.paths), weighted.weights, case.mean, case.covariance
     )
+    # Without a density a run replaces each draw, and says for how long.
+    case = case._replace(
+        model=jb.Diffusion(lambda x, p: -p @ x, params=model.params, reversible=True)
+    )
+    burn_in = float(weighted_bridges(case, 10).coupling.start_law.burn_in)
+    assert 8 <= burn_in <= 200 and burn_in == round(burn_in)  # in whole durations
     given = weighted_bridges(case, 100, start_law=jb.Stationary(burn_in=7.0))
     assert given.coupling.start_law.burn_in == 7.0
 

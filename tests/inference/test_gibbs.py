@@ -363,12 +363,17 @@ def test_a_state_must_fit_the_observations(unchecked):
 
 @pytest.mark.slow
 def test_a_run_that_replaces_a_sampler_would_depend_on_the_parameters(unchecked):
-    model = jb.Diffusion(lambda x, p: -p * x, None, lambda x, p: -p * x @ x, 1.0, reversible=True)
-    arguments = (jax.random.key(0), model, TIMES[:4], DATA[:4])
+    """Without a density there is no start law that serves for all; with one there is."""
+    drift, log_nu = lambda x, p: -p * x, lambda x, p: -p * x @ x
+    unknown = jb.Diffusion(drift, params=1.0, reversible=True)
+    known = jb.Diffusion(drift, None, log_nu, 1.0, reversible=True)
+    data, options = (TIMES[:4], DATA[:4]), dict(prior=PRIOR, num_iterations=2, num_steps=4)
+    key = jax.random.key(0)
     with pytest.raises(ValueError, match="burn_in"):
-        jb.gibbs(*arguments, prior=PRIOR, proposal=jb.Coupling(0.0))
-    made = jb.gibbs(*arguments, prior=PRIOR, num_iterations=2, num_steps=4)  # "auto" does without
-    assert made.theta.shape == (2, 1)
+        jb.gibbs(key, unknown, *data, **options, proposal=jb.Coupling(0.0))
+    for model, proposal in [(unknown, "auto"), (known, jb.Coupling(0.0))]:  # "auto" does without
+        made = jb.gibbs(key, model, *data, **options, proposal=proposal)
+        assert made.theta.shape == (2, 1) and made.num_missing == 0
 
 
 def test_other_types_are_refused(unchecked):

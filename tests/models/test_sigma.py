@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge.models.sigma import Constant, Diagonal, Full, Identity
+from jaxbridge.models.sigma import Constant, Diagonal, Full, Identity, Triangular, root_of
 
 rng = np.random.default_rng(0)
 
@@ -22,9 +22,10 @@ FORMS = {
     "constant": lambda d: Constant(a_matrix(d)),
     "diagonal": lambda d: Diagonal(a_diagonal(d)),
     "full": lambda d: Full(a_matrix(d)),
+    "triangular": lambda d: Full(a_matrix(d)).root(),
 }
 # Averages are asked for between coefficients of one model; a constant one does not change.
-VARYING = {"diagonal", "full"}
+VARYING = {"diagonal", "full", "triangular"}
 
 
 @pytest.mark.parametrize("d", [1, 2, 3, 6])
@@ -38,6 +39,9 @@ def test_products_and_solutions_are_those_of_the_dense_matrix(form, d):
     close(sigma.mv(vector), dense @ vector)
     close(sigma.mv_transpose(vector), dense.T @ vector)
     close(sigma.solve(vector), np.linalg.solve(dense, vector))
+    close(sigma.log_abs_det(), np.linalg.slogdet(dense)[1])
+    root = np.asarray(sigma.root().as_matrix(d, jnp.float32), np.float64)
+    close(root @ root.T, dense @ dense.T)
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -67,3 +71,11 @@ def test_a_large_constant_matrix_is_inverted_as_well():
     np.testing.assert_allclose(
         Constant(matrix).solve(vector), np.linalg.solve(matrix, vector), rtol=1e-3, atol=1e-4
     )
+
+
+def test_the_root_is_that_of_the_covariance_however_sigma_turns():
+    matrix, turn = a_matrix(3), np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    roots = [Full(matrix).root(), Full(matrix @ turn).root(), root_of(matrix @ matrix.T)]
+    assert all(isinstance(root, Triangular) for root in roots)
+    for root in roots[1:]:
+        np.testing.assert_allclose(root.matrix, roots[0].matrix, atol=2e-5)

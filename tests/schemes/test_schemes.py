@@ -247,3 +247,24 @@ def test_exact_transitions_need_a_linear_drift_and_a_constant_sigma(model):
         jb.GaussianTransition().step(
             model.forward(jnp.ones(2)), jnp.ones(2), jnp.asarray(0.1), jnp.ones(2)
         )
+
+
+@pytest.mark.parametrize("varies", [False, True])
+def test_the_default_scheme_is_the_one_that_the_scene_calls_for(varies, x64):
+    """Heun's for a constant σ, Euler's for one that depends on the state."""
+    model = full_model() if varies else paper_model()
+    x, dw, dt = jnp.array([0.3, -0.4]), jnp.array([0.05, 0.1]), jnp.asarray(0.02)
+    dynamics = model.forward(x)
+    expected = jb.Euler() if varies else jb.Heun()
+    assert jb.Coupling().scheme == jb.HeunOrEuler()
+    assert jb.HeunOrEuler().fitted(dynamics, x, dt) == expected
+    x_next = expected.step(dynamics, x, dt, dw)
+    for scheme in (jb.HeunOrEuler(), expected):
+        np.testing.assert_array_equal(scheme.step(dynamics, x, dt, dw), x_next)
+        np.testing.assert_array_equal(
+            scheme.noise(dynamics, x, x_next, dt), expected.noise(dynamics, x, x_next, dt)
+        )
+        frame = scheme.frame(dynamics, x, x_next, dt)
+        np.testing.assert_array_equal(frame.u, expected.frame(dynamics, x, x_next, dt).u)
+    assert jb.effects(model, at=x).corrector.simulated != varies
+    assert not jb.effects(model, at=x).stratonovich.simulated

@@ -15,6 +15,7 @@ from jaxbridge.studies.benchmark import (
 )
 from jaxbridge.studies.clock import in_turns
 from jaxbridge.studies.crossover import Rate
+from jaxbridge.studies.first_calls import FirstCall
 
 
 def made_up():
@@ -32,6 +33,7 @@ def made_up():
         [ratio],
         [(2, 10.0, 30.0)],
         rates,
+        [FirstCall("ours", 2.5, 0.01, 0.9, 12, 300)],
     )
 
 
@@ -47,6 +49,7 @@ def test_tables_show_ratios_and_shares():
     beyond = made_up()._replace(ratios=[Ratio("ours", "theirs", 0.2, np.inf, None)])
     assert "| ours | theirs | 0.2 s | not reached |  |" in in_markdown(beyond)
     assert "0.2 s  not reached" in in_plain_characters(beyond)
+    assert "| ours | 2.5 | 0.010 | 0.9 | 12 | 300 |" in text
 
 
 def test_functions_are_timed_in_turns():
