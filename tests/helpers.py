@@ -105,6 +105,17 @@ def unswirl(x):
     return jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]]) @ x
 
 
+def of_unknown_constant():
+    """An Ornstein–Uhlenbeck process with a sampler, whose `log_stationary` has a constant of 7."""
+    return jb.Diffusion(
+        lambda x, p: -x,
+        None,
+        lambda x, p: 7 - x @ x,
+        reversible=True,
+        sample_stationary=lambda key, p: jax.random.normal(key, (1,)) / jnp.sqrt(2),
+    )
+
+
 def loglog_slope(sizes, errors):
     """The exponent p of errors ∝ sizes^p."""
     return np.polyfit(np.log(sizes), np.log(errors), 1)[0]

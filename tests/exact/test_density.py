@@ -4,7 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import PAPER_CASES, chosen_of, count_compilations, exact_cases, paper_model
+from helpers import (
+    PAPER_CASES,
+    chosen_of,
+    count_compilations,
+    exact_cases,
+    of_unknown_constant,
+    paper_model,
+)
 
 import jaxbridge as jb
 from jaxbridge.proposals.auto import as_proposal
@@ -204,7 +211,7 @@ def test_errors_say_what_to_change(unchecked):
 def test_a_constant_that_is_not_known_is_refused(way, unchecked):
     """From the stationary law densities have the constant of `log_stationary`, whichever way a
     coupling comes in."""
-    model = jb.langevin(lambda x, p: 7 - x @ x)
+    model = of_unknown_constant()
     pairs = as_proposal(jb.Coupling(0.5), model, jnp.zeros(1))
     proposal = {
         "default": None,
@@ -232,6 +239,7 @@ def test_what_the_refusal_recommends_is_right():
     law = jb.GaussianLaw([0.0], [[0.5]])
     for case, proposal in [
         (declared, None),
+        (model, None),  # which has no sampler, and so a start law with a density
         (model, jb.Coupling(0.0, start_law=law)),
         (model, "auto"),
         (model, jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())),

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import PAPER_CASES, paper_model
+from helpers import PAPER_CASES, of_unknown_constant, paper_model
 
 import jaxbridge as jb
 
@@ -140,7 +140,7 @@ def test_errors_say_what_to_change(unchecked):
     key, blind = jax.random.key(0), jb.Diffusion(lambda x, p: -x, reversible=True)
     with pytest.raises(ValueError, match="need the stationary one, with any start law"):
         jb.fit_start_law(key, blind, [0.0], [0.1], 1.0, for_density=True)
-    rough = jb.langevin(lambda x, p: -x @ x)
+    rough = of_unknown_constant()
     with pytest.raises(ValueError, match="in proportion to `log_stationary`"):
         candidates = [jb.Coupling()]
         jb.choose_proposal(key, rough, [0.0], [0.1], 1.0, candidates=candidates, for_density=True)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import paper_model
+from helpers import of_unknown_constant, paper_model
 
 import jaxbridge as jb
 from jaxbridge import plot
@@ -221,7 +221,7 @@ def test_constants_of_one_precision_are_refused_before_anything_runs(unchecked):
 
 def test_densities_with_a_constant_that_is_not_known_are_refused_before_anything_runs():
     """Even where the right density is given: what a coupling finds would be another."""
-    model = jb.langevin(lambda x, p: 7 - x @ x)
+    model = of_unknown_constant()
     arguments = (KEY, model, [0.2], [0.5], 1.0)
     with pytest.raises(ValueError, match="in proportion to `log_stationary`"):
         jb.work_precision(
