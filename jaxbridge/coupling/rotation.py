@@ -1,5 +1,9 @@
 """The rotation O(x, x') of a pair (section 2.1): it turns the noise of X so that σ(x')O points
 where σ(x) does.
+
+Any O that both directions share is exact. With σ = L Q, L lower triangular and Q orthogonal, that
+which costs least is O(x, x') = Q(x')ᵀQ(x): then W̃ = Q W drives X through L, which tends to L(x')
+where x tends to x', and L solves by substitution (`driven_through_root`).
 """
 
 import equinox as eqx
@@ -83,7 +87,7 @@ def driven_through_root(
     coupling: AbstractCoupling, dynamics: Dynamics, like: Float[Array, " d"]
 ) -> Dynamics:
     """The same diffusion as the pair sees it: with σ = L Q driven by Q W through L, where that is
-    called for. This is the rotation O(x, x') = Q(x')ᵀQ(x), done once for each of the two."""
+    called for."""
     if not root_effect(coupling, type(eqx.filter_eval_shape(dynamics.sigma, like))).simulated:
         return dynamics
     return dynamics._replace(sigma=lambda x: dynamics.sigma(x).root())

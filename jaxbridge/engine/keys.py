@@ -4,8 +4,8 @@
     ├─ interval i                       numbered(key, I)
     │  └─ attempt j                     numbered_keys(keys, i, j)
     │     ├─ reversed path | driven path | coupling         of a proposal, split_each(keys, 3)
-    │     │  └─ chunk c of steps        folded(keys, c)
-    │     │     └─ normal numbers | uniform numbers
+    │     │  └─ chunk c of steps        folded(keys, c), where there is more than one
+    │     │     └─ normal and uniform numbers, of one draw
     │     └─ start | path | coupling    of an associated path, split_each(keys, 3)
     │        └─ ...
     └─ purpose                          key_for("burn-in", key)

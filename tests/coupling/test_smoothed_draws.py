@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import paper_model
+from helpers import paper_model, slow_beyond
 
 import jaxbridge as jb
 from jaxbridge.coupling.smoothed_draws import smoothed_draws
@@ -43,17 +43,17 @@ def test_its_density_is_that_of_its_draws_and_integrates_to_one(share):
 def test_its_ellipse_is_normalised_in_more_dimensions():
     """By importance sampling from a normal law of twice the covariance, in three dimensions."""
     root = jnp.array([[1.0, 0, 0], [0.8, 0.5, 0], [-0.3, 0.2, 2.0]])
-    points = jax.random.normal(jax.random.key(0), (512, 3)) @ root.T
+    points = jax.random.normal(jax.random.key(0), (64, 3)) @ root.T
     law = with_share(smoothed_draws(points, jnp.zeros(3), PULLED), 1.0)
     wide = jb.GaussianLaw(law.mean, 2 * law.root @ law.root.T)
-    x = jax.vmap(wide.sample)(jax.random.split(jax.random.key(1), 100_000))
+    x = jax.vmap(wide.sample)(jax.random.split(jax.random.key(1), 40_000))
     ratio = jnp.exp(jax.vmap(law.log_density)(x) - jax.vmap(wide.log_density)(x))
-    error = jnp.std(ratio) / jnp.sqrt(100_000)
+    error = jnp.std(ratio) / jnp.sqrt(40_000)
     assert abs(float(jnp.mean(ratio)) - 1) < 5 * error < 0.05
     draws = jax.vmap(lambda key: law.sample(key, PULLED))(
-        jax.random.split(jax.random.key(2), 50_000)
+        jax.random.split(jax.random.key(2), 20_000)
     )
-    np.testing.assert_allclose(jnp.cov(draws.T), law.root @ law.root.T, atol=0.12)
+    np.testing.assert_allclose(jnp.cov(draws.T), law.root @ law.root.T, atol=0.2)
 
 
 def test_one_mode_is_an_ellipse_and_two_are_kernels():
@@ -85,19 +85,19 @@ def blind(model):
 INTERVAL = ([0.0, 0.0], [0.5, -0.5], 1.0)
 
 
-def test_bridges_are_exact_though_the_draws_are_not_of_the_stationary_law():
+@pytest.mark.parametrize("share", slow_beyond(1, [0.0, 1.0]))
+def test_bridges_are_exact_though_the_draws_are_not_of_the_stationary_law(share):
     """Any draws will do: these have half the spread, and lie to one side."""
     model = paper_model()
     points = jnp.array([0.3, 0.1]) + 0.35 * jax.random.normal(jax.random.key(0), (512, 2))
     law = smoothed_draws(points, jnp.zeros(2), model)
     exact = jb.gaussian_bridge(model, *INTERVAL, [0.5])
-    for share in (0.0, 1.0):
-        coupling = jb.Coupling(0.5, start_law=with_share(law, share))
-        options = dict(num_bridges=4_000, save_at=[0.5], proposal=coupling)
-        weighted = jb.sample_weighted_bridges(jax.random.key(1), model, *INTERVAL, **options)
-        error = weighted.standard_error()[0]
-        assert jnp.all(jnp.abs(weighted.mean()[0] - exact.mean[0]) < 4.5 * error + 2e-3)
-        assert jnp.all(error < 0.05)
+    coupling = jb.Coupling(0.5, start_law=with_share(law, share))
+    options = dict(num_bridges=4_000, save_at=[0.5], proposal=coupling)
+    weighted = jb.sample_weighted_bridges(jax.random.key(1), model, *INTERVAL, **options)
+    error = weighted.standard_error()[0]
+    assert jnp.all(jnp.abs(weighted.mean()[0] - exact.mean[0]) < 4.5 * error + 2e-3)
+    assert jnp.all(error < 0.05)
 
 
 @pytest.mark.slow

