@@ -147,9 +147,10 @@ class EulerDensity(AbstractStepDensity):
             return StepLaw(x + drift * dt, sigma, jnp.ones((), x.dtype), dt)
 
         def decay(dt):
-            columns = _columns(sigma, x)
-            slopes = [jax.jvp(dynamics.drift, (x,), (column,))[1] for column in columns]
-            A = jnp.stack([sigma.solve(slope) for slope in slopes], axis=1)
+            def of_column(column):
+                return sigma.solve(jax.jvp(dynamics.drift, (x,), (column,))[1])
+
+            A = jax.vmap(of_column, 1, 1)(sigma.as_matrix(d, x.dtype))
             return jnp.eye(d, dtype=x.dtype) + dt * A
 
         return StepsFrom(law, decay)
