@@ -105,6 +105,17 @@ def unswirl(x):
     return jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]]) @ x
 
 
+def without_sampler(model, **options):
+    """The same diffusion, whose stationary law is known as a density only."""
+    return jb.Diffusion(
+        lambda x, p: model.with_params(p).drift(x),
+        None,
+        lambda x, p: model.with_params(p).log_stationary(x),
+        model.params,
+        **options,
+    )
+
+
 def of_unknown_constant():
     """An Ornstein–Uhlenbeck process with a sampler, whose `log_stationary` has a constant of 7."""
     return jb.Diffusion(

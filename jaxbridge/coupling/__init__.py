@@ -6,11 +6,10 @@ A coupling drives X' by the noise of X, and X by that of X' (`base`; `gamma`),
 
 with u along σ(x')⁻¹(x - x') and O a `rotation` that aligns σ(x) and σ(x'), which by default the
 triangular root of V = σσᵀ makes unnecessary, until a rule says that they have met (`meeting`): one
-step of a `pair`. With X run back from b and X' from a, joined where
-they meet, Z = X' before and X after is a proposed bridge (`join`), and those that met are kept
-(`bridges`). They have the density f_br(z) π(z) / π, π(z) the probability that the diffusion
-associated with z (`associated`) hits z; it starts from ν or another law (`start_laws`), for a ν
-without sampler from draws of it (`smoothed_draws`), taken when the past is forgotten (`burn_in`).
+step of a `pair`. With X run back from b and X' from a, joined where they meet, Z = X' before and X
+after is a proposed bridge (`join`), and those that met are kept (`bridges`). They have the density
+f_br(z) π(z) / π, π(z) the probability that the diffusion associated with z (`associated`)
+hits z; it starts from ν or another law (`start_laws`), for a ν without sampler from draws of it (`smoothed_draws`), taken when the past is forgotten (`burn_in`).
 How many it takes to hit is counted (`hitting`). `effects` is a table of what such a program
 simulates, and why.
 """

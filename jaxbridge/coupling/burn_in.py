@@ -57,9 +57,7 @@ def with_burn_in(
     found, by which `run_is_cut` knows it."""
     if not needs_burn_in(coupling.start_law, model):
         return coupling
-    usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
-    end = jnp.where(usable, end, end[jnp.argmax(usable)])  # bridges that were not found are NaN
-    time = _measure(key, model, coupling, end, duration, num_steps)
+    time = _measure(key, model, coupling, _known(end), duration, num_steps)
     # Not by the constructor, which takes no infinite time from a user.
     law = eqx.tree_at(lambda law: law.burn_in, Stationary(1.0), time)
     return eqx.tree_at(lambda c: c.start_law, coupling, law)
@@ -78,10 +76,14 @@ def with_start_law(
     known = with_burn_in(key, model, coupling, end, duration, num_steps)
     if not (needs_burn_in(coupling.start_law, model) and model.has_density):
         return known
-    usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
-    end = jnp.where(usable, end, end[jnp.argmax(usable)])
-    law = _draw_law(key, model, known, end, duration, num_steps)
+    law = _draw_law(key, model, known, _known(end), duration, num_steps)
     return eqx.tree_at(lambda c: c.start_law, known, law)
+
+
+def _known(end: Float[Array, "P d"]) -> Float[Array, "P d"]:
+    """A known end in place of those of bridges that were not found, which are NaN."""
+    usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
+    return jnp.where(usable, end, end[jnp.argmax(usable)])
 
 
 @eqx.filter_jit

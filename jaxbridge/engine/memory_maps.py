@@ -29,6 +29,11 @@ def warn_near_limit_of_maps() -> None:
 @functools.lru_cache(maxsize=1)
 def _num_maps(moment: int) -> int:
     """As of a moment, for to count them takes milliseconds."""
+    return count_maps()
+
+
+def count_maps() -> int:
+    """Those that this process has, zero where the system does not tell."""
     maps = Path("/proc/self/maps")  # not on every system
     try:
         return maps.read_bytes().count(b"\n")

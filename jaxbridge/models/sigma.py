@@ -20,7 +20,6 @@ from ..engine.linalg import (
     any_inverse,
     cholesky,
     log_abs_det,
-    log_of_product,
     lower_factor,
     matvec,
     solve,
@@ -146,10 +145,10 @@ class Diagonal(AbstractSigma):
         return Diagonal(jnp.abs(self.diagonal))
 
 
-class Full(AbstractSigma):
-    """A full matrix that changes with the state."""
+class AbstractMatrix(AbstractSigma):
+    """A matrix that changes with the state, multiplied the same whatever its form."""
 
-    matrix: Float[Array, "d d"]
+    matrix: eqx.AbstractVar[Float[Array, "d d"]]
 
     def mv(self, noise):
         return matvec(self.matrix, noise)
@@ -157,46 +156,39 @@ class Full(AbstractSigma):
     def mv_transpose(self, vector):
         return matvec(self.matrix.T, vector)
 
-    def solve(self, vector):
-        return solve(self.matrix, vector)
-
     def average(self, other):
-        assert isinstance(other, Full)
-        return Full((self.matrix + other.matrix) / 2)
-
-    def log_abs_det(self):
-        return log_abs_det(self.matrix)
+        assert isinstance(other, type(self))
+        return type(self)((self.matrix + other.matrix) / 2)  # pyright: ignore
 
     def as_matrix(self, dim, dtype):
         return self.matrix
+
+
+class Full(AbstractMatrix):
+    """A full matrix."""
+
+    matrix: Float[Array, "d d"]
+
+    def solve(self, vector):
+        return solve(self.matrix, vector)
+
+    def log_abs_det(self):
+        return log_abs_det(self.matrix)
 
     def root(self):
         return Triangular(lower_factor(self.matrix))
 
 
-class Triangular(AbstractSigma):
+class Triangular(AbstractMatrix):
     """A lower triangular matrix with a positive diagonal."""
 
     matrix: Float[Array, "d d"]
 
-    def mv(self, noise):
-        return matvec(self.matrix, noise)
-
-    def mv_transpose(self, vector):
-        return matvec(self.matrix.T, vector)
-
     def solve(self, vector):
         return solve_lower(self.matrix, vector)
 
-    def average(self, other):
-        assert isinstance(other, Triangular)
-        return Triangular((self.matrix + other.matrix) / 2)
-
     def log_abs_det(self):
-        return log_of_product([self.matrix[i, i] for i in range(self.matrix.shape[0])])
-
-    def as_matrix(self, dim, dtype):
-        return self.matrix
+        return total(jnp.log(jnp.diagonal(self.matrix)))
 
     def root(self):
         return self

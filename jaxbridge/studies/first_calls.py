@@ -12,7 +12,6 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +19,7 @@ import jax.numpy as jnp
 
 import jaxbridge as jb
 
+from ..engine.memory_maps import count_maps
 from .clock import timed
 from .paper import study_model
 from .report import Say, Table, silent
@@ -160,11 +160,6 @@ def _in_process(what: str, cache: str | None) -> dict[str, float]:
     return json.loads(made.stdout.splitlines()[-1])
 
 
-def _num_maps() -> int:
-    maps = Path("/proc/self/maps")  # not on every system
-    return len(maps.read_text().splitlines()) if maps.exists() else 0
-
-
 def _measure(what: str) -> dict[str, float]:
     """In this process, which has compiled nothing but a trifle."""
     compiled = []
@@ -175,9 +170,9 @@ def _measure(what: str) -> dict[str, float]:
 
     jax.block_until_ready(jnp.sum(jax.random.normal(jax.random.key(0), (3,))))
     jax.monitoring.register_event_duration_secs_listener(listen)
-    before = _num_maps()
+    before = count_maps()
     _, first = timed(ENTRIES[what])
-    programs, maps = len(compiled), _num_maps() - before
+    programs, maps = len(compiled), count_maps() - before
     _, again = timed(ENTRIES[what])
     return {"first": first, "again": again, "programs": programs, "maps": maps}
 

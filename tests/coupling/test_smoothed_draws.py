@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import paper_model, slow_beyond
+from helpers import paper_model, slow_beyond, without_sampler
 
 import jaxbridge as jb
 from jaxbridge.coupling.smoothed_draws import smoothed_draws
@@ -71,17 +71,6 @@ def test_draws_that_are_not_finite_or_all_the_same_make_a_law():
     assert jnp.all(jnp.isfinite(law.sample(jax.random.key(0), PULLED)))
 
 
-def blind(model):
-    """The same diffusion without its sampler."""
-    return jb.Diffusion(
-        lambda x, p: model.with_params(p).drift(x),
-        None,
-        lambda x, p: model.with_params(p).log_stationary(x),
-        model.params,
-        reversible=True,
-    )
-
-
 INTERVAL = ([0.0, 0.0], [0.5, -0.5], 1.0)
 
 
@@ -104,7 +93,7 @@ def test_bridges_are_exact_though_the_draws_are_not_of_the_stationary_law(share)
 def test_a_model_without_a_sampler_is_nearly_as_efficient_as_one_with():
     """Effective bridges per simulated path, and the density, for which μ brings its own size."""
     model, found = paper_model(), []
-    for each in (model, blind(model)):
+    for each in (model, without_sampler(model, reversible=True)):
         made = jb.sample_weighted_bridges(
             jax.random.key(0), each, *INTERVAL, num_bridges=4_000, proposal=jb.Coupling(0.5)
         )

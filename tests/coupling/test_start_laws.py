@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import NON_REVERSIBLE, assert_moments, paper_model
+from helpers import NON_REVERSIBLE, assert_moments, paper_model, without_sampler
 
 import jaxbridge as jb
 from jaxbridge.coupling import burn_in, start_laws
@@ -21,16 +21,6 @@ def starts(law, model, end, duration=1.0, num_steps=40, n=20_000):
         lambda keys: draw_starts(law, model.prepared(), jb.Heun(), keys, lanes, dt, num_steps)
     )
     return draw(keys).T
-
-
-def without_sampler(model):
-    """The same diffusion, whose stationary law is known as a density only."""
-    return jb.Diffusion(
-        lambda x, p: model.with_params(p).drift(x),
-        None,
-        lambda x, p: model.with_params(p).log_stationary(x),
-        model.params,
-    )
 
 
 @pytest.mark.slow

@@ -79,3 +79,11 @@ def test_the_root_is_that_of_the_covariance_however_sigma_turns():
     assert all(isinstance(root, Triangular) for root in roots)
     for root in roots[1:]:
         np.testing.assert_allclose(root.matrix, roots[0].matrix, atol=2e-5)
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e12])
+def test_the_determinant_is_that_of_coefficients_in_any_units(scale):
+    """Products of four such numbers are beyond single precision."""
+    sigma = Triangular(jnp.tril(a_matrix(5)) * scale)
+    expected = np.log(np.diagonal(np.asarray(sigma.matrix, float))).sum()
+    np.testing.assert_allclose(sigma.log_abs_det(), expected, rtol=1e-5)
