@@ -9,9 +9,9 @@ triangular root of V = σσᵀ makes unnecessary, until a rule says that they ha
 step of a `pair`. With X run back from b and X' from a, joined where they meet, Z = X' before and X
 after is a proposed bridge (`join`), and those that met are kept (`bridges`). They have the density
 f_br(z) π(z) / π, π(z) the probability that the diffusion associated with z (`associated`)
-hits z; it starts from ν or another law (`start_laws`), for a ν without sampler from draws of it (`smoothed_draws`), taken when the past is forgotten (`burn_in`).
-How many it takes to hit is counted (`hitting`). `effects` is a table of what such a program
-simulates, and why.
+hits z; it starts from ν or another law (`start_laws`), for a ν without sampler from draws of it
+(`smoothed_draws`), taken when the past is forgotten (`burn_in`). How many it takes to hit is
+counted (`hitting`). `effects` is a table of what such a program simulates, and why.
 """
 
 # What the folders above use of this one.

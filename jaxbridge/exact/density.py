@@ -98,7 +98,8 @@ def transition_log_density(
     - `proposal`: a `Coupling`, with its start law; by default `Coupling(gamma=0.0)` if the model
         is declared `normalised`. With `Stationary()` and `Reversed()` it must be (those of
         `ornstein_uhlenbeck` and `hyperbolic` are), unless the model has no sampler, in whose
-        place `Stationary()` takes a law with a density; with a start law that has a density, such as
+        place `Stationary()` takes a law with a density; with a start law that has a density,
+        such as
         `fit_start_law(..., for_density=True)` finds, it need not be, for the constant of
         `log_stationary` cancels. Or `ModifiedDiffusionBridge()`,
         `ResidualBridge()` or `Guided()`, which need no stationary law; or "auto", which tries
