@@ -9,6 +9,7 @@ Data flows one way, from folder to folder; each begins with its mathematics.
 - `coupling`: pairs of paths that meet, the bridges joined of them, and how often these are hit.
 - `proposals`: a path with an unbiased weight, by a coupling or pulled to the end point.
 - `exact`: what is made of weights: means, chains, transition densities.
+- `records`: what was seen with noise, or in part: likelihoods, paths, innovations.
 - `tuning`: which proposal, and what accuracy costs.
 - `inference`: parameters from observations.
 - `plot`, `studies`: pictures; the paper's study and the measurements, clients of all this.
@@ -76,6 +77,7 @@ from .inference.maximum_likelihood import (
 from .inference.pmmh import PMMHPosterior, PMMHState, pmmh
 from .inference.posterior import AbstractPosterior
 from .inference.priors import NormalPrior
+from .inference.record_gibbs import RecordPosterior, RecordState
 from .inference.score import Score, score
 from .models.diffusion import Diffusion
 from .models.gaussian_bridge import GaussianBridge, gaussian_bridge
@@ -98,6 +100,10 @@ from .proposals.guided import AbstractGuidedProposal, Step
 from .proposals.linear_guide import Guided
 from .proposals.modified_bridge import ModifiedDiffusionBridge
 from .proposals.residual_bridge import ResidualBridge
+from .records.innovations import Innovations, innovations
+from .records.observation import LinearGaussian, ObservationDensity
+from .records.particle_filter import LogLikelihood, log_likelihood
+from .records.smooth import Smoothed, smooth
 from .schemes.base import AbstractScheme
 from .schemes.euler import Euler
 from .schemes.gaussian_transition import GaussianTransition
@@ -187,10 +193,21 @@ __all__ = [
     "tune_coupling",
     "Tuning",
     "Pilot",
+    # Records with noise, or seen in part.
+    "LinearGaussian",
+    "ObservationDensity",
+    "log_likelihood",
+    "LogLikelihood",
+    "smooth",
+    "Smoothed",
+    "innovations",
+    "Innovations",
     # Inference from discrete observations.
     "gibbs",
     "GibbsPosterior",
     "GibbsState",
+    "RecordPosterior",
+    "RecordState",
     "pmmh",
     "PMMHPosterior",
     "PMMHState",

@@ -25,13 +25,16 @@ if _OWNS_CACHE:
 jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+jax.config.update("jax_disable_most_optimizations", True)  # of what is made while collecting
 
 
-def pytest_configure(config):
-    """Most of the time of tests that are not slow goes into compilation, of which optimisation
-    is half. What `helpers.run_program` runs is compiled as it is for users."""
-    if config.option.markexpr == "not slow":
-        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+@pytest.fixture(autouse=True)
+def compiled_in_haste(request):
+    """Most of the time of tests goes into compilation, of which optimisation is half. Tests marked
+    as `optimised`, which run for longer, are compiled as for users, as what `helpers.run_program`
+    runs is."""
+    haste = "optimised" not in request.keywords
+    jax.config.update("jax_disable_most_optimizations", haste)
 
 
 def pytest_unconfigure():

@@ -19,6 +19,7 @@ from jaxbridge.models.bridge_problem import Intervals
 
 PAGE = pathlib.Path(__file__).parent.parent / "notebooks" / "hard_cases.md"
 ROWS: list[tuple[str, str, str, str]] = []
+pytestmark = pytest.mark.optimised
 
 
 def hard(case, plain, here):

@@ -4,6 +4,7 @@ those of the stored run, and their links lead somewhere."""
 import pathlib
 import re
 
+import jax.numpy as jnp
 import pytest
 
 from jaxbridge.studies.benchmark import in_markdown, load
@@ -17,8 +18,9 @@ BLOCKS = re.findall(r"```python\n(.*?)```", "".join(TEXT.values()), re.DOTALL)
 
 def test_quickstart_runs():
     namespace = {}
-    for block in BLOCKS[:3]:
+    for block in BLOCKS[:4]:
         exec(block, namespace)
+    assert namespace["paths"].mean().shape == (291, 2)
     assert bool(namespace["bridges"].met.all()) and bool(namespace["many"].met.all())
     assert namespace["closer"].paths.shape == (1000, 51, 2)
 
@@ -26,7 +28,7 @@ def test_quickstart_runs():
 @pytest.mark.slow
 def test_code_runs():
     """The blocks of the pages go on from those of the README."""
-    assert len(BLOCKS) == 13
+    assert len(BLOCKS) == 16
     namespace = {}
     for block in BLOCKS:
         exec(block, namespace)
@@ -46,6 +48,10 @@ def test_code_runs():
     assert namespace["positive"].paths.shape == (1000, 51, 1)
     assert bool((namespace["positive"].paths > 0).all())
     assert namespace["densities"].value.shape == (500,)
+    assert namespace["noisy_posterior"].theta.shape == (300, 3)
+    assert jnp.isfinite(namespace["value"]) and set(namespace["slope"][0]) == {
+        "log_noise", "log_rate", "log_sigma"
+    }  # fmt: skip
     assert (namespace["densities"].standard_error < 0.5).mean() > 0.95
 
 

@@ -125,6 +125,39 @@ def time_steps(name: str, times: Numbers) -> tuple[Array, Array]:
         return array, jnp.asarray(steps, array.dtype)
 
 
+def check_increasing(times: np.ndarray, steps: np.ndarray) -> None:
+    """Raise `ValueError` where a time is missing, or is not after the one before it; `steps` are
+    their differences."""
+    missing = np.flatnonzero(~np.isfinite(times))
+    if missing.size:
+        raise ValueError(f"`times[{missing[0]}]` = {times[missing[0]]} is missing.")
+    back = np.flatnonzero(steps <= 0)
+    if back.size:
+        i = back[0]
+        raise ValueError(
+            f"`times` must increase, but `times[{i}]` = {times[i]} and `times[{i + 1}]` = "
+            f"{times[i + 1]}: sort them, with their observations."
+        )
+
+
+def steps_of_size(
+    durations: Array, num_steps: int | None, step_size: float
+) -> Int[np.ndarray, " I"]:
+    """How many steps each interval calls for, so that none is longer than about `step_size`.
+
+    **Raises:** `ValueError` where `num_steps` is given too, durations are traced, or no size."""
+    if num_steps is not None:
+        raise ValueError("pass `num_steps` or `step_size`, not both.")
+    if is_traced(durations):
+        raise ValueError(
+            "`step_size` divides intervals of known length; while `times` are traced pass "
+            "`num_steps`."
+        )
+    if isinstance(step_size, bool) or not isinstance(step_size, int | float) or not step_size > 0:
+        raise ValueError(f"`step_size` must be a positive number; got {step_size!r}.")
+    return np.ceil(np.asarray(durations, float) / step_size * (1 - 1e-4)).clip(1).astype(int)
+
+
 def check_key(key) -> None:
     """Raise `TypeError` for anything but one typed key."""
     if not (isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):

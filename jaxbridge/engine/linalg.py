@@ -188,6 +188,18 @@ def solve_lower(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float
     return jnp.stack(solved)
 
 
+def solve_lower_transposed(
+    matrix: Float[Array, "d d"], right: Float[Array, " d"]
+) -> Float[Array, " d"]:
+    """`L⁻ᵀ right` for a lower triangular L, by back substitution."""
+    d = matrix.shape[0]
+    solved: dict[int, Array] = {}
+    for i in reversed(range(d)):
+        rest = _minus(right[i], [matrix[j, i] * solved[j] for j in range(i + 1, d)])
+        solved[i] = rest / matrix[i, i]
+    return jnp.stack([solved[i] for i in range(d)])
+
+
 # Beyond this, writing the elimination out costs too much compilation.
 _UNROLLED = 16
 

@@ -12,6 +12,7 @@ grids make one estimate without their leading step error (`extrapolation`).
 from .chains import sample_exact_bridges as sample_exact_bridges
 from .density import (
     estimate_log_density as estimate_log_density,
+    log_mean_and_error as log_mean_and_error,
     transition_log_density as transition_log_density,
 )
 from .exact_bridges import AbstractExactBridges as AbstractExactBridges

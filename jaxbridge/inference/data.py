@@ -9,7 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced, time_steps
+from ..engine.checks import (
+    Numbers,
+    as_floating,
+    check_count,
+    check_increasing,
+    check_key,
+    is_traced,
+    steps_of_size,
+    time_steps,
+)
 from ..engine.memory_maps import warn_near_limit_of_maps
 from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion
@@ -48,25 +57,12 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
     if times.shape[0] < 2:
         raise ValueError(f"`observations` must be two or more; got {times.shape[0]}.")
     if not is_traced(times):
-        _check_increasing(np.asarray(times), np.asarray(duration))
+        check_increasing(np.asarray(times), np.asarray(duration))
     if not is_traced(observations):
         _check_finite(np.asarray(observations))
         _check_state_space(model, observations)
     intervals, _, _ = as_intervals(observations[:-1], observations[1:], duration)
     return intervals
-
-
-def _check_increasing(times: np.ndarray, duration: np.ndarray) -> None:
-    missing = np.flatnonzero(~np.isfinite(times))
-    if missing.size:
-        raise ValueError(f"`times[{missing[0]}]` = {times[missing[0]]} is missing.")
-    back = np.flatnonzero(duration <= 0)
-    if back.size:
-        i = back[0]
-        raise ValueError(
-            f"`times` must increase, but `times[{i}]` = {times[i]} and `times[{i + 1}]` = "
-            f"{times[i + 1]}: sort them, with their observations."
-        )
 
 
 def _check_finite(observations: np.ndarray) -> None:
@@ -143,16 +139,7 @@ def step_groups(
     if step_size is None:
         num_steps = check_count("num_steps", 50 if num_steps is None else num_steps)
         return (group(np.arange(len(durations)), num_steps),)
-    if num_steps is not None:
-        raise ValueError("pass `num_steps` or `step_size`, not both.")
-    if is_traced(durations):
-        raise ValueError(
-            "`step_size` divides intervals of known length; while `times` are traced pass "
-            "`num_steps`."
-        )
-    if isinstance(step_size, bool) or not isinstance(step_size, int | float) or not step_size > 0:
-        raise ValueError(f"`step_size` must be a positive number; got {step_size!r}.")
-    wanted = np.ceil(np.asarray(durations, float) / step_size * (1 - 1e-4)).clip(1).astype(int)
+    wanted = steps_of_size(durations, num_steps, step_size)
     levels = np.ceil(np.log2(wanted) * _LEVELS_PER_OCTAVE)
     alike = [wanted[levels == level] for level in np.unique(levels)]
     ends = _cheapest_groups(

@@ -16,10 +16,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.checks import Numbers, check_count, nondifferentiable
+from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
+from ..records import Initial, Observation, as_record_problem
 from .augmentation import Augmentation, augment
 from .data import as_problem
 from .parameter_kernels import (
@@ -29,7 +30,8 @@ from .parameter_kernels import (
     check_kernel,
     choose_kernel,
 )
-from .parameters import Constraint, Parameters, as_parameters
+from .parameter_walk import first_root
+from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
     drawn,
@@ -40,6 +42,7 @@ from .posterior import (
     summed,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
+from .record_gibbs import RecordPosterior, RecordState, sample_record
 
 # Of about so many of the draws the step error is worked out.
 _STEP_ERRORS = 256
@@ -117,12 +120,16 @@ def gibbs(
     parameter_kernel: Callable[[Callable], Any] | None = None,
     num_chains: int | None = None,
     thin: int = 1,
-    init: PyTree | GibbsState = None,
+    init: PyTree | GibbsState | RecordState = None,
+    observation: Observation | None = None,
+    initial: Initial = None,
+    num_warmup: int | None = None,
+    covariance: Numbers | None = None,
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
-) -> GibbsPosterior:
+) -> GibbsPosterior | RecordPosterior:
     """Draws from the posterior of a model's parameters, given discrete observations.
 
     **Arguments:**
@@ -154,12 +161,15 @@ def gibbs(
     - `num_chains`: several chains at once, which then have a leading axis in all results.
     - `init`: unknown parameters to start from, with a leading axis of chains if there are
         several and they differ; or the `state` of earlier draws, to go on from there.
+    - `observation`, `initial`: for a record that was seen with noise or in part, as in
+        `innovations`. Then parameters of σ and of the noise may be unknown too, and `num_warmup`
+        iterations before, by default 500, learn the size of moves; `covariance` as in `pmmh`.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
     The functions among these are compared by identity: define them once to compile once.
 
-    **Returns:** `GibbsPosterior`. Not differentiable.
+    **Returns:** `GibbsPosterior`; with an `observation`, `RecordPosterior`. Not differentiable.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
@@ -175,11 +185,29 @@ def gibbs(
     """
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
     parameters = as_parameters(model, where, constraint)
+    if observation is not None:
+        check_key(key)
+        _check_no_bridges(proposal, bridges, method, parameter_kernel)
+        steps = {"num_steps": num_steps, "step_size": step_size}
+        record = as_record_problem(model, times, observations, observation, initial, **steps)
+        unknown = theta_of_model(parameters, record.like.dtype)
+        log_prior = as_log_prior(prior, parameters, unknown)
+        theta, state = starting_points(
+            parameters, unknown, init, num_chains, log_prior, RecordState
+        )
+        start = (theta, first_root(covariance, log_prior, unknown)) if state is None else state
+        num_warmup = check_count("num_warmup", 500 if num_warmup is None else num_warmup, 0)
+        size = (num_warmup, num_iterations, thin)
+        return sample_record(key, parameters, record, log_prior, start, size, progress_meter)
+    if num_warmup is not None or covariance is not None:
+        raise ValueError("`num_warmup` and `covariance` are for records with an `observation`.")
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
     problem.check_sigma_known("use `pmmh`, which needs no path, or pick the others with `where=`.")
     check_kernel(parameter_kernel)
     log_prior = as_log_prior(prior, parameters, problem.theta)
-    theta, state = starting_points(problem, init, num_chains, log_prior, GibbsState)
+    theta, state = starting_points(
+        parameters, problem.theta, init, num_chains, log_prior, GibbsState
+    )
     augment_key, run_key = jax.random.split(key)
     budget = Budget(num_counts, max_proposals, max_trials)
     how = (proposal, bridges, method, budget)
@@ -191,6 +219,16 @@ def gibbs(
     else:
         augmentation.check_paths(state.paths, theta.shape[:-1])
     return _run(run_key, sampler, state, num_iterations, thin, progress_meter)
+
+
+def _check_no_bridges(proposal: Any, *others: Any) -> None:
+    """Raise `ValueError` where bridges between complete observations are asked for."""
+    bridges, *rest = others
+    if proposal is not None or bridges != "exact" or any(each is not None for each in rest):
+        raise ValueError(
+            "`proposal`, `bridges`, `method` and `parameter_kernel` are for complete observations "
+            "without noise: leave them out where there is an `observation`."
+        )
 
 
 class GibbsInfo(NamedTuple):

@@ -18,19 +18,30 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.checks import Numbers, as_floating, check_count, is_traced, nondifferentiable
-from ..engine.linalg import any_cholesky, any_inverse
+from ..engine.checks import (
+    Numbers,
+    check_count,
+    check_key,
+    nondifferentiable,
+)
 from ..engine.progress import as_meter
-from ..exact import acceptance_rate, estimate_log_density
+from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal, Budget
-from .blocks import Block, block_of, make_blocks, with_keys
+from ..records import Initial, Observation, as_record_problem, linearised
+from .blocks import Block, block_of, make_blocks
 from .data import Problem, as_problem
-from .parameters import Constraint, Parameters, as_parameters
+from .likelihood_estimates import (
+    AbstractLikelihood,
+    Estimate,
+    RecordLikelihood,
+    TransitionLikelihood,
+)
+from .parameter_walk import TARGET, adapted, first_root
+from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
     drawn,
@@ -41,9 +52,6 @@ from .posterior import (
     summed,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
-
-# Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
-_TARGET = 0.2
 
 
 class _Chain(NamedTuple):
@@ -134,6 +142,8 @@ def pmmh(
     num_chains: int | None = None,
     thin: int = 1,
     init: PyTree | PMMHState = None,
+    observation: Observation | None = None,
+    initial: Initial = None,
     num_counts: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
@@ -159,6 +169,10 @@ def pmmh(
     - `init`: unknown parameters to start from, or the `state` of earlier draws, which go on with
         the proposals of paths, and their bounds, that they had. Another `proposal` than "auto"
         takes their place; the estimate that the chain holds is still one of theirs.
+    - `observation`, `initial`: for a record that was seen with noise or in part, as in
+        `innovations`; `num_proposals` is then how many particles the filter has. By default the
+        state was seen whole and without noise. Unknown parameters of the noise are parameters of
+        the model that `LinearGaussian(covariance=)` is a function of.
     - `num_counts`, `max_trials`: as in `transition_log_density`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
@@ -182,20 +196,35 @@ def pmmh(
     num_warmup = check_count("num_warmup", num_warmup, 0)
     num_proposals = check_count("num_proposals", num_proposals)
     parameters = as_parameters(model, where, constraint)
-    problem = as_problem(key, parameters, times, observations, num_steps, step_size)
-    log_prior = as_log_prior(prior, parameters, problem.theta)
-    root = _first_root(covariance, log_prior, problem.theta)
-    theta, state = starting_points(problem, init, num_chains, log_prior, PMMHState)
+    check_key(key)
+    pilot_key, run_key = jax.random.split(key)
+    if observation is None:
+        problem = as_problem(key, parameters, times, observations, num_steps, step_size)
+        unknown = problem.theta
+
+        def likelihood_near(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
+            if state is not None and isinstance(proposal, str) and proposal == "auto":
+                blocks = _blocks_of_state(state, problem, model)
+            else:
+                budget = Budget(num_counts, None, max_trials)
+                blocks = make_blocks(pilot_key, model, problem, proposal, budget, "density")
+            return TransitionLikelihood(blocks, num_proposals)
+
+    else:
+        steps = {"num_steps": num_steps, "step_size": step_size}
+        record = as_record_problem(model, times, observations, observation, initial, **steps)
+        unknown = theta_of_model(parameters, record.like.dtype)
+
+        def likelihood_near(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
+            return RecordLikelihood(record, linearised(record, model).points, num_proposals)
+
+    log_prior = as_log_prior(prior, parameters, unknown)
+    root = first_root(covariance, log_prior, unknown)
+    theta, state = starting_points(parameters, unknown, init, num_chains, log_prior, PMMHState)
     if state is not None and covariance is not None:
         raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
-    pilot_key, run_key = jax.random.split(key)
-    pilot_model = parameters.bind(first_chain(theta))
-    if state is not None and isinstance(proposal, str) and proposal == "auto":
-        blocks = _blocks_of_state(state, problem, pilot_model)
-    else:
-        budget = Budget(num_counts, None, max_trials)
-        blocks = make_blocks(pilot_key, pilot_model, problem, proposal, budget, "density")
-    sampler = _Sampler(parameters, blocks, log_prior, num_proposals)
+    likelihood = likelihood_near(parameters.bind(first_chain(theta)), state)
+    sampler = _Sampler(parameters, likelihood, log_prior)
     meter = as_meter(progress_meter)
     if state is None:
         root = jnp.broadcast_to(root, (*theta.shape[:-1], *root.shape))
@@ -204,8 +233,7 @@ def pmmh(
         chain, num_done = _Chain(*state[: len(_Chain._fields)]), state.num_done
     size = (num_warmup, num_iterations, thin)
     made = _run(run_key, sampler, chain, num_done, size, meter)
-    proposals = tuple(block.proposal for block in blocks)
-    return replace(made, state=made.state._replace(proposals=proposals))
+    return replace(made, state=made.state._replace(proposals=likelihood.proposals))
 
 
 def _blocks_of_state(
@@ -228,44 +256,6 @@ def _blocks_of_state(
     return tuple(map(block_of, groups, state.proposals))
 
 
-def _first_root(
-    covariance: Numbers | None,
-    log_prior: NormalDensity | GivenDensity,
-    theta: Float[Array, " p"],
-) -> Float[Array, "p p"]:
-    p = theta.shape[0]
-    if covariance is not None:
-        matrix = as_floating("covariance", covariance).astype(theta.dtype)
-        if matrix.shape not in ((p,), (p, p)):
-            raise ValueError(
-                f"`covariance` must have shape ({p},) or ({p}, {p}); got {matrix.shape}."
-            )
-        matrix = jnp.diag(matrix) if matrix.ndim == 1 else matrix
-        if not is_traced(matrix):
-            known = np.asarray(matrix, float)
-            symmetric = np.allclose(known, known.T, rtol=1e-5)
-            if not (np.all(np.isfinite(known)) and symmetric and np.linalg.eigvalsh(known)[0] > 0):
-                raise ValueError(
-                    "`covariance` must be finite, symmetric and positive definite; got "
-                    f"{covariance}."
-                )
-        return any_cholesky(matrix)
-    if isinstance(log_prior, NormalDensity):
-        variance = any_inverse(log_prior.precision)
-        return 0.1 * jnp.diag(jnp.sqrt(jnp.diagonal(variance)))
-    return 0.1 * jnp.diag(jnp.maximum(jnp.abs(theta), 0.1))
-
-
-class _Estimate(NamedTuple):
-    """log of an unbiased estimate of the likelihood, -inf where there is none, with its variance
-    and its step error; and how many of its weights were cut off."""
-
-    log_likelihood: Float[Array, ""]
-    variance: Float[Array, ""]
-    log_step_error: Float[Array, ""]
-    num_truncated: Int[Array, ""]
-
-
 class PMMHInfo(NamedTuple):
     """Counted in one step: whether it was accepted; was refused because no estimate was to be had;
     and how many weights of the estimate were cut off."""
@@ -279,26 +269,11 @@ class _Sampler(eqx.Module):
     """What does not change from iteration to iteration, and the steps of one chain."""
 
     parameters: Parameters
-    blocks: tuple[Block, ...]
+    likelihood: AbstractLikelihood
     log_prior: NormalDensity | GivenDensity
-    num_proposals: int = eqx.field(static=True)
 
-    def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> _Estimate:
-        model = self.parameters.bind(theta).prepared()
-        zero = jnp.zeros((), theta.dtype)
-        total = _Estimate(zero, zero, zero, jnp.int32(0))
-        for block_key, block in with_keys(key, self.blocks):
-            arguments = (model, block.proposal, block.problem, self.num_proposals)
-            made = estimate_log_density(block_key, *arguments)
-            mine = _Estimate(
-                jnp.sum(made.value),
-                jnp.sum(made.standard_error**2),
-                jnp.sum(made.step_error),
-                jnp.sum(made.num_truncated, dtype=jnp.int32),
-            )
-            total = jax.tree.map(jnp.add, total, mine)
-        known = ~jnp.isnan(total.log_likelihood)
-        return total._replace(log_likelihood=jnp.where(known, total.log_likelihood, -jnp.inf))
+    def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Estimate:
+        return self.likelihood.estimate(key, self.parameters.bind(theta))
 
     def start(
         self, key: Key[Array, ""], start: tuple[Float[Array, " p"], Float[Array, "p p"]]
@@ -320,20 +295,12 @@ class _Sampler(eqx.Module):
         new = jnp.where(inside, made.log_likelihood + self.log_prior(proposed), -jnp.inf)
         rate = acceptance_rate(state.log_likelihood + self.log_prior(state.theta), new)
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
-        root = _adapted(state.root, noise, gain * (jnp.where(jnp.isnan(rate), 0, rate) - _TARGET))
+        root = adapted(state.root, noise, gain * (jnp.where(jnp.isnan(rate), 0, rate) - TARGET))
         root = jnp.where((gain > 0) & jnp.all(jnp.isfinite(root)), root, state.root)
         moved = _Chain(proposed, *made[:3], root)
         without = inside & (made.log_likelihood == -jnp.inf)
         chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), moved, state)
         return chain._replace(root=root), PMMHInfo(accepted, without, made.num_truncated)
-
-
-def _adapted(
-    root: Float[Array, "p p"], noise: Float[Array, " p"], change: Float[Array, ""]
-) -> Float[Array, "p p"]:
-    """S after one step of Vihola's."""
-    moved = root @ (noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6))
-    return any_cholesky(root @ root.T + change * jnp.outer(moved, moved))
 
 
 @eqx.filter_jit

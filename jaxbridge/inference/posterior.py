@@ -11,7 +11,6 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from ..engine.checks import check_count, is_traced
 from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
 from ..schemes import StepError, dominates
-from .data import Problem
 from .parameters import Parameters, init_vectors
 
 # Of fewer draws a covariance tells nothing.
@@ -102,14 +101,14 @@ class AbstractPosterior(eqx.Module):
 
 
 def starting_points(
-    problem: Problem,
+    parameters: Parameters,
+    theta: Float[Array, " p"],
     init: PyTree,
     num_chains: int | None,
     log_prior: Callable[[Array], Array],
     state_type: type,
 ) -> tuple[Float[Array, "*chains p"], Any]:
     """θ of each chain, and the state to go on from, if `init` is one."""
-    parameters, theta = problem.parameters, problem.theta
     chains = () if num_chains is None else (check_count("num_chains", num_chains),)
     state = init if isinstance(init, state_type) else None
     if state is not None:

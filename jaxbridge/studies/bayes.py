@@ -185,6 +185,7 @@ def run_sampler(
                 **options,
             )
         )
+        assert isinstance(half, jb.GibbsPosterior)
         state = half.state
         seconds.append(took)
         halves.append(half)

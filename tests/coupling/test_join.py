@@ -108,6 +108,7 @@ def test_exploding_lanes_are_told_apart():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_state_dependent_noise_is_recovered_and_coupled():
     """The driven path of an Ornstein–Uhlenbeck process in swirled coordinates, unswirled,
     averaged over the stationary law of the end point."""

@@ -35,7 +35,7 @@ def lane_counts(text):
 
 
 def run_on_eight_devices(program):
-    run_program(PRELUDE + program, deadline=300, num_devices=8)
+    run_program(PRELUDE + program, deadline=300, num_devices=8, in_haste=True)
 
 
 @pytest.mark.slow

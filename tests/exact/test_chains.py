@@ -37,6 +37,7 @@ FITTED = jb.GaussianLaw([0.4, 0.3], [[0.5, -0.3], [-0.3, 0.5]])
         ("renewal", "swirled"),
     ],
 )
+@pytest.mark.optimised
 def test_chain_midpoints_have_the_exact_law(method, name):
     case = CASES[name]()
     chain = jb.sample_exact_bridges(

@@ -17,6 +17,7 @@ SIZES = {"very unlikely": 30_000, "swirled": 20_000}
 
 
 @pytest.mark.parametrize("name", slow_cases(CASES, {"unlikely, gamma 0.5"}))
+@pytest.mark.optimised
 def test_weighted_proposals_have_the_exact_law(name):
     """One proposal each, of weight zero where it is no bridge: the mean weight is the density. The
     weighted mid-points have the law of the bridge's, and so has the chain that accepts one after

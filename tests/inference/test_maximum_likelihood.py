@@ -68,6 +68,7 @@ def test_one_unknown_rate():
 
 @pytest.mark.parametrize("method", ["em", "gradient"])
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_finds_the_maximum(method):
     model, times, observations = multivariate_ou()
     exact, covariance = exact_maximum()

@@ -1,0 +1,54 @@
+"""Normal random walks of θ, whose covariance S Sᵀ is learnt in a warm-up (Vihola 2012),
+
+    S Sᵀ ← S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,
+
+from the acceptance rates α_i of moves S ξ.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.linalg import any_cholesky, any_inverse
+from .priors import GivenDensity, NormalDensity
+
+# Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
+TARGET = 0.2
+
+
+def first_root(
+    covariance: Numbers | None,
+    log_prior: NormalDensity | GivenDensity,
+    theta: Float[Array, " p"],
+) -> Float[Array, "p p"]:
+    """S of the first moves: of the given covariance, or a tenth of what the prior or θ spans."""
+    p = theta.shape[0]
+    if covariance is not None:
+        matrix = as_floating("covariance", covariance).astype(theta.dtype)
+        if matrix.shape not in ((p,), (p, p)):
+            raise ValueError(
+                f"`covariance` must have shape ({p},) or ({p}, {p}); got {matrix.shape}."
+            )
+        matrix = jnp.diag(matrix) if matrix.ndim == 1 else matrix
+        if not is_traced(matrix):
+            known = np.asarray(matrix, float)
+            symmetric = np.allclose(known, known.T, rtol=1e-5)
+            if not (np.all(np.isfinite(known)) and symmetric and np.linalg.eigvalsh(known)[0] > 0):
+                raise ValueError(
+                    "`covariance` must be finite, symmetric and positive definite; got "
+                    f"{covariance}."
+                )
+        return any_cholesky(matrix)
+    if isinstance(log_prior, NormalDensity):
+        variance = any_inverse(log_prior.precision)
+        return 0.1 * jnp.diag(jnp.sqrt(jnp.diagonal(variance)))
+    return 0.1 * jnp.diag(jnp.maximum(jnp.abs(theta), 0.1))
+
+
+def adapted(
+    root: Float[Array, "p p"], noise: Float[Array, " p"], change: Float[Array, ""]
+) -> Float[Array, "p p"]:
+    """S after one step of Vihola's."""
+    moved = root @ (noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6))
+    return any_cholesky(root @ root.T + change * jnp.outer(moved, moved))

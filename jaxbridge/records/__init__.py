@@ -1,0 +1,43 @@
+"""Records: a diffusion seen at times t_0 < ... < t_K with noise, in part, or not at all.
+
+What is seen of the state is y_k ~ g(· | X(t_k)) (`observation`), and X(t_0) has a law (`initial`).
+Times, values and steps make a `record`. A linear process along a path (`linearisation`) has a
+density of all that is still to be seen, given the state,
+
+    h_i(x) = p̃(y_k: t_k > t_i | X(t_i) = x) ∝ exp(rᵀ(x - ξ_i) - ½ (x - ξ_i)ᵀ H (x - ξ_i)),
+
+by the backward information filter (`information_filter`). Paths whose steps are tilted by it
+(`tilted_step`, `guided_steps`) have weights w whose mean is the likelihood of the whole record:
+
+    w = Z_0 Π_i [∫ p_i(x'| x_i) g(y| x') h_{i+1}(x') dx' / h_i(x_i)],
+
+all equal where the model is linear; the density of a bridge's guided proposal (van der Meulen &
+Schauer 2017; Mider, Schauer & van der Meulen 2021) with data on the way. On it are built
+
+* `log_likelihood`: particles that are resampled where data are (`particle_filter`), an unbiased
+  estimate, however long the record is;
+* `innovations`: path and weight as smooth functions of parameters and of normal noise;
+* `smooth`: paths given the whole record, by moves of the noise in blocks.
+"""
+
+# What the folders above use of this one.
+from .guided_record import (
+    guided as guided,
+    linearised as linearised,
+    noise_and_log_weight as noise_and_log_weight,
+    path_and_log_weight as path_and_log_weight,
+)
+from .initial import Initial as Initial
+from .observation import Observation as Observation
+from .particle_filter import run_filters as run_filters
+from .path_blocks import (
+    Paths as Paths,
+    blocks_of_both_cuts as blocks_of_both_cuts,
+    cuts as cuts,
+    sweep as sweep,
+    tuned as tuned,
+)
+from .problem import (
+    RecordProblem as RecordProblem,
+    as_record_problem as as_record_problem,
+)

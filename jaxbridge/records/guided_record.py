@@ -1,0 +1,165 @@
+"""A whole record, guided: what the steps of its paths need, worked out before any is simulated."""
+
+import functools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Key
+
+from ..engine.checks import without_derivatives
+from ..models.diffusion import Diffusion
+from .guided_steps import (
+    Guide,
+    GuidedLaw,
+    guided_law,
+    guided_start,
+    guided_step,
+    relative,
+    solve_law,
+    solve_root,
+)
+from .information_filter import information_filter
+from .initial import initial_law, log_ratio
+from .linearisation import extended_kalman_path, linear_step
+from .observation import Scalars
+from .problem import RecordProblem
+from .segments import at_every_step, flat, following, split_first
+from .tilted_step import NormalStep
+
+# How often the path along which the process is linearised is found anew from the last.
+_LINEARISATIONS = 3
+
+
+class Guidance(NamedTuple):
+    """What guides paths at some parameters.
+
+    - `initial`: the normal law of X(t_0); `start`: the guided one, with its log weight.
+    - `steps`: the guides of all steps, leading axes (K, N).
+    - `scalars`: what is seen at the ends of the segments, leading axis K, counted from ξ.
+    """
+
+    initial: NormalStep
+    start: GuidedLaw
+    steps: Guide
+    scalars: Scalars
+
+
+def guided(problem: RecordProblem, model: Diffusion, points: Float[Array, "points d"]) -> Guidance:
+    """Linearised along these points."""
+    dynamics = model.forward(problem.like)
+    initial = initial_law(problem.initial, model, problem.like)
+    K, N = problem.num_segments, problem.num_steps
+    of_segments = lambda leaf: leaf.reshape(K, N, *leaf.shape[1:])
+    here, there = of_segments(points[:-1]), of_segments(points[1:])
+
+    def linear(point, next_point, dt):
+        return linear_step(problem.density, dynamics, point, next_point, dt)
+
+    linear_steps = jax.vmap(jax.vmap(linear))(here, there, problem.record.dt)
+    scalars = jax.vmap(relative)(problem.scalars(model), points[::N])
+    first, rest = split_first(scalars)
+    h = information_filter(linear_steps, rest)
+
+    steps = Guide(here, h, there, following(h), problem.record.dt)
+    h_first = jax.tree.map(lambda leaf: leaf[0, 0], h)
+    start = guided_start(initial, first, points[0], h_first)
+    return Guidance(initial, start, steps, rest)
+
+
+def path_and_log_weight(
+    problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points m"]
+) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
+    """The path that this noise makes, and its log weight: the first row is that of x_0."""
+    density, dynamics = problem.density, model.forward(problem.like)
+    start = guide.start.point(noise[0])
+
+    def one(state, inputs):
+        (x, log_weight), (zeta, step, scalars) = state, inputs
+        law = guided_step(density, dynamics, x, step, scalars)
+        x = law.point(zeta)
+        return (x, log_weight + law.log_weight), x
+
+    inputs = noise[1:], flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
+    (_, log_weight), path = lax.scan(one, (start, guide.start.log_weight), inputs)
+    path = jnp.concatenate([start[None], path])
+    return path, log_weight + corrections(problem, model, guide, path)
+
+
+def noise_and_log_weight(
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    model: Diffusion,
+    guide: Guidance,
+    path: Float[Array, "points d"],
+) -> tuple[Float[Array, "points m"], Float[Array, ""]]:
+    """The inverse of `path_and_log_weight`: noise that makes this path, where none moves it drawn
+    afresh."""
+    density, dynamics = problem.density, model.forward(problem.like)
+    scalars = at_every_step(guide.scalars, problem.num_steps)
+    hidden = jax.random.normal(key, (len(path), scalars.values.shape[1]), path.dtype)
+    first = guide.start.noise(path[0], functools.partial(solve_root, guide.initial.root), hidden[0])
+    # What the law of x_0 does not leave to noise is not moved by it, either.
+    still = jnp.diagonal(guide.initial.root) == 0
+    fresh = jax.random.normal(jax.random.fold_in(key, 1), first.shape, path.dtype)
+
+    def one(log_weight, inputs):
+        x, x_next, step, scalars, hidden = inputs
+        law = density.steps_from(dynamics, x).law(step.dt)
+        guided = guided_law(law, x, step, scalars)
+        zeta = guided.noise(x_next, functools.partial(solve_law, law), hidden)
+        return log_weight + guided.log_weight, zeta
+
+    inputs = path[:-1], path[1:], flat(guide.steps), scalars, hidden[1:]
+    log_weight, zeta = lax.scan(one, guide.start.log_weight, inputs)
+    noise = jnp.concatenate([jnp.where(still, fresh, first)[None], zeta])
+    return noise, log_weight + corrections(problem, model, guide, path)
+
+
+def corrections(
+    problem: RecordProblem, model: Diffusion, guide: Guidance, path: Float[Array, "points d"]
+) -> Float[Array, ""]:
+    """What the log weight of a path takes where observations are not of their guess, and the
+    initial law is not normal."""
+    each = jax.vmap(lambda y, x: correction(problem, model, y, x))
+    at_observations = each(problem.record.values, path[:: problem.num_steps])
+    return jnp.sum(at_observations) + log_ratio(problem.initial, model, guide.initial, path[0])
+
+
+def correction(
+    problem: RecordProblem, model: Diffusion, y: Float[Array, " m"], x: Float[Array, " d"]
+) -> Float[Array, ""]:
+    """What the log weight takes where an observation is not of its guess."""
+    return problem.observation.correction(y, x, model.params)
+
+
+class Linearised(NamedTuple):
+    """The points along which the process is linearised, and what guides paths there."""
+
+    points: Float[Array, "points d"]
+    guide: Guidance
+
+
+@eqx.filter_jit  # a program of its own, which all who read the record share
+def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
+    """Along the path of the extended Kalman filter, and then of the path that is guided without
+    noise. Neither has derivatives."""
+    model = without_derivatives(model)
+    initial = initial_law(problem.initial, model, problem.like)
+    dynamics, scalars = model.forward(problem.like), problem.scalars(model)
+    points = extended_kalman_path(problem.density, dynamics, initial, problem.record.dt, scalars)
+    silence = jnp.zeros_like(points)
+
+    def again(points):
+        guide = guided(problem, model, points)
+        path, _ = path_and_log_weight(problem, model, guide, silence)
+        return jnp.where(jnp.all(jnp.isfinite(path)), path, points), Linearised(points, guide)
+
+    # The guide of the last time round is the one that is wanted.
+    _, shapes = jax.eval_shape(again, points)
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    init, turns = (points, nothing), _LINEARISATIONS + 1
+    _, made = lax.fori_loop(0, turns, lambda _, state: again(state[0]), init)
+    return made

@@ -1,0 +1,113 @@
+"""Paths as smooth functions of parameters and normal noise (section 4 of van der Meulen & Schauer
+2017: the noise does not know the parameters).
+
+The path of a record is G_θ(ξ), guided by all that was seen, with ξ ~ N(0, I) under the law of the
+guided paths; so (θ, ξ) has the posterior density π(θ) N(ξ; 0, I) w(θ, ξ). Given ξ the path moves
+with θ, and θ may be a parameter of σ, of the noise or of the initial law, however small the steps.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from ..engine.checks import Numbers
+from ..models.diffusion import Diffusion
+from ..schemes import AbstractStepDensity
+from .guided_record import guided, linearised, path_and_log_weight
+from .initial import Initial
+from .observation import Observation
+from .problem import RecordProblem, as_record_problem
+
+
+class Innovations(eqx.Module):
+    """What `innovations` returns: the record's paths as functions of noise ξ, shape (`size`,)."""
+
+    _problem: RecordProblem
+    _points: Float[Array, "points d"]
+
+    @property
+    def size(self) -> int:
+        """How many numbers ξ has: d for x_0, and d for each step."""
+        return self._points.size
+
+    @property
+    def times(self) -> Float[Array, " points"]:
+        """Of the points of paths, shape (M + 1,)."""
+        return self._problem.record.grid()
+
+    def path(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, "points d"]:
+        """The path that this noise makes at these parameters of the model."""
+        return self._run(params, xi)[0]
+
+    def log_weight(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, ""]:
+        """log w, whose mean of w over ξ ~ N(0, I) is the likelihood; -∞ of a path that left the
+        state space."""
+        return self._run(params, xi)[1]
+
+    def log_density(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, ""]:
+        """log of the joint density of ξ and of what was seen, given the parameters: with a prior's
+        log density it is the target of any sampler."""
+        return self.log_weight(params, xi) - (xi @ xi + self.size * np.log(2 * np.pi)) / 2
+
+    def _run(self, params: PyTree, xi) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
+        model = self._problem.model.with_params(params)
+        guide = guided(self._problem, model, self._points)
+        noise = xi.reshape(self._points.shape)
+        path, log_weight = path_and_log_weight(self._problem, model, guide, noise)
+        return path, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
+
+
+def innovations(
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    *,
+    observation: Observation,
+    initial: Initial = None,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    initial_time: Numbers | None = None,
+    density: AbstractStepDensity | None = None,
+) -> Innovations:
+    """The paths of a record as smooth functions of parameters and noise, guided by what was seen.
+
+    **Arguments:**
+
+    - `model`: along its paths at its `params` the guide is linearised, once: what is made at other
+        parameters is as exact, but guided best near these.
+    - `times`: of the observations, shape (n,), increasing.
+    - `observations`: shape (n, m), NaN where a component was not seen.
+    - `observation`: how the state was seen, a `LinearGaussian` or an `ObservationDensity`.
+    - `initial`: the law of the state at the first time: a point, shape (d,), a `GaussianLaw`,
+        `Stationary()`, which is the default, or a function of params to one of these. Likelihoods
+        from the stationary law rest on a `normalised` model.
+    - `num_steps`: steps between two times, by default 10; or `step_size`, how long a step may be.
+    - `initial_time`: of `initial`, where that is before the first of `times`.
+    - `density`: of the steps, by default `ItoTaylorDensity()` for constant σ, else
+        `EulerDensity()`.
+
+    **Returns:** `Innovations`, differentiable in parameters and noise.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    seen = jb.LinearGaussian(covariance=0.01)
+    paths = jb.innovations(model, times, observations, observation=seen)
+    value, slope = jax.value_and_grad(paths.log_density)(model.params, jnp.zeros(paths.size))
+    ```
+    """
+    problem = as_record_problem(
+        model,
+        times,
+        observations,
+        observation,
+        initial,
+        num_steps=num_steps,
+        step_size=step_size,
+        initial_time=initial_time,
+        density=density,
+    )
+    return Innovations(problem, linearised(problem, model).points)

@@ -1,0 +1,96 @@
+"""A linear process along a path ξ_0, ..., ξ_M, and the path itself.
+
+From ξ_i a step goes to N(ξ_i + A_i u + a_i, Λ_i Λ_iᵀ), where u = x - ξ_i and A is the derivative of
+the mean: what the law of a step is for states near the path. The path is that of the extended
+Kalman filter, and then, a few times, the path without noise that is guided along the last one:
+Gauss and Newton's iteration for the most likely path (Bell 1994).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..engine.linalg import cholesky, matmul, matvec
+from ..models.dynamics import Dynamics
+from ..schemes import AbstractStepDensity, StepLaw
+from .observation import Scalars
+from .segments import at_every_step, split_first
+from .tilted_step import NormalStep
+
+
+class LinearisedStep(NamedTuple):
+    """u' = A u + a + Λ ζ, from u = x - ξ to u' = x' - ξ'."""
+
+    decay: Float[Array, "d d"]
+    shift: Float[Array, " d"]
+    root: Float[Array, "d m"]
+
+
+def root_of_law(law: StepLaw) -> Float[Array, "d m"]:
+    """Λ of N(μ, δ σ S σᵀ) = N(μ, Λ Λᵀ)."""
+    root = law.sigma.as_matrix(law.mean.shape[0], law.mean.dtype) * jnp.sqrt(law.dt)
+    if law.covariance.ndim == 0:
+        return root * jnp.sqrt(law.covariance)
+    return matmul(root, cholesky(law.covariance))
+
+
+def linear_step(
+    density: AbstractStepDensity,
+    dynamics: Dynamics,
+    point: Float[Array, " d"],
+    next_point: Float[Array, " d"],
+    dt: Float[Array, ""],
+) -> LinearisedStep:
+    """The step from `point`, linearised there, relative to the two."""
+    law = density.steps_from(dynamics, point).law(dt)
+    F = jax.jacfwd(dynamics.drift)(point)
+    decay = density.linear_step(F, jnp.zeros_like(F), dt).decay
+    return LinearisedStep(decay, law.mean - next_point, root_of_law(law))
+
+
+def filtered(
+    mean: Float[Array, " d"], covariance: Float[Array, "d d"], scalars: Scalars
+) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
+    """N(mean, covariance) given what is seen: Kalman's update, number by number."""
+    for row, value, variance, _ in zip(*scalars, strict=True):
+        along = matvec(covariance, row)
+        total = jnp.sum(row * along) + variance
+        some = total > 0
+        gain = jnp.where(some, along / jnp.where(some, total, 1), 0)
+        mean = mean + gain * (value - jnp.sum(row * mean))
+        covariance = covariance - gain[:, None] * along
+    return mean, covariance
+
+
+def extended_kalman_path(
+    density: AbstractStepDensity,
+    dynamics: Dynamics,
+    initial: NormalStep,
+    dt: Float[Array, "K N"],
+    scalars: Scalars,
+) -> Float[Array, "points d"]:
+    """The means of the extended Kalman filter, where these are finite, else the last ones that
+    are."""
+
+    def step(state, inputs):
+        (mean, covariance), (dt, seen) = state, inputs
+        law = linear_step(density, dynamics, mean, jnp.zeros_like(mean), dt)
+        spread = matmul(law.root, law.root.T)
+        moved = matmul(matmul(law.decay, covariance), law.decay.T) + spread
+        before = _finite((law.shift, moved), state)
+        return _finite(filtered(before[0], before[1], seen), before), mean
+
+    mean, root = initial
+    first, rest = split_first(scalars)
+    state = filtered(mean, matmul(root, root.T), first)
+    inputs = dt.reshape(-1), at_every_step(rest, dt.shape[1])
+    (last, _), means = lax.scan(step, state, inputs)
+    return jnp.concatenate([means, last[None]])
+
+
+def _finite(new, old):
+    good = jnp.all(jnp.stack([jnp.all(jnp.abs(leaf) < 1e12) for leaf in new]))
+    return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)

@@ -1,0 +1,247 @@
+"""How the state is seen: y_k given X(t_k).
+
+The components of a normal observation, y = L x + N(0, R), are made independent by R = U D Uᵀ with
+U unit triangular, for those that were seen: each is then a number c·x + N(0, ρ), with ρ = 0 for one
+that is exact. They are taken one by one, so nothing needs R to be invertible, and what was not seen
+is left out.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.linalg import dot
+from ..models.diffusion import check_value
+
+
+class Scalars(NamedTuple):
+    """Independent numbers seen of one state x: `values` = `rows` x + N(0, diag(`variances`)), those
+    of which `seen` is true. The others have row 0 and variance 1."""
+
+    rows: Float[Array, "m d"]
+    values: Float[Array, " m"]
+    variances: Float[Array, " m"]
+    seen: Bool[Array, " m"]
+
+
+class LinearGaussian(eqx.Module):
+    """Linear observations with normal noise: y = L x + N(0, R).
+
+    A component that was not seen is NaN, of any row; R may be singular, and zero for what is seen
+    exactly.
+
+    **Arguments:**
+
+    - `matrix`: L, shape (m, d); `None` for all of the state.
+    - `covariance`: R, shape (m, m); (m,) for its diagonal; () for a multiple of I; or a function
+        `params -> R` of the model's parameters, where it is unknown. In units of y, squared.
+
+    **Raises:** `ValueError` and `TypeError` for a matrix or a covariance that cannot be.
+
+    **Example:**
+
+    ```python
+    observation = jb.LinearGaussian(matrix=[[1.0, 0.0]], covariance=0.01)
+    ```
+    """
+
+    matrix: Float[Array, "m d"] | None
+    covariance: Float[Array, "..."] | None
+    _function: Callable | None = eqx.field(static=True)
+
+    def __init__(
+        self, matrix: Numbers | None = None, covariance: Numbers | Callable[[PyTree], Array] = 0.0
+    ):
+        self.matrix = None if matrix is None else as_floating("matrix", matrix)
+        if self.matrix is not None:
+            if self.matrix.ndim != 2:
+                raise ValueError(f"`matrix` must have shape (m, d); got {self.matrix.shape}.")
+            if not is_traced(self.matrix) and not np.all(np.isfinite(self.matrix)):
+                raise ValueError(f"`matrix` must be finite; got {self.matrix}.")
+        self._function = covariance if callable(covariance) else None
+        self.covariance = None if callable(covariance) else as_floating("covariance", covariance)
+        if self.covariance is not None:
+            _check_covariance(self.covariance)
+
+    @property
+    def linear(self) -> "LinearGaussian":
+        """By what paths are guided: itself."""
+        return self
+
+    def covariance_for(self, params: PyTree, m: int, dtype) -> Float[Array, "m m"]:
+        """R as a matrix."""
+        value = self.covariance if self._function is None else jnp.asarray(self._function(params))
+        assert value is not None
+        if value.shape not in ((), (m,), (m, m)):
+            raise ValueError(
+                f"`covariance` must have shape (), ({m},) or ({m}, {m}) for observations of {m} "
+                f"components; it has {value.shape}."
+            )
+        value = value.astype(dtype)
+        return value if value.ndim == 2 else value * jnp.eye(m, dtype=dtype)
+
+    def matrix_for(self, d: int, m: int, dtype) -> Float[Array, "m d"]:
+        """L as a matrix."""
+        if self.matrix is None:
+            return jnp.eye(d, dtype=dtype)
+        return self.matrix.astype(dtype)
+
+    def check(self, d: int, m: int, like: Array, params: PyTree) -> None:
+        """Raise `ValueError` where observations of m components of a state of d do not fit."""
+        rows = d if self.matrix is None else self.matrix.shape[0]
+        if self.matrix is not None and self.matrix.shape[1] != d:
+            raise ValueError(
+                f"`matrix` must have shape (m, {d}) for a state of {d} dimensions; got "
+                f"{self.matrix.shape}."
+            )
+        if rows != m:
+            raise ValueError(
+                f"`observations` must have {rows} components, as many as the observation of the "
+                f"state has; got {m}."
+            )
+        matrix, R = self.matrix_for(d, m, like.dtype), self.covariance_for(params, m, like.dtype)
+        if is_traced(matrix, R):
+            return
+        _check_covariance(R)
+        exact = np.asarray(matrix)[np.asarray(jnp.diagonal(R)) == 0]
+        if np.linalg.matrix_rank(exact) < len(exact):
+            raise ValueError(
+                f"{len(exact)} components are seen without noise, but their rows of `matrix` have "
+                f"rank {np.linalg.matrix_rank(exact)}: leave out those that follow from others, or "
+                "give them a variance."
+            )
+
+    def scalars(self, y: Float[Array, " m"], params: PyTree, d: int) -> Scalars:
+        """The same as independent numbers."""
+        m, seen = y.shape[0], jnp.isfinite(y)
+        rows = [self.matrix_for(d, m, y.dtype)[j] for j in range(m)]
+        values = [jnp.where(seen[j], y[j], 0) for j in range(m)]
+        R = self.covariance_for(params, m, y.dtype)
+        entry = lambda i, j: jnp.where(seen[i] & seen[j], R[i, j], 0)
+        rest = [[entry(i, j) for j in range(m)] for i in range(m)]
+        variances = []
+        for k in range(m):  # R = U D Uᵀ, by elimination
+            pivot = rest[k][k]
+            some = pivot > 0
+            variances.append(pivot)
+            for i in range(k + 1, m):
+                factor = jnp.where(some, rest[i][k] / jnp.where(some, pivot, 1), 0)
+                rows[i] = rows[i] - factor * rows[k]
+                values[i] = values[i] - factor * values[k]
+                for j in range(k + 1, m):
+                    rest[i][j] = rest[i][j] - factor * rest[k][j]
+        rows = jnp.where(seen[:, None], jnp.stack(rows), 0)
+        variances = jnp.where(seen, jnp.maximum(jnp.stack(variances), 0), 1)
+        return Scalars(rows, jnp.where(seen, jnp.stack(values), 0), variances, seen)
+
+    def correction(self, y, x, params):
+        """log g - log of its guess: nothing."""
+        return jnp.zeros((), x.dtype)
+
+
+class ObservationDensity(eqx.Module):
+    """Observations with any density g(y | x): counts, angles, what is rounded or cut off.
+
+    **Arguments:**
+
+    - `log_density`: log g, a function `(y, x, params) -> ()` of an observation, shape (m,), a
+        state, shape (d,), and the model's parameters. A row with a NaN in every component was not
+        seen; one with some reaches the function as it is.
+    - `guess`: a `LinearGaussian` like it, with positive variances, by which paths are guided. The
+        law does not depend on it, but how many paths count does.
+
+    **Raises:** `TypeError` for anything else; `ValueError` for a guess without noise.
+
+    **Example:**
+
+    ```python
+    counts = jb.ObservationDensity(
+        lambda y, x, p: jax.scipy.stats.poisson.logpmf(y[0], x[0]),
+        guess=jb.LinearGaussian([[1.0]], covariance=20.0),
+    )
+    ```
+    """
+
+    guess: LinearGaussian
+    _log_density: Callable = eqx.field(static=True)
+
+    def __init__(self, log_density: Callable, guess: LinearGaussian):
+        if not callable(log_density):
+            raise TypeError(f"`log_density` must be a function; got {log_density!r}.")
+        if not isinstance(guess, LinearGaussian):
+            raise TypeError(f"`guess` must be a `LinearGaussian`; got {guess!r}.")
+        R = guess.covariance
+        if R is not None and not is_traced(R):
+            if np.any((np.diagonal(R) if R.ndim == 2 else np.asarray(R)) <= 0):
+                raise ValueError(f"`guess` must have positive variances; got {R}.")
+        self._log_density, self.guess = log_density, guess
+
+    @property
+    def linear(self) -> LinearGaussian:
+        """By what paths are guided."""
+        return self.guess
+
+    def check(self, d: int, m: int, like: Array, params: PyTree) -> None:
+        """Raise `ValueError` where observations of m components of a state of d do not fit."""
+        self.guess.check(d, m, like, params)
+
+    def scalars(self, y: Float[Array, " m"], params: PyTree, d: int) -> Scalars:
+        """The guess, as independent numbers."""
+        return self.guess.scalars(y, params, d)
+
+    def correction(
+        self, y: Float[Array, " m"], x: Float[Array, " d"], params: PyTree
+    ) -> Float[Array, ""]:
+        """log g(y | x) - log of the guess."""
+        seen = jnp.any(jnp.isfinite(y))
+        shown = jnp.where(seen, y, jnp.zeros_like(y))
+        true = check_value("log_density", self._log_density(shown, x, params), (), x)
+        guess = log_density_of(self.scalars(y, params, x.shape[0]), x)
+        return jnp.where(seen, true - guess, 0)
+
+
+Observation = LinearGaussian | ObservationDensity
+
+
+def log_density_of(scalars: Scalars, x: Float[Array, " d"]) -> Float[Array, ""]:
+    """The log density of what was seen, given x."""
+    total = jnp.zeros((), x.dtype)
+    for row, value, variance, seen in zip(*scalars, strict=True):
+        residual = value - dot(row, x)
+        each = residual**2 / variance + jnp.log(2 * np.pi * variance)
+        total -= jnp.where(seen, each, 0) / 2
+    return total
+
+
+def check_observation(observation) -> None:
+    """Raise `TypeError` for anything but a way of seeing the state."""
+    if not isinstance(observation, LinearGaussian | ObservationDensity):
+        raise TypeError(
+            "`observation` must be a `LinearGaussian` or an `ObservationDensity`; got "
+            f"{observation!r}."
+        )
+
+
+def _check_covariance(R: Array) -> None:
+    if R.ndim > 2 or (R.ndim == 2 and R.shape[0] != R.shape[1]):
+        raise ValueError(f"`covariance` must have shape (), (m,) or (m, m); got {R.shape}.")
+    if is_traced(R):
+        return
+    known = np.asarray(R, float)
+    if not np.all(np.isfinite(known)):
+        raise ValueError(f"`covariance` must be finite; got {known}.")
+    if known.ndim < 2:
+        good = np.all(known >= 0)
+    else:
+        size = 100 * np.finfo(R.dtype).eps * np.abs(known).max()
+        good = np.abs(known - known.T).max() <= size and np.linalg.eigvalsh(known).min() >= -size
+    if not good:
+        raise ValueError(
+            "`covariance` must be symmetric, without negative variances (zero for what is seen "
+            f"exactly); got {known}."
+        )

@@ -1,0 +1,298 @@
+"""The guided particle filter: the likelihood of a record, however long it is.
+
+P particles take guided steps. At the end of each segment their weights are those of paths that end
+here, tilted by h: of what is seen later they know as much as the linear process does. Where few of
+them count they are resampled, systematically, and go on with equal weights. The product of the
+means of the weights, p̂(y), is unbiased (Del Moral 2004, theorem 7.4.2), up to the step error.
+
+Several filters that know nothing of each other make a mean, and its error is told by their spread:
+what one filter knows of its own error it has from the particles that it did not lose.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..engine.averages import effective_size, normalised
+from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
+from ..engine.lanes import over_lanes
+from ..exact import log_mean_and_error, transition_log_density
+from ..models.diffusion import Diffusion
+from ..schemes import AbstractStepDensity, StepError, dominates, share_of_order
+from .guided_record import Guidance, correction, linearised
+from .guided_steps import guided_step
+from .initial import Initial, log_ratio
+from .observation import Observation
+from .problem import RecordProblem, as_record_problem
+from .segments import split_last
+
+# Particles are resampled where fewer than this share of them count.
+_FEWEST_EFFECTIVE = 0.5
+
+
+class LogLikelihood(eqx.Module):
+    """What `log_likelihood` returns.
+
+    - `value`: log p̂(y); `exp(value)` is unbiased up to the step error. -inf where no particle
+        explains what was seen.
+    - `standard_error`: that of `value`, from the spread of the filters by the delta method;
+        infinite of a single one.
+    - `log_estimates`: log p̂ of each filter, shape (num_filters,).
+    - `effective_sample_size`: how many particles count before each observation is followed by
+        resampling, the mean over the filters, shape (n,).
+    - `num_nonfinite`: how many particles left the finite numbers or the state space.
+    - `step_error`: an estimate of what `value` is too large by for the length of the steps, from
+        half as many, with a standard error of it, `step_uncertainty`. NaN of one step.
+    """
+
+    value: Float[Array, ""]
+    standard_error: Float[Array, ""]
+    log_estimates: Float[Array, " num_filters"]
+    effective_sample_size: Float[Array, " n"]
+    num_nonfinite: Int[Array, ""]
+    step_error: Float[Array, ""]
+    step_uncertainty: Float[Array, ""]
+
+    @property
+    def unexplained(self) -> Int[Array, ""]:
+        """The number of the first observation that no particle explains; -1 where there is none."""
+        lost = self.effective_sample_size == 0
+        return jnp.where(jnp.any(lost), jnp.argmax(lost), -1)
+
+    @property
+    def step_error_dominates(self) -> Bool[Array, ""]:
+        """Whether the step error is beyond the standard error, or not known well enough to say:
+        then more steps help, and more particles do not."""
+        return dominates(StepError(self.step_error, self.step_uncertainty), self.standard_error)
+
+
+def log_likelihood(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    *,
+    observation: Observation | None = None,
+    initial: Initial = None,
+    num_particles: int = 100,
+    num_filters: int = 8,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    initial_time: Numbers | None = None,
+    density: AbstractStepDensity | None = None,
+) -> LogLikelihood:
+    """log p(y) of a record that was seen with noise or in part, unbiased on the natural scale.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
+        `initial_time`, `density`: as in `innovations`.
+        Without an `observation` the state was seen whole and exactly: the sum of the log transition
+        densities by `transition_log_density(proposal="auto")`, given the first.
+    - `num_particles`: of each filter.
+    - `num_filters`: filters that know nothing of each other, whose spread tells the error.
+
+    **Returns:** `LogLikelihood`. For a linear model all weights are equal, and `value` is that of
+    the Kalman filter of the steps. Not differentiable where particles are resampled:
+    `innovations` is.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    seen = jb.LinearGaussian(covariance=0.01)
+    made = jb.log_likelihood(key, model, times, observations, observation=seen)
+    made.value, made.standard_error
+    ```
+    """
+    check_key(key)
+    num_particles = check_count("num_particles", num_particles)
+    num_filters = check_count("num_filters", num_filters)
+    if observation is None:
+        if initial is not None or initial_time is not None or density is not None:
+            raise ValueError(
+                "without an `observation` the first state is given, and steps are those of "
+                "`transition_log_density`: leave out `initial`, `initial_time` and `density`."
+            )
+        return _exact(key, model, times, observations, num_particles, num_steps, step_size)
+    arguments = (model, times, observations, observation, initial)
+    options = {"step_size": step_size, "initial_time": initial_time, "density": density}
+    problem = as_record_problem(*arguments, num_steps=num_steps, **options)
+    size = num_filters, num_particles
+    fine = _estimates(key, problem, linearised(problem, model).guide, *size)
+    log_mean, error, _ = log_mean_and_error(fine.log_estimate[None])
+    step_error = StepError(*2 * [jnp.full_like(log_mean[0], jnp.nan)])
+    if problem.num_steps > 1:
+        halved = problem.halved()
+        coarse = _estimates(key, halved, linearised(halved, model).guide, *size)
+        coarse_mean, coarse_error, _ = log_mean_and_error(coarse.log_estimate[None])
+        share = share_of_order(problem.density.order)
+        doubt = share * jnp.sqrt(coarse_error[0] ** 2 + error[0] ** 2)
+        step_error = StepError(share * (coarse_mean[0] - log_mean[0]), doubt)
+    return LogLikelihood(
+        log_mean[0],
+        error[0],
+        fine.log_estimate,
+        jnp.mean(fine.size, axis=0)[problem.record.which],
+        jnp.sum(fine.num_nonfinite),
+        *step_error,
+    )
+
+
+def _exact(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    num_proposals: int,
+    num_steps: int | None,
+    step_size: float | None,
+) -> LogLikelihood:
+    """Of observations of the whole state without noise."""
+    if step_size is not None:
+        raise ValueError("`step_size` is for records with an `observation`: pass `num_steps`.")
+    times, gaps = time_steps("times", times)
+    points = as_floating("observations", observations)
+    if points.ndim != 2 or points.shape[0] != times.shape[0]:
+        raise ValueError(
+            f"`observations` must have shape ({times.shape[0]}, d), a row for each of `times`; got "
+            f"{points.shape}."
+        )
+    made = transition_log_density(
+        key,
+        model,
+        points[:-1],
+        points[1:],
+        gaps,
+        num_proposals=num_proposals,
+        num_steps=50 if num_steps is None else num_steps,
+        proposal="auto",
+    )
+    value = jnp.sum(made.value)
+    return LogLikelihood(
+        value,
+        jnp.sqrt(jnp.sum(made.standard_error**2)),
+        value[None],
+        made.effective_sample_size,
+        jnp.sum(made.num_nonfinite),
+        jnp.sum(made.step_error),
+        jnp.sqrt(jnp.sum(made.step_uncertainty**2)),
+    )
+
+
+class Filtered(NamedTuple):
+    """What filters estimate: log p̂; the effective number of particles at the ends of segments; and
+    how many were lost."""
+
+    log_estimate: Float[Array, " R"]
+    size: Float[Array, "R ends"]
+    num_nonfinite: Int[Array, " R"]
+
+
+@eqx.filter_jit
+def _estimates(
+    key: Key[Array, ""], problem: RecordProblem, guide: Guidance, R: int, P: int
+) -> Filtered:
+    return run_filters(key, problem, problem.model, guide, R, P)
+
+
+class _Particles(NamedTuple):
+    """Particles of all filters as lanes, and what is known of the filters."""
+
+    x: Float[Array, "d lanes"]
+    log_weight: Float[Array, "R P"]
+    log_estimate: Float[Array, " R"]
+    num_nonfinite: Int[Array, " R"]
+
+
+def run_filters(
+    key: Key[Array, ""], problem: RecordProblem, model: Diffusion, guide: Guidance, R: int, P: int
+) -> Filtered:
+    """R filters of P particles."""
+    d, dtype, values = problem.dim, problem.like.dtype, problem.record.values
+    density, dynamics = problem.density, model.forward(problem.like)
+
+    def corrected(y, x):
+        return jax.vmap(lambda x: correction(problem, model, y, x), in_axes=-1)(x)
+
+    def weighed(state: _Particles, key, change) -> tuple[_Particles, Float[Array, " R"]]:
+        """With what came to the weights, resampled where that is called for."""
+        log_weight = state.log_weight + change.reshape(R, P)
+        finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & ~jnp.isnan(log_weight)
+        log_weight = jnp.where(finite, log_weight, -jnp.inf)
+        lost = jnp.sum(~finite & (state.log_weight > -jnp.inf), axis=1, dtype=jnp.int32)
+        size = effective_size(normalised(log_weight))
+        state = state._replace(log_weight=log_weight, num_nonfinite=state.num_nonfinite + lost)
+        poor = size < _FEWEST_EFFECTIVE * P
+        resample = lambda: _resampled(key, state, poor)
+        return lax.cond(jnp.any(poor), resample, lambda: state), size
+
+    def one(state, inputs):
+        x, log_weight = state
+        zeta, step = inputs
+
+        def of_particle(x, zeta):
+            law = guided_step(density, dynamics, x, step, None)
+            return law.point(zeta), law.log_weight
+
+        x, change = over_lanes(-1, -1)(of_particle)(x, zeta)
+        return (x, log_weight + change), None
+
+    def segment(state: _Particles, inputs):
+        number, steps, scalars, y = inputs
+        noise_key, resampling_key = jax.random.split(jax.random.fold_in(key, number))
+        noise = jax.random.normal(noise_key, (problem.num_steps, d, R * P), dtype)
+        before, (zeta, last) = split_last((noise, steps))
+        (x, change), _ = lax.scan(one, (state.x, jnp.zeros(R * P, dtype)), before)
+
+        def of_particle(x, zeta):
+            law = guided_step(density, dynamics, x, last, scalars)
+            return law.point(zeta), law.log_weight
+
+        x, final = over_lanes(-1, -1)(of_particle)(x, zeta)
+        change = change + final + corrected(y, x)
+        return weighed(state._replace(x=x), resampling_key, change)
+
+    start_key, resampling_key = jax.random.split(jax.random.fold_in(key, 0))
+    zeta = jax.random.normal(start_key, (d, R * P), dtype)
+    x = over_lanes(-1)(guide.start.point)(zeta)
+    zero = jnp.zeros(R, dtype)
+    state = _Particles(x, jnp.zeros((R, P), dtype), zero, jnp.zeros(R, jnp.int32))
+    ratio = lambda x: log_ratio(problem.initial, model, guide.initial, x)
+    change = guide.start.log_weight + corrected(values[0], x) + jax.vmap(ratio, in_axes=-1)(x)
+    state, first = weighed(state, resampling_key, change)
+    numbers = 1 + jnp.arange(problem.num_segments)
+    inputs = (numbers, guide.steps, guide.scalars, values[1:])
+    state, sizes = lax.scan(segment, state, inputs)
+    log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
+    sizes = jnp.concatenate([first[None], sizes]).T
+    return Filtered(state.log_estimate + log_mean, sizes, state.num_nonfinite)
+
+
+def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) -> _Particles:
+    """Those filters whose particles are poor with particles that are alike."""
+    R, P = state.log_weight.shape
+    dtype = state.log_weight.dtype
+    weights = normalised(state.log_weight)
+    uniform = jax.random.uniform(key, (R, 1), dtype)
+    positions = (uniform + jnp.arange(P, dtype=dtype)) / P
+    bounds = jnp.cumsum(weights, axis=1)
+    bounds = bounds / jnp.maximum(bounds[:, -1:], jnp.finfo(dtype).tiny)
+    chosen = jax.vmap(jnp.searchsorted)(bounds, positions)
+    chosen = jnp.where(poor[:, None], jnp.minimum(chosen, P - 1), jnp.arange(P))
+    lanes = (jnp.arange(R)[:, None] * P + chosen).ravel()
+    log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
+    # Where no particle is left there is nothing to go on with: the estimate is zero.
+    level = jnp.where(poor, log_mean, 0)
+    fresh = jnp.where(log_mean > -jnp.inf, 0.0, -jnp.inf)[:, None].astype(dtype)
+    log_weight = jnp.where(poor[:, None], fresh, state.log_weight)
+    return state._replace(
+        x=state.x[:, lanes], log_weight=log_weight, log_estimate=state.log_estimate + level
+    )

@@ -1,0 +1,321 @@
+"""New paths for blocks of a record, given both ends of each.
+
+Given its ends a block's path is independent of all others. A record of K segments is cut into
+blocks of J, in two ways, the second shifted by half a block, and all blocks of one cut move at
+once: the end of a block is a state that is seen exactly, its beginning one without noise. Where the
+record begins it is the law of x_0, and where it ends nothing is known. What a block reaches beyond
+the record is filled with steps of length zero.
+
+The path of a block is that of noise ζ ~ N(0, I) with the weight w(ζ), so that
+
+    ζ' = √(1 - β²) ζ + β η,  η ~ N(0, I),    accepted with probability min(1, w(ζ') / w(ζ)),
+
+leaves its law alone (Neal 1998; Cotter, Roberts, Stuart & White 2013), and is accepted often, with
+β = 1 even, where guiding is good. Both paths go through one scan: the old one tells ζ.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..engine.lanes import over_lanes
+from ..exact import acceptance_rate
+from ..models.diffusion import Diffusion
+from .guided_record import correction
+from .guided_steps import Guide, guided_law, guided_start, relative, solve_law, solve_root
+from .information_filter import information_filter
+from .initial import initial_law, log_ratio
+from .linearisation import LinearisedStep, linear_step
+from .observation import Scalars
+from .problem import RecordProblem
+from .segments import following, split_last
+from .tilted_step import NormalStep
+
+# Of the moves: the share accepted to which β is tuned.
+_TARGET = 0.4
+
+
+class Paths(NamedTuple):
+    """Of C chains: x_0, and the points at the ends of all steps."""
+
+    start: Float[Array, "d C"]
+    points: Float[Array, "K N d C"]
+
+
+class Blocks(NamedTuple):
+    """One cut of a record into B blocks of J segments; arrays have blocks in the last axis.
+
+    - `segment`: which segments the blocks are made of, -1 before the record and K after it.
+    - `linear`, `points`, `next_points`, `dt`: of all steps, leading axes (J, N).
+    - `scalars`, `values`: what is seen at the ends of segments, leading axis J.
+    - `first`, `first_value`, `root`: what is seen of x_0, and the root of its law; of other blocks
+        nothing, and zero. `mean`: that of the law of x_0, shape (d,).
+    """
+
+    segment: Int[Array, "J B"]
+    linear: LinearisedStep
+    points: Float[Array, "J N d B"]
+    next_points: Float[Array, "J N d B"]
+    dt: Float[Array, "J N B"]
+    scalars: Scalars
+    values: Float[Array, "J m B"]
+    first: Scalars
+    first_value: Float[Array, "m B"]
+    root: Float[Array, "d d B"]
+    mean: Float[Array, " d"]
+
+
+def cuts(num_segments: int, length: int) -> Int[np.ndarray, "2 J B"]:
+    """Which segments the blocks of each cut are made of."""
+    length = min(length, num_segments)
+    num_blocks = -(-(num_segments + length // 2) // length)
+
+    def cut(offset: int) -> np.ndarray:
+        number = np.arange(num_blocks * length) - offset
+        return np.clip(number, -1, num_segments).reshape(num_blocks, length).T
+
+    return np.stack([cut(0), cut(length // 2)])
+
+
+def blocks_of(
+    problem: RecordProblem,
+    model: Diffusion,
+    points: Float[Array, "points d"],
+    segment: Int[np.ndarray, "J B"],
+) -> Blocks:
+    """The blocks of one cut, linearised along these points."""
+    dynamics, (K, N) = model.forward(problem.like), problem.record.dt.shape
+    outside = (segment < 0) | (segment >= K)
+    inside = np.clip(segment, 0, K - 1)
+    # Outside the record there is one point, and steps of no length.
+    of_step = np.where(outside, np.where(segment < 0, 0, K * N - 1), 0)[:, None]
+    number = np.where(outside[:, None], of_step, inside[:, None] * N + np.arange(N)[:, None])
+    edge = np.where(segment < 0, 0, K * N)[:, None]
+    here = points[np.where(outside[:, None], edge, number)]  # (J, N, B, d)
+    there = points[np.where(outside[:, None], edge, number + 1)]
+    dt = jnp.where(outside[:, None], 0, problem.record.dt.reshape(-1)[number])
+
+    def linear(point, next_point, dt):
+        return linear_step(problem.density, dynamics, point, next_point, dt)
+
+    steps = jax.vmap(jax.vmap(jax.vmap(linear)))(here, there, dt)
+    everything = _filled(jax.vmap(relative)(problem.scalars(model), points[::N]), problem.dim)
+    nothing = Scalars(
+        jnp.zeros_like(everything.rows[0]),
+        jnp.zeros_like(everything.values[0]),
+        jnp.ones_like(everything.variances[0]),
+        jnp.zeros_like(everything.seen[0]),
+    )
+
+    def seen(place: np.ndarray, absent: np.ndarray) -> Scalars:
+        """At these ends of segments, nothing where it is absent; their axes first."""
+
+        def of(all_, none):
+            here = all_[place]
+            return jnp.where(absent.reshape(*absent.shape, *[1] * none.ndim), none, here)
+
+        return jax.tree.map(of, everything, nothing)
+
+    lanes_last = lambda tree, axis: jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), tree)
+    is_first = np.arange(segment.shape[1]) == 0
+    initial = initial_law(problem.initial, model, problem.like)
+    at_end = np.where(outside, 0, inside + 1)
+    values = jnp.where(outside[..., None], jnp.nan, problem.record.values[at_end])
+    return Blocks(
+        jnp.asarray(segment),
+        lanes_last(steps, 2),
+        lanes_last(here, 2),
+        lanes_last(there, 2),
+        dt,
+        lanes_last(seen(at_end, outside), 1),
+        lanes_last(values, 1),
+        lanes_last(seen(np.zeros(len(is_first), int), ~is_first), 0),
+        jnp.where(is_first, problem.record.values[0][:, None], jnp.nan),
+        jnp.where(is_first, initial.root[..., None], 0),
+        initial.mean,
+    )
+
+
+def _filled(scalars: Scalars, num: int) -> Scalars:
+    """With at least so many rows, of which nothing is seen in those that were not there."""
+    lacking = max(num - scalars.values.shape[1], 0)
+    pad = lambda leaf, value: jnp.pad(
+        leaf, [(0, 0), (0, lacking), *[(0, 0)] * (leaf.ndim - 2)], constant_values=value
+    )
+    return Scalars(*(pad(*both) for both in zip(scalars, (0, 0, 1, False), strict=True)))
+
+
+class _State(NamedTuple):
+    """The old and the new path of each lane, and their log weights."""
+
+    old: Float[Array, "d lanes"]
+    new: Float[Array, "d lanes"]
+    log_old: Float[Array, " lanes"]
+    log_new: Float[Array, " lanes"]
+
+
+def move(
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    model: Diffusion,
+    blocks: Blocks,
+    scale: Float[Array, " B"],
+    paths: Paths,
+) -> tuple[Paths, Bool[Array, "B C"]]:
+    """New paths of all blocks, with β = `scale`; and which blocks took theirs."""
+    density, dynamics = problem.density, model.forward(problem.like)
+    (J, B), (K, N), C = blocks.segment.shape, problem.record.dt.shape, paths.start.shape[-1]
+    d, dtype = problem.dim, paths.start.dtype
+    noise_key, start_key, accept_key = jax.random.split(key, 3)
+    spread = lambda tree: jax.tree.map(lambda leaf: jnp.repeat(leaf, C, axis=-1), tree)
+    joined = lambda leaf: leaf.reshape(*leaf.shape[:-2], B * C)
+    # The old paths of the blocks: before the record x_0, after it the last point.
+    padded = jnp.concatenate(
+        [
+            jnp.broadcast_to(paths.start, (1, N, d, C)),
+            paths.points,
+            jnp.broadcast_to(paths.points[-1, -1], (1, N, d, C)),
+        ]
+    )
+    old = joined(jnp.moveaxis(padded[blocks.segment + 1], 1, -2))  # (J, N, d, B C)
+    starts = joined(jnp.moveaxis(padded[jnp.maximum(blocks.segment[0], 0), -1], 0, -2))
+    # Unless the record has ended, the end of a block is seen exactly.
+    is_pinned = spread(blocks.segment[-1] < K - 1)
+    last_point = spread(blocks.next_points[-1, -1])
+    scalars, last = spread(blocks.scalars), jax.tree.map(lambda leaf: leaf[-1], blocks.scalars)
+    pinned = _seen_exactly(old[-1, -1] - last_point, spread(last), is_pinned)
+    scalars = jax.tree.map(lambda leaf, pin: leaf.at[-1].set(pin), scalars, pinned)
+
+    linear, first = spread(blocks.linear), spread(blocks.first)
+    h = information_filter(linear, scalars, _in_lanes)
+    each = (spread(blocks.points), h, spread(blocks.next_points), following(h))
+    guides = Guide(*each, spread(blocks.dt))
+    rho, beta = spread(jnp.sqrt(1 - scale**2)), spread(scale)
+    # Noise that does not move a path may be anything: it stays apart from all that does.
+    nothing = jnp.zeros(blocks.first.values.shape[0], dtype)
+
+    def of_start(x, mean, root, first, point, h, eta, rho, beta):
+        law = guided_start(NormalStep(mean, root), first, point, h)
+        solve = functools.partial(solve_root, root)
+        return law.point(rho * law.noise(x, solve, nothing) + beta * eta), law.log_weight
+
+    is_first = spread(jnp.asarray(np.arange(B) == 0))
+    initial = NormalStep(blocks.mean, blocks.root[..., 0])
+    means = jnp.where(is_first, initial.mean[:, None], starts)
+    h_first = jax.tree.map(lambda leaf: leaf[0, 0], h)
+    eta = jax.random.normal(start_key, starts.shape, dtype)
+    arguments = (starts, means, spread(blocks.root), first, guides.point[0, 0], h_first, eta)
+    new_starts, log_start = over_lanes(*9 * [-1])(of_start)(*arguments, rho, beta)
+    new_starts = jnp.where(is_first, new_starts, starts)
+
+    def corrected(y, x):
+        each = jax.vmap(lambda y, x: correction(problem, model, y, x), in_axes=-1)
+        return each(spread(y), x)
+
+    def at_start(x):
+        ratio = jax.vmap(lambda x: log_ratio(problem.initial, model, initial, x), in_axes=-1)(x)
+        return log_start + corrected(blocks.first_value, x) + jnp.where(is_first, ratio, 0)
+
+    state = _State(starts, new_starts, at_start(starts), at_start(new_starts))
+
+    def step_of(old, new, old_next, eta, guide, scalars, rho, beta):
+        law = density.steps_from(dynamics, old).law(guide.dt)
+        here = guided_law(law, old, guide, scalars)
+        zeta = here.noise(old_next, functools.partial(solve_law, law), nothing)
+        zeta = rho * zeta + beta * eta
+        law = density.steps_from(dynamics, new).law(guide.dt)
+        there = guided_law(law, new, guide, scalars)
+        return there.point(zeta), here.log_weight, there.log_weight
+
+    def advance(state: _State, old_next, eta, guide, scalars) -> _State:
+        axes = (-1, -1, -1, -1, -1, None if scalars is None else -1, -1, -1)
+        arguments = (state.old, state.new, old_next, eta, guide, scalars, rho, beta)
+        new, log_old, log_new = over_lanes(*axes)(step_of)(*arguments)
+        return _State(old_next, new, state.log_old + log_old, state.log_new + log_new)
+
+    def one(state, inputs):
+        old_next, eta, guide = inputs
+        state = advance(state, old_next, eta, guide, None)
+        return state, state.new
+
+    def segment(state, inputs):
+        number, old, guides, scalars, y = inputs
+        eta = jax.random.normal(jax.random.fold_in(noise_key, number), old.shape, dtype)
+        plain, (old_last, eta_last, guide_last) = split_last((old, eta, guides))
+        state, path = lax.scan(one, state, plain)
+        state = advance(state, old_last, eta_last, guide_last, scalars)
+        state = state._replace(
+            log_old=state.log_old + corrected(y, state.old),
+            log_new=state.log_new + corrected(y, state.new),
+        )
+        return state, jnp.concatenate([path, state.new[None]])
+
+    # What is seen at a pinned end weighs both paths alike.
+    inputs = (jnp.arange(J), old, guides, scalars, blocks.values)
+    state, new = lax.scan(segment, state, inputs)
+    rate = acceptance_rate(state.log_old, state.log_new)
+    accepted = jax.random.uniform(accept_key, rate.shape, dtype) < rate  # false for NaN
+    new = jnp.where(accepted, new, old).reshape(J, N, d, B, C)
+    new = jnp.moveaxis(new, 3, 0).reshape(B * J, N, d, C)
+    begin = jnp.argmax(blocks.segment.T.ravel() == 0)
+    start = jnp.where(accepted, new_starts, starts).reshape(d, B, C)[:, 0]
+    return Paths(start, lax.dynamic_slice_in_dim(new, begin, K)), accepted.reshape(B, C)
+
+
+def blocks_of_both_cuts(
+    problem: RecordProblem, model: Diffusion, points: Float[Array, "points d"], length: int
+) -> Blocks:
+    """The blocks of both cuts, in a leading axis."""
+    each = [blocks_of(problem, model, points, cut) for cut in cuts(problem.num_segments, length)]
+    return jax.tree.map(lambda *both: jnp.stack(both), *each)
+
+
+def sweep(
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    model: Diffusion,
+    both: Blocks,
+    log_scales: Float[Array, "2 B"],
+    paths: Paths,
+) -> tuple[Paths, Float[Array, "2 B"]]:
+    """New paths of all blocks of one cut, then of the other, with log β; and the share of chains
+    in which each block took its own."""
+
+    def one(paths, inputs):
+        number, blocks, log_scale = inputs
+        mine = jax.random.fold_in(key, number)
+        paths, accepted = move(mine, problem, model, blocks, jnp.exp(log_scale), paths)
+        return paths, jnp.mean(accepted.astype(log_scale.dtype), axis=1)
+
+    return lax.scan(one, paths, (jnp.arange(2), both, log_scales))
+
+
+def tuned(
+    log_scales: Float[Array, "2 B"], taken: Float[Array, "2 B"], number: Float[Array, ""]
+) -> Float[Array, "2 B"]:
+    """log β after the sweep of this number in a warm-up, in which such shares were accepted."""
+    return jnp.minimum(log_scales + number**-0.6 * (taken - _TARGET), 0)
+
+
+def _in_lanes(function: Callable) -> Callable:
+    return lambda *arguments: over_lanes(*len(arguments) * [-1])(function)(*arguments)
+
+
+def _seen_exactly(
+    point: Float[Array, "d lanes"], otherwise: Scalars, where: Bool[Array, " lanes"]
+) -> Scalars:
+    """The state itself, counted from ξ, as what is seen; in other lanes what is seen there."""
+    d, rows = point.shape[0], otherwise.values.shape[0]
+    exact = Scalars(
+        jnp.broadcast_to(jnp.eye(rows, d, dtype=point.dtype)[..., None], otherwise.rows.shape),
+        jnp.zeros_like(otherwise.values).at[:d].set(point),
+        jnp.ones_like(otherwise.variances).at[:d].set(0),
+        jnp.zeros_like(otherwise.seen).at[:d].set(True),
+    )
+    return jax.tree.map(lambda pin, leaf: jnp.where(where, pin, leaf), exact, otherwise)

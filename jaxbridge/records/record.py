@@ -1,0 +1,157 @@
+"""Times and values as a record of segments, each of the same number of steps.
+
+Between two times that are far apart there are several segments, at whose ends nothing is seen. So
+every record is K segments of N steps, whatever its times, and one program.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..engine.checks import (
+    Numbers,
+    as_floating,
+    check_count,
+    check_increasing,
+    is_traced,
+    steps_of_size,
+    time_steps,
+)
+
+# What the end of a segment costs, in steps.
+_STEPS_PER_SEGMENT = 4
+
+
+class Record(eqx.Module):
+    """K segments of N steps.
+
+    - `times`: t of their ends, shape (K + 1,).
+    - `dt`: the lengths of the steps of each, shape (K, N); a step of length zero stays where it is.
+    - `values`: what is seen at these times, shape (K + 1, m), NaN where nothing is.
+    - `which`: the place of each observation among the ends of segments.
+    """
+
+    times: Float[Array, " ends"]
+    dt: Float[Array, "K N"]
+    values: Float[Array, "ends m"]
+    which: Int[Array, " n"]
+
+    @property
+    def num_steps(self) -> int:
+        """N."""
+        return self.dt.shape[1]
+
+    def grid(self) -> Float[Array, " points"]:
+        """The times of all points."""
+        within = jnp.cumsum(self.dt, axis=1) - self.dt
+        return jnp.append((self.times[:-1, None] + within).ravel(), self.times[-1])
+
+    def halved(self) -> "Record":
+        """The same with half as many steps, for programs that are compiled for N: of each pair the
+        first has length zero, so that the last of a segment has noise to be seen exactly."""
+        odd = self.num_steps % 2
+        both = self.dt[:, odd::2] + self.dt[:, odd + 1 :: 2]
+        pairs = jnp.stack([jnp.zeros_like(both), both], axis=-1).reshape(len(self.dt), -1)
+        return dataclasses.replace(self, dt=jnp.concatenate([self.dt[:, :odd], pairs], axis=1))
+
+
+def as_record(
+    times: Numbers,
+    observations: Numbers,
+    num_steps: int | None,
+    step_size: float | None,
+    initial_time: Numbers | None = None,
+) -> Record:
+    """The record of what was seen, `num_steps` between two times, or so many that none is longer
+    than `step_size`; from `initial_time` on.
+
+    **Raises:** `ValueError` that says what is wrong with which time or observation.
+    """
+    values = as_floating("observations", _filled("observations", observations))
+    times = _filled("times", times)
+    if initial_time is not None:
+        times, values = _from_initial(initial_time, times, values)
+    times, gaps = time_steps("times", times)
+    if times.ndim != 1 or values.ndim != 2 or values.shape[0] != times.shape[0]:
+        raise ValueError(
+            "`times` must have shape (n,) and `observations` (n, m), a row for each of them; got "
+            f"{times.shape} and {values.shape}."
+        )
+    if times.shape[0] < 2 or values.shape[1] == 0:
+        raise ValueError(
+            "a record has two times or more, at each of which there is something to be seen: "
+            f"`observations` have shape {values.shape}."
+        )
+    if not is_traced(times):
+        check_increasing(np.asarray(times), np.asarray(gaps))
+    if not is_traced(values):
+        infinite = np.argwhere(np.isinf(values))
+        if infinite.size:
+            i, j = infinite[0]
+            raise ValueError(f"`observations[{i}, {j}]` is infinite: NaN says it was not seen.")
+    num_steps, segments = _segments(gaps, num_steps, step_size)
+    return _cut(times, gaps, values, num_steps, tuple(segments.tolist()))
+
+
+@eqx.filter_jit
+def _cut(
+    times: Float[Array, " n"],
+    gaps: Float[Array, " gaps"],
+    values: Float[Array, "n m"],
+    num_steps: int,
+    segments: tuple[int, ...],
+) -> Record:
+    """The record, with so many segments to each gap."""
+    dtype = jnp.promote_types(times.dtype, values.dtype)
+    which = np.concatenate([[0], np.cumsum(segments)])
+    ends = jnp.full((which[-1] + 1, values.shape[1]), jnp.nan, dtype).at[which].set(values)
+    gap = np.repeat(np.arange(len(segments)), segments)
+    within = np.concatenate([np.arange(n) for n in segments])
+    dt = (gaps / jnp.asarray(np.array(segments) * num_steps, gaps.dtype))[gap]
+    start = times[gap] + jnp.asarray(within * num_steps, dt.dtype) * dt
+    all_times = jnp.append(start, times[-1])
+    dt = jnp.broadcast_to(dt[:, None], (len(dt), num_steps))
+    return Record(all_times.astype(dtype), dt.astype(dtype), ends, jnp.asarray(which))
+
+
+def _filled(name: str, values: Numbers) -> Numbers:
+    """What a masked array of NumPy holds, with NaN in the place of what is masked."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    if name == "times" and np.ma.getmaskarray(values).any():
+        raise ValueError("`times` has masked entries: leave them out, with their observations.")
+    return np.ma.filled(values.astype(float), np.nan)
+
+
+def _from_initial(initial_time: Numbers, times: Numbers, values: Array) -> tuple[Numbers, Array]:
+    """With a time of its own for the initial law, where that is before all that is seen."""
+    if is_traced(times, initial_time):
+        raise ValueError("`initial_time` must be known when compiling, and so must `times`.")
+    known, first = np.asarray(times), float(np.asarray(initial_time))
+    if not np.isfinite(first) or (known.size and known.flat[0] < first):
+        raise ValueError(
+            f"`times` must begin at `initial_time` = {first} or later; they do at {known.flat[0]}."
+        )
+    if known.ndim != 1 or known.size == 0 or known[0] == first:
+        return times, values
+    nothing = jnp.full((1, *values.shape[1:]), jnp.nan, values.dtype)
+    return np.concatenate([[first], known]), jnp.concatenate([nothing, values])
+
+
+def _segments(
+    gaps: Array, num_steps: int | None, step_size: float | None
+) -> tuple[int, Int[np.ndarray, " n"]]:
+    """N, and of how many segments each gap is made."""
+    if step_size is None:
+        num_steps = check_count("num_steps", 10 if num_steps is None else num_steps)
+        return num_steps, np.ones(gaps.shape[0], int)
+    wanted = steps_of_size(gaps, num_steps, step_size)
+
+    def cost(steps: int) -> int:
+        return int(np.sum(-(-wanted // steps)) * (steps + _STEPS_PER_SEGMENT))
+
+    best = min(np.unique(wanted).tolist(), key=cost)
+    return int(best), -(-wanted // best)

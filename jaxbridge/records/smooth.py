@@ -1,0 +1,154 @@
+"""Paths given a whole record: a Markov chain of paths, which move in blocks (`path_blocks`)."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key, PyTree
+
+from ..engine.averages import PathFunction
+from ..engine.checks import Numbers, check_count, check_key
+from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
+from ..engine.progress import metered_scan
+from ..models.diffusion import Diffusion
+from ..schemes import AbstractStepDensity
+from .guided_record import Linearised, linearised, path_and_log_weight
+from .initial import Initial
+from .observation import Observation
+from .path_blocks import Paths, blocks_of_both_cuts, sweep, tuned
+from .problem import RecordProblem, as_record_problem
+
+
+class Smoothed(eqx.Module):
+    """What `smooth` returns: draws of the path given all that was seen.
+
+    - `times`: of the points, shape (K,).
+    - `paths`: shape (chains, n, K, d).
+    - `accepted`: the share of moves that were accepted, of each block in both ways to cut the
+        record into blocks, shape (2, B).
+    """
+
+    times: Float[Array, " K"]
+    paths: Float[Array, "chains n K d"]
+    accepted: Float[Array, "2 B"]
+
+    def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """The mean of `fn(path)`, a function of one path of shape (K, d), by default itself."""
+        return jax.tree.map(lambda leaf: jnp.mean(leaf, axis=(0, 1)), self._values(fn))
+
+    def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """The Monte Carlo error of `mean(fn)`, entry by entry."""
+
+        def error(leaf):
+            return jnp.std(leaf, axis=(0, 1)) / jnp.sqrt(_effective(leaf))
+
+        return jax.tree.map(error, self._values(fn))
+
+    def effective_sample_size(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """How many independent draws of `fn(path)` these are worth, entry by entry."""
+        return jax.tree.map(_effective, self._values(fn))
+
+    def r_hat(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """R̂ of `fn(path)`, from the halves of all chains: near one if they agree."""
+        return jax.tree.map(potential_scale_reduction, self._values(fn))
+
+    def _values(self, fn: PathFunction) -> PyTree:
+        return jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, self.paths.dtype), jax.vmap(jax.vmap(fn))(self.paths)
+        )
+
+
+def _effective(values: Float[Array, "chains n ..."]) -> Float[Array, "..."]:
+    return jnp.sum(jax.vmap(effective_sample_size)(values), axis=0)
+
+
+def smooth(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    *,
+    observation: Observation,
+    initial: Initial = None,
+    num_draws: int = 1000,
+    num_warmup: int = 200,
+    num_chains: int = 4,
+    block_length: int = 10,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    initial_time: Numbers | None = None,
+    density: AbstractStepDensity | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> Smoothed:
+    """Draws of the path given a whole record, exact in the limit of many, up to the step error.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
+        `initial_time`, `density`: as in `innovations`.
+    - `num_draws`: of each chain, after `num_warmup` in which the size of moves is learnt.
+    - `num_chains`: chains, which start from guided paths that know nothing of each other.
+    - `block_length`: how many intervals between observations move at once.
+    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+
+    **Returns:** `Smoothed`. Not differentiable: `innovations` is.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+
+    **Example:**
+
+    ```python
+    seen = jb.LinearGaussian(covariance=0.01)
+    made = jb.smooth(key, model, times, observations, observation=seen, num_draws=500)
+    made.mean(), made.standard_error()
+    ```
+    """
+    check_key(key)
+    counts = (check_count("num_draws", num_draws), check_count("num_warmup", num_warmup, 0))
+    num_chains = check_count("num_chains", num_chains)
+    block_length = check_count("block_length", block_length, 2)
+    arguments = (model, times, observations, observation, initial)
+    options = {"step_size": step_size, "initial_time": initial_time, "density": density}
+    problem = as_record_problem(*arguments, num_steps=num_steps, any_constant=True, **options)
+    made = linearised(problem, model)
+    return _smooth(key, problem, made, counts, num_chains, block_length, progress_meter)
+
+
+@eqx.filter_jit
+def _smooth(
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    made: Linearised,
+    counts: tuple[int, int],
+    num_chains: int,
+    block_length: int,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> Smoothed:
+    model, (num_draws, num_warmup) = problem.model, counts
+    points, guide = made
+    start_key, key = jax.random.split(key)
+
+    def first(key):
+        noise = jax.random.normal(key, points.shape, points.dtype)
+        path, log_weight = path_and_log_weight(problem, model, guide, noise)
+        return jnp.where(jnp.isfinite(log_weight), path, points)
+
+    firsts = jnp.moveaxis(jax.vmap(first)(jax.random.split(start_key, num_chains)), 0, -1)
+    (K, N), d = problem.record.dt.shape, problem.dim
+    paths = Paths(firsts[0], firsts[1:].reshape(K, N, d, num_chains))
+    both = blocks_of_both_cuts(problem, model, points, block_length)
+
+    def step(state, i):
+        paths, log_scales = state
+        mine = jax.random.fold_in(key, i)
+        paths, taken = sweep(mine, problem, model, both, log_scales, paths)
+        learnt = tuned(log_scales, taken, (i + 1).astype(points.dtype))
+        path = jnp.concatenate([paths.start[None], paths.points.reshape(K * N, d, num_chains)])
+        log_scales = jnp.where(i < num_warmup, learnt, log_scales)
+        return (paths, log_scales), (jnp.moveaxis(path, -1, 0), taken)
+
+    init = paths, jnp.zeros((2, both.segment.shape[-1]), points.dtype)
+    _, made = metered_scan(step, init, jnp.arange(num_warmup + num_draws), progress_meter)
+    drawn, taken = jax.tree.map(lambda leaf: leaf[num_warmup:], made)
+    return Smoothed(problem.record.grid(), jnp.moveaxis(drawn, 1, 0), jnp.mean(taken, axis=0))

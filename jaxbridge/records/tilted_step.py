@@ -1,0 +1,144 @@
+"""A normal step, given what is seen at its end, and tilted by what is seen later.
+
+Points are counted from a point ξ' of the path along which the process is linearised, u = x' - ξ'.
+A step u ~ N(e, Λ Λᵀ), Λ of shape (d, m), given a number y = c·u + N(0, ρ) is, with b = Λᵀc and
+s = |b|² + ρ,
+
+    N(e + Λ b (y - c·e) / s, Λ⁺ Λ⁺ᵀ),    Λ⁺ = Λ (I - b bᵀ / (s (1 + √(ρ/s)))),
+
+which is Potter's square root (Bierman 1977, chapter V), and is right for ρ = 0: then Λ⁺ᵀ c = 0.
+Tilted by h(u) = exp(rᵀu - ½ uᵀH u), with M = I + ΛᵀHΛ = ℛ ℛᵀ and v = ℛ⁻¹ Λᵀ (r - He), it is
+
+    e + Λ ℛ⁻ᵀ (v + ζ),  ζ ~ N(0, I),    ∫ h dN = exp(rᵀe - ½ eᵀHe + ½ |v|²) / det ℛ.
+
+Neither calls for an inverse of Λ, so it may be singular, zero, or of fewer columns than rows.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ..engine.linalg import (
+    cholesky,
+    dot,
+    log_of_product,
+    matmul,
+    matvec,
+    solve_lower,
+    solve_lower_transposed,
+)
+from .observation import Scalars
+
+
+class Information(NamedTuple):
+    """log h(u) = rᵀu - ½ uᵀH u + constant."""
+
+    shift: Float[Array, " d"]
+    precision: Float[Array, "d d"]
+
+    def log(self, u: Float[Array, " d"]) -> Float[Array, ""]:
+        """log h(u)."""
+        return dot(self.shift, u) - dot(u, matvec(self.precision, u)) / 2
+
+
+class NormalStep(NamedTuple):
+    """N(e, Λ Λᵀ)."""
+
+    mean: Float[Array, " d"]
+    root: Float[Array, "d m"]
+
+
+class Seen(NamedTuple):
+    """What one number that was seen makes of Λ: b, the factor of b bᵀ in Λ⁺, Λ b / s and s; and
+    √(ρ/s)."""
+
+    along: Float[Array, " m"]
+    factor: Float[Array, ""]
+    gain: Float[Array, " d"]
+    variance: Float[Array, ""]
+    left: Float[Array, ""]
+
+
+def seen_of(root: Float[Array, "d m"], row: Float[Array, " d"], variance) -> Seen:
+    """Of a number c·u + N(0, ρ)."""
+    along = matvec(root.T, row)
+    total = dot(along, along) + variance
+    ratio = variance / total
+    exact = ratio <= 0
+    left = jnp.where(exact, 0, jnp.sqrt(jnp.where(exact, 1, ratio)))
+    return Seen(along, 1 / (total * (1 + left)), matvec(root, along) / total, total, left)
+
+
+def root_after(root: Float[Array, "d m"], seen: Seen) -> Float[Array, "d m"]:
+    """Λ⁺."""
+    return root - seen.factor * matvec(root, seen.along)[:, None] * seen.along
+
+
+def given(step: NormalStep, scalars: Scalars) -> tuple[NormalStep, Float[Array, ""], list[Seen]]:
+    """The step given what is seen at its end, relative to ξ' as it is; and the log density of
+    that."""
+    log_density, each = jnp.zeros((), step.mean.dtype), []
+    for row, value, variance, is_seen in zip(*scalars, strict=True):
+        seen = seen_of(step.root, row, variance)
+        residual = value - dot(row, step.mean)
+        log = residual**2 / seen.variance + jnp.log(2 * np.pi * seen.variance)
+        log_density -= jnp.where(is_seen, log, 0) / 2
+        step = NormalStep(step.mean + seen.gain * residual, root_after(step.root, seen))
+        each.append(seen)
+    return step, log_density, each
+
+
+class Tilted(NamedTuple):
+    """A step tilted by h: its mean e and root Λ before, ℛ and v, and log ∫ h dN."""
+
+    step: NormalStep
+    factor: Float[Array, "m m"]
+    shift: Float[Array, " m"]
+    log_integral: Float[Array, ""]
+
+    def point(self, zeta: Float[Array, " m"]) -> Float[Array, " d"]:
+        """e + Λ ℛ⁻ᵀ (v + ζ)."""
+        pulled = solve_lower_transposed(self.factor, self.shift + zeta)
+        return self.step.mean + matvec(self.step.root, pulled)
+
+    def noise(self, pulled: Float[Array, " m"]) -> Float[Array, " m"]:
+        """ζ of ℛ⁻ᵀ (v + ζ)."""
+        return matvec(self.factor.T, pulled) - self.shift
+
+
+def tilt_factor(
+    root: Float[Array, "d m"], h: Information
+) -> tuple[Float[Array, "m m"], Float[Array, "d m"]]:
+    """ℛ of I + ΛᵀHΛ = ℛ ℛᵀ, and HΛ."""
+    half = matmul(h.precision, root)
+    K = matmul(root.T, half)
+    return cholesky(jnp.eye(K.shape[0], dtype=K.dtype) + (K + K.T) / 2), half
+
+
+def tilted(step: NormalStep, h: Information) -> Tilted:
+    """The step tilted by h."""
+    e, root = step
+    factor, _ = tilt_factor(root, h)
+    v = solve_lower(factor, matvec(root.T, h.shift - matvec(h.precision, e)))
+    log_det = log_of_product([factor[j, j] for j in range(factor.shape[0])])
+    return Tilted(step, factor, v, h.log(e) + dot(v, v) / 2 - log_det)
+
+
+def coordinates(
+    displacement: Float[Array, " m"], each: list[Seen], hidden: Float[Array, " n"]
+) -> Float[Array, " m"]:
+    """q of Λ⁺ q = Λ `displacement`, with what is seen as `given` has it. Along what is seen exactly
+    q moves nothing, and is `hidden`, of which there is a number for each that is seen: under the
+    law of the noise it is N(0, 1), and independent of the path."""
+    q = displacement
+    for seen, free in zip(each, hidden, strict=True):
+        square, exact = dot(seen.along, seen.along), seen.left == 0
+        some = square > 0
+        share = dot(seen.along, q) / jnp.where(some, square, 1)
+        kept = share / jnp.where(exact, 1, seen.left)
+        wanted = jnp.where(exact, free * lax.rsqrt(jnp.where(some, square, 1)), kept)
+        q = q + jnp.where(some, wanted - share, 0) * seen.along
+    return q

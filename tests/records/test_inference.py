@@ -1,0 +1,165 @@
+"""Posteriors from records with noise, against the likelihood of the Kalman filter on a grid."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from kalman import exact_step, kalman
+
+import jaxbridge as jb
+from jaxbridge.records import (
+    as_record_problem,
+    linearised,
+    noise_and_log_weight,
+    path_and_log_weight,
+)
+
+TRUE = {"log_rate": 0.0, "log_sigma": 0.0, "log_noise": np.log(0.3)}
+TIMES = np.arange(40) * 0.4
+
+
+def model(params=None):
+    """dX = -rate X dt + sigma dW, with its noise among its parameters."""
+    return jb.Diffusion(
+        lambda x, p: -jnp.exp(p["log_rate"]) * x,
+        lambda x, p: jnp.exp(p["log_sigma"]) * jnp.ones(1),
+        lambda x, p: jnp.sum(
+            -(x**2) * jnp.exp(p["log_rate"] - 2 * p["log_sigma"])
+            + (p["log_rate"] - 2 * p["log_sigma"] - jnp.log(jnp.pi)) / 2
+        ),
+        params={name: float(value) for name, value in (params or TRUE).items()},
+        reversible=True,
+        normalised=True,
+    )
+
+
+SEEN = jb.LinearGaussian(covariance=lambda params: jnp.exp(2 * params["log_noise"]))
+
+
+@functools.cache
+def record():
+    rng = np.random.default_rng(5)
+    x, values = rng.normal() * np.sqrt(0.5), []
+    decay = np.exp(-0.4)
+    for _ in TIMES:
+        values.append(x + 0.3 * rng.normal())
+        x = decay * x + np.sqrt((1 - decay**2) / 2) * rng.normal()
+    values = np.array(values)[:, None]
+    values[7] = np.nan
+    return values
+
+
+def kalman_log_likelihood(log_rate, log_sigma, log_noise):
+    rate, sigma, noise = np.exp([log_rate, log_sigma, log_noise])
+    step = exact_step(np.array([[rate]]), np.array([[sigma**2]]))
+    spread = np.array([[sigma**2 / (2 * rate)]])
+    seen = (TIMES, record(), np.eye(1), np.array([[noise**2]]))
+    return kalman(step, *seen, np.zeros(1), spread, 1).log_likelihood
+
+
+def log_prior(params):
+    return -sum((params[name] - TRUE[name]) ** 2 for name in TRUE) / 2
+
+
+@functools.cache
+def exact_posterior():
+    """Means and sds of (log_noise, log_rate, log_sigma), by quadrature."""
+    axes = [np.linspace(-reach, reach, num) for reach, num in [(2.5, 15), (1.4, 15), (4, 21)]]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    points = grid + np.array([TRUE["log_rate"], TRUE["log_sigma"], TRUE["log_noise"]])
+    log = np.array([kalman_log_likelihood(*point) for point in points]) - (grid**2).sum(1) / 2
+    weights = np.exp(log - log.max())
+    weights /= weights.sum()
+    points = points[:, [2, 0, 1]]  # in alphabetical order
+    mean = weights @ points
+    return mean, np.sqrt(weights @ (points - mean) ** 2)
+
+
+@pytest.mark.slow
+def test_the_likelihood_follows_its_parameters():
+    other = {"log_rate": 0.4, "log_sigma": -0.3, "log_noise": -0.8}
+    made = jb.log_likelihood(
+        jax.random.key(0), model(other), TIMES, record(), observation=SEEN, num_particles=5
+    )
+    exact = kalman_log_likelihood(*other.values())
+    assert abs(made.value - exact) < 2e-3  # that of ten second order steps
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.parametrize("method", ["pmmh", "gibbs"])
+def test_rate_sigma_and_noise_are_found(method):
+    options = {"pmmh": {"num_proposals": 4}, "gibbs": {"thin": 2}}[method]
+    posterior = getattr(jb, method)(
+        jax.random.key(0), model(), TIMES, record(), observation=SEEN, prior=log_prior,
+        num_iterations=6000, num_warmup=1000, num_chains=4, num_steps=5, **options,
+    )  # fmt: skip
+    mean, sd = exact_posterior()
+    assert np.all(posterior.r_hat < 1.03)
+    error = np.asarray(posterior.standard_error)
+    theta = np.asarray(posterior.theta).reshape(-1, 3)
+    np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error + 0.02 * sd)
+    np.testing.assert_array_less(error, 0.1 * sd)
+    np.testing.assert_allclose(theta.std(0), sd, rtol=0.1)
+
+
+def test_gradients_are_those_of_differences(x64):
+    values = record()[:8]
+    paths = jb.innovations(model(), TIMES[:8], values, observation=SEEN, num_steps=3)
+    xi = jax.random.normal(jax.random.key(1), (paths.size,))
+    theta = jax.tree.map(jnp.asarray, model().params)
+
+    def density(move, along):
+        moved = jax.tree.map(lambda leaf, a: leaf + move * a, theta, {**along})
+        return paths.log_density(moved, xi + move * jnp.sin(jnp.arange(paths.size)))
+
+    along = {"log_rate": 1.0, "log_sigma": -0.7, "log_noise": 0.5}
+    slope = jax.jit(jax.grad(density))(0.0, along)
+    value = jax.jit(density)
+    differences = (value(1e-4, along) - value(-1e-4, along)) / 2e-4
+    assert abs(slope - differences) < 1e-6 * abs(slope)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_nuts_finds_them_too():
+    """The ten lines that any sampler needs: BlackJAX's, on parameters and noise."""
+    import blackjax
+
+    paths = jb.innovations(model(), TIMES, record(), observation=SEEN, num_steps=2)
+
+    def log_posterior(position):
+        params, xi = position
+        return log_prior(params) + paths.log_density(params, xi)
+
+    with jax.numpy_dtype_promotion("standard"):
+        start = (jax.tree.map(jnp.asarray, model().params), jnp.zeros(paths.size))
+        warmup = blackjax.window_adaptation(blackjax.nuts, log_posterior)
+        (state, found), _ = warmup.run(jax.random.key(0), start, 300)
+        kernel = blackjax.nuts(log_posterior, **found)
+
+        def step(state, key):
+            state, _ = kernel.step(key, state)
+            return state, state.position[0]
+
+        _, drawn = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 1000))
+    theta = np.stack([drawn[name] for name in sorted(drawn)], -1)
+    size = np.asarray(jb.effective_sample_size(theta))
+    mean, sd = exact_posterior()
+    assert np.all(size > 50)
+    np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * sd / np.sqrt(size) + 0.05 * sd)
+
+
+@pytest.mark.slow
+def test_noise_is_that_which_makes_the_path():
+    """The inverse of `path_and_log_weight`, to rounding, where noise moves the path everywhere."""
+    values, law = record()[:6], jb.GaussianLaw([0.0], [[0.5]])
+    problem = as_record_problem(model(), TIMES[:6], values, SEEN, law, num_steps=3)
+    points, guide = jax.jit(lambda: linearised(problem, model()))()
+    noise = jax.random.normal(jax.random.key(2), points.shape)
+    path, log_weight = path_and_log_weight(problem, model(), guide, noise)
+    again, same = noise_and_log_weight(jax.random.key(3), problem, model(), guide, path)
+    np.testing.assert_allclose(again, noise, atol=1e-4)
+    assert abs(log_weight - same) < 1e-4

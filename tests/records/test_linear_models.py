@@ -1,0 +1,108 @@
+"""Where everything is linear: likelihoods are Kalman's, and paths those of the smoother.
+
+Weights that are all equal leave no room for error: what is off anywhere shows in the sixth digit.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import slow_beyond
+from linear_records import four, plane
+
+import jaxbridge as jb
+
+KEY = jax.random.key(0)
+RECORDS = {"plane": plane(), "exact part": plane(exact_part=True), "four": four()}
+NAMES = slow_beyond(1, RECORDS)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_filter_is_kalmans(name):
+    record = RECORDS[name]
+    made = jb.log_likelihood(
+        KEY,
+        *record.arguments,
+        **record.options,
+        num_steps=40,
+        num_particles=10,
+        density=jb.EulerDensity(),
+    )
+    euler, exact = record.kalman(40), record.kalman(40, exact=True)
+    size = abs(euler.log_likelihood)
+    assert abs(made.value - euler.log_likelihood) < 1e-4 * max(size, 1)
+    assert np.ptp(np.asarray(made.log_estimates)) < 1e-5 * max(size, 1)  # weights all equal
+    np.testing.assert_allclose(made.effective_sample_size, 10, rtol=1e-3)
+    assert made.num_nonfinite == 0 and made.unexplained == -1
+    # The step error is told, to its leading term.
+    true = float(made.value) - exact.log_likelihood
+    assert abs(made.step_error - true) < 0.5 * abs(true)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RECORDS)
+def test_the_default_steps_are_of_second_order(name):
+    record = RECORDS[name]
+    options = {**record.options, "num_particles": 10, "num_steps": 20}
+    made = jb.log_likelihood(KEY, *record.arguments, **options)
+    exact, euler = record.kalman(20, exact=True), record.kalman(20)
+    error = abs(float(made.value) - exact.log_likelihood)
+    assert error < 0.1 * abs(euler.log_likelihood - exact.log_likelihood)
+    assert abs(made.step_error) > 0.5 * error
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RECORDS)
+def test_innovations_are_weighted_alike(name):
+    record = RECORDS[name]
+    paths = jb.innovations(
+        *record.arguments, **record.options, num_steps=10, density=jb.EulerDensity()
+    )
+    xi = jax.random.normal(KEY, (5, paths.size))
+    log_weights = jax.jit(jax.vmap(lambda xi: paths.log_weight(record.model.params, xi)))(xi)
+    exact = record.kalman(10).log_likelihood
+    np.testing.assert_allclose(log_weights, exact, rtol=2e-5)
+    assert paths.times.shape == (len(record.times) * 10 - 9,)
+    np.testing.assert_allclose(paths.times[::10], record.times, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_smoothed_paths_are_those_of_rauch_tung_and_striebel(name):
+    record = RECORDS[name]
+    made = jb.smooth(
+        KEY,
+        *record.arguments,
+        **record.options,
+        num_steps=5,
+        num_draws=500,
+        num_warmup=50,
+        density=jb.EulerDensity(),
+    )
+    exact = record.kalman(5)
+    sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
+    moving = sd > 1e-3
+    error = np.asarray(made.standard_error())
+    z = (np.asarray(made.mean()) - exact.mean)[moving] / error[moving]
+    assert np.max(np.abs(z)) < 5 and np.std(z) < 1.5
+    ratio = np.asarray(jnp.std(made.paths, axis=(0, 1)))[moving] / sd[moving]
+    size = np.asarray(made.effective_sample_size())[moving]
+    assert np.max(np.abs(ratio - 1) * np.sqrt(2 * size)) < 6
+    assert np.all(made.accepted[made.accepted > 0] > 0.99)  # guiding is exact here
+    if name == "exact part":
+        seen = np.isfinite(record.values[:, 0])
+        shown = np.asarray(made.paths[:, :, ::5]) @ record.matrix[0]
+        np.testing.assert_allclose(
+            shown[..., seen], np.broadcast_to(record.values[seen, 0], shown[..., seen].shape),
+            atol=1e-5,
+        )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_where_nothing_is_seen_paths_are_those_of_the_model():
+    model = jb.ornstein_uhlenbeck([[1.0]])
+    nothing = np.full((5, 1), np.nan)
+    options = {"observation": jb.LinearGaussian(covariance=0.1), "num_steps": 4}
+    made = jb.log_likelihood(KEY, model, np.arange(5.0), nothing, num_particles=4, **options)
+    assert abs(made.value) < 1e-5
+    paths = jb.smooth(KEY, model, np.arange(5.0), nothing, num_draws=500, **options).paths
+    assert abs(float(jnp.var(paths)) - 0.5) < 0.06  # step error and noise

@@ -1,0 +1,162 @@
+"""Where nothing is linear: against filters and smoothers on a grid."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from grid_filter import grid_filter
+from helpers import slow_beyond
+from scipy.special import gammaln
+
+import jaxbridge as jb
+
+KEY = jax.random.key(0)
+
+
+class Case(NamedTuple):
+    model: jb.Diffusion
+    drift: object
+    variance: object
+    nodes: np.ndarray
+    observation: object
+    log_density: object  # of values (n, 1) at nodes, NaN where nothing was seen
+    draw: object
+    start: float
+    gap: float
+    num: int = 25
+
+    @property
+    def times(self):
+        return np.arange(self.num) * self.gap
+
+
+def normal_density(noise):
+    def log_density(values, nodes):
+        log = -((values - nodes) ** 2) / (2 * noise**2) - np.log(noise * np.sqrt(2 * np.pi))
+        return np.where(np.isnan(values), 0, log)
+
+    return log_density
+
+
+def double_well():
+    """dX = 2 X (1 - X²) dt + .8 dW, with noise that hides in which well it is now and then."""
+    return Case(
+        jb.Diffusion(lambda x, p: 2 * x * (1 - x**2), [0.8]),
+        lambda x: 2 * x * (1 - x**2),
+        lambda x: np.full_like(x, 0.64),
+        np.linspace(-3, 3, 601),
+        jb.LinearGaussian(covariance=0.3**2),
+        normal_density(0.3),
+        lambda rng, x: x + 0.3 * rng.normal(),
+        -1.0,
+        0.4,
+    )
+
+
+def bent():
+    """σ(x) = .4 √(1 + x²), and a drift that bends."""
+    return Case(
+        jb.Diffusion(lambda x, p: jnp.sin(2 * x) - x, lambda x, p: 0.4 * jnp.sqrt(1 + x**2)),
+        lambda x: np.sin(2 * x) - x,
+        lambda x: 0.16 * (1 + x**2),
+        np.linspace(-4, 4, 801),
+        jb.LinearGaussian(covariance=0.2**2),
+        normal_density(0.2),
+        lambda rng, x: x + 0.2 * rng.normal(),
+        0.5,
+        0.5,
+    )
+
+
+def counts():
+    """An Ornstein–Uhlenbeck process that is the log of the rate at which something is counted."""
+
+    def log_density(values, nodes):
+        log = values * (nodes + 1) - np.exp(nodes + 1) - gammaln(values + 1)
+        return np.where(np.isnan(values), 0, log)
+
+    return Case(
+        jb.Diffusion(lambda x, p: -x, [0.9]),
+        lambda x: -x,
+        lambda x: np.full_like(x, 0.81),
+        np.linspace(-4, 4, 801),
+        jb.ObservationDensity(
+            lambda y, x, p: jax.scipy.stats.poisson.logpmf(y[0], jnp.exp(x[0] + 1)),
+            guess=jb.LinearGaussian([[3.0]], covariance=9.0),
+        ),
+        log_density,
+        lambda rng, x: rng.poisson(np.exp(x + 1)),
+        0.3,
+        0.3,
+    )
+
+
+CASES = {"double well": double_well, "bent": bent, "counts": counts}
+
+
+@functools.cache
+def recorded(name):
+    """What was seen, and what the grid makes of it."""
+    case = CASES[name]()
+    rng, x, values = np.random.default_rng(3), case.start, []
+    for _ in range(case.num):
+        values.append(case.draw(rng, x))
+        for _ in range(200):
+            dt = case.gap / 200
+            x += case.drift(x) * dt + np.sqrt(case.variance(np.array(x)) * dt) * rng.normal()
+    values = np.array(values, float)[:, None]
+    values[4] = np.nan
+    nodes = case.nodes
+    initial = np.exp(-((nodes - case.start) ** 2) / 0.5)
+    logs = case.log_density(values, nodes)
+    gaps = np.diff(case.times)
+    return case, values, grid_filter(case.drift, case.variance, nodes, initial, gaps, logs)
+
+
+def options(case):
+    law = jb.GaussianLaw([case.start], [[0.25]])
+    return {"observation": case.observation, "initial": law}
+
+
+@pytest.mark.parametrize("name", slow_beyond(1, CASES))
+def test_likelihoods(name):
+    case, values, exact = recorded(name)
+    made = jb.log_likelihood(
+        KEY, case.model, case.times, values, **options(case), num_steps=20, num_particles=1000
+    )
+    assert made.standard_error < 0.1 and made.num_nonfinite == 0
+    error = 4.5 * made.standard_error + abs(made.step_error) + 2 * made.step_uncertainty
+    assert abs(made.value - exact.log_likelihood) < error
+    assert error < 0.6
+    assert np.all(made.effective_sample_size > 10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_smoothed_paths(name):
+    case, values, exact = recorded(name)
+    made = jb.smooth(
+        KEY, case.model, case.times, values, **options(case), num_steps=20, num_draws=1500
+    )
+    at_times = lambda path: path[::20, 0]
+    mean = exact.weights @ exact.nodes
+    second = exact.weights @ exact.nodes**2
+    assert np.all(made.r_hat(at_times) < 1.05)
+    for fn, wanted in [(at_times, mean), (lambda path: at_times(path) ** 2, second)]:
+        allowance = 4.5 * made.standard_error(fn) + 0.02 * np.sqrt(second - mean**2).max()
+        assert np.all(np.abs(made.mean(fn) - wanted) < allowance)
+
+
+@pytest.mark.slow
+def test_what_no_particle_explains_is_said():
+    model = jb.ornstein_uhlenbeck([[1.0]])
+    flat = jb.ObservationDensity(
+        lambda y, x, p: jnp.where(x[0] > 50, 0.0, -jnp.inf), jb.LinearGaussian(covariance=1.0)
+    )
+    made = jb.log_likelihood(
+        KEY, model, np.arange(4.0), np.zeros((4, 1)), observation=flat, num_particles=10
+    )
+    assert made.value == -jnp.inf and made.unexplained == 0
