@@ -10,6 +10,11 @@ from jaxtyping import Array, Bool, Float, Inexact, PyTree, Shaped
 PathFunction = Callable[[Array], PyTree]
 
 
+def proper(log_weights: Float[Array, "*I"]) -> Float[Array, "*I"]:
+    """Log weights; -inf, no weight, where one is NaN or +inf."""
+    return jnp.where(log_weights < jnp.inf, log_weights, -jnp.inf)
+
+
 def normalised(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I n"]:
     """The weights, normalised to sum to one; all zero where nothing has weight."""
     largest = jnp.max(log_weights, axis=-1, keepdims=True)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
+from ..engine.averages import proper
 from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
@@ -81,12 +82,8 @@ class RecordLikelihood(AbstractLikelihood):
     def estimate(self, key, model):
         guide = guided(self.problem, model, self.points)
         made = run_filters(key, self.problem, model, guide, 1, self.num_particles)
-        value = made.log_estimate[0]
-        value = jnp.where(jnp.isnan(value), -jnp.inf, value)
+        value, variance = proper(made.log_estimate[0]), made.variance(self.num_particles)[0]
         unknown = jnp.full_like(value, jnp.nan)
-        # What the particles that count are worth, as if none had been resampled.
-        share = jnp.where(made.size[0] > 0, made.size[0] / self.num_particles, 1)
-        variance = jnp.sum(1 / share - 1) / self.num_particles
         return Estimate(value, variance, unknown, jnp.int32(0))
 
     @property

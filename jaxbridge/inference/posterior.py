@@ -54,9 +54,12 @@ class AbstractPosterior(eqx.Module):
 
     @property
     def standard_error(self) -> Float[Array, " p"]:
-        """The Monte Carlo error of the posterior mean of each unknown parameter."""
+        """The Monte Carlo error of the posterior mean of each unknown parameter; infinite where it
+        never moved in one of the chains."""
         draws = self.theta.reshape(-1, self.theta.shape[-1])
-        return jnp.std(draws, axis=0) / jnp.sqrt(self.effective_sample_size)
+        moved = jnp.all(jnp.any(self._chains != self._chains[:, :1], axis=1), axis=0)
+        made = jnp.std(draws, axis=0) / jnp.sqrt(self.effective_sample_size)
+        return jnp.where(moved, made, jnp.inf)
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:

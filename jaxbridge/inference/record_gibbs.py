@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from ..engine.averages import proper
 from ..engine.checks import nondifferentiable
 from ..engine.progress import metered_scan
 from ..exact import acceptance_rate
@@ -25,6 +26,7 @@ from ..records import (
     blocks_of_both_cuts,
     cuts,
     guided,
+    has_segments,
     linearised,
     noise_and_log_weight,
     path_and_log_weight,
@@ -67,6 +69,8 @@ class RecordPosterior(AbstractPosterior):
     - `names`: those of θ's entries.
     - `parameters_moved`: whether θ moved, shape (*chains, n).
     - `blocks_moved`: the share of the blocks of the path that moved, shape (*chains, n).
+    - `stuck`: whether there is a block that never did, shape (*chains): then the draws are not
+        those of the posterior, whatever their error.
     - `log_step_error`: NaN, for it is not worked out.
     - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
     """
@@ -76,6 +80,7 @@ class RecordPosterior(AbstractPosterior):
     names: tuple[str, ...] = eqx.field(static=True)
     parameters_moved: Bool[Array, "*chains n"]
     blocks_moved: Float[Array, "*chains n"]
+    stuck: Bool[Array, "*chains"]
     log_step_error: Float[Array, "*chains n"]
     state: RecordState
 
@@ -105,17 +110,18 @@ class RecordSampler(eqx.Module):
 
     def step(
         self, key: Key[Array, ""], state: RecordState, learning: Bool[Array, ""]
-    ) -> tuple[RecordState, tuple[Bool[Array, ""], Float[Array, ""]]]:
-        """The path given θ, then θ given ξ; both learn the size of their moves."""
+    ) -> tuple[RecordState, tuple[Bool[Array, ""], Bool[Array, "2 B 1"]]]:
+        """The path given θ, then θ given ξ; both learn the size of their moves. Whether θ moved,
+        and which blocks."""
         path_key, noise_key, walk_key, accept_key = jax.random.split(key, 4)
         problem, model = self.problem, self.parameters.bind(state.theta)
         (K, N), d = problem.record.dt.shape, problem.dim
-        both = blocks_of_both_cuts(problem, model, self.points, _BLOCK_LENGTH)
+        guide = guided(problem, model, self.points)
+        both = blocks_of_both_cuts(problem, self.points, guide, _BLOCK_LENGTH)
         paths = Paths(state.start, state.points)
         paths, taken = sweep(path_key, problem, model, both, state.log_scales, paths)
         path = jnp.concatenate([paths.start.T, paths.points.reshape(K * N, d)])
 
-        guide = guided(problem, model, self.points)
         noise, log_weight = noise_and_log_weight(noise_key, problem, model, guide, path)
         step = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
         proposed = state.theta + state.root @ step
@@ -125,8 +131,8 @@ class RecordSampler(eqx.Module):
         new_guide = guided(problem, other, self.points)
         new_path, new_weight = path_and_log_weight(problem, other, new_guide, noise)
         new = jnp.where(inside, new_weight + self.log_prior(proposed), -jnp.inf)
-        rate = acceptance_rate(log_weight + self.log_prior(state.theta), new)
-        rate = jnp.where(jnp.isnan(rate), 0, rate)
+        old = proper(log_weight) + self.log_prior(state.theta)
+        rate = acceptance_rate(old, proper(new))
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
 
         number = (state.num_done + 1).astype(rate.dtype)
@@ -143,9 +149,7 @@ class RecordSampler(eqx.Module):
             jnp.where(learning, log_scales, state.log_scales),
             state.num_done + 1,
         )
-        real = both.segment[:, 0] < K  # blocks beyond the record have nothing to move
-        share = jnp.sum(jnp.where(real, taken, 0)) / jnp.sum(real, dtype=rate.dtype)
-        return moved, (accepted, share)
+        return moved, (accepted, taken)
 
 
 def sample_record(
@@ -178,6 +182,7 @@ def _run(
 ) -> RecordPosterior:
     sampler, state = nondifferentiable((sampler, state))
     num_warmup, num_iterations, thin = size
+    real = has_segments(sampler.problem.num_segments, _BLOCK_LENGTH)[..., None]
     begun = state.num_done.reshape(-1)[0]
 
     def iterate(state, i):
@@ -186,19 +191,23 @@ def _run(
         return over_chains(step, jax.random.fold_in(key, begun + i + 1), state)
 
     def draw(state, i):
-        state, (moved, share) = lax.scan(iterate, state, i * thin + jnp.arange(thin))
-        return state, (state.theta, jnp.any(moved, axis=0), jnp.mean(share, axis=0))
+        state, (moved, taken) = lax.scan(iterate, state, i * thin + jnp.arange(thin))
+        taken = jnp.mean(taken.astype(state.theta.dtype), axis=0)
+        share = jnp.mean(taken, axis=(-3, -2, -1), where=real)
+        return state, (state.theta, jnp.any(moved, axis=0), share, taken > 0)
 
     # The warm-up counts in draws, too, so that there is one loop.
     skipped = -(-num_warmup // thin)
     state, made = metered_scan(draw, state, jnp.arange(skipped + num_iterations), progress_meter)
     draws = jax.tree.map(lambda leaf: leaf[skipped:], made)
-    fields, (moved, share) = drawn(sampler.parameters, *draws)
+    fields, (moved, share, taken) = drawn(sampler.parameters, *draws)
+    ever = jnp.any(taken, axis=-4)  # of all draws
     unknown = jnp.full(moved.shape, jnp.nan, share.dtype)
     return RecordPosterior(
         **fields,
         parameters_moved=moved,
         blocks_moved=share,
+        stuck=jnp.any(real & ~ever, axis=(-3, -2, -1)),
         log_step_error=unknown,
         state=state,
     )

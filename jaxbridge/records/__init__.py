@@ -34,6 +34,7 @@ from .path_blocks import (
     Paths as Paths,
     blocks_of_both_cuts as blocks_of_both_cuts,
     cuts as cuts,
+    has_segments as has_segments,
     sweep as sweep,
     tuned as tuned,
 )

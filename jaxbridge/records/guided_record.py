@@ -23,7 +23,7 @@ from .guided_steps import (
 )
 from .information_filter import information_filter
 from .initial import initial_law, log_ratio
-from .linearisation import extended_kalman_path, linear_step
+from .linearisation import LinearisedStep, extended_kalman_path, linear_step
 from .observation import Scalars
 from .problem import RecordProblem
 from .segments import at_every_step, flat, following, split_first
@@ -37,13 +37,17 @@ class Guidance(NamedTuple):
     """What guides paths at some parameters.
 
     - `initial`: the normal law of X(t_0); `start`: the guided one, with its log weight.
-    - `steps`: the guides of all steps, leading axes (K, N).
-    - `scalars`: what is seen at the ends of the segments, leading axis K, counted from ξ.
+    - `linear`: the steps of the linear process, and `steps`: the guides of all steps, leading axes
+        (K, N).
+    - `first`, `scalars`: what is seen of X(t_0), and at the ends of the segments, leading axis K,
+        counted from ξ.
     """
 
     initial: NormalStep
     start: GuidedLaw
+    linear: LinearisedStep
     steps: Guide
+    first: Scalars
     scalars: Scalars
 
 
@@ -58,15 +62,15 @@ def guided(problem: RecordProblem, model: Diffusion, points: Float[Array, "point
     def linear(point, next_point, dt):
         return linear_step(problem.density, dynamics, point, next_point, dt)
 
-    linear_steps = jax.vmap(jax.vmap(linear))(here, there, problem.record.dt)
+    steps = jax.vmap(jax.vmap(linear))(here, there, problem.record.dt)
     scalars = jax.vmap(relative)(problem.scalars(model), points[::N])
     first, rest = split_first(scalars)
-    h = information_filter(linear_steps, rest)
+    h = information_filter(steps, rest)
 
-    steps = Guide(here, h, there, following(h), problem.record.dt)
+    guides = Guide(here, h, there, following(h), problem.record.dt)
     h_first = jax.tree.map(lambda leaf: leaf[0, 0], h)
     start = guided_start(initial, first, points[0], h_first)
-    return Guidance(initial, start, steps, rest)
+    return Guidance(initial, start, steps, guides, first, rest)
 
 
 def path_and_log_weight(

@@ -195,6 +195,19 @@ class Filtered(NamedTuple):
     size: Float[Array, "R ends"]
     num_nonfinite: Int[Array, " R"]
 
+    def variance(self, num_particles: int) -> Float[Array, " R"]:
+        """That of log p̂ to first order, as one filter knows it: of each mean of weights that went
+        into p̂, those before resampling and the last. Infinite where no particle is left."""
+        share = self.size / num_particles
+        counts = _is_poor(self.size, num_particles).at[:, -1].set(True)
+        each = jnp.where(share > 0, 1 / share - 1, jnp.inf)
+        return jnp.sum(jnp.where(counts, each, 0), axis=1) / num_particles
+
+
+def _is_poor(size: Float[Array, "..."], num_particles: int) -> Bool[Array, "..."]:
+    """Whether so few particles count that they are resampled."""
+    return size < _FEWEST_EFFECTIVE * num_particles
+
 
 @eqx.filter_jit
 def _estimates(
@@ -225,12 +238,12 @@ def run_filters(
     def weighed(state: _Particles, key, change) -> tuple[_Particles, Float[Array, " R"]]:
         """With what came to the weights, resampled where that is called for."""
         log_weight = state.log_weight + change.reshape(R, P)
-        finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & ~jnp.isnan(log_weight)
+        finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & (log_weight < jnp.inf)
         log_weight = jnp.where(finite, log_weight, -jnp.inf)
         lost = jnp.sum(~finite & (state.log_weight > -jnp.inf), axis=1, dtype=jnp.int32)
         size = effective_size(normalised(log_weight))
         state = state._replace(log_weight=log_weight, num_nonfinite=state.num_nonfinite + lost)
-        poor = size < _FEWEST_EFFECTIVE * P
+        poor = _is_poor(size, P)
         resample = lambda: _resampled(key, state, poor)
         return lax.cond(jnp.any(poor), resample, lambda: state), size
 

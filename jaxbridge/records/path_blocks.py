@@ -12,6 +12,10 @@ The path of a block is that of noise ζ ~ N(0, I) with the weight w(ζ), so that
 
 leaves its law alone (Neal 1998; Cotter, Roberts, Stuart & White 2013), and is accepted often, with
 β = 1 even, where guiding is good. Both paths go through one scan: the old one tells ζ.
+
+A chain may begin with a path of no weight, as where the first guided path left the finite numbers.
+Any path that has a weight is accepted in its stead; and a chain in which a block never moved is
+told of, for its draws do not tell their own error.
 """
 
 import functools
@@ -24,17 +28,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from ..engine.averages import proper
 from ..engine.lanes import over_lanes
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
-from .guided_record import correction
-from .guided_steps import Guide, guided_law, guided_start, relative, solve_law, solve_root
+from .guided_record import Guidance, correction
+from .guided_steps import Guide, guided_law, guided_start, solve_law, solve_root
 from .information_filter import information_filter
-from .initial import initial_law, log_ratio
-from .linearisation import LinearisedStep, linear_step
+from .initial import log_ratio
+from .linearisation import LinearisedStep
 from .observation import Scalars
 from .problem import RecordProblem
-from .segments import following, split_last
+from .segments import flat, following, split_last
 from .tilted_step import NormalStep
 
 # Of the moves: the share accepted to which β is tuned.
@@ -83,14 +88,20 @@ def cuts(num_segments: int, length: int) -> Int[np.ndarray, "2 J B"]:
     return np.stack([cut(0), cut(length // 2)])
 
 
+def has_segments(num_segments: int, length: int) -> Bool[np.ndarray, "2 B"]:
+    """Which blocks of each cut hold a part of the record: the last may lie beyond it."""
+    segment = cuts(num_segments, length)
+    return np.any((segment >= 0) & (segment < num_segments), axis=1)
+
+
 def blocks_of(
     problem: RecordProblem,
-    model: Diffusion,
     points: Float[Array, "points d"],
+    guide: Guidance,
     segment: Int[np.ndarray, "J B"],
 ) -> Blocks:
-    """The blocks of one cut, linearised along these points."""
-    dynamics, (K, N) = model.forward(problem.like), problem.record.dt.shape
+    """The blocks of one cut, of a record that is guided along these points."""
+    (K, N), d = problem.record.dt.shape, problem.dim
     outside = (segment < 0) | (segment >= K)
     inside = np.clip(segment, 0, K - 1)
     # Outside the record there is one point, and steps of no length.
@@ -100,12 +111,18 @@ def blocks_of(
     here = points[np.where(outside[:, None], edge, number)]  # (J, N, B, d)
     there = points[np.where(outside[:, None], edge, number + 1)]
     dt = jnp.where(outside[:, None], 0, problem.record.dt.reshape(-1)[number])
-
-    def linear(point, next_point, dt):
-        return linear_step(problem.density, dynamics, point, next_point, dt)
-
-    steps = jax.vmap(jax.vmap(jax.vmap(linear)))(here, there, dt)
-    everything = _filled(jax.vmap(relative)(problem.scalars(model), points[::N]), problem.dim)
+    still = LinearisedStep(jnp.eye(d, dtype=dt.dtype), *2 * [jnp.zeros((), dt.dtype)])
+    steps = jax.tree.map(
+        lambda leaf, none: jnp.where(
+            outside.reshape(len(outside), 1, -1, *(leaf.ndim - 1) * [1]), none, leaf[number]
+        ),
+        flat(guide.linear),
+        still,
+    )
+    everything = jax.tree.map(
+        lambda first, rest: jnp.concatenate([first[None], rest]), guide.first, guide.scalars
+    )
+    everything = _filled(everything, d)
     nothing = Scalars(
         jnp.zeros_like(everything.rows[0]),
         jnp.zeros_like(everything.values[0]),
@@ -124,7 +141,6 @@ def blocks_of(
 
     lanes_last = lambda tree, axis: jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), tree)
     is_first = np.arange(segment.shape[1]) == 0
-    initial = initial_law(problem.initial, model, problem.like)
     at_end = np.where(outside, 0, inside + 1)
     values = jnp.where(outside[..., None], jnp.nan, problem.record.values[at_end])
     return Blocks(
@@ -137,8 +153,8 @@ def blocks_of(
         lanes_last(values, 1),
         lanes_last(seen(np.zeros(len(is_first), int), ~is_first), 0),
         jnp.where(is_first, problem.record.values[0][:, None], jnp.nan),
-        jnp.where(is_first, initial.root[..., None], 0),
-        initial.mean,
+        jnp.where(is_first, guide.initial.root[..., None], 0),
+        guide.initial.mean,
     )
 
 
@@ -203,7 +219,9 @@ def move(
     def of_start(x, mean, root, first, point, h, eta, rho, beta):
         law = guided_start(NormalStep(mean, root), first, point, h)
         solve = functools.partial(solve_root, root)
-        return law.point(rho * law.noise(x, solve, nothing) + beta * eta), law.log_weight
+        zeta = law.noise(x, solve, nothing)
+        zeta = rho * jnp.where(jnp.isfinite(zeta), zeta, 0) + beta * eta
+        return law.point(zeta), law.log_weight
 
     is_first = spread(jnp.asarray(np.arange(B) == 0))
     initial = NormalStep(blocks.mean, blocks.root[..., 0])
@@ -228,7 +246,7 @@ def move(
         law = density.steps_from(dynamics, old).law(guide.dt)
         here = guided_law(law, old, guide, scalars)
         zeta = here.noise(old_next, functools.partial(solve_law, law), nothing)
-        zeta = rho * zeta + beta * eta
+        zeta = rho * jnp.where(jnp.isfinite(zeta), zeta, 0) + beta * eta  # a path of no weight
         law = density.steps_from(dynamics, new).law(guide.dt)
         there = guided_law(law, new, guide, scalars)
         return there.point(zeta), here.log_weight, there.log_weight
@@ -259,8 +277,8 @@ def move(
     # What is seen at a pinned end weighs both paths alike.
     inputs = (jnp.arange(J), old, guides, scalars, blocks.values)
     state, new = lax.scan(segment, state, inputs)
-    rate = acceptance_rate(state.log_old, state.log_new)
-    accepted = jax.random.uniform(accept_key, rate.shape, dtype) < rate  # false for NaN
+    rate = acceptance_rate(proper(state.log_old), proper(state.log_new))
+    accepted = jax.random.uniform(accept_key, rate.shape, dtype) < rate
     new = jnp.where(accepted, new, old).reshape(J, N, d, B, C)
     new = jnp.moveaxis(new, 3, 0).reshape(B * J, N, d, C)
     begin = jnp.argmax(blocks.segment.T.ravel() == 0)
@@ -269,10 +287,10 @@ def move(
 
 
 def blocks_of_both_cuts(
-    problem: RecordProblem, model: Diffusion, points: Float[Array, "points d"], length: int
+    problem: RecordProblem, points: Float[Array, "points d"], guide: Guidance, length: int
 ) -> Blocks:
     """The blocks of both cuts, in a leading axis."""
-    each = [blocks_of(problem, model, points, cut) for cut in cuts(problem.num_segments, length)]
+    each = [blocks_of(problem, points, guide, cut) for cut in cuts(problem.num_segments, length)]
     return jax.tree.map(lambda *both: jnp.stack(both), *each)
 
 
@@ -283,24 +301,23 @@ def sweep(
     both: Blocks,
     log_scales: Float[Array, "2 B"],
     paths: Paths,
-) -> tuple[Paths, Float[Array, "2 B"]]:
-    """New paths of all blocks of one cut, then of the other, with log β; and the share of chains
-    in which each block took its own."""
+) -> tuple[Paths, Bool[Array, "2 B C"]]:
+    """New paths of all blocks of one cut, then of the other, with log β; and which took theirs."""
 
     def one(paths, inputs):
         number, blocks, log_scale = inputs
         mine = jax.random.fold_in(key, number)
-        paths, accepted = move(mine, problem, model, blocks, jnp.exp(log_scale), paths)
-        return paths, jnp.mean(accepted.astype(log_scale.dtype), axis=1)
+        return move(mine, problem, model, blocks, jnp.exp(log_scale), paths)
 
     return lax.scan(one, paths, (jnp.arange(2), both, log_scales))
 
 
 def tuned(
-    log_scales: Float[Array, "2 B"], taken: Float[Array, "2 B"], number: Float[Array, ""]
+    log_scales: Float[Array, "2 B"], taken: Bool[Array, "2 B C"], number: Float[Array, ""]
 ) -> Float[Array, "2 B"]:
-    """log β after the sweep of this number in a warm-up, in which such shares were accepted."""
-    return jnp.minimum(log_scales + number**-0.6 * (taken - _TARGET), 0)
+    """log β after the sweep of this number in a warm-up, in which these moves were accepted."""
+    share = jnp.mean(taken.astype(log_scales.dtype), axis=-1)
+    return jnp.minimum(log_scales + number**-0.6 * (share - _TARGET), 0)
 
 
 def _in_lanes(function: Callable) -> Callable:

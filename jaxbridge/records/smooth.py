@@ -4,7 +4,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ..engine.averages import PathFunction
 from ..engine.checks import Numbers, check_count, check_key
@@ -15,7 +15,7 @@ from ..schemes import AbstractStepDensity
 from .guided_record import Linearised, linearised, path_and_log_weight
 from .initial import Initial
 from .observation import Observation
-from .path_blocks import Paths, blocks_of_both_cuts, sweep, tuned
+from .path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep, tuned
 from .problem import RecordProblem, as_record_problem
 
 
@@ -26,11 +26,14 @@ class Smoothed(eqx.Module):
     - `paths`: shape (chains, n, K, d).
     - `accepted`: the share of moves that were accepted, of each block in both ways to cut the
         record into blocks, shape (2, B).
+    - `stuck`: the chains in which a block never moved, shape (chains,): `standard_error` is
+        infinite if there is one, for draws of a path that stays tell nothing of their error.
     """
 
     times: Float[Array, " K"]
     paths: Float[Array, "chains n K d"]
     accepted: Float[Array, "2 B"]
+    stuck: Bool[Array, " chains"]
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
         """The mean of `fn(path)`, a function of one path of shape (K, d), by default itself."""
@@ -40,7 +43,8 @@ class Smoothed(eqx.Module):
         """The Monte Carlo error of `mean(fn)`, entry by entry."""
 
         def error(leaf):
-            return jnp.std(leaf, axis=(0, 1)) / jnp.sqrt(_effective(leaf))
+            made = jnp.std(leaf, axis=(0, 1)) / jnp.sqrt(_effective(leaf))
+            return jnp.where(jnp.any(self.stuck), jnp.inf, made)
 
         return jax.tree.map(error, self._values(fn))
 
@@ -137,7 +141,7 @@ def _smooth(
     firsts = jnp.moveaxis(jax.vmap(first)(jax.random.split(start_key, num_chains)), 0, -1)
     (K, N), d = problem.record.dt.shape, problem.dim
     paths = Paths(firsts[0], firsts[1:].reshape(K, N, d, num_chains))
-    both = blocks_of_both_cuts(problem, model, points, block_length)
+    both = blocks_of_both_cuts(problem, points, guide, block_length)
 
     def step(state, i):
         paths, log_scales = state
@@ -151,4 +155,7 @@ def _smooth(
     init = paths, jnp.zeros((2, both.segment.shape[-1]), points.dtype)
     _, made = metered_scan(step, init, jnp.arange(num_warmup + num_draws), progress_meter)
     drawn, taken = jax.tree.map(lambda leaf: leaf[num_warmup:], made)
-    return Smoothed(problem.record.grid(), jnp.moveaxis(drawn, 1, 0), jnp.mean(taken, axis=0))
+    real = has_segments(K, block_length)[..., None]
+    stuck = jnp.any(real & ~jnp.any(taken, axis=0), axis=(0, 1))
+    share = jnp.mean(taken.astype(points.dtype), axis=(0, -1))
+    return Smoothed(problem.record.grid(), jnp.moveaxis(drawn, 1, 0), share, stuck)
