@@ -154,6 +154,7 @@ def test_a_chain_is_the_same_alone_inside_jit_and_vmap():
 
 @pytest.mark.slow
 def test_intervals_of_many_lengths():
+    """No step is longer than asked, in however few programs (`tests/inference/test_data.py`)."""
     times = np.array([0.0, 0.1, 0.2, 1.2, 5.2, 5.3, 6.3, 7.3])
     made = jb.gibbs(
         jax.random.key(0),
@@ -164,8 +165,7 @@ def test_intervals_of_many_lengths():
         step_size=0.1,
         **OPTIONS,
     )
-    steps = {block.num_steps for block in made.completion.blocks}
-    assert len(steps) == 3 and max(steps) == 40
+    assert max(block.num_steps for block in made.completion.blocks) == 40
     durations = np.diff(times)
     for block in made.completion.blocks:
         assert (durations[np.asarray(block.index)] / block.num_steps < 0.1001).all()
@@ -173,7 +173,8 @@ def test_intervals_of_many_lengths():
 
 @pytest.mark.slow
 def test_four_unknown_drifts_of_a_rotating_process():
-    """Given the paths B is normal with the moments of least squares; B may be any stable matrix."""
+    """Given the paths B is normal with the moments of least squares, where steps are Euler's; B may
+    be any stable matrix."""
     model, times, data = multivariate_ou()
     stable = lambda B: (jnp.trace(B) > 0) & (B[0, 0] * B[1, 1] > B[0, 1] * B[1, 0])
     made = jb.gibbs(
@@ -186,7 +187,7 @@ def test_four_unknown_drifts_of_a_rotating_process():
         num_steps=10,
         where=lambda params: params.B,
         constraint=stable,
-        proposal=jb.ModifiedDiffusionBridge(TRAPEZOID),
+        proposal=jb.ModifiedDiffusionBridge(),
     )
     assert made.exact_parameters and made.params.B.shape == (200, 2, 2)
     assert bool(jax.vmap(stable)(made.params.B).all())
@@ -373,7 +374,7 @@ def test_a_run_that_replaces_a_sampler_would_depend_on_the_parameters(unchecked)
         jb.gibbs(key, unknown, *data, **options, proposal=jb.Coupling(0.0))
     for model, proposal in [(unknown, "auto"), (known, jb.Coupling(0.0))]:  # "auto" does without
         made = jb.gibbs(key, model, *data, **options, proposal=proposal)
-        assert made.theta.shape == (2, 1) and made.num_missing == 0
+        assert made.theta.shape == (2, 1) and made.num_missing.sum() == 0
 
 
 def test_other_types_are_refused(unchecked):
