@@ -87,6 +87,8 @@ def path_and_log_weight(
         return (x, log_weight + law.log_weight), x
 
     inputs = noise[1:], flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
+    # For derivatives the states are kept: to keep all between them takes longer than to redo it.
+    one = jax.checkpoint(one, prevent_cse=False)
     (_, log_weight), path = lax.scan(one, (start, guide.start.log_weight), inputs)
     path = jnp.concatenate([start[None], path])
     return path, log_weight + corrections(problem, model, guide, path)

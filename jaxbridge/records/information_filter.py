@@ -61,5 +61,6 @@ def information_filter(
         return h, h
 
     inputs = flat(steps), at_every_step(scalars, N)
-    _, h = lax.scan(one, last, inputs, reverse=True)
+    # For derivatives the states are kept: to keep all between them takes longer than to redo it.
+    _, h = lax.scan(jax.checkpoint(one, prevent_cse=False), last, inputs, reverse=True)
     return jax.tree.map(lambda leaf: leaf.reshape(K, N, *leaf.shape[1:]), h)
