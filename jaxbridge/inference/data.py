@@ -23,6 +23,7 @@ from ..engine.memory_maps import warn_near_limit_of_maps
 from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
+from ..records import of_each, split_records
 from .parameters import Parameters, theta_of_model
 
 # Numbers of steps are looked at as so many per factor of two.
@@ -41,10 +42,18 @@ class Group(NamedTuple):
 
 
 def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> Intervals:
-    """The intervals between n + 1 observations.
+    """The intervals between n + 1 observations, or of several records, one after the other.
 
     **Raises:** `ValueError` that says what is wrong with which time or observation.
     """
+    one = lambda times, observations: _intervals(model, times, observations)
+    each = of_each(one, split_records(times, observations))
+    with jax.ensure_compile_time_eval():  # so that what is known stays so
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *each)
+
+
+def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Intervals:
+    """Those of one record."""
     times, duration = time_steps("times", _unmasked("times", times))
     observations = as_floating("observations", _unmasked("observations", observations))
     if times.ndim != 1:

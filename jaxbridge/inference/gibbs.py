@@ -20,7 +20,7 @@ from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
-from ..records import Initial, Observation, as_record_problem
+from ..records import Initial, Observation, as_record_problems
 from .augmentation import Augmentation, augment
 from .data import as_problem
 from .parameter_kernels import (
@@ -33,6 +33,7 @@ from .parameter_kernels import (
 from .parameter_walk import first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
+    STEP_ERRORS,
     AbstractPosterior,
     drawn,
     first_chain,
@@ -42,10 +43,7 @@ from .posterior import (
     summed,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
-from .record_gibbs import RecordPosterior, RecordState, sample_record
-
-# Of about so many of the draws the step error is worked out.
-_STEP_ERRORS = 256
+from .record_gibbs import RecordPosterior, RecordState, sample_records
 
 
 class GibbsState(NamedTuple):
@@ -137,7 +135,8 @@ def gibbs(
     - `key`: a typed key.
     - `model`: its `params` are where chains start. σ must not depend on those that are unknown.
     - `times`: increasing, shape (n + 1,), in the model's units of time.
-    - `observations`: of the diffusion at these times, shape (n + 1, d).
+    - `observations`: of the diffusion at these times, shape (n + 1, d). Several records, which are
+        independent given the parameters, are lists of both, or have a leading axis.
     - `prior`: a `NormalPrior`, or a function that maps the unknown parameters to the log of a
         density. It is restricted to `constraint`.
     - `num_iterations`: draws that are kept; between two of them are `thin` iterations.
@@ -189,8 +188,8 @@ def gibbs(
         check_key(key)
         _check_no_bridges(proposal, bridges, method, parameter_kernel)
         steps = {"num_steps": num_steps, "step_size": step_size}
-        record = as_record_problem(model, times, observations, observation, initial, **steps)
-        unknown = theta_of_model(parameters, record.like.dtype)
+        records = as_record_problems(model, times, observations, observation, initial, **steps)
+        unknown = theta_of_model(parameters, records.stacked.like.dtype)
         log_prior = as_log_prior(prior, parameters, unknown)
         theta, state = starting_points(
             parameters, unknown, init, num_chains, log_prior, RecordState
@@ -198,7 +197,7 @@ def gibbs(
         start = (theta, first_root(covariance, log_prior, unknown)) if state is None else state
         num_warmup = check_count("num_warmup", 500 if num_warmup is None else num_warmup, 0)
         size = (num_warmup, num_iterations, thin)
-        return sample_record(key, parameters, record, log_prior, start, size, progress_meter)
+        return sample_records(key, parameters, records, log_prior, start, size, progress_meter)
     if num_warmup is not None or covariance is not None:
         raise ValueError("`num_warmup` and `covariance` are for records with an `observation`.")
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
@@ -281,7 +280,7 @@ def _run(
     sampler, state = nondifferentiable((sampler, state))
     chains, dtype = state.theta.shape[:-1], state.theta.dtype
     # As many draws as tell a covariance, for D takes a good part of the time of an iteration.
-    every = max(1, num_iterations // _STEP_ERRORS)
+    every = max(1, num_iterations // STEP_ERRORS)
 
     def step_errors(i, state):
         one = lambda state: sampler.log_step_error(state)  # `cond` hashes it

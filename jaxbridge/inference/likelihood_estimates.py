@@ -17,7 +17,8 @@ from ..engine.averages import proper
 from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
-from ..records import RecordProblem, guided, run_filters
+from ..records import Records, guided, run_filters
+from ..schemes import share_of_order
 from .blocks import Block, with_keys
 
 
@@ -37,6 +38,15 @@ class AbstractLikelihood(eqx.Module):
     @abstractmethod
     def estimate(self, key: Key[Array, ""], model: Diffusion) -> Estimate:
         """The estimate for this model."""
+
+    @abstractmethod
+    def log_step_error(self, key: Key[Array, ""], model: Diffusion) -> Float[Array, ""]:
+        """The step error of the log likelihood, with noise of its own."""
+
+    @property
+    @abstractmethod
+    def tells_step_error(self) -> bool:
+        """Whether estimates come with theirs, at no cost worth mentioning."""
 
     @property
     @abstractmethod
@@ -67,24 +77,61 @@ class TransitionLikelihood(AbstractLikelihood):
         known = ~jnp.isnan(total.log_likelihood)
         return total._replace(log_likelihood=jnp.where(known, total.log_likelihood, -jnp.inf))
 
+    def log_step_error(self, key, model):
+        return self.estimate(key, model).log_step_error
+
+    @property
+    def tells_step_error(self):
+        return True
+
     @property
     def proposals(self):
         return tuple(block.proposal for block in self.blocks)
 
 
 class RecordLikelihood(AbstractLikelihood):
-    """A guided particle filter, linearised along the same points at all parameters."""
+    """Guided particle filters of all records, linearised along the same points at all parameters;
+    and with half as many steps, which tell the step error."""
 
-    problem: RecordProblem
-    points: Float[Array, "points d"]
+    records: Records
+    points: Float[Array, "R points d"]
+    coarse: Records
+    coarse_points: Float[Array, "R points d"]
     num_particles: int = eqx.field(static=True)
 
     def estimate(self, key, model):
-        guide = guided(self.problem, model, self.points)
-        made = run_filters(key, self.problem, model, guide, 1, self.num_particles)
-        value, variance = proper(made.log_estimate[0]), made.variance(self.num_particles)[0]
-        unknown = jnp.full_like(value, jnp.nan)
-        return Estimate(value, variance, unknown, jnp.int32(0))
+        value, variance = self._filtered(key, model, self.records, self.points)
+        return Estimate(proper(value), variance, jnp.full_like(value, jnp.nan), jnp.int32(0))
+
+    def log_step_error(self, key, model):
+        fine, variance = self._filtered(key, model, self.records, self.points)
+        if self.records.stacked.num_steps == 1:
+            return jnp.full_like(fine, jnp.nan)
+        coarse, coarse_variance = self._filtered(key, model, self.coarse, self.coarse_points)
+        # The mean of log p̂ is too small by half its variance.
+        ratio = coarse - fine + (coarse_variance - variance) / 2
+        return share_of_order(self.records.stacked.density.order) * ratio
+
+    @property
+    def tells_step_error(self):
+        return False
+
+    def _filtered(
+        self,
+        key: Key[Array, ""],
+        model: Diffusion,
+        records: Records,
+        points: Float[Array, "R points d"],
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """log p̂ with its variance."""
+        P = self.num_particles
+
+        def one(problem, key, points):
+            made = run_filters(key, problem, model, guided(problem, model, points), 1, P)
+            return made.log_estimate[0], made.variance(P)[0]
+
+        each = records.each(one, jax.random.split(key, records.number), points)
+        return jnp.sum(each[0]), jnp.sum(each[1])
 
     @property
     def proposals(self):

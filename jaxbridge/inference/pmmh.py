@@ -31,7 +31,7 @@ from ..engine.progress import as_meter
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal, Budget
-from ..records import Initial, Observation, as_record_problem, linearised
+from ..records import Initial, Observation, as_record_problems, linearisations
 from .blocks import Block, block_of, make_blocks
 from .data import Problem, as_problem
 from .likelihood_estimates import (
@@ -43,6 +43,7 @@ from .likelihood_estimates import (
 from .parameter_walk import TARGET, adapted, first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
+    STEP_ERRORS,
     AbstractPosterior,
     drawn,
     first_chain,
@@ -100,8 +101,8 @@ class PMMHPosterior(AbstractPosterior):
         than three, the chain holds on to lucky estimates and hardly moves: take as many times more
         `num_proposals`, or a better `proposal`; far below, fewer make iterations cheaper. Infinite
         where weights were cut off (`num_truncated`), and with one proposal.
-    - `log_step_error`: an estimate of the step error of each of these, shape (*chains, n): what
-        `step_error`, that of the posterior mean, is made of.
+    - `log_step_error`: an estimate of the step error of each of these, NaN where none was worked
+        out, shape (*chains, n): what `step_error`, that of the posterior mean, is made of.
     - `accepted`: shape (*chains, n).
     - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
         parameters were refused because no estimate was to be had, shape (*chains,). With couplings
@@ -212,11 +213,13 @@ def pmmh(
 
     else:
         steps = {"num_steps": num_steps, "step_size": step_size}
-        record = as_record_problem(model, times, observations, observation, initial, **steps)
-        unknown = theta_of_model(parameters, record.like.dtype)
+        records = as_record_problems(model, times, observations, observation, initial, **steps)
+        unknown = theta_of_model(parameters, records.stacked.like.dtype)
 
         def likelihood_near(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
-            return RecordLikelihood(record, linearised(record, model).points, num_proposals)
+            coarse = records.halved()
+            both = linearisations(records, model), coarse, linearisations(coarse, model)
+            return RecordLikelihood(records, *both, num_proposals)
 
     log_prior = as_log_prior(prior, parameters, unknown)
     root = first_root(covariance, log_prior, unknown)
@@ -275,6 +278,9 @@ class _Sampler(eqx.Module):
     def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Estimate:
         return self.likelihood.estimate(key, self.parameters.bind(theta))
 
+    def log_step_error(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Float[Array, ""]:
+        return self.likelihood.log_step_error(key, self.parameters.bind(theta))
+
     def start(
         self, key: Key[Array, ""], start: tuple[Float[Array, " p"], Float[Array, "p p"]]
     ) -> _Chain:
@@ -316,6 +322,7 @@ def _run(
     sampler, chain = nondifferentiable((sampler, chain))
     p, dtype = chain.theta.shape[-1], chain.theta.dtype
     num_warmup, num_iterations, thin = size
+    every = max(1, num_iterations // STEP_ERRORS)
     total = num_warmup + num_iterations * thin
 
     def iterate(carry, i):
@@ -328,9 +335,19 @@ def _run(
         progress = meter.step(progress, (i + 1).astype(jnp.float32) / total)
         return (chain, progress), info
 
+    def log_step_error(i, chain):
+        """That of the held estimate, or one of its own for some of the draws."""
+        mine = jax.random.fold_in(jax.random.fold_in(key, num_done + num_warmup + i * thin + 1), 1)
+        if sampler.likelihood.tells_step_error:
+            return chain.log_step_error
+        known = lambda chain: over_chains(sampler.log_step_error, mine, chain.theta)
+        unknown = lambda chain: jnp.full_like(chain.log_likelihood, jnp.nan)
+        return lax.cond(i % every == 0, known, unknown, chain)
+
     def draw(carry, i):
         carry, infos = lax.scan(iterate, carry, num_warmup + i * thin + jnp.arange(thin))
-        return carry, (carry[0]._replace(root=None), summed(infos))
+        held = carry[0]._replace(root=None, log_step_error=log_step_error(i, carry[0]))
+        return carry, (held, summed(infos))
 
     carry, warmup = lax.scan(iterate, (chain, meter.init()), jnp.arange(num_warmup))
     (chain, progress), draws = lax.scan(draw, carry, jnp.arange(num_iterations))
@@ -339,12 +356,12 @@ def _run(
     counted = jax.tree.map(jnp.add, summed(warmup), summed(info))
     others = (held.log_likelihood, held.log_step_error, info.accepted > 0)
     fields, others = drawn(sampler.parameters, held.theta, *others)
-    log_likelihood, log_step_error, accepted = others
+    log_likelihood, of_likelihood, accepted = others
     return PMMHPosterior(
         **fields,
         log_likelihood=log_likelihood,
         log_likelihood_variance=jnp.median(held.variance, axis=0),
-        log_step_error=log_step_error,
+        log_step_error=of_likelihood,
         accepted=accepted,
         num_without_estimate=counted.num_without_estimate,
         num_truncated=counted.num_truncated,

@@ -13,6 +13,8 @@ from ..engine.diagnostics import effective_sample_size, potential_scale_reductio
 from ..schemes import StepError, dominates
 from .parameters import Parameters, init_vectors
 
+# Of about so many of the draws the step error is worked out.
+STEP_ERRORS = 256
 # Of fewer draws a covariance tells nothing.
 _FEWEST = 10
 

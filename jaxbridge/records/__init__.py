@@ -38,7 +38,10 @@ from .path_blocks import (
     sweep as sweep,
     tuned as tuned,
 )
-from .problem import (
-    RecordProblem as RecordProblem,
-    as_record_problem as as_record_problem,
+from .problem import as_record_problem as as_record_problem
+from .record import of_each as of_each, split_records as split_records
+from .several import (
+    Records as Records,
+    as_record_problems as as_record_problems,
+    linearisations as linearisations,
 )

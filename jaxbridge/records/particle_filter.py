@@ -28,8 +28,10 @@ from .guided_record import Guidance, correction, linearised
 from .guided_steps import guided_step
 from .initial import Initial, log_ratio
 from .observation import Observation
-from .problem import RecordProblem, as_record_problem
+from .problem import RecordProblem
+from .record import of_each, split_records
 from .segments import split_last
+from .several import Records, as_record_problems
 
 # Particles are resampled where fewer than this share of them count.
 _FEWEST_EFFECTIVE = 0.5
@@ -92,7 +94,8 @@ def log_likelihood(
 
     - `key`: a typed key.
     - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
-        `initial_time`, `density`: as in `innovations`.
+        `initial_time`, `density`: as in `innovations`. Lists of `times` and of `observations`, or
+        a leading axis, are several records, independent given the parameters.
         Without an `observation` the state was seen whole and exactly: the sum of the log transition
         densities by `transition_log_density(proposal="auto")`, given the first.
     - `num_particles`: of each filter.
@@ -124,26 +127,34 @@ def log_likelihood(
         return _exact(key, model, times, observations, num_particles, num_steps, step_size)
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
-    problem = as_record_problem(*arguments, num_steps=num_steps, **options)
+    records = as_record_problems(*arguments, num_steps=num_steps, **options)
     size = num_filters, num_particles
-    fine = _estimates(key, problem, linearised(problem, model).guide, *size)
-    log_mean, error, _ = log_mean_and_error(fine.log_estimate[None])
-    step_error = StepError(*2 * [jnp.full_like(log_mean[0], jnp.nan)])
-    if problem.num_steps > 1:
-        halved = problem.halved()
-        coarse = _estimates(key, halved, linearised(halved, model).guide, *size)
-        coarse_mean, coarse_error, _ = log_mean_and_error(coarse.log_estimate[None])
-        share = share_of_order(problem.density.order)
-        doubt = share * jnp.sqrt(coarse_error[0] ** 2 + error[0] ** 2)
-        step_error = StepError(share * (coarse_mean[0] - log_mean[0]), doubt)
+    value, error, fine = _log_mean(key, records, *size)
+    step_error = StepError(*2 * [jnp.full_like(value, jnp.nan)])
+    if records.stacked.num_steps > 1:
+        coarse, coarse_error, _ = _log_mean(key, records.halved(), *size)
+        share = share_of_order(records.stacked.density.order)
+        doubt = share * jnp.sqrt(coarse_error**2 + error**2)
+        step_error = StepError(share * (coarse - value), doubt)
     return LogLikelihood(
-        log_mean[0],
-        error[0],
-        fine.log_estimate,
-        jnp.mean(fine.size, axis=0)[problem.record.which],
+        value,
+        error,
+        jnp.sum(fine.log_estimate, axis=0),
+        records.at_observations(jnp.mean(fine.size, axis=1)),
         jnp.sum(fine.num_nonfinite),
         *step_error,
     )
+
+
+def _log_mean(
+    key: Key[Array, ""], records: Records, R: int, P: int
+) -> tuple[Float[Array, ""], Float[Array, ""], "Filtered"]:
+    """log p̂ of all records, with its standard error, and what their filters say."""
+    model = records.stacked.model
+    guides = records.each(lambda problem: linearised(problem, model).guide)
+    made = _estimates(key, records, guides, R, P)
+    log_means, errors, _ = log_mean_and_error(made.log_estimate)
+    return jnp.sum(log_means), jnp.sqrt(jnp.sum(errors**2)), made
 
 
 def _exact(
@@ -158,19 +169,14 @@ def _exact(
     """Of observations of the whole state without noise."""
     if step_size is not None:
         raise ValueError("`step_size` is for records with an `observation`: pass `num_steps`.")
-    times, gaps = time_steps("times", times)
-    points = as_floating("observations", observations)
-    if points.ndim != 2 or points.shape[0] != times.shape[0]:
-        raise ValueError(
-            f"`observations` must have shape ({times.shape[0]}, d), a row for each of `times`; got "
-            f"{points.shape}."
-        )
+    intervals = of_each(_intervals, split_records(times, observations))
+    start, end, duration = (jnp.concatenate(each) for each in zip(*intervals, strict=True))
     made = transition_log_density(
         key,
         model,
-        points[:-1],
-        points[1:],
-        gaps,
+        start,
+        end,
+        duration,
         num_proposals=num_proposals,
         num_steps=50 if num_steps is None else num_steps,
         proposal="auto",
@@ -185,6 +191,18 @@ def _exact(
         jnp.sum(made.step_error),
         jnp.sqrt(jnp.sum(made.step_uncertainty**2)),
     )
+
+
+def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Array]:
+    """Start, end and duration of each."""
+    times, gaps = time_steps("times", times)
+    points = as_floating("observations", observations)
+    if points.ndim != 2 or points.shape[0] != times.shape[0]:
+        raise ValueError(
+            f"`observations` must have shape ({times.shape[0]}, d), a row for each of `times`; got "
+            f"{points.shape}."
+        )
+    return points[:-1], points[1:], gaps
 
 
 class Filtered(NamedTuple):
@@ -210,10 +228,10 @@ def _is_poor(size: Float[Array, "..."], num_particles: int) -> Bool[Array, "..."
 
 
 @eqx.filter_jit
-def _estimates(
-    key: Key[Array, ""], problem: RecordProblem, guide: Guidance, R: int, P: int
-) -> Filtered:
-    return run_filters(key, problem, problem.model, guide, R, P)
+def _estimates(key: Key[Array, ""], records: Records, guides: Guidance, R: int, P: int) -> Filtered:
+    """Of each record."""
+    filters = lambda problem, key, guide: run_filters(key, problem, problem.model, guide, R, P)
+    return records.each(filters, jax.random.split(key, records.number), guides)
 
 
 class _Particles(NamedTuple):

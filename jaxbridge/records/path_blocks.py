@@ -61,6 +61,7 @@ class Blocks(NamedTuple):
     - `scalars`, `values`: what is seen at the ends of segments, leading axis J.
     - `first`, `first_value`, `root`: what is seen of x_0, and the root of its law; of other blocks
         nothing, and zero. `mean`: that of the law of x_0, shape (d,).
+    - `goes_on`: after which of them there is more of the record.
     """
 
     segment: Int[Array, "J B"]
@@ -74,6 +75,7 @@ class Blocks(NamedTuple):
     first_value: Float[Array, "m B"]
     root: Float[Array, "d d B"]
     mean: Float[Array, " d"]
+    goes_on: Bool[Array, " B"]
 
 
 def cuts(num_segments: int, length: int) -> Int[np.ndarray, "2 J B"]:
@@ -88,10 +90,15 @@ def cuts(num_segments: int, length: int) -> Int[np.ndarray, "2 J B"]:
     return np.stack([cut(0), cut(length // 2)])
 
 
-def has_segments(num_segments: int, length: int) -> Bool[np.ndarray, "2 B"]:
+def has_length(problem: RecordProblem) -> Bool[Array, " K"]:
+    """Which segments are a part of the record: those beyond its end have steps of length zero."""
+    return jnp.any(problem.record.dt > 0, axis=1)
+
+
+def has_segments(problem: RecordProblem, length: int) -> Bool[Array, "2 B"]:
     """Which blocks of each cut hold a part of the record: the last may lie beyond it."""
-    segment = cuts(num_segments, length)
-    return np.any((segment >= 0) & (segment < num_segments), axis=1)
+    some = jnp.pad(has_length(problem), 1)
+    return jnp.any(some[cuts(problem.num_segments, length) + 1], axis=1)
 
 
 def blocks_of(
@@ -143,6 +150,8 @@ def blocks_of(
     is_first = np.arange(segment.shape[1]) == 0
     at_end = np.where(outside, 0, inside + 1)
     values = jnp.where(outside[..., None], jnp.nan, problem.record.values[at_end])
+    # Whether a segment has a length, or one that comes after it.
+    after = jnp.cumsum(has_length(problem)[::-1])[::-1] > 0
     return Blocks(
         jnp.asarray(segment),
         lanes_last(steps, 2),
@@ -155,6 +164,7 @@ def blocks_of(
         jnp.where(is_first, problem.record.values[0][:, None], jnp.nan),
         jnp.where(is_first, guide.initial.root[..., None], 0),
         guide.initial.mean,
+        jnp.append(after[1:], False)[inside[-1]],
     )
 
 
@@ -202,7 +212,7 @@ def move(
     old = joined(jnp.moveaxis(padded[blocks.segment + 1], 1, -2))  # (J, N, d, B C)
     starts = joined(jnp.moveaxis(padded[jnp.maximum(blocks.segment[0], 0), -1], 0, -2))
     # Unless the record has ended, the end of a block is seen exactly.
-    is_pinned = spread(blocks.segment[-1] < K - 1)
+    is_pinned = spread(blocks.goes_on)
     last_point = spread(blocks.next_points[-1, -1])
     scalars, last = spread(blocks.scalars), jax.tree.map(lambda leaf: leaf[-1], blocks.scalars)
     pinned = _seen_exactly(old[-1, -1] - last_point, spread(last), is_pinned)
@@ -313,8 +323,8 @@ def sweep(
 
 
 def tuned(
-    log_scales: Float[Array, "2 B"], taken: Bool[Array, "2 B C"], number: Float[Array, ""]
-) -> Float[Array, "2 B"]:
+    log_scales: Float[Array, "*R 2 B"], taken: Bool[Array, "*R 2 B C"], number: Float[Array, ""]
+) -> Float[Array, "*R 2 B"]:
     """log β after the sweep of this number in a warm-up, in which these moves were accepted."""
     share = jnp.mean(taken.astype(log_scales.dtype), axis=-1)
     return jnp.minimum(log_scales + number**-0.6 * (share - _TARGET), 0)

@@ -15,7 +15,7 @@ from ..proposals.guided import check_step_density
 from ..schemes import AbstractStepDensity, EulerDensity, ItoTaylorDensity
 from .initial import Initial, bound, initial_law
 from .observation import Observation, Scalars, check_observation
-from .record import Record, as_record
+from .record import Record, as_records, split_records
 
 
 class RecordProblem(eqx.Module):
@@ -35,7 +35,7 @@ class RecordProblem(eqx.Module):
 
     @property
     def num_segments(self) -> int:
-        return self.record.dt.shape[0]
+        return self.record.dt.shape[-2]
 
     @property
     def like(self) -> Float[Array, " d"]:
@@ -65,15 +65,36 @@ def as_record_problem(
     density: AbstractStepDensity | None = None,
     any_constant: bool = False,
 ) -> RecordProblem:
-    """What the arguments that all who read records share say. The constant of ν may be unknown
+    """What the arguments that all who read one record share say. The constant of ν may be unknown
     where only paths at fixed parameters are asked for, `any_constant`.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    """
+    seen = split_records(times, observations)
+    if len(seen) > 1:
+        raise ValueError(
+            f"`observations` are {len(seen)} records, and here there is a path of one: given the "
+            "parameters they are independent, so take one after the other."
+        )
+    (record,) = as_records(seen, num_steps, step_size, initial_time)
+    return problem_of(model, record, observation, initial, density, any_constant)
+
+
+def problem_of(
+    model: Diffusion,
+    record: Record,
+    observation: Observation,
+    initial: Initial,
+    density: AbstractStepDensity | None = None,
+    any_constant: bool = False,
+) -> RecordProblem:
+    """What is asked of a record.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
     """
     warn_near_limit_of_maps()
     check_diffusion(model)
     check_observation(observation)
-    record = as_record(times, observations, num_steps, step_size, initial_time)
     m = record.values.shape[1]
     guess = observation.linear
     dim = m if guess.matrix is None else guess.matrix.shape[1]

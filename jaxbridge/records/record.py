@@ -5,8 +5,11 @@ every record is K segments of N steps, whatever its times, and one program.
 """
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -42,7 +45,7 @@ class Record(eqx.Module):
     @property
     def num_steps(self) -> int:
         """N."""
-        return self.dt.shape[1]
+        return self.dt.shape[-1]
 
     def grid(self) -> Float[Array, " points"]:
         """The times of all points."""
@@ -58,15 +61,85 @@ class Record(eqx.Module):
         return dataclasses.replace(self, dt=jnp.concatenate([self.dt[:, :odd], pairs], axis=1))
 
 
-def as_record(
-    times: Numbers,
-    observations: Numbers,
+def as_records(
+    seen: list[tuple[Numbers, Numbers]],
     num_steps: int | None,
     step_size: float | None,
     initial_time: Numbers | None = None,
-) -> Record:
-    """The record of what was seen, `num_steps` between two times, or so many that none is longer
-    than `step_size`; from `initial_time` on.
+) -> list[Record]:
+    """The records of times and of what was seen at them, `num_steps` between two times, or so many
+    that none is longer than `step_size`; from `initial_time` on. All have the same N.
+
+    **Raises:** `ValueError` that says what is wrong with which time or observation.
+    """
+    check = lambda times, values: _checked(times, values, initial_time)
+    each = of_each(check, seen)
+    widths = [values.shape[1] for _, _, values in each]
+    if len(set(widths)) > 1:
+        raise ValueError(
+            "several records must be seen alike, with as many columns of `observations`; got "
+            f"{widths}."
+        )
+    with jax.ensure_compile_time_eval():  # so that gaps that are known stay so
+        gaps = jnp.concatenate([gaps for _, gaps, _ in each])
+    num_steps, segments = _segments(gaps, num_steps, step_size)
+    ends = np.cumsum([len(gaps) for _, gaps, _ in each])[:-1]
+    counts = np.split(segments, ends)
+    return [
+        _cut(times, gaps, values, num_steps, tuple(mine.tolist()))
+        for (times, gaps, values), mine in zip(each, counts, strict=True)
+    ]
+
+
+def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, Numbers]]:
+    """Times and observations of each of several records: of lists of them, or of arrays with a
+    leading axis; or of the only one. Records may share their `times`.
+
+    **Raises:** `ValueError` where there are not as many of the one as of the other.
+    """
+    if _num_axes(observations) != 3:
+        return [(times, observations)]
+    rows: list[Any] = list(observations)  # pyright: ignore[reportArgumentType]
+    when: list[Any] = len(rows) * [times]
+    if _num_axes(times) > 1:
+        when = list(times)  # pyright: ignore[reportArgumentType]
+    if len(rows) == 0 or len(when) != len(rows):
+        raise ValueError(
+            "several records are a list of `times` and a list of `observations`, as long and not "
+            f"empty; got {len(when)} and {len(rows)}."
+        )
+    return list(zip(when, rows, strict=True))
+
+
+def of_each(function: Callable[..., Any], seen: list[tuple[Numbers, Numbers]]) -> list[Any]:
+    """`function(times, observations)` of each record, whose errors say of which they are, if there
+    are several.
+
+    **Raises:** what it raises.
+    """
+    if len(seen) == 1:
+        return [function(*seen[0])]
+    made = []
+    for number, (times, observations) in enumerate(seen):
+        try:
+            made.append(function(times, observations))
+        except (ValueError, TypeError) as error:
+            raise type(error)(f"in record {number}: {error}") from error
+    return made
+
+
+def _num_axes(value: Any) -> int:
+    """Of an array, or of nested lists, by their first entries."""
+    if hasattr(value, "ndim"):
+        return value.ndim
+    is_list = isinstance(value, list | tuple)
+    return 1 + _num_axes(value[0]) if is_list and value else int(is_list)
+
+
+def _checked(
+    times: Numbers, observations: Numbers, initial_time: Numbers | None
+) -> tuple[Float[Array, " n"], Float[Array, " gaps"], Float[Array, "n m"]]:
+    """Times, the gaps between them, and values.
 
     **Raises:** `ValueError` that says what is wrong with which time or observation.
     """
@@ -92,8 +165,7 @@ def as_record(
         if infinite.size:
             i, j = infinite[0]
             raise ValueError(f"`observations[{i}, {j}]` is infinite: NaN says it was not seen.")
-    num_steps, segments = _segments(gaps, num_steps, step_size)
-    return _cut(times, gaps, values, num_steps, tuple(segments.tolist()))
+    return times, gaps, values
 
 
 @eqx.filter_jit

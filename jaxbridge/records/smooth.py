@@ -155,7 +155,7 @@ def _smooth(
     init = paths, jnp.zeros((2, both.segment.shape[-1]), points.dtype)
     _, made = metered_scan(step, init, jnp.arange(num_warmup + num_draws), progress_meter)
     drawn, taken = jax.tree.map(lambda leaf: leaf[num_warmup:], made)
-    real = has_segments(K, block_length)[..., None]
+    real = has_segments(problem, block_length)[..., None]
     stuck = jnp.any(real & ~jnp.any(taken, axis=0), axis=(0, 1))
     share = jnp.mean(taken.astype(points.dtype), axis=(0, -1))
     return Smoothed(problem.record.grid(), jnp.moveaxis(drawn, 1, 0), share, stuck)

@@ -1,10 +1,12 @@
 """Records and their groups of steps."""
 
+import jax
 import numpy as np
 import pytest
 
+import jaxbridge as jb
 from jaxbridge.inference import data
-from jaxbridge.inference.data import _cheapest_groups, step_groups
+from jaxbridge.inference.data import _cheapest_groups, as_observations, step_groups
 from jaxbridge.models.bridge_problem import as_intervals
 
 
@@ -45,3 +47,19 @@ def test_the_groups_are_the_cheapest(cost, monkeypatch):
         for kept in range(16)
     ]
     assert total(_cheapest_groups(numbers, counts)) == min(map(total, ways))
+
+
+def test_a_record_in_two_parts_that_share_a_point_is_the_same_record():
+    model, times = jb.ornstein_uhlenbeck([[1.0]]), np.cumsum([0.0, 0.5, 0.25, 1.0, 0.5])
+    values = np.linspace(-1, 1, 5)[:, None]
+    parts = [times[:3], times[2:] + 7], [values[:3], values[2:]]
+    whole, cut = as_observations(model, times, values), as_observations(model, *parts)
+    for one, other in zip(jax.tree.leaves(whole), jax.tree.leaves(cut), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_a_point_that_is_missing_is_told_with_its_record():
+    model, values = jb.ornstein_uhlenbeck([[1.0]]), np.zeros((2, 3, 1))
+    values[1, 2] = np.nan
+    with pytest.raises(ValueError, match=r"in record 1: `observations\[2\]`"):
+        as_observations(model, np.arange(3.0), values)

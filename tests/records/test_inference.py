@@ -51,12 +51,24 @@ def record():
     return values
 
 
-def kalman_log_likelihood(log_rate, log_sigma, log_noise):
+def ito_taylor_step(A, V):
+    """Of dX = -a X dt + noise, of second order."""
+    z = A[0, 0]
+    return lambda dt: ((1 - z * dt + (z * dt) ** 2 / 2) * np.eye(1), V * dt * _decay(z * dt))
+
+
+def _decay(z):
+    return 1 - z + z**2 / 3
+
+
+def kalman_log_likelihood(log_rate, log_sigma, log_noise, law=exact_step, num=1, parts=((0, 40),)):
+    """Of the parts of the record, each of which begins anew."""
     rate, sigma, noise = np.exp([log_rate, log_sigma, log_noise])
-    step = exact_step(np.array([[rate]]), np.array([[sigma**2]]))
-    spread = np.array([[sigma**2 / (2 * rate)]])
-    seen = (TIMES, record(), np.eye(1), np.array([[noise**2]]))
-    return kalman(step, *seen, np.zeros(1), spread, 1).log_likelihood
+    step = law(np.array([[rate]]), np.array([[sigma**2]]))
+    start = (np.zeros(1), np.array([[sigma**2 / (2 * rate)]]))
+    seen = (np.eye(1), np.array([[noise**2]]))
+    part = lambda i, j: kalman(step, TIMES[i:j], record()[i:j], *seen, *start, num).log_likelihood
+    return sum(part(*ends) for ends in parts)
 
 
 def log_prior(params):
@@ -64,12 +76,15 @@ def log_prior(params):
 
 
 @functools.cache
-def exact_posterior():
+def exact_posterior(**options):
     """Means and sds of (log_noise, log_rate, log_sigma), by quadrature."""
     axes = [np.linspace(-reach, reach, num) for reach, num in [(2.5, 15), (1.4, 15), (4, 21)]]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
     points = grid + np.array([TRUE["log_rate"], TRUE["log_sigma"], TRUE["log_noise"]])
-    log = np.array([kalman_log_likelihood(*point) for point in points]) - (grid**2).sum(1) / 2
+    log = (
+        np.array([kalman_log_likelihood(*point, **options) for point in points])
+        - (grid**2).sum(1) / 2
+    )
     weights = np.exp(log - log.max())
     weights /= weights.sum()
     points = points[:, [2, 0, 1]]  # in alphabetical order
@@ -102,6 +117,42 @@ def test_rate_sigma_and_noise_are_found(method):
     theta = np.asarray(posterior.theta).reshape(-1, 3)
     np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error + 0.02 * sd)
     np.testing.assert_array_less(error, 0.1 * sd)
+    np.testing.assert_allclose(theta.std(0), sd, rtol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.parametrize("method", ["pmmh", "gibbs"])
+def test_the_step_error_is_told(method):
+    """Of two steps between observations: that of the chain of these steps, whose posterior is known
+    as well."""
+    posterior = getattr(jb, method)(
+        jax.random.key(0), model(), TIMES, record(), observation=SEEN, prior=log_prior,
+        num_iterations=3000, num_warmup=1000, num_chains=4, num_steps=2,
+        **{"pmmh": {"num_proposals": 4}, "gibbs": {"thin": 2}}[method],
+    )  # fmt: skip
+    (exact, sd), (of_steps, _) = exact_posterior(), exact_posterior(law=ito_taylor_step, num=2)
+    told, doubt = np.asarray(posterior.step_error), np.asarray(posterior.step_uncertainty)
+    assert np.all(np.abs(told - (of_steps - exact)) < 4.5 * doubt)
+    assert np.all(doubt < 0.03 * sd)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.parametrize("method", ["pmmh", "gibbs"])
+def test_several_records_have_one_posterior(method):
+    parts = ((0, 25), (25, 40))
+    times, values = zip(*((TIMES[i:j], record()[i:j]) for i, j in parts), strict=True)
+    posterior = getattr(jb, method)(
+        jax.random.key(1), model(), times, values, observation=SEEN, prior=log_prior,
+        num_iterations=3000, num_warmup=1000, num_chains=4, num_steps=4,
+        **{"pmmh": {"num_proposals": 4}, "gibbs": {"thin": 2}}[method],
+    )  # fmt: skip
+    mean, sd = exact_posterior(parts=parts)
+    error = np.asarray(posterior.standard_error)
+    theta = np.asarray(posterior.theta).reshape(-1, 3)
+    assert np.all(posterior.r_hat < 1.03) and not np.any(getattr(posterior, "stuck", False))
+    np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error + 0.02 * sd)
     np.testing.assert_allclose(theta.std(0), sd, rtol=0.1)
 
 

@@ -24,9 +24,15 @@ NEVER = jb.ObservationDensity(lambda y, x, p: -jnp.inf, GUESS)
 LAW = jb.GaussianLaw([0.0], [[0.5]])
 
 
+def problem_of_length(num, observation=POSITIVE):
+    counts = np.resize(COUNTS, (num + 1, 1))
+    return as_record_problem(
+        MODEL, np.arange(num + 1) * 0.3, counts, observation, LAW, num_steps=4, any_constant=True
+    )
+
+
 def test_a_path_of_no_weight_is_left():
-    options = {"num_steps": 4, "any_constant": True}
-    problem = as_record_problem(MODEL, TIMES, COUNTS, POSITIVE, LAW, **options)
+    problem = problem_of_length(6)
     both = blocks_of_both_cuts(problem, *linearised(problem, MODEL), 2)
     scales = jnp.zeros((2, both.segment.shape[-1]))
     paths = Paths(jnp.full((1, 3), -1.0), jnp.full((6, 4, 1, 3), -1.0))
@@ -41,15 +47,16 @@ def test_a_chain_that_never_moves_says_so():
         jax.random.key(0), MODEL, TIMES, COUNTS, observation=NEVER, initial=LAW,
         num_draws=4, num_warmup=0, num_chains=2, num_steps=4,
     )  # fmt: skip
-    assert np.all(made.stuck) and np.all(made.accepted[has_segments(6, 10)] == 0)
+    real = has_segments(problem_of_length(6), 10)
+    assert np.all(made.stuck) and np.all(made.accepted[real] == 0)
     assert np.all(np.isfinite(made.paths)) and np.all(made.standard_error() == np.inf)
 
 
 def test_blocks_beyond_the_record_are_not_stuck():
     """Of nine segments in blocks of four the second cut needs all three of its blocks, the first
     its first three; of four segments in one block the first cut's second is empty."""
-    assert has_segments(9, 4).tolist() == [[True] * 3, [True] * 3]
-    assert has_segments(4, 4).tolist() == [[True, False], [True, True]]
+    assert has_segments(problem_of_length(9), 4).tolist() == [[True] * 3, [True] * 3]
+    assert has_segments(problem_of_length(4), 4).tolist() == [[True, False], [True, True]]
 
 
 def test_parameters_that_never_moved_have_no_error():

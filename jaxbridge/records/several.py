@@ -1,0 +1,103 @@
+"""Several records that share a model: given the parameters they are independent.
+
+So likelihoods multiply, and paths move each by themselves. Records are lanes: all are given as many
+segments as the longest, those beyond the end of a record of steps of length zero, at which nothing
+is seen.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from ..engine.checks import Numbers
+from ..models.diffusion import Diffusion
+from ..schemes import AbstractStepDensity
+from .guided_record import linearised
+from .initial import Initial
+from .observation import Observation
+from .problem import RecordProblem, problem_of
+from .record import Record, as_records, split_records
+
+
+class Records(eqx.Module):
+    """R records, whose axis is the first of all arrays of `stacked.record`; and how many times each
+    has something, or nothing, to be seen at."""
+
+    stacked: RecordProblem
+    num_times: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def number(self) -> int:
+        """R."""
+        return len(self.num_times)
+
+    def halved(self) -> "Records":
+        """The same with half as many steps."""
+        record = jax.vmap(lambda record: record.halved())(self.stacked.record)
+        return Records(dataclasses.replace(self.stacked, record=record), self.num_times)
+
+    def each(self, function: Callable, *mapped: PyTree) -> Any:
+        """`function(problem, *mapped)` of each record, with their axis in front of what is mapped
+        and of all results."""
+
+        def one(record: Record, *mapped: PyTree):
+            return function(dataclasses.replace(self.stacked, record=record), *mapped)
+
+        arguments = self.stacked.record, *mapped
+        if self.number > 1:
+            return jax.vmap(one)(*arguments)
+        # A single record takes no lanes: under `vmap` both branches of a `cond` would be run.
+        alone = jax.tree.map(lambda leaf: leaf[0], arguments)
+        return jax.tree.map(lambda leaf: leaf[None], one(*alone))
+
+    def at_observations(self, values: Float[Array, "R ends"]) -> Float[Array, " n"]:
+        """What belongs to the ends of segments, at all observations, record after record."""
+        each = zip(values, self.stacked.record.which, self.num_times, strict=True)
+        return jnp.concatenate([mine[which[:num]] for mine, which, num in each])
+
+
+def as_record_problems(
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    observation: Observation,
+    initial: Initial,
+    *,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    initial_time: Numbers | None = None,
+    density: AbstractStepDensity | None = None,
+) -> Records:
+    """What the arguments that all who read one record, or several, share say.
+
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    """
+    seen = split_records(times, observations)
+    records = as_records(seen, num_steps, step_size, initial_time)
+    problem = problem_of(model, records[0], observation, initial, density)
+    num_times = tuple(len(record.which) for record in records)
+    num_segments = max(len(record.dt) for record in records)
+    same = [_padded(record, num_segments, max(num_times)) for record in records]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *same)
+    return Records(dataclasses.replace(problem, record=stacked), num_times)
+
+
+def _padded(record: Record, num_segments: int, num_times: int) -> Record:
+    """With so many segments, the last of which have no length and nothing to be seen."""
+    more, last = num_segments - record.dt.shape[0], record.times[-1]
+    return Record(
+        jnp.pad(record.times, (0, more), constant_values=last),
+        jnp.pad(record.dt, ((0, more), (0, 0))),
+        jnp.pad(record.values, ((0, more), (0, 0)), constant_values=jnp.nan),
+        jnp.pad(record.which, (0, num_times - len(record.which))),
+    )
+
+
+def linearisations(records: Records, model: Diffusion) -> Float[Array, "R points d"]:
+    """The points along which each record is linearised."""
+    return records.each(lambda problem: linearised(problem, model).points)

@@ -1,0 +1,107 @@
+"""Several records that share a model, against the Kalman filters of each."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from linear_records import plane
+
+import jaxbridge as jb
+from jaxbridge.records import (
+    Paths,
+    as_record_problems,
+    blocks_of_both_cuts,
+    guided,
+    linearisations,
+    sweep,
+)
+
+LONG = plane(9)
+SHORT = LONG._replace(times=LONG.times[:6] + 1, values=-LONG.values[5::-1])
+
+
+def both():
+    times, values = [LONG.times, SHORT.times], [LONG.values, SHORT.values]
+    return LONG.model, times, values
+
+
+def test_likelihoods_multiply():
+    made = jb.log_likelihood(
+        jax.random.key(0), *both(), **LONG.options, num_particles=5, num_filters=2, num_steps=4,
+        density=jb.EulerDensity(),
+    )  # fmt: skip
+    exact = LONG.kalman(4).log_likelihood + SHORT.kalman(4).log_likelihood
+    assert abs(made.value - exact) < 1e-4
+    assert made.effective_sample_size.shape == (15,)
+    np.testing.assert_allclose(made.effective_sample_size, 5, rtol=1e-3)
+    alone = jb.log_likelihood(
+        jax.random.key(0), *SHORT.arguments, **SHORT.options, num_particles=5, num_filters=2,
+        num_steps=4, density=jb.EulerDensity(),
+    )  # fmt: skip
+    assert abs(alone.value - SHORT.kalman(4).log_likelihood) < 1e-4
+
+
+def test_paths_beyond_the_end_of_the_shorter_one_are_nobodys():
+    """Paths of both records, in blocks that reach beyond the end of the shorter one, have the law
+    that each has by itself."""
+    model, times, values = both()
+    records = as_record_problems(
+        model, times, values, **LONG.options, num_steps=4, density=jb.EulerDensity()
+    )
+    points, chains = linearisations(records, model), 200
+
+    def first(problem, points):
+        start = jnp.broadcast_to(points[0][:, None], (2, chains))
+        K, N = problem.record.dt.shape
+        rest = points[1:].reshape(K, N, 2, 1)
+        return start, jnp.broadcast_to(rest, (K, N, 2, chains))
+
+    def moved(problem, key, points, start, rest):
+        blocks = blocks_of_both_cuts(problem, points, guided(problem, model, points), 4)
+        scales = jnp.zeros((2, blocks.segment.shape[-1]))
+        return sweep(key, problem, model, blocks, scales, Paths(start, rest))[0]
+
+    @jax.jit
+    def step(paths, key):
+        return Paths(*records.each(moved, jax.random.split(key, 2), points, *paths)), None
+
+    paths = Paths(*records.each(first, points))
+    paths, _ = jax.lax.scan(step, paths, jax.random.split(jax.random.key(1), 30))
+    for number, record in enumerate((LONG, SHORT)):
+        exact = record.kalman(4)
+        ends = np.asarray(paths.points[number, : len(record.times) - 1, -1])
+        variance = np.diagonal(exact.covariance, axis1=1, axis2=2)[4::4]
+        error = np.sqrt(variance / chains)
+        assert np.all(np.abs(ends.mean(-1) - exact.mean[4::4]) < 4.5 * error)
+        ratio = ends.var(-1) / variance
+        assert np.all(np.abs(ratio - 1) < 4.5 * np.sqrt(2 / chains))
+
+
+def test_records_of_one_shape_may_share_their_times():
+    model, times = jb.ornstein_uhlenbeck([[1.0]]), np.arange(3) * 0.5
+    values = np.linspace(-0.5, 0.5, 6).reshape(2, 3, 1)
+    made = jb.log_likelihood(jax.random.key(0), model, times, values, num_particles=50)
+    each = [
+        jb.log_likelihood(jax.random.key(0), model, times, row, num_particles=50) for row in values
+    ]
+    error = np.sqrt(made.standard_error**2 + sum(one.standard_error**2 for one in each))
+    assert abs(made.value - sum(one.value for one in each)) < 4.5 * error + 1e-5
+
+
+@pytest.mark.parametrize(
+    ("times", "values", "says"),
+    [
+        ([[0, 1.0]], [np.zeros((2, 1)), np.zeros((2, 1))], "got 1 and 2"),
+        ([[0, 1.0], [0, 1.0]], [np.zeros((2, 1)), np.zeros((2, 2))], r"columns.*\[1, 2\]"),
+        ([[0, 1.0], [0, -1.0]], [np.zeros((2, 1)), np.zeros((2, 1))], "in record 1: .*increase"),
+    ],
+)
+def test_records_that_do_not_fit(times, values, says):
+    model, seen = jb.ornstein_uhlenbeck([[1.0]]), jb.LinearGaussian(covariance=1.0)
+    with pytest.raises(ValueError, match=says):
+        jb.log_likelihood(jax.random.key(0), model, times, values, observation=seen)
+
+
+def test_a_path_is_of_one_record():
+    with pytest.raises(ValueError, match="2 records, and here there is a path of one"):
+        jb.smooth(jax.random.key(0), *both(), **LONG.options)
