@@ -78,6 +78,7 @@ from .inference.pmmh import PMMHPosterior, PMMHState, pmmh
 from .inference.posterior import AbstractPosterior
 from .inference.priors import NormalPrior
 from .inference.record_gibbs import RecordPosterior, RecordState
+from .inference.record_maximum import RecordMaximumLikelihood
 from .inference.score import Score, score
 from .models.diffusion import Diffusion
 from .models.gaussian_bridge import GaussianBridge, gaussian_bridge
@@ -213,6 +214,7 @@ __all__ = [
     "PMMHState",
     "maximum_likelihood",
     "MaximumLikelihood",
+    "RecordMaximumLikelihood",
     "score",
     "Score",
     "NormalPrior",

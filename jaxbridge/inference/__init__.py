@@ -20,4 +20,8 @@ proposal that suits its use (`blocks`). On these are built:
 * the maximum of Σ_k log p̂_θ(x_{k-1}, x_k) with fixed noise, smooth in θ where proposals are pulled
   to the end point (`simulated_likelihood`): for parameters of σ, which a whole path gives away.
   Either way it is `maximum_likelihood`.
+
+Of records that were seen with noise or in part the likelihood is E[w(θ, ξ)], the mean weight of
+paths that normal noise ξ makes (`record_paths`). Draws from π(θ) N(ξ; 0, I) w(θ, ξ) are `gibbs` as
+well (`record_gibbs`), and the maximum is `maximum_likelihood` (`record_maximum`).
 """

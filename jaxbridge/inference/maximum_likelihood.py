@@ -7,6 +7,8 @@ independent bridges gives the observed information I, one step of Newton's metho
 
 Where σ depends on the unknown parameters paths are of no use, and the maximum is that of the
 likelihood by simulation (`simulated_likelihood`).
+
+Of records that were seen with noise or in part see `record_maximum`.
 """
 
 from collections.abc import Callable
@@ -19,10 +21,11 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.checks import Numbers, check_count
+from ..engine.checks import Numbers, check_count, check_key
 from ..engine.pareto import is_reliable
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
+from ..records import Initial, Observation, as_record_problems
 from ..schemes import StepError, dominates
 from .augmentation import augment
 from .data import Problem, as_problem
@@ -30,7 +33,9 @@ from .parameters import (
     Constraint,
     Parameters,
     as_parameters,
+    theta_of_model,
 )
+from .record_maximum import RecordMaximumLikelihood, maximum_of_records
 from .score import Score, as_score, score_at
 from .simulated_likelihood import (
     as_pulled,
@@ -118,11 +123,13 @@ def maximum_likelihood(
     proposal: Any = "auto",
     where: Callable[[PyTree], PyTree] | None = None,
     constraint: Constraint | None = None,
+    observation: Observation | None = None,
+    initial: Initial = None,
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
-) -> MaximumLikelihood:
+) -> MaximumLikelihood | RecordMaximumLikelihood:
     """The maximum likelihood estimate of a model's parameters, given discrete observations.
 
     **Arguments:**
@@ -140,6 +147,9 @@ def maximum_likelihood(
     - `num_iterations`: of the stochastic approximation.
     - `num_bridges`: weighted bridges of each interval for the last step and the errors; where σ
         is unknown, for the likelihood whose maximum is the estimate.
+    - `observation`, `initial`: for records that were seen with noise or in part, as in
+        `innovations`. Any parameters may be unknown there, and `num_bridges` are draws of each of
+        eight chains of paths.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
@@ -155,7 +165,8 @@ def maximum_likelihood(
     order: `num_steps` matters. Only σ σᵀ is in the law of the data: of a matrix, leave unknown
     what that determines.
 
-    **Returns:** `MaximumLikelihood`. Not differentiable.
+    **Returns:** `MaximumLikelihood`; with an `observation`, `RecordMaximumLikelihood`. Not
+    differentiable.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
@@ -179,9 +190,18 @@ def maximum_likelihood(
     if method == "em" and optimizer is not None:
         raise ValueError('`method="em"` takes no `optimizer`.')
     parameters = as_parameters(model, where, constraint)
+    optimizer = _ADAM if optimizer is None else optimizer
+    if observation is not None:
+        check_key(key)
+        _check_no_bridges(method, proposal)
+        steps = {"num_steps": num_steps, "step_size": step_size}
+        records = as_record_problems(model, times, observations, observation, initial, **steps)
+        unknown = theta_of_model(parameters, records.stacked.like.dtype)
+        search = Search(Gradient(optimizer), num_iterations, progress_meter)
+        return maximum_of_records(key, parameters, records, unknown, search, num_bridges)
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
     parameters.check_allowed(problem.theta)
-    rule = EM() if method == "em" else Gradient(_ADAM if optimizer is None else optimizer)
+    rule = EM() if method == "em" else Gradient(optimizer)
     proposal = "auto" if proposal is None else proposal
     budget = Budget(num_counts, max_proposals, max_trials)
     search = Search(rule, num_iterations, progress_meter)
@@ -194,6 +214,15 @@ def maximum_likelihood(
             "with `where=`."
         )
     return _by_simulation(key, problem, proposal, budget, search, num_bridges)
+
+
+def _check_no_bridges(method: str, proposal: Any) -> None:
+    """Raise `ValueError` where bridges between complete observations are asked for."""
+    if method != "gradient" or not (isinstance(proposal, str) and proposal == "auto"):
+        raise ValueError(
+            '`proposal` and `method="em"` are for complete observations without noise: leave them '
+            "out where there is an `observation`."
+        )
 
 
 def _by_bridges(

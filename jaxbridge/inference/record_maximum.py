@@ -1,0 +1,286 @@
+"""Maximum likelihood from records that were seen with noise or in part.
+
+With ξ ~ N(0, I) and the path of ξ at θ (`record_paths`) the likelihood is E[w(θ, ξ)]; the law of ξ
+does not know θ, so that Fisher's identity and Louis's (1982) are
+
+    ∇ log L(θ) = E[∇ log w | y],    -∇² log L(θ) = -E[∇² log w | y] - Cov(∇ log w | y),
+
+means over ξ given θ and the data, derivatives in θ. Parameters of σ, of the noise and of the
+initial law are as good as those of the drift, however small the steps.
+
+Chains of paths move given the current θ, are read as ξ, and θ makes a step of an optimiser along
+the mean of ∇ log w, which takes the paths along (Gu & Kong 1998). From the average of the second
+half of the iterates, where the chains run on with θ fixed, one step of Newton's method is made.
+
+The step error e = log L_N - log L of the likelihood, about a share of log L_{N/2} - log L_N, moves
+the maximum by I⁻¹ ∇e, and with the weight w̃ of half as many steps and D = log w̃ / w,
+
+    ∇ log L_{N/2} = E[(w̃ / w) ∇ log w̃ | y] / E[w̃ / w | y] ≈ E[∇ log w̃ | y] + Cov(D, ∇ log w̃ | y).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from ..engine.checks import all_finite_leaves, nondifferentiable
+from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
+from ..engine.progress import metered_scan
+from ..records import Records, tuned
+from ..schemes import StepError, dominates
+from .parameters import Parameters
+from .record_paths import RecordPaths, as_record_paths
+from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
+
+_CHAINS = 8
+# Sweeps of the chains before θ moves, and after it has come to rest.
+_SWEEPS = 50
+
+
+class RecordMaximumLikelihood(eqx.Module):
+    """The maximum likelihood estimate, from `maximum_likelihood`, of records that were seen with
+    noise or in part.
+
+    - `params`: all parameters of the model, the unknown ones estimated.
+    - `standard_errors`: a pytree like the unknown parameters, from the observed information.
+    - `monte_carlo_errors`: likewise, of the search for the maximum; more `num_bridges` make them
+        smaller.
+    - `theta`, `covariance`: the unknown parameters as a vector, shape (p,), and the inverse of
+        the observed information, shape (p, p).
+    - `step_error`: what `theta` is too large by for the length of the steps, an estimate, shape
+        (p,), with a standard error of it, `step_uncertainty`. NaN of one step.
+    - `iterates`: of the stochastic approximation, shape (n, p).
+    - `gradient`: of the log likelihood at the average of the later iterates, before the last step,
+        shape (p,), with the `effective_sample_size` of its draws and `r_hat` over the chains.
+    - `stuck`: chains in which a block of a path never moved, of those at the end, shape (chains,).
+    - `num_refused`: iterations whose step led out of the constraint, or to what is not finite, and
+        was not made.
+    - `newton`: whether the last step was made. Not so if the information was not positive definite,
+        or the step longer than about a standard error, or out of the constraint: then the average
+        of the iterates is returned, which is not the maximum, and more iterations are needed, or
+        longer steps.
+    """
+
+    params: PyTree
+    standard_errors: PyTree
+    monte_carlo_errors: PyTree
+    theta: Float[Array, " p"]
+    covariance: Float[Array, "p p"]
+    step_error: Float[Array, " p"]
+    step_uncertainty: Float[Array, " p"]
+    iterates: Float[Array, "n p"]
+    gradient: Float[Array, " p"]
+    effective_sample_size: Float[Array, " p"]
+    r_hat: Float[Array, " p"]
+    stuck: Bool[Array, " chains"]
+    num_refused: Int[Array, ""]
+    newton: Bool[Array, ""]
+
+    @property
+    def trustworthy(self) -> Bool[Array, ""]:
+        """Whether a maximum was found by chains that agree (R̂ below 1.1) and move, with a step
+        error that does not dominate."""
+        agree = jnp.all(self.r_hat < 1.1) & ~jnp.any(self.stuck)
+        return self.newton & agree & ~jnp.any(self.step_error_dominates)
+
+    @property
+    def step_error_dominates(self) -> Bool[Array, " p"]:
+        """Whether the step error is beyond the standard error of the estimate, or not known well
+        enough to say: then more steps are needed."""
+        error = StepError(self.step_error, self.step_uncertainty)
+        return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
+
+
+class _Chains(NamedTuple):
+    """Paths of all chains, and log β of the moves of their blocks."""
+
+    paths: Float[Array, "chains R points d"]
+    log_scales: Float[Array, "chains R 2 B"]
+
+
+class _Draw(NamedTuple):
+    """Of one ξ: ∇ log w and ∇² log w, log w̃ / w and ∇ log w̃; and which blocks moved."""
+
+    gradient: Float[Array, "*n p"]
+    hessian: Float[Array, "*n p p"]
+    log_ratio: Float[Array, "*n"]
+    coarse: Float[Array, "*n p"]
+    taken: Bool[Array, "*n R 2 B"]
+
+
+def maximum_of_records(
+    key: Key[Array, ""],
+    parameters: Parameters,
+    records: Records,
+    theta: Float[Array, " p"],
+    search: Search,
+    num_draws: int,
+) -> RecordMaximumLikelihood:
+    """The estimate, by so many draws of each chain at the end."""
+    parameters.check_allowed(theta)
+    run_key, last_key = jax.random.split(key)
+    completion = as_record_paths(parameters, records, theta)
+    iterates, info = _approximate(run_key, completion, search, theta)
+    rough = jnp.mean(iterates[len(iterates) // 2 :], axis=0)
+    # What guides well at the first θ need not do so at the last.
+    completion = as_record_paths(parameters, records, rough)
+    draws = _draws_at(last_key, completion, rough, num_draws, search.progress_meter)
+    return _summary(completion, rough, iterates, info, draws)
+
+
+def _of_chains(function: Callable, key: Key[Array, ""], *mapped: PyTree) -> PyTree:
+    return jax.vmap(function)(jax.random.split(key, _CHAINS), *mapped)
+
+
+def _swept(
+    key: Key[Array, ""],
+    completion: RecordPaths,
+    theta: Float[Array, " p"],
+    chains: _Chains,
+    number: Int[Array, ""],
+) -> tuple[_Chains, Bool[Array, "chains R 2 B"]]:
+    """The paths after a sweep given θ, the `number`-th in which moves learn their size; and which
+    blocks moved."""
+    renewed = lambda key, *each: completion.renewed(key, theta, *each)
+    paths, taken = _of_chains(renewed, key, *chains)
+    log_scales = tuned(chains.log_scales, taken, (number + 1).astype(theta.dtype))
+    return _Chains(paths, log_scales), taken[..., 0]
+
+
+def _burnt_in(key: Key[Array, ""], completion: RecordPaths, theta: Float[Array, " p"]) -> _Chains:
+    """Chains after some sweeps at θ."""
+    first_key, key = jax.random.split(key)
+    first = _Chains(*_of_chains(lambda key: completion.first(key, theta), first_key))
+
+    def sweep(chains, i):
+        return _swept(jax.random.fold_in(key, i), completion, theta, chains, i)[0], None
+
+    return jax.lax.scan(sweep, first, jnp.arange(_SWEEPS))[0]
+
+
+@eqx.filter_jit
+def _approximate(
+    key: Key[Array, ""], completion: RecordPaths, search: Search, theta: Float[Array, " p"]
+) -> tuple[Float[Array, "n p"], SearchInfo]:
+    """The iterates of the stochastic approximation."""
+    completion = nondifferentiable(completion)
+    first_key, run_key = jax.random.split(key)
+    parameters, rule = completion.parameters, search.rule
+    assert isinstance(rule, Gradient)
+    number_seen = sum(completion.fine.records.num_times)
+
+    def propose(i, theta, memory, chains):
+        sweep_key, noise_key = jax.random.split(jax.random.fold_in(run_key, i))
+        chains, _ = _swept(sweep_key, completion, theta, chains, i + _SWEEPS)
+        read = lambda key, paths: completion.noise(key, theta, paths)[0]
+        noise = _of_chains(read, noise_key, chains.paths)
+        gradient = jax.grad(_mean_log_weight)(theta, completion, noise) / number_seen
+        new_theta, new_memory = rule.ascend(theta, memory, gradient)
+        # As `iterate` decides it: paths follow θ where that moves.
+        moves = parameters.allowed(new_theta) & all_finite_leaves(new_memory)
+        goal = jnp.where(moves, new_theta, theta)
+        paths, log_weights = jax.vmap(lambda noise: completion.of_noise(goal, noise))(noise)
+        good = jnp.isfinite(log_weights)[:, None, None, None]
+        chains = chains._replace(paths=jnp.where(good, paths, chains.paths))
+        return (new_theta, new_memory), chains, (jnp.int32(0), jnp.int32(0))
+
+    first = _burnt_in(first_key, completion, theta)
+    return iterate(propose, parameters, search, theta, first)
+
+
+def _mean_log_weight(
+    theta: Float[Array, " p"], completion: RecordPaths, noise: Float[Array, "chains R points d"]
+) -> Float[Array, ""]:
+    """The mean over chains, of those with a path that has weight."""
+    each = jax.vmap(lambda noise: completion.of_noise(theta, noise)[1])(noise)
+    return jnp.mean(each, where=jnp.isfinite(each))
+
+
+@eqx.filter_jit
+def _draws_at(
+    key: Key[Array, ""],
+    completion: RecordPaths,
+    theta: Float[Array, " p"],
+    num_draws: int,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> _Draw:
+    """Of all chains, axes (chains, n), at θ."""
+    completion, theta = nondifferentiable((completion, theta))
+    first_key, run_key = jax.random.split(key)
+
+    def derivatives(key, paths, taken):
+        noise, log_weight = completion.noise(key, theta, paths)
+        fine = lambda theta: completion.of_noise(theta, noise)[1]
+        coarse = lambda theta: completion.coarse_log_weight(theta, noise)
+        coarse_weight, coarse_gradient = jax.value_and_grad(coarse)(theta)
+        ratio = coarse_weight - log_weight
+        return _Draw(jax.grad(fine)(theta), jax.hessian(fine)(theta), ratio, coarse_gradient, taken)
+
+    def draw(chains, i):
+        sweep_key, noise_key = jax.random.split(jax.random.fold_in(run_key, i))
+        moved, taken = _swept(sweep_key, completion, theta, chains, i)
+        chains = chains._replace(paths=moved.paths)
+        return chains, _of_chains(derivatives, noise_key, chains.paths, taken)
+
+    first = _burnt_in(first_key, completion, theta)
+    _, draws = metered_scan(draw, first, jnp.arange(num_draws), progress_meter)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), draws)
+
+
+def _summary(
+    completion: RecordPaths,
+    rough: Float[Array, " p"],
+    iterates: Float[Array, "n p"],
+    info: SearchInfo,
+    draws: _Draw,
+) -> RecordMaximumLikelihood:
+    """One step of Newton's method, and the errors of where it leads."""
+    parameters, p = completion.parameters, len(rough)
+    gradients = draws.gradient.reshape(-1, p)
+    gradient, spread = jnp.mean(gradients, axis=0), jnp.cov(gradients.T).reshape(p, p)
+    information = -jnp.mean(draws.hessian, axis=(0, 1)) - spread
+    covariance = jnp.linalg.inv(information)
+    step = covariance @ gradient
+    definite = jnp.all(jnp.linalg.eigvalsh(information) > 0)
+    # Further off the likelihood need not be near its quadratic approximation.
+    ok = definite & (gradient @ step < p) & parameters.allowed(rough + step)
+    theta = jnp.where(ok, rough + step, rough)
+    size = jnp.sum(jax.vmap(effective_sample_size)(draws.gradient), axis=0)
+    left = covariance @ (spread / jnp.sqrt(size[:, None] * size)) @ covariance
+    stuck = jnp.any(completion.movable() & ~jnp.any(draws.taken, axis=1), axis=(1, 2, 3))
+    monte_carlo = jnp.sqrt(jnp.diagonal(left))
+    monte_carlo = jnp.where(jnp.any(stuck), jnp.inf, monte_carlo)
+    step_error = _step_error(completion, draws, covariance)
+    return RecordMaximumLikelihood(
+        parameters.full(theta),
+        parameters.select(jnp.sqrt(jnp.diagonal(covariance))),
+        parameters.select(monte_carlo),
+        theta,
+        covariance,
+        *step_error,
+        iterates,
+        gradient,
+        size,
+        potential_scale_reduction(draws.gradient),
+        stuck,
+        info.refused,
+        ok,
+    )
+
+
+def _step_error(
+    completion: RecordPaths, draws: _Draw, covariance: Float[Array, "p p"]
+) -> StepError:
+    """I⁻¹ ∇e, with its standard error by the chains."""
+    if completion.num_steps == 1:
+        return StepError(*2 * [jnp.full_like(draws.gradient[0, 0], jnp.nan)])
+    centred = draws.coarse - jnp.mean(draws.coarse, axis=(0, 1))
+    ratio = (draws.log_ratio - jnp.mean(draws.log_ratio))[..., None]
+    each = (draws.coarse - draws.gradient + ratio * centred) @ covariance
+    each = completion.share_of_step_error * each
+    size = jnp.sum(jax.vmap(effective_sample_size)(each), axis=0)
+    return StepError(jnp.mean(each, axis=(0, 1)), jnp.std(each, axis=(0, 1)) / jnp.sqrt(size))

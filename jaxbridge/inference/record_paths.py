@@ -1,0 +1,167 @@
+"""Paths of records as functions of θ and of noise ξ, and moves of them given θ.
+
+A path moves given θ in blocks (`records.path_blocks`); it is read as the noise ξ that makes it,
+guided through its record at θ; and ξ makes another path at another θ. Given a whole path its σ
+would be known, given ξ it is not (Roberts & Stramer 2001; van der Meulen & Schauer 2017).
+
+The step error of the likelihood is that of w. From ξ steps of twice the length have the noise
+(ζ_i + ζ_{i+1}) / √2, which is N(0, I) as well, and a weight w̃; so L̃(θ) = E[w̃ / w] L(θ), the mean
+over ξ given θ and the data.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from ..records import (
+    Paths,
+    Records,
+    blocks_of_both_cuts,
+    cuts,
+    guided,
+    has_segments,
+    linearisations,
+    noise_and_log_weight,
+    path_and_log_weight,
+    sweep,
+)
+from ..schemes import share_of_order
+from .parameters import Parameters
+
+# Intervals between observations that move at once.
+_BLOCK_LENGTH = 10
+
+
+class GuidedRecords(NamedTuple):
+    """Records, and the points along which each is linearised, whatever the parameters."""
+
+    records: Records
+    points: Float[Array, "R points d"]
+
+
+class RecordPaths(eqx.Module):
+    """What makes and moves the paths of R records, of one chain; `coarse` have half as many
+    steps."""
+
+    parameters: Parameters
+    fine: GuidedRecords
+    coarse: GuidedRecords
+
+    @property
+    def num_steps(self) -> int:
+        """N, of each segment."""
+        return self.fine.records.stacked.num_steps
+
+    @property
+    def share_of_step_error(self) -> float:
+        """The step error as a share of what half as many steps change."""
+        return share_of_order(self.fine.records.stacked.density.order)
+
+    def first(
+        self, key: Key[Array, ""], theta: Float[Array, " p"]
+    ) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:
+        """Paths to begin with, and log β of the moves of their blocks."""
+        model, (records, points) = self.parameters.bind(theta), self.fine
+
+        def one(problem, key, points):
+            noise = jax.random.normal(key, points.shape, points.dtype)
+            guide = guided(problem, model, points)
+            path, log_weight = path_and_log_weight(problem, model, guide, noise)
+            return jnp.where(jnp.isfinite(log_weight), path, points)
+
+        paths = records.each(one, jax.random.split(key, records.number), points)
+        num_blocks = cuts(records.stacked.num_segments, _BLOCK_LENGTH).shape[-1]
+        return paths, jnp.zeros((records.number, 2, num_blocks), theta.dtype)
+
+    def renewed(
+        self,
+        key: Key[Array, ""],
+        theta: Float[Array, " p"],
+        paths: Float[Array, "R points d"],
+        log_scales: Float[Array, "R 2 B"],
+    ) -> tuple[Float[Array, "R points d"], Bool[Array, "R 2 B 1"]]:
+        """The paths after a sweep given θ, and which blocks moved."""
+        model, (records, points) = self.parameters.bind(theta), self.fine
+
+        def one(problem, key, points, log_scales, path):
+            (K, N), d = problem.record.dt.shape, problem.dim
+            both = blocks_of_both_cuts(
+                problem, points, guided(problem, model, points), _BLOCK_LENGTH
+            )
+            old = Paths(path[0][:, None], path[1:].reshape(K, N, d, 1))
+            made, taken = sweep(key, problem, model, both, log_scales, old)
+            return jnp.concatenate([made.start.T, made.points.reshape(K * N, d)]), taken
+
+        keys = jax.random.split(key, records.number)
+        return records.each(one, keys, points, log_scales, paths)
+
+    def noise(
+        self, key: Key[Array, ""], theta: Float[Array, " p"], paths: Float[Array, "R points d"]
+    ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
+        """ξ of these paths, and log w."""
+        model, (records, points) = self.parameters.bind(theta), self.fine
+
+        def one(problem, key, points, path):
+            guide = guided(problem, model, points)
+            return noise_and_log_weight(key, problem, model, guide, path)
+
+        keys = jax.random.split(key, records.number)
+        noise, log_weight = records.each(one, keys, points, paths)
+        return noise, jnp.sum(log_weight)
+
+    def of_noise(
+        self, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
+    ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
+        """The paths of ξ, and log w."""
+        return _of_noise(self.fine, self.parameters, theta, noise)
+
+    def coarse_log_weight(
+        self, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
+    ) -> Float[Array, ""]:
+        """log w̃ of ξ, with steps of twice the length."""
+        halved = jax.vmap(lambda noise: _of_pairs(noise, self.num_steps))(noise)
+        return _of_noise(self.coarse, self.parameters, theta, halved)[1]
+
+    def movable(self) -> Bool[Array, "R 2 B"]:
+        """Which blocks hold a part of a record."""
+        return self.fine.records.each(lambda problem: has_segments(problem, _BLOCK_LENGTH))
+
+
+def as_record_paths(
+    parameters: Parameters, records: Records, theta: Float[Array, " p"]
+) -> RecordPaths:
+    """Linearised at θ."""
+    model = parameters.bind(theta)
+    of = lambda records: GuidedRecords(records, linearisations(records, model))
+    return RecordPaths(parameters, of(records), of(records.halved()))
+
+
+def _of_noise(
+    guide: GuidedRecords,
+    parameters: Parameters,
+    theta: Float[Array, " p"],
+    noise: Float[Array, "R points d"],
+) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
+    model = parameters.bind(theta)
+
+    def one(problem, points, noise):
+        return path_and_log_weight(problem, model, guided(problem, model, points), noise)
+
+    paths, log_weight = guide.records.each(one, guide.points, noise)
+    return paths, jnp.sum(log_weight)
+
+
+def _of_pairs(noise: Float[Array, "points d"], num_steps: int) -> Float[Array, "points d"]:
+    """The noise of steps of twice the length, as `Record.halved` has them: of each pair of a
+    segment the second step."""
+    odd = num_steps % 2
+    segments = noise[1:].reshape(-1, num_steps, noise.shape[-1])
+    first, second = segments[:, odd::2], segments[:, odd + 1 :: 2]
+    pairs = jnp.stack([first, (first + second) * np.sqrt(0.5).astype(noise.dtype)], axis=2)
+    pairs = pairs.reshape(len(segments), -1, noise.shape[-1])
+    segments = jnp.concatenate([segments[:, :odd], pairs], axis=1)
+    return jnp.concatenate([noise[:1], segments.reshape(-1, noise.shape[-1])])
