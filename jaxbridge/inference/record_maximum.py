@@ -37,7 +37,7 @@ from .record_paths import RecordPaths, as_record_paths
 from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 
 _CHAINS = 8
-# Sweeps of the chains before θ moves, and after it has come to rest.
+# Of the chains before θ moves.
 _SWEEPS = 50
 
 
@@ -124,11 +124,11 @@ def maximum_of_records(
     parameters.check_allowed(theta)
     run_key, last_key = jax.random.split(key)
     completion = as_record_paths(parameters, records, theta)
-    iterates, info = _approximate(run_key, completion, search, theta)
+    iterates, chains, info = _approximate(run_key, completion, search, theta)
     rough = jnp.mean(iterates[len(iterates) // 2 :], axis=0)
     # What guides well at the first θ need not do so at the last.
     completion = as_record_paths(parameters, records, rough)
-    draws = _draws_at(last_key, completion, rough, num_draws, search.progress_meter)
+    draws = _draws_at(last_key, completion, rough, chains, num_draws, search.progress_meter)
     return _summary(completion, rough, iterates, info, draws)
 
 
@@ -151,22 +151,11 @@ def _swept(
     return _Chains(paths, log_scales), taken[..., 0]
 
 
-def _burnt_in(key: Key[Array, ""], completion: RecordPaths, theta: Float[Array, " p"]) -> _Chains:
-    """Chains after some sweeps at θ."""
-    first_key, key = jax.random.split(key)
-    first = _Chains(*_of_chains(lambda key: completion.first(key, theta), first_key))
-
-    def sweep(chains, i):
-        return _swept(jax.random.fold_in(key, i), completion, theta, chains, i)[0], None
-
-    return jax.lax.scan(sweep, first, jnp.arange(_SWEEPS))[0]
-
-
 @eqx.filter_jit
 def _approximate(
     key: Key[Array, ""], completion: RecordPaths, search: Search, theta: Float[Array, " p"]
-) -> tuple[Float[Array, "n p"], SearchInfo]:
-    """The iterates of the stochastic approximation."""
+) -> tuple[Float[Array, "n p"], _Chains, SearchInfo]:
+    """The iterates of the stochastic approximation, and where chains are at its end."""
     completion = nondifferentiable(completion)
     first_key, run_key = jax.random.split(key)
     parameters, rule = completion.parameters, search.rule
@@ -175,11 +164,15 @@ def _approximate(
 
     def propose(i, theta, memory, chains):
         sweep_key, noise_key = jax.random.split(jax.random.fold_in(run_key, i))
-        chains, _ = _swept(sweep_key, completion, theta, chains, i + _SWEEPS)
+        chains, _ = _swept(sweep_key, completion, theta, chains, i)
         read = lambda key, paths: completion.noise(key, theta, paths)[0]
         noise = _of_chains(read, noise_key, chains.paths)
         gradient = jax.grad(_mean_log_weight)(theta, completion, noise) / number_seen
-        new_theta, new_memory = rule.ascend(theta, memory, gradient)
+        new = rule.ascend(theta, memory, gradient)
+        burnt_in = i >= _SWEEPS
+        new_theta, new_memory = jax.tree.map(
+            lambda new, old: jnp.where(burnt_in, new, old), new, (theta, memory)
+        )
         # As `iterate` decides it: paths follow θ where that moves.
         moves = parameters.allowed(new_theta) & all_finite_leaves(new_memory)
         goal = jnp.where(moves, new_theta, theta)
@@ -188,8 +181,10 @@ def _approximate(
         chains = chains._replace(paths=jnp.where(good, paths, chains.paths))
         return (new_theta, new_memory), chains, (jnp.int32(0), jnp.int32(0))
 
-    first = _burnt_in(first_key, completion, theta)
-    return iterate(propose, parameters, search, theta, first)
+    first = _Chains(*_of_chains(lambda key: completion.first(key, theta), first_key))
+    search = search._replace(num_iterations=_SWEEPS + search.num_iterations)
+    iterates, chains, info = iterate(propose, parameters, search, theta, first)
+    return iterates[_SWEEPS:], chains, info
 
 
 def _mean_log_weight(
@@ -197,7 +192,8 @@ def _mean_log_weight(
 ) -> Float[Array, ""]:
     """The mean over chains, of those with a path that has weight."""
     each = jax.vmap(lambda noise: completion.of_noise(theta, noise)[1])(noise)
-    return jnp.mean(each, where=jnp.isfinite(each))
+    good = jnp.isfinite(each)
+    return jnp.sum(jnp.where(good, each, 0)) / jnp.maximum(jnp.sum(good.astype(each.dtype)), 1)
 
 
 @eqx.filter_jit
@@ -205,29 +201,32 @@ def _draws_at(
     key: Key[Array, ""],
     completion: RecordPaths,
     theta: Float[Array, " p"],
+    chains: _Chains,
     num_draws: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> _Draw:
     """Of all chains, axes (chains, n), at θ."""
     completion, theta = nondifferentiable((completion, theta))
-    first_key, run_key = jax.random.split(key)
 
     def derivatives(key, paths, taken):
         noise, log_weight = completion.noise(key, theta, paths)
-        fine = lambda theta: completion.of_noise(theta, noise)[1]
-        coarse = lambda theta: completion.coarse_log_weight(theta, noise)
-        coarse_weight, coarse_gradient = jax.value_and_grad(coarse)(theta)
-        ratio = coarse_weight - log_weight
-        return _Draw(jax.grad(fine)(theta), jax.hessian(fine)(theta), ratio, coarse_gradient, taken)
+
+        def gradient(theta):
+            made = jax.grad(lambda theta: completion.of_noise(theta, noise)[1])(theta)
+            return made, made
+
+        hessian, fine = jax.jacfwd(gradient, has_aux=True)(theta)
+        coarse_log_weight = lambda theta: completion.coarse_log_weight(theta, noise)
+        value, coarse = jax.value_and_grad(coarse_log_weight)(theta)
+        return _Draw(fine, hessian, value - log_weight, coarse, taken)
 
     def draw(chains, i):
-        sweep_key, noise_key = jax.random.split(jax.random.fold_in(run_key, i))
+        sweep_key, noise_key = jax.random.split(jax.random.fold_in(key, i))
         moved, taken = _swept(sweep_key, completion, theta, chains, i)
         chains = chains._replace(paths=moved.paths)
         return chains, _of_chains(derivatives, noise_key, chains.paths, taken)
 
-    first = _burnt_in(first_key, completion, theta)
-    _, draws = metered_scan(draw, first, jnp.arange(num_draws), progress_meter)
+    _, draws = metered_scan(draw, chains, jnp.arange(num_draws), progress_meter)
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), draws)
 
 

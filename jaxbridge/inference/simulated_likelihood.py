@@ -371,4 +371,5 @@ def stochastic_ascent(
         )
         return rule.ascend(theta, memory, gradient), None, (missing, jnp.int32(0))
 
-    return iterate(propose, parameters, search, theta, None)
+    iterates, _, info = iterate(propose, parameters, search, theta, None)
+    return iterates, info

@@ -104,7 +104,8 @@ def approximate(
         return moved, paths, (bridges.missing, bridges.truncated)
 
     first, _ = augmentation.first(first_key, parameters.bind(theta))
-    return iterate(propose, parameters, search, theta, first)
+    iterates, _, info = iterate(propose, parameters, search, theta, first)
+    return iterates, info
 
 
 def iterate(
@@ -113,10 +114,10 @@ def iterate(
     search: Search,
     theta: Float[Array, " p"],
     paths: PyTree,
-) -> tuple[Float[Array, "n p"], SearchInfo]:
-    """The iterates from θ and paths. `propose(i, θ, memory, paths)` makes ((θ, memory), paths, what
-    was missing and truncated), with what the rule remembers; θ stays where that leads out of the
-    constraint, or to what is not finite."""
+) -> tuple[Float[Array, "n p"], PyTree, SearchInfo]:
+    """The iterates from θ and paths, and the last paths. `propose(i, θ, memory, paths)` makes
+    ((θ, memory), paths, what was missing and truncated), with what the rule remembers; θ stays
+    where that leads out of the constraint, or to what is not finite."""
 
     def step(state, i):
         theta, memory, paths = state
@@ -130,8 +131,8 @@ def iterate(
         return (theta, memory, paths), (theta, info)
 
     start, steps = (theta, search.rule.init(theta), paths), jnp.arange(search.num_iterations)
-    _, (iterates, info) = metered_scan(step, start, steps, search.progress_meter)
-    return iterates, _counted(info)
+    last, (iterates, info) = metered_scan(step, start, steps, search.progress_meter)
+    return iterates, last[2], _counted(info)
 
 
 def _counted(info: SearchInfo) -> SearchInfo:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from kalman import exact_step, kalman
+from scipy.optimize import minimize
 
 import jaxbridge as jb
 from jaxbridge.records import (
@@ -154,6 +155,59 @@ def test_several_records_have_one_posterior(method):
     assert np.all(posterior.r_hat < 1.03) and not np.any(getattr(posterior, "stuck", False))
     np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error + 0.02 * sd)
     np.testing.assert_allclose(theta.std(0), sd, rtol=0.1)
+
+
+@functools.cache
+def maximum(**options):
+    """Of (log_noise, log_rate, log_sigma), with standard errors, by SciPy."""
+
+    def minus(point):
+        return -kalman_log_likelihood(*point, **options)
+
+    found = minimize(minus, list(TRUE.values()), method="Nelder-Mead", options={"xatol": 1e-5})
+    moves = 1e-3 * np.eye(3)
+    signs = [(a, b) for a in (-1, 1) for b in (-1, 1)]
+    hessian = [
+        [sum(a * b * minus(found.x + a * u + b * v) for a, b in signs) / 4e-6 for v in moves]
+        for u in moves
+    ]
+    order = [2, 0, 1]
+    return found.x[order], np.sqrt(np.diagonal(np.linalg.inv(hessian)))[order]
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.parametrize("parts", [((0, 40),), ((0, 25), (25, 40))])
+def test_the_maximum_is_that_of_the_kalman_filter(parts):
+    """Of linear models all paths have the same weight: nothing is left to chance but the search."""
+    times, values = zip(*((TIMES[i:j], record()[i:j]) for i, j in parts), strict=True)
+    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
+        estimate = jb.maximum_likelihood(
+            jax.random.key(0),
+            model(),
+            times,
+            values,
+            observation=SEEN,
+            num_steps=2,
+            num_iterations=400,
+            num_bridges=20,
+        )
+    of_steps, error = maximum(law=ito_taylor_step, num=2, parts=parts)
+    exact, _ = maximum(parts=parts)
+    assert estimate.trustworthy and not np.any(estimate.stuck)
+    np.testing.assert_allclose(estimate.theta, of_steps, atol=2e-3)
+    told = [estimate.standard_errors[name] for name in sorted(TRUE)]
+    np.testing.assert_allclose(told, error, rtol=0.01)
+    # Of the second order that is left out of the step error.
+    np.testing.assert_allclose(estimate.step_error, of_steps - exact, atol=1e-3)
+
+
+@pytest.mark.parametrize("options", [{"method": "em"}, {"proposal": "guided"}])
+def test_maxima_from_noise_need_no_bridges(options):
+    with pytest.raises(ValueError, match="for complete observations without noise"):
+        jb.maximum_likelihood(
+            jax.random.key(0), model(), TIMES, record(), observation=SEEN, **options
+        )
 
 
 def test_gradients_are_those_of_differences(x64):

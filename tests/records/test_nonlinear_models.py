@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from grid_filter import grid_filter
 from helpers import slow_beyond
+from scipy.optimize import minimize
 from scipy.special import gammaln
 
 import jaxbridge as jb
@@ -160,3 +161,42 @@ def test_what_no_particle_explains_is_said():
         KEY, model, np.arange(4.0), np.zeros((4, 1)), observation=flat, num_particles=10
     )
     assert made.value == -jnp.inf and made.unexplained == 0
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_the_maximum_is_that_of_the_grid():
+    """Drift and sigma of the double well, whose paths differ in weight."""
+    case, values, _ = recorded("double well")
+    model = jb.Diffusion(
+        lambda x, p: p[0] * x * (1 - x**2), lambda x, p: jnp.exp(p[1]) * jnp.ones(1),
+        params=jnp.array([2.0, np.log(0.8)]),
+    )  # fmt: skip
+    nodes = np.linspace(-3, 3, 241)
+    initial = np.exp(-((nodes - case.start) ** 2) / 0.5)
+    logs = case.log_density(values, nodes)
+
+    def minus(point):
+        drift = lambda x: point[0] * x * (1 - x**2)
+        variance = lambda x: np.full_like(x, np.exp(2 * point[1]))
+        made = grid_filter(drift, variance, nodes, initial, np.diff(case.times), logs)
+        return -made.log_likelihood
+
+    exact = minimize(minus, [2.0, np.log(0.8)], method="Nelder-Mead", options={"xatol": 1e-3}).x
+    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
+        estimate = jb.maximum_likelihood(
+            KEY,
+            model,
+            case.times,
+            values,
+            **options(case),
+            num_steps=20,
+            num_bridges=400,
+            constraint=lambda p: p[0] > 0,
+        )
+    error = np.hypot(estimate.monte_carlo_errors, estimate.step_uncertainty)
+    assert estimate.newton and np.all(estimate.r_hat < 1.1)
+    np.testing.assert_array_less(error, 0.1 * np.asarray(estimate.standard_errors))
+    told = np.asarray(estimate.theta - estimate.step_error)
+    grid = 0.02 * np.asarray(estimate.standard_errors)
+    np.testing.assert_array_less(np.abs(told - exact), 4.5 * error + grid)
