@@ -15,7 +15,10 @@ half of the iterates, where the chains run on with θ fixed, one step of Newton'
 The step error e = log L_N - log L of the likelihood, about a share of log L_{N/2} - log L_N, moves
 the maximum by I⁻¹ ∇e, and with the weight w̃ of half as many steps and D = log w̃ / w,
 
-    ∇ log L_{N/2} = E[(w̃ / w) ∇ log w̃ | y] / E[w̃ / w | y] ≈ E[∇ log w̃ | y] + Cov(D, ∇ log w̃ | y).
+    ∇ log L_{N/2} = E[(w̃ / w) ∇ log w̃ | y] / E[w̃ / w | y]
+                  ≈ E[∇ log w̃ | y] + Cov(D + ½ (D - ED)², ∇ log w̃ | y),
+
+where the square is of the order of D's mean if σ varies with the state.
 """
 
 from collections.abc import Callable
@@ -278,7 +281,8 @@ def _step_error(
     if completion.num_steps == 1:
         return StepError(*2 * [jnp.full_like(draws.gradient[0, 0], jnp.nan)])
     centred = draws.coarse - jnp.mean(draws.coarse, axis=(0, 1))
-    ratio = (draws.log_ratio - jnp.mean(draws.log_ratio))[..., None]
+    deviation = draws.log_ratio - jnp.mean(draws.log_ratio)
+    ratio = (deviation + (deviation**2 - jnp.mean(deviation**2)) / 2)[..., None]
     each = (draws.coarse - draws.gradient + ratio * centred) @ covariance
     each = completion.share_of_step_error * each
     size = jnp.sum(jax.vmap(effective_sample_size)(each), axis=0)

@@ -71,20 +71,24 @@ def paths_in_space(
 
 def bridge_fan(
     times: Float[Reals, " K"],
-    paths: Float[Reals, "n K d"],
+    paths: Float[Reals, "*n K d"],
     ax: Axes | None = None,
     coordinate: int = 0,
     num_paths: int = 5,
     exact: jb.GaussianBridge | None = None,
     weights: Float[Reals, " n"] | None = None,
+    data: tuple[Float[Reals, " m"], Float[Reals, " m"]] | None = None,
+    data_sd: Number | Float[Reals, " m"] = 0.0,
 ) -> Axes:
     """One coordinate of many bridges: median, 50 % and 90 % bands, and the first few paths.
 
-    `times`, shape (K,), and `paths`, (n, K, d), as `sample_bridges` returns them; bridges not found
-    are left out. `coordinate` counts from zero; `num_paths` are drawn. `weights`, shape (n,), are
-    those of weighted bridges, by which the paths that are drawn are chosen too. The same quantiles
-    of an `exact` law, a result of `gaussian_bridge` at these times, are dashed. `ax` is where to
-    draw.
+    `times`, shape (K,), and `paths`, (n, K, d), as `sample_bridges` returns them, or (chains, n, K,
+    d), as `smooth` does; bridges not found are left out. `coordinate` counts from zero; `num_paths`
+    are drawn. `weights`, shape (n,), are those of weighted bridges, by which the paths that are
+    drawn are chosen too. The same quantiles of an `exact` law, a result of `gaussian_bridge` at
+    these times, are dashed. `data` are times and values at which this coordinate was seen, NaN
+    where it was not, with noise of standard deviation `data_sd`, drawn twice either way. `ax` is
+    where to draw.
 
     **Example:**
 
@@ -93,7 +97,8 @@ def bridge_fan(
     ```
     """
     ax = axes_or_new(ax)
-    times, (kept, index) = np.asarray(times, float), found(paths)
+    times, paths = np.asarray(times, float), np.asarray(paths)
+    kept, index = found(paths.reshape(-1, *paths.shape[2:]) if paths.ndim == 4 else paths)
     values = kept[..., coordinate]
     if weights is None:
         shown, curves = values[:num_paths], np.quantile(values, LEVELS, axis=0)
@@ -115,6 +120,11 @@ def bridge_fan(
         curves = mean[:, None] + np.sqrt(np.maximum(variance, 0))[:, None] * SCORES
         lines = ax.plot(times, curves, color=EXACT, linewidth=0.9, linestyle=DASHES[0])
         lines[2].set_label("exact")
+    if data is not None:
+        when, seen = (np.asarray(each, float) for each in data)
+        error = np.where(np.isnan(seen), np.nan, 2 * np.asarray(data_sd, float))
+        style = {"fmt": ".", "color": COLOURS[1], "markersize": 5, "elinewidth": 0.9, "zorder": 3}
+        ax.errorbar(when, seen, error if np.any(error > 0) else None, label="seen", **style)
     ax.set(xlabel="time", ylabel=f"$Z^{{({coordinate + 1})}}_t$", xlim=(times[0], times[-1]))
     return finish(ax)
 

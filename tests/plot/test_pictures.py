@@ -78,6 +78,21 @@ def test_bands_of_weighted_bridges():
     assert all(40 <= value <= 50 for value in drawn) and len(drawn) == 2
 
 
+def test_data_are_drawn_with_their_noise():
+    times, values = np.linspace(0, 1, 3), np.random.default_rng(0).normal(size=(101, 3, 1))
+    chains = np.stack([values, values])
+    data = (np.array([0.0, 0.5, 1.0]), np.array([0.2, np.nan, -0.3]))
+    ax = plot.bridge_fan(times, chains, num_paths=0, data=data, data_sd=np.array([0.1, 0.1, 0.2]))
+    points, _, (bars,) = ax.containers[0]
+    np.testing.assert_array_equal(points.get_data(), data)
+    reach = [bar[:, 1].tolist() for bar in bars.get_segments() if not np.isnan(bar).any()]
+    np.testing.assert_allclose(reach, [[0.0, 0.4], [-0.7, 0.1]], atol=1e-12)
+    exact = plot.bridge_fan(times, values, num_paths=0, data=data)
+    assert not exact.containers[0].has_yerr
+    medians = [next(line for line in a.lines if line.get_label() == "median") for a in (ax, exact)]
+    np.testing.assert_allclose(*(line.get_ydata() for line in medians))
+
+
 def test_bridges_not_found_are_left_out():
     rng = np.random.default_rng(0)
     draws = rng.normal(size=(400, 2))
