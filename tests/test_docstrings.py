@@ -31,6 +31,7 @@ RESULTS = {
     "Kernel": ["pseudo_marginal", "renewal", "crank_nicolson"],
     "LogLikelihood": ["log_likelihood"],
     "MaximumLikelihood": ["maximum_likelihood"],
+    "RecordMaximumLikelihood": ["maximum_likelihood"],
     "PMMHPosterior": ["pmmh"],
     "PMMHState": ["pmmh"],
     "Pilot": ["tune_coupling"],

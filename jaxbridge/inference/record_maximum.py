@@ -66,16 +66,6 @@ class RecordMaximumLikelihood(eqx.Module):
         or the step longer than about a standard error, or out of the constraint: then the average
         of the iterates is returned, which is not the maximum, and more iterations are needed, or
         longer steps.
-
-    **Example:**
-
-    ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    estimate = jb.maximum_likelihood(
-        key, model, times, observations, observation=seen, num_iterations=20, num_bridges=10
-    )
-    estimate.params, estimate.standard_errors, estimate.trustworthy
-    ```
     """
 
     params: PyTree
