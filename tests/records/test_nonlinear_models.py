@@ -126,7 +126,7 @@ def options(case):
 def test_likelihoods(name):
     case, values, exact = recorded(name)
     made = jb.log_likelihood(
-        KEY, case.model, case.times, values, **options(case), num_steps=20, num_particles=1000
+        KEY, case.model, case.times, values, **options(case), num_steps=20, num_particles=4000
     )
     assert made.standard_error < 0.1 and made.num_nonfinite == 0
     error = 4.5 * made.standard_error + abs(made.step_error) + 2 * made.step_uncertainty
