@@ -28,6 +28,7 @@ def exact_moments():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     "proposal",
     [
@@ -42,7 +43,7 @@ def test_posterior_is_exact(proposal):
         ou_1d(0.8, 0.7),
         TIMES,
         DATA,
-        num_iterations=12_000,
+        num_iterations=4_000,
         num_proposals=20,
         num_chains=2,
         proposal=proposal,
@@ -51,7 +52,7 @@ def test_posterior_is_exact(proposal):
     draws = np.asarray(made.theta, float).reshape(-1, 2)
     n = np.asarray(made.effective_sample_size)
     mean, sd = exact_moments()
-    assert (n > 300).all() and (made.r_hat < 1.05).all()
+    assert (n > 150).all() and (made.r_hat < 1.05).all()
     # An estimate by couplings is zero, unbiased as it is, where no pair met.
     assert isinstance(proposal, jb.Coupling) or made.num_without_estimate.sum() == 0
     np.testing.assert_array_less(np.abs(draws.mean(0) - mean) / sd, 5 / np.sqrt(n) + 0.03)
@@ -91,7 +92,7 @@ def test_going_on_is_one_run():
     assert more.state.num_done == 20
     (before,), (after,) = first.state.proposals, more.state.proposals
     assert after is before and before.chosen.shape == (5,)
-    with pytest.raises(ValueError, match="had 1 numbers of steps, but here they have 2"):
+    with pytest.raises(ValueError, match="is one for 5 intervals, but there are 2"):
         jb.pmmh(
             arguments[0],
             arguments[1],
@@ -105,38 +106,25 @@ def test_going_on_is_one_run():
 
 @pytest.mark.slow
 def test_the_variance_of_the_estimate_is_that_of_repetitions():
+    """By steps so short that θ stays where it is: over a posterior the variance changes by powers
+    of ten."""
     bridge = jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())
-    model = ou_1d(1.5, 0.7)
+    model, options = ou_1d(0.8, 0.7), dict(num_proposals=10, proposal=bridge)
     made = jb.pmmh(
-        jax.random.key(0),
-        model,
-        TIMES,
-        DATA,
-        num_iterations=400,
-        num_warmup=200,
-        num_proposals=10,
-        proposal=bridge,
-        **OPTIONS,
-    )
-    # At the mean of the posterior, where the chain is: fresh estimates.
-    model = model.with_params(tuple(float(each.mean()) for each in made.params))
+        jax.random.key(0), model, TIMES, DATA, num_iterations=400, num_warmup=0,
+        covariance=[1e-10, 1e-10], **options, **OPTIONS,
+    )  # fmt: skip
+    assert float(jnp.ptp(made.params[0])) < 1e-3 and made.accepted.mean() > 0.8
 
     def estimate(key):
         return jb.transition_log_density(
-            key,
-            model,
-            DATA[:-1],
-            DATA[1:],
-            0.5,
-            num_proposals=10,
-            num_steps=8,
-            proposal=bridge,
+            key, model, DATA[:-1], DATA[1:], 0.5, num_steps=8, **options
         ).value.sum()
 
-    repeated = jax.jit(jax.vmap(estimate))(jax.random.split(jax.random.key(1), 2000))
-    ratio = float(made.log_likelihood_variance) / float(jnp.var(repeated))
-    assert made.log_likelihood_variance.shape == () and abs(np.log(ratio)) < 0.3
-    print(f"{float(made.log_likelihood_variance):.5f}, repeated {float(jnp.var(repeated)):.5f}")
+    repeated = jnp.var(jax.jit(jax.vmap(estimate))(jax.random.split(jax.random.key(1), 2000)))
+    # Of 2000 repetitions, and of as many estimates of it as were accepted.
+    assert made.log_likelihood_variance.shape == ()
+    assert abs(np.log(float(made.log_likelihood_variance / repeated))) < 0.15
 
 
 def test_unknown_parameters_have_names():

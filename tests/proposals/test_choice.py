@@ -107,8 +107,14 @@ def test_a_candidate_that_cannot_win_makes_no_pilot_run():
 
 @pytest.mark.slow
 def test_densities_are_not_mixed_where_they_have_different_constants():
-    """A coupling from the stationary law needs a normalised log ν; the others none."""
-    model = jb.langevin(lambda x, p: p - 1.5 * x @ x, 7.0)
+    """A coupling from draws of the stationary law needs a normalised log ν; the others none."""
+    model = jb.Diffusion(
+        lambda x, p: -1.5 * x,
+        None,
+        lambda x, p: 7 - 1.5 * x @ x,
+        reversible=True,
+        sample_stationary=lambda key, p: jax.random.normal(key, (2,)) / jnp.sqrt(3),
+    )
     arguments = (jax.random.key(0), model, [[0.0, 0.0], [0.3, 0.1]], [0.3, 0.1], 0.1)
     estimate = jb.transition_log_density(
         *arguments, num_steps=10, num_proposals=20, proposal="auto"

@@ -249,7 +249,7 @@ def test_couplings_agree(duration):
     model, ends = two_wells(), ([-1.0, 0.0], [0.8, 0.3])
     box = jb.GaussianLaw([0.0, 0.0], [[0.9, 0.0], [0.0, 0.35]])
     coupled = jb.transition_log_density(
-        jax.random.key(0), model, *ends, duration, num_proposals=40_000,
+        jax.random.key(0), model, *ends, duration, num_proposals=60_000,
         num_steps=round(50 * duration), proposal=jb.Coupling(0.0, start_law=box),
     )  # fmt: skip
     guided = jb.transition_log_density(

@@ -1,5 +1,6 @@
 """What half as many steps would have given: E[w e^D h] is their estimate."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -91,9 +92,12 @@ def test_factor_is_that_of_quadrature(case, x64):
     model, density, _ = case
     nodes = np.linspace(-5, 5, 401) if model is VARYING else np.linspace(-3.5, 3.5, 351)
     fine, coarse = (quadrature(density, model, [-0.3], [1.0], 1.0, n, nodes) for n in (16, 8))
-    weighted = weighted_paths(model, [-0.3], [1.0], 320_000, 16, density)
-    known = ~np.isnan(weighted.log_halving)
-    w, D = np.exp(weighted.log_weights[known]), np.asarray(weighted.log_halving)[known]
+    weighted = weighted_paths(model, [-0.3], [1.0], 160_000, 16, density)
+    paths = weighted.paths  # of all of them, where the sampler looks at a part
+    dt = jnp.broadcast_to(jnp.diff(weighted.times)[:, None], (16, len(paths)))
+    log_halving = eqx.filter_jit(log_halving_of_paths)
+    D = np.asarray(log_halving(density, model.forward(paths[0, 0]), dt, paths))
+    w = np.exp(np.asarray(weighted.log_weights))
     w, factor = w / w.sum(), np.exp(D - (coarse - fine))
     error = np.linalg.norm(w * (factor - w @ factor))
     assert abs(w @ factor - 1) < 5 * error < 0.04
