@@ -106,18 +106,11 @@ def inverse(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
 
 
 def cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """The lower triangular L with `L Lᵀ = matrix`; NaN where there is none.
-
-    Number by number, which fuses; in many dimensions, where that takes long to compile, column by
-    column."""
+    """The lower triangular L with `L Lᵀ = matrix`; NaN where there is none. Number by number, which
+    fuses; in many dimensions, where that takes long to compile, in a loop over columns."""
     d = matrix.shape[0]
     if d > _UNROLLED:
-        rest, columns = matrix, []
-        for k in range(d):
-            column = jnp.where(np.arange(d) < k, 0, rest[:, k] * lax.rsqrt(rest[k, k]))
-            columns.append(column)
-            rest = rest - column[:, None] * column
-        return jnp.stack(columns, axis=1)
+        return _looped_cholesky(matrix)
     L: list[list[Array]] = [[] for _ in range(d)]
     for k in range(d):
         rest = [_minus(matrix[i, k], [L[i][j] * L[k][j] for j in range(k)]) for i in range(k, d)]
@@ -163,8 +156,11 @@ def quadratic_form(
     matrix: Float[Array, "d d"], vector: Float[Array, " d"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """vᵀM⁻¹v and log det M of a positive definite matrix, NaN of another, by elimination: without
-    the square roots of `cholesky`, with which XLA does not vectorise loops over lanes on CPU."""
+    the square roots of `cholesky`, with which XLA does not vectorise loops over lanes on CPU. From
+    five dimensions on what is written out is slower to run as well, by factors of 3 to 7."""
     d = matrix.shape[0]
+    if d > _WRITTEN_FORM:
+        return _looped_quadratic_form(matrix, vector)
     rows = [[matrix[i, j] for j in range(i + 1)] for i in range(d)]  # of the lower triangle
     left, terms, pivots = list(vector), [], []
     for k in range(d):
@@ -181,6 +177,8 @@ def quadratic_form(
 
 def solve_lower(matrix: Float[Array, "d d"], right: Float[Array, " d"]) -> Float[Array, " d"]:
     """`L⁻¹ right` for a lower triangular L, by forward substitution."""
+    if matrix.shape[0] > _UNROLLED:
+        return _looped_substitution(matrix, right, range(matrix.shape[0]))
     solved = []
     for i in range(matrix.shape[0]):
         rest = _minus(right[i], [matrix[i, j] * solved[j] for j in range(i)])
@@ -193,6 +191,8 @@ def solve_lower_transposed(
 ) -> Float[Array, " d"]:
     """`L⁻ᵀ right` for a lower triangular L, by back substitution."""
     d = matrix.shape[0]
+    if d > _UNROLLED:
+        return _looped_substitution(matrix.T, right, range(d - 1, -1, -1))
     solved: dict[int, Array] = {}
     for i in reversed(range(d)):
         rest = _minus(right[i], [matrix[j, i] * solved[j] for j in range(i + 1, d)])
@@ -200,8 +200,56 @@ def solve_lower_transposed(
     return jnp.stack([solved[i] for i in range(d)])
 
 
-# Beyond this, writing the elimination out costs too much compilation.
-_UNROLLED = 16
+# Beyond this, writing the elimination out costs too much compilation: in fifty dimensions minutes,
+# and all memory.
+_UNROLLED, _WRITTEN_FORM = 16, 4
+
+
+def _looped_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """`cholesky`, in a loop over columns."""
+    n = np.arange(matrix.shape[0])
+
+    def eliminate(k, carry):
+        rest, L = carry
+        column = jnp.where(n < k, 0, rest[k] * lax.rsqrt(rest[k, k]))
+        return rest - column[:, None] * column, jnp.where(n == k, column[:, None], L)
+
+    return lax.fori_loop(0, len(n), eliminate, (matrix, jnp.zeros_like(matrix)))[1]
+
+
+def _looped_quadratic_form(
+    matrix: Float[Array, "d d"], vector: Float[Array, " d"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """`quadratic_form`, in a loop: -vᵀM⁻¹v is what elimination leaves of a last row (vᵀ, 0)."""
+    d = matrix.shape[0]
+    n = np.arange(d + 1)
+    zero = jnp.zeros_like(vector, shape=(1, 1))
+    bordered = jnp.block([[matrix, vector[:, None]], [vector[None, :], zero]])
+
+    def eliminate(k, carry):
+        rest, log_det = carry
+        pivot, row = rest[k, k], jnp.where(n > k, rest[k], 0)
+        log = jnp.log(jnp.where(pivot > 0, pivot, jnp.nan))
+        return rest - row[:, None] * (row / pivot), log_det + log
+
+    rest, log_det = lax.fori_loop(0, d, eliminate, (bordered, zero[0, 0]))
+    return -rest[d, d], log_det
+
+
+def _looped_substitution(
+    matrix: Float[Array, "d d"], right: Float[Array, " d"], order: range
+) -> Float[Array, " d"]:
+    """`matrix⁻¹ right` of a triangular matrix, whose unknowns are found in this order."""
+    n, order = np.arange(len(order)), jnp.array(order)
+
+    def substitute(i, carry):
+        rest, solved = carry
+        k = order[i]
+        found = rest[k] / matrix[k, k]
+        # What is on the other side of the diagonal is zero, and belongs to what has been found.
+        return rest - matrix[:, k] * found, jnp.where(n == k, found, solved)
+
+    return lax.fori_loop(0, len(n), substitute, (right, jnp.zeros_like(right)))[1]
 
 
 def any_solve(matrix: Float[Array, "p p"], right: Float[Array, "p *m"]) -> Float[Array, "p *m"]:

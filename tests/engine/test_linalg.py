@@ -18,6 +18,8 @@ from jaxbridge.engine.linalg import (
     quadratic_form,
     safe_norm,
     solve,
+    solve_lower,
+    solve_lower_transposed,
 )
 
 DIMENSIONS = [1, 2, 3, 5]
@@ -118,7 +120,7 @@ def test_ten_dimensions(x64):
     )
 
 
-@pytest.mark.parametrize("d", DIMENSIONS)
+@pytest.mark.parametrize("d", [*DIMENSIONS, 20])
 def test_cholesky_equals_numpys(d, precision):
     rng = np.random.default_rng(d)
     roots = with_singular_values(rng, np.linspace(1, 3, d))
@@ -157,7 +159,7 @@ def test_lower_factor_does_not_square_the_condition_number():
     assert not np.allclose(squared, exact, rtol=5e-2)
 
 
-@pytest.mark.parametrize("d", DIMENSIONS)
+@pytest.mark.parametrize("d", [*DIMENSIONS, 20])
 def test_quadratic_form_equals_numpys(d, precision):
     rng = np.random.default_rng(d)
     roots = with_singular_values(rng, np.linspace(1, 3, d))
@@ -171,8 +173,39 @@ def test_quadratic_form_equals_numpys(d, precision):
 
 
 @pytest.mark.parametrize("diagonal", [(-1.0, 1.0), (-1.0, -1.0), (0.0, 1.0)])
-def test_quadratic_form_of_what_is_not_positive_definite_has_no_log(diagonal):
-    assert np.isnan(quadratic_form(jnp.diag(jnp.array(diagonal)), jnp.ones(2))[1])
+@pytest.mark.parametrize("d", [2, 6])  # written out, and in a loop
+def test_quadratic_form_of_what_is_not_positive_definite_has_no_log(diagonal, d):
+    matrix = jnp.diag(jnp.array([*diagonal, *np.ones(d - 2)]))
+    assert np.isnan(quadratic_form(matrix, jnp.ones(d))[1])
+
+
+@pytest.mark.parametrize("d", [3, 6, 20])
+def test_derivatives_of_a_quadratic_form(d, x64):
+    """-M⁻¹v vᵀM⁻¹ and M⁻¹ in M, 2 M⁻¹v in v."""
+    rng = np.random.default_rng(d)
+    root = with_singular_values(rng, np.linspace(1, 3, d))[0]
+    matrix, vector = root @ root.T, rng.normal(size=d)
+    (of_form, of_vector), (of_log_det, _) = jax.jacobian(quadratic_form, (0, 1))(matrix, vector)
+    solved = np.linalg.solve(matrix, vector)
+    symmetric = lambda slopes: (slopes + slopes.T) / 2
+    np.testing.assert_allclose(symmetric(of_form), -np.outer(solved, solved), atol=1e-10)
+    np.testing.assert_allclose(symmetric(of_log_det), np.linalg.inv(matrix), atol=1e-10)
+    np.testing.assert_allclose(of_vector, 2 * solved, atol=1e-10)
+
+
+@pytest.mark.parametrize("d", [*DIMENSIONS, 20])
+def test_substitutions_equal_numpys(d, precision):
+    rng = np.random.default_rng(d)
+    roots = with_singular_values(rng, np.linspace(1, 3, d))
+    lower = np.linalg.cholesky(roots @ roots.swapaxes(1, 2)).astype(precision)
+    right = rng.normal(size=(COUNT, d)).astype(precision)
+    for substitute, matrices in (
+        (solve_lower, lower),
+        (solve_lower_transposed, lower.swapaxes(1, 2)),
+    ):
+        expected = np.linalg.solve(matrices, right[..., None])[..., 0]
+        found = jax.jit(jax.vmap(substitute))(lower, right)
+        np.testing.assert_allclose(found, expected, atol=20 * TOLERANCE[precision])
 
 
 @pytest.mark.parametrize("d", DIMENSIONS)
