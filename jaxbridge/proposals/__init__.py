@@ -28,7 +28,7 @@ from .base import (
     AbstractWeightedProposal as AbstractWeightedProposal,
     WeightedPaths as WeightedPaths,
 )
-from .choice import Choice as Choice
+from .choice import Choice as Choice, best_at_worst as best_at_worst
 from .coupled import (
     CoupledPairs as CoupledPairs,
     as_pairs as as_pairs,

@@ -239,6 +239,20 @@ def _pick(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
     return lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
+def best_at_worst(choice: Choice, num: int) -> Choice:
+    """One way for each of the groups of `num` intervals that follow each other: that which is best
+    where it is worst. For chains in which end points move, whose pilot runs were from several."""
+    rates = value_rates(choice.efficiency, choice.seconds, choice.step_error, choice.pareto_k)
+    # Where no pilot run was needed, because another way was better, by what it could at best be.
+    bounds = jnp.array([each.efficiency_bound for each in choice.candidates], rates.dtype)
+    rates = jnp.where(jnp.isnan(rates), bounds[:, None] / choice.seconds, rates)
+    worst = jnp.min(rates.reshape(len(choice.candidates), -1, num), axis=2)
+    chosen = jnp.repeat(jnp.argmax(worst, axis=0).astype(jnp.int32), num)
+    told = (choice.seconds, choice.efficiency, choice.step_error, choice.pareto_k)
+    whole = Choice(choice.candidates, *told, chosen, choice.used, choice.left_out)
+    return whole.of(np.arange(0, len(chosen), num))
+
+
 @jax.jit  # one program where it is called outside of any
 def value_rates(
     efficiency: Float[Array, "*C I"],

@@ -323,8 +323,8 @@ def sweep(
 
 
 def tuned(
-    log_scales: Float[Array, "*R 2 B"], taken: Bool[Array, "*R 2 B C"], number: Float[Array, ""]
-) -> Float[Array, "*R 2 B"]:
+    log_scales: Float[Array, "*moves"], taken: Bool[Array, "*moves C"], number: Float[Array, ""]
+) -> Float[Array, "*moves"]:
     """log β after the sweep of this number in a warm-up, in which these moves were accepted."""
     share = jnp.mean(taken.astype(log_scales.dtype), axis=-1)
     return jnp.minimum(log_scales + number**-0.6 * (share - _TARGET), 0)

@@ -1,10 +1,13 @@
-"""Paths given a whole record: a Markov chain of paths, which move in blocks (`path_blocks`)."""
+"""Paths given a whole record: a Markov chain of paths, which move in blocks (`path_blocks`), or of
+states and the bridges between them (`states`)."""
+
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import PathFunction
 from ..engine.checks import Numbers, check_count, check_key
@@ -17,6 +20,7 @@ from .initial import Initial
 from .observation import Observation
 from .path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep, tuned
 from .problem import RecordProblem, as_record_problem
+from .states import sample_states
 
 
 class Smoothed(eqx.Module):
@@ -25,15 +29,18 @@ class Smoothed(eqx.Module):
     - `times`: of the points, shape (K,).
     - `paths`: shape (chains, n, K, d).
     - `accepted`: the share of moves that were accepted, of each block in both ways to cut the
-        record into blocks, shape (2, B).
+        record into blocks, shape (2, B); or of each state, shape (ends,), with a `proposal`.
     - `stuck`: the chains in which a block never moved, shape (chains,): `standard_error` is
         infinite if there is one, for draws of a path that stays tell nothing of their error.
+    - `num_truncated`: how many weights of a `proposal` were cut off at a bound on the work, by
+        which draws are not exact.
     """
 
     times: Float[Array, " K"]
     paths: Float[Array, "chains n K d"]
-    accepted: Float[Array, "2 B"]
+    accepted: Float[Array, "..."]
     stuck: Bool[Array, " chains"]
+    num_truncated: Int[Array, ""]
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
         """The mean of `fn(path)`, a function of one path of shape (K, d), by default itself."""
@@ -78,6 +85,8 @@ def smooth(
     num_warmup: int = 200,
     num_chains: int = 4,
     block_length: int = 10,
+    proposal: Any = None,
+    num_proposals: int = 10,
     num_steps: int | None = None,
     step_size: float | None = None,
     initial_time: Numbers | None = None,
@@ -94,6 +103,12 @@ def smooth(
     - `num_draws`: of each chain, after `num_warmup` in which the size of moves is learnt.
     - `num_chains`: chains, which start from guided paths that know nothing of each other.
     - `block_length`: how many intervals between observations move at once.
+    - `proposal`: by default paths are guided by all that was seen, as by a linear process. Across
+        gaps in which the diffusion could have gone several ways (wells, many relaxation times)
+        give a proposal of bridges, as `sample_exact_bridges` takes them: a `Coupling`, or "auto",
+        which tries several on each gap. Then the states at the times of observations move, with
+        new bridges on both sides. That asks for a stationary law and for noise in all that is seen.
+    - `num_proposals`: how many bridges of a `proposal` are made for each move of each gap.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
     **Returns:** `Smoothed`. Not differentiable: `innovations` is.
@@ -115,8 +130,31 @@ def smooth(
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     problem = as_record_problem(*arguments, num_steps=num_steps, any_constant=True, **options)
+    num_proposals = check_count("num_proposals", num_proposals)
     made = linearised(problem, model)
-    return _smooth(key, problem, made, counts, num_chains, block_length, progress_meter)
+    if proposal is None:
+        return _smooth(key, problem, made, counts, num_chains, block_length, progress_meter)
+    start_key, key = jax.random.split(key)
+    firsts = _guided_paths(start_key, problem, made, num_chains)
+    drawn = sample_states(key, problem, proposal, firsts, (*counts, num_proposals), progress_meter)
+    paths = jnp.moveaxis(drawn.paths, 1, 0)
+    return Smoothed(drawn.times, paths, drawn.accepted, drawn.stuck, drawn.num_truncated)
+
+
+@eqx.filter_jit
+def _guided_paths(
+    key: Key[Array, ""], problem: RecordProblem, made: Linearised, num_chains: int
+) -> Float[Array, "chains points d"]:
+    """Guided paths that know nothing of each other, or where they left the finite numbers the one
+    along which they are guided."""
+    points, guide = made
+
+    def first(key):
+        noise = jax.random.normal(key, points.shape, points.dtype)
+        path, log_weight = path_and_log_weight(problem, problem.model, guide, noise)
+        return jnp.where(jnp.isfinite(log_weight), path, points)
+
+    return jax.vmap(first)(jax.random.split(key, num_chains))
 
 
 @eqx.filter_jit
@@ -133,12 +171,7 @@ def _smooth(
     points, guide = made
     start_key, key = jax.random.split(key)
 
-    def first(key):
-        noise = jax.random.normal(key, points.shape, points.dtype)
-        path, log_weight = path_and_log_weight(problem, model, guide, noise)
-        return jnp.where(jnp.isfinite(log_weight), path, points)
-
-    firsts = jnp.moveaxis(jax.vmap(first)(jax.random.split(start_key, num_chains)), 0, -1)
+    firsts = jnp.moveaxis(_guided_paths(start_key, problem, made, num_chains), 0, -1)
     (K, N), d = problem.record.dt.shape, problem.dim
     paths = Paths(firsts[0], firsts[1:].reshape(K, N, d, num_chains))
     both = blocks_of_both_cuts(problem, points, guide, block_length)
@@ -158,4 +191,5 @@ def _smooth(
     real = has_segments(problem, block_length)[..., None]
     stuck = jnp.any(real & ~jnp.any(taken, axis=0), axis=(0, 1))
     share = jnp.mean(taken.astype(points.dtype), axis=(0, -1))
-    return Smoothed(problem.record.grid(), jnp.moveaxis(drawn, 1, 0), share, stuck)
+    nothing = jnp.int32(0)
+    return Smoothed(problem.record.grid(), jnp.moveaxis(drawn, 1, 0), share, stuck, nothing)

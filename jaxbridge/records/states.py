@@ -1,0 +1,336 @@
+"""Paths of a record across gaps in which the diffusion could have gone several ways: the states at
+the ends of segments are part of the chain, and bridges from any proposal join them.
+
+A proposal of bridges is a path from a to b with a weight w, E[w h(path)] = p(b|a) E_bridge[h]. So
+does the mean ŵ of several, with one of them drawn in proportion to its weight. The chain holds the
+states x_k, and for each segment such a path and its ŵ; and (Andrieu & Roberts 2009)
+
+    π(x_0) Π_k ŵ_k g(y_k|x_k)
+
+is a density on all of it, of which what the record says of states and paths is a marginal. States
+with even and with odd k move in turn, all of one kind at once: x_k' with new paths on both of its
+sides is accepted with probability
+
+    min{1, ŵ'_left ŵ'_right g(y_k|x_k') q(x_k) / (ŵ_left ŵ_right g(y_k|x_k) q(x_k'))},
+
+from a random walk, where q falls out, and every other time from a normal law q, the stationary
+mean and covariance as the observation corrects them. Then each segment is offered a new path
+between the same two states.
+"""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..coupling import Coupling, Stationary, with_start_law
+from ..engine.averages import proper
+from ..engine.checks import is_traced, nondifferentiable
+from ..engine.keys import key_for
+from ..engine.linalg import any_cholesky, any_inverse, dot, solve_lower
+from ..engine.progress import metered_scan
+from ..exact import acceptance_rate
+from ..models.bridge_problem import Intervals
+from ..models.diffusion import Diffusion
+from ..models.gaussian_law import GaussianLaw
+from ..proposals import (
+    AbstractProposal,
+    AbstractWeightedProposal,
+    Choice,
+    as_proposal,
+    best_at_worst,
+    resolve,
+)
+from .initial import bound
+from .observation import Scalars, log_density_of
+from .path_blocks import tuned
+from .problem import RecordProblem
+
+# Draws of ν for the moments of q, which is made so much wider, for tails that are not normal.
+_NUM_DRAWS, _WIDER = 512, 1.3
+# Pairs of ends of each segment between which "auto" tries the ways to join them.
+_NUM_PILOTS = 6
+
+
+class States(NamedTuple):
+    """Of C chains: the states at the ends of segments, a path of each segment, and log ŵ.
+    `num_truncated` counts the weights that have been cut off so far."""
+
+    x: Float[Array, "C ends d"]
+    paths: Float[Array, "C K points d"]
+    log_weights: Float[Array, "C K"]
+    num_truncated: Int[Array, ""]
+
+
+class Moved(NamedTuple):
+    """Which states and which paths moved in one iteration."""
+
+    states: Bool[Array, "C ends"]
+    paths: Bool[Array, "C K"]
+
+
+class NormalLaws(NamedTuple):
+    """q of each state: means and lower triangular roots of covariances."""
+
+    mean: Float[Array, "ends d"]
+    root: Float[Array, "ends d d"]
+
+
+class StateSampler(eqx.Module):
+    """What does not change from iteration to iteration; `proposal` is for the intervals of all
+    chains, each with its K segments in a row, and `movable` says which states are not known."""
+
+    problem: RecordProblem
+    model: Diffusion
+    proposal: AbstractWeightedProposal
+    laws: NormalLaws
+    scalars: Scalars
+    movable: Bool[Array, " ends"]
+    num_proposals: int = eqx.field(static=True)
+
+    def log_target(self, x: Float[Array, "C ends d"]) -> Float[Array, "C ends"]:
+        """log g(y_k|x_k), and of the first state its law."""
+        params, values = self.model.params, self.problem.record.values
+
+        def seen(scalars, y, x):
+            return log_density_of(scalars, x) + self.problem.observation.correction(y, x, params)
+
+        of_chain = jax.vmap(seen)
+        logs = jax.vmap(lambda x: of_chain(self.scalars, values, x))(x)
+        law = bound(self.problem.initial, self.model)
+        if isinstance(law, Stationary):
+            logs = logs.at[:, 0].add(jax.vmap(self.model.log_stationary)(x[:, 0]))
+        elif isinstance(law, GaussianLaw):
+            logs = logs.at[:, 0].add(jax.vmap(law.log_density)(x[:, 0]))
+        return proper(logs)
+
+    def log_q(self, x: Float[Array, "C ends d"]) -> Float[Array, "C ends"]:
+        """log q up to a constant."""
+
+        def of_one(mean, root, x):
+            white = solve_lower(root, x - mean)
+            return -dot(white, white) / 2
+
+        return jax.vmap(lambda x: jax.vmap(of_one)(*self.laws, x))(x)
+
+    def paths(self, key: Key[Array, ""], x: Float[Array, "C ends d"]) -> States:
+        """New paths of all segments between these states."""
+        draw_key, pick_key = jax.random.split(key)
+        C, ends, d = x.shape
+        num = C * (ends - 1)
+        durations = jnp.tile(jnp.diff(self.problem.record.times), C)
+        intervals = Intervals(x[:, :-1].reshape(num, d), x[:, 1:].reshape(num, d), durations)
+        keys = jax.random.split(draw_key, (num, self.num_proposals))
+        drawn = self.proposal.draw(keys, self.model, intervals, self.problem.num_steps, None, True)
+        log_weights = proper(drawn.log_weights)
+        picked = jax.random.categorical(pick_key, log_weights)
+        paths = jnp.take_along_axis(drawn.paths, picked[:, None, None, None], axis=1)[:, 0]
+        log_mean = jax.nn.logsumexp(log_weights, axis=1) - np.log(self.num_proposals)
+        paths, log_mean = paths.reshape(C, ends - 1, -1, d), log_mean.reshape(C, ends - 1)
+        return States(x, paths, log_mean, jnp.sum(drawn.truncated, dtype=jnp.int32))
+
+    def move_states(
+        self,
+        key: Key[Array, ""],
+        state: States,
+        parity: int,
+        walk: Bool[Array, ""],
+        log_scales: Float[Array, " ends"],
+    ) -> tuple[States, Bool[Array, "C ends"]]:
+        """The states with even or odd k, and what is beside them; which moved."""
+        noise_key, path_key, accept_key = jax.random.split(key, 3)
+        x, (mean, root) = state.x, self.laws
+        noise = jnp.einsum("kij,ckj->cki", root, jax.random.normal(noise_key, x.shape, x.dtype))
+        proposed = jnp.where(walk, x + jnp.exp(log_scales)[:, None] * noise, mean + noise)
+        mine = self.movable & (np.arange(x.shape[1]) % 2 == parity)
+        new = self.paths(path_key, jnp.where(mine[:, None], proposed, x))
+
+        def of_states(state):
+            beside = jnp.pad(state.log_weights, ((0, 0), (1, 1)))
+            log_q = jnp.where(walk, 0, self.log_q(state.x))
+            return beside[:, :-1] + beside[:, 1:] + self.log_target(state.x) - log_q
+
+        rate = acceptance_rate(proper(of_states(state)), proper(of_states(new)))
+        accepted = mine & (jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate)
+        beside = accepted[:, :-1] | accepted[:, 1:]
+        return States(
+            jnp.where(accepted[..., None], new.x, x),
+            jnp.where(beside[..., None, None], new.paths, state.paths),
+            jnp.where(beside, new.log_weights, state.log_weights),
+            state.num_truncated + new.num_truncated,
+        ), accepted
+
+    def move_paths(self, key: Key[Array, ""], state: States) -> tuple[States, Bool[Array, "C K"]]:
+        """New paths between the same states, and which of them were taken."""
+        path_key, accept_key = jax.random.split(key)
+        new = self.paths(path_key, state.x)
+        rate = acceptance_rate(state.log_weights, new.log_weights)
+        accepted = jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate
+        return States(
+            state.x,
+            jnp.where(accepted[..., None, None], new.paths, state.paths),
+            jnp.where(accepted, new.log_weights, state.log_weights),
+            state.num_truncated + new.num_truncated,
+        ), accepted
+
+    def sweep(
+        self,
+        key: Key[Array, ""],
+        state: States,
+        walk: Bool[Array, ""],
+        log_scales: Float[Array, " ends"],
+    ) -> tuple[States, Moved]:
+        """Even states, odd states, paths."""
+        even_key, odd_key, path_key = jax.random.split(key, 3)
+        state, even = self.move_states(even_key, state, 0, walk, log_scales)
+        state, odd = self.move_states(odd_key, state, 1, walk, log_scales)
+        state, paths = self.move_paths(path_key, state)
+        states = even | odd
+        return state, Moved(states, paths | states[:, :-1] | states[:, 1:])
+
+
+class StateDraws(NamedTuple):
+    """`times` of the points, draws of whole paths, the share of moves `accepted` of each state, the
+    chains in which one or a path was `stuck`, and how many weights were cut off."""
+
+    times: Float[Array, " points"]
+    paths: Float[Array, "n C points d"]
+    accepted: Float[Array, " ends"]
+    stuck: Bool[Array, " C"]
+    num_truncated: Int[Array, ""]
+
+
+def sample_states(
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    proposal: Any,
+    guided: Float[Array, "C points d"],
+    counts: tuple[int, int, int],
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> StateDraws:
+    """So many draws, after so many iterations of a warm-up, with so many paths in each ŵ; from
+    guided paths of the whole record.
+
+    **Raises:** `ValueError` where the proposal does not fit, nothing is known of the stationary
+    law, or components are seen without noise.
+    """
+    model, K = problem.model, problem.num_segments
+    if not (model.has_sampler or model.has_density):
+        raise ValueError(
+            "states at the times of observations are proposed by the moments of the stationary "
+            "law: give `Diffusion` a `log_stationary` or `sample_stationary`, or leave out "
+            "`proposal`, so that paths are guided by the whole record."
+        )
+    scalars = problem.scalars(model)
+    if not is_traced(scalars) and np.any(scalars.seen & (scalars.variances <= 0)):
+        raise ValueError(
+            "with a `proposal` every component that is seen must have noise, but `covariance` has "
+            "variances of zero: leave out `proposal`, so that paths are guided by the record."
+        )
+    first = guided[:, :: problem.num_steps]
+    durations = jnp.diff(problem.record.times)
+    intervals = Intervals(first[0, :-1], first[0, 1:], durations)
+    pilot_key = key_for("states", key)
+    laws = _normal_laws(pilot_key, problem, scalars, intervals)
+    proposal = _prepared(pilot_key, problem, as_proposal(proposal, model, problem.like), laws)
+    proposal = proposal.of(np.tile(np.arange(K), len(guided)))  # all chains alike
+    assert isinstance(proposal, AbstractWeightedProposal)
+    point = not isinstance(bound(problem.initial, model), Stationary | GaussianLaw)
+    movable = jnp.ones(K + 1, bool).at[0].set(not point)
+    num_draws, num_warmup, num_proposals = counts
+    model = nondifferentiable(model.prepared())
+    sampler = StateSampler(problem, model, proposal, laws, scalars, movable, num_proposals)
+    within = jnp.asarray(proposal.fractions(problem.num_steps)[:-1], durations.dtype)
+    times = problem.record.times
+    grid = jnp.append((times[:-1, None] + durations[:, None] * within).ravel(), times[-1])
+    paths, moved, cut = _run(key, sampler, guided, (num_draws, num_warmup), progress_meter)
+    ever = jnp.all(jnp.any(moved.states, axis=0) | ~movable, axis=1)
+    ever &= jnp.all(jnp.any(moved.paths, axis=0), axis=1)
+    accepted = jnp.mean(moved.states.astype(grid.dtype), axis=(0, 1))
+    return StateDraws(grid, paths, accepted, ~ever, cut)
+
+
+def _prepared(
+    key: Key[Array, ""], problem: RecordProblem, proposal: AbstractProposal, laws: NormalLaws
+) -> AbstractProposal:
+    """The proposal for the segments of one chain. "auto" tries each between several states that
+    may be its ends: what is best between two in one well may be useless between two wells."""
+    model, num_steps, (ends, d) = problem.model, problem.num_steps, laws.mean.shape
+    noise = jax.random.normal(key, (ends, _NUM_PILOTS, d), laws.mean.dtype)
+    x = laws.mean[:, None] + jnp.einsum("kij,knj->kni", laws.root, noise)
+    durations = jnp.repeat(jnp.diff(problem.record.times), _NUM_PILOTS)
+    pilots = Intervals(x[:-1].reshape(-1, d), x[1:].reshape(-1, d), durations)
+    one_each = jax.tree.map(lambda leaf: leaf[::_NUM_PILOTS], pilots)
+    if proposal.is_open and not is_traced(key, model, pilots):
+        proposal.check(model, pilots)
+        choice = resolve(proposal, key, model, pilots, num_steps)
+        return best_at_worst(choice, _NUM_PILOTS) if isinstance(choice, Choice) else choice
+    proposal.check(model, one_each)
+    return proposal.prepared(key, model.prepared(), one_each, num_steps)
+
+
+def _normal_laws(
+    key: Key[Array, ""], problem: RecordProblem, scalars: Scalars, intervals: Intervals
+) -> NormalLaws:
+    """q: N(m, S) of the stationary law, times the normal guess of what was seen."""
+    model = problem.model.prepared()
+    keys = jax.random.split(key, _NUM_DRAWS)
+    if model.has_sampler:
+        draws = jax.vmap(model.sample_stationary)(keys)
+    else:
+        made = with_start_law(
+            key, model, Coupling(), intervals.end, intervals.duration, problem.num_steps
+        )
+        law: Any = made.start_law  # with a density, and so with draws
+        draws = jax.vmap(lambda key: law.sample(key, model))(keys)
+    draws = draws.astype(problem.like.dtype)
+    mean, eye = jnp.mean(draws, axis=0), jnp.eye(problem.dim, dtype=draws.dtype)
+    centred = draws - mean
+    S = centred.T @ centred / _NUM_DRAWS
+    S += 1e-6 * jnp.max(jnp.diagonal(S)) * eye
+    before = any_inverse(S)
+
+    def of_one(scalars):
+        rows, residual = scalars.rows, scalars.values - scalars.rows @ mean
+        scaled = jnp.where(scalars.seen, 1 / scalars.variances, 0)[:, None] * rows
+        covariance = any_inverse(before + rows.T @ scaled)
+        return mean + covariance @ (scaled.T @ residual), _WIDER * any_cholesky(covariance)
+
+    return NormalLaws(*jax.vmap(of_one)(scalars))
+
+
+@eqx.filter_jit
+def _run(
+    key: Key[Array, ""],
+    sampler: StateSampler,
+    guided: Float[Array, "C points d"],
+    counts: tuple[int, int],
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> tuple[Float[Array, "n C points d"], Moved, Int[Array, ""]]:
+    num_draws, num_warmup = counts
+    N, (C, _, d), dtype = sampler.problem.num_steps, guided.shape, guided.dtype
+    first_key, key = jax.random.split(key)
+
+    def step(carry: tuple[States, Array], i: Int[Array, ""]):
+        state, log_scales = carry
+        walk = i % 2 == 0
+        state, moved = sampler.sweep(jax.random.fold_in(key, i), state, walk, log_scales)
+        learnt = tuned(log_scales, moved.states.T, (i // 2 + 1).astype(dtype))
+        log_scales = jnp.where(walk & (i < num_warmup), learnt, log_scales)
+        path = state.paths[:, :, :-1].reshape(C, -1, d)
+        return (state, log_scales), (jnp.concatenate([path, state.x[:, -1:]], axis=1), moved)
+
+    state = sampler.paths(first_key, guided[:, ::N])
+    # Where no proposal became a bridge the guided path stands in, with no weight.
+    within = jnp.arange(sampler.problem.num_segments)[:, None] * N + jnp.arange(N + 1)
+    found = (state.log_weights > -jnp.inf)[..., None, None]
+    state = state._replace(paths=jnp.where(found, state.paths, guided[:, within]))
+    init = state, jnp.zeros(sampler.movable.shape, dtype)
+    steps = jnp.arange(num_warmup + num_draws)
+    (state, _), made = metered_scan(step, init, steps, progress_meter)
+    paths, moved = jax.tree.map(lambda leaf: leaf[num_warmup:], made)
+    return paths, moved, state.num_truncated

@@ -1,0 +1,140 @@
+"""States that move with the bridges on both sides: against Gaussian conditioning, and against
+Kolmogorov's equation where the diffusion may have gone several ways."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from grid_filter import grid_filter
+from helpers import NON_REVERSIBLE
+from scipy.linalg import expm, solve_continuous_lyapunov
+
+import jaxbridge as jb
+
+KEY = jax.random.key(0)
+
+
+def conditioned(B, matrix, variance, times, values, at):
+    """Means and sds at the times `at` of the stationary process dX = -BX dt + dW, of which
+    `matrix` X + noise was seen."""
+    S = solve_continuous_lyapunov(B, np.eye(len(B)))
+
+    def covariance(s, t):
+        return expm(-B * (s - t)) @ S if s >= t else S @ expm(-B * (t - s)).T
+
+    def block(first, second):
+        return np.block([[covariance(s, t) for t in second] for s in first])
+
+    seen = np.isfinite(values).all(1)
+    L = np.kron(np.eye(seen.sum()), matrix)
+    among = L @ block(times[seen], times[seen]) @ L.T + variance * np.eye(len(L))
+    gain = np.linalg.solve(among, L @ block(times[seen], at)).T
+    mean = gain @ values[seen].ravel()
+    left = block(at, at) - gain @ L @ block(times[seen], at)
+    return mean.reshape(len(at), -1), np.sqrt(np.diag(left)).reshape(len(at), -1)
+
+
+def assert_agrees(made, mean, sd):
+    """Means and squares within 4.5 standard errors, at all points of the grid."""
+    assert not made.stuck.any() and made.num_truncated == 0
+    for power, exact in ((1, mean), (2, mean**2 + sd**2)):
+        fn = lambda path, power=power: path**power
+        error = np.asarray(made.standard_error(fn))
+        assert (error < 0.06).all()
+        np.testing.assert_array_less(np.abs(made.mean(fn) - exact), 4.5 * error)
+
+
+TIMES = np.array([0.0, 1.5, 2.5, 5.0, 7.0])
+
+
+def test_linear_process():
+    """Unequal gaps, nothing seen at one time; steps of the exact transition law."""
+    model = jb.ornstein_uhlenbeck(jnp.array([[1.0]]))
+    values = np.array([[0.8], [-0.5], [np.nan], [1.2], [0.1]])
+    made = jb.smooth(
+        KEY, model, TIMES, values, observation=jb.LinearGaussian(covariance=0.2),
+        num_steps=4, num_draws=500, num_warmup=50, num_chains=4, num_proposals=4,
+        proposal=jb.Coupling(0.0, scheme=jb.GaussianTransition()),
+    )  # fmt: skip
+    exact = conditioned(np.eye(1), np.eye(1), 0.2, TIMES, values, np.asarray(made.times, float))
+    assert made.paths.shape == (4, 500, 17, 1) and made.accepted.shape == (5,)
+    assert (made.accepted > 0.2).all()
+    assert_agrees(made, *exact)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "proposal",
+    [jb.Coupling(0.5), "auto", jb.Guided(density=jb.ItoTaylorDensity())],
+    ids=["coupling", "auto", "guided"],
+)
+def test_part_of_a_process_that_turns(proposal):
+    B, matrix = NON_REVERSIBLE, np.array([[1.0, -0.5]])
+    values = np.array([[0.8], [-0.5], [np.nan], [1.2], [0.1]])
+    made = jb.smooth(
+        KEY, jb.ornstein_uhlenbeck(B), TIMES, values,
+        observation=jb.LinearGaussian(matrix, covariance=0.2),
+        num_steps=50, num_draws=1000, num_warmup=100, proposal=proposal,
+    )  # fmt: skip
+    exact = conditioned(B, matrix, 0.2, TIMES, values, np.asarray(made.times, float))
+    assert_agrees(made, *exact)
+
+
+DRIFT = lambda x: 2 * x * (1 - x**2)
+WELLS = jb.Diffusion(
+    lambda x, p: DRIFT(x), [0.8], lambda x, p: jnp.sum((x**2 - x**4 / 2) / 0.32)
+)  # not normalised, without a sampler
+
+
+def seen_rarely(num, gap):
+    """What was seen of the wells, at what times; and the probability of the right one, by grid."""
+    rng, x, values = np.random.default_rng(0), -1.0, []
+    for _ in range(num):
+        values.append(x + 0.3 * rng.normal())
+        for _ in range(round(gap / 0.005)):
+            x += DRIFT(x) * 0.005 + 0.8 * np.sqrt(0.005) * rng.normal()
+    values = np.array(values)
+    values[5:7] = np.nan
+    nodes = np.linspace(-2.6, 2.6, 521)
+    logs = np.where(np.isnan(values), 0, -((values - nodes[:, None]) ** 2) / 0.18).T
+    initial = np.exp(-((nodes + 1) ** 2) / 0.5)
+    arguments = (DRIFT, lambda x: np.full_like(x, 0.64), nodes, initial, np.full(num - 1, gap))
+    exact = grid_filter(*arguments, logs)
+    return np.arange(num) * gap, values[:, None], exact.weights @ (nodes > 0)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.parametrize("proposal", [jb.Coupling(0.0), "auto"], ids=["coupling", "auto"])
+def test_wells_that_are_seen_rarely(proposal):
+    """Gaps of twenty units of time, within which the diffusion changes its well or does not: the
+    probability of each is known to a part in a hundred from some hundreds of draws."""
+    num_steps = 200
+    times, values, exact = seen_rarely(12, 20.0)
+    made = jb.smooth(
+        KEY, WELLS, times, values, observation=jb.LinearGaussian(covariance=0.09),
+        initial=jb.GaussianLaw([-1.0], [[0.25]]), num_steps=num_steps, num_draws=400,
+        num_warmup=100, proposal=proposal,
+    )  # fmt: skip
+    assert not made.stuck.any() and made.num_truncated == 0
+    share = lambda path: (path[::num_steps, 0] > 0).astype(jnp.float32)
+    # Where all draws agree there is no standard error: that of one in so many.
+    error = np.maximum(made.standard_error(share), 1 / 400)
+    assert ((0.2 < exact) & (exact < 0.8)).any() and (error < 0.1).all()
+    np.testing.assert_array_less(np.abs(made.mean(share) - exact), 4.5 * error)
+
+
+def test_what_does_not_fit_is_refused():
+    values, seen = np.zeros((3, 1)), jb.LinearGaussian(covariance=0.1)
+    unknown = jb.Diffusion(lambda x, p: -x)
+    options = {"observation": seen, "initial": [0.0], "proposal": jb.Guided(), "num_steps": 4}
+    with pytest.raises(ValueError, match="leave out `proposal`, so that paths are guided by the"):
+        jb.smooth(KEY, unknown, TIMES[:3], values, **options)
+    known = jb.ornstein_uhlenbeck(jnp.eye(1))
+    with pytest.raises(ValueError, match="every component that is seen must have noise"):
+        exactly = options | {"observation": jb.LinearGaussian(covariance=0.0)}
+        jb.smooth(KEY, known, TIMES[:3], values, **exactly)
+    with pytest.raises(TypeError, match="`proposal` must be a `Coupling`"):
+        jb.smooth(KEY, known, TIMES[:3], values, **options | {"proposal": 3})
+    with pytest.raises(ValueError, match="`num_proposals` must"):
+        jb.smooth(KEY, known, TIMES[:3], values, num_proposals=0, **options)
