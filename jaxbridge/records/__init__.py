@@ -17,7 +17,8 @@ Schauer 2017; Mider, Schauer & van der Meulen 2021) with data on the way. On it 
 * `log_likelihood`: particles that are resampled where data are (`particle_filter`), an unbiased
   estimate, however long the record is;
 * `innovations`: path and weight as smooth functions of parameters and of normal noise;
-* `smooth`: paths given the whole record, by moves of the noise in blocks.
+* `smooth`: paths given the whole record, by moves of the noise in blocks (`path_blocks`), or across
+  long gaps by moves of the states with new bridges on both sides (`states`).
 """
 
 # What the folders above use of this one.
