@@ -28,7 +28,7 @@ def test_quickstart_runs():
 @pytest.mark.slow
 def test_code_runs():
     """The blocks of the pages go on from those of the README."""
-    assert len(BLOCKS) == 16
+    assert len(BLOCKS) == 17
     namespace = {}
     for block in BLOCKS:
         exec(block, namespace)

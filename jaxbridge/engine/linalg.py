@@ -240,11 +240,11 @@ def _looped_substitution(
     matrix: Float[Array, "d d"], right: Float[Array, " d"], order: range
 ) -> Float[Array, " d"]:
     """`matrix⁻¹ right` of a triangular matrix, whose unknowns are found in this order."""
-    n, order = np.arange(len(order)), jnp.array(order)
+    n, which = np.arange(len(order)), jnp.array(order)
 
     def substitute(i, carry):
         rest, solved = carry
-        k = order[i]
+        k = which[i]
         found = rest[k] / matrix[k, k]
         # What is on the other side of the diagonal is zero, and belongs to what has been found.
         return rest - matrix[:, k] * found, jnp.where(n == k, found, solved)

@@ -41,7 +41,8 @@ class TransitionLogDensity(eqx.Module):
     - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` can be trusted.
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, with
         a standard error of it, `step_uncertainty`. NaN where it is not known, as of one step.
-    - `step_share`: the step error as a share of what half as many steps change; `num_steps`: N.
+    - `step_share`: the step error as a share of what half as many steps change, infinite where that
+        says little of it (couplings with a σ(x) that varies); `num_steps`: N.
     """
 
     value: Float[Array, "*I"]

@@ -27,7 +27,8 @@ class AbstractExactBridges(eqx.Module):
     - `paths`, `met`: shapes (n, K, d) and (n,).
     - `log_halving`: log of the factor by which the weight of a path would change with half as many
         steps, NaN where none was worked out, shape (n,).
-    - `step_share`: the step error as a share of what that changes, shape ().
+    - `step_share`: the step error as a share of what that changes, shape (); infinite where that
+        says little of it, and then its uncertainty is, too: of couplings with a σ(x) that varies.
     - `proposal`: what they were made with.
     """
 

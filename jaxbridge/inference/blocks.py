@@ -23,7 +23,14 @@ from ..proposals import (
     resolve,
     why_left_out,
 )
-from ..schemes import Form, density_of_form, forms_of_targets, log_halving_of_paths, share_of_order
+from ..schemes import (
+    Form,
+    density_of_form,
+    forms_of_targets,
+    guessed,
+    log_halving_of_paths,
+    share_of_order,
+)
 from .data import Group, Problem
 
 _NO_SAMPLER = (
@@ -72,7 +79,7 @@ class Block(eqx.Module):
         """The step error of each interval, of its bridges or of this form, as a share of what half
         as many steps change."""
         share = share_of_order(density_of_form(form).order)
-        return jnp.maximum(self.proposal.step_share(model, self.intervals), share)
+        return jnp.maximum(guessed(self.proposal.step_share(model, self.intervals)), share)
 
 
 def make_blocks(

@@ -34,7 +34,7 @@ from ..engine.keys import key_for
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..schemes import error_of_log_mean
+from ..schemes import error_of_log_mean, guessed
 from .base import AbstractSingleProposal
 from .choice import Choice, value_rates
 
@@ -156,7 +156,7 @@ def _look(
     # What takes too long to hit would have a weight beyond those that are seen.
     size = _extrapolated_size(jnp.where(drawn.truncated, -jnp.inf, drawn.log_weights))
     efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
-    share = candidate.step_share(model, intervals)
+    share = guessed(candidate.step_share(model, intervals))
     error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
     seen_error = jnp.maximum(jnp.abs(error.value) - 2 * error.uncertainty, 0)
     seen_error = jnp.where(jnp.isnan(seen_error), 0, seen_error)  # nothing is known of one step

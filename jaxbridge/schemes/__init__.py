@@ -54,6 +54,7 @@ from .step_error import (
     dominates as dominates,
     error_of_log_mean as error_of_log_mean,
     error_of_mean as error_of_mean,
+    guessed as guessed,
     is_gross as is_gross,
     share_of_known_order as share_of_known_order,
     share_of_order as share_of_order,

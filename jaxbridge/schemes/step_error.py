@@ -11,6 +11,7 @@ nearly all of the weights w e^D, the two laws have little in common: steps are t
 for anything, and the uncertainty is infinite.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -53,7 +54,7 @@ def error_of_log_mean(
     change = jnp.log(ratio) + largest[..., 0]
     overlap = _overlap(weights, coarse)
     spread = jnp.where(overlap, spread, jnp.inf)
-    return StepError(_told(share, change, some), _told(share, spread, some))
+    return _told(share, change, spread, some)
 
 
 def error_of_mean(
@@ -80,10 +81,8 @@ def error_of_mean(
     )
     spread = jnp.where(overlap, spread, jnp.inf)
     some = jnp.isfinite(coarse_mean) & jnp.isfinite(fine_mean)
-    return StepError(
-        _told(share, jnp.where(some, coarse_mean - fine_mean, 0), some),
-        _told(share, jnp.where(some, spread, 0), some),
-    )
+    change = jnp.where(some, coarse_mean - fine_mean, 0)
+    return _told(share, change, jnp.where(some, spread, 0), some)
 
 
 @jax.jit  # one program where it is called outside of any
@@ -103,6 +102,16 @@ def is_gross(error: StepError) -> Bool[Array, "..."]:
 def share_of_order(order: int) -> float:
     """(2^p - 1)⁻¹."""
     return 1 / (2**order - 1)
+
+
+# Of an error of which D tells no more than the size, and that badly: its uncertainty is infinite.
+UNKNOWN_SHARE = math.inf
+_GUESS = 3.0
+
+
+def guessed(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
+    """The share, with a guess on the safe side of those that are not known."""
+    return jnp.where(share == UNKNOWN_SHARE, _GUESS, share)
 
 
 def share_of_known_order(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
@@ -127,7 +136,11 @@ def _known(
     return normalised(jnp.where(known, log_weights, -jnp.inf)), known
 
 
-def _told(share, value, some):
-    """The share of a change, exactly zero where the share is; NaN where nothing is known."""
-    share = jnp.asarray(share, value.dtype)
-    return jnp.where(share == 0, 0, jnp.where(some, share * value, jnp.nan))
+def _told(share, change, spread, some):
+    """The share of a change, with its uncertainty: exactly zero where the share is, infinitely
+    uncertain where that is not known; NaN where nothing is."""
+    share = jnp.asarray(share, change.dtype)
+    spread = jnp.where(share == UNKNOWN_SHARE, jnp.inf, spread)
+    known = guessed(share)
+    of = lambda value: jnp.where(share == 0, 0, jnp.where(some, known * value, jnp.nan))
+    return StepError(of(change), of(spread))
