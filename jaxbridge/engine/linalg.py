@@ -222,18 +222,21 @@ def _looped_quadratic_form(
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """`quadratic_form`, in a loop: -vᵀM⁻¹v is what elimination leaves of a last row (vᵀ, 0)."""
     d = matrix.shape[0]
-    n = np.arange(d + 1)
-    zero = jnp.zeros_like(vector, shape=(1, 1))
-    bordered = jnp.block([[matrix, vector[:, None]], [vector[None, :], zero]])
+    zeros = jnp.zeros_like(vector, shape=(d + 1, 1))
+    rest = jnp.concatenate([matrix, vector[None, :]], axis=0)
+    rest = jnp.concatenate([rest, jnp.append(vector, 0)[:, None]], axis=1)
 
-    def eliminate(k, carry):
+    def eliminate(_, carry):
+        # What is left moves up and to the left, so that all steps are alike.
         rest, log_det = carry
-        pivot, row = rest[k, k], jnp.where(n > k, rest[k], 0)
-        log = jnp.log(jnp.where(pivot > 0, pivot, jnp.nan))
-        return rest - row[:, None] * (row / pivot), log_det + log
+        pivot = rest[0, 0]
+        rest = rest[1:, 1:] - rest[1:, :1] * (rest[:1, 1:] / pivot)
+        rest = jnp.concatenate([rest, zeros[:d].T], axis=0)
+        rest = jnp.concatenate([rest, zeros], axis=1)
+        return rest, log_det + jnp.log(jnp.where(pivot > 0, pivot, jnp.nan))
 
-    rest, log_det = lax.fori_loop(0, d, eliminate, (bordered, zero[0, 0]))
-    return -rest[d, d], log_det
+    rest, log_det = lax.fori_loop(0, d, eliminate, (rest, zeros[0, 0]))
+    return -rest[0, 0], log_det
 
 
 def _looped_substitution(
