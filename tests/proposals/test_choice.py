@@ -8,6 +8,7 @@ from helpers import assert_weighted_moments, chosen_of, count_compilations, pape
 
 import jaxbridge as jb
 from jaxbridge.proposals.auto import as_proposal
+from jaxbridge.proposals.choice import Choice, best_at_worst
 
 slow = pytest.mark.slow
 HYPERBOLIC = jb.hyperbolic(0.8, 2)
@@ -20,6 +21,24 @@ def mixed_choice(model, num_intervals):
     proposals = tuple(as_proposal(candidate, model, jnp.zeros(2)) for candidate in CANDIDATES)
     chosen = jnp.arange(num_intervals, dtype=jnp.int32) % 3
     return chosen_of(proposals, chosen, (0, 1, 2))
+
+
+def test_best_where_it_is_worst():
+    """Of three pilot runs of each interval; where one was left out, by what it could be."""
+    proposals = tuple(
+        as_proposal(candidate, paper_model(), jnp.zeros(2)) for candidate in CANDIDATES
+    )
+    efficiency = np.array(
+        [
+            [0.9, 0.9, 0.001, 0.9, 0.8, 0.9],
+            [0.3, 0.2, 0.2, 0.7, 0.7, 0.7],
+            [np.nan, 0.1, 0.1, np.nan, np.nan, np.nan],
+        ]
+    )
+    seconds, nothing = jnp.ones((3, 6)), jnp.zeros((3, 6))
+    told = (seconds, jnp.asarray(efficiency, jnp.float32), nothing, nothing)
+    choice = best_at_worst(Choice(proposals, *told, jnp.zeros(6, jnp.int32), (0, 1, 2)), 3)
+    assert list(choice.chosen) == [1, 0] and choice.used == (0, 1)
 
 
 @slow

@@ -9,6 +9,7 @@ from test_step_density import DENSITIES, FROM, TO
 
 import jaxbridge as jb
 from jaxbridge.schemes.step_error import (
+    UNKNOWN_SHARE,
     StepError,
     dominates,
     error_of_log_mean,
@@ -97,6 +98,11 @@ def test_changes_are_those_of_weights_and_factors():
     np.testing.assert_allclose(error.value, change, atol=1e-5)
     assert np.isnan(error_of_log_mean(log_w, jnp.full(50, jnp.nan), share).value)
     assert error_of_log_mean(log_w, D, 0 * share).value == 0
+    guess = error_of_log_mean(log_w, D, jnp.asarray(UNKNOWN_SHARE))
+    known = error_of_log_mean(log_w, D, one)
+    np.testing.assert_allclose(guess.value, 3 * known.value, rtol=1e-6)
+    assert guess.uncertainty == np.inf
+    assert dominates(guess, one)
 
 
 def test_uncertainty_is_the_spread_of_repetitions():
