@@ -110,11 +110,38 @@ def methods(model, start):
     return made | ({"Euler": jb.Coupling(0.0, scheme=jb.Euler())} if varies else {})
 
 
+def extrapolated_middles(both):
+    """The same by an `ExtrapolatedBridges`, taking half of what was removed for what is left."""
+    grids = both.fine, both.coarse
+    usable = all(bool(one.pareto_k < 0.7) and not bool(one.truncated.any()) for one in grids)
+    rows = [row[0] for row in (both.mean(), both.standard_error(), both.removed() / 2)]
+    return [
+        Told(value, error, left, 0.0, usable and abs(left) < 3 * error)
+        for value, error, left in np.array(rows, float).T
+    ]
+
+
 def tell(key, model, random, proposal, num_steps, num_proposals=2_000):
-    """Of the density and the mid-point, in that order. With one proposal for each bridge the mean
-    of the weights is the density."""
-    coupled = isinstance(proposal, jb.Coupling)
-    weighted = jb.sample_weighted_bridges(
+    """Of the density and the mid-point, in that order, by two grids where one cannot tell its step
+    error: by couplings with a σ(x) that varies."""
+    sizes = num_steps, num_proposals
+    weighted = weigh(key, model, random, proposal, *sizes)
+    if weighted.proposal.coupled:  # by "auto", perhaps: of it as of a coupling misses count
+        proposal = weighted.proposal.singles[0].by_coupling
+        weighted = weigh(key, model, random, proposal, *sizes)
+    if jnp.isfinite(weighted.step_share):
+        return [density(density_of(weighted)), *middles(weighted)]
+    coarse_key, num_steps = jax.random.fold_in(key, 1), num_steps // 2
+    coarse = weigh(coarse_key, model, random, proposal, num_steps, num_proposals)
+    both = jb.extrapolate(density_of(weighted), density_of(coarse))
+    log_density = Told(both.value, both.standard_error, both.removed / 2, 0.0, both.trustworthy)
+    return [log_density, *extrapolated_middles(jb.extrapolate(weighted, coarse))]
+
+
+def weigh(key, model, random, proposal, num_steps, num_proposals):
+    """With one proposal for each bridge, so that the mean of the weights is the density."""
+    coupled = isinstance(proposal, jb.AbstractCoupling)
+    return jb.sample_weighted_bridges(
         key,
         model,
         random.start,
@@ -126,7 +153,6 @@ def tell(key, model, random, proposal, num_steps, num_proposals=2_000):
         save_at=[random.duration / 2],
         **(dict(max_proposals=1, max_trials=1_000) if coupled else {}),
     )
-    return [density_of(weighted), *middles(weighted)]
 
 
 def density_of(weighted):
@@ -136,21 +162,19 @@ def density_of(weighted):
     error = jnp.std(jnp.exp(log_weights - value)) / math.sqrt(num)
     truncated = jnp.sum(weighted.truncated)
     step_error = error_of_log_mean(log_weights, weighted.log_halving, weighted.step_share)
-    return density(
-        jb.TransitionLogDensity(
-            value,
-            jnp.where(truncated > 0, jnp.inf, error),
-            weighted.effective_sample_size,
-            jnp.sum(weighted.met),
-            truncated,
-            weighted.num_simulated,
-            weighted.num_nonfinite,
-            weighted.proposal,
-            weighted.pareto_k,
-            *step_error,
-            weighted.step_share,
-            weighted.num_steps,
-        )
+    return jb.TransitionLogDensity(
+        value,
+        jnp.where(truncated > 0, jnp.inf, error),
+        weighted.effective_sample_size,
+        jnp.sum(weighted.met),
+        truncated,
+        weighted.num_simulated,
+        weighted.num_nonfinite,
+        weighted.proposal,
+        weighted.pareto_k,
+        *step_error,
+        weighted.step_share,
+        weighted.num_steps,
     )
 
 
@@ -167,7 +191,7 @@ def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):
         coupling = "Euler" if "Euler" in chosen and index % 2 else "Heun"
         chosen = {name: chosen[name] for name in (coupling, other)}
     told = {
-        name: tell(jax.random.key(index), model, random, proposal, 50)
+        name: tell(jax.random.key(index), model, random, proposal, 52)
         for name, proposal in chosen.items()
     }
     if random.name in random_models.EXACT:
