@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_bound, check_count, check_key, without_derivatives
+from ..engine.compiled import compiled
 from ..engine.devices import over_devices
 from ..engine.keys import numbered_keys
 from ..engine.rejection import Accepted, Attempts, Search, default_num_lanes, rejection_sample
@@ -136,7 +137,7 @@ def sample_bridges(
     return throw_where_incomplete(bridges, "paths", model, ~bridges.met) if throw else bridges
 
 
-@eqx.filter_jit
+@compiled
 def _sample_bridges(
     key: Key[Array, ""],
     model: Diffusion,

@@ -25,6 +25,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key, is_traced
+from ..engine.compiled import compiled
 from ..engine.keys import folded, key_for
 from ..engine.lanes import over_lanes
 from ..engine.linalg import is_finite
@@ -86,7 +87,7 @@ def _known(end: Float[Array, "P d"]) -> Float[Array, "P d"]:
     return jnp.where(usable, end, end[jnp.argmax(usable)])
 
 
-@eqx.filter_jit
+@compiled
 def _draw_law(key, model, coupling, end, duration, num_steps) -> SmoothedDraws:
     mine = jnp.arange(NUM_DRAWS) * len(end) // NUM_DRAWS
     # If no burn-in was found it is infinite, and the longest run has to do.
@@ -148,7 +149,7 @@ def measure_burn_in(
     return time
 
 
-@eqx.filter_jit
+@compiled
 def _measure(
     key: Key[Array, ""],
     model: Diffusion,

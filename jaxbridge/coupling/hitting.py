@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import check_bound, check_count, check_key, nondifferentiable
+from ..engine.compiled import compiled
 from ..engine.keys import key_for, numbered_keys
 from ..engine.rejection import Attempts, Search, default_num_lanes, rejection_sample
 from ..models.diffusion import Diffusion, check_diffusion
@@ -150,7 +151,7 @@ def hitting_counts(
     return _hitting_counts(key_for("hitting counts", key), model, coupling, bridges, search)
 
 
-@eqx.filter_jit
+@compiled
 def _hitting_counts(key, model, coupling, bridges, search):
     return counts_of(key, model, coupling, bridges, search)[0]
 

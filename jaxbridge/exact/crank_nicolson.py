@@ -14,7 +14,6 @@ again. The number of steps does not matter for the acceptance (Beskos, Roberts, 
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +26,7 @@ from ..engine.checks import (
     is_traced,
     nondifferentiable,
 )
+from ..engine.compiled import compiled
 from ..engine.keys import split_each
 from ..engine.progress import metered_scan
 from ..models.bridge_problem import BridgeProblem, Intervals
@@ -103,7 +103,7 @@ def crank_nicolson(
     return Kernel(init, step)
 
 
-@eqx.filter_jit
+@compiled
 def _init(
     keys: Key[Array, " I"],
     paths: Float[Array, "I points d"] | None,
@@ -123,7 +123,7 @@ def _init(
     return CrankNicolsonState(paths, noise, _finite(log_weights), log_halving)
 
 
-@eqx.filter_jit
+@compiled
 def _step(rng_key, state, model, proposal, intervals, beta):
     model, intervals = nondifferentiable((model.prepared(), intervals))
     dynamics = model.forward(intervals.start[0])
@@ -159,7 +159,7 @@ def _move(
     return jax.tree.map(choose, candidate, state), info
 
 
-@eqx.filter_jit
+@compiled
 def run_crank_nicolson(
     key: Key[Array, ""],
     model: Diffusion,

@@ -15,6 +15,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key
+from ..engine.compiled import compiled
 from ..engine.pareto import is_reliable, pareto_k
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import BridgeProblem, bridge_problem
@@ -152,7 +153,7 @@ def transition_log_density(
     )
 
 
-@eqx.filter_jit
+@compiled
 def estimate_log_density(
     key: Key[Array, ""],
     model: Diffusion,

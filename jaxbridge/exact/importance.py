@@ -32,6 +32,7 @@ from ..engine.averages import (
     weighted_mean,
 )
 from ..engine.checks import Numbers, check_count, check_key
+from ..engine.compiled import compiled
 from ..engine.keys import key_for
 from ..engine.pareto import is_reliable, pareto_k
 from ..engine.throwing import throw_where_incomplete
@@ -214,7 +215,7 @@ def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
     )
 
 
-@eqx.filter_jit
+@compiled
 def _weigh_bridges(key, model, pairs, bridges, search):
     paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
     ends, durations = paths[:, -1], durations_of(bridges)
@@ -308,7 +309,7 @@ def sample_weighted_bridges(
     return _or_throw(weighted, model) if throw else weighted
 
 
-@eqx.filter_jit
+@compiled
 def _sample_weighted(
     key: Key[Array, ""],
     model: Diffusion,

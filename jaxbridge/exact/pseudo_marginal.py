@@ -8,13 +8,13 @@ once, and the chain itself is a scan over numbers.
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_key, nondifferentiable
+from ..engine.compiled import compiled
 from ..engine.keys import split_each
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import BridgeProblem
@@ -92,14 +92,14 @@ def pseudo_marginal(
     return Kernel(init, step)
 
 
-@eqx.filter_jit
+@compiled
 def _draw_state(rng_key, model, proposal, intervals, num_steps):
     model, intervals = nondifferentiable((model.prepared(), intervals))
     drawn = proposal.draw(rng_key[None, None], model, intervals, num_steps, None, False)
     return _first(drawn), drawn.num_simulated[0, 0]
 
 
-@eqx.filter_jit
+@compiled
 def _reweigh_state(rng_key, path, model, proposal, intervals, num_steps):
     model, intervals, path = nondifferentiable((model.prepared(), intervals, path))
     return _first(proposal.reweigh(rng_key[None], model, intervals, path[None]))
@@ -109,7 +109,7 @@ def _first(drawn: WeightedPaths) -> PseudoMarginalState:
     return PseudoMarginalState(drawn.paths[0, 0], drawn.log_weights[0, 0], drawn.truncated[0, 0])
 
 
-@eqx.filter_jit
+@compiled
 def _pseudo_marginal_step(rng_key, state, *setting):
     draw_key, accept_key = jax.random.split(rng_key)
     candidate, num_simulated = _draw_state(draw_key, *setting)
@@ -120,7 +120,7 @@ def _pseudo_marginal_step(rng_key, state, *setting):
     return kept, PseudoMarginalInfo(rate, accepted, candidate.log_weight, num_simulated)
 
 
-@eqx.filter_jit
+@compiled
 def run_pseudo_marginal(
     key: Key[Array, ""],
     model: Diffusion,

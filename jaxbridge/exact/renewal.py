@@ -12,7 +12,6 @@ is symmetric in (z, x_0) and (z', x_0'), h being the probability of a hit from x
 from typing import NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -28,6 +27,7 @@ from ..coupling import (
     run_is_cut,
 )
 from ..engine.checks import Numbers, check_key, nondifferentiable
+from ..engine.compiled import compiled
 from ..engine.keys import split_each
 from ..engine.progress import metered_while_loop
 from ..engine.rejection import Accepted, Search, default_num_lanes, most_lanes
@@ -99,7 +99,7 @@ def renewal(
     return Kernel(init, step)
 
 
-@eqx.filter_jit
+@compiled
 def _renewal_step(rng_key, state, model, pairs, intervals):
     everything = jnp.ones(1, bool)
     model, intervals, path = nondifferentiable((model.prepared(), intervals, state.position))
@@ -218,7 +218,7 @@ class _Runner(NamedTuple):
         return jnp.where(self.head[:, None, None], first, segments.ends[before])
 
 
-@eqx.filter_jit
+@compiled
 def run_renewal(
     key: Key[Array, ""],
     model: Diffusion,
@@ -335,7 +335,7 @@ def propose_paths(
     return find_bridges(keys, inputs, active, num_steps, None, search)
 
 
-@eqx.filter_jit
+@compiled
 def first_paths(
     keys: Key[Array, " I"],
     model: Diffusion,

@@ -3,7 +3,6 @@ inferred from them."""
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from ..engine.checks import (
     steps_of_size,
     time_steps,
 )
+from ..engine.compiled import compiled
 from ..engine.memory_maps import warn_near_limit_of_maps
 from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion
@@ -123,7 +123,7 @@ def _check_state_space(model: Diffusion, observations: Array) -> None:
         )
 
 
-@eqx.filter_jit
+@compiled
 def _inside(model: Diffusion, observations: Float[Array, "n d"]) -> Bool[Array, " n"]:
     """At which points coefficients and stationary density are finite."""
 

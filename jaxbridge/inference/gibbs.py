@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
+from ..engine.compiled import compiled
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
@@ -268,7 +269,7 @@ class _Sampler(eqx.Module):
         return self.augmentation.log_step_error(model, state.paths)
 
 
-@eqx.filter_jit
+@compiled
 def _run(
     key: Key[Array, ""],
     sampler: _Sampler,

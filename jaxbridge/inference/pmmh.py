@@ -27,6 +27,7 @@ from ..engine.checks import (
     check_key,
     nondifferentiable,
 )
+from ..engine.compiled import compiled
 from ..engine.progress import as_meter
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
@@ -309,7 +310,7 @@ class _Sampler(eqx.Module):
         return chain._replace(root=root), PMMHInfo(accepted, without, made.num_truncated)
 
 
-@eqx.filter_jit
+@compiled
 def _run(
     key: Key[Array, ""],
     sampler: _Sampler,

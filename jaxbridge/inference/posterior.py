@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ..engine.checks import check_count, is_traced
+from ..engine.compiled import compiled
 from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
 from ..schemes import StepError, dominates
 from .parameters import Parameters, init_vectors
@@ -155,7 +156,7 @@ def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
     return jax.vmap(lambda *each: function(*each))(keys, state)
 
 
-@eqx.filter_jit
+@compiled
 def first_states(start: Callable, key: Key[Array, ""], state: PyTree) -> Any:
     """The states that chains start from: key number 0 is theirs, and iterations have the others."""
     return over_chains(start, jax.random.fold_in(key, 0), state)

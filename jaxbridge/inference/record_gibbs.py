@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import proper
 from ..engine.checks import nondifferentiable
+from ..engine.compiled import compiled
 from ..engine.progress import metered_scan
 from ..exact import acceptance_rate
 from ..records import Records, tuned
@@ -154,7 +155,7 @@ def sample_records(
     return _run(key, sampler, state, size, progress_meter)
 
 
-@eqx.filter_jit
+@compiled
 def _run(
     key: Key[Array, ""],
     sampler: RecordSampler,

@@ -31,6 +31,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import all_finite_leaves, nondifferentiable
+from ..engine.compiled import compiled
 from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
 from ..engine.progress import metered_scan
 from ..records import Records, tuned
@@ -154,7 +155,7 @@ def _swept(
     return _Chains(paths, log_scales), taken[..., 0]
 
 
-@eqx.filter_jit
+@compiled
 def _approximate(
     key: Key[Array, ""], completion: RecordPaths, search: Search, theta: Float[Array, " p"]
 ) -> tuple[Float[Array, "n p"], _Chains, SearchInfo]:
@@ -199,7 +200,7 @@ def _mean_log_weight(
     return jnp.sum(jnp.where(good, each, 0)) / jnp.maximum(jnp.sum(good.astype(each.dtype)), 1)
 
 
-@eqx.filter_jit
+@compiled
 def _draws_at(
     key: Key[Array, ""],
     completion: RecordPaths,

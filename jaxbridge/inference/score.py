@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, check_count, nondifferentiable
+from ..engine.compiled import compiled
 from ..engine.pareto import pareto_k
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
@@ -197,7 +198,7 @@ def _draw(
 ) -> _Bridges:
     """Bridges of this model, prepared at θ."""
     intervals, num_steps = block.intervals, block.num_steps
-    m = num_looked(n, model.forward(intervals.start[0]).sigma_varies)
+    m = num_looked(n, model.sigma_varies(intervals.start[0]))
     keys = jax.random.split(key, (len(block.index), n))
     drawn = block.proposal.draw(keys, model, intervals, num_steps, None, False)
     start = intervals.start[:, None, None]
@@ -218,7 +219,7 @@ def _draw(
     return _Bridges(drawn.log_weights, drawn.truncated, *derivatives, *halvings)
 
 
-@eqx.filter_jit
+@compiled
 def _of_block(
     key: Key[Array, ""],
     parameters: Parameters,

@@ -20,7 +20,6 @@ with the number of steps: that takes p² of them, for p unknown parameters.
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
+from ..engine.compiled import compiled
 from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractProposal, Budget, as_proposal, choice_between, guided_candidates
@@ -179,7 +179,7 @@ def simulated(
     return over_intervals(blocks, made)
 
 
-@eqx.filter_jit
+@compiled
 def step_error_of_score(
     key: Key[Array, ""],
     parameters: Parameters,
@@ -281,7 +281,7 @@ class _Ascent(NamedTuple):
     done: Bool[Array, ""]
 
 
-@eqx.filter_jit
+@compiled
 def newton_ascent(
     key: Key[Array, ""],
     parameters: Parameters,
@@ -343,7 +343,7 @@ def newton_ascent(
     return Maximum(last.theta, made, found)
 
 
-@eqx.filter_jit
+@compiled
 def stochastic_ascent(
     key: Key[Array, ""],
     parameters: Parameters,

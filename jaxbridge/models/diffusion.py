@@ -280,6 +280,10 @@ class Diffusion(eqx.Module):
             constant_sigma = _as_sigma(self._constant_sigma, like)
         return Dynamics(drift, lambda x: constant_sigma, sigma_varies=False)
 
+    def sigma_varies(self, like: Float[Array, " d"]) -> bool:
+        """Whether σ depends on the point. Nothing is computed for the answer."""
+        return eqx.filter_eval_shape(lambda model, x: model.forward(x).sigma_varies, self, like)
+
     def backward(self, like: Float[Array, " d"]) -> Dynamics:
         """The coefficients α* and σ of the time-reversed diffusion, as for `forward`."""
         self.check_reversal()

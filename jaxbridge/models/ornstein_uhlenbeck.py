@@ -182,13 +182,23 @@ def _noise_covariance(params: OrnsteinUhlenbeckParams) -> Float[Array, "d d"]:
 
 
 def _lyapunov(B: Float[Array, "d d"], V: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """Γ with BΓ + ΓBᵀ = V, equation (Gamma), as one linear system of size d²."""
+    """Γ with BΓ + ΓBᵀ = V, equation (Gamma), as one linear system of size d²; up to two dimensions
+    by Γ = [|B| V + (B - tr B I) V (B - tr B I)ᵀ] / (2 |B| tr B)."""
     identity = jnp.eye(B.shape[0], dtype=B.dtype)
+    if B.shape[0] <= 2:
+        determinant, trace = _determinant(B), jnp.trace(B)
+        rest = B - trace * identity
+        return (determinant * V + rest @ V @ rest.T) / (2 * determinant * trace)
     operator = jnp.kron(B, identity) + jnp.kron(identity, B)
     # Inference does this in a loop, where LAPACK is a hazard; but d² soon is much to write out.
     solved = solve if B.shape[0] <= 3 else jnp.linalg.solve
     solution = solved(operator, V.reshape(-1)).reshape(V.shape)
     return (solution + solution.T) / 2
+
+
+def _determinant(B: Float[Array, "d d"]) -> Float[Array, ""]:
+    """Of one or two dimensions."""
+    return B[0, 0] if B.shape[0] == 1 else B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
 
 
 def decay_and_covariance(

@@ -1,7 +1,6 @@
 """Unconditional paths of the diffusion, by diffrax."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -9,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
+from ..engine.compiled import compiled
 from .diffusion import Diffusion, check_diffusion
 from .dynamics import Dynamics, ito_correction
 from .sigma import AbstractSigma, Diagonal
@@ -73,7 +73,7 @@ def simulate(
     return _simulate(path_key, model, x0, times.astype(x0.dtype), num_steps, solver)
 
 
-@eqx.filter_jit
+@compiled
 def _simulate(key, model, x0, times, num_steps, solver):
     (num_paths, d), num_intervals = x0.shape, times.shape[0] - 1
     dynamics = model.forward(x0[0])

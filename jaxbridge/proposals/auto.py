@@ -196,7 +196,7 @@ def choice_between(
 
 def guided_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[AbstractSingleProposal]:
     """With the same order of step error as couplings, where that is to be had."""
-    density = EulerDensity() if model.forward(like).sigma_varies else ItoTaylorDensity()
+    density = EulerDensity() if model.sigma_varies(like) else ItoTaylorDensity()
     guided = [Guided(along, density) for along in ("end", "path")]
     return [ModifiedDiffusionBridge(density), *guided]
 

@@ -94,7 +94,7 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return type(self.density).__name__, "", np.nan
 
     def most_accurate(self, model, like):
-        if model.forward(like).sigma_varies:
+        if model.sigma_varies(like):
             return self
         is_density = lambda leaf: isinstance(leaf, AbstractStepDensity)
         return eqx.tree_at(lambda p: p.density, self, ItoTaylorDensity(), is_leaf=is_density)

@@ -22,7 +22,6 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +29,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import is_traced
+from ..engine.compiled import compiled
 from ..engine.keys import key_for
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import Intervals
@@ -136,7 +136,7 @@ def _run_pilot(
     return _Pilot(candidate, run, run(), seconds)
 
 
-@eqx.filter_jit
+@compiled
 def _look(
     key: Key[Array, ""],
     model: Diffusion,

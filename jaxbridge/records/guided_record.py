@@ -3,13 +3,13 @@
 import functools
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Key
 
 from ..engine.checks import without_derivatives
+from ..engine.compiled import compiled
 from ..models.diffusion import Diffusion
 from .guided_steps import (
     Guide,
@@ -148,7 +148,7 @@ class Linearised(NamedTuple):
     guide: Guidance
 
 
-@eqx.filter_jit  # a program of its own, which all who read the record share
+@compiled  # a program of its own, which all who read the record share
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     """Along the path of the extended Kalman filter, and then of the path that is guided without
     noise. Neither has derivatives."""

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
+from ..engine.compiled import compiled
 from ..engine.lanes import over_lanes
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
@@ -227,7 +228,7 @@ def _is_poor(size: Float[Array, "..."], num_particles: int) -> Bool[Array, "..."
     return size < _FEWEST_EFFECTIVE * num_particles
 
 
-@eqx.filter_jit
+@compiled
 def _estimates(key: Key[Array, ""], records: Records, guides: Guidance, R: int, P: int) -> Filtered:
     """Of each record."""
     filters = lambda problem, key, guide: run_filters(key, problem, problem.model, guide, R, P)

@@ -116,6 +116,6 @@ def problem_of(
         )
     jax.eval_shape(lambda model: initial_law(initial, model, like), model)  # for its checks
     if density is None:
-        varies = model.forward(like).sigma_varies
+        varies = model.sigma_varies(like)
         density = EulerDensity() if varies else ItoTaylorDensity()
     return RecordProblem(model, record, observation, initial, check_step_density(density), dim)

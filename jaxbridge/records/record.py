@@ -23,6 +23,7 @@ from ..engine.checks import (
     steps_of_size,
     time_steps,
 )
+from ..engine.compiled import compiled
 
 # What the end of a segment costs, in steps.
 _STEPS_PER_SEGMENT = 4
@@ -168,7 +169,7 @@ def _checked(
     return times, gaps, values
 
 
-@eqx.filter_jit
+@compiled
 def _cut(
     times: Float[Array, " n"],
     gaps: Float[Array, " gaps"],

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import PathFunction
 from ..engine.checks import Numbers, check_count, check_key
+from ..engine.compiled import compiled
 from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
@@ -141,7 +142,7 @@ def smooth(
     return Smoothed(drawn.times, paths, drawn.accepted, drawn.stuck, drawn.num_truncated)
 
 
-@eqx.filter_jit
+@compiled
 def _guided_paths(
     key: Key[Array, ""], problem: RecordProblem, made: Linearised, num_chains: int
 ) -> Float[Array, "chains points d"]:
@@ -157,7 +158,7 @@ def _guided_paths(
     return jax.vmap(first)(jax.random.split(key, num_chains))
 
 
-@eqx.filter_jit
+@compiled
 def _smooth(
     key: Key[Array, ""],
     problem: RecordProblem,

@@ -30,6 +30,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..coupling import Coupling, Stationary, with_start_law
 from ..engine.averages import proper
 from ..engine.checks import is_traced, nondifferentiable
+from ..engine.compiled import compiled
 from ..engine.keys import key_for
 from ..engine.linalg import any_cholesky, any_inverse, dot, solve_lower
 from ..engine.progress import metered_scan
@@ -303,7 +304,7 @@ def _normal_laws(
     return NormalLaws(*jax.vmap(of_one)(scalars))
 
 
-@eqx.filter_jit
+@compiled
 def _run(
     key: Key[Array, ""],
     sampler: StateSampler,

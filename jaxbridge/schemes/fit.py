@@ -1,11 +1,11 @@
 """Do the model, the end points and the scheme fit?"""
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.checks import is_traced
+from ..engine.compiled import compiled
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion, check_invertible
 from .base import AbstractScheme
@@ -43,10 +43,10 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
             )
 
 
-@eqx.filter_jit
+@compiled
 def _coefficients(model: Diffusion, points: Float[Array, "n d"], with_slopes: bool):
     """α and σ at the points, a constant σ only once; ∂σ where it is asked for and varies."""
-    varies = model.forward(points[0]).sigma_varies
+    varies = model.sigma_varies(points[0])
     sigma = jax.vmap(model.diffusion)(points if varies else points[:1])
     slopes = jax.vmap(jax.jacfwd(model.diffusion))(points) if varies and with_slopes else None
     return jax.vmap(model.drift)(points), sigma, slopes

@@ -42,6 +42,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, is_traced, time_steps
+from ..engine.compiled import compiled
 from ..engine.lanes import over_lanes
 from ..engine.linalg import dot, total
 from ..models.diffusion import Diffusion, check_diffusion
@@ -171,7 +172,7 @@ def log_likelihoods(
     return jnp.sum(values.reshape(num_points - 1, num_paths), axis=0)
 
 
-_compiled = eqx.filter_jit(log_likelihoods)
+_compiled = compiled(log_likelihoods)
 
 
 def _ito(model: Diffusion, dynamics: Dynamics, steps, points) -> Float[Array, " P"]:
@@ -225,7 +226,7 @@ def _driftless(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
 
 def forms_of(model: Diffusion, like: Float[Array, " d"]) -> tuple[Form, ...]:
     """The forms relative to the law of σW that the model has, the most accurate first."""
-    if model.forward(like).sigma_varies:
+    if model.sigma_varies(like):
         return ("girsanov",)
     forms: tuple[Form, ...] = ("ito_taylor", "girsanov")
     if model.reversible or like.shape[0] == 1:

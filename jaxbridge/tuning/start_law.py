@@ -28,6 +28,7 @@ from ..coupling import (
     sample_bridges,
 )
 from ..engine.checks import Numbers, check_count, check_key, is_traced
+from ..engine.compiled import compiled
 from ..engine.keys import key_for
 from ..engine.rejection import most_lanes
 from ..exact import weigh_bridges
@@ -274,7 +275,7 @@ def _stationary_draws(
     return law, np.asarray(draws, float).T
 
 
-@eqx.filter_jit
+@compiled
 def _draw_stationary(law, model, scheme, keys, intervals, num_steps):
     _, end, duration = intervals
     lanes = jnp.broadcast_to(end.T, (end.shape[1], len(keys)))
