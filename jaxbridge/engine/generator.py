@@ -92,6 +92,7 @@ def with_keys_written_out(tree: PyTree) -> PyTree:
 def _written_out(leaf):
     if not (isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)):
         return leaf
-    if jax.random.key_impl(leaf) != "threefry2x32" or not jax.config.jax_threefry_partitionable:
+    partitionable = jax.config.jax_threefry_partitionable  # pyright: ignore[reportAttributeAccessIssue]
+    if jax.random.key_impl(leaf) != "threefry2x32" or not partitionable:
         return leaf
     return jax.random.wrap_key_data(jax.random.key_data(leaf), impl=_WRITTEN_OUT)
