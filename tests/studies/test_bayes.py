@@ -51,6 +51,7 @@ def test_distant_observations_are_draws_from_the_stationary_law():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_study_runs_and_renders(tmp_path):
     examples = run_bayes(jax.random.key(0), 0.04)
     text = format_bayes(examples)
