@@ -519,20 +519,3 @@ def test_unknown_sigma_of_cox_ingersoll_and_ross():
     assert made.newton and made.num_missing <= 5  # of 60,000, for raw paths may leave the half line
     np.testing.assert_array_less(np.abs(made.theta - fit.params), 0.2 * fit.sd)
     np.testing.assert_allclose(np.array(made.standard_errors), fit.sd, rtol=0.08)
-
-
-@pytest.mark.slow
-def test_unknown_sigma_is_refused_in_coordinates_that_move_with_it():
-    """Observations were mapped by a σ that is fixed."""
-    times, observations = cir.data()
-    moved = cir.in_roots()
-    arguments = (jax.random.key(0), moved.model, times, moved.forward(observations))
-    calls = [
-        lambda: jb.maximum_likelihood(*arguments),
-        lambda: jb.score(*arguments),
-        lambda: jb.gibbs(*arguments, prior=lambda p: 0.0),
-        lambda: jb.pmmh(*arguments, prior=lambda p: 0.0),
-    ]
-    for call in calls:
-        with pytest.raises(ValueError, match=r"coordinates of `lamperti` depend.*original"):
-            call()

@@ -142,7 +142,7 @@ def as_start_law(law: Any) -> AnyStartLaw:
         matrix = np.asarray(law.covariance, float)
         if not (np.all(np.isfinite(law.mean)) and np.linalg.eigvalsh(matrix).min() > 0):
             raise ValueError(
-                "a start law must have a finite mean and a positive definite covariance; got "
+                "`start_law` must have a finite mean and a positive definite covariance; got "
                 f"{law.mean} and {law.covariance}."
             )
     if not all(eqx.is_array_like(leaf) for leaf in jax.tree.leaves(law)):
@@ -199,7 +199,7 @@ def draw_starts(
         draws = jax.vmap(lambda key: law.sample(key, model))(keys)
     if draws.shape[1:] != end.shape[:1]:
         raise ValueError(
-            f"a start law must give points of shape {end.shape[:1]}, as the end points are; it "
+            f"`start_law` must give points of shape {end.shape[:1]}, as the end points are; it "
             f"gave {draws.shape[1:]}."
         )
     return draws.T.astype(end.dtype)

@@ -153,7 +153,8 @@ def _check_pair(fine: Any, coarse: Any) -> None:
     structures = [jax.tree.structure(one.proposal) for one in (fine, coarse)]
     if structures[0] != structures[1] or len(fine.proposal.singles) > 1:
         raise ValueError(
-            "both must come of the same single proposal, for the step errors of two do not cancel: "
+            "`fine` and `coarse` must come of the same single proposal, for the step errors of two "
+            "do not cancel: "
             f"got {fine.proposal.describe()} and {coarse.proposal.describe()}."
         )
 

@@ -163,7 +163,7 @@ class _Lamperti:
     def drift(self, y: Float[Array, " one"], table: _Table) -> Float[Array, " one"]:
         if y.shape != (1,):
             raise ValueError(
-                f"Lamperti's transform is for a one-dimensional model; points have shape {y.shape}."
+                f"`lamperti` is for a one-dimensional `model`; points have shape {y.shape}."
             )
         x = self.inverse(table, y)
         sigma = lambda x: self._sigma(x[0], table.params)

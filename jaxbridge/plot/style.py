@@ -56,7 +56,7 @@ def there(name: str, draws: Float[Reals, "n ..."]) -> Float[np.ndarray, "m ..."]
     draws = np.asarray(draws, float)
     kept = draws[_finite(draws)]
     if len(kept) == 0:
-        raise ValueError(f"the sample {name!r} must have draws that are finite; none is.")
+        raise ValueError(f"the sample `{name}` must have draws that are finite; none is.")
     return kept
 
 

@@ -185,14 +185,3 @@ def test_the_dimension_is_found():
     assert jb.effects(three).reverse_drift.simulated
     full_in_three = jb.Diffusion(drift, lambda x, p: full(x[:3], p), log_density)
     assert jb.effects(full_in_three).triangular_root.simulated
-
-
-def test_errors_say_what_to_change(unchecked):
-    with pytest.raises(ValueError, match="pass a point"):
-        jb.effects(jb.Diffusion(lambda x, p: jnp.zeros(100), None, log_density))
-    with pytest.raises(ValueError, match=r"shape \(d,\)"):
-        jb.effects(model(), at=jnp.zeros((2, 2)))
-    with pytest.raises(TypeError, match="`coupling` must be"):
-        jb.effects(model(), 0.5)
-    with pytest.raises(ValueError, match="time reversal"):
-        jb.effects(jb.Diffusion(drift))

@@ -155,19 +155,6 @@ def test_other_couplings_make_bridges_too(coupling):
     assert_moments(bridges.paths[:, 1], exact.mean[0], exact.covariance[0])
 
 
-@pytest.mark.parametrize("gamma", [-1.01, 1.0, 2.0, float("nan")])
-def test_gamma_outside_its_range(gamma):
-    with pytest.raises(ValueError, match=r"`gamma` must be in \[-1, 1\)"):
-        jb.Coupling(gamma)
-
-
-def test_bad_couplings():
-    with pytest.raises(ValueError, match="`gamma` must be a scalar"):
-        jb.Coupling(jnp.zeros(3))
-    with pytest.raises(ValueError, match="reflection coupling only"):
-        jb.Coupling(0.5, jb.ReflectionPlane())
-
-
 @pytest.mark.parametrize("gamma", slow_beyond(1, [1.0, 1.5, -1.1]))
 def test_gamma_out_of_its_range_where_it_cannot_be_seen(gamma):
     """From a law, or traced: then no pair meets, and all are counted."""

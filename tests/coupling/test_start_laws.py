@@ -9,7 +9,7 @@ from helpers import NON_REVERSIBLE, assert_moments, paper_model, without_sampler
 
 import jaxbridge as jb
 from jaxbridge.coupling import burn_in, start_laws
-from jaxbridge.coupling.start_laws import as_start_law, draw_starts
+from jaxbridge.coupling.start_laws import draw_starts
 
 
 def starts(law, model, end, duration=1.0, num_steps=40, n=20_000):
@@ -224,22 +224,3 @@ def test_a_density_is_exact_though_no_burn_in_is_found(short_runs):
     exact = -0.5 * (0.3**2 / variance + np.log(2 * np.pi * variance))
     assert estimate.trustworthy and estimate.num_truncated == 0
     assert abs(estimate.value - exact) < 4.5 * estimate.standard_error < 0.1
-
-
-def test_errors_say_what_to_change(unchecked):
-    with pytest.raises(TypeError, match="`start_law` must be"):
-        as_start_law(3.0)
-    with pytest.raises(TypeError, match="not a class"):
-        jb.Coupling(0.5, start_law=jb.Reversed)
-    with pytest.raises(ValueError, match="positive time"):
-        jb.Stationary(-1.0)
-    with pytest.raises(ValueError, match="must have shape"):
-        jb.GaussianLaw([0.0, 0.0], jnp.eye(3))
-    with pytest.raises(ValueError, match="positive definite"):
-        jb.GaussianLaw([0.0, 0.0], [[1.0, 2.0], [2.0, 1.0]])
-    with pytest.raises(ValueError, match="positive definite"):
-        jb.Coupling(start_law=jb.GaussianLaw([0.0, 0.0], [[1.0, 1.0], [1.0, 1.0]]))
-    bridges = jb.sample_bridges(jax.random.key(0), paper_model(), [0.0, 0.0], [0.5, 0.0], 1.0)
-    with pytest.raises(ValueError, match=r"must give points of shape \(2,\)"):
-        law = jb.GaussianLaw([0.0], [[1.0]])
-        jb.hitting_counts(jax.random.key(0), paper_model(), bridges, start_law=law)

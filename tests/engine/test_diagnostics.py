@@ -35,12 +35,8 @@ def test_chains_that_agree_have_r_hat_near_one():
     draws[0, :, 1] += 1
     apart = jb.potential_scale_reduction(draws)
     assert apart[0] < 1.02 and apart[1] > 1.05
-    with pytest.raises(ValueError, match="at least 4 draws"):
-        jb.potential_scale_reduction(draws[:, :3])
 
 
 def test_chains_that_do_not_move():
     assert jb.effective_sample_size(np.ones(100)) == 1
     assert np.isnan(jb.effective_sample_size(np.full(100, np.nan)))
-    with pytest.raises(ValueError, match="at least 4"):
-        jb.effective_sample_size([1.0, 2.0])

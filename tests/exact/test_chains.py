@@ -286,23 +286,6 @@ def test_numbers_change_without_compiling_again():
     assert len(compiled) == 0
 
 
-def test_errors_say_what_to_change(unchecked):
-    model, key, interval = ARGUMENTS[0], jax.random.key(0), ARGUMENTS[1:]
-    with pytest.raises(ValueError, match='`method` must be "pseudo_marginal", "renewal"'):
-        jb.sample_exact_bridges(key, model, *interval, method="gibbs")
-    with pytest.raises(ValueError, match="for one interval"):
-        jb.pseudo_marginal(model, jnp.zeros((3, 2)), jnp.zeros((3, 2)), 1.0)
-    with pytest.raises(ValueError, match=r"shape \(21, 2\), or `None`"):
-        jb.renewal(model, *interval, num_steps=20).init(jnp.zeros((5, 2)), key)
-    blind = jb.Diffusion(lambda x, p: -x, None, lambda x, p: -x @ x)
-    with pytest.raises(ValueError, match="Stationary\\(burn_in"):
-        jb.pseudo_marginal(blind, *interval)
-    with pytest.raises(TypeError, match="`proposal` must be"):
-        jb.sample_exact_bridges(key, model, *interval, proposal=0.5)
-    with pytest.raises(ValueError, match="counts nothing"):
-        jb.sample_exact_bridges(key, model, *interval, method="renewal", num_counts=2)
-
-
 @pytest.mark.slow
 def test_progress_is_shown(capfd):
     meter = diffrax.TextProgressMeter(minimum_increase=0.2)

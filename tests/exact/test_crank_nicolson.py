@@ -164,12 +164,3 @@ def test_progress_is_shown(capfd):
     )  # fmt: skip
     jax.effects_barrier()
     assert "100.00%" in capfd.readouterr().out
-
-
-def test_errors_say_what_to_change(unchecked):
-    with pytest.raises(ValueError, match=r"`step_size` must be a number in \(0, 1\]"):
-        jb.crank_nicolson(*HARD, step_size=1.5)
-    with pytest.raises(TypeError, match="paths from normal noise"):
-        jb.crank_nicolson(*HARD, proposal=jb.Coupling())
-    with pytest.raises(ValueError, match='`step_size` is for method="crank_nicolson"'):
-        jb.sample_exact_bridges(jax.random.key(0), *HARD, step_size=0.5)

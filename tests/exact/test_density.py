@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from helpers import (
     PAPER_CASES,
-    chosen_of,
     count_compilations,
     exact_cases,
-    of_unknown_constant,
     paper_model,
 )
 
 import jaxbridge as jb
-from jaxbridge.proposals.auto import as_proposal
 
 CASES = exact_cases()
 
@@ -195,37 +192,6 @@ def test_an_error_is_not_stated_where_weights_were_cut_off():
     )
     assert estimate.num_truncated[0] == 0 < estimate.num_truncated[1]
     assert np.isfinite(estimate.standard_error[0]) and estimate.standard_error[1] == np.inf
-
-
-def test_errors_say_what_to_change(unchecked):
-    model = jb.Diffusion(lambda x, p: -x, reversible=True)
-    with pytest.raises(ValueError, match="log_stationary"):
-        jb.transition_log_density(jax.random.key(0), model, [0.0], [1.0], 1.0)
-    with pytest.raises(TypeError, match="`proposal` must be"):
-        jb.transition_log_density(
-            jax.random.key(0), paper_model(), [0.0, 0.0], [1.0, 0.0], 1.0, proposal="coupling"
-        )
-
-
-@pytest.mark.parametrize("way", ["default", "coupling", "printed", "pairs", "choice", "custom"])
-def test_a_constant_that_is_not_known_is_refused(way, unchecked):
-    """From the stationary law densities have the constant of `log_stationary`, whichever way a
-    coupling comes in."""
-    model = of_unknown_constant()
-    pairs = as_proposal(jb.Coupling(0.5), model, jnp.zeros(1))
-    proposal = {
-        "default": None,
-        "coupling": jb.Coupling(0.0),
-        "printed": jb.Coupling.as_published(0.5),
-        "pairs": pairs,
-        "choice": chosen_of((pairs,), jnp.zeros(1, jnp.int32), (0,)),
-        "custom": jb.Coupling(0.0, start_law=jb.Stationary(burn_in=3.0)),
-    }[way]
-    arguments = (jax.random.key(0), model, [0.0], [0.5], 1.0)
-    with pytest.raises(ValueError, match="in proportion to `log_stationary`") as refused:
-        jb.transition_log_density(*arguments, proposal=proposal)
-    for remedy in ("normalised=True", "fit_start_law(..., for_density=True)", '"auto"'):
-        assert remedy in str(refused.value)
 
 
 @pytest.mark.slow

@@ -106,27 +106,6 @@ def test_chains_and_several_intervals():
 
 
 @pytest.mark.slow
-def test_what_cannot_be_differentiated_is_refused(bridges, unchecked):
-    model = multivariate_ou()[0]
-    with pytest.raises(TypeError, match="σ depends on parameters"):
-        jax.grad(
-            lambda sigma: jb.expectation(
-                lambda path: path[3, 0],
-                bridges,
-                model.with_params(model.params._replace(sigma=sigma)),
-            )
-        )(model.params.sigma)
-    approximate = jb.sample_bridges(jax.random.key(0), model, *ENDS, num_steps=5)
-    with pytest.raises(TypeError, match="exact law"):
-        jb.expectation(lambda path: path, approximate, model)
-    sparse = jb.sample_weighted_bridges(
-        jax.random.key(0), model, *ENDS, num_steps=5, save_at=[1.0], proposal=jb.Guided()
-    )
-    with pytest.raises(ValueError, match="whole path"):
-        jb.expectation(lambda path: path, sparse, model)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "density", [jb.EulerDensity(), jb.ItoTaylorDensity()], ids=["euler", "ito_taylor"]
 )

@@ -95,17 +95,3 @@ def test_nothing_is_left_of_a_density_that_noise_made_negative(densities):
     larger = jb.TransitionLogDensity(**(vars(larger) | {"value": fine.value + 1.0}))
     both = jb.extrapolate(fine, larger)
     assert both.value == -jnp.inf and both.standard_error == jnp.inf and not both.trustworthy
-
-
-def test_what_does_not_fit_is_refused(densities):
-    fine, coarse = densities
-    with pytest.raises(ValueError, match="half as many steps"):
-        jb.extrapolate(coarse, fine)
-    with pytest.raises(TypeError, match="must both be what"):
-        jb.extrapolate(fine, weighted(jax.random.key(0), 16, 100))
-    other = density(jax.random.key(0), 16, 100, jb.Guided())
-    with pytest.raises(ValueError, match="the same single proposal"):
-        jb.extrapolate(fine, other)
-    whole = jb.extrapolate(*(weighted(jax.random.key(0), n, 100) for n in (16, 8)))
-    with pytest.raises(ValueError, match="save_at"):
-        whole.mean()

@@ -58,8 +58,8 @@ def test_a_record_in_two_parts_that_share_a_point_is_the_same_record():
         np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
-def test_a_point_that_is_missing_is_told_with_its_record():
-    model, values = jb.ornstein_uhlenbeck([[1.0]]), np.zeros((2, 3, 1))
-    values[1, 2] = np.nan
-    with pytest.raises(ValueError, match=r"in record 1: `observations\[2\]`"):
-        as_observations(model, np.arange(3.0), values)
+def test_masked_arrays_without_anything_masked_are_arrays():
+    model, times, values = jb.ornstein_uhlenbeck([[1.0]]), np.arange(3.0), np.zeros((3, 1))
+    masked = as_observations(model, np.ma.masked_less(times, -1), np.ma.masked_invalid(values))
+    plain = as_observations(model, times, values)
+    jax.tree.map(np.testing.assert_array_equal, masked, plain)

@@ -211,46 +211,6 @@ def test_arviz_takes_the_draws():
     assert arviz.summary(data, var_names=["0"]).shape[0] == 1
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (dict(times=[0.0, 2.0, 1.0]), r"`times\[1\]`.*sort them"),
-        (dict(times=[0.0, np.nan, 1.0]), r"`times\[1\]` = nan is missing"),
-        (dict(times=[0.0, 1.0]), "`observations` must have shape"),
-        (dict(times=[0.0], data=[[1.0]]), "must be two or more"),
-        (dict(data=[[0.0], [np.nan], [1.0]]), r"`observations\[1\]`.*leave out"),
-        (dict(data=[0.0, 1.0, 2.0]), "`observations` must have shape"),
-        (dict(prior=jb.NormalPrior(jnp.zeros(3), 1.0)), "`prior.mean` must be"),
-        (dict(prior=jb.NormalPrior(0.0, jnp.ones((2, 2)))), "`prior.variance` must be"),
-        (dict(prior=jb.NormalPrior(0.0, -1.0)), "positive"),
-        (dict(where=None), "σ depends on the unknown parameters"),
-        (dict(where=lambda p: p[1]), "use `pmmh`"),
-        (dict(constraint=lambda rate: rate > 5), "do not satisfy `constraint`"),
-        (dict(bridges="other"), "`bridges` must be"),
-        (dict(method="other"), "`method` must be"),
-        (dict(num_steps=3, step_size=0.1), "not both"),
-        (dict(step_size=-1.0), "`step_size` must be"),
-        (dict(init=jnp.zeros(3)), "`init` must have"),
-        (dict(num_iterations=0), "`num_iterations`"),
-        (dict(init=0, constraint=None, prior=lambda rate: jnp.log(rate)), "`prior` is -inf"),
-        (dict(times=np.float32([7e4, 70_000.01, 70_000.02])), "`times` are too large"),
-    ],
-)
-def test_bad_input_is_refused_with_a_sentence(change, message, unchecked):
-    change = {"times": [0.0, 1.0, 2.0], "data": [[0.0], [0.5], [1.0]], **OPTIONS, **change}
-    times, data = change.pop("times"), change.pop("data")
-    with pytest.raises(ValueError, match=message):
-        jb.gibbs(jax.random.key(0), ou_1d(), times, data, **change)
-
-
-def test_observations_outside_the_state_space_are_named(unchecked):
-    root = jb.Diffusion(
-        lambda x, p: p * (1 - x), lambda x, p: jnp.sqrt(x), lambda x, p: jnp.sum(jnp.log(x)), 1.0
-    )
-    with pytest.raises(ValueError, match=r"`observations\[2\]`.*outside the state space"):
-        jb.gibbs(jax.random.key(0), root, [0.0, 1.0, 2.0], [[1.0], [0.5], [-0.1]], prior=PRIOR)
-
-
 @pytest.mark.slow
 def test_parameters_in_which_the_drift_is_not_linear():
     """Rate e^θ: the information at θ is not that at θ', and Metropolis–Hastings must know."""
@@ -370,24 +330,9 @@ def test_a_run_that_replaces_a_sampler_would_depend_on_the_parameters(unchecked)
     known = jb.Diffusion(drift, None, log_nu, 1.0, reversible=True)
     data, options = (TIMES[:4], DATA[:4]), dict(prior=PRIOR, num_iterations=2, num_steps=4)
     key = jax.random.key(0)
-    with pytest.raises(ValueError, match="burn_in"):
-        jb.gibbs(key, unknown, *data, **options, proposal=jb.Coupling(0.0))
     for model, proposal in [(unknown, "auto"), (known, jb.Coupling(0.0))]:  # "auto" does without
         made = jb.gibbs(key, model, *data, **options, proposal=proposal)
         assert made.theta.shape == (2, 1) and made.num_missing.sum() == 0
-
-
-def test_other_types_are_refused(unchecked):
-    arguments = (jax.random.key(0), ou_1d(), [0.0, 1.0], [[0.0], [1.0]])
-    with pytest.raises(TypeError, match="`prior` must be"):
-        jb.gibbs(*arguments, prior=3.0, where=RATE)
-    with pytest.raises(TypeError, match="renewal is for couplings"):
-        jb.gibbs(*arguments, prior=PRIOR, where=RATE, proposal=jb.Guided(), method="renewal")
-    with pytest.raises(TypeError, match='bridges="approximate" is for couplings'):
-        guided = dict(proposal=jb.Guided(), bridges="approximate")
-        jb.gibbs(*arguments, prior=PRIOR, where=RATE, **guided)
-    with pytest.raises(TypeError, match="`constraint` must be"):
-        jb.gibbs(*arguments, prior=PRIOR, where=RATE, constraint=3.0)
 
 
 def test_a_prior_may_have_the_shape_of_the_parameters():

@@ -93,13 +93,3 @@ def test_finds_the_maximum(method):
     np.testing.assert_allclose(made.standard_errors.reshape(-1), sd, rtol=0.1)
     assert np.abs(exact - model.params.B.reshape(-1)).max() > 0.3 * sd.max()
     np.testing.assert_allclose(made.params.B, made.theta.reshape(2, 2))
-
-
-def test_bad_input_is_refused(unchecked):
-    arguments = (jax.random.key(0), *multivariate_ou())
-    with pytest.raises(ValueError, match="`method` must be"):
-        jb.maximum_likelihood(*arguments, method="other", **OPTIONS)
-    with pytest.raises(ValueError, match="takes no `optimizer`"):
-        jb.maximum_likelihood(*arguments, optax.sgd(0.1), method="em", **OPTIONS)
-    with pytest.raises(ValueError, match="σ depends"):
-        jb.maximum_likelihood(*arguments, method="em", num_steps=20)

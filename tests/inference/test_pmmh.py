@@ -145,29 +145,6 @@ def test_unknown_parameters_have_names():
     assert picked["rate"] == 3 and list(picked["noise"]) == [1, 2]
 
 
-def test_bad_input_is_refused(unchecked):
-    arguments = (jax.random.key(0), ou_1d(), TIMES, DATA)
-    with pytest.raises(ValueError, match="`covariance` must have shape"):
-        jb.pmmh(*arguments, covariance=jnp.ones(3), **OPTIONS)
-    with pytest.raises(ValueError, match="`covariance` must be finite, symmetric and positive"):
-        jb.pmmh(*arguments, covariance=[-1.0, 0.1], **OPTIONS)
-    with pytest.raises(ValueError, match="stationary one"):
-        unknown = jb.Diffusion(lambda x, p: -p * x, params=1.0, reversible=True)
-        options = dict(OPTIONS, constraint=None, prior=jb.NormalPrior(1.0, 1.0))
-        jb.pmmh(arguments[0], unknown, TIMES, DATA, proposal=jb.Coupling(), **options)
-    # The constant of ν depends on θ, and would be part of the posterior.
-    with pytest.raises(ValueError, match="normalised=True"):
-        rough = jb.Diffusion(
-            lambda x, p: -p * x,
-            None,
-            lambda x, p: -p * x @ x,
-            1.0,
-            reversible=True,
-            sample_stationary=lambda key, p: jax.random.normal(key, (1,)) / jnp.sqrt(2 * p),
-        )
-        jb.pmmh(arguments[0], rough, TIMES, DATA, proposal=jb.Coupling(), **options)
-
-
 @pytest.mark.slow
 def test_what_is_cut_off_is_counted():
     made = jb.pmmh(

@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from inference_oracles import multivariate_ou, ou_1d, ou_transitions_log_density
+from inference_oracles import multivariate_ou, ou_transitions_log_density
 
 import jaxbridge as jb
 
@@ -61,13 +61,3 @@ def test_intervals_may_have_numbers_of_steps_of_their_own():
     error = np.sqrt(np.diagonal(one.covariance + two.covariance))
     np.testing.assert_array_less(np.abs(one.gradient - two.gradient), 5 * error + 0.1)
     assert two.effective_sample_size.shape == (7,)
-
-
-def test_sigma_must_be_known():
-    with pytest.raises(ValueError, match="σ depends on the unknown parameters"):
-        jb.score(jax.random.key(0), ou_1d(), [0.0, 1.0], [[0.0], [1.0]])
-    model, times, observations = multivariate_ou()
-    with pytest.raises(ValueError, match="σ depends"):
-        jb.score(jax.random.key(0), model, times, observations)
-    with pytest.raises(ValueError, match="no parameters"):
-        jb.score(jax.random.key(0), jb.Diffusion(lambda x, p: -x), [0.0, 1.0], [[0.0], [1.0]])

@@ -14,7 +14,7 @@ import jaxbridge as jb
 from jaxbridge.inference import simulated_likelihood
 from jaxbridge.inference.data import as_problem
 from jaxbridge.inference.parameters import as_parameters
-from jaxbridge.proposals.auto import choice_between, guided_candidates
+from jaxbridge.proposals.auto import guided_candidates
 
 POSITIVE = lambda params: jnp.all(jnp.stack(params) > 0)
 BRIDGE = jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())
@@ -206,19 +206,6 @@ def test_a_maximum_that_is_not_allowed_is_not_found():
     with count_compilations() as compiled:
         estimate(jax.random.key(1), other, *arguments, **options)
     assert not compiled
-
-
-def test_proposals_that_are_not_pulled_are_refused(unchecked):
-    times, data, *_ = ou_problem()
-    arguments = (jax.random.key(0), ou_1d(), times[:3], data[:3])
-    undecided = choice_between([jb.Coupling(0.0), BRIDGE])
-    for proposal in (jb.Coupling(0.0), undecided):
-        with pytest.raises(ValueError, match="with couplings its estimates have no derivative"):
-            estimate(*arguments, **dict(SHORT, proposal=proposal))
-    with pytest.raises(ValueError, match="`num_counts`"):
-        estimate(*arguments, num_counts=2, **SHORT)
-    with pytest.raises(ValueError, match="EM would never leave it"):
-        estimate(*arguments, method="em", **SHORT)
 
 
 @pytest.mark.slow

@@ -224,23 +224,3 @@ def test_a_constant_V_is_recognised():
     )
     assert not model.forward(jnp.ones(2)).sigma_varies
     np.testing.assert_allclose(model.drift(jnp.array([1.0, 0.0])), [-1, -0.5])
-
-
-@pytest.mark.parametrize("alpha", [0.0, -1.0, np.inf, np.nan, [1.0, 2.0]])
-def test_the_hyperbolic_alpha_must_be_one_positive_number(alpha):
-    with pytest.raises(ValueError, match="`alpha` must be one positive number"):
-        jb.hyperbolic(alpha, 2)
-
-
-def test_the_hyperbolic_dim_must_be_a_positive_whole_number(unchecked):
-    with pytest.raises(ValueError, match="`dim` must be at least 1"):
-        jb.hyperbolic(1.0, 0)
-    with pytest.raises(TypeError, match="`dim` must be a Python integer"):
-        jb.hyperbolic(1.0, 2.0)
-
-
-@pytest.mark.parametrize("name", ["log_density", "V", "Q"])
-def test_what_is_not_a_function_is_named(name, unchecked):
-    arguments = {"log_density": log_density} | {name: np.eye(2)}
-    with pytest.raises(TypeError, match=f"`{name}` must be a function"):
-        jb.stationary_diffusion(**arguments)

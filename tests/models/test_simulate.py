@@ -164,30 +164,3 @@ def test_paths_are_differentiable_in_forward_mode():
     end = lambda x: jb.simulate(jax.random.key(0), process(), x, TIMES, num_steps=50)[0, -1]
     jacobian = jax.jit(jax.jacfwd(end))(jnp.asarray(START, jnp.float32))
     np.testing.assert_allclose(jacobian, scipy.linalg.expm(-B), atol=2e-3)
-
-
-@pytest.mark.parametrize(
-    "changed, error, message",
-    [
-        ({"key": jax.random.PRNGKey(0)}, TypeError, "`key` must be a typed key"),
-        ({"key": 0}, TypeError, "`key` must be a typed key"),
-        ({"key": jax.random.split(jax.random.key(0))}, ValueError, "`key` must be a single key"),
-        ({"times": 1.0}, ValueError, "`times` must have shape"),
-        ({"times": [1.0]}, ValueError, "`times` must have shape"),
-        ({"times": [0.0, 0.0]}, ValueError, "`times` must increase"),
-        ({"times": [0.0, 2.0, 1.0]}, ValueError, "`times` must increase"),
-        ({"times": [0.0, np.nan]}, ValueError, "`times` must increase"),
-        ({"x0": 1.0}, ValueError, "`x0` must have shape"),
-        ({"x0": np.zeros((3, 2))}, ValueError, "`x0` must have shape"),
-        ({"x0": np.zeros(3)}, ValueError, r"at a point of shape \(3,\)"),
-        ({"num_paths": 0}, ValueError, "`num_paths` must be at least 1"),
-        ({"num_steps": 0}, ValueError, "`num_steps` must be at least 1"),
-        ({"num_steps": 2.0}, TypeError, "`num_steps` must be a Python integer"),
-        ({"model": None}, TypeError, "`model` must be a"),
-        ({"model": jb.Diffusion(lambda x, p: -x), "x0": None}, ValueError, "sample_stationary="),
-    ],
-)
-def test_what_cannot_be_simulated_is_refused(changed, error, message, unchecked):
-    arguments = {"key": jax.random.key(0), "model": process(), "x0": START, "times": TIMES}
-    with pytest.raises(error, match=message):
-        jb.simulate(**({"num_paths": 2, "num_steps": 2} | arguments | changed))

@@ -209,33 +209,6 @@ def test_auto_has_the_exact_law():
     )
 
 
-def test_errors_say_what_to_change(unchecked):
-    key, model = jax.random.key(0), paper_model()
-    arguments = (key, model, [0.0, 0.0], [0.5, 0.0], 1.0)
-    with pytest.raises(TypeError, match='what `choose_proposal` returns, or "auto"'):
-        jb.sample_exact_bridges(*arguments, proposal="best")
-    with pytest.raises(ValueError, match="a kernel makes no pilot run"):
-        jb.pseudo_marginal(*arguments[1:], proposal="auto")
-    with pytest.raises(TypeError, match="by the clock"):
-        jax.jit(lambda end: jb.choose_proposal(key, model, [0.0, 0.0], end, 1.0).chosen)(
-            jnp.array([0.5, 0.0])
-        )
-    with pytest.raises(ValueError, match="at least one proposal"):
-        jb.choose_proposal(*arguments, candidates=[])
-    with pytest.raises(ValueError, match="on one grid"):
-        jb.choose_proposal(*arguments, candidates=[jb.Guided(), jb.Guided(refinement=2.0)])
-    with pytest.raises(ValueError, match="one for 3 intervals, but there are 1"):
-        jb.sample_exact_bridges(*arguments, proposal=mixed_choice(model, 3))
-    with pytest.raises(ValueError, match="single proposals"):
-        jb.choose_proposal(*arguments, candidates=[mixed_choice(model, 1)])
-    with pytest.raises(TypeError, match="renewal is for couplings"):
-        jb.sample_exact_bridges(*arguments, proposal="auto", method="renewal")
-    with pytest.raises(TypeError, match="paths from normal noise"):
-        jb.sample_exact_bridges(*arguments, proposal="auto", method="crank_nicolson")
-    with pytest.raises(ValueError, match="`num_pilot` must be at least 2"):
-        jb.choose_proposal(*arguments, num_pilot=1)
-
-
 @slow
 def test_no_derivative_is_taken_of_a_choice_with_couplings(unchecked):
     key, model = jax.random.key(0), paper_model()

@@ -426,15 +426,13 @@ def test_lost_paths_do_not_spoil_derivatives():
     np.testing.assert_allclose(forward, difference, rtol=0.05)
 
 
-def test_no_stationary_law_is_called_for_and_a_coupling_says_so():
+def test_no_stationary_law_is_called_for():
     arguments = (BENT, jnp.array([0.3]), jnp.array([-0.2]), 0.5)
     chain = jb.sample_exact_bridges(
         jax.random.key(0), *arguments, num_bridges=50, proposal=jb.ModifiedDiffusionBridge()
     )
     assert chain.met.all() and chain.acceptance_rate > 0.8
     assert chain.coupling is None and not chain.truncated.any()
-    with pytest.raises(ValueError, match=r"does not need it, such as `ModifiedDiffusionBridge"):
-        jb.sample_exact_bridges(jax.random.key(0), *arguments, proposal=jb.Coupling())
 
 
 @pytest.mark.parametrize("ends", [([0.0, 0.0], [1.0, 1.0]), ([0.5, -0.3], [-0.4, 0.8])])
@@ -497,16 +495,10 @@ def test_thousands_of_intervals_without_compiling_again():
 
 
 @pytest.mark.parametrize("proposal", [jb.ModifiedDiffusionBridge(), jb.Guided()])
-def test_what_cannot_be_a_bridge_is_refused_or_flagged(unchecked, proposal):
+def test_what_cannot_be_a_bridge_is_flagged_where_it_is_traced(unchecked, proposal):
     key = jax.random.key(0)
     options = dict(num_bridges=4, num_steps=5, proposal=proposal)
     root = jb.Diffusion(lambda x, p: 1 - x, lambda x, p: jnp.sqrt(x))
-    with pytest.raises(ValueError, match="inside the state space"):
-        jb.sample_weighted_bridges(key, root, [1.0], [-0.5], 1.0, **options)
-    with pytest.raises(ValueError, match="must be invertible"):
-        jb.sample_weighted_bridges(key, root, [1.0], [0.0], 1.0, **options)
-    with pytest.raises(ValueError, match="too short"):
-        jb.sample_weighted_bridges(key, root, [1.0], [0.5], 1e-38, **options)
 
     @jax.jit
     def inside(end):
@@ -545,28 +537,3 @@ def test_explosions_are_counted_and_never_returned(start, found):
     assert np.isnan(weighted.paths[~weighted.met]).all()
     assert np.isfinite(weighted.paths[weighted.met]).all()
     assert (np.isfinite(weighted.mean()) == (found > 0)).all()  # of none there is no mean
-
-
-def test_errors_say_what_to_change(unchecked):
-    with pytest.raises(ValueError, match='`linearisation` must be "end", "path" or a matrix'):
-        jb.Guided("start")
-    with pytest.raises(ValueError, match=r"must be a matrix, shape \(d, d\)"):
-        jb.Guided([1.0, 2.0])
-    with pytest.raises(ValueError, match="must be finite"):
-        jb.Guided([[jnp.nan]])
-    with pytest.raises(ValueError, match="`refinement` must be between 1"):
-        jb.ModifiedDiffusionBridge(refinement=0.5)
-    with pytest.raises(TypeError, match="`density` must be `EulerDensity"):
-        jb.Guided("end", 2.0)
-    with pytest.raises(ValueError, match="too short to be told from none"):
-        arguments = (jax.random.key(0), paper_model(), [0.0, 0.0], [0.5, 0.0], 1.0)
-        jb.sample_weighted_bridges(*arguments, num_steps=2000, proposal=jb.Guided(refinement=4.0))
-    with pytest.raises(TypeError, match="`refinement` must be a Python number"):
-        jb.ResidualBridge(refinement="2")
-    arguments = (jax.random.key(0), paper_model(), [0.0, 0.0], [0.5, 0.0], 1.0)
-    with pytest.raises(ValueError, match=r"must have shape \(2, 2\) for points in 2 dimensions"):
-        jb.sample_weighted_bridges(*arguments, proposal=jb.Guided(jnp.eye(3)))
-    with pytest.raises(ValueError, match="lie on the grid"):
-        jb.sample_weighted_bridges(*arguments, save_at=[0.5], proposal=jb.Guided(refinement=2.0))
-    with pytest.raises(ValueError, match="`num_counts`, `max_proposals` and `max_trials`"):
-        jb.sample_weighted_bridges(*arguments, num_counts=2, proposal=jb.Guided())

@@ -202,14 +202,6 @@ def test_the_maximum_is_that_of_the_kalman_filter(parts):
     np.testing.assert_allclose(estimate.step_error, of_steps - exact, atol=1e-3)
 
 
-@pytest.mark.parametrize("options", [{"method": "em"}, {"proposal": "guided"}])
-def test_maxima_from_noise_need_no_bridges(options):
-    with pytest.raises(ValueError, match="for complete observations without noise"):
-        jb.maximum_likelihood(
-            jax.random.key(0), model(), TIMES, record(), observation=SEEN, **options
-        )
-
-
 def test_gradients_are_those_of_differences(x64):
     values = record()[:8]
     paths = jb.innovations(model(), TIMES[:8], values, observation=SEEN, num_steps=3)

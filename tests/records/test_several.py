@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from linear_records import plane
 
 import jaxbridge as jb
@@ -86,22 +85,3 @@ def test_records_of_one_shape_may_share_their_times():
     ]
     error = np.sqrt(made.standard_error**2 + sum(one.standard_error**2 for one in each))
     assert abs(made.value - sum(one.value for one in each)) < 4.5 * error + 1e-5
-
-
-@pytest.mark.parametrize(
-    ("times", "values", "says"),
-    [
-        ([[0, 1.0]], [np.zeros((2, 1)), np.zeros((2, 1))], "got 1 and 2"),
-        ([[0, 1.0], [0, 1.0]], [np.zeros((2, 1)), np.zeros((2, 2))], r"columns.*\[1, 2\]"),
-        ([[0, 1.0], [0, -1.0]], [np.zeros((2, 1)), np.zeros((2, 1))], "in record 1: .*increase"),
-    ],
-)
-def test_records_that_do_not_fit(times, values, says):
-    model, seen = jb.ornstein_uhlenbeck([[1.0]]), jb.LinearGaussian(covariance=1.0)
-    with pytest.raises(ValueError, match=says):
-        jb.log_likelihood(jax.random.key(0), model, times, values, observation=seen)
-
-
-def test_a_path_is_of_one_record():
-    with pytest.raises(ValueError, match="2 records, and here there is a path of one"):
-        jb.smooth(jax.random.key(0), *both(), **LONG.options)

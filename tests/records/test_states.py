@@ -122,19 +122,3 @@ def test_wells_that_are_seen_rarely(proposal):
     error = np.maximum(made.standard_error(share), 1 / 400)
     assert ((0.2 < exact) & (exact < 0.8)).any() and (error < 0.1).all()
     np.testing.assert_array_less(np.abs(made.mean(share) - exact), 4.5 * error)
-
-
-def test_what_does_not_fit_is_refused():
-    values, seen = np.zeros((3, 1)), jb.LinearGaussian(covariance=0.1)
-    unknown = jb.Diffusion(lambda x, p: -x)
-    options = {"observation": seen, "initial": [0.0], "proposal": jb.Guided(), "num_steps": 4}
-    with pytest.raises(ValueError, match="leave out `proposal`, so that paths are guided by the"):
-        jb.smooth(KEY, unknown, TIMES[:3], values, **options)
-    known = jb.ornstein_uhlenbeck(jnp.eye(1))
-    with pytest.raises(ValueError, match="every component that is seen must have noise"):
-        exactly = options | {"observation": jb.LinearGaussian(covariance=0.0)}
-        jb.smooth(KEY, known, TIMES[:3], values, **exactly)
-    with pytest.raises(TypeError, match="`proposal` must be a `Coupling`"):
-        jb.smooth(KEY, known, TIMES[:3], values, **options | {"proposal": 3})
-    with pytest.raises(ValueError, match="`num_proposals` must"):
-        jb.smooth(KEY, known, TIMES[:3], values, num_proposals=0, **options)

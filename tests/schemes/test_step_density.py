@@ -327,12 +327,3 @@ def test_guides_along_a_path_that_explodes_are_finite(precision):
     )  # fmt: skip
     assert estimate.num_met == 100
     assert estimate.effective_sample_size > 5
-
-
-def test_state_dependent_sigma_is_refused():
-    model = jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + 0.1 * x**2)
-    with pytest.raises(ValueError, match="is for constant σ"):
-        jb.sample_weighted_bridges(
-            jax.random.key(0), model, [0.3], [0.1], 1.0, num_bridges=2,
-            proposal=jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
-        )  # fmt: skip

@@ -46,17 +46,3 @@ def test_paper_figures_with_its_own_settings(name, gamma, paper):
     published = jb.hitting_variation(key(2), model, weighted, (20, 40, 80))
     assert published.num_truncated == 0
     assert abs(published.ratio - paper) < 5 * published.ratio_error + 0.03
-
-
-@pytest.mark.slow
-def test_errors_say_what_to_change(unchecked):
-    model, key = paper_model(), jax.random.key(0)
-    bridges = jb.sample_bridges(key, model, [0.0, 0.0], [0.5, 0.0], 1.0, num_bridges=3)
-    with pytest.raises(TypeError, match="must have the exact law"):
-        jb.hitting_variation(key, model, bridges)
-    weighted = jb.weigh_bridges(key, model, bridges)
-    with pytest.raises(ValueError, match="two or more increasing"):
-        jb.hitting_variation(key, model, weighted, num_counts=(5, 5))
-    with pytest.raises(ValueError, match="must be two or more"):
-        one = jb.sample_exact_bridges(key, model, [0.0, 0.0], [0.5, 0.0], 1.0, num_bridges=1)
-        jb.hitting_variation(key, model, one)

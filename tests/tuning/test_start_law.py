@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import PAPER_CASES, of_unknown_constant, paper_model
+from helpers import PAPER_CASES, paper_model
 from scipy.integrate import quad
 
 import jaxbridge as jb
@@ -136,23 +136,6 @@ def test_a_choice_for_densities_may_be_used_for_them():
     error = float(estimate.standard_error)
     assert error < 0.06
     assert abs(float(estimate.value) + np.log(constant)) < 5 * error + 0.02
-
-
-def test_errors_say_what_to_change(unchecked):
-    key, blind = jax.random.key(0), jb.Diffusion(lambda x, p: -x, reversible=True)
-    with pytest.raises(ValueError, match="need the stationary one, with any start law"):
-        jb.fit_start_law(key, blind, [0.0], [0.1], 1.0, for_density=True)
-    rough = of_unknown_constant()
-    with pytest.raises(ValueError, match="in proportion to `log_stationary`"):
-        candidates = [jb.Coupling()]
-        jb.choose_proposal(key, rough, [0.0], [0.1], 1.0, candidates=candidates, for_density=True)
-    model = paper_model()
-    with pytest.raises(TypeError, match="which `jit` and `vmap` hide"):
-        jax.jit(lambda a: jb.fit_start_law(jax.random.key(0), model, a, a, 1.0))(jnp.zeros(2))
-    with pytest.raises(ValueError, match="one interval"):
-        jb.fit_start_law(
-            jax.random.key(0), model, jnp.zeros((2, 2)), jnp.zeros((2, 2)), 1.0, num_pilot=40
-        )
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import of_unknown_constant, paper_model
+from helpers import paper_model
 
 import jaxbridge as jb
 from jaxbridge import plot
@@ -165,29 +165,6 @@ def test_the_table_reads_well_and_exports():
     assert line in ("target", "weights, Coupling(0), Heun, BrownianCrossing, float32")
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (dict(methods=("exact",)), "`methods` must be some of"),
-        (dict(methods=()), "`methods` must be some of"),
-        (dict(methods=("crank_nicolson",)), "none of `proposals` fits"),
-        (dict(dtypes=("float16",)), "`dtypes` must be"),
-        (dict(target=0.0), "`target` must be positive"),
-        (dict(num_steps=(0,)), "`num_steps` must be at least 1"),
-        (dict(num_steps=()), "at least one number of steps"),
-        pytest.param(dict(save_at=[0.0, 1.0]), "nothing to estimate", marks=pytest.mark.slow),
-        (dict(num_bridges=0), "`num_bridges` must be at least 1"),
-        (dict(start=[[0.0, 0.0]] * 2), "one interval"),
-        (dict(proposals=["auto"]), "must be single ones"),
-        (dict(num_steps=(5,)), "`num_steps` must be even"),
-    ],
-)
-def test_errors_say_what_to_change(changes, message, unchecked):
-    arguments = dict(start=[0.0, 0.0], end=[1.0, 0.0], duration=1.0, num_steps=(4,)) | changes
-    with pytest.raises(ValueError, match=message):
-        jb.work_precision(KEY, paper_model(), **arguments)
-
-
 @pytest.mark.slow
 def test_constants_of_one_precision_are_refused_before_anything_runs(unchecked):
     """NumPy's, which JAX takes for those of the precision in which it sees them first."""
@@ -219,16 +196,6 @@ def test_constants_of_one_precision_are_refused_before_anything_runs(unchecked):
     run(cast)
 
 
-def test_densities_with_a_constant_that_is_not_known_are_refused_before_anything_runs():
-    """Even where the right density is given: what a coupling finds would be another."""
-    model = of_unknown_constant()
-    arguments = (KEY, model, [0.2], [0.5], 1.0)
-    with pytest.raises(ValueError, match="in proportion to `log_stationary`"):
-        jb.work_precision(
-            *arguments, proposals=[jb.Coupling()], methods=("density",), log_density=-0.4
-        )
-
-
 @pytest.mark.slow
 def test_bridges_that_are_not_found_are_counted():
     """Ends that no pair joins in so short a time."""
@@ -246,3 +213,9 @@ def test_bridges_that_are_not_found_are_counted():
     ).settings
     assert setting.num_missing == 3
     assert np.isnan(setting.error) and setting.seconds_for(1.0) == np.inf
+
+
+@pytest.mark.slow
+def test_ends_alone_leave_nothing_to_estimate(unchecked):
+    with pytest.raises(ValueError, match="nothing to estimate"):
+        jb.work_precision(KEY, paper_model(), *ENDS, num_steps=(4,), save_at=[0.0, 1.0])
