@@ -179,6 +179,7 @@ def density_of(weighted):
 
 
 @slow
+@pytest.mark.optimised
 @pytest.mark.parametrize("index", range(len(RANDOM)), ids=[each.name for each in RANDOM])
 def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):
     """Densities and mid-points by proposals of all kinds, where none has a warning: of all by the
