@@ -1,12 +1,14 @@
 """How our programs are compiled: `equinox.filter_jit`, with keys that take less of the compiler's
-time (`generator`)."""
+time (`generator`), and an eye on the room that is left for programs (`memory_maps`)."""
 
 import functools
 from collections.abc import Callable
 
 import equinox as eqx
 
+from .checks import is_traced
 from .generator import with_keys_written_out
+from .memory_maps import mind_memory_maps
 
 
 def compiled(fn: Callable) -> Callable:
@@ -17,4 +19,9 @@ def compiled(fn: Callable) -> Callable:
     def program(*args, **kwargs):
         return fn(*with_keys_written_out(args), **with_keys_written_out(kwargs))
 
-    return program
+    @functools.wraps(fn)
+    def call(*args, **kwargs):
+        mind_memory_maps(lambda: is_traced(args, kwargs))
+        return program(*args, **kwargs)
+
+    return call

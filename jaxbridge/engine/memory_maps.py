@@ -7,23 +7,35 @@ is kept. Linux gives a process 65,530 (`vm.max_map_count`), and beyond that LLVM
 import functools
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
-_SHARE = 0.75
-_SECONDS = 5.0
+import jax
+
+# Shares of the limit beyond which there is a warning, and beyond which room is made.
+_NEAR, _TOO_NEAR = 0.75, 0.9
+_SECONDS = 1.0
 
 
-def warn_near_limit_of_maps() -> None:
-    """Warn where compiled programs have taken three quarters of the memory maps that there are."""
+def mind_memory_maps(is_tracing: Callable[[], bool]) -> None:
+    """Warn where compiled programs have taken three quarters of the memory maps that there are, and
+    drop them all where it is nine tenths: to compile again is better than to end. Not in the midst
+    of tracing."""
     num, most = _num_maps(int(time.monotonic() / _SECONDS)), _most_maps()
-    if most and num > _SHARE * most:
-        warnings.warn(
-            f"compiled programs have taken {num:,} of the {most:,} memory maps that this process "
-            "may have, and beyond them it would end: call `jax.clear_caches()` when you have tried "
-            "many models, or raise the limit, `vm.max_map_count`.",
-            RuntimeWarning,
-            stacklevel=4,
-        )
+    if not most or num <= _NEAR * most:
+        return
+    what_is_done = "beyond nine tenths they will be dropped"
+    if num > _TOO_NEAR * most and not is_tracing():
+        jax.clear_caches()
+        _num_maps.cache_clear()
+        what_is_done = "they were dropped, and what is called again will be compiled again"
+    warnings.warn(
+        f"compiled programs have taken {num:,} of the {most:,} memory maps that this process may "
+        f"have, and beyond them it would end; {what_is_done}. Call `jax.clear_caches()` when you "
+        "have tried many models, or raise the limit, `vm.max_map_count`.",
+        RuntimeWarning,
+        stacklevel=3,
+    )
 
 
 @functools.lru_cache(maxsize=1)

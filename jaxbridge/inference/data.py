@@ -19,7 +19,6 @@ from ..engine.checks import (
     time_steps,
 )
 from ..engine.compiled import compiled
-from ..engine.memory_maps import warn_near_limit_of_maps
 from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
@@ -215,7 +214,6 @@ def as_problem(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
     """
-    warn_near_limit_of_maps()
     check_key(key)
     intervals = as_observations(parameters.model, times, observations)
     theta = theta_of_model(parameters, intervals.start.dtype)

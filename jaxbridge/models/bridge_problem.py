@@ -16,7 +16,6 @@ from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
 from ..engine.checks import Numbers, as_floating, as_real, check_count, is_traced
 from ..engine.keys import numbered
-from ..engine.memory_maps import warn_near_limit_of_maps
 from .diffusion import Diffusion, check_diffusion
 
 
@@ -88,7 +87,6 @@ def bridge_problem(
     model: Diffusion, start: Numbers, end: Numbers, duration: Numbers, num_steps: int
 ) -> BridgeProblem:
     """What every function that makes bridges is asked for, checked; whole paths are kept."""
-    warn_near_limit_of_maps()
     check_diffusion(model)
     num_steps = check_count("num_steps", num_steps)
     intervals, batched, several_durations = as_intervals(start, end, duration)

@@ -9,7 +9,6 @@ from jaxtyping import Array, Float
 
 from ..coupling import Stationary
 from ..engine.checks import Numbers
-from ..engine.memory_maps import warn_near_limit_of_maps
 from ..models.diffusion import Diffusion, check_diffusion
 from ..proposals.guided import check_step_density
 from ..schemes import AbstractStepDensity, EulerDensity, ItoTaylorDensity
@@ -92,7 +91,6 @@ def problem_of(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
     """
-    warn_near_limit_of_maps()
     check_diffusion(model)
     check_observation(observation)
     m = record.values.shape[1]
