@@ -216,28 +216,19 @@ def sample_states(
     """So many draws, after so many iterations of a warm-up, with so many paths in each ŵ; from
     guided paths of the whole record.
 
-    **Raises:** `ValueError` where the proposal does not fit, nothing is known of the stationary
+    **Raises:** `ValueError` where the proposal does not fit, too little is known of the stationary
     law, or components are seen without noise.
     """
     model, K = problem.model, problem.num_segments
-    if not (model.has_sampler or model.has_density):
-        raise ValueError(
-            "states at the times of observations are proposed by the moments of the stationary "
-            "law: give `Diffusion` a `log_stationary` or `sample_stationary`, or leave out "
-            "`proposal`, so that paths are guided by the whole record."
-        )
     scalars = problem.scalars(model)
-    if not is_traced(scalars) and np.any(scalars.seen & (scalars.variances <= 0)):
-        raise ValueError(
-            "with a `proposal` every component that is seen must have noise, but `covariance` has "
-            "variances of zero: leave out `proposal`, so that paths are guided by the record."
-        )
+    proposal = as_proposal(proposal, model, problem.like)
+    _check(proposal, model, scalars)
     first = guided[:, :: problem.num_steps]
     durations = jnp.diff(problem.record.times)
     intervals = Intervals(first[0, :-1], first[0, 1:], durations)
     pilot_key = key_for("states", key)
     laws = _normal_laws(pilot_key, problem, scalars, intervals)
-    proposal = _prepared(pilot_key, problem, as_proposal(proposal, model, problem.like), laws)
+    proposal = _prepared(pilot_key, problem, proposal, laws)
     proposal = proposal.of(np.tile(np.arange(K), len(guided)))  # all chains alike
     assert isinstance(proposal, AbstractWeightedProposal)
     point = not isinstance(bound(problem.initial, model), Stationary | GaussianLaw)
@@ -253,6 +244,27 @@ def sample_states(
     ever &= jnp.all(jnp.any(moved.paths, axis=0), axis=1)
     accepted = jnp.mean(moved.states.astype(grid.dtype), axis=(0, 1))
     return StateDraws(grid, paths, accepted, ~ever, cut)
+
+
+def _check(proposal: AbstractProposal, model: Diffusion, scalars: Scalars) -> None:
+    """Raise `ValueError` where states cannot move with this proposal."""
+    if not (model.has_sampler or model.has_density):
+        raise ValueError(
+            "states at the times of observations are proposed by the moments of the stationary "
+            "law: give `Diffusion` a `log_stationary` or `sample_stationary`, or leave out "
+            "`proposal`, so that paths are guided by the whole record."
+        )
+    if proposal.coupled and not model.has_density:
+        raise ValueError(
+            "a coupling weighs the states that move by the stationary density: give `Diffusion` a "
+            "`log_stationary` (up to a constant), or choose a proposal that does not need it, such "
+            "as `ModifiedDiffusionBridge()` or `Guided()`."
+        )
+    if not is_traced(scalars) and np.any(scalars.seen & (scalars.variances <= 0)):
+        raise ValueError(
+            "with a `proposal` every component that is seen must have noise, but `covariance` has "
+            "variances of zero: leave out `proposal`, so that paths are guided by the record."
+        )
 
 
 def _prepared(
