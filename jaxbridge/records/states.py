@@ -123,7 +123,7 @@ class StateSampler(eqx.Module):
         draw_key, pick_key = jax.random.split(key)
         C, ends, d = x.shape
         num = C * (ends - 1)
-        durations = jnp.tile(jnp.diff(self.problem.record.times), C)
+        durations = jnp.tile(self.problem.record.durations, C)
         intervals = Intervals(x[:, :-1].reshape(num, d), x[:, 1:].reshape(num, d), durations)
         keys = jax.random.split(draw_key, (num, self.num_proposals))
         drawn = self.proposal.draw(keys, self.model, intervals, self.problem.num_steps, None, True)
@@ -224,7 +224,7 @@ def sample_states(
     proposal = as_proposal(proposal, model, problem.like)
     _check(proposal, model, scalars)
     first = guided[:, :: problem.num_steps]
-    durations = jnp.diff(problem.record.times)
+    durations = problem.record.durations
     intervals = Intervals(first[0, :-1], first[0, 1:], durations)
     pilot_key = key_for("states", key)
     laws = _normal_laws(pilot_key, problem, scalars, intervals)
@@ -275,7 +275,7 @@ def _prepared(
     model, num_steps, (ends, d) = problem.model, problem.num_steps, laws.mean.shape
     noise = jax.random.normal(key, (ends, _NUM_PILOTS, d), laws.mean.dtype)
     x = laws.mean[:, None] + jnp.einsum("kij,knj->kni", laws.root, noise)
-    durations = jnp.repeat(jnp.diff(problem.record.times), _NUM_PILOTS)
+    durations = jnp.repeat(problem.record.durations, _NUM_PILOTS)
     pilots = Intervals(x[:-1].reshape(-1, d), x[1:].reshape(-1, d), durations)
     one_each = jax.tree.map(lambda leaf: leaf[::_NUM_PILOTS], pilots)
     if proposal.is_open and not is_traced(key, model, pilots):
