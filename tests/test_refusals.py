@@ -469,6 +469,7 @@ RECORDS = [
     ("free", smooth(FREE, TIMES, LINE), "leave out `proposal`, so that paths are guided by the"),
     ("no ν", of_draws(proposal=PAIRS), "give `Diffusion` a `log_stationary`"),
     ("no noise", between(observation=EXACTLY), "every component that is seen must have noise"),
+    ("half known", between(initial=jb.GaussianLaw([0.0], [[0.0]])), "covariance of `initial`"),
     ("proposal", between(proposal=3), "`proposal` must be a `Coupling`", TypeError),
     ("no proposals", between(num_proposals=0), "`num_proposals` must"),
 ]

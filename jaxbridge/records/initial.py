@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..coupling import Stationary
 from ..engine.checks import as_floating, is_traced
-from ..engine.linalg import cholesky, dot, inverse, matvec, solve_lower
+from ..engine.linalg import cholesky, dot, inverse, matvec, semidefinite_cholesky, solve_lower
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
 from .tilted_step import NormalStep
@@ -32,7 +32,7 @@ def initial_law(initial: Initial, model: Diffusion, like: Float[Array, " d"]) ->
     initial = bound(initial, model)
     if isinstance(initial, GaussianLaw):
         _check_shape(initial.mean, like)
-        root = cholesky(initial.covariance.astype(dtype))
+        root = semidefinite_cholesky(initial.covariance.astype(dtype))
         return NormalStep(initial.mean.astype(dtype), root)
     if isinstance(initial, Stationary):
         return _stationary(model, like)

@@ -32,7 +32,7 @@ from ..engine.averages import proper
 from ..engine.checks import is_traced, nondifferentiable
 from ..engine.compiled import compiled
 from ..engine.keys import key_for
-from ..engine.linalg import any_cholesky, any_inverse, dot, solve_lower
+from ..engine.linalg import any_cholesky, any_inverse, dot, semidefinite_cholesky, solve_lower
 from ..engine.progress import metered_scan
 from ..exact import acceptance_rate
 from ..models.bridge_problem import Intervals
@@ -222,7 +222,7 @@ def sample_states(
     model, K = problem.model, problem.num_segments
     scalars = problem.scalars(model)
     proposal = as_proposal(proposal, model, problem.like)
-    _check(proposal, model, scalars)
+    _check(proposal, problem, scalars)
     first = guided[:, :: problem.num_steps]
     durations = problem.record.durations
     intervals = Intervals(first[0, :-1], first[0, 1:], durations)
@@ -246,8 +246,9 @@ def sample_states(
     return StateDraws(grid, paths, accepted, ~ever, cut)
 
 
-def _check(proposal: AbstractProposal, model: Diffusion, scalars: Scalars) -> None:
+def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars) -> None:
     """Raise `ValueError` where states cannot move with this proposal."""
+    model, law = problem.model, bound(problem.initial, problem.model)
     if not (model.has_sampler or model.has_density):
         raise ValueError(
             "states at the times of observations are proposed by the moments of the stationary "
@@ -265,6 +266,13 @@ def _check(proposal: AbstractProposal, model: Diffusion, scalars: Scalars) -> No
             "with a `proposal` every component that is seen must have noise, but `covariance` has "
             "variances of zero: leave out `proposal`, so that paths are guided by the record."
         )
+    if isinstance(law, GaussianLaw) and not is_traced(law):
+        if np.any(np.diagonal(semidefinite_cholesky(law.covariance)) == 0):
+            raise ValueError(
+                "with a `proposal` the first state is known or has a density, but the covariance "
+                "of `initial` is singular: leave out `proposal`, so that paths are guided by the "
+                "record."
+            )
 
 
 def _prepared(
