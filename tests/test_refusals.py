@@ -406,6 +406,8 @@ seen = lambda *arguments, **options: dict(observation=jb.LinearGaussian(*argumen
 several = lambda times, values: of(jb.log_likelihood)(KEY, OU, times, values, observation=SEEN)
 smooth = of(jb.smooth, KEY, observation=SEEN, initial=[0.0], proposal=GUIDED, num_steps=4)
 between = functools.partial(smooth, OU, TIMES, LINE)
+DRAWN = jb.Diffusion(DECAY, sample_stationary=lambda key, p: jnp.zeros(1), reversible=True)
+of_draws = functools.partial(smooth, DRAWN, TIMES, LINE)
 RECORD = dict(times=AT, observations=VALUES, observation=SEEN, initial=A)
 OF_A_RECORD = [
     (
@@ -465,7 +467,9 @@ RECORDS = [
     ),
     # Paths between what was seen.
     ("free", smooth(FREE, TIMES, LINE), "leave out `proposal`, so that paths are guided by the"),
+    ("no ν", of_draws(proposal=PAIRS), "give `Diffusion` a `log_stationary`"),
     ("no noise", between(observation=EXACTLY), "every component that is seen must have noise"),
+    ("half known", between(initial=jb.GaussianLaw([0.0], [[0.0]])), "covariance of `initial`"),
     ("proposal", between(proposal=3), "`proposal` must be a `Coupling`", TypeError),
     ("no proposals", between(num_proposals=0), "`num_proposals` must"),
 ]

@@ -120,6 +120,20 @@ def cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
     return _lower(L)
 
 
+def semidefinite_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """`cholesky` of a covariance that may be singular: a pivot that is zero, but for rounding, has
+    a column of zeros."""
+    d, rest, columns = matrix.shape[0], matrix, []
+    for k in range(d):
+        pivot = rest[k, k]
+        least = 10 * d * jnp.finfo(matrix.dtype).eps * jnp.abs(matrix[k, k])
+        nothing = jnp.abs(pivot) <= least
+        column = rest[k] * jnp.where(nothing, 0, lax.rsqrt(jnp.where(nothing, 1, pivot)))
+        columns.append(jnp.where(np.arange(d) < k, 0, column))
+        rest = rest - columns[-1][:, None] * columns[-1]
+    return jnp.stack(columns, axis=1)
+
+
 def lower_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
     """L of `matrix = L Q`, lower triangular with a positive diagonal, Q orthogonal: the root of
     `matrix matrixᵀ`, without squaring the condition number. By Gram and Schmidt's procedure on the

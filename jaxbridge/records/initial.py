@@ -1,16 +1,18 @@
 """The law of the state at the beginning of a record: a normal law, and what is left to weigh."""
 
+from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from ..coupling import Stationary
 from ..engine.checks import as_floating, is_traced
-from ..engine.linalg import cholesky, dot, inverse, matvec, solve_lower
+from ..engine.linalg import cholesky, dot, inverse, matvec, semidefinite_cholesky, solve_lower
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
 from .tilted_step import NormalStep
@@ -30,7 +32,7 @@ def initial_law(initial: Initial, model: Diffusion, like: Float[Array, " d"]) ->
     initial = bound(initial, model)
     if isinstance(initial, GaussianLaw):
         _check_shape(initial.mean, like)
-        root = cholesky(initial.covariance.astype(dtype))
+        root = semidefinite_cholesky(initial.covariance.astype(dtype))
         return NormalStep(initial.mean.astype(dtype), root)
     if isinstance(initial, Stationary):
         return _stationary(model, like)
@@ -50,6 +52,21 @@ def log_ratio(
     white = solve_lower(normal.root, x - normal.mean)
     log_scale = jnp.sum(jnp.log(np.sqrt(2 * np.pi) * jnp.diagonal(normal.root)))
     return model.log_stationary(x) + dot(white, white) / 2 + log_scale
+
+
+class _OfParams(eqx.Module):
+    """A function of params that gives the law, as a pytree without arrays."""
+
+    function: Callable[[PyTree], Any] = eqx.field(static=True)
+
+    def __call__(self, params: PyTree) -> Any:
+        return self.function(params)
+
+
+def as_initial(initial: Initial) -> Initial:
+    """What the user gave, as a pytree of arrays."""
+    is_function = callable(initial) and jax.tree_util.all_leaves([initial])
+    return _OfParams(initial) if is_function else initial
 
 
 def bound(initial: Initial, model: Diffusion) -> Initial:

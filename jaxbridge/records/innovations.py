@@ -80,8 +80,9 @@ def innovations(
     - `observations`: shape (n, m), NaN where a component was not seen.
     - `observation`: how the state was seen, a `LinearGaussian` or an `ObservationDensity`.
     - `initial`: the law of the state at the first time: a point, shape (d,), a `GaussianLaw`,
-        `Stationary()`, which is the default, or a function of params to one of these. Likelihoods
-        from the stationary law rest on a `normalised` model.
+        whose covariance is singular where part of the state is known, `Stationary()`, which is the
+        default, or a function of params to one of these. Likelihoods from the stationary law rest
+        on a `normalised` model.
     - `num_steps`: steps between two times, by default 10; or `step_size`, how long a step may be.
     - `initial_time`: of `initial`, where that is before the first of `times`.
     - `density`: of the steps, by default `ItoTaylorDensity()` for constant σ, else

@@ -12,7 +12,7 @@ from ..engine.checks import Numbers
 from ..models.diffusion import Diffusion, check_diffusion
 from ..proposals.guided import check_step_density
 from ..schemes import AbstractStepDensity, EulerDensity, ItoTaylorDensity
-from .initial import Initial, bound, initial_law
+from .initial import Initial, as_initial, bound, initial_law
 from .observation import Observation, Scalars, check_observation
 from .record import Record, as_records, split_records
 
@@ -105,6 +105,7 @@ def problem_of(
                 "`log_stationary`, whose law is where records begin by default."
             )
         initial = Stationary()
+    initial = as_initial(initial)
     if isinstance(bound(initial, model), Stationary) and not (model.normalised or any_constant):
         raise ValueError(
             "`initial` is the stationary law, whose constant is part of the likelihood and may "

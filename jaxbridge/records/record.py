@@ -48,6 +48,11 @@ class Record(eqx.Module):
         """N."""
         return self.dt.shape[-1]
 
+    @property
+    def durations(self) -> Float[Array, " K"]:
+        """How long segments are: of times that are large rounding would leave little."""
+        return jnp.sum(self.dt, axis=1)
+
     def grid(self) -> Float[Array, " points"]:
         """The times of all points."""
         within = jnp.cumsum(self.dt, axis=1) - self.dt

@@ -32,7 +32,7 @@ from ..engine.averages import proper
 from ..engine.checks import is_traced, nondifferentiable
 from ..engine.compiled import compiled
 from ..engine.keys import key_for
-from ..engine.linalg import any_cholesky, any_inverse, dot, solve_lower
+from ..engine.linalg import any_cholesky, any_inverse, dot, semidefinite_cholesky, solve_lower
 from ..engine.progress import metered_scan
 from ..exact import acceptance_rate
 from ..models.bridge_problem import Intervals
@@ -123,7 +123,7 @@ class StateSampler(eqx.Module):
         draw_key, pick_key = jax.random.split(key)
         C, ends, d = x.shape
         num = C * (ends - 1)
-        durations = jnp.tile(jnp.diff(self.problem.record.times), C)
+        durations = jnp.tile(self.problem.record.durations, C)
         intervals = Intervals(x[:, :-1].reshape(num, d), x[:, 1:].reshape(num, d), durations)
         keys = jax.random.split(draw_key, (num, self.num_proposals))
         drawn = self.proposal.draw(keys, self.model, intervals, self.problem.num_steps, None, True)
@@ -216,28 +216,19 @@ def sample_states(
     """So many draws, after so many iterations of a warm-up, with so many paths in each ŵ; from
     guided paths of the whole record.
 
-    **Raises:** `ValueError` where the proposal does not fit, nothing is known of the stationary
+    **Raises:** `ValueError` where the proposal does not fit, too little is known of the stationary
     law, or components are seen without noise.
     """
     model, K = problem.model, problem.num_segments
-    if not (model.has_sampler or model.has_density):
-        raise ValueError(
-            "states at the times of observations are proposed by the moments of the stationary "
-            "law: give `Diffusion` a `log_stationary` or `sample_stationary`, or leave out "
-            "`proposal`, so that paths are guided by the whole record."
-        )
     scalars = problem.scalars(model)
-    if not is_traced(scalars) and np.any(scalars.seen & (scalars.variances <= 0)):
-        raise ValueError(
-            "with a `proposal` every component that is seen must have noise, but `covariance` has "
-            "variances of zero: leave out `proposal`, so that paths are guided by the record."
-        )
+    proposal = as_proposal(proposal, model, problem.like)
+    _check(proposal, problem, scalars)
     first = guided[:, :: problem.num_steps]
-    durations = jnp.diff(problem.record.times)
+    durations = problem.record.durations
     intervals = Intervals(first[0, :-1], first[0, 1:], durations)
     pilot_key = key_for("states", key)
     laws = _normal_laws(pilot_key, problem, scalars, intervals)
-    proposal = _prepared(pilot_key, problem, as_proposal(proposal, model, problem.like), laws)
+    proposal = _prepared(pilot_key, problem, proposal, laws)
     proposal = proposal.of(np.tile(np.arange(K), len(guided)))  # all chains alike
     assert isinstance(proposal, AbstractWeightedProposal)
     point = not isinstance(bound(problem.initial, model), Stationary | GaussianLaw)
@@ -255,6 +246,35 @@ def sample_states(
     return StateDraws(grid, paths, accepted, ~ever, cut)
 
 
+def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars) -> None:
+    """Raise `ValueError` where states cannot move with this proposal."""
+    model, law = problem.model, bound(problem.initial, problem.model)
+    if not (model.has_sampler or model.has_density):
+        raise ValueError(
+            "states at the times of observations are proposed by the moments of the stationary "
+            "law: give `Diffusion` a `log_stationary` or `sample_stationary`, or leave out "
+            "`proposal`, so that paths are guided by the whole record."
+        )
+    if proposal.coupled and not model.has_density:
+        raise ValueError(
+            "a coupling weighs the states that move by the stationary density: give `Diffusion` a "
+            "`log_stationary` (up to a constant), or choose a proposal that does not need it, such "
+            "as `ModifiedDiffusionBridge()` or `Guided()`."
+        )
+    if not is_traced(scalars) and np.any(scalars.seen & (scalars.variances <= 0)):
+        raise ValueError(
+            "with a `proposal` every component that is seen must have noise, but `covariance` has "
+            "variances of zero: leave out `proposal`, so that paths are guided by the record."
+        )
+    if isinstance(law, GaussianLaw) and not is_traced(law):
+        if np.any(np.diagonal(semidefinite_cholesky(law.covariance)) == 0):
+            raise ValueError(
+                "with a `proposal` the first state is known or has a density, but the covariance "
+                "of `initial` is singular: leave out `proposal`, so that paths are guided by the "
+                "record."
+            )
+
+
 def _prepared(
     key: Key[Array, ""], problem: RecordProblem, proposal: AbstractProposal, laws: NormalLaws
 ) -> AbstractProposal:
@@ -263,7 +283,7 @@ def _prepared(
     model, num_steps, (ends, d) = problem.model, problem.num_steps, laws.mean.shape
     noise = jax.random.normal(key, (ends, _NUM_PILOTS, d), laws.mean.dtype)
     x = laws.mean[:, None] + jnp.einsum("kij,knj->kni", laws.root, noise)
-    durations = jnp.repeat(jnp.diff(problem.record.times), _NUM_PILOTS)
+    durations = jnp.repeat(problem.record.durations, _NUM_PILOTS)
     pilots = Intervals(x[:-1].reshape(-1, d), x[1:].reshape(-1, d), durations)
     one_each = jax.tree.map(lambda leaf: leaf[::_NUM_PILOTS], pilots)
     if proposal.is_open and not is_traced(key, model, pilots):

@@ -17,6 +17,7 @@ from jaxbridge.engine.linalg import (
     polar_factor,
     quadratic_form,
     safe_norm,
+    semidefinite_cholesky,
     solve,
     solve_lower,
     solve_lower_transposed,
@@ -128,6 +129,18 @@ def test_cholesky_equals_numpys(d, precision):
     np.testing.assert_allclose(
         many_cholesky(matrices), np.linalg.cholesky(matrices), atol=TOLERANCE[precision]
     )
+
+
+@pytest.mark.parametrize("rank", [0, 1, 2, 3])
+def test_semidefinite_cholesky_of_any_rank(rank):
+    """As many columns are zero as there are pivots without a direction of their own."""
+    factor = np.random.default_rng(0).normal(size=(3, rank)).astype(np.float32)
+    factor[0] = 0 if rank < 3 else factor[0]
+    matrix = factor @ factor.T
+    L = np.asarray(semidefinite_cholesky(jnp.asarray(matrix)))
+    np.testing.assert_allclose(L @ L.T, matrix, atol=1e-6)
+    assert np.all(L == np.tril(L)) and np.sum(np.any(L, axis=0)) == rank
+    assert np.isnan(semidefinite_cholesky(-jnp.eye(2))).any()
 
 
 def test_cholesky_of_an_indefinite_matrix_is_nan():

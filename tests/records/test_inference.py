@@ -10,6 +10,7 @@ from kalman import exact_step, kalman
 from scipy.optimize import minimize
 
 import jaxbridge as jb
+from jaxbridge.engine.checks import nondifferentiable
 from jaxbridge.records import (
     as_record_problem,
     linearised,
@@ -200,6 +201,14 @@ def test_the_maximum_is_that_of_the_kalman_filter(parts):
     np.testing.assert_allclose(told, error, rtol=0.01)
     # Of the second order that is left out of the step error.
     np.testing.assert_allclose(estimate.step_error, of_steps - exact, atol=1e-3)
+
+
+@pytest.mark.parametrize("law", [lambda params: [0.0], lambda params: jb.GaussianLaw([0.0], [[1]])])
+def test_beginnings_may_be_functions_of_parameters(law):
+    """In programs of which no derivative is taken, as those of all who infer parameters are."""
+    problem = as_record_problem(model(), TIMES, record(), SEEN, law, num_steps=2)
+    same = nondifferentiable(problem)
+    assert same.initial(model().params) is not None and same.initial == problem.initial
 
 
 def test_gradients_are_those_of_differences(x64):

@@ -39,6 +39,22 @@ def test_the_filter_is_kalmans(name):
     assert abs(made.step_error - true) < 0.5 * abs(true)
 
 
+@pytest.mark.parametrize("along", [[0.0, 1.0], [1.0, -0.5]])
+def test_the_first_state_may_be_known_in_part(along):
+    """Known but for a normal number along one direction: the likelihood, and the path's mean."""
+    record = plane(8)._replace(covariance=0.3 * np.outer(along, along))
+    arguments = (KEY, *record.arguments)
+    options = {**record.options, "num_steps": 2, "density": jb.EulerDensity()}
+    exact = record.kalman(2)
+    made = jb.log_likelihood(*arguments, **options, num_particles=4, num_filters=2)
+    assert abs(made.value - exact.log_likelihood) < 1e-4 * abs(exact.log_likelihood)
+    paths = jb.smooth(*arguments, **options, num_draws=200, num_warmup=10)
+    error = np.asarray(paths.standard_error())
+    np.testing.assert_array_less(np.abs(paths.mean() - exact.mean), 5 * error + 1e-5)
+    fixed = np.array([along[1], -along[0]])
+    np.testing.assert_allclose(paths.paths[:, :, 0] @ fixed, record.mean @ fixed, atol=1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
 def test_the_default_steps_are_of_second_order(name):

@@ -62,6 +62,21 @@ def test_linear_process():
     assert_agrees(made, *exact)
 
 
+def test_gaps_are_known_after_a_long_time():
+    """Those of .01 after 45,000 units of time, which single precision knows to .004."""
+    times, values = np.array([0.0, 0.01, 0.03, 0.04]), np.zeros((4, 1))
+
+    def paths(start):
+        made = jb.smooth(
+            KEY, jb.ornstein_uhlenbeck([[1.0]]), start + times, values,
+            observation=jb.LinearGaussian(covariance=0.1), num_steps=2, num_draws=3, num_warmup=0,
+            num_chains=2, num_proposals=2, proposal=jb.ModifiedDiffusionBridge(),
+        )  # fmt: skip
+        return made.paths
+
+    np.testing.assert_allclose(paths(45_000.0), paths(0.0), atol=1e-5)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "proposal",
