@@ -6,7 +6,8 @@ guided paths; so (θ, ξ) has the posterior density π(θ) N(ξ; 0, I) w(θ, ξ)
 with θ, and θ may be a parameter of σ, of the noise or of the initial law, however small the steps.
 """
 
-import equinox as eqx
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
@@ -20,21 +21,26 @@ from .observation import Observation
 from .problem import RecordProblem, as_record_problem
 
 
-class Innovations(eqx.Module):
-    """What `innovations` returns: the record's paths as functions of noise ξ, shape (`size`,)."""
+class Innovations(NamedTuple):
+    """What `innovations` returns: the record's paths as functions of noise ξ, shape (`size`,). Its
+    methods may be given to `jax.jit` and `jax.grad` as they are.
 
-    _problem: RecordProblem
-    _points: Float[Array, "points d"]
+    - `problem`: the model, what was seen of it, and how.
+    - `points`: along which it is linearised, shape (M + 1, d).
+    """
+
+    problem: RecordProblem
+    points: Float[Array, "points d"]
 
     @property
     def size(self) -> int:
         """How many numbers ξ has: d for x_0, and d for each step."""
-        return self._points.size
+        return self.points.size
 
     @property
     def times(self) -> Float[Array, " points"]:
         """Of the points of paths, shape (M + 1,)."""
-        return self._problem.record.grid()
+        return self.problem.record.grid()
 
     def path(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, "points d"]:
         """The path that this noise makes at these parameters of the model."""
@@ -51,10 +57,10 @@ class Innovations(eqx.Module):
         return self.log_weight(params, xi) - (xi @ xi + self.size * np.log(2 * np.pi)) / 2
 
     def _run(self, params: PyTree, xi) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
-        model = self._problem.model.with_params(params)
-        guide = guided(self._problem, model, self._points)
-        noise = xi.reshape(self._points.shape)
-        path, log_weight = path_and_log_weight(self._problem, model, guide, noise)
+        model = self.problem.model.with_params(params)
+        guide = guided(self.problem, model, self.points)
+        noise = xi.reshape(self.points.shape)
+        path, log_weight = path_and_log_weight(self.problem, model, guide, noise)
         return path, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
 
 

@@ -54,7 +54,7 @@ CASES = {
     ),
     "exact and redundant": (
         dict(observation=jb.LinearGaussian([[1.0, 0.0], [2.0, 0.0]], 0.0)),
-        "have rank 1",
+        "have rank 1: leave out",
     ),
     "fewer rows": (dict(values=VALUES[:3]), "a row for each of them"),
     "times go back": (dict(times=TIMES[::-1]), "`times` must increase"),
@@ -118,3 +118,47 @@ def test_long_gaps_are_cut_into_segments():
     assert steps.max() < 0.1 * (1 + 1e-4) and steps.min() > 0
     assert len(steps) < 60
     assert np.all(np.abs(times[:, None] - np.asarray(made.times)).min(1) < 1e-6)
+
+
+POSITIVE = jb.Diffusion(lambda x, p: 1 - x, [0.5], domain=lambda x, p: jnp.all(x > 0))
+SIZES = {
+    "matrix": (jb.LinearGaussian([[1.0, 0.0, 0.0]], 0.1), r"`matrix` must have shape \(1, 2\)"),
+    "no matrix": (SEEN, "`observations` have 1 components, and without a `matrix`"),
+}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_sizes_that_are_not_those_of_the_state(name, unchecked):
+    """With the default initial law, which has no size of its own."""
+    observation, message = SIZES[name]
+    for read in (jb.innovations, lambda *record, **how: jb.log_likelihood(KEY, *record, **how)):
+        with pytest.raises(ValueError, match=message):
+            read(MODEL, TIMES, VALUES[:, :1], observation=observation)
+
+
+@pytest.mark.parametrize(
+    "observation, values, initial, message",
+    [
+        (jb.LinearGaussian(), [1.0, -1.0], [1.0], r"`observations\[1\]` is the state .* `domain`"),
+        (jb.LinearGaussian([[-2.0]]), [-1.0, 2.0], [0.5], r"`observations\[1\]` is the state"),
+        (jb.LinearGaussian(covariance=0.1), [1.0, -1.0], [-1.0], "`initial` = .* `domain`"),
+    ],
+)
+def test_states_outside_the_state_space(observation, values, initial, message, unchecked):
+    record = np.arange(2.0), np.array(values)[:, None]
+    with pytest.raises(ValueError, match=message):
+        jb.innovations(POSITIVE, *record, observation=observation, initial=initial)
+    several = [record[0], record[0]], [np.ones_like(record[1]) * np.sign(values[0]), record[1]]
+    with pytest.raises(ValueError, match=message):
+        jb.log_likelihood(KEY, POSITIVE, *several, observation=observation, initial=initial)
+
+
+def test_what_is_known_to_be_redundant_or_of_no_variance(unchecked):
+    """Of matrix and covariance together; and by a function of the parameters."""
+    singular = jb.LinearGaussian([[1.0, 0.0], [1.0, 0.0]], [[1.0, 1.0], [1.0, 1.0]])
+    with pytest.raises(ValueError, match="`matrix` and `covariance` side by side have rank 1"):
+        jb.innovations(MODEL, TIMES, VALUES, observation=singular)
+    guess = jb.LinearGaussian(covariance=lambda params: jnp.zeros(2))
+    density = jb.ObservationDensity(lambda y, x, p: -(y - x) @ (y - x), guess)
+    with pytest.raises(ValueError, match="`guess` must have positive variances"):
+        jb.innovations(MODEL, TIMES, VALUES, observation=density)
