@@ -19,6 +19,7 @@ from .guided_record import guided, linearised, path_and_log_weight
 from .initial import Initial
 from .observation import Observation
 from .problem import RecordProblem, as_record_problem
+from .start_share import start_share
 
 
 class Innovations(NamedTuple):
@@ -56,6 +57,13 @@ class Innovations(NamedTuple):
         log density it is the target of any sampler."""
         return self.log_weight(params, xi) - (xi @ xi + self.size * np.log(2 * np.pi)) / 2
 
+    def start_share(self) -> Float[Array, ""]:
+        """The share of draws of x_0 by normal noise that count, at the parameters of the model: one
+        where its law is normal. Near zero the normal law in the place of the stationary one leaves
+        out a mode or falls off too fast: then means of w over ξ are not to be trusted, and a
+        sampler may not find its way; `log_likelihood` covers that law with several."""
+        return start_share(self.problem, self.problem.model, self.points)
+
     def _run(self, params: PyTree, xi) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
         model = self.problem.model.with_params(params)
         guide = guided(self.problem, model, self.points)
@@ -87,7 +95,9 @@ def innovations(
     - `observation`: how the state was seen, a `LinearGaussian` or an `ObservationDensity`.
     - `initial`: the law of the state at the first time: a point, shape (d,), a `GaussianLaw`,
         `Stationary()`, which is the default, or a function of params to one of these. Likelihoods
-        from the stationary law rest on a `normalised` model.
+        from the stationary law rest on a `normalised` model. Where that is not normal x_0 is made
+        from noise by the normal law with its mean and covariance, and weighed: exact, but see
+        `start_share`.
     - `num_steps`: steps between two times, by default 10; or `step_size`, how long a step may be.
     - `initial_time`: of `initial`, where that is before the first of `times`.
     - `density`: of the steps, by default `ItoTaylorDensity()` for constant σ, else

@@ -104,7 +104,9 @@ def log_likelihood(
     - `num_filters`: filters that know nothing of each other, whose spread tells the error.
 
     **Returns:** `LogLikelihood`. For a linear model all weights are equal, and `value` is that of
-    the Kalman filter of the steps. Not differentiable where particles are resampled:
+    the Kalman filter of the steps. A stationary law that is not normal is covered by a mixture of
+    normal laws at draws of it, and wider ones beyond: `effective_sample_size` says how well in its
+    first number. Not differentiable where particles are resampled:
     `innovations` is.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
@@ -312,7 +314,7 @@ def _starts(
     """The first states of all particles, and their log weights, where observations are of their
     guess. A law that is not normal is covered by a mixture, whose parts each filter takes in
     proportion to their shares."""
-    model, dtype = model.prepared(), problem.like.dtype
+    dtype = problem.like.dtype
     noise_key, position_key = jax.random.split(key)
     zeta = jax.random.normal(noise_key, (problem.dim, R * P), dtype)
     if not calls_for_cover(problem.initial, model, problem.like):
@@ -325,7 +327,8 @@ def _starts(
     uniform = jax.random.uniform(position_key, (R, 1), dtype)
     positions = (uniform + jnp.arange(P, dtype=dtype)) / P
     x = start.points(positions.ravel(), zeta)
-    ratio = lambda x: model.log_stationary(x) - law.log_density(x)
+    log_nu = model.prepared().log_stationary
+    ratio = lambda x: log_nu(x) - law.log_density(x)
     return x, start.log_weight + jax.vmap(ratio, in_axes=-1)(x)
 
 
