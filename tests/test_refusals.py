@@ -394,7 +394,7 @@ EXACT = [
 ]
 
 linear, seen_by = of(jb.LinearGaussian), of(jb.ObservationDensity)
-AT, VALUES = np.arange(4.0), np.zeros((4, 2))
+AT, VALUES, TWO = np.arange(4.0), np.zeros((4, 2)), [0.0, 1.0]
 READERS = {
     "innovations": lambda key, *record, **how: jb.innovations(*record, **how),
     "log_likelihood": jb.log_likelihood,
@@ -409,15 +409,37 @@ between = functools.partial(smooth, OU, TIMES, LINE)
 DRAWN = jb.Diffusion(DECAY, sample_stationary=lambda key, p: jnp.zeros(1), reversible=True)
 of_draws = functools.partial(smooth, DRAWN, TIMES, LINE)
 RECORD = dict(times=AT, observations=VALUES, observation=SEEN, initial=A)
+NO_NOISE = jb.LinearGaussian(covariance=lambda params: jnp.zeros(2))
+GUESSED = jb.ObservationDensity(lambda y, x, p: -(y - x) @ (y - x), NO_NOISE)
+POSITIVE = jb.Diffusion(lambda x, p: 1 - x, [0.5], domain=lambda x, p: jnp.all(x > 0))
+outside = lambda reader, observation, values, initial=1.0: of(READERS[reader])(
+    KEY, POSITIVE, TWO, np.array(values)[:, None], observation=observation, initial=[initial]
+)
 OF_A_RECORD = [
     (
         "another state",
         dict(observation=OF_SPACE, observations=VALUES[:, :1]),
-        "`initial` must be a point of shape",
+        r"`matrix` must have shape \(1, 2\)",
+    ),
+    (
+        "another state, and no beginning",
+        dict(observation=OF_SPACE, observations=VALUES[:, :1], initial=None),
+        r"`matrix` must have shape \(1, 2\)",
+    ),
+    (
+        "a part without a matrix",
+        dict(observations=VALUES[:, :1], initial=None),
+        "`observations` have 1 components, and without a `matrix`",
     ),
     ("other components", seen([B], 0.1), "`observations` must have 1 components"),
     ("noise of others", seen(covariance=np.eye(3)), "`covariance` must have shape"),
-    ("redundant", seen([[1.0, 0.0], [2.0, 0.0]], 0.0), "have rank 1"),
+    ("redundant", seen([[1.0, 0.0], [2.0, 0.0]], 0.0), "have rank 1: leave out"),
+    (
+        "redundant together",
+        seen([B, B], np.ones((2, 2))),
+        "`matrix` and `covariance` side by side have rank 1",
+    ),
+    ("a guess without noise", dict(observation=GUESSED), "`guess` must have positive variances"),
     ("fewer rows", dict(observations=VALUES[:3]), "a row for each of them"),
     ("times go back", dict(times=AT[::-1]), "`times` must increase"),
     ("a time is missing", dict(times=[0.0, NAN, 2.0, 3.0]), r"`times\[1\]` = nan is missing"),
@@ -430,7 +452,7 @@ OF_A_RECORD = [
     ("initial of another shape", dict(initial=[0.0]), "`initial` must be a point of shape"),
     ("initial is not finite", dict(initial=[0.0, NAN]), "`initial` must be finite"),
 ]
-ROUGH, TWO = jb.Diffusion(DECAY, None, lambda x, p: 7 - x @ x), [0.0, 1.0]
+ROUGH = jb.Diffusion(DECAY, None, lambda x, p: 7 - x @ x)
 SEEING = "`observation` must be a `LinearGaussian`"
 by_number = lambda y, x, p: 0.0
 reads = lambda reader, model=PAPER: of(READERS[reader], KEY, model, **RECORD)
@@ -450,6 +472,15 @@ RECORDS = [
     *(
         (f"{reader}: {what}", reads(reader)(**changed), message)
         for reader, (what, changed, message) in itertools.product(READERS, OF_A_RECORD)
+    ),
+    *(
+        ("outside the domain", outside(reader, *seen), message)
+        for reader in ("innovations", "log_likelihood")
+        for *seen, message in (
+            (EXACTLY, [1.0, -1.0], r"`observations\[1\]` is the state .* `domain`"),
+            (jb.LinearGaussian([[-2.0]]), [-1.0, 2.0], r"`observations\[1\]` is the state"),
+            (SEEN, [1.0, -1.0], -1.0, "`initial` = .* `domain`"),
+        )
     ),
     ("no beginning", reads("innovations", FREE)(initial=None), "`initial` is missing"),
     *(

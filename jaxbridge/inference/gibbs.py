@@ -134,7 +134,8 @@ def gibbs(
     **Arguments:**
 
     - `key`: a typed key.
-    - `model`: its `params` are where chains start. σ must not depend on those that are unknown.
+    - `model`: its `params` are where chains start. σ must not depend on those that are unknown,
+        unless there is an `observation`.
     - `times`: increasing, shape (n + 1,), in the model's units of time.
     - `observations`: of the diffusion at these times, shape (n + 1, d). Several records, which are
         independent given the parameters, are lists of both, or have a leading axis.

@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Inexact, Key, PyTree
+from jaxtyping import Array, Bool, Float, Inexact, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
 from . import decisions
@@ -144,6 +144,15 @@ class Diffusion(eqx.Module):
     def log_stationary(self, x: Numbers) -> Float[Array, ""]:
         """log ν(x) up to a constant."""
         return self._log_stationary_function()(as_floating("x", x))
+
+    @property
+    def has_domain(self) -> bool:
+        """Whether the state space is declared to be less than all of R^d."""
+        return self._domain is not None
+
+    def is_inside(self, x: Numbers) -> Bool[Array, ""]:
+        """Whether a point is in the state space, `domain`."""
+        return self._is_inside(as_floating("x", x), self._prepared_params())
 
     def sample_stationary(self, key: Key[Array, ""]) -> Float[Array, " d"]:
         """One draw from ν, shape (d,), by the model's own sampler."""
@@ -310,21 +319,23 @@ class Diffusion(eqx.Module):
     ) -> Callable[[Float[Array, " d"]], Float[Array, " d"]]:
         """A drift, NaN outside the state space: a path that steps out is lost with the next step,
         and no bridge ends there."""
-        domain = self._domain
 
         def drift(x):
             value = check_value(name, function(x, params), x.shape, x)
-            if domain is None:
+            if self._domain is None:
                 return value
-            inside = jnp.asarray(domain(x, params))
-            if inside.shape != () or inside.dtype != bool:
-                raise ValueError(
-                    "`domain` must return one truth value, such as `jnp.all(x > 0)`; it returned "
-                    f"shape {inside.shape} and dtype {inside.dtype}."
-                )
-            return jnp.where(inside, value, jnp.nan)
+            return jnp.where(self._is_inside(x, params), value, jnp.nan)
 
         return drift
+
+    def _is_inside(self, x: Float[Array, " d"], params: PyTree) -> Bool[Array, ""]:
+        inside = jnp.asarray(True if self._domain is None else self._domain(x, params))
+        if inside.shape != () or inside.dtype != bool:
+            raise ValueError(
+                "`domain` must return one truth value, such as `jnp.all(x > 0)`; it returned "
+                f"shape {inside.shape} and dtype {inside.dtype}."
+            )
+        return inside
 
     def _prepared_params(self) -> PyTree:
         return self.params if self._prepare is None else self._prepare(self.params)

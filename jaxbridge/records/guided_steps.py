@@ -82,7 +82,9 @@ def guided_start(
 ) -> GuidedLaw:
     """The law of x_0, given what is seen at t_0 and h_0."""
     step = NormalStep(initial.mean - point, initial.root)
-    step, log_seen, seen = given(step, scalars)
+    eps, size = jnp.finfo(point.dtype).eps, jnp.abs(initial.mean) + jnp.abs(point)
+    of_rows = jnp.stack([dot(jnp.abs(row), size) for row in scalars.rows])
+    step, log_seen, seen = given(step, scalars, 100 * eps * (of_rows + jnp.abs(scalars.values)))
     bent = tilted(step, h)
     return GuidedLaw(point, bent, log_seen + bent.log_integral, seen)
 

@@ -1,4 +1,11 @@
-"""The law of the state at the beginning of a record: a normal law, and what is left to weigh."""
+"""The law of the state at the beginning of a record: a normal law, and what is left to weigh.
+
+Where that is ν, and ν is not normal, in its place is a normal law with the mean and covariance of
+ν: by as much as it is wider than each of the wells of ν noise can lead to all of them. Both are
+weighted means over a ladder of normal laws around a mode, of which each is twice as wide as the
+last, at fixed noise: a smooth function of the parameters. Where so few points count that they tell
+no covariance, as in many dimensions, that at the mode is added.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,23 +15,37 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, PyTree
 
 from ..coupling import Stationary
+from ..engine.averages import effective_size, normalised, proper
 from ..engine.checks import as_floating, is_traced
-from ..engine.linalg import cholesky, dot, inverse, matvec, semidefinite_cholesky, solve_lower
+from ..engine.linalg import (
+    cholesky,
+    dot,
+    inverse,
+    matmul,
+    matvec,
+    semidefinite_cholesky,
+    solve_lower,
+)
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
+from ..models.tracing import uses_argument
 from .tilted_step import NormalStep
 
 # Of Newton's method for the mode of ν, from the origin.
 _NEWTON_STEPS = 50
+# How much wider than at the mode the laws of the ladder are, and how many points each has. So many
+# that count tell a covariance.
+_WIDTHS, _NUM_POINTS, _ENOUGH = 2.0 ** np.arange(8), 128, 10
 
 Initial = Any  # a point, a `GaussianLaw`, `Stationary()`, or a function of params to one of these
 
 
 def initial_law(initial: Initial, model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
-    """The law of X(t_0), a point like this one, or a normal law near it (`log_ratio`).
+    """The law of X(t_0), a point like this one, or a normal law in its place (`log_ratio`).
 
     **Raises:** `TypeError` and `ValueError` for what is none.
     """
@@ -43,15 +64,33 @@ def initial_law(initial: Initial, model: Diffusion, like: Float[Array, " d"]) ->
     return NormalStep(point, jnp.zeros((len(point), len(point)), dtype))
 
 
+def check_initial(initial: Initial, model: Diffusion, like: Float[Array, " d"]) -> None:
+    """Raise `TypeError` and `ValueError` for what is no law of a point like this one."""
+    if isinstance(bound(initial, model), Stationary):
+        jax.eval_shape(lambda model, x: model.log_stationary(x), model, like)
+        return
+    jax.eval_shape(lambda model: initial_law(initial, model, like), model)
+    point = bound(initial, model)
+    if isinstance(point, GaussianLaw) or not model.has_domain or is_traced(point, model):
+        return
+    if not model.is_inside(point):
+        raise ValueError(f"`initial` = {point} is outside the model's `domain`.")
+
+
 def log_ratio(
     initial: Initial, model: Diffusion, normal: NormalStep, x: Float[Array, " d"]
 ) -> Float[Array, ""]:
     """log of the density of X(t_0) over that of the normal law in its place: nothing, but for ν."""
     if not isinstance(bound(initial, model), Stationary):
         return jnp.zeros((), x.dtype)
-    white = solve_lower(normal.root, x - normal.mean)
-    log_scale = jnp.sum(jnp.log(np.sqrt(2 * np.pi) * jnp.diagonal(normal.root)))
-    return model.log_stationary(x) + dot(white, white) / 2 + log_scale
+    return model.log_stationary(x) - log_normal(normal, x)
+
+
+def log_normal(law: NormalStep, x: Float[Array, " d"]) -> Float[Array, ""]:
+    """The log density of a normal law that has one."""
+    white = solve_lower(law.root, x - law.mean)
+    log_scale = jnp.sum(jnp.log(np.sqrt(2 * np.pi) * jnp.diagonal(law.root)))
+    return -dot(white, white) / 2 - log_scale
 
 
 class _OfParams(eqx.Module):
@@ -84,7 +123,44 @@ def _check_shape(mean: Array, like: Float[Array, " d"]) -> None:
         )
 
 
+def is_normal(model: Diffusion, like: Float[Array, " d"]) -> bool:
+    """Whether ν is a normal law, seen from whether the second derivatives of log ν depend on the
+    point."""
+    return not uses_argument(jax.hessian(model.log_stationary), like)
+
+
 def _stationary(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
+    """ν, or the normal law with its mean and covariance."""
+    model = model.prepared()
+    mode = _at_mode(model, like)
+    if is_normal(model, like):
+        return mode
+    points, log_weights = ladder(model, mode)
+    weights = normalised(log_weights)
+    mean = weights @ points
+    away = points - mean
+    lack = 1 / (1 + effective_size(weights) / _ENOUGH) ** 2
+    covariance = away.T @ (weights[:, None] * away) + lack * matmul(mode.root, mode.root.T)
+    root = cholesky(covariance)
+    usable = jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(root))
+    return jax.tree.map(lambda a, b: jnp.where(usable, a, b), NormalStep(mean, root), mode)
+
+
+def ladder(model: Diffusion, mode: NormalStep) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
+    """Points of normal laws around a mode, at fixed noise, and their log weights as draws of ν."""
+    (d,), dtype = mode.mean.shape, mode.mean.dtype
+    widths = jnp.asarray(_WIDTHS, dtype)
+    zeta = jax.random.normal(jax.random.key(0), (len(widths), _NUM_POINTS, d), dtype)
+    white = (widths[:, None, None] * zeta).reshape(-1, d)
+    points = mode.mean + jax.vmap(lambda white: matvec(mode.root, white))(white)
+    square = jnp.sum(white**2, axis=1)
+    # Of all laws, up to what they have in common.
+    log_laws = -square[:, None] / (2 * widths**2) - d * jnp.log(widths)
+    log_nu = jax.vmap(lambda x: model.log_stationary(x))(points)
+    return points, proper(log_nu - logsumexp(log_laws, axis=1))
+
+
+def _at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     """The normal law with the mode of ν and the curvature of log ν there."""
     log_nu = model.log_stationary
     eye = jnp.eye(like.shape[0], dtype=like.dtype)

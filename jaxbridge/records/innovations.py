@@ -6,7 +6,8 @@ guided paths; so (θ, ξ) has the posterior density π(θ) N(ξ; 0, I) w(θ, ξ)
 with θ, and θ may be a parameter of σ, of the noise or of the initial law, however small the steps.
 """
 
-import equinox as eqx
+from typing import NamedTuple
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
@@ -18,23 +19,29 @@ from .guided_record import guided, linearised, path_and_log_weight
 from .initial import Initial
 from .observation import Observation
 from .problem import RecordProblem, as_record_problem
+from .start_share import start_share
 
 
-class Innovations(eqx.Module):
-    """What `innovations` returns: the record's paths as functions of noise ξ, shape (`size`,)."""
+class Innovations(NamedTuple):
+    """What `innovations` returns: the record's paths as functions of noise ξ, shape (`size`,). Its
+    methods may be given to `jax.jit` and `jax.grad` as they are.
 
-    _problem: RecordProblem
-    _points: Float[Array, "points d"]
+    - `problem`: the model, what was seen of it, and how.
+    - `points`: along which it is linearised, shape (M + 1, d).
+    """
+
+    problem: RecordProblem
+    points: Float[Array, "points d"]
 
     @property
     def size(self) -> int:
         """How many numbers ξ has: d for x_0, and d for each step."""
-        return self._points.size
+        return self.points.size
 
     @property
     def times(self) -> Float[Array, " points"]:
         """Of the points of paths, shape (M + 1,)."""
-        return self._problem.record.grid()
+        return self.problem.record.grid()
 
     def path(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, "points d"]:
         """The path that this noise makes at these parameters of the model."""
@@ -50,11 +57,18 @@ class Innovations(eqx.Module):
         log density it is the target of any sampler."""
         return self.log_weight(params, xi) - (xi @ xi + self.size * np.log(2 * np.pi)) / 2
 
+    def start_share(self) -> Float[Array, ""]:
+        """The share of draws of x_0 by normal noise that count, at the parameters of the model: one
+        where its law is normal. Near zero the normal law in the place of the stationary one leaves
+        out a mode or falls off too fast: then means of w over ξ are not to be trusted, and a
+        sampler may not find its way; `log_likelihood` covers that law with several."""
+        return start_share(self.problem, self.problem.model, self.points)
+
     def _run(self, params: PyTree, xi) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
-        model = self._problem.model.with_params(params)
-        guide = guided(self._problem, model, self._points)
-        noise = xi.reshape(self._points.shape)
-        path, log_weight = path_and_log_weight(self._problem, model, guide, noise)
+        model = self.problem.model.with_params(params)
+        guide = guided(self.problem, model, self.points)
+        noise = xi.reshape(self.points.shape)
+        path, log_weight = path_and_log_weight(self.problem, model, guide, noise)
         return path, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
 
 
@@ -82,7 +96,8 @@ def innovations(
     - `initial`: the law of the state at the first time: a point, shape (d,), a `GaussianLaw`,
         whose covariance is singular where part of the state is known, `Stationary()`, which is the
         default, or a function of params to one of these. Likelihoods from the stationary law rest
-        on a `normalised` model.
+        on a `normalised` model. Where that is not normal x_0 is made from noise by the normal law
+        with its mean and covariance, and weighed: exact, but see `start_share`.
     - `num_steps`: steps between two times, by default 10; or `step_size`, how long a step may be.
     - `initial_time`: of `initial`, where that is before the first of `times`.
     - `density`: of the steps, by default `ItoTaylorDensity()` for constant σ, else

@@ -3,19 +3,21 @@
 The components of a normal observation, y = L x + N(0, R), are made independent by R = U D Uᵀ with
 U unit triangular, for those that were seen: each is then a number c·x + N(0, ρ), with ρ = 0 for one
 that is exact. They are taken one by one, so nothing needs R to be invertible, and what was not seen
-is left out.
+is left out. So is what follows from other numbers that are exact, where it agrees with them; where
+it does not, or R has a negative variance, nothing explains what was seen.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.checks import Numbers, as_floating, is_traced
-from ..engine.linalg import dot
+from ..engine.linalg import dot, safe_norm
 from ..models.diffusion import check_value
 
 
@@ -108,36 +110,34 @@ class LinearGaussian(eqx.Module):
         if is_traced(matrix, R):
             return
         _check_covariance(R)
-        exact = np.asarray(matrix)[np.asarray(jnp.diagonal(R)) == 0]
-        if np.linalg.matrix_rank(exact) < len(exact):
+        each = [np.asarray(part, float) for part in (matrix, R)]
+        rank = np.linalg.matrix_rank(np.hstack([a / max(np.abs(a).max(), 1e-300) for a in each]))
+        if rank < m:
             raise ValueError(
-                f"{len(exact)} components are seen without noise, but their rows of `matrix` have "
-                f"rank {np.linalg.matrix_rank(exact)}: leave out those that follow from others, or "
-                "give them a variance."
+                f"{m} components are seen, but `matrix` and `covariance` side by side have rank "
+                f"{rank}: leave out those that follow from others without noise, or give them a "
+                "variance of their own."
             )
 
     def scalars(self, y: Float[Array, " m"], params: PyTree, d: int) -> Scalars:
         """The same as independent numbers."""
         m, seen = y.shape[0], jnp.isfinite(y)
-        rows = [self.matrix_for(d, m, y.dtype)[j] for j in range(m)]
-        values = [jnp.where(seen[j], y[j], 0) for j in range(m)]
+        rows = jnp.where(seen[:, None], self.matrix_for(d, m, y.dtype), 0)
         R = self.covariance_for(params, m, y.dtype)
-        entry = lambda i, j: jnp.where(seen[i] & seen[j], R[i, j], 0)
-        rest = [[entry(i, j) for j in range(m)] for i in range(m)]
-        variances = []
-        for k in range(m):  # R = U D Uᵀ, by elimination
-            pivot = rest[k][k]
-            some = pivot > 0
-            variances.append(pivot)
-            for i in range(k + 1, m):
-                factor = jnp.where(some, rest[i][k] / jnp.where(some, pivot, 1), 0)
-                rows[i] = rows[i] - factor * rows[k]
-                values[i] = values[i] - factor * values[k]
-                for j in range(k + 1, m):
-                    rest[i][j] = rest[i][j] - factor * rest[k][j]
-        rows = jnp.where(seen[:, None], jnp.stack(rows), 0)
-        variances = jnp.where(seen, jnp.maximum(jnp.stack(variances), 0), 1)
-        return Scalars(rows, jnp.where(seen, jnp.stack(values), 0), variances, seen)
+        R = jnp.where(seen[:, None] & seen, R, 0)
+        made, sizes, possible = _independent(Scalars(rows, jnp.where(seen, y, 0), R, seen))
+        follows, agrees = _follows(made, sizes)
+        made = made._replace(
+            rows=jnp.where(follows[:, None], 0, made.rows),
+            values=jnp.where(follows, 0, made.values),
+            variances=jnp.where(follows, 1, made.variances),
+            seen=seen & ~follows,
+        )
+        # Where nothing explains y it is as if nothing of x were seen, but what has no density.
+        beyond = 2 * np.sqrt(float(jnp.finfo(y.dtype).max))
+        never = Scalars(jnp.zeros_like(rows), jnp.full_like(y, beyond), jnp.ones_like(y), seen)
+        explained = possible & jnp.all(agrees)
+        return jax.tree.map(lambda a, b: jnp.where(explained, a, b), made, never)
 
     def correction(self, y, x, params):
         """log g - log of its guess: nothing."""
@@ -175,10 +175,8 @@ class ObservationDensity(eqx.Module):
             raise TypeError(f"`log_density` must be a function; got {log_density!r}.")
         if not isinstance(guess, LinearGaussian):
             raise TypeError(f"`guess` must be a `LinearGaussian`; got {guess!r}.")
-        R = guess.covariance
-        if R is not None and not is_traced(R):
-            if np.any((np.diagonal(R) if R.ndim == 2 else np.asarray(R)) <= 0):
-                raise ValueError(f"`guess` must have positive variances; got {R}.")
+        if guess.covariance is not None:
+            _check_positive(guess.covariance)
         self._log_density, self.guess = log_density, guess
 
     @property
@@ -189,6 +187,7 @@ class ObservationDensity(eqx.Module):
     def check(self, d: int, m: int, like: Array, params: PyTree) -> None:
         """Raise `ValueError` where observations of m components of a state of d do not fit."""
         self.guess.check(d, m, like, params)
+        _check_positive(self.guess.covariance_for(params, m, like.dtype))
 
     def scalars(self, y: Float[Array, " m"], params: PyTree, d: int) -> Scalars:
         """The guess, as independent numbers."""
@@ -218,6 +217,58 @@ def log_density_of(scalars: Scalars, x: Float[Array, " d"]) -> Float[Array, ""]:
     return total
 
 
+def _independent(
+    given: Scalars,
+) -> tuple[Scalars, tuple[Float[Array, " m"], Float[Array, " m"]], Bool[Array, ""]]:
+    """Of numbers with a matrix in the place of variances, R = U D Uᵀ by elimination: independent
+    ones; the sizes of what their rows and values are the sums of; and whether R is a covariance, up
+    to rounding."""
+    m, eps = given.values.shape[0], 100 * jnp.finfo(given.values.dtype).eps
+    rows, values = list(given.rows), list(given.values)
+    sizes = [[safe_norm(row) for row in rows], [jnp.abs(value) for value in values]]
+    R = given.variances
+    rest = [[R[i, j] for j in range(m)] for i in range(m)]
+    variances, possible = [], jnp.ones((), bool)
+    for k in range(m):
+        pivot = jnp.where(jnp.abs(rest[k][k]) <= eps * jnp.abs(R[k, k]), 0, rest[k][k])
+        some = pivot > 0
+        possible &= pivot >= 0
+        variances.append(jnp.where(given.seen[k], jnp.maximum(pivot, 0), 1))
+        for i in range(k + 1, m):
+            least = eps * jnp.sqrt(jnp.abs(R[k, k] * R[i, i]))
+            possible &= some | (jnp.abs(rest[i][k]) <= least)
+            factor = jnp.where(some, rest[i][k] / jnp.where(some, pivot, 1), 0)
+            for changed, size in zip((rows, values), sizes, strict=True):
+                size[i] = size[i] + jnp.abs(factor) * size[k]
+                changed[i] = changed[i] - factor * changed[k]
+            for j in range(k + 1, m):
+                rest[i][j] = rest[i][j] - factor * rest[k][j]
+    of_rows, of_values = (jnp.stack(size) for size in sizes)
+    made = Scalars(jnp.stack(rows), jnp.stack(values), jnp.stack(variances), given.seen)
+    return made, (of_rows, of_values), possible
+
+
+def _follows(
+    scalars: Scalars, sizes: tuple[Float[Array, " m"], Float[Array, " m"]]
+) -> tuple[Bool[Array, " m"], Bool[Array, " m"]]:
+    """Which of the exact numbers follow from those before them, and which agree with these, up to
+    rounding: by Gram and Schmidt's procedure."""
+    eps = 100 * jnp.finfo(scalars.values.dtype).eps
+    directions, follows, agrees = [], [], []
+    for row, value, variance, seen, row_size, size in zip(*scalars, *sizes, strict=True):
+        for direction, along in directions:
+            share = dot(row, direction)
+            row, value = row - share * direction, value - share * along
+            size = size + jnp.abs(share * along)
+        length, exact = safe_norm(row), seen & (variance == 0)
+        new = length > eps * row_size
+        follows.append(exact & ~new)
+        agrees.append(~follows[-1] | (jnp.abs(value) <= eps * size))
+        scale = jnp.where(exact & new, 1 / jnp.where(new, length, 1), 0)
+        directions.append((row * scale, value * scale))
+    return jnp.stack(follows), jnp.stack(agrees)
+
+
 def check_observation(observation) -> None:
     """Raise `TypeError` for anything but a way of seeing the state."""
     if not isinstance(observation, LinearGaussian | ObservationDensity):
@@ -245,3 +296,10 @@ def _check_covariance(R: Array) -> None:
             "`covariance` must be symmetric, without negative variances (zero for what is seen "
             f"exactly); got {known}."
         )
+
+
+def _check_positive(R: Array) -> None:
+    if is_traced(R):
+        return
+    if np.any((np.diagonal(R) if R.ndim == 2 else np.asarray(R)) <= 0):
+        raise ValueError(f"`guess` must have positive variances; got {R}.")

@@ -25,6 +25,7 @@ from ..engine.lanes import over_lanes
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity, StepError, dominates, share_of_order
+from .cover import calls_for_cover, cover, covered_start
 from .guided_record import Guidance, correction, linearised
 from .guided_steps import guided_step
 from .initial import Initial, log_ratio
@@ -103,7 +104,9 @@ def log_likelihood(
     - `num_filters`: filters that know nothing of each other, whose spread tells the error.
 
     **Returns:** `LogLikelihood`. For a linear model all weights are equal, and `value` is that of
-    the Kalman filter of the steps. Not differentiable where particles are resampled:
+    the Kalman filter of the steps. A stationary law that is not normal is covered by a mixture of
+    normal laws at draws of it, and wider ones beyond: `effective_sample_size` says how well in its
+    first number. Not differentiable where particles are resampled:
     `innovations` is.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
@@ -293,19 +296,40 @@ def run_filters(
         return weighed(state._replace(x=x), resampling_key, change)
 
     start_key, resampling_key = jax.random.split(jax.random.fold_in(key, 0))
-    zeta = jax.random.normal(start_key, (d, R * P), dtype)
-    x = over_lanes(-1)(guide.start.point)(zeta)
+    x, change = _starts(start_key, problem, model, guide, R, P)
     zero = jnp.zeros(R, dtype)
     state = _Particles(x, jnp.zeros((R, P), dtype), zero, jnp.zeros(R, jnp.int32))
-    ratio = lambda x: log_ratio(problem.initial, model, guide.initial, x)
-    change = guide.start.log_weight + corrected(values[0], x) + jax.vmap(ratio, in_axes=-1)(x)
-    state, first = weighed(state, resampling_key, change)
+    state, first = weighed(state, resampling_key, change + corrected(values[0], x))
     numbers = 1 + jnp.arange(problem.num_segments)
     inputs = (numbers, guide.steps, guide.scalars, values[1:])
     state, sizes = lax.scan(segment, state, inputs)
     log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
     sizes = jnp.concatenate([first[None], sizes]).T
     return Filtered(state.log_estimate + log_mean, sizes, state.num_nonfinite)
+
+
+def _starts(
+    key: Key[Array, ""], problem: RecordProblem, model: Diffusion, guide: Guidance, R: int, P: int
+) -> tuple[Float[Array, "d lanes"], Float[Array, " lanes"]]:
+    """The first states of all particles, and their log weights, where observations are of their
+    guess. A law that is not normal is covered by a mixture, whose parts each filter takes in
+    proportion to their shares."""
+    dtype = problem.like.dtype
+    noise_key, position_key = jax.random.split(key)
+    zeta = jax.random.normal(noise_key, (problem.dim, R * P), dtype)
+    if not calls_for_cover(problem.initial, model, problem.like):
+        x = over_lanes(-1)(guide.start.point)(zeta)
+        ratio = lambda x: log_ratio(problem.initial, model, guide.initial, x)
+        return x, guide.start.log_weight + jax.vmap(ratio, in_axes=-1)(x)
+    law = cover(model, guide.initial)
+    h = jax.tree.map(lambda leaf: leaf[0, 0], guide.steps.h)
+    start = covered_start(law, guide.first, guide.start.origin, h)
+    uniform = jax.random.uniform(position_key, (R, 1), dtype)
+    positions = (uniform + jnp.arange(P, dtype=dtype)) / P
+    x = start.points(positions.ravel(), zeta)
+    log_nu = model.prepared().log_stationary
+    ratio = lambda x: log_nu(x) - law.log_density(x)
+    return x, start.log_weight + jax.vmap(ratio, in_axes=-1)(x)
 
 
 def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) -> _Particles:

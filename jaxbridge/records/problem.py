@@ -5,16 +5,20 @@ import dataclasses
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..coupling import Stationary
-from ..engine.checks import Numbers
+from ..engine.checks import Numbers, is_traced
 from ..models.diffusion import Diffusion, check_diffusion
 from ..proposals.guided import check_step_density
 from ..schemes import AbstractStepDensity, EulerDensity, ItoTaylorDensity
-from .initial import Initial, as_initial, bound, initial_law
-from .observation import Observation, Scalars, check_observation
+from .initial import Initial, as_initial, bound, check_initial
+from .observation import LinearGaussian, Observation, Scalars, check_observation
 from .record import Record, as_records, split_records
+
+# Beyond twice as many, how many dimensions a state may have that are tried for what to say.
+_MOST_TRIED = 8
 
 
 class RecordProblem(eqx.Module):
@@ -97,6 +101,7 @@ def problem_of(
     guess = observation.linear
     dim = m if guess.matrix is None else guess.matrix.shape[1]
     like = jnp.zeros(dim, record.values.dtype)
+    _check_dimension(model, guess, like)
     observation.check(dim, m, like, model.params)
     if initial is None:
         if not model.has_density:
@@ -113,8 +118,67 @@ def problem_of(
             "`log_stationary` is the log of a density, or give `initial=` a point or a "
             "`GaussianLaw`."
         )
-    jax.eval_shape(lambda model: initial_law(initial, model, like), model)  # for its checks
+    check_initial(initial, model, like)
+    check_domain(model, observation, record)
     if density is None:
         varies = model.sigma_varies(like)
         density = EulerDensity() if varies else ItoTaylorDensity()
     return RecordProblem(model, record, observation, initial, check_step_density(density), dim)
+
+
+def _check_dimension(model: Diffusion, guess: LinearGaussian, like: Float[Array, " d"]) -> None:
+    """Raise `ValueError` where the model's state has other dimensions than what is seen of it."""
+    if _has_dimension(model, like):
+        return
+    (d,), most = like.shape, 2 * like.shape[0] + _MOST_TRIED
+    fits = [n for n in range(1, most) if _has_dimension(model, jnp.zeros(n, like.dtype))]
+    if not fits:  # the model's own fault, which is told where it is used
+        return
+    if guess.matrix is None:
+        raise ValueError(
+            f"`observations` have {d} components, and without a `matrix` they are all of the "
+            f"state, which has {fits[0]}: give `LinearGaussian` the `matrix` of what is seen, "
+            f"shape ({d}, {fits[0]})."
+        )
+    rows = guess.matrix.shape[0]
+    raise ValueError(
+        f"`matrix` must have shape ({rows}, {fits[0]}) for a state of {fits[0]} dimensions; got "
+        f"{guess.matrix.shape}."
+    )
+
+
+def _has_dimension(model: Diffusion, like: Float[Array, " d"]) -> bool:
+    """Whether points like this one are states of the model."""
+
+    def coefficients(model, x):
+        dynamics = model.forward(x)
+        return dynamics.drift(x), dynamics.sigma(x).as_matrix(len(x), x.dtype)
+
+    try:
+        _, sigma = jax.eval_shape(coefficients, model, like)
+    except Exception:  # whatever functions of the user's raise
+        return False
+    return sigma.shape == 2 * like.shape
+
+
+def check_domain(model: Diffusion, observation: Observation, record: Record) -> None:
+    """Raise `ValueError` where a state that was seen whole and without noise is none of the
+    model's."""
+    d, seen = record.values.shape[-1], record.values[record.which]
+    if not (model.has_domain and isinstance(observation, LinearGaussian)):
+        return
+    if is_traced(model, observation, seen):
+        return
+    matrix = np.asarray(observation.matrix_for(d, d, seen.dtype), float)
+    R = np.asarray(observation.covariance_for(model.params, d, seen.dtype))
+    if matrix.shape != (d, d) or np.any(R):
+        return
+    whole = np.all(np.isfinite(np.asarray(seen)), axis=1)
+    states = np.linalg.solve(matrix, np.where(whole[:, None], seen, 0).T).T
+    inside = jax.vmap(model.is_inside)(jnp.asarray(states, seen.dtype))
+    outside = np.flatnonzero(whole & ~np.asarray(inside))
+    if outside.size:
+        raise ValueError(
+            f"`observations[{outside[0]}]` is the state {states[outside[0]]}, seen without noise, "
+            "and that is outside the model's `domain`: give it noise, or leave it out as NaN."
+        )

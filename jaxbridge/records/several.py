@@ -20,7 +20,7 @@ from ..schemes import AbstractStepDensity
 from .guided_record import linearised
 from .initial import Initial
 from .observation import Observation
-from .problem import RecordProblem, problem_of
+from .problem import RecordProblem, check_domain, problem_of
 from .record import Record, as_records, split_records
 
 
@@ -80,6 +80,8 @@ def as_record_problems(
     seen = split_records(times, observations)
     records = as_records(seen, num_steps, step_size, initial_time)
     problem = problem_of(model, records[0], observation, initial, density)
+    for record in records[1:]:
+        check_domain(model, observation, record)
     num_times = tuple(len(record.which) for record in records)
     num_segments = max(len(record.dt) for record in records)
     same = [_padded(record, num_segments, max(num_times)) for record in records]

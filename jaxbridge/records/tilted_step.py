@@ -63,13 +63,14 @@ class Seen(NamedTuple):
 
 
 def seen_of(root: Float[Array, "d m"], row: Float[Array, " d"], variance) -> Seen:
-    """Of a number c·u + N(0, ρ)."""
+    """Of a number c·u + N(0, ρ). One that is known before it is seen, s = 0, moves nothing."""
     along = matvec(root.T, row)
     total = dot(along, along) + variance
-    ratio = variance / total
+    safe = jnp.where(total > 0, total, 1)
+    ratio = variance / safe
     exact = ratio <= 0
     left = jnp.where(exact, 0, jnp.sqrt(jnp.where(exact, 1, ratio)))
-    return Seen(along, 1 / (total * (1 + left)), matvec(root, along) / total, total, left)
+    return Seen(along, 1 / (safe * (1 + left)), matvec(root, along) / safe, total, left)
 
 
 def root_after(root: Float[Array, "d m"], seen: Seen) -> Float[Array, "d m"]:
@@ -77,14 +78,21 @@ def root_after(root: Float[Array, "d m"], seen: Seen) -> Float[Array, "d m"]:
     return root - seen.factor * matvec(root, seen.along)[:, None] * seen.along
 
 
-def given(step: NormalStep, scalars: Scalars) -> tuple[NormalStep, Float[Array, ""], list[Seen]]:
+def given(
+    step: NormalStep, scalars: Scalars, rounding: Float[Array, " n"] | None = None
+) -> tuple[NormalStep, Float[Array, ""], list[Seen]]:
     """The step given what is seen at its end, relative to ξ' as it is; and the log density of
-    that."""
+    that. A number that is known before it is seen has none: zero where it is as it must be, up to
+    `rounding`, and else -inf."""
     log_density, each = jnp.zeros((), step.mean.dtype), []
-    for row, value, variance, is_seen in zip(*scalars, strict=True):
+    slack = jnp.zeros_like(scalars.values) if rounding is None else rounding
+    for row, value, variance, is_seen, error in zip(*scalars, slack, strict=True):
         seen = seen_of(step.root, row, variance)
         residual = value - dot(row, step.mean)
-        log = residual**2 / seen.variance + jnp.log(2 * np.pi * seen.variance)
+        known = seen.variance == 0
+        total = jnp.where(known, 1, seen.variance)
+        log = residual**2 / total + jnp.log(2 * np.pi * total)
+        log = jnp.where(known, jnp.where(jnp.abs(residual) <= error, 0, jnp.inf), log)
         log_density -= jnp.where(is_seen, log, 0) / 2
         step = NormalStep(step.mean + seen.gain * residual, root_after(step.root, seen))
         each.append(seen)

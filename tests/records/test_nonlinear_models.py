@@ -195,16 +195,5 @@ def test_the_maximum_is_that_of_the_grid():
     assert estimate.newton and np.all(estimate.r_hat < 1.1)
     np.testing.assert_array_less(error, 0.1 * np.asarray(estimate.standard_errors))
     told = np.asarray(estimate.theta - estimate.step_error)
-    print(
-        told,
-        exact,
-        error,
-        estimate.r_hat,
-        estimate.effective_sample_size,
-        estimate.step_error,
-        estimate.step_uncertainty,
-        estimate.monte_carlo_errors,
-        estimate.standard_errors,
-    )
     grid = 0.02 * np.asarray(estimate.standard_errors)
     np.testing.assert_array_less(np.abs(told - exact), 4.5 * error + grid)

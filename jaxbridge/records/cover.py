@@ -1,0 +1,152 @@
+"""A law that covers ν, for the beginning of a record where ν is not normal.
+
+One normal law may leave out a mode of ν, or fall off faster than ν does: then what is weighed by
+their ratio has no bound, and tells a small error of a wrong number. A mixture of normal laws,
+
+    q(x) = ½ Σ_j w_j N(x; x_j, r_j² S) + ½ Σ_c N(x; m_c, S_c) / C,
+
+has kernels at draws x_j of ν, with weights w_j, whose mean and covariance are m and S, each as wide
+as it is far to a sixteenth of the others; and wide laws for what is beyond them, up to eight times
+as wide as ν. Given what is seen, and tilted by h, it is a mixture again: its shares are multiplied
+by the integrals. What is left to weigh is ν/q.
+
+Draws are those of the model's sampler; without one they are the points of a ladder around the
+normal law in place of ν (`initial`), weighed by ν, and twice more draws of the mixture that they
+make (population Monte Carlo; Cappé, Guillin, Marin & Robert 2004). Keys are fixed, so q depends on
+parameters only. What rests on q is exact whatever it is; how many draws count is not.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Float
+
+from ..coupling import Stationary
+from ..engine.averages import normalised, proper
+from ..engine.linalg import cholesky, is_finite, matmul, matvec, solve_lower
+from ..models.diffusion import Diffusion
+from .guided_steps import GuidedLaw, guided_start
+from .initial import Initial, bound, is_normal, ladder, log_normal
+from .observation import Scalars
+from .tilted_step import Information, NormalStep
+
+# Kernels, and how often new ones are drawn from the last.
+_NUM_KERNELS, _NUM_ROUNDS = 256, 2
+# How much wider than ν what covers its tails is.
+_WIDER = (1.0, 2.0, 4.0, 8.0)
+# To what share of all draws a kernel reaches.
+_NEAREST = 1 / 16
+
+
+class Cover(NamedTuple):
+    """A mixture of J normal laws."""
+
+    log_shares: Float[Array, " J"]
+    laws: NormalStep
+
+    def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
+        """log q(x)."""
+        return logsumexp(self.log_shares + jax.vmap(lambda law: log_normal(law, x))(self.laws))
+
+    def points(self, positions: Float[Array, " n"], zeta: Float[Array, "n d"]):
+        """Draws, from uniform positions and normal noise."""
+
+        def one(j, zeta):
+            return self.laws.mean[j] + matvec(self.laws.root[j], zeta)
+
+        return jax.vmap(one)(chosen(self.log_shares, positions), zeta)
+
+
+class CoveredStart(NamedTuple):
+    """The laws of a cover, given what is seen at t_0 and h_0, and their shares."""
+
+    laws: GuidedLaw
+    log_shares: Float[Array, " J"]
+
+    @property
+    def log_weight(self) -> Float[Array, ""]:
+        """The log of the integral of the cover times what it is tilted by."""
+        return logsumexp(self.log_shares)
+
+    def points(
+        self, positions: Float[Array, " n"], zeta: Float[Array, "d n"]
+    ) -> Float[Array, "d n"]:
+        """Draws of x_0, from uniform positions and normal noise."""
+
+        def one(j, zeta):
+            return jax.tree.map(lambda leaf: leaf[j], self.laws).point(zeta)
+
+        return jax.vmap(one, in_axes=(0, -1), out_axes=-1)(chosen(self.log_shares, positions), zeta)
+
+
+def chosen(log_shares: Float[Array, " J"], positions: Float[Array, " n"]):
+    """Which are at these positions of [0, 1), in the order in which they come."""
+    bounds = jnp.cumsum(normalised(proper(log_shares)))
+    bounds = bounds / jnp.maximum(bounds[-1], jnp.finfo(bounds.dtype).tiny)
+    return jnp.minimum(jnp.searchsorted(bounds, positions, side="right"), len(bounds) - 1)
+
+
+def calls_for_cover(initial: Initial, model: Diffusion, like: Float[Array, " d"]) -> bool:
+    """Whether X(t_0) has the law ν, and that is not a normal law."""
+    return isinstance(bound(initial, model), Stationary) and not is_normal(model, like)
+
+
+def cover(model: Diffusion, normal: NormalStep) -> Cover:
+    """Of ν, from the normal law in its place."""
+    model, (d,), dtype = model.prepared(), normal.mean.shape, normal.mean.dtype
+    keys = jax.random.split(jax.random.key(0), _NUM_ROUNDS + 1)
+    alike = jnp.zeros(_NUM_KERNELS, dtype)
+    if model.has_sampler:
+        keys = jax.random.split(keys[0], _NUM_KERNELS)
+        return _fitted(jax.vmap(model.sample_stationary)(keys).astype(dtype), alike, normal)
+    evenly = (jnp.arange(_NUM_KERNELS, dtype=dtype) + 0.5) / _NUM_KERNELS
+    points, log_weights = ladder(model, normal)
+    law = _fitted(points[chosen(log_weights, evenly)], alike, normal)
+    for key in keys[1:]:
+        points = law.points(evenly, jax.random.normal(key, (_NUM_KERNELS, d), dtype))
+        log_ratio = jax.vmap(lambda x, law=law: model.log_stationary(x) - law.log_density(x))
+        law = _fitted(points, proper(log_ratio(points)), normal)
+    return law
+
+
+def _fitted(
+    points: Float[Array, "M d"], log_weights: Float[Array, " M"], normal: NormalStep
+) -> Cover:
+    """The mixture that weighted draws make, without those that are not finite."""
+    (M, d), dtype = points.shape, points.dtype
+    finite = jnp.all(is_finite(points), axis=1)
+    points = jnp.where(finite[:, None], points, normal.mean)
+    weights = normalised(jnp.where(finite, log_weights, -jnp.inf))
+    mean = weights @ points
+    # Some of the normal law's own, for draws that are all one point.
+    S = (points - mean).T @ (weights[:, None] * (points - mean))
+    root = cholesky(S + 1e-3 * matmul(normal.root, normal.root.T))
+    usable = jnp.all(jnp.isfinite(root))
+    root, mean = jnp.where(usable, root, normal.root), jnp.where(usable, mean, normal.mean)
+    white = jax.vmap(lambda x: solve_lower(root, x - mean))(points)
+    distance = jnp.sqrt(jnp.sum((white[:, None] - white) ** 2, axis=-1))
+    order = jnp.argsort(distance, axis=1)
+    near = jnp.cumsum(weights[order], axis=1) < _NEAREST
+    reach = jnp.take_along_axis(distance, order, axis=1)
+    reach = jnp.take_along_axis(reach, jnp.minimum(jnp.sum(near, axis=1), M - 1)[:, None], axis=1)
+    widths = jnp.maximum(reach[:, 0] / np.sqrt(d), 1e-3)
+    wider = jnp.asarray(_WIDER, dtype)
+    wide = jnp.concatenate([wider[:, None, None] * root, normal.root[None]])
+    means = jnp.concatenate([jnp.broadcast_to(mean, (len(wider), d)), normal.mean[None]])
+    kernels = NormalStep(points, widths[:, None, None] * root)
+    laws = jax.tree.map(lambda *both: jnp.concatenate(both), kernels, NormalStep(means, wide))
+    some = weights > 0
+    shares = jnp.where(some, jnp.log(jnp.where(some, weights, 1)), -jnp.inf)
+    even = jnp.full(len(means), -np.log(len(means)), dtype)
+    return Cover(jnp.concatenate([shares, even]) - np.log(2), laws)
+
+
+def covered_start(
+    law: Cover, scalars: Scalars, point: Float[Array, " d"], h: Information
+) -> CoveredStart:
+    """The cover given what is seen at t_0, counted from the point, and h_0."""
+    laws = jax.vmap(lambda each: guided_start(each, scalars, point, h))(law.laws)
+    return CoveredStart(laws, law.log_shares + laws.log_weight)

@@ -1,0 +1,48 @@
+"""How many draws of x_0 by normal noise count, told by draws that leave nothing out.
+
+With f the density of x_0 times what it is tilted by, n the normal law in its place, tilted, and q
+the cover, tilted, the share is (∫f)² / ∫ f²/n = (E_q f/q)² / E_q (f/q)(f/n).
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Float
+
+from ..engine.averages import proper
+from ..engine.compiled import compiled
+from ..models.diffusion import Diffusion
+from .cover import calls_for_cover, cover, covered_start
+from .guided_record import correction, guided
+from .initial import log_ratio
+from .problem import RecordProblem
+
+_NUM_DRAWS = 1024
+
+
+@compiled
+def start_share(
+    problem: RecordProblem, model: Diffusion, points: Float[Array, "points d"]
+) -> Float[Array, ""]:
+    """The share of draws that count: of a record that is guided along these points."""
+    dtype = problem.like.dtype
+    if not calls_for_cover(problem.initial, model, problem.like):
+        return jnp.ones((), dtype)
+    guide, log_nu = guided(problem, model, points), model.prepared().log_stationary
+    law = cover(model, guide.initial)
+    h = jax.tree.map(lambda leaf: leaf[0, 0], guide.steps.h)
+    start = covered_start(law, guide.first, points[0], h)
+    positions = (jnp.arange(_NUM_DRAWS, dtype=dtype) + 0.5) / _NUM_DRAWS
+    zeta = jax.random.normal(jax.random.key(0), (problem.dim, _NUM_DRAWS), dtype)
+
+    def both(x):
+        seen = correction(problem, model, problem.record.values[0], x)
+        to_cover = log_nu(x) - law.log_density(x) + start.log_weight
+        to_normal = log_ratio(problem.initial, model, guide.initial, x) + guide.start.log_weight
+        return proper(seen + to_cover), proper(seen + to_normal)
+
+    to_cover, to_normal = jax.vmap(both, in_axes=-1)(start.points(positions, zeta))
+    log_num = np.log(_NUM_DRAWS)
+    log_mean = logsumexp(to_cover) - log_num
+    return jnp.exp(2 * log_mean - logsumexp(to_cover + to_normal) + log_num)
