@@ -19,7 +19,7 @@ def filters(log_density, num_particles, num_filters=500):
         jb.GaussianLaw([0.0], [[0.5]]), num_steps=4,
     )  # fmt: skip
     guide, size = linearised(problem, MODEL).guide, (num_filters, num_particles)
-    run = jax.jit(lambda key: run_filters(key, problem, MODEL, guide, *size))
+    run = jax.jit(lambda key: run_filters(key, problem, MODEL, guide, size))
     return run(jax.random.key(0))
 
 
