@@ -37,6 +37,8 @@ from .several import Records, as_record_problems
 
 # Particles are resampled where fewer than this share of them count.
 _FEWEST_EFFECTIVE = 0.5
+# Fewer particles that count, or a larger standard error of a log, tell nothing.
+_FEWEST_TRUSTED, _MOST_SPREAD = 5, 0.5
 
 
 class LogLikelihood(eqx.Module):
@@ -75,6 +77,15 @@ class LogLikelihood(eqx.Module):
         """Whether the step error is beyond the standard error, or not known well enough to say:
         then more steps help, and more particles do not."""
         return dominates(StepError(self.step_error, self.step_uncertainty), self.standard_error)
+
+    @property
+    def trustworthy(self) -> Bool[Array, ""]:
+        """Whether `value` and `standard_error` are to be trusted: particles that count at all
+        observations, filters that agree, so that the delta method holds, and a step error that
+        does not dominate."""
+        counted = jnp.all(self.effective_sample_size >= _FEWEST_TRUSTED)
+        agree = jnp.isfinite(self.value) & (self.standard_error < _MOST_SPREAD)
+        return counted & agree & ~self.step_error_dominates
 
 
 def log_likelihood(
