@@ -29,19 +29,52 @@ def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
             f"`draws` must be a chain of at least 4, shape (n, ...); got {draws.shape}."
         )
     n = draws.shape[0]
+    covariance = _autocovariance(draws)
+    moving = covariance[0] > 0
+    size = n / _correlation_time(covariance / jnp.where(moving, covariance[0], 1))
+    # A chain that alternates can be worth more than n, but how much is not well determined.
+    size = jnp.where(moving, jnp.minimum(size, n * math.log10(n)), 1)
+    return jnp.where(jnp.isfinite(covariance[0]), size, jnp.nan)
+
+
+def effective_size_of_chains(draws: Float[Array, "chains n ..."]) -> Float[Array, "..."]:
+    """How many independent draws several chains are worth together, with correlations relative to
+    the variance of all draws,
+
+        ρ_t = 1 - (W - mean of the chains' autocovariances at t) / V,   V = (n - 1)/n W + B,
+
+    where W is the variance within chains and B that of their means (Vehtari, Gelman, Simpson,
+    Carpenter & Bürkner 2021): chains that disagree are worth few draws, however many they have. Of
+    a single chain as `effective_sample_size`."""
+    num_chains, n = draws.shape[:2]
+    if num_chains == 1:
+        return effective_sample_size(draws[0])
+    covariance = jnp.mean(jax.vmap(_autocovariance)(draws), axis=0) / (n - 1)
+    within = covariance[0]
+    overall = within * ((n - 1) / n) + jnp.var(jnp.mean(draws, axis=1), axis=0, ddof=1)
+    moving = overall > 0
+    correlation = 1 - (within - covariance) / jnp.where(moving, overall, 1)
+    total = num_chains * n
+    size = total / _correlation_time(correlation.at[0].set(1))
+    size = jnp.where(moving, jnp.minimum(size, total * math.log10(total)), num_chains)
+    return jnp.where(jnp.isfinite(overall), size, jnp.nan)
+
+
+def _autocovariance(draws: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """n times that of one chain, for all lags."""
+    n = draws.shape[0]
     centred = draws - jnp.mean(draws, axis=0)
     spectrum = jnp.fft.rfft(centred, 2 * n, axis=0)
-    covariance = jnp.fft.irfft(jnp.abs(spectrum) ** 2, 2 * n, axis=0)[:n]
-    moving = covariance[0] > 0
-    correlation = covariance / jnp.where(moving, covariance[0], 1)
-    pairs = correlation[: n // 2 * 2].reshape(n // 2, 2, *draws.shape[1:]).sum(1)
+    return jnp.fft.irfft(jnp.abs(spectrum) ** 2, 2 * n, axis=0)[:n]
+
+
+def _correlation_time(correlation: Float[Array, "n ..."]) -> Float[Array, "..."]:
+    """1 + 2 Σ_t ρ_t, summed as far as sums of adjacent pairs are positive, and made to decrease."""
+    n = correlation.shape[0]
+    pairs = correlation[: n // 2 * 2].reshape(n // 2, 2, *correlation.shape[1:]).sum(1)
     positive = jnp.cumprod(pairs > 0, axis=0)
     pairs = jax.lax.cummin(jnp.where(positive, pairs, 0), axis=0)
-    time = 2 * jnp.sum(pairs, axis=0) - 1
-    # A chain that alternates can be worth more than n, but how much is not well determined.
-    size = jnp.minimum(n / jnp.maximum(time, 1 / n), n * math.log10(n))
-    size = jnp.where(moving, size, 1)
-    return jnp.where(jnp.isfinite(covariance[0]), size, jnp.nan)
+    return jnp.maximum(2 * jnp.sum(pairs, axis=0) - 1, 1 / n)
 
 
 def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:

@@ -18,7 +18,7 @@ from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
 from ..records import Records, guided, run_filters
-from ..schemes import share_of_order
+from ..schemes import share_of_grid
 from .blocks import Block, with_keys
 
 
@@ -110,7 +110,8 @@ class RecordLikelihood(AbstractLikelihood):
         coarse, coarse_variance = self._filtered(key, model, self.coarse, self.coarse_points)
         # The mean of log p̂ is too small by half its variance.
         ratio = coarse - fine + (coarse_variance - variance) / 2
-        return share_of_order(self.records.stacked.density.order) * ratio
+        density, num_steps = self.records.stacked.density, self.records.stacked.num_steps
+        return share_of_grid(density.order, num_steps) * ratio
 
     @property
     def tells_step_error(self):
@@ -124,10 +125,10 @@ class RecordLikelihood(AbstractLikelihood):
         points: Float[Array, "R points d"],
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """log p̂ with its variance."""
-        P = self.num_particles
+        P, moving = self.num_particles, records.moving
 
         def one(problem, key, points):
-            made = run_filters(key, problem, model, guided(problem, model, points), 1, P)
+            made = run_filters(key, problem, model, guided(problem, model, points), (1, P), moving)
             return made.log_estimate[0], made.variance(P)[0]
 
         each = records.each(one, jax.random.split(key, records.number), points)

@@ -218,7 +218,7 @@ def pmmh(
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
 
         def likelihood_near(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
-            coarse = records.halved()
+            coarse = records.coarsened()
             both = linearisations(records, model), coarse, linearisations(coarse, model)
             return RecordLikelihood(records, *both, num_proposals)
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled
-from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
+from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..schemes import StepError, dominates
 from .parameters import Parameters, init_vectors
 
@@ -34,9 +34,8 @@ class AbstractPosterior(eqx.Module):
 
     @property
     def effective_sample_size(self) -> Float[Array, " p"]:
-        """Of each unknown parameter, summed over the chains: to be trusted where `r_hat` says that
-        they agree."""
-        return jnp.sum(jax.vmap(effective_sample_size)(self._chains), axis=0)
+        """Of each unknown parameter, from all chains: few where they disagree."""
+        return effective_size_of_chains(self._chains)
 
     @property
     def r_hat(self) -> Float[Array, " p"]:

@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import all_finite_leaves, nondifferentiable
 from ..engine.compiled import compiled
-from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
+from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.progress import metered_scan
 from ..records import Records, tuned
 from ..schemes import StepError, dominates
@@ -252,7 +252,7 @@ def _summary(
     # Further off the likelihood need not be near its quadratic approximation.
     ok = definite & (gradient @ step < p) & parameters.allowed(rough + step)
     theta = jnp.where(ok, rough + step, rough)
-    size = jnp.sum(jax.vmap(effective_sample_size)(draws.gradient), axis=0)
+    size = effective_size_of_chains(draws.gradient)
     left = covariance @ (spread / jnp.sqrt(size[:, None] * size)) @ covariance
     stuck = jnp.any(completion.movable() & ~jnp.any(draws.taken, axis=1), axis=(1, 2, 3))
     monte_carlo = jnp.sqrt(jnp.diagonal(left))
@@ -286,5 +286,5 @@ def _step_error(
     ratio = (deviation + (deviation**2 - jnp.mean(deviation**2)) / 2)[..., None]
     each = (draws.coarse - draws.gradient + ratio * centred) @ covariance
     each = completion.share_of_step_error * each
-    size = jnp.sum(jax.vmap(effective_sample_size)(each), axis=0)
+    size = effective_size_of_chains(each)
     return StepError(jnp.mean(each, axis=(0, 1)), jnp.std(each, axis=(0, 1)) / jnp.sqrt(size))

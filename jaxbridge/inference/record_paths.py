@@ -29,7 +29,7 @@ from ..records import (
     path_and_log_weight,
     sweep,
 )
-from ..schemes import share_of_order
+from ..schemes import share_of_grid
 from .parameters import Parameters
 
 # Intervals between observations that move at once.
@@ -59,7 +59,7 @@ class RecordPaths(eqx.Module):
     @property
     def share_of_step_error(self) -> float:
         """The step error as a share of what half as many steps change."""
-        return share_of_order(self.fine.records.stacked.density.order)
+        return share_of_grid(self.fine.records.stacked.density.order, self.num_steps)
 
     def first(
         self, key: Key[Array, ""], theta: Float[Array, " p"]
@@ -137,7 +137,7 @@ def as_record_paths(
     """Linearised at θ."""
     model = parameters.bind(theta)
     of = lambda records: GuidedRecords(records, linearisations(records, model))
-    return RecordPaths(parameters, of(records), of(records.halved()))
+    return RecordPaths(parameters, of(records), of(records.coarsened()))
 
 
 def _of_noise(
@@ -156,7 +156,7 @@ def _of_noise(
 
 
 def _of_pairs(noise: Float[Array, "points d"], num_steps: int) -> Float[Array, "points d"]:
-    """The noise of steps of twice the length, as `Record.halved` has them: of each pair of a
+    """The noise of steps of twice the length, as `Record.coarsened` has them: of each pair of a
     segment the second step."""
     odd = num_steps % 2
     segments = noise[1:].reshape(-1, num_steps, noise.shape[-1])

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
@@ -24,7 +25,7 @@ from ..engine.compiled import compiled
 from ..engine.lanes import over_lanes
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
-from ..schemes import AbstractStepDensity, StepError, dominates, share_of_order
+from ..schemes import AbstractStepDensity, StepError, dominates, error_of_grids, num_coarse_grids
 from .cover import calls_for_cover, cover, covered_start
 from .guided_record import Guidance, correction, linearised
 from .guided_steps import guided_step
@@ -37,6 +38,8 @@ from .several import Records, as_record_problems
 
 # Particles are resampled where fewer than this share of them count.
 _FEWEST_EFFECTIVE = 0.5
+# Fewer particles that count, or a larger standard error of a log, tell nothing.
+_FEWEST_TRUSTED, _MOST_SPREAD = 5, 0.5
 
 
 class LogLikelihood(eqx.Module):
@@ -51,7 +54,9 @@ class LogLikelihood(eqx.Module):
         resampling, the mean over the filters, shape (n,).
     - `num_nonfinite`: how many particles left the finite numbers or the state space.
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, from
-        half as many, with a standard error of it, `step_uncertainty`. NaN of one step.
+        half as many; `step_uncertainty` is its Monte Carlo error and what it leaves out, by a
+        quarter as many, infinite where what steps change does not shrink with them. NaN of one
+        step.
     """
 
     value: Float[Array, ""]
@@ -73,6 +78,15 @@ class LogLikelihood(eqx.Module):
         """Whether the step error is beyond the standard error, or not known well enough to say:
         then more steps help, and more particles do not."""
         return dominates(StepError(self.step_error, self.step_uncertainty), self.standard_error)
+
+    @property
+    def trustworthy(self) -> Bool[Array, ""]:
+        """Whether `value` and `standard_error` are to be trusted: particles that count at all
+        observations, filters that agree, so that the delta method holds, and a step error that
+        does not dominate."""
+        counted = jnp.all(self.effective_sample_size >= _FEWEST_TRUSTED)
+        agree = jnp.isfinite(self.value) & (self.standard_error < _MOST_SPREAD)
+        return counted & agree & ~self.step_error_dominates
 
 
 def log_likelihood(
@@ -133,13 +147,16 @@ def log_likelihood(
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     records = as_record_problems(*arguments, num_steps=num_steps, **options)
     size = num_filters, num_particles
+    num_steps = records.stacked.num_steps
+    levels = range(1, 1 + num_coarse_grids(num_steps))
     value, error, fine = _log_mean(key, records, *size)
-    step_error = StepError(*2 * [jnp.full_like(value, jnp.nan)])
-    if records.stacked.num_steps > 1:
-        coarse, coarse_error, _ = _log_mean(key, records.halved(), *size)
-        share = share_of_order(records.stacked.density.order)
-        doubt = share * jnp.sqrt(coarse_error**2 + error**2)
-        step_error = StepError(share * (coarse - value), doubt)
+    coarse = [_log_mean(key, records.coarsened(level), *size)[:2] for level in levels]
+    values, errors = map(jnp.stack, zip((value, error), *coarse, strict=True))
+    # What rounding leaves of the sum over all steps is no change, either.
+    rounding = np.sqrt(records.stacked.record.dt.size) * jnp.finfo(value.dtype).eps
+    rounding = rounding.astype(value.dtype) * jnp.maximum(1, jnp.abs(value))
+    errors = jnp.hypot(errors, rounding)
+    step_error = error_of_grids(values, errors, records.stacked.density.order, num_steps)
     return LogLikelihood(
         value,
         error,
@@ -234,7 +251,11 @@ def _is_poor(size: Float[Array, "..."], num_particles: int) -> Bool[Array, "..."
 @compiled
 def _estimates(key: Key[Array, ""], records: Records, guides: Guidance, R: int, P: int) -> Filtered:
     """Of each record."""
-    filters = lambda problem, key, guide: run_filters(key, problem, problem.model, guide, R, P)
+    moving = records.moving
+
+    def filters(problem, key, guide):
+        return run_filters(key, problem, problem.model, guide, (R, P), moving)
+
     return records.each(filters, jax.random.split(key, records.number), guides)
 
 
@@ -248,9 +269,16 @@ class _Particles(NamedTuple):
 
 
 def run_filters(
-    key: Key[Array, ""], problem: RecordProblem, model: Diffusion, guide: Guidance, R: int, P: int
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    model: Diffusion,
+    guide: Guidance,
+    size: tuple[int, int],
+    moving: Bool[Array, " N"] | None = None,
 ) -> Filtered:
-    """R filters of P particles."""
+    """R filters of P particles. Steps that are known not to be `moving`, whatever the record, take
+    no time."""
+    R, P = size
     d, dtype, values = problem.dim, problem.like.dtype, problem.record.values
     density, dynamics = problem.density, model.forward(problem.like)
 
@@ -269,29 +297,31 @@ def run_filters(
         resample = lambda: _resampled(key, state, poor)
         return lax.cond(jnp.any(poor), resample, lambda: state), size
 
-    def one(state, inputs):
-        x, log_weight = state
-        zeta, step = inputs
-
+    def moved(x, zeta, step, scalars):
         def of_particle(x, zeta):
-            law = guided_step(density, dynamics, x, step, None)
+            law = guided_step(density, dynamics, x, step, scalars)
             return law.point(zeta), law.log_weight
 
-        x, change = over_lanes(-1, -1)(of_particle)(x, zeta)
-        return (x, log_weight + change), None
+        return over_lanes(-1, -1)(of_particle)(x, zeta)
+
+    def one(state, inputs):
+        zeta, step, moves = inputs
+
+        def taken(x, log_weight):
+            x, change = moved(x, zeta, step, None)
+            return x, log_weight + change
+
+        if moves is None:
+            return taken(*state), None
+        return lax.cond(moves, taken, lambda *state: state, *state), None
 
     def segment(state: _Particles, inputs):
         number, steps, scalars, y = inputs
         noise_key, resampling_key = jax.random.split(jax.random.fold_in(key, number))
         noise = jax.random.normal(noise_key, (problem.num_steps, d, R * P), dtype)
-        before, (zeta, last) = split_last((noise, steps))
+        before, (zeta, last, _) = split_last((noise, steps, moving))
         (x, change), _ = lax.scan(one, (state.x, jnp.zeros(R * P, dtype)), before)
-
-        def of_particle(x, zeta):
-            law = guided_step(density, dynamics, x, last, scalars)
-            return law.point(zeta), law.log_weight
-
-        x, final = over_lanes(-1, -1)(of_particle)(x, zeta)
+        x, final = moved(x, zeta, last, scalars)
         change = change + final + corrected(y, x)
         return weighed(state._replace(x=x), resampling_key, change)
 
@@ -342,8 +372,8 @@ def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) 
     bounds = jnp.cumsum(weights, axis=1)
     bounds = bounds / jnp.maximum(bounds[:, -1:], jnp.finfo(dtype).tiny)
     chosen = jax.vmap(jnp.searchsorted)(bounds, positions)
-    chosen = jnp.where(poor[:, None], jnp.minimum(chosen, P - 1), jnp.arange(P))
-    lanes = (jnp.arange(R)[:, None] * P + chosen).ravel()
+    chosen = jnp.where(poor[:, None], jnp.minimum(chosen, P - 1), jnp.arange(P, dtype=chosen.dtype))
+    lanes = (jnp.arange(R, dtype=chosen.dtype)[:, None] * P + chosen).ravel()
     log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
     # Where no particle is left there is nothing to go on with: the estimate is zero.
     level = jnp.where(poor, log_mean, 0)

@@ -1,7 +1,5 @@
 """What is asked of a record: the model, what was seen and how, and where it began."""
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -44,10 +42,6 @@ class RecordProblem(eqx.Module):
     def like(self) -> Float[Array, " d"]:
         """A point, of which only shape and dtype count."""
         return jnp.zeros(self.dim, self.record.dt.dtype)
-
-    def halved(self) -> "RecordProblem":
-        """The same with half as many steps."""
-        return dataclasses.replace(self, record=self.record.halved())
 
     def scalars(self, model: Diffusion) -> Scalars:
         """What is seen at the ends of segments, with a leading axis K + 1."""

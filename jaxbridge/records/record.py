@@ -58,13 +58,15 @@ class Record(eqx.Module):
         within = jnp.cumsum(self.dt, axis=1) - self.dt
         return jnp.append((self.times[:-1, None] + within).ravel(), self.times[-1])
 
-    def halved(self) -> "Record":
-        """The same with half as many steps, for programs that are compiled for N: of each pair the
-        first has length zero, so that the last of a segment has noise to be seen exactly."""
-        odd = self.num_steps % 2
-        both = self.dt[:, odd::2] + self.dt[:, odd + 1 :: 2]
-        pairs = jnp.stack([jnp.zeros_like(both), both], axis=-1).reshape(len(self.dt), -1)
-        return dataclasses.replace(self, dt=jnp.concatenate([self.dt[:, :odd], pairs], axis=1))
+    def coarsened(self, level: int = 1) -> "Record":
+        """The same with steps that are 2^level as long, the first of a segment what is left of N,
+        for programs that are compiled for N: of each the last of its parts has the length and the
+        others have none, so that the last of a segment has noise to be seen exactly."""
+        size = 2**level
+        left_out = -self.num_steps % size
+        parts = jnp.pad(self.dt, ((0, 0), (left_out, 0))).reshape(len(self.dt), -1, size)
+        dt = jnp.zeros_like(parts).at[..., -1].set(jnp.sum(parts, axis=-1))
+        return dataclasses.replace(self, dt=dt.reshape(len(self.dt), -1)[:, left_out:])
 
 
 def as_records(

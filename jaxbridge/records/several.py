@@ -12,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.checks import Numbers
 from ..models.diffusion import Diffusion
@@ -36,10 +36,15 @@ class Records(eqx.Module):
         """R."""
         return len(self.num_times)
 
-    def halved(self) -> "Records":
-        """The same with half as many steps."""
-        record = jax.vmap(lambda record: record.halved())(self.stacked.record)
+    def coarsened(self, level: int = 1) -> "Records":
+        """The same with steps that are 2^level as long."""
+        record = jax.vmap(lambda record: record.coarsened(level))(self.stacked.record)
         return Records(dataclasses.replace(self.stacked, record=record), self.num_times)
+
+    @property
+    def moving(self) -> Bool[Array, " N"]:
+        """Which steps of a segment have a length in any of the records: others are left out."""
+        return jnp.any(self.stacked.record.dt > 0, axis=(0, 1))
 
     def each(self, function: Callable, *mapped: PyTree) -> Any:
         """`function(problem, *mapped)` of each record, with their axis in front of what is mapped

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.averages import PathFunction
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled
-from ..engine.diagnostics import effective_sample_size, potential_scale_reduction
+from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
@@ -22,6 +22,9 @@ from .observation import Observation
 from .path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep, tuned
 from .problem import RecordProblem, as_record_problem
 from .states import sample_states
+
+# R̂ beyond which chains disagree.
+_MOST_R_HAT = 1.1
 
 
 class Smoothed(eqx.Module):
@@ -51,27 +54,32 @@ class Smoothed(eqx.Module):
         """The Monte Carlo error of `mean(fn)`, entry by entry."""
 
         def error(leaf):
-            made = jnp.std(leaf, axis=(0, 1)) / jnp.sqrt(_effective(leaf))
+            made = jnp.std(leaf, axis=(0, 1)) / jnp.sqrt(effective_size_of_chains(leaf))
             return jnp.where(jnp.any(self.stuck), jnp.inf, made)
 
         return jax.tree.map(error, self._values(fn))
 
     def effective_sample_size(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """How many independent draws of `fn(path)` these are worth, entry by entry."""
-        return jax.tree.map(_effective, self._values(fn))
+        """How many independent draws of `fn(path)` these are worth, entry by entry: few where
+        chains disagree, as where each found one of two wells."""
+        return jax.tree.map(effective_size_of_chains, self._values(fn))
 
     def r_hat(self, fn: PathFunction = lambda path: path) -> PyTree:
         """R̂ of `fn(path)`, from the halves of all chains: near one if they agree."""
         return jax.tree.map(potential_scale_reduction, self._values(fn))
 
+    @property
+    def trustworthy(self) -> Bool[Array, ""]:
+        """Whether means of the path, with their errors, are to be trusted: no block that never
+        moved, no weight cut off, and chains that agree at all points."""
+        moves = jnp.var(self.paths, axis=(0, 1)) > 0
+        agree = jnp.all((self.r_hat() < _MOST_R_HAT) | ~moves)
+        return agree & ~jnp.any(self.stuck) & (self.num_truncated == 0)
+
     def _values(self, fn: PathFunction) -> PyTree:
         return jax.tree.map(
             lambda leaf: jnp.asarray(leaf, self.paths.dtype), jax.vmap(jax.vmap(fn))(self.paths)
         )
-
-
-def _effective(values: Float[Array, "chains n ..."]) -> Float[Array, "..."]:
-    return jnp.sum(jax.vmap(effective_sample_size)(values), axis=0)
 
 
 def smooth(

@@ -8,7 +8,7 @@ points fit is checked (`fit`); by default it is the one that the scene calls for
 (`heun_or_euler`). The density of a step, N(μ(x), δ σ S σᵀ) (`step_density`), makes the
 likelihood of a path, Σ log q(x_i, x_{i+1}) (`path_likelihood`). The same of every other point says
 what half as many steps would give (`halving`), and so how far N steps are from the limit
-(`step_error`).
+(`step_error`); or estimates on coarser and coarser grids do (`coarse_grids`).
 """
 
 # What the folders above use of this one.
@@ -16,6 +16,11 @@ from .base import (
     AbstractScheme as AbstractScheme,
     fitted_in_lanes as fitted_in_lanes,
     steps_in_lanes as steps_in_lanes,
+)
+from .coarse_grids import (
+    error_of_grids as error_of_grids,
+    num_coarse_grids as num_coarse_grids,
+    share_of_grid as share_of_grid,
 )
 from .euler import Euler as Euler
 from .fit import check_model as check_model

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
+from jaxbridge.engine.diagnostics import effective_size_of_chains
 
 
 @pytest.mark.slow
@@ -40,3 +41,25 @@ def test_chains_that_agree_have_r_hat_near_one():
 def test_chains_that_do_not_move():
     assert jb.effective_sample_size(np.ones(100)) == 1
     assert np.isnan(jb.effective_sample_size(np.full(100, np.nan)))
+
+
+def test_chains_that_disagree_are_worth_few_draws():
+    """In two wells, two draws and not four thousand; where they agree, as those of the library
+    that counts alike, and what each is worth by itself."""
+    rng = np.random.default_rng(0)
+    noise, draws = rng.normal(size=(4, 2000)), np.zeros((4, 2000))
+    for i in range(1, 2000):
+        draws[:, i] = 0.7 * draws[:, i - 1] + noise[:, i]
+    together = jnp.asarray(draws, jnp.float32)
+    made = effective_size_of_chains(together)
+    np.testing.assert_allclose(made, 8000 * 0.3 / 1.7, rtol=0.15)
+    other = blackjax.diagnostics.effective_sample_size(together)
+    np.testing.assert_allclose(made, other, rtol=0.05)
+    alone = sum(jb.effective_sample_size(chain) for chain in together)
+    np.testing.assert_allclose(made, alone, rtol=0.1)
+    apart = together.at[::2].add(10)
+    assert effective_size_of_chains(apart) < 8
+    np.testing.assert_allclose(
+        effective_size_of_chains(together[:1]), jb.effective_sample_size(together[0])
+    )
+    assert effective_size_of_chains(jnp.ones((3, 10))) == 3

@@ -1,5 +1,7 @@
 """What one filter knows of its own error, and likelihoods of states that were seen exactly."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +21,7 @@ def filters(log_density, num_particles, num_filters=500):
         jb.GaussianLaw([0.0], [[0.5]]), num_steps=4,
     )  # fmt: skip
     guide, size = linearised(problem, MODEL).guide, (num_filters, num_particles)
-    run = jax.jit(lambda key: run_filters(key, problem, MODEL, guide, *size))
+    run = jax.jit(lambda key: run_filters(key, problem, MODEL, guide, size))
     return run(jax.random.key(0))
 
 
@@ -51,3 +53,19 @@ def test_states_seen_exactly():
     error = 4.5 * made.standard_error + np.abs(made.step_error) + 2 * made.step_uncertainty
     assert abs(made.value - exact) < error < 0.2
     assert made.effective_sample_size.shape == (3,)
+
+
+def test_what_is_not_to_be_trusted():
+    good = jb.LogLikelihood(
+        jnp.array(-3.0), jnp.array(0.1), jnp.full(8, -3.0), jnp.full(5, 30.0), jnp.int32(0),
+        jnp.array(0.05), jnp.array(0.02),
+    )  # fmt: skip
+    assert good.trustworthy
+    for change in (
+        {"value": jnp.array(-jnp.inf)},
+        {"standard_error": jnp.array(0.7)},
+        {"effective_sample_size": jnp.array([30.0, 2.0])},
+        {"step_error": jnp.array(0.3)},
+        {"step_uncertainty": jnp.array(jnp.inf)},
+    ):
+        assert not dataclasses.replace(good, **change).trustworthy
