@@ -91,10 +91,11 @@ def _known(end: Float[Array, "P d"]) -> Float[Array, "P d"]:
 def _draw_law(key, model, coupling, end, duration, num_steps) -> SmoothedDraws:
     mine = jnp.arange(NUM_DRAWS) * len(end) // NUM_DRAWS
     # If no burn-in was found it is infinite, and the longest run has to do.
-    keys = jax.random.split(key_for("smoothed draws", key), NUM_DRAWS)
+    draw_key, fit_key = (key_for(f"smoothed draws{which}", key) for which in ("", ", fit"))
+    keys = jax.random.split(draw_key, NUM_DRAWS)
     dt, law = duration[mine] / num_steps, coupling.start_law
     draws = draw_starts(law, model.prepared(), coupling.scheme, keys, end[mine].T, dt, num_steps)
-    return smoothed_draws(draws.T, end[0], model.prepared())
+    return smoothed_draws(fit_key, draws.T, end[0], model.prepared())
 
 
 def measure_burn_in(

@@ -7,8 +7,13 @@ a density serves if it is paid for (`start_laws`), so M runs are enough. Their e
 
 where E has their mean and covariance and elliptical contours, E ∝ (1 - |L⁻¹(x - m)|²/ρ²)^α: near a
 normal law, which serves in many dimensions, where kernels are far between; these serve where there
-is more than one mode. λ is 0, ½ or 1, by what the effective number of draws is that are weighted by
-μ/ν, half of them kept out of the fit.
+is more than one mode. λ and the widths of the kernels are those of a few with the largest effective
+share of weights μ/ν under ν,
+
+    (∫ μ)² / ∫ μ²/ν,
+
+both integrals by draws of μ. Draws of ν would not do: where ν falls off fast and μ does not the
+weights are large, and seldom seen.
 
 Draws of μ cost nothing, and what rests on it is exact whether or not the runs have forgotten where
 they started: that decides how near μ is to ν, and so how many trials a bridge takes. It ends
@@ -21,17 +26,18 @@ import math
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import gammaln
+import numpy as np
+from jax.scipy.special import gammaln, logsumexp
 from jaxtyping import Array, Float, Key
 
-from ..engine.averages import effective_size, normalised
 from ..engine.linalg import any_cholesky, dot, is_finite, solve_lower
 from ..models.diffusion import Diffusion
 
 NUM_DRAWS = 512
 # The variance of K, and α.
 _VARIANCE, _POWER = 1 / 6, 8
-_SHARES = (0.0, 0.5, 1.0)
+# λ, and the widths of kernels beside those of Scott's rule.
+_CANDIDATES = (1.0, 1.0), (0.5, 1.0), (0.5, 0.5), (0.0, 1.0), (0.0, 0.7), (0.0, 0.5), (0.0, 0.35)
 
 
 class SmoothedDraws(eqx.Module):
@@ -70,22 +76,36 @@ class SmoothedDraws(eqx.Module):
 
 
 def smoothed_draws(
-    draws: Float[Array, "M d"], otherwise: Float[Array, " d"], model: Diffusion
+    key: Key[Array, ""],
+    draws: Float[Array, "M d"],
+    otherwise: Float[Array, " d"],
+    model: Diffusion,
 ) -> SmoothedDraws:
     """The law of these draws of ν; those that are not finite give way to a point that is."""
     finite = jnp.all(is_finite(draws), axis=1, keepdims=True)
-    points = jnp.where(finite, draws, otherwise)
-    others, half = points[::2], _fit(points[1::2])
-    log_nu = jax.vmap(model.log_stationary)(others)
+    fit = _fit(jnp.where(finite, draws, otherwise))
 
-    def effective(share):
-        law = eqx.tree_at(lambda law: law.share, half, share)
-        log_ratio = jax.vmap(law.log_density)(others) - log_nu
-        return effective_size(normalised(jnp.where(log_ratio < jnp.inf, log_ratio, -jnp.inf)))
+    def law_of(share, scale):
+        smoother = eqx.tree_at(lambda law: law.widths, fit, scale * fit.widths)
+        return eqx.tree_at(lambda law: law.share, smoother, share)
 
-    shares = jnp.asarray(_SHARES, points.dtype)
-    best = shares[jnp.argmax(jax.vmap(effective)(shares))]
-    return eqx.tree_at(lambda law: law.share, _fit(points), best)
+    shares, scales = np.array(_CANDIDATES).T.astype(fit.mean.dtype)
+    efficiency = lambda share, scale: _log_efficiency(key, law_of(share, scale), model)
+    best = jnp.argmax(jax.vmap(efficiency)(jnp.asarray(shares), jnp.asarray(scales)))
+    return law_of(jnp.asarray(shares)[best], jnp.asarray(scales)[best])
+
+
+def _log_efficiency(key: Key[Array, ""], law: SmoothedDraws, model: Diffusion) -> Float[Array, ""]:
+    """log of (∫ μ)² / ∫ μ²/ν, over where ν > 0."""
+    x = jax.vmap(lambda key: law.sample(key, model))(jax.random.split(key, NUM_DRAWS))
+    log_ratio = jax.vmap(law.log_density)(x) - jax.vmap(lambda x: model.log_stationary(x))(x)
+    inside = jnp.isfinite(log_ratio)
+
+    def log_sum(values):
+        return logsumexp(jnp.where(inside, values, -jnp.inf))
+
+    found = 2 * log_sum(jnp.zeros_like(log_ratio)) - log_sum(log_ratio) - log_sum(-log_ratio)
+    return jnp.where(jnp.any(inside), found, -jnp.inf)
 
 
 def _fit(points: Float[Array, "M d"]) -> SmoothedDraws:
