@@ -17,7 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Inexact, Key, PyTree
+from jaxtyping import Array, Bool, Float, Inexact, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
 from . import decisions
@@ -310,21 +310,34 @@ class Diffusion(eqx.Module):
     ) -> Callable[[Float[Array, " d"]], Float[Array, " d"]]:
         """A drift, NaN outside the state space: a path that steps out is lost with the next step,
         and no bridge ends there."""
-        domain = self._domain
+        inside = self._state_space(params)
 
         def drift(x):
             value = check_value(name, function(x, params), x.shape, x)
-            if domain is None:
-                return value
-            inside = jnp.asarray(domain(x, params))
-            if inside.shape != () or inside.dtype != bool:
-                raise ValueError(
-                    "`domain` must return one truth value, such as `jnp.all(x > 0)`; it returned "
-                    f"shape {inside.shape} and dtype {inside.dtype}."
-                )
-            return jnp.where(inside, value, jnp.nan)
+            return value if inside is None else jnp.where(inside(x), value, jnp.nan)
 
         return drift
+
+    def state_space(self) -> Callable[[Float[Array, " d"]], Bool[Array, ""]] | None:
+        """Whether a point is inside, a function with everything done that does not depend on it;
+        `None` where the state space is all of R^d."""
+        return self._state_space(self._prepared_params())
+
+    def _state_space(self, params: PyTree) -> Callable[[Array], Array] | None:
+        domain = self._domain
+        if domain is None:
+            return None
+
+        def inside(x):
+            value = jnp.asarray(domain(x, params))
+            if value.shape != () or value.dtype != bool:
+                raise ValueError(
+                    "`domain` must return one truth value, such as `jnp.all(x > 0)`; it returned "
+                    f"shape {value.shape} and dtype {value.dtype}."
+                )
+            return value
+
+        return inside
 
     def _prepared_params(self) -> PyTree:
         return self.params if self._prepare is None else self._prepare(self.params)
