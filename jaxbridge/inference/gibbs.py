@@ -100,6 +100,10 @@ class GibbsPosterior(AbstractPosterior):
     completion: Augmentation
     exact_parameters: bool = eqx.field(static=True)
 
+    @property
+    def _stuck(self):
+        return False
+
 
 def gibbs(
     key: Key[Array, ""],

@@ -124,6 +124,10 @@ class PMMHPosterior(AbstractPosterior):
     num_truncated: Int[Array, "*chains"]
     state: PMMHState
 
+    @property
+    def _stuck(self):
+        return False
+
 
 def pmmh(
     key: Key[Array, ""],

@@ -1,5 +1,6 @@
 """Draws from a posterior, and how far to trust them."""
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -29,6 +30,11 @@ class AbstractPosterior(eqx.Module):
     log_step_error: eqx.AbstractVar[Float[Array, "*chains n"]]
 
     @property
+    @abstractmethod
+    def _stuck(self) -> Bool[Array, "*chains"] | bool:
+        """Whether a path that is drawn with them never moved."""
+
+    @property
     def _chains(self) -> Float[Array, "chains n p"]:
         return self.theta if self.theta.ndim == 3 else self.theta[None]
 
@@ -56,10 +62,11 @@ class AbstractPosterior(eqx.Module):
 
     @property
     def standard_error(self) -> Float[Array, " p"]:
-        """The Monte Carlo error of the posterior mean of each unknown parameter; infinite where it
-        never moved in one of the chains."""
+        """The Monte Carlo error of the posterior mean of each unknown parameter; infinite where it,
+        or a path that is drawn with it, never moved in one of the chains."""
         draws = self.theta.reshape(-1, self.theta.shape[-1])
         moved = jnp.all(jnp.any(self._chains != self._chains[:, :1], axis=1), axis=0)
+        moved &= ~jnp.any(jnp.asarray(self._stuck))
         made = jnp.std(draws, axis=0) / jnp.sqrt(self.effective_sample_size)
         return jnp.where(moved, made, jnp.inf)
 

@@ -65,7 +65,7 @@ class RecordPosterior(AbstractPosterior):
     - `parameters_moved`: whether θ moved, shape (*chains, n).
     - `blocks_moved`: the share of the blocks of the path that moved, shape (*chains, n).
     - `stuck`: whether there is a block that never did, shape (*chains): then the draws are not
-        those of the posterior, whatever their error.
+        those of the posterior, and `standard_error` is infinite.
     - `log_step_error`: an estimate of the step error of the log density of data and noise at each
         draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
         `step_error`, that of the posterior mean, is made of.
@@ -80,6 +80,10 @@ class RecordPosterior(AbstractPosterior):
     stuck: Bool[Array, "*chains"]
     log_step_error: Float[Array, "*chains n"]
     state: RecordState
+
+    @property
+    def _stuck(self):
+        return self.stuck
 
 
 class RecordSampler(eqx.Module):

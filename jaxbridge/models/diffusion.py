@@ -145,15 +145,6 @@ class Diffusion(eqx.Module):
         """log ν(x) up to a constant."""
         return self._log_stationary_function()(as_floating("x", x))
 
-    @property
-    def has_domain(self) -> bool:
-        """Whether the state space is declared to be less than all of R^d."""
-        return self._domain is not None
-
-    def is_inside(self, x: Numbers) -> Bool[Array, ""]:
-        """Whether a point is in the state space, `domain`."""
-        return self._is_inside(as_floating("x", x), self._prepared_params())
-
     def sample_stationary(self, key: Key[Array, ""]) -> Float[Array, " d"]:
         """One draw from ν, shape (d,), by the model's own sampler."""
         if self._sample_stationary is None:
@@ -319,22 +310,33 @@ class Diffusion(eqx.Module):
     ) -> Callable[[Float[Array, " d"]], Float[Array, " d"]]:
         """A drift, NaN outside the state space: a path that steps out is lost with the next step,
         and no bridge ends there."""
+        inside = self._state_space(params)
 
         def drift(x):
             value = check_value(name, function(x, params), x.shape, x)
-            if self._domain is None:
-                return value
-            return jnp.where(self._is_inside(x, params), value, jnp.nan)
+            return value if inside is None else jnp.where(inside(x), value, jnp.nan)
 
         return drift
 
-    def _is_inside(self, x: Float[Array, " d"], params: PyTree) -> Bool[Array, ""]:
-        inside = jnp.asarray(True if self._domain is None else self._domain(x, params))
-        if inside.shape != () or inside.dtype != bool:
-            raise ValueError(
-                "`domain` must return one truth value, such as `jnp.all(x > 0)`; it returned "
-                f"shape {inside.shape} and dtype {inside.dtype}."
-            )
+    def state_space(self) -> Callable[[Float[Array, " d"]], Bool[Array, ""]] | None:
+        """Whether a point is inside, a function with everything done that does not depend on it;
+        `None` where the state space is all of R^d."""
+        return self._state_space(self._prepared_params())
+
+    def _state_space(self, params: PyTree) -> Callable[[Array], Array] | None:
+        domain = self._domain
+        if domain is None:
+            return None
+
+        def inside(x):
+            value = jnp.asarray(domain(x, params))
+            if value.shape != () or value.dtype != bool:
+                raise ValueError(
+                    "`domain` must return one truth value, such as `jnp.all(x > 0)`; it returned "
+                    f"shape {value.shape} and dtype {value.dtype}."
+                )
+            return value
+
         return inside
 
     def _prepared_params(self) -> PyTree:

@@ -1,6 +1,7 @@
 """A whole record, guided: what the steps of its paths need, worked out before any is simulated."""
 
 import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -129,16 +130,23 @@ def corrections(
 ) -> Float[Array, ""]:
     """What the log weight of a path takes where observations are not of their guess, and the
     initial law is not normal."""
-    each = jax.vmap(lambda y, x: correction(problem, model, y, x))
+    each = jax.vmap(correction(problem, model))
     at_observations = each(problem.record.values, path[:: problem.num_steps])
     return jnp.sum(at_observations) + log_ratio(problem.initial, model, guide.initial, path[0])
 
 
 def correction(
-    problem: RecordProblem, model: Diffusion, y: Float[Array, " m"], x: Float[Array, " d"]
-) -> Float[Array, ""]:
-    """What the log weight takes where an observation is not of its guess."""
-    return problem.observation.correction(y, x, model.params)
+    problem: RecordProblem, model: Diffusion
+) -> Callable[[Float[Array, " m"], Float[Array, " d"]], Float[Array, ""]]:
+    """What the log weight takes where an observation is not of its guess, a function of it and of
+    the state; NaN outside the state space, for of the last state no drift is asked."""
+    inside = model.state_space()
+
+    def of(y, x):
+        value = problem.observation.correction(y, x, model.params)
+        return value if inside is None else jnp.where(inside(x), value, jnp.nan)
+
+    return of
 
 
 class Linearised(NamedTuple):

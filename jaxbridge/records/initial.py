@@ -71,9 +71,10 @@ def check_initial(initial: Initial, model: Diffusion, like: Float[Array, " d"]) 
         return
     jax.eval_shape(lambda model: initial_law(initial, model, like), model)
     point = bound(initial, model)
-    if isinstance(point, GaussianLaw) or not model.has_domain or is_traced(point, model):
+    if isinstance(point, GaussianLaw) or is_traced(point, model):
         return
-    if not model.is_inside(point):
+    inside = model.state_space()
+    if inside is not None and not inside(jnp.asarray(point, like.dtype)):
         raise ValueError(f"`initial` = {point} is outside the model's `domain`.")
 
 

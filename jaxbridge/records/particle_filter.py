@@ -281,9 +281,7 @@ def run_filters(
     R, P = size
     d, dtype, values = problem.dim, problem.like.dtype, problem.record.values
     density, dynamics = problem.density, model.forward(problem.like)
-
-    def corrected(y, x):
-        return jax.vmap(lambda x: correction(problem, model, y, x), in_axes=-1)(x)
+    corrected = jax.vmap(correction(problem, model), in_axes=(None, -1))
 
     def weighed(state: _Particles, key, change) -> tuple[_Particles, Float[Array, " R"]]:
         """With what came to the weights, resampled where that is called for."""

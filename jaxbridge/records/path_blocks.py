@@ -242,9 +242,8 @@ def move(
     new_starts, log_start = over_lanes(*9 * [-1])(of_start)(*arguments, rho, beta)
     new_starts = jnp.where(is_first, new_starts, starts)
 
-    def corrected(y, x):
-        each = jax.vmap(lambda y, x: correction(problem, model, y, x), in_axes=-1)
-        return each(spread(y), x)
+    each_corrected = jax.vmap(correction(problem, model), in_axes=-1)
+    corrected = lambda y, x: each_corrected(spread(y), x)
 
     def at_start(x):
         ratio = jax.vmap(lambda x: log_ratio(problem.initial, model, initial, x), in_axes=-1)(x)

@@ -159,7 +159,8 @@ def check_domain(model: Diffusion, observation: Observation, record: Record) -> 
     """Raise `ValueError` where a state that was seen whole and without noise is none of the
     model's."""
     d, seen = record.values.shape[-1], record.values[record.which]
-    if not (model.has_domain and isinstance(observation, LinearGaussian)):
+    is_inside = model.state_space()
+    if is_inside is None or not isinstance(observation, LinearGaussian):
         return
     if is_traced(model, observation, seen):
         return
@@ -169,7 +170,7 @@ def check_domain(model: Diffusion, observation: Observation, record: Record) -> 
         return
     whole = np.all(np.isfinite(np.asarray(seen)), axis=1)
     states = np.linalg.solve(matrix, np.where(whole[:, None], seen, 0).T).T
-    inside = jax.vmap(model.is_inside)(jnp.asarray(states, seen.dtype))
+    inside = jax.vmap(is_inside)(jnp.asarray(states, seen.dtype))
     outside = np.flatnonzero(whole & ~np.asarray(inside))
     if outside.size:
         raise ValueError(

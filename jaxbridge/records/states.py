@@ -46,6 +46,7 @@ from ..proposals import (
     best_at_worst,
     resolve,
 )
+from .guided_record import correction
 from .initial import bound
 from .observation import Scalars, log_density_of
 from .path_blocks import tuned
@@ -95,14 +96,15 @@ class StateSampler(eqx.Module):
 
     def log_target(self, x: Float[Array, "C ends d"]) -> Float[Array, "C ends"]:
         """log g(y_k|x_k), and of the first state its law."""
-        params, values = self.model.params, self.problem.record.values
+        problem, values = self.problem, self.problem.record.values
+        corrected = correction(problem, problem.model)
 
         def seen(scalars, y, x):
-            return log_density_of(scalars, x) + self.problem.observation.correction(y, x, params)
+            return log_density_of(scalars, x) + corrected(y, x)
 
         of_chain = jax.vmap(seen)
         logs = jax.vmap(lambda x: of_chain(self.scalars, values, x))(x)
-        law = bound(self.problem.initial, self.model)
+        law = bound(problem.initial, problem.model)
         if isinstance(law, Stationary):
             logs = logs.at[:, 0].add(jax.vmap(self.model.log_stationary)(x[:, 0]))
         elif isinstance(law, GaussianLaw):
@@ -228,7 +230,7 @@ def sample_states(
     intervals = Intervals(first[0, :-1], first[0, 1:], durations)
     pilot_key = key_for("states", key)
     laws = _normal_laws(pilot_key, problem, scalars, intervals)
-    proposal = _prepared(pilot_key, problem, proposal, laws)
+    proposal = _prepared(pilot_key, problem, proposal, laws, first[0])
     proposal = proposal.of(np.tile(np.arange(K), len(guided)))  # all chains alike
     assert isinstance(proposal, AbstractWeightedProposal)
     point = not isinstance(bound(problem.initial, model), Stationary | GaussianLaw)
@@ -276,13 +278,20 @@ def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars)
 
 
 def _prepared(
-    key: Key[Array, ""], problem: RecordProblem, proposal: AbstractProposal, laws: NormalLaws
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    proposal: AbstractProposal,
+    laws: NormalLaws,
+    guided: Float[Array, "ends d"],
 ) -> AbstractProposal:
     """The proposal for the segments of one chain. "auto" tries each between several states that
-    may be its ends: what is best between two in one well may be useless between two wells."""
+    may be its ends: what is best between two in one well may be useless between two wells. In the
+    place of what is outside the state space are those of a guided path."""
     model, num_steps, (ends, d) = problem.model, problem.num_steps, laws.mean.shape
     noise = jax.random.normal(key, (ends, _NUM_PILOTS, d), laws.mean.dtype)
     x = laws.mean[:, None] + jnp.einsum("kij,knj->kni", laws.root, noise)
+    if (inside := model.state_space()) is not None:
+        x = jnp.where(jax.vmap(jax.vmap(inside))(x)[..., None], x, guided[:, None])
     durations = jnp.repeat(problem.record.durations, _NUM_PILOTS)
     pilots = Intervals(x[:-1].reshape(-1, d), x[1:].reshape(-1, d), durations)
     one_each = jax.tree.map(lambda leaf: leaf[::_NUM_PILOTS], pilots)

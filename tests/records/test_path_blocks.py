@@ -63,5 +63,10 @@ def test_parameters_that_never_moved_have_no_error():
     theta = jax.random.normal(jax.random.key(0), (2, 50, 2)).at[1, :, 1].set(0.3)
     moved, share = jnp.ones((2, 50), bool), jnp.ones((2, 50))
     state = RecordState(theta[:, 0], *4 * [share[:, :0]])
-    posterior = RecordPosterior(theta, theta, ("a", "b"), moved, share, moved[:, 0], share, state)
-    assert 0 < posterior.standard_error[0] < 1 and posterior.standard_error[1] == np.inf
+
+    def error(stuck):
+        draws = (theta, theta, ("a", "b"), moved, share, jnp.asarray(stuck), share, state)
+        return RecordPosterior(*draws).standard_error
+
+    assert 0 < error([False, False])[0] < 1 and error([False, False])[1] == np.inf
+    assert np.all(error([False, True]) == np.inf)

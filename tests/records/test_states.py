@@ -77,6 +77,25 @@ def test_gaps_are_known_after_a_long_time():
     np.testing.assert_allclose(paths(45_000.0), paths(0.0), atol=1e-5)
 
 
+def test_states_stay_in_the_state_space():
+    """The last one as well, of which no bridge begins; and what was seen is a function of the
+    parameters as they are, not as they were prepared."""
+    model = jb.Diffusion(
+        lambda x, p: p[0] - x, params={"level": 0.2, "noise": 1.0}, domain=lambda x, p: x[0] > p[1],
+        prepare=lambda params: (params["level"], -0.1 + 0 * params["noise"]),
+        sample_stationary=lambda key, p: 0.2 + jax.random.normal(key, (1,)) / jnp.sqrt(2),
+    )  # fmt: skip
+    seen = jb.ObservationDensity(
+        lambda y, x, params: -((y[0] - x[0]) ** 2) / params["noise"], jb.LinearGaussian(None, 0.5)
+    )
+    made = jb.smooth(
+        KEY, model, [0.0, 0.5, 1.0], np.full((3, 1), -0.5), observation=seen, num_steps=2,
+        initial=lambda params: [params["level"]], num_draws=100, num_warmup=20, num_chains=2,
+        num_proposals=2, proposal=jb.ModifiedDiffusionBridge(),
+    )  # fmt: skip
+    assert np.all(made.paths > -0.1) and not np.any(made.stuck)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "proposal",
