@@ -33,11 +33,12 @@ def start_share(
     law = cover(model, guide.initial)
     h = jax.tree.map(lambda leaf: leaf[0, 0], guide.steps.h)
     start = covered_start(law, guide.first, points[0], h)
+    of_first = correction(problem, model)
     positions = (jnp.arange(_NUM_DRAWS, dtype=dtype) + 0.5) / _NUM_DRAWS
     zeta = jax.random.normal(jax.random.key(0), (problem.dim, _NUM_DRAWS), dtype)
 
     def both(x):
-        seen = correction(problem, model, problem.record.values[0], x)
+        seen = of_first(problem.record.values[0], x)
         to_cover = log_nu(x) - law.log_density(x) + start.log_weight
         to_normal = log_ratio(problem.initial, model, guide.initial, x) + guide.start.log_weight
         return proper(seen + to_cover), proper(seen + to_normal)
