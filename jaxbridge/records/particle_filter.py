@@ -25,10 +25,10 @@ from ..engine.lanes import over_lanes
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity, StepError, dominates, share_of_order
-from .cover import calls_for_cover, cover, covered_start
+from .cover import cover, covered_start
 from .guided_record import Guidance, correction, linearised
 from .guided_steps import guided_step
-from .initial import Initial, log_ratio
+from .initial import Initial, calls_for_cover, log_ratio
 from .observation import Observation
 from .problem import RecordProblem
 from .record import of_each, split_records

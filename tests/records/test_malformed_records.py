@@ -42,7 +42,7 @@ def test_kinds_of_things(unchecked):
 CASES = {
     "matrix for another state": (
         dict(observation=jb.LinearGaussian([[1.0, 0.0, 0.0]], 0.1), values=VALUES[:, :1]),
-        "`initial` must be a point of shape",
+        r"`matrix` must have shape \(1, 2\)",
     ),
     "other components": (
         dict(observation=jb.LinearGaussian([[1.0, 0.0]], 0.1)),
