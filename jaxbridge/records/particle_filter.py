@@ -253,14 +253,17 @@ def run_filters(
     """R filters of P particles."""
     d, dtype, values = problem.dim, problem.like.dtype, problem.record.values
     density, dynamics = problem.density, model.forward(problem.like)
+    most = 0.01 / jnp.finfo(dtype).eps
 
     def corrected(y, x):
         return jax.vmap(lambda x: correction(problem, model, y, x), in_axes=-1)(x)
 
     def weighed(state: _Particles, key, change) -> tuple[_Particles, Float[Array, " R"]]:
         """With what came to the weights, resampled where that is called for."""
-        log_weight = state.log_weight + change.reshape(R, P)
-        finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & (log_weight < jnp.inf)
+        change = change.reshape(R, P)
+        log_weight = state.log_weight + change
+        # Of a path that has exploded h is so small that what it is divided by is lost to rounding.
+        finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & (change < most)
         log_weight = jnp.where(finite, log_weight, -jnp.inf)
         lost = jnp.sum(~finite & (state.log_weight > -jnp.inf), axis=1, dtype=jnp.int32)
         size = effective_size(normalised(log_weight))
@@ -297,11 +300,9 @@ def run_filters(
 
     start_key, resampling_key = jax.random.split(jax.random.fold_in(key, 0))
     x, change = _starts(start_key, problem, model, guide, R, P)
-    zero = jnp.zeros(R, dtype)
-    state = _Particles(x, jnp.zeros((R, P), dtype), zero, jnp.zeros(R, jnp.int32))
+    state = _Particles(x, *(jnp.zeros(n, dtype) for n in [(R, P), R]), jnp.zeros(R, jnp.int32))
     state, first = weighed(state, resampling_key, change + corrected(values[0], x))
-    numbers = 1 + jnp.arange(problem.num_segments)
-    inputs = (numbers, guide.steps, guide.scalars, values[1:])
+    inputs = (1 + jnp.arange(problem.num_segments), guide.steps, guide.scalars, values[1:])
     state, sizes = lax.scan(segment, state, inputs)
     log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
     sizes = jnp.concatenate([first[None], sizes]).T
