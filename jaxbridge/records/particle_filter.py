@@ -300,7 +300,8 @@ def run_filters(
 
     start_key, resampling_key = jax.random.split(jax.random.fold_in(key, 0))
     x, change = _starts(start_key, problem, model, guide, R, P)
-    state = _Particles(x, *(jnp.zeros(n, dtype) for n in [(R, P), R]), jnp.zeros(R, jnp.int32))
+    alike, zero = jnp.zeros((R, P), dtype), jnp.zeros(R, dtype)
+    state = _Particles(x, alike, zero, jnp.zeros(R, jnp.int32))
     state, first = weighed(state, resampling_key, change + corrected(values[0], x))
     inputs = (1 + jnp.arange(problem.num_segments), guide.steps, guide.scalars, values[1:])
     state, sizes = lax.scan(segment, state, inputs)
