@@ -24,12 +24,11 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
-from ..coupling import Stationary
 from ..engine.averages import normalised, proper
 from ..engine.linalg import cholesky, is_finite, matmul, matvec, solve_lower
 from ..models.diffusion import Diffusion
 from .guided_steps import GuidedLaw, guided_start
-from .initial import Initial, bound, is_normal, ladder, log_normal
+from .initial import ladder, log_normal
 from .observation import Scalars
 from .tilted_step import Information, NormalStep
 
@@ -87,11 +86,6 @@ def chosen(log_shares: Float[Array, " J"], positions: Float[Array, " n"]):
     bounds = jnp.cumsum(normalised(proper(log_shares)))
     bounds = bounds / jnp.maximum(bounds[-1], jnp.finfo(bounds.dtype).tiny)
     return jnp.minimum(jnp.searchsorted(bounds, positions, side="right"), len(bounds) - 1)
-
-
-def calls_for_cover(initial: Initial, model: Diffusion, like: Float[Array, " d"]) -> bool:
-    """Whether X(t_0) has the law ν, and that is not a normal law."""
-    return isinstance(bound(initial, model), Stationary) and not is_normal(model, like)
 
 
 def cover(model: Diffusion, normal: NormalStep) -> Cover:

@@ -23,7 +23,7 @@ from .guided_steps import (
     solve_root,
 )
 from .information_filter import information_filter
-from .initial import initial_law, log_ratio
+from .initial import calls_for_cover, initial_law, likeliest, log_ratio
 from .linearisation import LinearisedStep, extended_kalman_path, linear_step
 from .observation import Scalars
 from .problem import RecordProblem
@@ -159,16 +159,23 @@ class Linearised(NamedTuple):
 @compiled  # a program of its own, which all who read the record share
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     """Along the path of the extended Kalman filter, and then of the path that is guided without
-    noise. Neither has derivatives."""
+    noise; both begin at a likely point where ν is not normal. Neither has derivatives."""
     model = without_derivatives(model)
     initial = initial_law(problem.initial, model, problem.like)
     dynamics, scalars = model.forward(problem.like), problem.scalars(model)
-    points = extended_kalman_path(problem.density, dynamics, initial, problem.record.dt, scalars)
+    begin = likeliest(problem.initial, model, initial, split_first(scalars)[0])
+    first = initial._replace(mean=begin)
+    points = extended_kalman_path(problem.density, dynamics, first, problem.record.dt, scalars)
     silence = jnp.zeros_like(points)
 
     def again(points):
         guide = guided(problem, model, points)
-        path, _ = path_and_log_weight(problem, model, guide, silence)
+        noise = silence
+        if calls_for_cover(problem.initial, model, problem.like):
+            solve = functools.partial(solve_root, guide.initial.root)
+            hidden = jnp.zeros_like(guide.first.values)
+            noise = silence.at[0].set(guide.start.noise(begin, solve, hidden))
+        path, _ = path_and_log_weight(problem, model, guide, noise)
         return jnp.where(jnp.all(jnp.isfinite(path)), path, points), Linearised(points, guide)
 
     # The guide of the last time round is the one that is wanted.

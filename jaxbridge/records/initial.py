@@ -33,6 +33,7 @@ from ..engine.linalg import (
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
 from ..models.tracing import uses_argument
+from .observation import Scalars, log_density_of
 from .tilted_step import NormalStep
 
 # Of Newton's method for the mode of ν, from the origin.
@@ -124,6 +125,11 @@ def _check_shape(mean: Array, like: Float[Array, " d"]) -> None:
         )
 
 
+def calls_for_cover(initial: Initial, model: Diffusion, like: Float[Array, " d"]) -> bool:
+    """Whether X(t_0) has the law ν, and that is not a normal law."""
+    return isinstance(bound(initial, model), Stationary) and not is_normal(model, like)
+
+
 def is_normal(model: Diffusion, like: Float[Array, " d"]) -> bool:
     """Whether ν is a normal law, seen from whether the second derivatives of log ν depend on the
     point."""
@@ -159,6 +165,21 @@ def ladder(model: Diffusion, mode: NormalStep) -> tuple[Float[Array, "n d"], Flo
     log_laws = -square[:, None] / (2 * widths**2) - d * jnp.log(widths)
     log_nu = jax.vmap(lambda x: model.log_stationary(x))(points)
     return points, proper(log_nu - logsumexp(log_laws, axis=1))
+
+
+def likeliest(
+    initial: Initial, model: Diffusion, normal: NormalStep, scalars: Scalars
+) -> Float[Array, " d"]:
+    """A likely X(t_0), given what is seen of it: the mean of a normal law, or that point of the
+    ladder around ν. In a well, and not between two, as a mean may be."""
+    if not calls_for_cover(initial, model, normal.mean):
+        return normal.mean
+    noisy = scalars._replace(seen=scalars.seen & (scalars.variances > 0))
+    points, _ = ladder(model, normal)
+    log_nu = model.prepared().log_stationary
+    logs = jax.vmap(lambda x: log_nu(x) + log_density_of(noisy, x))(points)
+    best, known = jnp.argmax(proper(logs)), jnp.any(logs > -jnp.inf)
+    return jnp.where(known, points[best], normal.mean)
 
 
 def _at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:

@@ -26,10 +26,10 @@ from ..engine.lanes import over_lanes
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity, StepError, dominates, error_of_grids, num_coarse_grids
-from .cover import calls_for_cover, cover, covered_start
+from .cover import cover, covered_start
 from .guided_record import Guidance, correction, linearised
 from .guided_steps import guided_step
-from .initial import Initial, log_ratio
+from .initial import Initial, calls_for_cover, log_ratio
 from .observation import Observation
 from .problem import RecordProblem
 from .record import of_each, split_records
@@ -282,11 +282,14 @@ def run_filters(
     d, dtype, values = problem.dim, problem.like.dtype, problem.record.values
     density, dynamics = problem.density, model.forward(problem.like)
     corrected = jax.vmap(correction(problem, model), in_axes=(None, -1))
+    most = 0.01 / jnp.finfo(dtype).eps
 
     def weighed(state: _Particles, key, change) -> tuple[_Particles, Float[Array, " R"]]:
         """With what came to the weights, resampled where that is called for."""
-        log_weight = state.log_weight + change.reshape(R, P)
-        finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & (log_weight < jnp.inf)
+        change = change.reshape(R, P)
+        log_weight = state.log_weight + change
+        # Of a path that has exploded h is so small that what it is divided by is lost to rounding.
+        finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & (change < most)
         log_weight = jnp.where(finite, log_weight, -jnp.inf)
         lost = jnp.sum(~finite & (state.log_weight > -jnp.inf), axis=1, dtype=jnp.int32)
         size = effective_size(normalised(log_weight))
@@ -325,11 +328,10 @@ def run_filters(
 
     start_key, resampling_key = jax.random.split(jax.random.fold_in(key, 0))
     x, change = _starts(start_key, problem, model, guide, R, P)
-    zero = jnp.zeros(R, dtype)
-    state = _Particles(x, jnp.zeros((R, P), dtype), zero, jnp.zeros(R, jnp.int32))
+    alike, zero = jnp.zeros((R, P), dtype), jnp.zeros(R, dtype)
+    state = _Particles(x, alike, zero, jnp.zeros(R, jnp.int32))
     state, first = weighed(state, resampling_key, change + corrected(values[0], x))
-    numbers = 1 + jnp.arange(problem.num_segments)
-    inputs = (numbers, guide.steps, guide.scalars, values[1:])
+    inputs = (1 + jnp.arange(problem.num_segments), guide.steps, guide.scalars, values[1:])
     state, sizes = lax.scan(segment, state, inputs)
     log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
     sizes = jnp.concatenate([first[None], sizes]).T

@@ -13,9 +13,9 @@ from jaxtyping import Array, Float
 from ..engine.averages import proper
 from ..engine.compiled import compiled
 from ..models.diffusion import Diffusion
-from .cover import calls_for_cover, cover, covered_start
+from .cover import cover, covered_start
 from .guided_record import correction, guided
-from .initial import log_ratio
+from .initial import calls_for_cover, log_ratio
 from .problem import RecordProblem
 
 _NUM_DRAWS = 1024
