@@ -3,7 +3,6 @@
 import functools
 
 import blackjax.util
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +10,6 @@ import pytest
 from helpers import (
     PAPER_CASES,
     assert_chain_moments,
-    count_compilations,
     exact_case,
     exact_cases,
     paper_model,
@@ -137,25 +135,6 @@ def test_segments_of_hard_bridges_are_mended_to_one_chain():
     np.testing.assert_allclose(chain.paths, states.position[:, [5, 10]], atol=1e-5)
 
 
-@pytest.mark.parametrize("method", ["pseudo_marginal", pytest.param("renewal", marks=slow)])
-@pytest.mark.slow
-def test_several_intervals_are_several_chains(method):
-    model = paper_model()
-    starts, ends = jnp.array([[0.3, 0.1], [0.785, 0.785]]), jnp.array([[0.0, 0.5], [1.0, 1.0]])
-    durations = jnp.array([1.0, 1.5])
-    options = dict(num_bridges=150, num_steps=20, proposal=jb.Coupling(0.5), method=method)
-    key = jax.random.key(0)
-    both = jb.sample_exact_bridges(key, model, starts, ends, durations, **options)
-    assert both.paths.shape == (2, 150, 21, 2) and both.times.shape == (2, 21)
-    assert both.acceptance_rate.shape == (2,)
-    kernel = getattr(jb, method)(
-        model, starts[1], ends[1], durations[1], num_steps=20, proposal=jb.Coupling(0.5)
-    )
-    run = jax.jit(functools.partial(run_kernel, kernel), static_argnums=1)
-    states, _ = run(jax.random.fold_in(key, 1), 150)
-    np.testing.assert_allclose(both.paths[1], states.position, atol=1e-5)
-
-
 @pytest.mark.parametrize("method", [pytest.param("pseudo_marginal", marks=slow), "renewal"])
 @pytest.mark.slow
 def test_blackjax_runs_the_kernels(method):
@@ -261,39 +240,3 @@ def test_cut_off_counts_are_flagged():
     )
     assert chain.truncated.any() and chain.met.all()
     assert np.isfinite(chain.log_weights).all() and np.isfinite(chain.paths).all()
-
-
-@pytest.mark.slow
-def test_numbers_change_without_compiling_again():
-    model = paper_model()
-
-    def run(seed, value):
-        return jb.sample_exact_bridges(
-            jax.random.key(seed),
-            model,
-            jnp.array([value, 0.0]),
-            jnp.array([0.0, value]),
-            1.0 + value,
-            num_bridges=50,
-            proposal=jb.Coupling(value),
-            max_trials=500 + seed,
-            max_proposals=1000 + seed,
-        )
-
-    run(0, 0.1)
-    with count_compilations() as compiled:
-        jax.block_until_ready(run(1, 0.2).paths)
-    assert len(compiled) == 0
-
-
-@pytest.mark.slow
-def test_progress_is_shown(capfd):
-    meter = diffrax.TextProgressMeter(minimum_increase=0.2)
-    for method in ("pseudo_marginal", "renewal"):
-        chain = jb.sample_exact_bridges(
-            jax.random.key(0), *ARGUMENTS, num_bridges=200, method=method, progress_meter=meter
-        )
-        jax.block_until_ready(chain.paths)
-        jax.effects_barrier()
-        printed = capfd.readouterr().out
-        assert "0.00%" in printed and "100.00%" in printed

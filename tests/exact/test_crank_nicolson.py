@@ -3,7 +3,6 @@
 import functools
 
 import blackjax.util
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -154,13 +153,3 @@ def test_several_intervals_have_chains_of_their_own():
     np.testing.assert_allclose(chains.paths[1, :, 1], alone.paths[:, 5], atol=1e-5)
     # Weights of a linear process are equal, so every move is accepted.
     assert (chains.acceptance_rate > 0.99).all()
-
-
-@pytest.mark.slow
-def test_progress_is_shown(capfd):
-    jb.sample_exact_bridges(
-        jax.random.key(0), *HARD, num_bridges=20, num_steps=5,
-        method="crank_nicolson", progress_meter=diffrax.TextProgressMeter(),
-    )  # fmt: skip
-    jax.effects_barrier()
-    assert "100.00%" in capfd.readouterr().out

@@ -7,7 +7,6 @@ import pytest
 from helpers import (
     PAPER_CASES,
     assert_weighted_moments,
-    count_compilations,
     exact_case,
     exact_cases,
     paper_model,
@@ -200,24 +199,3 @@ def test_double_precision():
             )
             assert chain.paths.dtype == chain.log_weights.dtype == point
             assert chain.num_simulated.dtype == "int32"
-
-
-@pytest.mark.slow
-def test_numbers_change_without_compiling_again():
-    model = paper_model()
-
-    def run(seed, gamma, mean, scale):
-        coupling = jb.Coupling(gamma, start_law=jb.GaussianLaw([mean, 0.0], scale * jnp.eye(2)))
-        B = scale * jnp.array([[1.5, 1.0], [1.0, 1.5]])
-        changed = model.with_params(model.params._replace(B=B))
-        key = jax.random.key(seed)
-        bridges = jb.sample_bridges(
-            key, changed, [mean, 0.0], [0.0, mean], scale, num_bridges=50, coupling=coupling
-        )
-        return jb.weigh_bridges(key, changed, bridges, max_trials=1000 + seed)
-
-    run(0, 0.5, 0.1, 1.0)
-    with count_compilations() as compiled:
-        jax.block_until_ready(run(1, 0.3, 0.2, 1.1).log_weights)
-    # Model and laws are built from new numbers by small programs of their own.
-    assert len([seconds for seconds in compiled if seconds > 0.5]) == 0

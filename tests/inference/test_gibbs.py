@@ -138,20 +138,6 @@ def test_chains_start_where_they_are_told_and_go_on():
     np.testing.assert_array_equal(more.theta, again.theta)
 
 
-@SLOW
-def test_a_chain_is_the_same_alone_inside_jit_and_vmap():
-    options = dict(OPTIONS, num_steps=8, proposal=jb.Coupling(0.5), num_iterations=20)
-    data = jnp.stack([jnp.asarray(ou_data(seed, TIMES)) for seed in (3, 4)])
-
-    def run(key, data):
-        return jb.gibbs(key, ou_1d(), TIMES, data, **options).theta
-
-    keys = jax.random.split(jax.random.key(0), 2)
-    alone = run(keys[1], data[1])
-    np.testing.assert_allclose(jax.jit(run)(keys[1], data[1]), alone, rtol=1e-3)
-    np.testing.assert_allclose(jax.jit(jax.vmap(run))(keys, data)[1], alone, rtol=1e-3)
-
-
 @pytest.mark.slow
 def test_intervals_of_many_lengths():
     """No step is longer than asked, in however few programs (`tests/inference/test_data.py`)."""
