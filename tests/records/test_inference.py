@@ -11,6 +11,7 @@ from scipy.optimize import minimize
 
 import jaxbridge as jb
 from jaxbridge.engine.checks import nondifferentiable
+from jaxbridge.engine.diagnostics import effective_size_of_chains
 from jaxbridge.records import (
     as_record_problem,
     linearised,
@@ -120,6 +121,41 @@ def test_rate_sigma_and_noise_are_found(method):
     np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error + 0.02 * sd)
     np.testing.assert_array_less(error, 0.1 * sd)
     np.testing.assert_allclose(theta.std(0), sd, rtol=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_means_and_sds_of_the_posterior():
+    """Means within .1 sd and sds within 5 %, each of which is 4.5 standard errors or more."""
+    made = jb.gibbs(
+        jax.random.key(2), model(), TIMES, record(), observation=SEEN, prior=log_prior,
+        num_iterations=30_000, num_warmup=2000, num_chains=8, num_steps=5,
+    )  # fmt: skip
+    mean, sd = exact_posterior()
+    squares = (made.theta - mean.astype(np.float32)) ** 2
+    size = np.asarray(effective_size_of_chains(squares))
+    error = np.asarray(jnp.std(squares, axis=(0, 1))) / np.sqrt(size)
+    np.testing.assert_array_less(4.5 * np.asarray(made.standard_error), 0.1 * sd)
+    np.testing.assert_array_less(4.5 * error / (2 * sd**2), 0.05)
+    theta = np.asarray(made.theta).reshape(-1, 3)
+    np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 0.1 * sd)
+    np.testing.assert_allclose(theta.std(0), sd, rtol=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_short_steps_mix_as_well_as_long_ones():
+    """σ and the noise among the parameters: given paths instead of noise it would be N times as
+    slow."""
+    sizes = []
+    for num_steps in (5, 20, 80):
+        made = jb.gibbs(
+            jax.random.key(3), model(), TIMES, record(), observation=SEEN, prior=log_prior,
+            num_iterations=6000, num_warmup=1000, num_chains=4, num_steps=num_steps,
+        )  # fmt: skip
+        assert not made.stuck.any() and (made.r_hat < 1.05).all()
+        sizes.append(made.effective_sample_size)
+    assert np.all(np.max(sizes, axis=0) < 1.5 * np.min(sizes, axis=0)), sizes
 
 
 @pytest.mark.slow

@@ -39,6 +39,7 @@ def test_the_filter_is_kalmans(name):
     assert abs(made.step_error - true) < 0.5 * abs(true)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("along", [[0.0, 1.0], [1.0, -0.5]])
 def test_the_first_state_may_be_known_in_part(along):
     """Known but for a normal number along one direction: the likelihood, and the path's mean."""
@@ -55,6 +56,7 @@ def test_the_first_state_may_be_known_in_part(along):
     np.testing.assert_allclose(paths.paths[:, :, 0] @ fixed, record.mean @ fixed, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_beyond(1, ["four", "plane"]))
 def test_the_filter_is_kalmans_to_many_digits(name, x64):
     """Neither model is reversible; they are seen in part, at unequal times, some not at all."""
@@ -101,6 +103,7 @@ def test_innovations_are_weighted_alike(name):
     np.testing.assert_allclose(paths.times[::10], record.times, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_smoothed_paths_are_those_of_rauch_tung_and_striebel(name):
     record = RECORDS[name]

@@ -24,6 +24,7 @@ NEVER = jb.ObservationDensity(lambda y, x, p: -jnp.inf, GUESS)
 LAW = jb.GaussianLaw([0.0], [[0.5]])
 
 
+@pytest.mark.slow
 def problem_of_length(num, observation=POSITIVE):
     counts = np.resize(COUNTS, (num + 1, 1))
     return as_record_problem(

@@ -19,6 +19,7 @@ LONG = plane(9)
 SHORT = LONG._replace(times=LONG.times[:6] + 1, values=-LONG.values[5::-1])
 
 
+@pytest.mark.slow
 def both():
     times, values = [LONG.times, SHORT.times], [LONG.values, SHORT.values]
     return LONG.model, times, values
@@ -76,6 +77,7 @@ def test_paths_beyond_the_end_of_the_shorter_one_are_nobodys():
         assert np.all(np.abs(ratio - 1) < 4.5 * np.sqrt(2 / chains))
 
 
+@pytest.mark.slow
 def test_records_of_one_shape_may_share_their_times():
     model, times = jb.ornstein_uhlenbeck([[1.0]]), np.arange(3) * 0.5
     values = np.linspace(-0.5, 0.5, 6).reshape(2, 3, 1)

@@ -52,6 +52,7 @@ def test_no_filter_takes_a_negative_variance():
     assert value(-0.5) == (-np.inf, 0)
 
 
+@pytest.mark.slow
 def told(values, initial=POINT):
     return jb.log_likelihood(
         KEY, MODEL, TIMES, values, observation=jb.LinearGaussian(covariance=[0.0, 0.1]),
@@ -72,6 +73,7 @@ def test_a_state_that_is_known_and_seen_exactly():
     assert other.value == -np.inf and other.unexplained == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 3.3])
 def test_numbers_that_follow_from_others(size):
     """Two rows with one noise are one number, if the numbers agree: where a correlation is found to

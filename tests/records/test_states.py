@@ -47,6 +47,7 @@ def assert_agrees(made, mean, sd):
 TIMES = np.array([0.0, 1.5, 2.5, 5.0, 7.0])
 
 
+@pytest.mark.slow
 def test_linear_process():
     """Unequal gaps, nothing seen at one time; steps of the exact transition law."""
     model = jb.ornstein_uhlenbeck(jnp.array([[1.0]]))
@@ -77,6 +78,7 @@ def test_gaps_are_known_after_a_long_time():
     np.testing.assert_allclose(paths(45_000.0), paths(0.0), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_states_stay_in_the_state_space():
     """The last one as well, of which no bridge begins; and what was seen is a function of the
     parameters as they are, not as they were prepared."""

@@ -51,6 +51,7 @@ def record(values):
 RECORDS = [(first, None) for first in (-1.0, 1.0)] + [(-1.0, -0.8, None, 0.3)]
 
 
+@pytest.mark.slow
 def test_both_wells_count():
     """Noise of two sizes, and a beginning in either well: with the normal law at one mode in the
     place of ν the first were told to be too small by 1.5 and 3.6."""
