@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxbridge as jb
 from jaxbridge.inference.record_gibbs import RecordPosterior, RecordState

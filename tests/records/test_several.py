@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from linear_records import plane
 
 import jaxbridge as jb
