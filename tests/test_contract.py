@@ -184,6 +184,8 @@ def test_several_intervals_and_saved_times(name):
     both = DOORS[name](several, save_at=[0.0, 0.5, 1.0])
     assert both.paths.shape == (2, 30, 3, 2) and both.met.shape == (2, 30)
     np.testing.assert_allclose(both.times, several.duration[:, None] * np.array([0, 0.5, 1]))
+    np.testing.assert_array_equal(both.paths[:, :, 0], np.stack(30 * [several.start], 1))
+    np.testing.assert_array_equal(both.paths[:, :, 2], np.stack(30 * [several.end], 1))
     for i in range(2):
         mine = several._replace(
             start=several.start[i], end=several.end[i], duration=several.duration[i]
