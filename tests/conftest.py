@@ -4,10 +4,21 @@ dtypes and warnings as errors."""
 import os
 import pathlib
 import shutil
+import subprocess
 import sys
 import tempfile
 
-from jaxtyping import config as jaxtyping_config, install_import_hook
+# XLA's older way to make kernels takes a third of the time; what it makes is slower for many lanes.
+# A flag that XLA no longer knows would end the process: it is tried in another.
+_FLAGS = "XLA_FLAGS"
+_QUICK = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+if _QUICK not in os.environ.get(_FLAGS, ""):
+    _flags = {_FLAGS: f"{os.environ.get(_FLAGS, '')} {_QUICK}".strip()}
+    _trial = [sys.executable, "-c", "import jax; jax.devices()"]
+    if not subprocess.run(_trial, env={**os.environ, **_flags}, capture_output=True).returncode:
+        os.environ.update(_flags)
+
+from jaxtyping import config as jaxtyping_config, install_import_hook  # noqa: E402
 
 install_import_hook("jaxbridge", "beartype.beartype")
 

@@ -26,7 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import proper
 from ..engine.lanes import over_lanes
@@ -177,6 +177,25 @@ def _filled(scalars: Scalars, num: int) -> Scalars:
     return Scalars(*(pad(*both) for both in zip(scalars, (0, 0, 1, False), strict=True)))
 
 
+class _Lanes(NamedTuple):
+    """The blocks of all chains, B C lanes in the last axis: their old paths, what guides paths to
+    the ends of these, and how far noise turns.
+
+    - `start`, `old`: where the old paths begin, and their points, leading axes (J, N).
+    - `guides`, `scalars`: of all steps, and what is seen at the ends of segments.
+    - `is_first`: which begin where the record does.
+    - `rho`, `beta`: √(1 - β²), and β.
+    """
+
+    start: Float[Array, "d lanes"]
+    old: Float[Array, "J N d lanes"]
+    guides: Guide
+    scalars: Scalars
+    is_first: Bool[Array, " lanes"]
+    rho: Float[Array, " lanes"]
+    beta: Float[Array, " lanes"]
+
+
 class _State(NamedTuple):
     """The old and the new path of each lane, and their log weights."""
 
@@ -195,11 +214,25 @@ def move(
     paths: Paths,
 ) -> tuple[Paths, Bool[Array, "B C"]]:
     """New paths of all blocks, with β = `scale`; and which blocks took theirs."""
-    density, dynamics = problem.density, model.forward(problem.like)
-    (J, B), (K, N), C = blocks.segment.shape, problem.record.dt.shape, paths.start.shape[-1]
-    d, dtype = problem.dim, paths.start.dtype
     noise_key, start_key, accept_key = jax.random.split(key, 3)
-    spread = lambda tree: jax.tree.map(lambda leaf: jnp.repeat(leaf, C, axis=-1), tree)
+    lanes = _lanes_of(blocks, scale, paths)
+    first = _new_starts(start_key, problem, model, blocks, lanes)
+    last, new = _new_points(noise_key, problem, model, blocks, lanes, first)
+    rate = acceptance_rate(proper(last.log_old), proper(last.log_new))
+    accepted = jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate
+
+    # The blocks one after the other, without what reaches beyond the record.
+    (J, B), (K, N), (d, C) = blocks.segment.shape, problem.record.dt.shape, paths.start.shape
+    points = jnp.where(accepted, new, lanes.old).reshape(J, N, d, B, C)
+    points = jnp.moveaxis(points, 3, 0).reshape(B * J, N, d, C)
+    begin = jnp.argmax(blocks.segment.T.ravel() == 0)
+    start = jnp.where(accepted, first.new, lanes.start).reshape(d, B, C)[:, 0]
+    return Paths(start, lax.dynamic_slice_in_dim(points, begin, K)), accepted.reshape(B, C)
+
+
+def _lanes_of(blocks: Blocks, scale: Float[Array, " B"], paths: Paths) -> _Lanes:
+    B, (N, d, C) = blocks.segment.shape[1], paths.points.shape[1:]
+    spread = functools.partial(_for_chains, C)
     joined = lambda leaf: leaf.reshape(*leaf.shape[:-2], B * C)
     # The old paths of the blocks: before the record x_0, after it the last point.
     padded = jnp.concatenate(
@@ -210,89 +243,119 @@ def move(
         ]
     )
     old = joined(jnp.moveaxis(padded[blocks.segment + 1], 1, -2))  # (J, N, d, B C)
-    starts = joined(jnp.moveaxis(padded[jnp.maximum(blocks.segment[0], 0), -1], 0, -2))
+    start = joined(jnp.moveaxis(padded[jnp.maximum(blocks.segment[0], 0), -1], 0, -2))
     # Unless the record has ended, the end of a block is seen exactly.
-    is_pinned = spread(blocks.goes_on)
-    last_point = spread(blocks.next_points[-1, -1])
     scalars, last = spread(blocks.scalars), jax.tree.map(lambda leaf: leaf[-1], blocks.scalars)
-    pinned = _seen_exactly(old[-1, -1] - last_point, spread(last), is_pinned)
+    end = old[-1, -1] - spread(blocks.next_points[-1, -1])
+    pinned = _seen_exactly(end, spread(last), spread(blocks.goes_on))
     scalars = jax.tree.map(lambda leaf, pin: leaf.at[-1].set(pin), scalars, pinned)
-
-    linear, first = spread(blocks.linear), spread(blocks.first)
-    h = information_filter(linear, scalars, _in_lanes)
+    h = information_filter(spread(blocks.linear), scalars, _in_lanes)
     each = (spread(blocks.points), h, spread(blocks.next_points), following(h))
     guides = Guide(*each, spread(blocks.dt))
-    rho, beta = spread(jnp.sqrt(1 - scale**2)), spread(scale)
-    # Noise that does not move a path may be anything: it stays apart from all that does.
-    nothing = jnp.zeros(blocks.first.values.shape[0], dtype)
+    is_first = spread(jnp.asarray(np.arange(B) == 0))
+    return _Lanes(start, old, guides, scalars, is_first, *spread((jnp.sqrt(1 - scale**2), scale)))
+
+
+def _new_starts(
+    key: Key[Array, ""], problem: RecordProblem, model: Diffusion, blocks: Blocks, lanes: _Lanes
+) -> _State:
+    """Where the paths begin: new only where the record does."""
+    spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
+    nothing = _no_noise(blocks)
 
     def of_start(x, mean, root, first, point, h, eta, rho, beta):
         law = guided_start(NormalStep(mean, root), first, point, h)
-        solve = functools.partial(solve_root, root)
-        zeta = law.noise(x, solve, nothing)
-        zeta = rho * jnp.where(jnp.isfinite(zeta), zeta, 0) + beta * eta
-        return law.point(zeta), law.log_weight
+        zeta = law.noise(x, functools.partial(solve_root, root), nothing)
+        return law.point(_turned(zeta, eta, rho, beta)), law.log_weight
 
-    is_first = spread(jnp.asarray(np.arange(B) == 0))
     initial = NormalStep(blocks.mean, blocks.root[..., 0])
-    means = jnp.where(is_first, initial.mean[:, None], starts)
-    h_first = jax.tree.map(lambda leaf: leaf[0, 0], h)
-    eta = jax.random.normal(start_key, starts.shape, dtype)
-    arguments = (starts, means, spread(blocks.root), first, guides.point[0, 0], h_first, eta)
-    new_starts, log_start = over_lanes(*9 * [-1])(of_start)(*arguments, rho, beta)
-    new_starts = jnp.where(is_first, new_starts, starts)
+    means = jnp.where(lanes.is_first, initial.mean[:, None], lanes.start)
+    point, h = jax.tree.map(lambda leaf: leaf[0, 0], lanes.guides[:2])
+    eta = jax.random.normal(key, lanes.start.shape, lanes.start.dtype)
+    law = (means, spread(blocks.root), spread(blocks.first), point, h)
+    arguments = (lanes.start, *law, eta, lanes.rho, lanes.beta)
+    new, log_start = over_lanes(*9 * [-1])(of_start)(*arguments)
+    new = jnp.where(lanes.is_first, new, lanes.start)
+    corrected = _corrections(problem, model, spread)
+    of_law = lambda x: log_ratio(problem.initial, model, initial, x)
 
-    each_corrected = jax.vmap(correction(problem, model), in_axes=-1)
-    corrected = lambda y, x: each_corrected(spread(y), x)
+    def log_weight(x):
+        ratio = jnp.where(lanes.is_first, jax.vmap(of_law, in_axes=-1)(x), 0)
+        return log_start + corrected(blocks.first_value, x) + ratio
 
-    def at_start(x):
-        ratio = jax.vmap(lambda x: log_ratio(problem.initial, model, initial, x), in_axes=-1)(x)
-        return log_start + corrected(blocks.first_value, x) + jnp.where(is_first, ratio, 0)
+    return _State(lanes.start, new, log_weight(lanes.start), log_weight(new))
 
-    state = _State(starts, new_starts, at_start(starts), at_start(new_starts))
+
+def _new_points(
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    model: Diffusion,
+    blocks: Blocks,
+    lanes: _Lanes,
+    first: _State,
+) -> tuple[_State, Float[Array, "J N d lanes"]]:
+    """The rest of the new paths, and the weights of both."""
+    spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
+    density, dynamics = problem.density, model.forward(problem.like)
+    nothing, corrected = _no_noise(blocks), _corrections(problem, model, spread)
 
     def step_of(old, new, old_next, eta, guide, scalars, rho, beta):
         law = density.steps_from(dynamics, old).law(guide.dt)
         here = guided_law(law, old, guide, scalars)
         zeta = here.noise(old_next, functools.partial(solve_law, law), nothing)
-        zeta = rho * jnp.where(jnp.isfinite(zeta), zeta, 0) + beta * eta  # a path of no weight
         law = density.steps_from(dynamics, new).law(guide.dt)
         there = guided_law(law, new, guide, scalars)
-        return there.point(zeta), here.log_weight, there.log_weight
+        return there.point(_turned(zeta, eta, rho, beta)), here.log_weight, there.log_weight
 
     def advance(state: _State, old_next, eta, guide, scalars) -> _State:
         axes = (-1, -1, -1, -1, -1, None if scalars is None else -1, -1, -1)
-        arguments = (state.old, state.new, old_next, eta, guide, scalars, rho, beta)
+        arguments = (state.old, state.new, old_next, eta, guide, scalars, lanes.rho, lanes.beta)
         new, log_old, log_new = over_lanes(*axes)(step_of)(*arguments)
         return _State(old_next, new, state.log_old + log_old, state.log_new + log_new)
 
     def one(state, inputs):
-        old_next, eta, guide = inputs
-        state = advance(state, old_next, eta, guide, None)
+        state = advance(state, *inputs, None)
         return state, state.new
 
     def segment(state, inputs):
         number, old, guides, scalars, y = inputs
-        eta = jax.random.normal(jax.random.fold_in(noise_key, number), old.shape, dtype)
-        plain, (old_last, eta_last, guide_last) = split_last((old, eta, guides))
+        eta = jax.random.normal(jax.random.fold_in(key, number), old.shape, old.dtype)
+        plain, last = split_last((old, eta, guides))
         state, path = lax.scan(one, state, plain)
-        state = advance(state, old_last, eta_last, guide_last, scalars)
+        state = advance(state, *last, scalars)
+        # What is seen at a pinned end weighs both paths alike.
         state = state._replace(
             log_old=state.log_old + corrected(y, state.old),
             log_new=state.log_new + corrected(y, state.new),
         )
         return state, jnp.concatenate([path, state.new[None]])
 
-    # What is seen at a pinned end weighs both paths alike.
-    inputs = (jnp.arange(J), old, guides, scalars, blocks.values)
-    state, new = lax.scan(segment, state, inputs)
-    rate = acceptance_rate(proper(state.log_old), proper(state.log_new))
-    accepted = jax.random.uniform(accept_key, rate.shape, dtype) < rate
-    new = jnp.where(accepted, new, old).reshape(J, N, d, B, C)
-    new = jnp.moveaxis(new, 3, 0).reshape(B * J, N, d, C)
-    begin = jnp.argmax(blocks.segment.T.ravel() == 0)
-    start = jnp.where(accepted, new_starts, starts).reshape(d, B, C)[:, 0]
-    return Paths(start, lax.dynamic_slice_in_dim(new, begin, K)), accepted.reshape(B, C)
+    numbers = jnp.arange(len(lanes.old))
+    inputs = (numbers, lanes.old, lanes.guides, lanes.scalars, blocks.values)
+    return lax.scan(segment, first, inputs)
+
+
+def _for_chains(num_chains: int, tree: PyTree) -> PyTree:
+    """What belongs to blocks, in the lanes of all chains."""
+    return jax.tree.map(lambda leaf: jnp.repeat(leaf, num_chains, axis=-1), tree)
+
+
+def _turned(zeta, eta, rho, beta):
+    """ζ' = √(1 - β²) ζ + β η; of a path of no weight ζ may be anything."""
+    return rho * jnp.where(jnp.isfinite(zeta), zeta, 0) + beta * eta
+
+
+def _no_noise(blocks: Blocks) -> Float[Array, " n"]:
+    """In the place of noise that does not move a path: it stays apart from all that does."""
+    return jnp.zeros(blocks.first.values.shape[0], blocks.dt.dtype)
+
+
+def _corrections(
+    problem: RecordProblem, model: Diffusion, spread: Callable[[PyTree], PyTree]
+) -> Callable[[Float[Array, "m B"], Float[Array, "d lanes"]], Float[Array, " lanes"]]:
+    """Of what blocks saw, and the states of their lanes."""
+    each = jax.vmap(correction(problem, model), in_axes=-1)
+    return lambda y, x: each(spread(y), x)
 
 
 def blocks_of_both_cuts(

@@ -59,6 +59,7 @@ METHODS = (
 )
 
 
+_NOTHING_TO_ESTIMATE = "`fn` at `save_at` is the same for all bridges: nothing to estimate."
 _FOR_COUPLINGS, _FOR_GUIDED = ("approximate", "renewal"), ("crank_nicolson",)
 
 
@@ -152,14 +153,7 @@ def work_precision(
         raise ValueError(f"to extrapolate, `num_steps` must be even; got {tuple(steps)}.")
     for candidate, n in itertools.product(candidates, grids):
         problem.keep(save_at, duration, candidate.fractions(n))
-    runs = [
-        Run(method, candidate, dtype, n, num_bridges)
-        for method, candidate in itertools.product(methods, candidates)
-        if method not in (_FOR_GUIDED if candidate.coupled else _FOR_COUPLINGS)
-        for dtype, n in itertools.product(dtypes, steps)
-    ]
-    if not runs:
-        raise ValueError(f"none of `proposals` fits any of `methods`; got {tuple(methods)}.")
+    runs = _runs(methods, candidates, dtypes, steps, num_bridges)
     if any(is_density(method) for method in methods):
         for candidate in candidates:
             candidate.check_for_density(model)
@@ -177,6 +171,9 @@ def work_precision(
     start_point, end_point = (np.asarray(point[0]) for point in problem.intervals[:2])
     length = float(problem.intervals.duration[0])
     times = np.asarray(save_at, float)
+    inside = (times > 0) & (times < length)
+    if not inside.any() and not all(map(is_density, methods)):
+        raise ValueError(_NOTHING_TO_ESTIMATE)
     scene = Scene(model, start_point, end_point, length, times, whole, fn is None)
     given_values = {False: given(reference), True: given_density(log_density)}
     alone = all(m != "approximate" and given_values[is_density(m)] for m in methods)
@@ -193,6 +190,25 @@ def work_precision(
     meter.close(state)
     sources = dict.fromkeys(estimate.source for estimate in exact.values())
     return WorkPrecision(tuple(settings), "; ".join(sources), target)
+
+
+def _runs(
+    methods: Sequence[str],
+    candidates: Sequence[AbstractProposal],
+    dtypes: Sequence[str],
+    steps: Sequence[int],
+    num_bridges: int,
+) -> list[Run]:
+    """All settings, but the pairs of a method and a proposal that do not fit."""
+    runs = [
+        Run(method, candidate, dtype, n, num_bridges)
+        for method, candidate in itertools.product(methods, candidates)
+        if method not in (_FOR_GUIDED if candidate.coupled else _FOR_COUPLINGS)
+        for dtype, n in itertools.product(dtypes, steps)
+    ]
+    if not runs:
+        raise ValueError(f"none of `proposals` fits any of `methods`; got {tuple(methods)}.")
+    return runs
 
 
 def _check_settings(
@@ -246,5 +262,5 @@ def _references(
             for i, proposal in approximate.items()
         }
     if not all(np.any(estimate.is_random) for estimate in exact.values()):
-        raise ValueError("`fn` at `save_at` is the same for all bridges: nothing to estimate.")
+        raise ValueError(_NOTHING_TO_ESTIMATE)
     return exact, limits

@@ -215,7 +215,6 @@ def test_bridges_that_are_not_found_are_counted():
     assert np.isnan(setting.error) and setting.seconds_for(1.0) == np.inf
 
 
-@pytest.mark.slow
 def test_ends_alone_leave_nothing_to_estimate(unchecked):
     with pytest.raises(ValueError, match="nothing to estimate"):
         jb.work_precision(KEY, paper_model(), *ENDS, num_steps=(4,), save_at=[0.0, 1.0])
