@@ -1,5 +1,5 @@
-"""Every test runs with the package's annotations checked at run time, strict promotion of
-dtypes and warnings as errors."""
+"""Every test runs with strict promotion of dtypes and warnings as errors, and those that run by
+default with the package's annotations checked."""
 
 import os
 import pathlib
@@ -72,6 +72,13 @@ def unchecked():
     jaxtyping_config.update("jaxtyping_disable", True)
     yield
     jaxtyping_config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(autouse=True)
+def checked_by_default(request):
+    """Annotations are checked in what runs by default: it takes as long as tracing itself."""
+    if "slow" in request.keywords:
+        request.getfixturevalue("unchecked")
 
 
 @pytest.fixture(autouse=True)

@@ -20,6 +20,8 @@ from jaxbridge.models.bridge_problem import Intervals
 PAGE = pathlib.Path(__file__).parent.parent / "notebooks" / "hard_cases.md"
 ROWS: list[tuple[str, str, str, str]] = []
 pytestmark = pytest.mark.optimised
+# Where rounding is not what is hard.
+in_single = pytest.mark.parametrize("precision", ["float32"], indirect=True)
 
 
 def hard(case, plain, here):
@@ -106,6 +108,7 @@ def test_pairs_that_have_met_before_they_start(precision):
     "finite for every γ < 1, and fewer meetings as it grows, within the bound; γ = 1 is refused",
 )
 @pytest.mark.slow
+@in_single
 def test_gamma_at_both_ends(precision, unchecked):
     dtype, acceptance = jnp.dtype(precision), []
     start, end = jnp.array([0.3, 0.3], dtype), jnp.array([0.4, 0.2], dtype)
@@ -138,6 +141,7 @@ def test_gamma_at_both_ends(precision, unchecked):
     "are kept as logarithms",
 )
 @pytest.mark.slow
+@in_single
 def test_very_unlikely_bridges(precision):
     model, dtype = paper_model(), jnp.dtype(precision)
     exact = lambda a, b: float(jb.ou_transition(model, a, 1.0).log_density(b))
@@ -281,6 +285,7 @@ def log_wells(x, p):
 )
 @pytest.mark.slow
 @pytest.mark.parametrize("wells", [[8.0, 0.5], [[8.0, 0.5], [-0.8, -0.4]]], ids=["line", "plane"])
+@in_single
 def test_superlinear_drift(wells, precision):
     """`wells` are start and end in coordinates where the density is a product."""
     wells = np.atleast_2d(wells)
@@ -385,6 +390,7 @@ def test_nearly_singular_sigma(mixing, precision):
     "O is σ(x')ᵀσ(x) itself, and bridges have the Ornstein–Uhlenbeck law",
 )
 @pytest.mark.slow
+@in_single
 def test_rotating_sigma(precision):
     dtype = jnp.dtype(precision)
 
@@ -446,6 +452,7 @@ def half_plane(x, p):
     "log_density",
     [student, *(pytest.param(f, marks=pytest.mark.slow) for f in (uniform, laplace, half_plane))],
 )
+@in_single
 def test_unusual_stationary_densities(log_density, precision):
     dtype = jnp.dtype(precision)
     model = jb.langevin(log_density)
@@ -475,6 +482,7 @@ def test_unusual_stationary_densities(log_density, precision):
 )
 @pytest.mark.slow
 @pytest.mark.parametrize("d", [1, 2, 10, 50])
+@in_single
 def test_dimensions(d, precision):
     model, dtype = jb.ornstein_uhlenbeck(jnp.eye(d)), jnp.dtype(precision)
     check_meetings(model, d, dtype)
@@ -545,6 +553,7 @@ def check_memory(model, d, dtype):
     "α* from log ν turns the other way; the density is that of the closed form",
 )
 @pytest.mark.slow
+@in_single
 def test_rotation_dominated_drift(precision):
     dtype = jnp.dtype(precision)
     model = jb.ornstein_uhlenbeck([[0.1, 20.0], [-20.0, 0.1]])
@@ -665,7 +674,7 @@ def test_the_same_key_gives_the_same_numbers():
     "no LAPACK call in any loop: elimination and polar iterations written out",
 )
 @pytest.mark.slow
-@pytest.mark.parametrize("d", [2, 5, 12])
+@pytest.mark.parametrize("d", [2, 6])
 def test_no_deadlock(d):
     """Sampler, counts, weights and Gibbs in a process of their own, with a deadline."""
     run_program(
