@@ -218,3 +218,36 @@ def test_bridges_that_are_not_found_are_counted():
 def test_ends_alone_leave_nothing_to_estimate(unchecked):
     with pytest.raises(ValueError, match="nothing to estimate"):
         jb.work_precision(KEY, paper_model(), *ENDS, num_steps=(4,), save_at=[0.0, 1.0])
+
+
+@pytest.mark.slow
+def test_two_grids_leave_less_of_a_step_error():
+    """An Ornstein–Uhlenbeck process seen through sinh, σ(x) = √(1 + x²): the mid-point and the
+    density, against closed forms, by one grid and by two."""
+    ou = jb.ornstein_uhlenbeck([[1.0]])
+    stretched = jb.transform(ou, jnp.sinh, jnp.arcsinh)
+    start, end = (np.sinh([y]) for y in (0.3, 1.0))
+    middle = jb.gaussian_bridge(ou, [0.3], [1.0], 1.0, [0.5])
+    log_density = jb.ou_transition(ou, jnp.array([0.3]), 1.0).log_density(jnp.array([1.0]))
+    made = jb.work_precision(
+        KEY,
+        stretched.model,
+        start,
+        end,
+        1.0,
+        proposals=[jb.ModifiedDiffusionBridge()],
+        num_steps=(8,),
+        methods=("weights", "extrapolated_weights", "density", "extrapolated_density"),
+        num_bridges=100_000,
+        fn=lambda path: jnp.arcsinh(path[0]),
+        reference=(middle.mean[0], np.sqrt(middle.covariance[0, 0])),
+        log_density=log_density - np.log(np.cosh(1.0)),
+        repeats=1,
+    )
+    for name in ("weights", "density"):
+        (one,), (two,) = by_method(made, name), by_method(made, f"extrapolated_{name}")
+        assert one.step_error > 5 * one.step_uncertainty
+        assert two.step_error < one.step_error / 4 + 3 * two.step_uncertainty
+        # Twice the noise of the fine grid, and that of the coarse one.
+        assert two.monte_carlo_error > 2 * one.monte_carlo_error
+        assert two.num_simulated == 2 * one.num_simulated
