@@ -236,7 +236,7 @@ def test_two_grids_leave_less_of_a_step_error():
         end,
         1.0,
         proposals=[jb.ModifiedDiffusionBridge()],
-        num_steps=(8,),
+        num_steps=(16,),
         methods=("weights", "extrapolated_weights", "density", "extrapolated_density"),
         num_bridges=100_000,
         fn=lambda path: jnp.arcsinh(path[0]),
@@ -247,7 +247,7 @@ def test_two_grids_leave_less_of_a_step_error():
     for name in ("weights", "density"):
         (one,), (two,) = by_method(made, name), by_method(made, f"extrapolated_{name}")
         assert one.step_error > 5 * one.step_uncertainty
-        assert two.step_error < one.step_error / 4 + 3 * two.step_uncertainty
+        assert two.step_error < one.step_error / 2 + 3 * two.step_uncertainty
         # Twice the noise of the fine grid, and that of the coarse one.
         assert two.monte_carlo_error > 2 * one.monte_carlo_error
         assert two.num_simulated == 2 * one.num_simulated
