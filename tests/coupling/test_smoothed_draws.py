@@ -24,6 +24,7 @@ def sampled(law, key, num):
     return jax.vmap(lambda key: law.sample(key, PULLED))(jax.random.split(key, num))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_its_density_is_that_of_its_draws_and_integrates_to_one(share):
     """In one dimension, against the histogram of many draws, by quadrature."""
@@ -42,6 +43,7 @@ def test_its_density_is_that_of_its_draws_and_integrates_to_one(share):
     assert np.all(np.abs(counts - 40_000 * bins) <= 5 * error + 3)
 
 
+@pytest.mark.slow
 def test_its_ellipse_is_normalised_in_more_dimensions():
     """By importance sampling from a normal law of twice the covariance, in three dimensions."""
     root = jnp.array([[1.0, 0, 0], [0.8, 0.5, 0], [-0.3, 0.2, 2.0]])

@@ -16,7 +16,7 @@ CASES = exact_cases()
 SIZES = {"very unlikely": 30_000, "swirled": 20_000}
 
 
-@pytest.mark.parametrize("name", slow_cases(CASES, {"unlikely, gamma 0.5"}))
+@pytest.mark.parametrize("name", slow_cases(CASES, {"one dimension"}))
 @pytest.mark.optimised
 def test_weighted_proposals_have_the_exact_law(name):
     """One proposal each, of weight zero where it is no bridge: the mean weight is the density. The

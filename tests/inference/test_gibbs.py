@@ -102,6 +102,7 @@ def test_other_priors_and_kernels_have_their_posteriors():
         assert_posterior(made.params[0][100:], *moments)
 
 
+@pytest.mark.slow
 def test_newton_steps_are_exact_draws_where_these_exist():
     """A normal prior, given as a function, for a quadratic log likelihood."""
     log_prior = lambda rate: -((rate - 1) ** 2) / 2

@@ -149,6 +149,7 @@ def test_noise_that_varies_with_the_state():
     check_maximum(estimate(jax.random.key(0), model, times, data, **options), exact, sd)
 
 
+@pytest.mark.slow
 def test_derivatives_are_those_of_the_value(x64):
     times, data, *_ = ou_problem()
     parameters, blocks, theta = few(times[:5], data[:5], 5, ou_1d(4.0))

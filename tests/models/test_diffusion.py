@@ -192,6 +192,7 @@ def test_the_reversed_ou_process_retraces_stationary_paths():
         assert_moments(forward[:, ::-1].reshape(-1, 4), mean, joint)
 
 
+@pytest.mark.slow
 def test_the_reversal_of_a_state_dependent_sigma_retraces_stationary_paths():
     def moments(early, late):
         """E f(early) g(late) with standard errors, for several f and g."""

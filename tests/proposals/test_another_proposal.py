@@ -36,6 +36,7 @@ INTERVAL = ([0.2], [0.5], 0.4)
 KEY = jax.random.key(0)
 
 
+@pytest.mark.slow
 def test_densities_and_choices_take_it():
     candidates = [Wide(), jb.ModifiedDiffusionBridge()]
     choice = jb.choose_proposal(KEY, MODEL, *INTERVAL, num_steps=4, candidates=candidates)

@@ -122,6 +122,7 @@ def options(case):
     return {"observation": case.observation, "initial": law}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_beyond(1, CASES))
 def test_likelihoods(name):
     case, values, exact = recorded(name)

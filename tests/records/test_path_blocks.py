@@ -33,6 +33,7 @@ def problem_of_length(num, observation=POSITIVE):
     )
 
 
+@pytest.mark.slow
 def test_a_path_of_no_weight_is_left():
     problem = problem_of_length(6)
     both = blocks_of_both_cuts(problem, *linearised(problem, MODEL), 2)

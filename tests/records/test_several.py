@@ -26,6 +26,7 @@ def both():
     return LONG.model, times, values
 
 
+@pytest.mark.slow
 def test_likelihoods_multiply():
     made = jb.log_likelihood(
         jax.random.key(0), *both(), **LONG.options, num_particles=5, num_filters=2, num_steps=4,

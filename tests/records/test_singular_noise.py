@@ -26,6 +26,7 @@ def weigher(model, values, observation):
     return jax.jit(lambda params: paths.log_weight(params, jnp.zeros(paths.size)))
 
 
+@pytest.mark.slow
 def test_a_negative_variance_explains_nothing():
     """One that is found in a search, of one component or only of a combination of two."""
     model = jb.Diffusion(drift, params=0.5)

@@ -63,6 +63,7 @@ def test_linear_process():
     assert_agrees(made, *exact)
 
 
+@pytest.mark.slow
 def test_gaps_are_known_after_a_long_time():
     """Those of .01 after 45,000 units of time, which single precision knows to .004."""
     times, values = np.array([0.0, 0.01, 0.03, 0.04]), np.zeros((4, 1))

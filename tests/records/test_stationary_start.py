@@ -99,6 +99,7 @@ def test_paths_begin_in_both_wells():
     assert np.all(made.standard_error(left) < 0.03) and np.all(made.r_hat(left) < 1.05)
 
 
+@pytest.mark.slow
 def test_the_beginning_is_a_smooth_function_of_parameters(x64):
     model = jb.Diffusion(
         lambda x, p: -2 * x * (x**2 - p), [0.8], lambda x, p: -((x[0] ** 2 - p) ** 2) / 0.64,

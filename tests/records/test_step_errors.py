@@ -82,6 +82,7 @@ CASES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "density", "num_steps"), slow_beyond(1, CASES))
 def test_filters_tell_it(name, density, num_steps, x64):
     """All weights are equal, so that nothing hides it."""

@@ -103,6 +103,7 @@ def test_factor_is_that_of_quadrature(case, x64):
     assert abs(w @ factor - 1) < 5 * error < 0.04
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("density", slow_beyond(1, DENSITIES.values()), ids=DENSITIES)
 @pytest.mark.parametrize("num_steps", slow_beyond(1, [7, 2, 1]))
 def test_one_d_for_each_path(density, num_steps, x64):
