@@ -4,6 +4,7 @@ Inside compiled code what is missing is data: `met`, `truncated`, `num_nonfinite
 turned into one error at the end, with a sentence that says what to change.
 """
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 import equinox as eqx
@@ -58,14 +59,25 @@ def throw_where_incomplete(
     """The result, whose `field` raises `RuntimeError` if anything is missing or cut off, if weights
     have `heavy` tails or the step error is `gross`. What is missing has not met if pairs were
     `coupled`."""
-    value = getattr(result, field)
-    for bad, message in [
-        (~all_finite_leaves(model), _PARAMETERS),
-        (jnp.any(missing), _MISSING if coupled else _FAILED),
+    faults = [
+        (missing, _MISSING if coupled else _FAILED),
         (truncated, _TRUNCATED),
         (heavy, _HEAVY),
         (gross, _GROSS),
-    ]:
+    ]
+    return throw_where(result, field, model, faults)
+
+
+def throw_where(
+    result: _Result,
+    field: str,
+    model: PyTree,
+    faults: Sequence[tuple[Bool[Array, "..."] | None, str]],
+) -> _Result:
+    """The result, whose `field` raises `RuntimeError` where parameters of the model are not finite,
+    or with the message of the first of these faults that there is."""
+    value = getattr(result, field)
+    for bad, message in [(~all_finite_leaves(model), _PARAMETERS), *faults]:
         if bad is not None:
             value = eqx.error_if(value, jnp.any(bad), message)
     return eqx.tree_at(lambda tree: getattr(tree, field), result, value)

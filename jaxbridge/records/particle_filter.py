@@ -23,6 +23,7 @@ from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
 from ..engine.compiled import compiled
 from ..engine.lanes import over_lanes
+from ..engine.throwing import throw_where
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity, StepError, dominates, error_of_grids, num_coarse_grids
@@ -40,6 +41,17 @@ from .several import Records, as_record_problems
 _FEWEST_EFFECTIVE = 0.5
 # Fewer particles that count, or a larger standard error of a log, tell nothing.
 _FEWEST_TRUSTED, _MOST_SPREAD = 5, 0.5
+
+_UNEXPLAINED = (
+    "no particle explains some observation (`unexplained` is its number): look whether it is an "
+    "outlier that the noise of `observation` has no room for, or take more steps or particles."
+)
+_DISAGREE = (
+    "so few particles count somewhere, or filters disagree so much, that the likelihood and its "
+    "error cannot be trusted: take more `num_particles`; across gaps in which the diffusion could "
+    "have gone several ways more observations are needed, or `smooth` with a `proposal`."
+)
+_STEPS = "the step error is beyond the standard error, or not known: take more `num_steps`."
 
 
 class LogLikelihood(eqx.Module):
@@ -84,9 +96,12 @@ class LogLikelihood(eqx.Module):
         """Whether `value` and `standard_error` are to be trusted: particles that count at all
         observations, filters that agree, so that the delta method holds, and a step error that
         does not dominate."""
+        return self._filters_agree & ~self.step_error_dominates
+
+    @property
+    def _filters_agree(self) -> Bool[Array, ""]:
         counted = jnp.all(self.effective_sample_size >= _FEWEST_TRUSTED)
-        agree = jnp.isfinite(self.value) & (self.standard_error < _MOST_SPREAD)
-        return counted & agree & ~self.step_error_dominates
+        return counted & jnp.isfinite(self.value) & (self.standard_error < _MOST_SPREAD)
 
 
 def log_likelihood(
@@ -103,6 +118,7 @@ def log_likelihood(
     step_size: float | None = None,
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
+    throw: bool = False,
 ) -> LogLikelihood:
     """log p(y) of a record that was seen with noise or in part, unbiased on the natural scale.
 
@@ -116,6 +132,7 @@ def log_likelihood(
         densities by `transition_log_density(proposal="auto")`, given the first.
     - `num_particles`: of each filter.
     - `num_filters`: filters that know nothing of each other, whose spread tells the error.
+    - `throw`: raise an error at run time where the result is not `trustworthy`.
 
     **Returns:** `LogLikelihood`. For a linear model all weights are equal, and `value` is that of
     the Kalman filter of the steps. A stationary law that is not normal is covered by a mixture of
@@ -142,7 +159,8 @@ def log_likelihood(
                 "without an `observation` the first state is given, and steps are those of "
                 "`transition_log_density`: leave out `initial`, `initial_time` and `density`."
             )
-        return _exact(key, model, times, observations, num_particles, num_steps, step_size)
+        made = _exact(key, model, times, observations, num_particles, num_steps, step_size)
+        return _or_throw(made, model) if throw else made
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     records = as_record_problems(*arguments, num_steps=num_steps, **options)
@@ -157,7 +175,7 @@ def log_likelihood(
     rounding = rounding.astype(value.dtype) * jnp.maximum(1, jnp.abs(value))
     errors = jnp.hypot(errors, rounding)
     step_error = error_of_grids(values, errors, records.stacked.density.order, num_steps)
-    return LogLikelihood(
+    made = LogLikelihood(
         value,
         error,
         jnp.sum(fine.log_estimate, axis=0),
@@ -165,6 +183,16 @@ def log_likelihood(
         jnp.sum(fine.num_nonfinite),
         *step_error,
     )
+    return _or_throw(made, model) if throw else made
+
+
+def _or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
+    faults = [
+        (made.unexplained >= 0, _UNEXPLAINED),
+        (~made._filters_agree, _DISAGREE),
+        (made.step_error_dominates, _STEPS),
+    ]
+    return throw_where(made, "value", model, faults)
 
 
 def _log_mean(

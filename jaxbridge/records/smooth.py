@@ -14,6 +14,7 @@ from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.progress import metered_scan
+from ..engine.throwing import throw_where
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
 from .guided_record import Linearised, linearised, path_and_log_weight
@@ -25,6 +26,16 @@ from .states import sample_states
 
 # R̂ beyond which chains disagree.
 _MOST_R_HAT = 1.1
+
+_STUCK = (
+    "a block of the path never moved: take more `num_draws`, a shorter `block_length` or more "
+    "steps; where the diffusion could have gone several ways, a `proposal`."
+)
+_CUT_OFF = (
+    "some weights of the `proposal` were cut off at its bound on the work: allow more trials, or "
+    "choose another."
+)
+_APART = "chains disagree (R̂ above 1.1 at some points): take more `num_draws` and `num_warmup`."
 
 
 class Smoothed(eqx.Module):
@@ -72,9 +83,12 @@ class Smoothed(eqx.Module):
     def trustworthy(self) -> Bool[Array, ""]:
         """Whether means of the path, with their errors, are to be trusted: no block that never
         moved, no weight cut off, and chains that agree at all points."""
+        return self._chains_agree & ~jnp.any(self.stuck) & (self.num_truncated == 0)
+
+    @property
+    def _chains_agree(self) -> Bool[Array, ""]:
         moves = jnp.var(self.paths, axis=(0, 1)) > 0
-        agree = jnp.all((self.r_hat() < _MOST_R_HAT) | ~moves)
-        return agree & ~jnp.any(self.stuck) & (self.num_truncated == 0)
+        return jnp.all((self.r_hat() < _MOST_R_HAT) | ~moves)
 
     def _values(self, fn: PathFunction) -> PyTree:
         return jax.tree.map(
@@ -101,6 +115,7 @@ def smooth(
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
+    throw: bool = False,
 ) -> Smoothed:
     """Draws of the path given a whole record, exact in the limit of many, up to the step error.
 
@@ -119,6 +134,7 @@ def smooth(
         new bridges on both sides. That asks for a stationary law and for noise in all that is seen.
     - `num_proposals`: how many bridges of a `proposal` are made for each move of each gap.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time where the result is not `trustworthy`.
 
     **Returns:** `Smoothed`. Not differentiable: `innovations` is.
 
@@ -142,12 +158,24 @@ def smooth(
     num_proposals = check_count("num_proposals", num_proposals)
     made = linearised(problem, model)
     if proposal is None:
-        return _smooth(key, problem, made, counts, num_chains, block_length, progress_meter)
-    start_key, key = jax.random.split(key)
-    firsts = _guided_paths(start_key, problem, made, num_chains)
-    drawn = sample_states(key, problem, proposal, firsts, (*counts, num_proposals), progress_meter)
-    paths = jnp.moveaxis(drawn.paths, 1, 0)
-    return Smoothed(drawn.times, paths, drawn.accepted, drawn.stuck, drawn.num_truncated)
+        smoothed = _smooth(key, problem, made, counts, num_chains, block_length, progress_meter)
+    else:
+        start_key, key = jax.random.split(key)
+        firsts, sizes = (
+            _guided_paths(start_key, problem, made, num_chains),
+            (*counts, num_proposals),
+        )
+        drawn = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
+        paths = jnp.moveaxis(drawn.paths, 1, 0)
+        smoothed = Smoothed(drawn.times, paths, drawn.accepted, drawn.stuck, drawn.num_truncated)
+    if not throw:
+        return smoothed
+    faults = [
+        (smoothed.stuck, _STUCK),
+        (smoothed.num_truncated > 0, _CUT_OFF),
+        (~smoothed._chains_agree, _APART),
+    ]
+    return throw_where(smoothed, "paths", model, faults)
 
 
 @compiled

@@ -115,6 +115,7 @@ def test_smoothed_paths_are_those_of_rauch_tung_and_striebel(name):
         num_draws=500,
         num_warmup=50,
         density=jb.EulerDensity(),
+        throw=True,
     )
     exact = record.kalman(5)
     sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))

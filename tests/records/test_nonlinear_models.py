@@ -158,10 +158,12 @@ def test_what_no_particle_explains_is_said():
     flat = jb.ObservationDensity(
         lambda y, x, p: jnp.where(x[0] > 50, 0.0, -jnp.inf), jb.LinearGaussian(covariance=1.0)
     )
-    made = jb.log_likelihood(
-        KEY, model, np.arange(4.0), np.zeros((4, 1)), observation=flat, num_particles=10
-    )
+    arguments = (KEY, model, np.arange(4.0), np.zeros((4, 1)))
+    options = {"observation": flat, "num_particles": 10}
+    made = jb.log_likelihood(*arguments, **options)
     assert made.value == -jnp.inf and made.unexplained == 0
+    with pytest.raises(Exception, match="no particle explains"):
+        jax.block_until_ready(jb.log_likelihood(*arguments, **options, throw=True).value)
 
 
 @pytest.mark.slow

@@ -46,10 +46,12 @@ def test_a_path_of_no_weight_is_left():
 
 
 def test_a_chain_that_never_moves_says_so():
-    made = jb.smooth(
-        jax.random.key(0), MODEL, TIMES, COUNTS, observation=NEVER, initial=LAW,
-        num_draws=4, num_warmup=0, num_chains=2, num_steps=4,
-    )  # fmt: skip
+    options = dict(num_draws=4, num_warmup=0, num_chains=2, num_steps=4)
+    arguments = (jax.random.key(0), MODEL, TIMES, COUNTS)
+    made = jb.smooth(*arguments, observation=NEVER, initial=LAW, **options)
+    with pytest.raises(Exception, match="never moved"):
+        thrown = jb.smooth(*arguments, observation=NEVER, initial=LAW, **options, throw=True)
+        jax.block_until_ready(thrown.paths)
     real = has_segments(problem_of_length(6), 10)
     assert np.all(made.stuck) and np.all(made.accepted[real] == 0)
     assert np.all(np.isfinite(made.paths)) and np.all(made.standard_error() == np.inf)
