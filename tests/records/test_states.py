@@ -102,8 +102,8 @@ def test_states_stay_in_the_state_space():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "proposal",
-    [jb.Coupling(0.5), "auto", jb.Guided(density=jb.ItoTaylorDensity())],
-    ids=["coupling", "auto", "guided"],
+    [jb.Coupling(0.5), jb.Guided(density=jb.ItoTaylorDensity())],
+    ids=["coupling", "guided"],
 )
 def test_part_of_a_process_that_turns(proposal):
     B, matrix = NON_REVERSIBLE, np.array([[1.0, -0.5]])
