@@ -146,7 +146,7 @@ def seen_rarely(num, gap):
 def test_wells_that_are_seen_rarely(proposal):
     """Gaps of twenty units of time, within which the diffusion changes its well or does not: the
     probability of each is known to a part in a hundred from some hundreds of draws."""
-    num_steps = 200
+    num_steps = 100
     times, values, exact = seen_rarely(12, 20.0)
     made = jb.smooth(
         KEY, WELLS, times, values, observation=jb.LinearGaussian(covariance=0.09),
