@@ -7,6 +7,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import PathFunction
@@ -16,7 +17,13 @@ from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduc
 from ..engine.progress import metered_scan
 from ..engine.throwing import throw_where
 from ..models.diffusion import Diffusion
-from ..schemes import AbstractStepDensity
+from ..schemes import (
+    AbstractStepDensity,
+    StepError,
+    dominates,
+    log_halving_of_paths,
+    share_of_order,
+)
 from .guided_record import Linearised, linearised, path_and_log_weight
 from .initial import Initial
 from .observation import Observation
@@ -56,6 +63,7 @@ class Smoothed(eqx.Module):
     accepted: Float[Array, "..."]
     stuck: Bool[Array, " chains"]
     num_truncated: Int[Array, ""]
+    _problem: RecordProblem | None
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
         """The mean of `fn(path)`, a function of one path of shape (K, d), by default itself."""
@@ -69,6 +77,24 @@ class Smoothed(eqx.Module):
             return jnp.where(jnp.any(self.stuck), jnp.inf, made)
 
         return jax.tree.map(error, self._values(fn))
+
+    def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """What `mean(fn)` is too large by for the length of the steps, entry by entry, to its
+        leading term: from half as many steps, by which each path is e^D times as likely (`halving`
+        in `schemes`). NaN where nothing is known, with a `proposal` or of one step."""
+        return self._step_errors(fn)[0]
+
+    def step_uncertainty(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """The Monte Carlo error of `step_error(fn)`, entry by entry; infinite where σ varies, for
+        then D tells no more than the size: compare two numbers of steps there."""
+        return self._step_errors(fn)[1]
+
+    def step_error_dominates(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """Whether the step error of `mean(fn)` is beyond its standard error, or not known well
+        enough to say, entry by entry: then more steps help, and more draws do not."""
+        told = map(StepError, *map(jax.tree.leaves, self._step_errors(fn)))
+        errors, treedef = jax.tree.flatten(self.standard_error(fn))
+        return jax.tree.unflatten(treedef, list(map(dominates, told, errors)))
 
     def effective_sample_size(self, fn: PathFunction = lambda path: path) -> PyTree:
         """How many independent draws of `fn(path)` these are worth, entry by entry: few where
@@ -89,6 +115,19 @@ class Smoothed(eqx.Module):
     def _chains_agree(self) -> Bool[Array, ""]:
         moves = jnp.var(self.paths, axis=(0, 1)) > 0
         return jnp.all((self.r_hat() < _MOST_R_HAT) | ~moves)
+
+    def _step_errors(self, fn: PathFunction) -> tuple[PyTree, PyTree]:
+        values, problem = self._values(fn), self._problem
+        if problem is None or problem.num_steps == 1:
+            unknown = jax.tree.map(lambda leaf: jnp.full(leaf.shape[2:], jnp.nan), values)
+            return unknown, unknown
+        D = _log_halving(problem, self.paths)
+        leaves, treedef = jax.tree.flatten(values)
+        varies = problem.model.sigma_varies(problem.like)
+        share = share_of_order(problem.density.order)
+        each = [_change(leaf, D, share, varies) for leaf in leaves]
+        values, doubts = zip(*each, strict=True)
+        return jax.tree.unflatten(treedef, values), jax.tree.unflatten(treedef, doubts)
 
     def _values(self, fn: PathFunction) -> PyTree:
         return jax.tree.map(
@@ -158,7 +197,8 @@ def smooth(
     num_proposals = check_count("num_proposals", num_proposals)
     made = linearised(problem, model)
     if proposal is None:
-        smoothed = _smooth(key, problem, made, counts, num_chains, block_length, progress_meter)
+        sizes = counts, num_chains, block_length
+        smoothed = Smoothed(*_smooth(key, problem, made, *sizes, progress_meter), problem)
     else:
         start_key, key = jax.random.split(key)
         firsts, sizes = (
@@ -167,7 +207,8 @@ def smooth(
         )
         drawn = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
         paths = jnp.moveaxis(drawn.paths, 1, 0)
-        smoothed = Smoothed(drawn.times, paths, drawn.accepted, drawn.stuck, drawn.num_truncated)
+        found = (drawn.accepted, drawn.stuck, drawn.num_truncated)
+        smoothed = Smoothed(drawn.times, paths, *found, None)
     if not throw:
         return smoothed
     faults = [
@@ -203,7 +244,8 @@ def _smooth(
     num_chains: int,
     block_length: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
-) -> Smoothed:
+) -> tuple[Array, ...]:
+    """All that `Smoothed` has of them, in its order."""
     model, (num_draws, num_warmup) = problem.model, counts
     points, guide = made
     start_key, key = jax.random.split(key)
@@ -228,5 +270,35 @@ def _smooth(
     real = has_segments(problem, block_length)[..., None]
     stuck = jnp.any(real & ~jnp.any(taken, axis=0), axis=(0, 1))
     share = jnp.mean(taken.astype(points.dtype), axis=(0, -1))
-    nothing = jnp.int32(0)
-    return Smoothed(problem.record.grid(), jnp.moveaxis(drawn, 1, 0), share, stuck, nothing)
+    return problem.record.grid(), jnp.moveaxis(drawn, 1, 0), share, stuck, jnp.int32(0)
+
+
+@compiled
+def _log_halving(
+    problem: RecordProblem, paths: Float[Array, "chains n K d"]
+) -> Float[Array, "chains n"]:
+    """D of each path: each segment is one of its own, for pairs of steps do not reach beyond."""
+    (K, N), d, chains = problem.record.dt.shape, problem.dim, paths.shape[0]
+    dynamics = problem.model.forward(problem.like)
+    dt = jnp.tile(problem.record.dt, (chains, 1)).T
+    place = jnp.arange(K)[:, None] * N + jnp.arange(N + 1)
+
+    def of_draw(path):
+        segments = path[:, place].reshape(chains * K, N + 1, d)
+        each = log_halving_of_paths(problem.density, dynamics, dt, segments)
+        return jnp.sum(each.reshape(chains, K), axis=1)
+
+    return lax.map(of_draw, jnp.moveaxis(paths, 1, 0)).T
+
+
+def _change(
+    values: Float[Array, "chains n ..."], D: Float[Array, "chains n"], share: float, varies: bool
+) -> StepError:
+    """The share of E[e^D f] / E[e^D] - E[f] that is error, to second order in D: the covariance of
+    f with D + ½ (D - ED)²."""
+    D = D - jnp.mean(D)
+    D = (D + D**2 / 2).reshape(*D.shape, *[1] * (values.ndim - 2))
+    products = (values - jnp.mean(values, axis=(0, 1))) * (D - jnp.mean(D))
+    error = jnp.std(products, axis=(0, 1)) / jnp.sqrt(effective_size_of_chains(products))
+    doubt = jnp.full_like(error, jnp.inf) if varies else share * error
+    return StepError(share * jnp.mean(products, axis=(0, 1)), doubt)

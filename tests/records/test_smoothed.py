@@ -10,7 +10,7 @@ from jaxbridge.records.smooth import Smoothed
 def smoothed(paths, stuck=False):
     chains = len(paths)
     flags = jnp.full(chains, stuck)
-    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, jnp.int32(0))
+    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, jnp.int32(0), None)
 
 
 def test_chains_in_two_wells_know_little():

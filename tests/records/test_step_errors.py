@@ -101,6 +101,47 @@ def test_filters_tell_it(name, density, num_steps, x64):
     np.testing.assert_allclose(made.step_uncertainty, wanted.uncertainty, rtol=1e-5)
 
 
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.parametrize("num_steps", [4, 5])
+def test_smoothed_paths_tell_it(num_steps):
+    """Means and squares at the times of observations: what half as many steps change, by exact
+    smoothers of both grids, of an odd number of steps too."""
+    record = plane()
+    made = jb.smooth(
+        jax.random.key(0), *record.arguments, **record.options, num_steps=num_steps,
+        num_draws=4000, num_warmup=20, density=jb.EulerDensity(),
+    )  # fmt: skip
+
+    def moment(power, n):
+        one = record.kalman(n)
+        variance = np.diagonal(one.covariance[::n], 0, 1, 2)
+        return one.mean[::n] ** power + (power - 1) * variance
+
+    for power in (1, 2):
+        fn = lambda path, power=power: path[::num_steps] ** power
+        told, doubt = np.asarray(made.step_error(fn)), np.asarray(made.step_uncertainty(fn))
+        true = moment(power, num_steps) - moment(power, 200)
+        # Its leading term, and what Monte Carlo leaves of it.
+        np.testing.assert_array_less(np.abs(told - true), 4.5 * doubt + 0.5 * np.abs(true).max())
+        assert np.max(np.abs(told) / doubt) > 10
+        if num_steps == 4:  # to second order in what they change
+            change = moment(power, 2) - moment(power, 4)
+            allowance = 4.5 * doubt + 0.15 * np.abs(change).max()
+            np.testing.assert_array_less(np.abs(told - change), allowance)
+
+
+def test_what_is_not_known_of_smoothed_paths_is_not_told():
+    """Where σ varies, and of a single step."""
+    options = {"observation": jb.LinearGaussian(covariance=0.1), "initial": [0.3], "num_draws": 6}
+    varying = jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + 0.3 * jnp.sin(x))
+    record = (jax.random.key(0), varying, [0.0, 0.5], [[0.3], [0.1]])
+    made = jb.smooth(*record, **options, num_steps=2, num_warmup=0, num_chains=2)
+    assert np.isfinite(made.step_error()).all() and np.isinf(made.step_uncertainty()).all()
+    of_one = jb.smooth(*record, **options, num_steps=1, num_warmup=0, num_chains=2)
+    assert np.isnan(of_one.step_error()).all() and np.isnan(of_one.step_uncertainty()).all()
+
+
 # Sums of orders 1 and 2 of steps of length 1/N.
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("num_steps", [3, 4, 5, 10, 21])
