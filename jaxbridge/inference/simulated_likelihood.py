@@ -298,6 +298,7 @@ def newton_ascent(
     parameters, blocks, starts = nondifferentiable((parameters, blocks, starts))
     at_start = len(starts)
 
+    @jax.jit  # for its shapes and in the loop traced once
     def at(theta):
         return simulated(key, parameters, blocks, theta, num_paths)
 

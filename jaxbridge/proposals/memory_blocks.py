@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key
@@ -73,7 +72,8 @@ def in_blocks(
             lambda _, i: (None, numbered_block(i)), None, jnp.arange(num_blocks), progress_meter
         )
     else:
-        shapes = eqx.filter_eval_shape(one_block, 0, 0)
+        numbered_block = jax.jit(numbered_block)  # for its shapes and in the loop traced once
+        shapes = jax.eval_shape(numbered_block, jnp.int32(0))
         nothing = jax.tree.map(
             lambda leaf: jnp.zeros((num_blocks, *leaf.shape), leaf.dtype), shapes
         )

@@ -168,6 +168,7 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     points = extended_kalman_path(problem.density, dynamics, first, problem.record.dt, scalars)
     silence = jnp.zeros_like(points)
 
+    @jax.jit  # for its shapes and in the loop traced once
     def again(points):
         guide = guided(problem, model, points)
         noise = silence

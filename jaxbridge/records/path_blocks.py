@@ -314,15 +314,16 @@ def _new_points(
         return _State(old_next, new, state.log_old + log_old, state.log_new + log_new)
 
     def one(state, inputs):
-        state = advance(state, *inputs, None)
+        old_next, eta, guide = inputs
+        state = advance(state, old_next, eta, guide, None)
         return state, state.new
 
     def segment(state, inputs):
         number, old, guides, scalars, y = inputs
         eta = jax.random.normal(jax.random.fold_in(key, number), old.shape, old.dtype)
-        plain, last = split_last((old, eta, guides))
+        plain, (old_last, eta_last, guide_last) = split_last((old, eta, guides))
         state, path = lax.scan(one, state, plain)
-        state = advance(state, *last, scalars)
+        state = advance(state, old_last, eta_last, guide_last, scalars)
         # What is seen at a pinned end weighs both paths alike.
         state = state._replace(
             log_old=state.log_old + corrected(y, state.old),

@@ -29,7 +29,7 @@ from .initial import Initial
 from .observation import Observation
 from .path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep, tuned
 from .problem import RecordProblem, as_record_problem
-from .states import sample_states
+from .states import Draws, sample_states
 
 # R̂ beyond which chains disagree.
 _MOST_R_HAT = 1.1
@@ -198,17 +198,17 @@ def smooth(
     made = linearised(problem, model)
     if proposal is None:
         sizes = counts, num_chains, block_length
-        smoothed = Smoothed(*_smooth(key, problem, made, *sizes, progress_meter), problem)
+        drawn = _smooth(key, problem, made, *sizes, progress_meter)
+        told_by = problem
     else:
         start_key, key = jax.random.split(key)
-        firsts, sizes = (
-            _guided_paths(start_key, problem, made, num_chains),
-            (*counts, num_proposals),
-        )
+        firsts = _guided_paths(start_key, problem, made, num_chains)
+        sizes = (*counts, num_proposals)
         drawn = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
-        paths = jnp.moveaxis(drawn.paths, 1, 0)
-        found = (drawn.accepted, drawn.stuck, drawn.num_truncated)
-        smoothed = Smoothed(drawn.times, paths, *found, None)
+        told_by = None
+    paths = jnp.moveaxis(drawn.paths, 1, 0)
+    found = (drawn.accepted, drawn.stuck, drawn.num_truncated)
+    smoothed = Smoothed(drawn.times, paths, *found, told_by)
     if not throw:
         return smoothed
     faults = [
@@ -244,8 +244,7 @@ def _smooth(
     num_chains: int,
     block_length: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
-) -> tuple[Array, ...]:
-    """All that `Smoothed` has of them, in its order."""
+) -> Draws:
     model, (num_draws, num_warmup) = problem.model, counts
     points, guide = made
     start_key, key = jax.random.split(key)
@@ -270,7 +269,7 @@ def _smooth(
     real = has_segments(problem, block_length)[..., None]
     stuck = jnp.any(real & ~jnp.any(taken, axis=0), axis=(0, 1))
     share = jnp.mean(taken.astype(points.dtype), axis=(0, -1))
-    return problem.record.grid(), jnp.moveaxis(drawn, 1, 0), share, stuck, jnp.int32(0)
+    return Draws(problem.record.grid(), drawn, share, stuck, jnp.int32(0))
 
 
 @compiled

@@ -196,13 +196,13 @@ class StateSampler(eqx.Module):
         return state, Moved(states, paths | states[:, :-1] | states[:, 1:])
 
 
-class StateDraws(NamedTuple):
-    """`times` of the points, draws of whole paths, the share of moves `accepted` of each state, the
-    chains in which one or a path was `stuck`, and how many weights were cut off."""
+class Draws(NamedTuple):
+    """`times` of the points, draws of whole paths, the share of moves `accepted`, of each state or
+    block, the chains in which one was `stuck`, and how many weights were cut off."""
 
     times: Float[Array, " points"]
     paths: Float[Array, "n C points d"]
-    accepted: Float[Array, " ends"]
+    accepted: Float[Array, "..."]
     stuck: Bool[Array, " C"]
     num_truncated: Int[Array, ""]
 
@@ -214,7 +214,7 @@ def sample_states(
     guided: Float[Array, "C points d"],
     counts: tuple[int, int, int],
     progress_meter: diffrax.AbstractProgressMeter | None,
-) -> StateDraws:
+) -> Draws:
     """So many draws, after so many iterations of a warm-up, with so many paths in each ŵ; from
     guided paths of the whole record.
 
@@ -245,7 +245,7 @@ def sample_states(
     ever = jnp.all(jnp.any(moved.states, axis=0) | ~movable, axis=1)
     ever &= jnp.all(jnp.any(moved.paths, axis=0), axis=1)
     accepted = jnp.mean(moved.states.astype(grid.dtype), axis=(0, 1))
-    return StateDraws(grid, paths, accepted, ~ever, cut)
+    return Draws(grid, paths, accepted, ~ever, cut)
 
 
 def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars) -> None:
