@@ -4,25 +4,10 @@ default with the package's annotations checked."""
 import os
 import pathlib
 import shutil
-import subprocess
 import sys
 import tempfile
 
-# XLA's older way to make kernels takes a third of the time, what it makes is slower for many lanes;
-# and loops of little work run as one function rather than part by part. A flag that XLA no longer
-# knows would end the process: they are tried in another.
-_FLAGS = "XLA_FLAGS"
-_QUICK = (
-    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1 "
-    "--xla_backend_extra_options=xla_cpu_small_while_loop_byte_threshold=200000"
-)
-if _QUICK not in os.environ.get(_FLAGS, ""):
-    _flags = {_FLAGS: f"{os.environ.get(_FLAGS, '')} {_QUICK}".strip()}
-    _trial = [sys.executable, "-c", "import jax; jax.devices()"]
-    if not subprocess.run(_trial, env={**os.environ, **_flags}, capture_output=True).returncode:
-        os.environ.update(_flags)
-
-from jaxtyping import config as jaxtyping_config, install_import_hook  # noqa: E402
+from jaxtyping import config as jaxtyping_config, install_import_hook
 
 install_import_hook("jaxbridge", "beartype.beartype")
 
@@ -46,8 +31,8 @@ jax.config.update("jax_disable_most_optimizations", True)  # of what is made whi
 @pytest.fixture(autouse=True)
 def compiled_in_haste(request):
     """Most of the time of tests goes into compilation, of which optimisation is half. Tests marked
-    as `optimised`, which run for longer, are compiled with it, as what `helpers.run_program` runs
-    is."""
+    as `optimised`, which run for longer, are compiled as for users, as what `helpers.run_program`
+    runs is."""
     haste = "optimised" not in request.keywords
     jax.config.update("jax_disable_most_optimizations", haste)
 
@@ -80,7 +65,7 @@ def unchecked():
 
 @pytest.fixture(autouse=True)
 def checked_by_default(request):
-    """Annotations are checked in what runs by default: it takes as long as tracing itself."""
+    """Annotations are checked in what runs by default, of which that takes a tenth of the time."""
     if "slow" in request.keywords:
         request.getfixturevalue("unchecked")
 
