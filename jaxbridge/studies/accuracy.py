@@ -99,7 +99,7 @@ def run_accuracy(
         1.0,
         proposals=better[1:3],
         num_steps=all_steps[:3],
-        methods=("weights", "extrapolated_weights"),  # σ(x): all schemes are of first order
+        methods=("weights",),
         reference=reference,
         num_bridges=num_bridges,
         repeats=1,
