@@ -80,7 +80,7 @@ class Coordinates(AbstractForm):
         operands = [np.broadcast_to(self._all(operand), shape) for operand in operands]
 
         def entry(index):
-            numbers = jnp.broadcast_arrays(*(operand[index] for operand in operands))
+            numbers = _of_one_shape([operand[index] for operand in operands])
             return equation.primitive.bind(*numbers, **equation.params)
 
         return _objects(shape, entry)
@@ -147,7 +147,7 @@ class LanesLast(AbstractForm):
         return isinstance(value, _Lanes)
 
     def elementwise(self, equation, operands):
-        arrays = jnp.broadcast_arrays(*map(self._array, operands))
+        arrays = _of_one_shape(list(map(self._array, operands)))
         return _Lanes(equation.primitive.bind(*arrays, **equation.params))
 
     def moved(self, equation, operands):
@@ -213,6 +213,19 @@ def _objects(shape: tuple[int, ...], entry: Callable[[tuple[int, ...]], Any]) ->
     for index in np.ndindex(shape):
         objects[index] = entry(index)
     return objects
+
+
+def _of_one_shape(arrays: Sequence) -> list:
+    """Broadcast where there is anything to do: `jnp.broadcast_arrays`, which is called for each
+    coordinate of each operation here, takes longer to trace than the operation."""
+    shape = np.broadcast_shapes(*map(np.shape, arrays))
+
+    def wide(array):
+        if np.shape(array) == shape:
+            return array
+        return lax.broadcast_in_dim(array, shape, range(len(shape) - np.ndim(array), len(shape)))
+
+    return list(map(wide, arrays))
 
 
 def _broadcast(value, *, shape, broadcast_dimensions, **_):

@@ -222,6 +222,7 @@ class _Lanes:
         self.steps = _Steps(guide, *jax.tree.map(lambda leaf: leaf[:-1], each))
         self._last = _Steps(None, *jax.tree.map(lambda leaf: leaf[-1], each))
         self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.density
+        self._of_pairs = jax.jit(self._log_halving)  # traced once, for the loop and for its end
 
     def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
         """What belongs to an interval, for each of its lanes."""
@@ -304,24 +305,29 @@ class _Lanes:
     def _moved(self, state: _State, x_next, log_densities, steps: _Steps) -> _State:
         """The state at x_next, given the log densities of the step."""
         here, there = self._looked(state.x), self._looked(x_next)
-
-        def one(before, x, x_next, dt_before, dt):
-            points, both = (before, x, x_next), (dt_before, dt)
-            return log_halving_of_pair(self._density, self._dynamics, points, both)
-
-        def of_pairs():
-            if self._of_lane is None:
-                both = self._of_each((steps.before, steps.dt))
-            else:
-                both = (jnp.repeat(dt, self._num_looked) for dt in (steps.before, steps.dt))
-            each = (-1, -1, -1, self._of_lane, self._of_lane)
-            return over_lanes(*each)(one)(state.before, here, there, *both)
-
-        change = lax.cond(steps.ends_pair, of_pairs, lambda: jnp.zeros_like(state.log_halving))
+        change = lax.cond(
+            steps.ends_pair,
+            lambda: self._of_pairs(state.before, here, there, steps.before, steps.dt),
+            lambda: jnp.zeros_like(state.log_halving),
+        )
         log_halving = state.log_halving + lax.stop_gradient(change)
         target, proposal = log_densities
         sums = state.log_target + target, state.log_proposal + proposal
         return _State(x_next, *sums, here, log_halving)
+
+    def _log_halving(self, before, x, x_next, *both):
+        """The part of D of pairs of steps, of the paths that are looked at."""
+
+        def one(before, x, x_next, *both):
+            points = (before, x, x_next)
+            return log_halving_of_pair(self._density, self._dynamics, points, both)
+
+        if self._of_lane is None:
+            both = self._of_each(both)
+        else:
+            both = [jnp.repeat(dt, self._num_looked) for dt in both]
+        each = (-1, -1, -1, self._of_lane, self._of_lane)
+        return over_lanes(*each)(one)(before, x, x_next, *both)
 
 
 def noise_of(

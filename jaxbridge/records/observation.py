@@ -85,7 +85,7 @@ class LinearGaussian(eqx.Module):
                 f"components; it has {value.shape}."
             )
         value = value.astype(dtype)
-        return value if value.ndim == 2 else value * jnp.eye(m, dtype=dtype)
+        return value if value.ndim == 2 else value * np.eye(m, dtype=dtype)
 
     def matrix_for(self, d: int, m: int, dtype) -> Float[Array, "m d"]:
         """L as a matrix."""

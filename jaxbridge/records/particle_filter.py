@@ -165,24 +165,9 @@ def log_likelihood(
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     records = as_record_problems(*arguments, num_steps=num_steps, **options)
     size = num_filters, num_particles
-    num_steps = records.stacked.num_steps
-    levels = range(1, 1 + num_coarse_grids(num_steps))
-    value, error, fine = _log_mean(key, records, *size)
-    coarse = [_log_mean(key, records.coarsened(level), *size)[:2] for level in levels]
-    values, errors = map(jnp.stack, zip((value, error), *coarse, strict=True))
-    # What rounding leaves of the sum over all steps is no change, either.
-    rounding = np.sqrt(records.stacked.record.dt.size) * jnp.finfo(value.dtype).eps
-    rounding = rounding.astype(value.dtype) * jnp.maximum(1, jnp.abs(value))
-    errors = jnp.hypot(errors, rounding)
-    step_error = error_of_grids(values, errors, records.stacked.density.order, num_steps)
-    made = LogLikelihood(
-        value,
-        error,
-        jnp.sum(fine.log_estimate, axis=0),
-        records.at_observations(jnp.mean(fine.size, axis=1)),
-        jnp.sum(fine.num_nonfinite),
-        *step_error,
-    )
+    levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
+    grids = [records, *map(records.coarsened, levels)]
+    made = _told(records, [_estimates(key, grid, _guides(grid), *size) for grid in grids])
     return _or_throw(made, model) if throw else made
 
 
@@ -195,15 +180,31 @@ def _or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
     return throw_where(made, "value", model, faults)
 
 
-def _log_mean(
-    key: Key[Array, ""], records: Records, R: int, P: int
-) -> tuple[Float[Array, ""], Float[Array, ""], "Filtered"]:
-    """log p̂ of all records, with its standard error, and what their filters say."""
-    model = records.stacked.model
-    guides = records.each(lambda problem: linearised(problem, model).guide)
-    made = _estimates(key, records, guides, R, P)
-    log_means, errors, _ = log_mean_and_error(made.log_estimate)
-    return jnp.sum(log_means), jnp.sqrt(jnp.sum(errors**2)), made
+@compiled
+def _told(records: Records, grids: list["Filtered"]) -> LogLikelihood:
+    """What filters on the grid, and on coarser ones, say of all records together."""
+    means = [log_mean_and_error(each.log_estimate) for each in grids]
+    values = jnp.stack([jnp.sum(log_mean) for log_mean, _, _ in means])
+    errors = jnp.stack([jnp.sqrt(jnp.sum(error**2)) for _, error, _ in means])
+    (value, *_), (error, *_), fine = values, errors, grids[0]
+    # What rounding leaves of the sum over all steps is no change, either.
+    rounding = np.sqrt(records.stacked.record.dt.size) * jnp.finfo(value.dtype).eps
+    rounding = rounding.astype(value.dtype) * jnp.maximum(1, jnp.abs(value))
+    order, num_steps = records.stacked.density.order, records.stacked.num_steps
+    step_error = error_of_grids(values, jnp.hypot(errors, rounding), order, num_steps)
+    return LogLikelihood(
+        value,
+        error,
+        jnp.sum(fine.log_estimate, axis=0),
+        records.at_observations(jnp.mean(fine.size, axis=1)),
+        jnp.sum(fine.num_nonfinite),
+        *step_error,
+    )
+
+
+def _guides(records: Records) -> Guidance:
+    """Of each record, at the parameters of the model."""
+    return records.each(lambda problem: linearised(problem, problem.model).guide)
 
 
 def _exact(

@@ -158,10 +158,10 @@ def _has_dimension(model: Diffusion, like: Float[Array, " d"]) -> bool:
 def check_domain(model: Diffusion, observation: Observation, record: Record) -> None:
     """Raise `ValueError` where a state that was seen whole and without noise is none of the
     model's."""
-    d, seen = record.values.shape[-1], record.values[record.which]
     is_inside = model.state_space()
     if is_inside is None or not isinstance(observation, LinearGaussian):
         return
+    d, seen = record.values.shape[-1], record.values[record.which]
     if is_traced(model, observation, seen):
         return
     matrix = np.asarray(observation.matrix_for(d, d, seen.dtype), float)

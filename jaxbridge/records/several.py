@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.checks import Numbers
+from ..engine.compiled import compiled
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
 from .guided_record import linearised
@@ -38,7 +39,7 @@ class Records(eqx.Module):
 
     def coarsened(self, level: int = 1) -> "Records":
         """The same with steps that are 2^level as long."""
-        record = jax.vmap(lambda record: record.coarsened(level))(self.stacked.record)
+        record = _coarsened(self.stacked.record, level)
         return Records(dataclasses.replace(self.stacked, record=record), self.num_times)
 
     @property
@@ -57,8 +58,7 @@ class Records(eqx.Module):
         if self.number > 1:
             return jax.vmap(one)(*arguments)
         # A single record takes no lanes: under `vmap` both branches of a `cond` would be run.
-        alone = jax.tree.map(lambda leaf: leaf[0], arguments)
-        return jax.tree.map(lambda leaf: leaf[None], one(*alone))
+        return _with_axis(one(*_without_axis(arguments)))
 
     def at_observations(self, values: Float[Array, "R ends"]) -> Float[Array, " n"]:
         """What belongs to the ends of segments, at all observations, record after record."""
@@ -88,10 +88,32 @@ def as_record_problems(
     for record in records[1:]:
         check_domain(model, observation, record)
     num_times = tuple(len(record.which) for record in records)
+    return Records(dataclasses.replace(problem, record=_stacked(records)), num_times)
+
+
+# One program each, where there would be one for every array.
+@compiled
+def _stacked(records: list[Record]) -> Record:
+    """Records of one length, with an axis in front."""
     num_segments = max(len(record.dt) for record in records)
-    same = [_padded(record, num_segments, max(num_times)) for record in records]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *same)
-    return Records(dataclasses.replace(problem, record=stacked), num_times)
+    num_times = max(len(record.which) for record in records)
+    same = [_padded(record, num_segments, num_times) for record in records]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *same)
+
+
+@compiled
+def _coarsened(stacked: Record, level: int) -> Record:
+    return jax.vmap(lambda record: record.coarsened(level))(stacked)
+
+
+@compiled
+def _without_axis(tree: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[0], tree)
+
+
+@compiled
+def _with_axis(tree: PyTree) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[None], tree)
 
 
 def _padded(record: Record, num_segments: int, num_times: int) -> Record:
