@@ -68,6 +68,16 @@ def _sum(terms: list[Array]) -> Array:
     return functools.reduce(operator.add, terms)
 
 
+def sum_of_many(terms: Float[Array, " n"]) -> Float[Array, ""]:
+    """Σ terms, in pairs: to rounding of one addition and of their logarithm, and without what is
+    said of reductions in `_sum`."""
+    while terms.shape[0] > 1:
+        half = terms.shape[0] // 2
+        pairs = terms[:half] + terms[half : 2 * half]
+        terms = jnp.concatenate([pairs, terms[2 * half :]])
+    return terms[0]
+
+
 def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
     """|v| with a zero (not NaN) derivative at v = 0."""
     square = dot(vector, vector)

@@ -7,10 +7,13 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Key, PyTree
 
 from ..engine.checks import without_derivatives
 from ..engine.compiled import compiled
+from ..engine.lanes import over_lanes
+from ..engine.linalg import sum_of_many
+from ..engine.recursion import recursion
 from ..models.diffusion import Diffusion
 from .guided_steps import (
     Guide,
@@ -80,19 +83,24 @@ def path_and_log_weight(
     """The path that this noise makes, and its log weight: the first row is that of x_0."""
     density, dynamics = problem.density, model.forward(problem.like)
     start = guide.start.point(noise[0])
+    steps = flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
 
-    def one(state, inputs):
-        (x, log_weight), (zeta, step, scalars) = state, inputs
+    def one(x, inputs):
+        zeta, step, scalars = inputs
         law = guided_step(density, dynamics, x, step, scalars)
-        x = law.point(zeta)
-        return (x, log_weight + law.log_weight), x
+        return law.point(zeta), law.log_weight
 
-    inputs = noise[1:], flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
-    # For derivatives the states are kept: to keep all between them takes longer than to redo it.
-    one = jax.checkpoint(one, prevent_cse=False)
-    (_, log_weight), path = lax.scan(one, (start, guide.start.log_weight), inputs)
-    path = jnp.concatenate([start[None], path])
+    points, log_weights = recursion(one, start, (noise[1:], *steps))
+    path = jnp.concatenate([start[None], points])
+    log_weight = guide.start.log_weight + sum_of_many(log_weights)
     return path, log_weight + corrections(problem, model, guide, path)
+
+
+def _of_each_step(of_step: Callable, *steps: PyTree) -> PyTree:
+    """`of_step` of all steps, which are the first axes of arrays, side by side."""
+    last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), steps)
+    each = over_lanes(*[-1] * len(steps))(of_step)(*last)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), each)
 
 
 def noise_and_log_weight(
@@ -112,16 +120,15 @@ def noise_and_log_weight(
     still = jnp.diagonal(guide.initial.root) == 0
     fresh = jax.random.normal(jax.random.fold_in(key, 1), first.shape, path.dtype)
 
-    def one(log_weight, inputs):
-        x, x_next, step, scalars, hidden = inputs
+    def of_step(x, x_next, step, scalars, hidden):
         law = density.steps_from(dynamics, x).law(step.dt)
         guided = guided_law(law, x, step, scalars)
-        zeta = guided.noise(x_next, functools.partial(solve_law, law), hidden)
-        return log_weight + guided.log_weight, zeta
+        return guided.noise(x_next, functools.partial(solve_law, law), hidden), guided.log_weight
 
-    inputs = path[:-1], path[1:], flat(guide.steps), scalars, hidden[1:]
-    log_weight, zeta = lax.scan(one, guide.start.log_weight, inputs)
+    steps = path[:-1], path[1:], flat(guide.steps), scalars, hidden[1:]
+    zeta, log_weights = _of_each_step(of_step, *steps)
     noise = jnp.concatenate([jnp.where(still, fresh, first)[None], zeta])
+    log_weight = guide.start.log_weight + sum_of_many(log_weights)
     return noise, log_weight + corrections(problem, model, guide, path)
 
 

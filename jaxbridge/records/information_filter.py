@@ -6,23 +6,54 @@ step, with E = A and f = a at first, and log h_i what the log densities of their
 h_{i+1} is integrated: with W = ℛ⁻¹ Λᵀ H,
 
     log h_i += (r - Wᵀℛ⁻¹Λᵀr)ᵀ e - ½ eᵀ (H - WᵀW) e.
+
+What h_i owes to h_{i+1} needs no derivative of this. Given all that is seen later u' has a mean
+Γu + m, the tilted step's, and a small change of log h_{i+1} changes log h_i by its mean, so that
+
+    Ḣ_i = Γᵀ Ḣ Γ,   ṙ_i = Γᵀ (ṙ - Ḣ m),   Γ = (I - G H) E,   m = (I - G H) f + G r,
+
+with G = Λ (ℛ ℛᵀ)⁻¹ Λᵀ, the covariance of u' given all that.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jaxtyping import Array, Float
 
-from ..engine.linalg import dot, matmul, matvec, solve_lower
+from ..engine.linalg import dot, matmul, matvec, solve_lower, solve_lower_transposed
+from ..engine.recursion import StateDerivative, recursion
 from .linearisation import LinearisedStep
 from .observation import Scalars
 from .segments import at_every_step, flat
 from .tilted_step import Information, root_after, seen_of, tilt_factor
 
 
+class _Mean(NamedTuple):
+    """E u + f, the mean of a step given what is seen at its end; and Λ."""
+
+    slope: Float[Array, "d d"]
+    shift: Float[Array, " d"]
+    root: Float[Array, "d m"]
+
+
 def back(h: Information, step: LinearisedStep, scalars: Scalars) -> Information:
     """h_i, from h_{i+1} and what is seen at the end of the step."""
+    (E, f, root), seen = _seen(step, scalars)
+    factor, half = tilt_factor(root, h)
+    W = jnp.stack([solve_lower(factor, row) for row in half])  # Wᵀ
+    w = solve_lower(factor, matvec(root.T, h.shift))
+    H = h.precision - matmul(W, W.T)
+    r = h.shift - matvec(W, w) - matvec(H, f)
+    shift = seen.shift + matvec(E.T, r)
+    precision = seen.precision + matmul(E.T, matmul(H, E))
+    return Information(shift, (precision + precision.T) / 2)
+
+
+def _seen(step: LinearisedStep, scalars: Scalars) -> tuple[_Mean, Information]:
+    """What is seen at the end of the step makes of its mean, and what it says of its beginning."""
     E, f, root = step
     shift, precision = jnp.zeros_like(f), jnp.zeros_like(E)
     for row, value, variance, is_seen in zip(*scalars, strict=True):
@@ -34,33 +65,45 @@ def back(h: Information, step: LinearisedStep, scalars: Scalars) -> Information:
         E = E - seen.gain[:, None] * slope
         f = f + seen.gain * residual
         root = root_after(root, seen)
+    return _Mean(E, f, root), Information(shift, precision)
+
+
+def _tilted_mean(h: Information, inputs: tuple[LinearisedStep, Scalars]):
+    """Γ and m."""
+    (E, f, root), _ = _seen(*inputs)
     factor, half = tilt_factor(root, h)
-    W = jnp.stack([solve_lower(factor, row) for row in half])  # Wᵀ
-    w = solve_lower(factor, matvec(root.T, h.shift))
-    H = h.precision - matmul(W, W.T)
-    r = h.shift - matvec(W, w) - matvec(H, f)
-    shift = shift + matvec(E.T, r)
-    precision = precision + matmul(E.T, matmul(H, E))
-    return Information(shift, (precision + precision.T) / 2)
+
+    def pulled(v):
+        """Λ (ℛ ℛᵀ)⁻¹ v."""
+        return matvec(root, solve_lower_transposed(factor, solve_lower(factor, v)))
+
+    gain = jnp.stack([pulled(row) for row in half])  # H G
+    m = f - matvec(gain.T, f) + pulled(matvec(root.T, h.shift))
+    return E - matmul(gain.T, E), m
+
+
+def _through_mean(mean: tuple[Array, Array], h_dot: Information) -> Information:
+    """Of a change of h_{i+1}, that of h_i."""
+    slope, shift = mean
+    r = matvec(slope.T, h_dot.shift - matvec(h_dot.precision, shift))
+    return Information(r, matmul(slope.T, matmul(h_dot.precision, slope)))
 
 
 def information_filter(
     steps: LinearisedStep,
     scalars: Scalars,
-    each: Callable[[Callable], Callable] = lambda function: function,
+    over_lanes: Callable[[Callable], Callable] | None = None,
 ) -> Information:
     """h at the beginning of every step, for steps with leading axes (K, N), and what is seen at the
-    ends of segments, leading axis K. `each` maps a function of one point over lanes, where there
-    are any, in the last axis."""
+    ends of segments, leading axis K. Where there are lanes, in the last axis, `over_lanes` maps a
+    function of one point over them; then there are no derivatives."""
     K, N = steps.shift.shape[:2]
-    shift, decay = steps.shift[0, 0], steps.decay[0, 0]
-    last = Information(jnp.zeros_like(shift), jnp.zeros_like(decay))
-
-    def one(h, inputs):
-        h = each(back)(h, *inputs)
-        return h, h
-
-    inputs = flat(steps), at_every_step(scalars, N)
-    # For derivatives the states are kept: to keep all between them takes longer than to redo it.
-    _, h = lax.scan(jax.checkpoint(one, prevent_cse=False), last, inputs, reverse=True)
-    return jax.tree.map(lambda leaf: leaf.reshape(K, N, *leaf.shape[1:]), h)
+    last = Information(jnp.zeros_like(steps.shift[0, 0]), jnp.zeros_like(steps.decay[0, 0]))
+    inputs = jax.tree.map(lambda leaf: leaf[::-1], (flat(steps), at_every_step(scalars, N)))
+    if over_lanes is None:
+        one = lambda h, inputs: (back(h, *inputs), None)
+        h, _ = recursion(one, last, inputs, StateDerivative(_tilted_mean, _through_mean))
+    else:
+        each = over_lanes(back)
+        h = lax.scan(lambda h, inputs: 2 * (each(h, *inputs),), last, inputs)[1]
+    return jax.tree.map(lambda leaf: leaf[::-1].reshape(K, N, *leaf.shape[1:]), h)
