@@ -669,18 +669,17 @@ def test_the_same_key_gives_the_same_numbers():
 
 
 @hard(
-    "60,000 lanes with a full σ(x), d = 2, 5, 12",
+    "60,000 lanes with a full σ(x), d = 6",
     "batched LAPACK calls inside a scan deadlock XLA's thread pool on CPU",
     "no LAPACK call in any loop: elimination and polar iterations written out",
 )
 @pytest.mark.slow
-@pytest.mark.parametrize("d", [2, 6])
-def test_no_deadlock(d):
+def test_no_deadlock():
     """Sampler, counts, weights and Gibbs in a process of their own, with a deadline."""
     run_program(
-        f"""
+        """
         import jax, jax.numpy as jnp, jaxbridge as jb
-        d, n = {d}, 60_000
+        d, n = 6, 60_000
         mix = lambda x: jnp.eye(d) + 0.1 * jnp.sin(x)[:, None] * jnp.cos(x)
         model = jb.Diffusion(
             lambda x, p: -p * x, lambda x, p: mix(x), lambda x, p: -x @ x, 1.0, reversible=True

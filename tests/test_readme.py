@@ -16,21 +16,17 @@ TEXT = {page: page.read_text(encoding="utf-8") for page in PAGES}
 BLOCKS = re.findall(r"```python\n(.*?)```", "".join(TEXT.values()), re.DOTALL)
 
 
-def test_quickstart_runs():
+@pytest.mark.slow
+def test_code_runs():
+    """The quickstart, and the blocks of the pages, which go on from those of the README."""
+    assert len(BLOCKS) == 17
     namespace = {}
     for block in BLOCKS[:4]:
         exec(block, namespace)
     assert namespace["paths"].mean().shape == (291, 2)
     assert bool(namespace["bridges"].met.all()) and bool(namespace["many"].met.all())
     assert namespace["closer"].paths.shape == (1000, 51, 2)
-
-
-@pytest.mark.slow
-def test_code_runs():
-    """The blocks of the pages go on from those of the README."""
-    assert len(BLOCKS) == 17
-    namespace = {}
-    for block in BLOCKS:
+    for block in BLOCKS[4:]:
         exec(block, namespace)
     assert namespace["bridges"].paths.shape == (1000, 101, 2)
     assert bool(namespace["bridges"].met.all())

@@ -23,7 +23,7 @@ from jaxbridge.schemes.step_error import error_of_log_mean
 
 slow = pytest.mark.slow
 RANDOM = random_models.random_models()
-ALL_METHODS = 4
+ALL_METHODS = 2
 
 
 class Told(NamedTuple):

@@ -48,7 +48,7 @@ def assert_same(one, other):
 def test_derivatives_are_those_of_the_loop(x64, arguments):
     arguments = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), arguments)
     for transform in (
-        lambda f: jax.jit(jax.value_and_grad(f, argnums=(0, 1, 2))),
+        lambda f: jax.value_and_grad(f, argnums=(0, 1, 2)),
         lambda f: jax.jacfwd(jax.grad(f, argnums=(0, 1)), argnums=(0, 1)),
         lambda f: (
             lambda params, start, pulls: jax.vmap(jax.grad(f, argnums=1), in_axes=(None, 0, None))(
@@ -56,8 +56,9 @@ def test_derivatives_are_those_of_the_loop(x64, arguments):
             )
         ),
     ):
-        made = [transform(lambda *a, run=run: value(run, *a)) for run in (recursion, as_loop)]
-        assert_same(made[0](*arguments), made[1](*arguments))
+        by = lambda run, transform=transform: transform(lambda *a: value(run, *a))
+        made = [jax.jit(by(run))(*arguments) for run in (recursion, as_loop)]
+        assert_same(*made)
 
 
 def test_a_derivative_of_its_own_is_used(x64):

@@ -43,6 +43,7 @@ def test_likelihoods_multiply():
     assert abs(alone.value - SHORT.kalman(4).log_likelihood) < 1e-4
 
 
+@pytest.mark.slow
 def test_paths_beyond_the_end_of_the_shorter_one_are_nobodys():
     """Paths of both records, in blocks that reach beyond the end of the shorter one, have the law
     that each has by itself."""
