@@ -148,6 +148,13 @@ MODELS = [
     *each("x0", lambda x: simulate(x0=x), [1.0, np.zeros((3, 2))], "`x0` must have shape"),
     ("x0 on a line", simulate(x0=[0.0]), r"at a point of shape \(1,\)"),
     ("x0 in space", simulate(model=ROTATING, x0=np.zeros(3)), r"at a point of shape \(3,\)"),
+    ("x0 in more dimensions than OU's", simulate(model=OU, x0=A), r"for points of shape \(1,\)"),
+    (
+        "x0 in less",
+        simulate(model=HYPERBOLIC, x0=[0.0]),
+        r"for points of shape \(2,\)",
+    ),
+    ("x0 in more", simulate(model=HYPERBOLIC, x0=np.zeros(3)), r"for points of shape \(2,\)"),
     ("no model", simulate(model=None), "`model` must be a", TypeError),
     ("no x0", simulate(model=FREE, x0=None), "sample_stationary="),
     # Other coordinates.

@@ -4,9 +4,10 @@ What is given becomes arrays, or an error that says what to change (`checks`). A
 function of its place in a tree of keys (`keys`), so nothing depends on what runs beside it. Points
 are small and lanes, one simulated path each, are many: a function of one point is evaluated with
 lanes in the last axis (`lanes`, whose values have one of the `lane_forms`), its algebra written
-out (`linalg`), in scans over time that draw their noise chunk by chunk (`noise`). Attempts are made
-side by side until each of many problems has its successes (`rejection`), on all `devices`, in loops
-that tell how far they are (`progress`).
+out (`linalg`), in scans over time that draw their noise chunk by chunk (`noise`), or, where there
+is but one path, have the derivatives of all steps at once (`recursion`). Attempts are made side by
+side until each of many problems has its successes (`rejection`), on all `devices`, in loops that
+tell how far they are (`progress`).
 
 Of what comes out means are taken, Σ w h / Σ w (`averages`), whose weights have tails that allow it
 or not (`pareto`), and whose draws are worth so many independent ones (`diagnostics`). What is

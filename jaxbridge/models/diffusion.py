@@ -382,6 +382,15 @@ def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) 
     return value.astype(x.dtype)
 
 
+def check_dimension(x: Float[Array, " d"], dim: int) -> None:
+    """Raise `ValueError` where a model whose dimension is known is asked of another point."""
+    if x.shape != (dim,):
+        raise ValueError(
+            f"the `drift` of this model is for points of shape ({dim},); it was called at a point "
+            f"of shape {x.shape}."
+        )
+
+
 @functools.lru_cache(maxsize=256)
 def _constant_function(values: tuple) -> Callable:
     """σ as a function of a point, the same one for the same numbers."""

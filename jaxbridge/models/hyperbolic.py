@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced
 from ..engine.linalg import dot
-from .diffusion import Diffusion
+from .diffusion import Diffusion, check_dimension
 
 
 def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
@@ -37,7 +37,7 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     if alpha.shape != () or not (is_traced(alpha) or 0 < np.asarray(alpha) < np.inf):
         raise ValueError(f"`alpha` must be one positive number; got {alpha}.")
     return Diffusion(
-        drift=_hyperbolic_drift,
+        drift=_HyperbolicDrift(dim),
         log_stationary=_hyperbolic_log_stationary,
         params=alpha,
         sample_stationary=_HyperbolicSampler(dim),
@@ -64,8 +64,13 @@ class _PrepareHyperbolic:
         return _Hyperbolic(alpha, np.log(2) + log_bessel + power)
 
 
-def _hyperbolic_drift(x: Float[Array, " d"], p: _Hyperbolic) -> Float[Array, " d"]:
-    return -p.alpha * x / jnp.sqrt(1 + dot(x, x))
+@dataclasses.dataclass(frozen=True)
+class _HyperbolicDrift:
+    dim: int
+
+    def __call__(self, x: Float[Array, " d"], p: _Hyperbolic) -> Float[Array, " d"]:
+        check_dimension(x, self.dim)  # for the normaliser is of this one
+        return -p.alpha * x / jnp.sqrt(1 + dot(x, x))
 
 
 def _hyperbolic_log_stationary(x: Float[Array, " d"], p: _Hyperbolic) -> Float[Array, ""]:

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import any_cholesky, any_inverse, dot, matvec, solve
 from .bridge_problem import as_intervals
-from .diffusion import Diffusion, check_invertible
+from .diffusion import Diffusion, check_dimension, check_invertible
 from .gaussian_law import GaussianLaw
 from .linear import linear_transition
 
@@ -141,12 +141,17 @@ def ou_transition(model: Diffusion, start: Numbers, duration: Numbers) -> Gaussi
     return GaussianLaw(params.mean + decay @ (start - params.mean), covariance)
 
 
+def _deviation(x, p: _Prepared):
+    check_dimension(x, len(p.mean))
+    return x - p.mean
+
+
 def _drift(x, p: _Prepared):
-    return -matvec(p.B, x - p.mean)
+    return -matvec(p.B, _deviation(x, p))
 
 
 def _reverse_drift(x, p: _Prepared):
-    return -matvec(p.reverse_B, x - p.mean)
+    return -matvec(p.reverse_B, _deviation(x, p))
 
 
 def _sigma(x, p: _Prepared):
@@ -154,7 +159,7 @@ def _sigma(x, p: _Prepared):
 
 
 def _log_stationary(x, p: _Prepared):
-    deviation = x - p.mean
+    deviation = _deviation(x, p)
     return -dot(deviation, matvec(p.precision, deviation)) / 2 - p.log_normaliser
 
 
