@@ -160,7 +160,7 @@ def log_likelihood(
                 "`transition_log_density`: leave out `initial`, `initial_time` and `density`."
             )
         made = _exact(key, model, times, observations, num_particles, num_steps, step_size)
-        return _or_throw(made, model) if throw else made
+        return or_throw(made, model) if throw else made
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     records = as_record_problems(*arguments, num_steps=num_steps, **options)
@@ -168,10 +168,11 @@ def log_likelihood(
     levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
     grids = [records, *map(records.coarsened, levels)]
     made = _told(records, [_estimates(key, grid, _guides(grid), *size) for grid in grids])
-    return _or_throw(made, model) if throw else made
+    return or_throw(made, model) if throw else made
 
 
-def _or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
+def or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
+    """The same, whose value raises `RuntimeError` where it is not to be trusted."""
     faults = [
         (made.unexplained >= 0, _UNEXPLAINED),
         (~made._filters_agree, _DISAGREE),

@@ -209,8 +209,11 @@ def smooth(
     paths = jnp.moveaxis(drawn.paths, 1, 0)
     found = (drawn.accepted, drawn.stuck, drawn.num_truncated)
     smoothed = Smoothed(drawn.times, paths, *found, told_by)
-    if not throw:
-        return smoothed
+    return or_throw(smoothed, model) if throw else smoothed
+
+
+def or_throw(smoothed: Smoothed, model: Diffusion) -> Smoothed:
+    """The same, whose paths raise `RuntimeError` where they are not to be trusted."""
     faults = [
         (smoothed.stuck, _STUCK),
         (smoothed.num_truncated > 0, _CUT_OFF),

@@ -1,0 +1,66 @@
+"""What is not to be trusted is an error for those who ask for it, and says what to change."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxbridge as jb
+from jaxbridge.records import particle_filter, smooth
+from jaxbridge.records.particle_filter import LogLikelihood
+from jaxbridge.records.smooth import Smoothed
+
+MODEL = jb.Diffusion(lambda x, p: -p * x, params=1.0)
+
+
+def likelihood(error=0.1, sizes=50.0, step_error=0.0, doubt=0.01):
+    value, filters = jnp.array(-3.0), jnp.full(4, -3.0)
+    told = map(jnp.array, (step_error, doubt))
+    return LogLikelihood(value, jnp.array(error), filters, jnp.full(5, sizes), jnp.int32(0), *told)
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        (dict(sizes=0.0), "no particle explains"),
+        (dict(sizes=4.0), "num_particles"),
+        (dict(error=0.6), "num_particles"),
+        (dict(error=jnp.inf), "num_particles"),
+        (dict(step_error=0.2), "num_steps"),
+        (dict(step_error=jnp.nan, doubt=jnp.nan), "num_steps"),
+        (dict(doubt=jnp.inf), "num_steps"),
+    ],
+)
+def test_likelihoods(changed, message):
+    made = likelihood(**changed)
+    assert not made.trustworthy
+    with pytest.raises(Exception, match=message):
+        particle_filter.or_throw(made, MODEL)
+
+
+def smoothed(apart=0.0, stuck=False, num_truncated=0):
+    paths = jax.random.normal(jax.random.key(0), (4, 100, 3, 1)).at[::2].add(apart)
+    flags = jnp.full(4, stuck)
+    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, jnp.int32(num_truncated), None)
+
+
+@pytest.mark.parametrize(
+    "changed, message",
+    [
+        (dict(stuck=True), "never moved"),
+        (dict(num_truncated=2), "cut off"),
+        (dict(apart=3.0), "chains"),
+    ],
+)
+def test_smoothed_paths(changed, message):
+    made = smoothed(**changed)
+    assert not made.trustworthy
+    with pytest.raises(Exception, match=message):
+        smooth.or_throw(made, MODEL)
+
+
+def test_what_is_trusted_is_not_thrown():
+    assert particle_filter.or_throw(likelihood(), MODEL).value == -3
+    made = smoothed()
+    assert jnp.all(smooth.or_throw(made, MODEL).paths == made.paths)
+    with pytest.raises(Exception, match="not finite"):
+        smooth.or_throw(made, MODEL.with_params(jnp.nan))
