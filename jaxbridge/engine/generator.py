@@ -7,8 +7,9 @@ rounds of
 
 after every fourth of which a word of the key is added to each. On CPUs JAX makes a loop of these,
 for which the compiler needs a dozen kernels at each place where keys are derived or numbers drawn:
-half of the time that a small program takes to compile. Written out each place is one kernel. The
-numbers are the same, bit by bit.
+half of the time that a small program takes to compile. Written out each place is one kernel, or
+part of those that read its numbers; only a single number is left to JAX. The numbers are the same,
+bit by bit.
 """
 
 import math
@@ -67,6 +68,11 @@ def _fold_in(key, number):
 
 
 def _random_bits(key, width, shape):
+    if math.prod(shape) == 1:
+        # Written out it would be worked out anew in each turn of the loop that reads it, and LLVM
+        # (of JAX 0.10.2) may take minutes for one with all of this in its body.
+        own = jax.random.wrap_key_data(key, impl="threefry2x32")
+        return jax.random.bits(own, shape, f"uint{width}")
     high, low = threefry(key, _counts(shape))
     if width == 64:
         return high.astype(np.uint64) << np.uint64(32) | low.astype(np.uint64)

@@ -1,4 +1,5 @@
-"""Keys that are written out give JAX's own numbers, by programs that have no loops."""
+"""Keys that are written out give JAX's own numbers, by programs that have no loops but for single
+numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,8 @@ DRAWS = {
     "16 bits": lambda key: jax.random.bits(key, (5, 3), "uint16"),
     "32 bits": lambda key: jax.random.bits(key, (5, 3)),
     "no shape": lambda key: jax.random.bits(key),
+    "one number": lambda key: jax.random.bits(key, (1, 1), "uint16"),
+    "one in lanes": lambda key: jax.vmap(jax.random.uniform)(jax.random.split(key, 5)),
     "nothing": lambda key: jax.random.bits(key, (0, 3)),
     "integers": lambda key: jax.random.randint(key, (4,), 0, 10),
     "permutation": lambda key: jax.random.permutation(key, 20),
@@ -50,6 +53,13 @@ def test_there_are_no_loops():
         return jax.jit(draw).lower(KEY).as_text().count("stablehlo.while")
 
     assert num_loops(draw) > 0 == num_loops(lambda key: draw(with_keys_written_out(key)))
+
+
+def test_a_single_number_is_a_loop():
+    """That a loop which reads it cannot have in its body."""
+    for shape in ((), (1,)):
+        draw = lambda key, shape=shape: jax.random.uniform(with_keys_written_out(key), shape)
+        assert jax.jit(draw).lower(KEY).compile().as_text().count(" while(") == 1
 
 
 def test_keys_of_other_kinds_are_as_they_were():

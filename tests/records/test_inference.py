@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import run_program
 from kalman import exact_step, kalman
 from scipy.optimize import minimize
 
@@ -103,6 +104,29 @@ def test_the_likelihood_follows_its_parameters():
     )
     exact = kalman_log_likelihood(*other.values())
     assert abs(made.value - exact) < 2e-3  # that of ten second order steps
+
+
+@pytest.mark.slow
+def test_a_single_chain_is_compiled_in_time():
+    """Of one dimension, optimised as for users: LLVM took minutes for a loop that had the random
+    number of a decision in its body."""
+    run_program(
+        """
+        import jax, jax.numpy as jnp, numpy as np, jaxbridge as jb
+        model = jb.Diffusion(
+            lambda x, p: -jnp.exp(p["rate"]) * x,
+            lambda x, p: jnp.exp(p["sigma"]) * jnp.ones(1),
+            params={"rate": 0.0, "sigma": 0.0, "noise": -1.0},
+        )
+        made = jb.gibbs(
+            jax.random.key(0), model, np.arange(20) * 0.4, np.linspace(-1, 1, 20)[:, None],
+            observation=jb.LinearGaussian(covariance=lambda p: jnp.exp(2 * p["noise"])),
+            initial=jb.GaussianLaw([0.0], [[1.0]]), prior=jb.NormalPrior(3 * [0.0], 3 * [1.0]),
+            num_iterations=50, num_steps=5,
+        )
+        assert np.isfinite(made.theta).all() and made.parameters_moved.any()
+        """
+    )
 
 
 @pytest.mark.slow
