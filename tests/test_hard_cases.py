@@ -19,7 +19,6 @@ from jaxbridge.models.bridge_problem import Intervals
 
 PAGE = pathlib.Path(__file__).parent.parent / "notebooks" / "hard_cases.md"
 ROWS: list[tuple[str, str, str, str]] = []
-pytestmark = pytest.mark.optimised
 # Where rounding is not what is hard.
 in_single = pytest.mark.parametrize("precision", ["float32"], indirect=True)
 
@@ -73,6 +72,7 @@ def density_on_grid(drift, grid, start, duration):
     "u is zero there, with derivative zero; index 0 counts as a meeting",
 )
 @pytest.mark.slow
+@in_single
 def test_pairs_that_have_met_before_they_start(precision):
     model, dtype = paper_model(), jnp.dtype(precision)
     coupling = jb.Coupling(0.5)
@@ -141,6 +141,7 @@ def test_gamma_at_both_ends(precision, unchecked):
     "are kept as logarithms",
 )
 @pytest.mark.slow
+@pytest.mark.optimised
 @in_single
 def test_very_unlikely_bridges(precision):
     model, dtype = paper_model(), jnp.dtype(precision)
@@ -189,6 +190,7 @@ def test_very_unlikely_bridges(precision):
     "times are i δ, computed from i; only the times asked for are kept",
 )
 @pytest.mark.slow
+@pytest.mark.optimised
 @pytest.mark.parametrize("model", [paper_model(), jb.hyperbolic(0.8, 2)], ids=["OU", "hyperbolic"])
 def test_long_intervals(model):
     bridges = jb.sample_bridges(
@@ -212,6 +214,7 @@ def test_long_intervals(model):
     "pairs do not meet unless the ends are close: a search for ever",
     "`met` is false within the bound, and `throw=True` says what to do instead",
 )
+@in_single
 def test_short_intervals(precision):
     dtype = jnp.dtype(precision)
     options = dict(num_bridges=2, num_steps=10, max_proposals=2_000)
@@ -232,6 +235,7 @@ def test_short_intervals(precision):
     "`GaussianTransition` stay stable and give the right density",
 )
 @pytest.mark.slow
+@in_single
 def test_stiff_drift(precision):
     dtype = jnp.dtype(precision)
     model = jb.ornstein_uhlenbeck([[0.5, 0.0], [0.0, 500.0]])
@@ -366,6 +370,7 @@ def test_metastable_double_well():
     [np.diag([1.0, 1e-6]), np.array([[1.0, 0.0], [0.9999, 0.014]])],
     ids=["scales", "correlation"],
 )
+@in_single
 def test_nearly_singular_sigma(mixing, precision):
     """The paper's process in other linear coordinates."""
     dtype = jnp.dtype(precision)

@@ -52,8 +52,14 @@ _FACTORS = 4
 
 
 def matvec(matrix: Float[Array, "n m"], vector: Float[Array, " m"]) -> Float[Array, " n"]:
-    """`matrix @ vector`, column by column."""
+    """`matrix @ vector`, column by column where those are few."""
+    if matrix.shape[1] > _MOST_COLUMNS:
+        return matrix @ vector
     return _sum([matrix[:, j] * vector[j] for j in range(matrix.shape[1])])
+
+
+# More take long to compile, and one product of matrices for all lanes is as fast.
+_MOST_COLUMNS = 16
 
 
 def matmul(left: Float[Array, "n k"], right: Float[Array, "k m"]) -> Float[Array, "n m"]:

@@ -23,7 +23,7 @@ from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
 from . import decisions
 from .dynamics import Dynamics, stationary_flux
 from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
-from .tracing import uses_argument
+from .tracing import traced_once, uses_argument
 
 
 class Diffusion(eqx.Module):
@@ -268,7 +268,7 @@ class Diffusion(eqx.Module):
         drift = self._inside("drift", self._drift, params)
 
         if self._diffusion is not None:
-            diffusion = self._diffusion
+            diffusion = traced_once(self._diffusion)
 
             def sigma(x):
                 return _as_sigma(diffusion(x, params), x, constant=False)
@@ -310,7 +310,7 @@ class Diffusion(eqx.Module):
     ) -> Callable[[Float[Array, " d"]], Float[Array, " d"]]:
         """A drift, NaN outside the state space: a path that steps out is lost with the next step,
         and no bridge ends there."""
-        inside = self._state_space(params)
+        inside, function = self._state_space(params), traced_once(function)
 
         def drift(x):
             value = check_value(name, function(x, params), x.shape, x)
@@ -347,7 +347,7 @@ class Diffusion(eqx.Module):
             raise ValueError(
                 "this model has no stationary density: pass `log_stationary=` to `Diffusion`."
             )
-        params, log_stationary = self._prepared_params(), self._log_stationary
+        params, log_stationary = self._prepared_params(), traced_once(self._log_stationary)
         return lambda x: check_value("log_stationary", log_stationary(x, params), (), x)
 
 

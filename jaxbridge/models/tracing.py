@@ -1,9 +1,35 @@
-"""What is seen of a function by tracing it: which of its values depend on its argument."""
+"""Tracing of the functions that make a model: once, and what is seen of them by it."""
 
+import functools
 from collections.abc import Callable
 
 import jax.extend
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+
+def traced_once(function: Callable) -> Callable:
+    """`function`, whose jaxpr is kept for arguments of the same shapes: a program evaluates the
+    coefficients of a model in some twenty places, and derivatives in them are long to trace."""
+
+    def call(*args: PyTree) -> PyTree:
+        leaves, structure = jax.tree.flatten(args)
+        arrays = [leaf if isinstance(leaf, _ARRAYS) else None for leaf in leaves]
+        # With their types, for 1 and 1.0 are equal.
+        others = tuple((type(leaf), leaf) for leaf in leaves if not isinstance(leaf, _ARRAYS))
+        return _of_parts(function, structure, others, arrays)
+
+    return call
+
+
+_ARRAYS = (jax.Array, np.ndarray)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1, 2), inline=True)
+def _of_parts(function, structure, others, arrays):
+    values = iter(others)
+    leaves = [next(values)[1] if array is None else array for array in arrays]
+    return function(*jax.tree.unflatten(structure, leaves))
 
 
 def uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:

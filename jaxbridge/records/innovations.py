@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..engine.checks import Numbers
+from ..engine.compiled import compiled
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
 from .guided_record import guided, linearised, path_and_log_weight
@@ -65,11 +66,15 @@ class Innovations(NamedTuple):
         return start_share(self.problem, self.problem.model, self.points)
 
     def _run(self, params: PyTree, xi) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
-        model = self.problem.model.with_params(params)
-        guide = guided(self.problem, model, self.points)
-        noise = xi.reshape(self.points.shape)
-        path, log_weight = path_and_log_weight(self.problem, model, guide, noise)
-        return path, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
+        return _path_and_log_weight(self.problem, self.points, params, xi)
+
+
+@compiled
+def _path_and_log_weight(problem: RecordProblem, points, params: PyTree, xi):
+    model = problem.model.with_params(params)
+    guide = guided(problem, model, points)
+    path, log_weight = path_and_log_weight(problem, model, guide, xi.reshape(points.shape))
+    return path, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
 
 
 def innovations(
