@@ -28,6 +28,11 @@ def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
         raise ValueError(
             f"`draws` must be a chain of at least 4, shape (n, ...); got {draws.shape}."
         )
+    return _effective_sample_size(draws)
+
+
+@jax.jit
+def _effective_sample_size(draws):
     n = draws.shape[0]
     covariance = _autocovariance(draws)
     moving = covariance[0] > 0
@@ -37,6 +42,7 @@ def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
     return jnp.where(jnp.isfinite(covariance[0]), size, jnp.nan)
 
 
+@jax.jit
 def effective_size_of_chains(draws: Float[Array, "chains n ..."]) -> Float[Array, "..."]:
     """How many independent draws several chains are worth together, with correlations relative to
     the variance of all draws,
@@ -95,6 +101,11 @@ def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
             "`draws` must be chains of at least 4 draws each, shape (chains, n, ...); got "
             f"{draws.shape}."
         )
+    return _potential_scale_reduction(draws)
+
+
+@jax.jit
+def _potential_scale_reduction(draws):
     n = draws.shape[1] // 2
     halves = jnp.concatenate([draws[:, :n], draws[:, -n:]])
     between = jnp.var(jnp.mean(halves, axis=1), axis=0, ddof=1)

@@ -9,6 +9,8 @@ The bridge from a to b in T is Gaussian. With Γ_t of `ornstein_uhlenbeck` and t
 (The paper prints the gain without these transposes; that is right for reversible processes.)
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,7 +21,12 @@ from jaxtyping import Array, Float, Key
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import any_cholesky, any_solve
 from .diffusion import Diffusion
-from .ornstein_uhlenbeck import decay_and_covariance, ou_params, single_interval
+from .ornstein_uhlenbeck import (
+    OrnsteinUhlenbeckParams,
+    decay_and_covariance,
+    ou_params,
+    single_interval,
+)
 
 
 class GaussianBridge(eqx.Module):
@@ -41,26 +48,31 @@ class GaussianBridge(eqx.Module):
     def sample(self, key: Key[Array, ""], num_paths: int) -> Float[Array, "n K d"]:
         """Independent paths at `times`, exact in law: an unconditional path X, corrected by
         `Z_t = X_t + K_t (b - X_T)`, as in the paper's lemma on the bridge."""
-        params = ou_params(self._model)
-        grid = jnp.concatenate([self.times, self._duration[None]])
-        steps = jnp.diff(grid, prepend=jnp.zeros((), grid.dtype))
-        decay, covariance = jax.vmap(lambda t: decay_and_covariance(params, t))(steps)
-        still = (steps <= 0)[:, None, None]  # two equal times: no noise between them
-        identity = jnp.eye(len(self._start), dtype=grid.dtype)
-        root = jax.vmap(any_cholesky)(jnp.where(still, identity, covariance))
-        root = jnp.where(still, 0, root)
-        noise = jax.random.normal(key, (len(steps), num_paths, len(self._start)), grid.dtype)
+        return _paths(self, key, num_paths)
 
-        def step(x, inputs):  # x: deviations from the mean, (num_paths, d)
-            decay, root, noise = inputs
-            x = x @ decay.T + noise @ root.T
-            return x, x
 
-        start = jnp.broadcast_to(self._start - params.mean, (num_paths, len(self._start)))
-        _, path = lax.scan(step, start, (decay, root, noise))
-        miss = self._end - params.mean - path[-1]
-        correction = jnp.einsum("kij,nj->nki", self._gain, miss)
-        return params.mean + jnp.moveaxis(path[:-1], 0, 1) + correction
+@functools.partial(jax.jit, static_argnums=2)
+def _paths(bridge: GaussianBridge, key, num_paths):
+    params = ou_params(bridge._model)
+    grid = jnp.concatenate([bridge.times, bridge._duration[None]])
+    steps = jnp.diff(grid, prepend=jnp.zeros((), grid.dtype))
+    decay, covariance = jax.vmap(lambda t: decay_and_covariance(params, t))(steps)
+    still = (steps <= 0)[:, None, None]  # two equal times: no noise between them
+    identity = jnp.eye(len(bridge._start), dtype=grid.dtype)
+    root = jax.vmap(any_cholesky)(jnp.where(still, identity, covariance))
+    root = jnp.where(still, 0, root)
+    noise = jax.random.normal(key, (len(steps), num_paths, len(bridge._start)), grid.dtype)
+
+    def step(x, inputs):  # x: deviations from the mean, (num_paths, d)
+        decay, root, noise = inputs
+        x = x @ decay.T + noise @ root.T
+        return x, x
+
+    start = jnp.broadcast_to(bridge._start - params.mean, (num_paths, len(bridge._start)))
+    _, path = lax.scan(step, start, (decay, root, noise))
+    miss = bridge._end - params.mean - path[-1]
+    correction = jnp.einsum("kij,nj->nki", bridge._gain, miss)
+    return params.mean + jnp.moveaxis(path[:-1], 0, 1) + correction
 
 
 def gaussian_bridge(
@@ -100,6 +112,12 @@ def gaussian_bridge(
         np.all(np.diff(times, prepend=0, append=total) >= 0) and times.size
     ):
         raise ValueError(f"`times` must increase within [0, {total}]; got {times}.")
+    mean, covariance, gain = _moments(params, a, b, total, times)
+    return GaussianBridge(times, mean, covariance, model, a, b, total, gain)
+
+
+@jax.jit
+def _moments(params: OrnsteinUhlenbeckParams, a, b, total, times):
     decay_T, covariance_T = decay_and_covariance(params, total)
     miss = b - params.mean - decay_T @ (a - params.mean)
 
@@ -110,5 +128,4 @@ def gaussian_bridge(
         mean = params.mean + decay @ (a - params.mean) + gain @ miss
         return mean, covariance - gain @ remaining @ covariance, gain
 
-    mean, covariance, gain = jax.vmap(moments)(times)
-    return GaussianBridge(times, mean, covariance, model, a, b, total, gain)
+    return jax.vmap(moments)(times)

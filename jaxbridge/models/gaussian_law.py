@@ -1,5 +1,6 @@
 """The normal law."""
 
+import functools
 from collections.abc import Iterator
 
 import equinox as eqx
@@ -57,11 +58,21 @@ class GaussianLaw(eqx.Module):
 
     def sample(self, key: Key[Array, ""], model: Diffusion | None = None) -> Float[Array, " d"]:
         """One draw, shape (d,). The model is not looked at: start laws are called with one."""
-        noise = jax.random.normal(key, self.mean.shape, self.mean.dtype)
-        return self.mean + matvec(any_cholesky(self.covariance), noise)
+        return _draw(self.mean, self.covariance, key)
 
     def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
         """The normalised log density at a point."""
-        root = any_cholesky(self.covariance)
-        white = matvec(any_inverse(root), (x - self.mean).astype(root.dtype))
-        return -dot(white, white) / 2 - jnp.sum(jnp.log(jnp.sqrt(2 * np.pi) * jnp.diag(root)))
+        return _log_density(self.mean, self.covariance, x)
+
+
+@functools.partial(jax.jit, inline=True)
+def _draw(mean, covariance, key):
+    noise = jax.random.normal(key, mean.shape, mean.dtype)
+    return mean + matvec(any_cholesky(covariance), noise)
+
+
+@functools.partial(jax.jit, inline=True)
+def _log_density(mean, covariance, x):
+    root = any_cholesky(covariance)
+    white = matvec(any_inverse(root), (x - mean).astype(root.dtype))
+    return -dot(white, white) / 2 - jnp.sum(jnp.log(jnp.sqrt(2 * np.pi) * jnp.diag(root)))

@@ -7,8 +7,10 @@ For `dX = -B (X - m) dt + σ dW`, V = σσᵀ and B with eigenvalues in the righ
 the stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x - m), Γ_t).
 """
 
+import functools
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -118,8 +120,8 @@ def ou_stationary(model: Diffusion) -> GaussianLaw:
     jb.ou_stationary(model).covariance  # shape (2, 2)
     ```
     """
-    prepared = _prepare(ou_params(model))
-    return GaussianLaw(prepared.mean, prepared.covariance)
+    params = ou_params(model)
+    return GaussianLaw(params.mean, _stationary_covariance(params))
 
 
 def ou_transition(model: Diffusion, start: Numbers, duration: Numbers) -> GaussianLaw:
@@ -137,8 +139,18 @@ def ou_transition(model: Diffusion, start: Numbers, duration: Numbers) -> Gaussi
     """
     params = ou_params(model)
     start, _, duration = single_interval(params, start, start, duration)
+    return GaussianLaw(*_transition(params, start, duration))
+
+
+@functools.partial(jax.jit, inline=True)
+def _stationary_covariance(params: OrnsteinUhlenbeckParams) -> Float[Array, "d d"]:
+    return _lyapunov(params.B, _noise_covariance(params))
+
+
+@jax.jit
+def _transition(params: OrnsteinUhlenbeckParams, start, duration):
     decay, covariance = decay_and_covariance(params, duration)
-    return GaussianLaw(params.mean + decay @ (start - params.mean), covariance)
+    return params.mean + decay @ (start - params.mean), covariance
 
 
 def _deviation(x, p: _Prepared):
@@ -169,7 +181,7 @@ def _sample_stationary(key, p: _Prepared):
 
 def _prepare(params: OrnsteinUhlenbeckParams) -> _Prepared:
     B, mean, sigma = params
-    covariance = _lyapunov(B, _noise_covariance(params))
+    covariance = _stationary_covariance(params)
     precision = any_inverse(covariance)
     precision = (precision + precision.T) / 2
     root = any_cholesky(2 * jnp.pi * covariance)
