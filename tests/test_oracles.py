@@ -98,7 +98,7 @@ def test_muller_brown():
 @pytest.mark.parametrize(
     "random",
     [
-        pytest.param(m, id=m.name, marks=[] if i == 16 else pytest.mark.slow)
+        pytest.param(m, id=m.name, marks=[] if i == 11 else pytest.mark.slow)
         for i, m in enumerate(random_models.random_models())
     ],
 )

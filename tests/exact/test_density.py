@@ -37,7 +37,7 @@ def test_density_is_that_of_the_closed_form():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("num_steps", "gamma", "reversible"),
-    [(1, 0.5, False), (1, -1.0, True), (2, 0.5, True), (2, 0.0, False)],
+    [(1, 0.5, False), (2, -1.0, True)],
 )
 def test_exact_transitions_leave_no_step_error(num_steps, gamma, reversible):
     """One step is as good as many, with no allowance."""
