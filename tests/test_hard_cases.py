@@ -370,6 +370,7 @@ def test_metastable_double_well():
     [np.diag([1.0, 1e-6]), np.array([[1.0, 0.0], [0.9999, 0.014]])],
     ids=["scales", "correlation"],
 )
+@pytest.mark.optimised
 @in_single
 def test_nearly_singular_sigma(mixing, precision):
     """The paper's process in other linear coordinates."""

@@ -351,7 +351,7 @@ def in_markdown(benchmark: Benchmark) -> str:
 def _run(key, quick, say) -> Benchmark:
     if quick:
         few = tuple(ENTRIES)[:1]
-        return run_benchmark(key, 0.04, (0.05, 5.0), processes()[:1], (2,), few, say)
+        return run_benchmark(key, 0.04, (0.05,), processes()[:1], (2,), few, say)
     return run_benchmark(key, say=say)
 
 
