@@ -301,6 +301,12 @@ def any_cholesky(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
     return cholesky(matrix) if matrix.shape[0] <= _UNROLLED else jnp.linalg.cholesky(matrix)
 
 
+def any_log_abs_det(matrix: Float[Array, "p p"]) -> Float[Array, ""]:
+    """`log_abs_det`, likewise."""
+    small = matrix.shape[0] <= _UNROLLED
+    return log_abs_det(matrix) if small else jnp.linalg.slogdet(matrix)[1]
+
+
 def log_abs_det(matrix: Float[Array, "d d"]) -> Float[Array, ""]:
     """log |det matrix|, by elimination with partial pivoting."""
     d, rows, logs = matrix.shape[0], matrix, []

@@ -5,6 +5,10 @@ For `dX = -B (X - m) dt + σ dW`, V = σσᵀ and B with eigenvalues in the righ
     Γ solves B Γ + Γ Bᵀ = V,   Γ_t = ∫_0^t e^{-sB} V e^{-sBᵀ} ds = Γ - e^{-tB} Γ e^{-tBᵀ},
 
 the stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x - m), Γ_t).
+
+Γ is found, factored and inverted in the coordinates x or σ⁻¹x, whichever make B the smaller. A
+process whose noise is nearly singular may be harmless in the second and have a B of huge entries
+that cancel, and a Γ beyond the precision of numbers, in the first; another the other way round.
 """
 
 import functools
@@ -16,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, is_traced
-from ..engine.linalg import any_cholesky, any_inverse, dot, matvec, solve
+from ..engine.linalg import any_cholesky, any_inverse, any_log_abs_det, dot, matvec, solve
 from .bridge_problem import as_intervals
 from .diffusion import Diffusion, check_dimension, check_invertible
 from .gaussian_law import GaussianLaw
@@ -45,7 +49,7 @@ class _Prepared(NamedTuple):
     B: Float[Array, "d d"]
     mean: Float[Array, " d"]
     sigma: Float[Array, "..."] | None
-    covariance: Float[Array, "d d"]
+    root: Float[Array, "d d"]
     precision: Float[Array, "d d"]
     log_normaliser: Float[Array, ""]
     reverse_B: Float[Array, "d d"]
@@ -176,18 +180,38 @@ def _log_stationary(x, p: _Prepared):
 
 
 def _sample_stationary(key, p: _Prepared):
-    return GaussianLaw(p.mean, p.covariance).sample(key)
+    return p.mean + matvec(p.root, jax.random.normal(key, p.mean.shape, p.mean.dtype))
 
 
 def _prepare(params: OrnsteinUhlenbeckParams) -> _Prepared:
     B, mean, sigma = params
-    covariance = _stationary_covariance(params)
-    precision = any_inverse(covariance)
+    if sigma is None:
+        return _Prepared(B, mean, sigma, *_stationary(B, jnp.eye(len(B), dtype=B.dtype)))
+    forth = jnp.diag(sigma) if sigma.ndim == 1 else sigma
+    back = jnp.diag(1 / sigma) if sigma.ndim == 1 else any_inverse(sigma)
+    smaller = jnp.sum((back @ B @ forth) ** 2) < jnp.sum(B**2)
+    identity = jnp.eye(len(B), dtype=B.dtype)
+    forth, noise = jnp.where(smaller, forth, identity), jnp.where(smaller, identity, forth)
+    back = jnp.where(smaller, back, identity)
+    root, precision, log_normaliser, reverse_B = _stationary(back @ B @ forth, noise)
+    return _Prepared(
+        B,
+        mean,
+        sigma,
+        root=forth @ root,
+        precision=back.T @ precision @ back,
+        log_normaliser=log_normaliser + any_log_abs_det(forth),
+        reverse_B=forth @ reverse_B @ back,
+    )
+
+
+def _stationary(B: Float[Array, "d d"], sigma: Float[Array, "d d"]) -> tuple[Array, ...]:
+    """A root of Γ, Γ⁻¹, ½ log |2πΓ| and the matrix ΓBᵀΓ⁻¹ of the reversal."""
+    covariance = _lyapunov(B, sigma @ sigma.T)
+    root, precision = any_cholesky(covariance), any_inverse(covariance)
     precision = (precision + precision.T) / 2
-    root = any_cholesky(2 * jnp.pi * covariance)
-    log_normaliser = jnp.sum(jnp.log(jnp.diagonal(root)))
-    reverse_B = covariance @ B.T @ precision
-    return _Prepared(B, mean, sigma, covariance, precision, log_normaliser, reverse_B)
+    log_normaliser = jnp.sum(jnp.log(jnp.diagonal(root))) + len(B) / 2 * float(np.log(2 * np.pi))
+    return root, precision, log_normaliser, covariance @ B.T @ precision
 
 
 def _noise_covariance(params: OrnsteinUhlenbeckParams) -> Float[Array, "d d"]:

@@ -286,3 +286,25 @@ def test_a_diagonal_sigma_is_the_dense_one(x64):
     dense = jb.ornstein_uhlenbeck(B, mean, np.diag([0.5, 2.0]))
     for ours, exact in zip(jb.ou_stationary(diagonal), jb.ou_stationary(dense), strict=True):
         np.testing.assert_allclose(ours, exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("simple_in", ["noise", "space"])
+def test_nearly_singular_noise_leaves_a_stationary_law(simple_in):
+    """In single precision, where V = σσᵀ is barely regular: B is simple in σ⁻¹x, with huge entries
+    in x, or simple in x, with huge entries in σ⁻¹x."""
+    sigma, simple = np.array([[1.0, 0.0], [0.9999, 0.0014]]), np.array([[1.0, 2.0], [-0.5, 1.5]])
+    B = sigma @ simple @ np.linalg.inv(sigma) if simple_in == "noise" else simple
+    model = jb.ornstein_uhlenbeck(jnp.asarray(B, jnp.float32), sigma=sigma)
+    covariance = (
+        sigma @ scipy.linalg.solve_continuous_lyapunov(simple, np.eye(2)) @ sigma.T
+        if simple_in == "noise"
+        else scipy.linalg.solve_continuous_lyapunov(B, sigma @ sigma.T)
+    )
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
+    keys = jax.random.split(jax.random.key(0), 5_000)
+    samples = np.asarray(jax.jit(jax.vmap(model.sample_stationary))(keys), float) @ whiten.T
+    # σ has condition number 1,400, by which the rounding of B counts.
+    assert_moments(samples, np.zeros(2), np.eye(2))
+    x = np.linalg.inv(whiten) @ [0.6, -0.5]
+    exact = scipy.stats.multivariate_normal(np.zeros(2), covariance).logpdf(x)
+    assert abs(float(model.log_stationary(jnp.asarray(x, jnp.float32))) - exact) < 0.05
