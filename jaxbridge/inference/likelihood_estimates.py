@@ -17,9 +17,10 @@ from ..engine.averages import proper
 from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
-from ..records import Records, guided, run_filters
+from ..records import guided, run_filters
 from ..schemes import share_of_grid
 from .blocks import Block, with_keys
+from .record_paths import GuidedRecords, guided_near
 
 
 class Estimate(NamedTuple):
@@ -42,6 +43,15 @@ class AbstractLikelihood(eqx.Module):
     @abstractmethod
     def log_step_error(self, key: Key[Array, ""], model: Diffusion) -> Float[Array, ""]:
         """The step error of the log likelihood, with noise of its own."""
+
+    @abstractmethod
+    def near(self, model: Diffusion) -> "AbstractLikelihood":
+        """What estimates the same, guided as is best for models like this."""
+
+    @property
+    @abstractmethod
+    def guided(self) -> bool:
+        """Whether `near` changes anything."""
 
     @property
     @abstractmethod
@@ -80,6 +90,13 @@ class TransitionLikelihood(AbstractLikelihood):
     def log_step_error(self, key, model):
         return self.estimate(key, model).log_step_error
 
+    def near(self, model):
+        return self
+
+    @property
+    def guided(self):
+        return False
+
     @property
     def tells_step_error(self):
         return True
@@ -93,45 +110,49 @@ class RecordLikelihood(AbstractLikelihood):
     """Guided particle filters of all records, linearised along the same points at all parameters;
     and with half as many steps, which tell the step error."""
 
-    records: Records
-    points: Float[Array, "R points d"]
-    coarse: Records
-    coarse_points: Float[Array, "R points d"]
+    fine: GuidedRecords
+    coarse: GuidedRecords
     num_particles: int = eqx.field(static=True)
 
     def estimate(self, key, model):
-        value, variance = self._filtered(key, model, self.records, self.points)
+        value, variance = self._filtered(key, model, self.fine)
         return Estimate(proper(value), variance, jnp.full_like(value, jnp.nan), jnp.int32(0))
 
     def log_step_error(self, key, model):
-        fine, variance = self._filtered(key, model, self.records, self.points)
-        if self.records.stacked.num_steps == 1:
+        fine, variance = self._filtered(key, model, self.fine)
+        problem = self.fine.records.stacked
+        if problem.num_steps == 1:
             return jnp.full_like(fine, jnp.nan)
-        coarse, coarse_variance = self._filtered(key, model, self.coarse, self.coarse_points)
+        coarse, coarse_variance = self._filtered(key, model, self.coarse)
         # The mean of log p̂ is too small by half its variance.
         ratio = coarse - fine + (coarse_variance - variance) / 2
-        density, num_steps = self.records.stacked.density, self.records.stacked.num_steps
-        return share_of_grid(density.order, num_steps) * ratio
+        return share_of_grid(problem.density.order, problem.num_steps) * ratio
+
+    def near(self, model):
+        fine, coarse = (guided_near(each.records, model) for each in (self.fine, self.coarse))
+        return RecordLikelihood(fine, coarse, self.num_particles)
+
+    @property
+    def guided(self):
+        return True
 
     @property
     def tells_step_error(self):
         return False
 
     def _filtered(
-        self,
-        key: Key[Array, ""],
-        model: Diffusion,
-        records: Records,
-        points: Float[Array, "R points d"],
+        self, key: Key[Array, ""], model: Diffusion, grid: GuidedRecords
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """log p̂ with its variance."""
-        P, moving = self.num_particles, records.moving
+        records, P = grid.records, self.num_particles
 
         def one(problem, key, points):
-            made = run_filters(key, problem, model, guided(problem, model, points), (1, P), moving)
+            made = run_filters(
+                key, problem, model, guided(problem, model, points), (1, P), records.moving
+            )
             return made.log_estimate[0], made.variance(P)[0]
 
-        each = records.each(one, jax.random.split(key, records.number), points)
+        each = records.each(one, jax.random.split(key, records.number), grid.points)
         return jnp.sum(each[0]), jnp.sum(each[1])
 
     @property

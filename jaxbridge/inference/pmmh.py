@@ -28,11 +28,11 @@ from ..engine.checks import (
     nondifferentiable,
 )
 from ..engine.compiled import compiled
-from ..engine.progress import as_meter
+from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal, Budget
-from ..records import Initial, Observation, as_record_problems, linearisations
+from ..records import Initial, Observation, as_record_problems
 from .blocks import Block, block_of, make_blocks
 from .data import Problem, as_problem
 from .likelihood_estimates import (
@@ -48,12 +48,12 @@ from .posterior import (
     AbstractPosterior,
     drawn,
     first_chain,
-    first_states,
     over_chains,
     starting_points,
-    summed,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
+from .record_paths import unguided
+from .warm_up import stages
 
 
 class _Chain(NamedTuple):
@@ -222,9 +222,8 @@ def pmmh(
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
 
         def likelihood_near(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
-            coarse = records.coarsened()
-            both = linearisations(records, model), coarse, linearisations(coarse, model)
-            return RecordLikelihood(records, *both, num_proposals)
+            grids = unguided(records), unguided(records.coarsened())
+            return RecordLikelihood(*grids, num_proposals)
 
     log_prior = as_log_prior(prior, parameters, unknown)
     root = first_root(covariance, log_prior, unknown)
@@ -233,14 +232,9 @@ def pmmh(
         raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
     likelihood = likelihood_near(parameters.bind(first_chain(theta)), state)
     sampler = _Sampler(parameters, likelihood, log_prior)
-    meter = as_meter(progress_meter)
-    if state is None:
-        root = jnp.broadcast_to(root, (*theta.shape[:-1], *root.shape))
-        chain, num_done = first_states(sampler.start, run_key, (theta, root)), jnp.int32(0)
-    else:
-        chain, num_done = _Chain(*state[: len(_Chain._fields)]), state.num_done
+    start = (theta, root) if state is None else state
     size = (num_warmup, num_iterations, thin)
-    made = _run(run_key, sampler, chain, num_done, size, meter)
+    made = _run(run_key, sampler, start, size, progress_meter)
     return replace(made, state=made.state._replace(proposals=likelihood.proposals))
 
 
@@ -273,12 +267,24 @@ class PMMHInfo(NamedTuple):
     num_truncated: Int[Array, "*chains"]
 
 
+class _Run(NamedTuple):
+    """A chain, how many iterations it has done, and what was counted in those of this call."""
+
+    chain: _Chain
+    num_done: Int[Array, ""]
+    counted: PMMHInfo
+
+
 class _Sampler(eqx.Module):
     """What does not change from iteration to iteration, and the steps of one chain."""
 
     parameters: Parameters
     likelihood: AbstractLikelihood
     log_prior: NormalDensity | GivenDensity
+
+    def near(self, theta: Float[Array, " p"]) -> "_Sampler":
+        likelihood = self.likelihood.near(self.parameters.bind(theta))
+        return _Sampler(self.parameters, likelihood, self.log_prior)
 
     def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Estimate:
         return self.likelihood.estimate(key, self.parameters.bind(theta))
@@ -311,55 +317,66 @@ class _Sampler(eqx.Module):
         moved = _Chain(proposed, *made[:3], root)
         without = inside & (made.log_likelihood == -jnp.inf)
         chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), moved, state)
-        return chain._replace(root=root), PMMHInfo(accepted, without, made.num_truncated)
+        count = lambda which: which.astype(jnp.int32)
+        info = PMMHInfo(count(accepted), count(without), made.num_truncated)
+        return chain._replace(root=root), info
 
 
 @compiled
 def _run(
     key: Key[Array, ""],
     sampler: _Sampler,
-    chain: _Chain,
-    num_done: Int[Array, ""],
+    start: tuple[Float[Array, "*chains p"], Float[Array, "p p"]] | PMMHState,
     size: tuple[int, int, int],
-    meter: diffrax.AbstractProgressMeter,
+    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> PMMHPosterior:
     """After so many iterations of the warm-up, so many draws, with so many iterations each."""
-    sampler, chain = nondifferentiable((sampler, chain))
-    p, dtype = chain.theta.shape[-1], chain.theta.dtype
+    sampler, start = nondifferentiable((sampler, start))
+    fresh = not isinstance(start, PMMHState)
     num_warmup, num_iterations, thin = size
+    # The warm-up counts in draws, too, so that there is one loop.
+    skipped = -(-num_warmup // thin)
     every = max(1, num_iterations // STEP_ERRORS)
-    total = num_warmup + num_iterations * thin
+    state = _not_begun(*start) if fresh else _going_on(start)
+    p, dtype = state.chain.theta.shape[-1], state.chain.theta.dtype
 
-    def iterate(carry, i):
-        chain, progress = carry
-        learning = jnp.minimum(1.0, p * (i + 1).astype(dtype) ** (-2 / 3))
-        gain = jnp.where(i < num_warmup, learning, 0)
-        mine = jax.random.fold_in(key, num_done + i + 1)  # number 0 made the first estimate
-        step = lambda key, chain: sampler.step(key, chain, gain)
-        chain, info = over_chains(step, mine, chain)
-        progress = meter.step(progress, (i + 1).astype(jnp.float32) / total)
-        return (chain, progress), info
+    def begin(run, i):
+        mine = sampler.near(first_chain(run.chain.theta))
+        if not fresh:
+            return run, mine
+        # An estimate by the guide before may be a lucky one, which a chain would hold on to.
+        mine_key = jax.random.fold_in(key, -run.num_done)  # iterations have positive numbers
+        chain = over_chains(mine.start, mine_key, (run.chain.theta, run.chain.root))
+        return run._replace(chain=chain), mine
 
-    def log_step_error(i, chain):
+    def log_step_error(mine, i, run):
         """That of the held estimate, or one of its own for some of the draws."""
-        mine = jax.random.fold_in(jax.random.fold_in(key, num_done + num_warmup + i * thin + 1), 1)
-        if sampler.likelihood.tells_step_error:
-            return chain.log_step_error
-        known = lambda chain: over_chains(sampler.log_step_error, mine, chain.theta)
+        if mine.likelihood.tells_step_error:
+            return run.chain.log_step_error
+        own_key = jax.random.fold_in(jax.random.fold_in(key, run.num_done), 1)
+        known = lambda chain: over_chains(mine.log_step_error, own_key, chain.theta)
         unknown = lambda chain: jnp.full_like(chain.log_likelihood, jnp.nan)
-        return lax.cond(i % every == 0, known, unknown, chain)
+        called_for = (i >= skipped) & ((i - skipped) % every == 0)
+        return lax.cond(called_for, known, unknown, run.chain)
 
-    def draw(carry, i):
-        carry, infos = lax.scan(iterate, carry, num_warmup + i * thin + jnp.arange(thin))
-        held = carry[0]._replace(root=None, log_step_error=log_step_error(i, carry[0]))
-        return carry, (held, summed(infos))
+    def draw(mine, run, i):
+        def iterate(run, i):
+            learning = jnp.minimum(1.0, p * (i + 1).astype(dtype) ** (-2 / 3))
+            gain = jnp.where(i < num_warmup, learning, 0)
+            step = lambda key, chain: mine.step(key, chain, gain)
+            number = run.num_done + 1
+            chain, info = over_chains(step, jax.random.fold_in(key, number), run.chain)
+            counted = jax.tree.map(lambda so_far, one: so_far + one, run.counted, info)
+            return _Run(chain, number, counted), info.accepted
 
-    carry, warmup = lax.scan(iterate, (chain, meter.init()), jnp.arange(num_warmup))
-    (chain, progress), draws = lax.scan(draw, carry, jnp.arange(num_iterations))
-    meter.close(progress)
-    held, info = draws
-    counted = jax.tree.map(jnp.add, summed(warmup), summed(info))
-    others = (held.log_likelihood, held.log_step_error, info.accepted > 0)
+        run, accepted = lax.scan(iterate, run, i * thin + jnp.arange(thin))
+        held = run.chain._replace(root=None, log_step_error=log_step_error(mine, i, run))
+        return run, (held, jnp.any(accepted > 0, axis=0))
+
+    bounds = stages(skipped if fresh and sampler.likelihood.guided else 0, skipped + num_iterations)
+    run, draws = metered_stages(begin, draw, state, bounds, num_iterations, progress_meter)
+    held, accepted = draws
+    others = (held.log_likelihood, held.log_step_error, accepted)
     fields, others = drawn(sampler.parameters, held.theta, *others)
     log_likelihood, of_likelihood, accepted = others
     return PMMHPosterior(
@@ -368,7 +385,24 @@ def _run(
         log_likelihood_variance=jnp.median(held.variance, axis=0),
         log_step_error=of_likelihood,
         accepted=accepted,
-        num_without_estimate=counted.num_without_estimate,
-        num_truncated=counted.num_truncated,
-        state=PMMHState(**chain._asdict(), num_done=num_done + total, proposals=()),
+        num_without_estimate=run.counted.num_without_estimate,
+        num_truncated=run.counted.num_truncated,
+        state=PMMHState(**run.chain._asdict(), num_done=run.num_done, proposals=()),
     )
+
+
+def _not_begun(theta: Float[Array, "*chains p"], root: Float[Array, "p p"]) -> _Run:
+    """Before there is an estimate."""
+    chains = theta.shape[:-1]
+    nothing, none = jnp.zeros(chains, theta.dtype), jnp.zeros(chains, jnp.int32)
+    root = jnp.broadcast_to(root, (*chains, *root.shape))
+    chain = _Chain(theta, nothing, nothing, nothing, root)
+    return _Run(chain, jnp.int32(0), PMMHInfo(none, none, none))
+
+
+def _going_on(state: PMMHState) -> _Run:
+    chain = _Chain(
+        state.theta, state.log_likelihood, state.variance, state.log_step_error, state.root
+    )
+    none = jnp.zeros(chain.log_likelihood.shape, jnp.int32)
+    return _Run(chain, state.num_done, PMMHInfo(none, none, none))

@@ -5,6 +5,10 @@ The state is (θ, path). In turn the path moves given θ; then it is read as the
 path along. So parameters of σ, of the noise and of the initial law are as good as those of the
 drift, however small the steps.
 
+The guide is linearised along a path that is likely at some θ, and may be a bad one where θ is far
+off. Neither the law of the path given θ nor that of θ given ξ depends on it; so a warm-up finds it
+anew (`warm_up`).
+
 The step error of the likelihood is that of E[w̃ / w] (`record_paths`), and with D = log w̃ / w, to
 second order, log E[w̃ / w] = E[D + ½ (D - ED)²].
 """
@@ -21,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.averages import proper
 from ..engine.checks import nondifferentiable
 from ..engine.compiled import compiled
-from ..engine.progress import metered_scan
+from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..records import Records, tuned
 from .parameter_walk import TARGET, adapted
@@ -31,11 +35,11 @@ from .posterior import (
     AbstractPosterior,
     drawn,
     first_chain,
-    first_states,
     over_chains,
 )
 from .priors import GivenDensity, NormalDensity
-from .record_paths import RecordPaths, as_record_paths
+from .record_paths import RecordPaths, as_record_paths, movable, no_paths, share_of_step_error
+from .warm_up import stages
 
 
 class RecordState(NamedTuple):
@@ -139,6 +143,7 @@ class RecordSampler(eqx.Module):
         return self.completion.coarse_log_weight(state.theta, noise) - log_weight
 
 
+@compiled
 def sample_records(
     key: Key[Array, ""],
     parameters: Parameters,
@@ -149,55 +154,51 @@ def sample_records(
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> RecordPosterior:
     """After so many iterations of the warm-up, so many draws, with so many iterations each."""
-    theta = start.theta if isinstance(start, RecordState) else start[0]
-    completion = as_record_paths(parameters, records, first_chain(theta))
-    sampler = RecordSampler(completion, log_prior)
-    if isinstance(start, RecordState):
-        return _run(key, sampler, start, size, progress_meter)
-    root = jnp.broadcast_to(start[1], (*theta.shape[:-1], *start[1].shape))
-    state = first_states(sampler.start, key, (theta, root))
-    return _run(key, sampler, state, size, progress_meter)
-
-
-@compiled
-def _run(
-    key: Key[Array, ""],
-    sampler: RecordSampler,
-    state: RecordState,
-    size: tuple[int, int, int],
-    progress_meter: diffrax.AbstractProgressMeter | None,
-) -> RecordPosterior:
-    sampler, state = nondifferentiable((sampler, state))
+    parameters, records, log_prior, start = nondifferentiable(
+        (parameters, records, log_prior, start)
+    )
+    fresh = not isinstance(start, RecordState)
     num_warmup, num_iterations, thin = size
-    begun = state.num_done.reshape(-1)[0]
     # The warm-up counts in draws, too, so that there is one loop.
     skipped = -(-num_warmup // thin)
     every = max(1, num_iterations // STEP_ERRORS)
 
-    def iterate(state, i):
-        step = lambda key, state: sampler.step(key, state, i < num_warmup)
-        # Number 0 made the first paths.
-        return over_chains(step, jax.random.fold_in(key, begun + i + 1), state)
+    def begin(state, i):
+        completion = as_record_paths(parameters, records, first_chain(state.theta))
+        sampler = RecordSampler(completion, log_prior)
+        if not fresh:
+            return state, sampler
+        first = lambda state: over_chains(
+            sampler.start, jax.random.fold_in(key, 0), (state.theta, state.root)
+        )
+        return lax.cond(i == 0, first, lambda state: state, state), sampler
 
-    def log_ratios(i, state):
-        mine = jax.random.fold_in(jax.random.fold_in(key, begun + (i + 1) * thin), 1)
+    def number(state):
+        return state.num_done.reshape(-1)[0]  # 0 made the first paths
+
+    def log_ratios(sampler, i, state):
+        mine = jax.random.fold_in(jax.random.fold_in(key, number(state)), 1)
         known = lambda state: over_chains(sampler.log_ratio, mine, state)
         unknown = lambda state: jnp.full(state.theta.shape[:-1], jnp.nan, state.theta.dtype)
-        if sampler.completion.num_steps == 1:
+        if records.stacked.num_steps == 1:
             return unknown(state)
         return lax.cond((i >= skipped) & ((i - skipped) % every == 0), known, unknown, state)
 
-    def draw(state, i):
+    def draw(sampler, state, i):
+        def iterate(state, i):
+            step = lambda key, state: sampler.step(key, state, i < num_warmup)
+            return over_chains(step, jax.random.fold_in(key, number(state) + 1), state)
+
         state, (moved, taken) = lax.scan(iterate, state, i * thin + jnp.arange(thin))
         share = jnp.mean(taken.astype(state.theta.dtype), axis=0)
-        made = state.theta, jnp.any(moved, axis=0), share[..., 0], log_ratios(i, state)
+        made = state.theta, jnp.any(moved, axis=0), share[..., 0], log_ratios(sampler, i, state)
         return state, made
 
-    steps = jnp.arange(skipped + num_iterations)
-    state, made = metered_scan(draw, state, steps, progress_meter)
-    draws = jax.tree.map(lambda leaf: leaf[skipped:], made)
-    fields, (moved, taken, log_ratio) = drawn(sampler.parameters, *draws)
-    real = sampler.completion.movable()
+    bounds = stages(skipped if fresh else 0, skipped + num_iterations)
+    state = _not_begun(records, *start) if fresh else start
+    state, draws = metered_stages(begin, draw, state, bounds, num_iterations, progress_meter)
+    fields, (moved, taken, log_ratio) = drawn(parameters, *draws)
+    real = movable(records)
     ever = jnp.any(taken > 0, axis=-4)  # of all draws
     deviation = log_ratio - jnp.nanmean(log_ratio)
     return RecordPosterior(
@@ -205,6 +206,18 @@ def _run(
         parameters_moved=moved,
         blocks_moved=jnp.mean(taken, axis=(-3, -2, -1), where=real),
         stuck=jnp.any(real & ~ever, axis=(-3, -2, -1)),
-        log_step_error=sampler.completion.share_of_step_error * (log_ratio + deviation**2 / 2),
+        log_step_error=share_of_step_error(records) * (log_ratio + deviation**2 / 2),
         state=state,
     )
+
+
+def _not_begun(
+    records: Records, theta: Float[Array, "*chains p"], root: Float[Array, "p p"]
+) -> RecordState:
+    """The state before there are paths."""
+    chains = theta.shape[:-1]
+    paths, log_scales, root, num_done = (
+        jnp.broadcast_to(leaf, (*chains, *leaf.shape))
+        for leaf in (*no_paths(records), root, jnp.int32(0))
+    )
+    return RecordState(theta, paths, root, log_scales, num_done)

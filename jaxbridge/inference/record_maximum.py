@@ -37,7 +37,7 @@ from ..engine.progress import metered_scan
 from ..records import Records, tuned
 from ..schemes import StepError, dominates
 from .parameters import Parameters
-from .record_paths import RecordPaths, as_record_paths
+from .record_paths import RecordPaths, as_record_paths, movable, share_of_step_error
 from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 
 _CHAINS = 8
@@ -254,7 +254,9 @@ def _summary(
     theta = jnp.where(ok, rough + step, rough)
     size = effective_size_of_chains(draws.gradient)
     left = covariance @ (spread / jnp.sqrt(size[:, None] * size)) @ covariance
-    stuck = jnp.any(completion.movable() & ~jnp.any(draws.taken, axis=1), axis=(1, 2, 3))
+    stuck = jnp.any(
+        movable(completion.fine.records) & ~jnp.any(draws.taken, axis=1), axis=(1, 2, 3)
+    )
     monte_carlo = jnp.sqrt(jnp.diagonal(left))
     monte_carlo = jnp.where(jnp.any(stuck), jnp.inf, monte_carlo)
     step_error = _step_error(completion, draws, covariance)
@@ -285,6 +287,6 @@ def _step_error(
     deviation = draws.log_ratio - jnp.mean(draws.log_ratio)
     ratio = (deviation + (deviation**2 - jnp.mean(deviation**2)) / 2)[..., None]
     each = (draws.coarse - draws.gradient + ratio * centred) @ covariance
-    each = completion.share_of_step_error * each
+    each = share_of_step_error(completion.fine.records) * each
     size = effective_size_of_chains(each)
     return StepError(jnp.mean(each, axis=(0, 1)), jnp.std(each, axis=(0, 1)) / jnp.sqrt(size))

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from ..models.diffusion import Diffusion
 from ..records import (
     Paths,
     Records,
@@ -56,11 +57,6 @@ class RecordPaths(eqx.Module):
         """N, of each segment."""
         return self.fine.records.stacked.num_steps
 
-    @property
-    def share_of_step_error(self) -> float:
-        """The step error as a share of what half as many steps change."""
-        return share_of_grid(self.fine.records.stacked.density.order, self.num_steps)
-
     def first(
         self, key: Key[Array, ""], theta: Float[Array, " p"]
     ) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:
@@ -74,8 +70,7 @@ class RecordPaths(eqx.Module):
             return jnp.where(jnp.isfinite(log_weight), path, points)
 
         paths = records.each(one, jax.random.split(key, records.number), points)
-        num_blocks = cuts(records.stacked.num_segments, _BLOCK_LENGTH).shape[-1]
-        return paths, jnp.zeros((records.number, 2, num_blocks), theta.dtype)
+        return paths, no_paths(records)[1]
 
     def renewed(
         self,
@@ -126,9 +121,34 @@ class RecordPaths(eqx.Module):
         halved = jax.vmap(lambda noise: _of_pairs(noise, self.num_steps))(noise)
         return _of_noise(self.coarse, self.parameters, theta, halved)[1]
 
-    def movable(self) -> Bool[Array, "R 2 B"]:
-        """Which blocks hold a part of a record."""
-        return self.fine.records.each(lambda problem: has_segments(problem, _BLOCK_LENGTH))
+
+def movable(records: Records) -> Bool[Array, "R 2 B"]:
+    """Which blocks hold a part of a record."""
+    return records.each(lambda problem: has_segments(problem, _BLOCK_LENGTH))
+
+
+def share_of_step_error(records: Records) -> float:
+    """The step error as a share of what half as many steps change."""
+    return share_of_grid(records.stacked.density.order, records.stacked.num_steps)
+
+
+def unguided(records: Records) -> GuidedRecords:
+    """With points that stand in until there are some."""
+    problem = records.stacked
+    shape = records.number, problem.num_segments * problem.num_steps + 1, problem.dim
+    return GuidedRecords(records, jnp.zeros(shape, problem.like.dtype))
+
+
+def guided_near(records: Records, model: Diffusion) -> GuidedRecords:
+    """Linearised at the parameters of this model."""
+    return GuidedRecords(records, linearisations(records, model))
+
+
+def no_paths(records: Records) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:
+    """What stands in for paths, and log β of the moves of their blocks, until there are some."""
+    num_blocks = cuts(records.stacked.num_segments, _BLOCK_LENGTH).shape[-1]
+    points = unguided(records).points
+    return points, jnp.zeros((records.number, 2, num_blocks), points.dtype)
 
 
 def as_record_paths(
@@ -136,8 +156,8 @@ def as_record_paths(
 ) -> RecordPaths:
     """Linearised at θ."""
     model = parameters.bind(theta)
-    of = lambda records: GuidedRecords(records, linearisations(records, model))
-    return RecordPaths(parameters, of(records), of(records.coarsened()))
+    fine, coarse = (guided_near(each, model) for each in (records, records.coarsened()))
+    return RecordPaths(parameters, fine, coarse)
 
 
 def _of_noise(
