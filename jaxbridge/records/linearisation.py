@@ -31,7 +31,9 @@ class LinearisedStep(NamedTuple):
 
 def root_of_law(law: StepLaw) -> Float[Array, "d m"]:
     """Λ of N(μ, δ σ S σᵀ) = N(μ, Λ Λᵀ)."""
-    root = law.sigma.as_matrix(law.mean.shape[0], law.mean.dtype) * jnp.sqrt(law.dt)
+    moving = law.dt > 0  # √ has no derivative at zero, the length of steps beyond a record's end
+    length = jnp.where(moving, jnp.sqrt(jnp.where(moving, law.dt, 1)), 0)
+    root = law.sigma.as_matrix(law.mean.shape[0], law.mean.dtype) * length
     if law.covariance.ndim == 0:
         return root * jnp.sqrt(law.covariance)
     return matmul(root, cholesky(law.covariance))
