@@ -115,9 +115,7 @@ def bootstrap_filter(key, values, num_particles):
         square = jnp.sum((x - y) ** 2, axis=-1) / NOISE**2
         log_weight = -square / 2 - 2 * np.log(NOISE) - np.log(2 * np.pi)
         log_weight = jnp.where(jnp.all(inside, axis=-1), log_weight, -jnp.inf)
-        positions = (
-            jnp.arange(num_particles, dtype=x.dtype) + jax.random.uniform(keys[0, 0])
-        ) / num_particles
+        grid = jnp.arange(num_particles, dtype=x.dtype) + jax.random.uniform(keys[0, 0])
         bounds = jnp.cumsum(jax.nn.softmax(log_weight))
         ancestors = jnp.minimum(jnp.searchsorted(bounds, grid / num_particles), num_particles - 1)
         return x[ancestors], logsumexp(log_weight) - np.log(num_particles)
