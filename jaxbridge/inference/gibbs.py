@@ -168,7 +168,8 @@ def gibbs(
         several and they differ; or the `state` of earlier draws, to go on from there.
     - `observation`, `initial`: for a record that was seen with noise or in part, as in
         `innovations`. Then parameters of σ and of the noise may be unknown too, and `num_warmup`
-        iterations before, by default 500, learn the size of moves; `covariance` as in `pmmh`.
+        iterations before, by default 500, learn the size of moves and what guides paths;
+        `covariance` as in `pmmh`.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 

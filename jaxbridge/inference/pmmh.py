@@ -176,8 +176,9 @@ def pmmh(
         the proposals of paths, and their bounds, that they had. Another `proposal` than "auto"
         takes their place; the estimate that the chain holds is still one of theirs.
     - `observation`, `initial`: for a record that was seen with noise or in part, as in
-        `innovations`; `num_proposals` is then how many particles the filter has. By default the
-        state was seen whole and without noise. Unknown parameters of the noise are parameters of
+        `innovations`; `num_proposals` is then how many particles the filter has, of which few do.
+        What guides them is found anew in the warm-up. By default the state was seen whole and
+        without noise. Unknown parameters of the noise are parameters of
         the model that `LinearGaussian(covariance=)` is a function of.
     - `num_counts`, `max_trials`: as in `transition_log_density`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.

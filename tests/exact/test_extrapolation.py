@@ -95,3 +95,40 @@ def test_nothing_is_left_of_a_density_that_noise_made_negative(densities):
     larger = jb.TransitionLogDensity(**(vars(larger) | {"value": fine.value + 1.0}))
     both = jb.extrapolate(fine, larger)
     assert both.value == -jnp.inf and both.standard_error == jnp.inf and not both.trustworthy
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_few_steps_of_a_sigma_that_turns():
+    """A rotation through full turns, in ten steps by default: σσᵀ = I, so the law is that of an
+    Ornstein–Uhlenbeck process."""
+
+    def turn(x, p):
+        cosine, sine = jnp.cos(2 * x[0]), jnp.sin(2 * x[0])
+        return jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
+
+    model = jb.Diffusion(
+        lambda x, p: -x / 2,
+        turn,
+        lambda x, p: -x @ x / 2 - float(np.log(2 * np.pi)),
+        reversible=True,
+        normalised=True,
+    )
+    start, end, duration = jnp.array([0.3, -0.2]), jnp.array([-0.5, 0.4]), 2.0
+    law = jb.ou_transition(jb.ornstein_uhlenbeck(0.5 * jnp.eye(2)), start, duration)
+    coarse, fine = (
+        jb.transition_log_density(
+            jax.random.key(num_steps),
+            model,
+            start,
+            end,
+            duration,
+            num_steps=num_steps,
+            num_proposals=100_000,
+            proposal=jb.Coupling(0.5),
+        )
+        for num_steps in (5, 10)
+    )
+    off = lambda estimate: abs(float(jnp.expm1(estimate.value - law.log_density(end))))
+    assert off(fine) < 0.045 and off(jb.extrapolate(fine, coarse)) < 0.045
+    assert fine.standard_error < 0.005
