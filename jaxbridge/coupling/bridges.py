@@ -41,7 +41,7 @@ class Bridges(eqx.Module):
         and N; -1 where no bridge was found. Shape (n,).
     - `reverse_start`: the reversed path at time 0, shape (n, d); NaN where no bridge was found.
     - `num_proposals`: proposals made until the last bridge was found, or until the bound.
-        `n / num_proposals` estimates the acceptance probability.
+        The number of those `met` over it estimates the acceptance probability.
     - `num_nonfinite`: how many of them left the finite numbers, or came further out than 1e18, and
         were rejected for it.
     - `coupling`, `num_steps`: those they were made with.
@@ -227,7 +227,8 @@ def _propose_numbered(
     meeting_step: Int[Array, " lanes"] | None = None,
     time_scale: Float[Array, " lanes"] | float = 1.0,
 ) -> Proposals:
-    """The proposals with these numbers, of these intervals: a function of nothing else."""
+    """The proposals with these numbers, of these intervals: a function of nothing else, where none
+    is replayed with its `meeting_step`."""
     start, end, duration = inputs.intervals
     lanes = Intervals(start[interval].T, end[interval].T, duration[interval] * time_scale)
     lane_keys = numbered_keys(keys, interval, number)

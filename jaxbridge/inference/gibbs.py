@@ -45,6 +45,7 @@ from .posterior import (
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_gibbs import RecordPosterior, RecordState, sample_records
+from .record_paths import check_no_bridges
 
 
 class GibbsState(NamedTuple):
@@ -82,7 +83,7 @@ class GibbsPosterior(AbstractPosterior):
     - `log_step_error`: an estimate of the step error of the log density of the completed data at
         each draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
         `step_error`, that of the posterior mean, is made of.
-    - `state`: where it ended; pass it as `init` to go on.
+    - `state`: where it ended; pass it as `init`, with another key, to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.
     """
@@ -146,8 +147,8 @@ def gibbs(
     - `prior`: a `NormalPrior`, or a function that maps the unknown parameters to the log of a
         density. It is restricted to `constraint`.
     - `num_iterations`: draws that are kept; between two of them are `thin` iterations.
-    - `num_steps`: N for each interval, by default 50; or `step_size`, the longest step, from
-        which each interval gets its own number of steps.
+    - `num_steps`: N for each interval, by default 50, or 10 with an `observation`; or
+        `step_size`, the longest step, from which each interval gets its own number of steps.
     - `proposal`: a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, `Guided()`, or
         "auto", the default, which finds the best for each interval by a pilot run; or, for
         approximate bridges or where a `method` is given, a `Coupling`, by default
@@ -193,7 +194,15 @@ def gibbs(
     parameters = as_parameters(model, where, constraint)
     if observation is not None:
         check_key(key)
-        _check_no_bridges(proposal, bridges, method, parameter_kernel)
+        check_no_bridges(
+            proposal=proposal,
+            bridges=bridges,
+            method=method,
+            parameter_kernel=parameter_kernel,
+            num_counts=num_counts,
+            max_proposals=max_proposals,
+            max_trials=max_trials,
+        )
         steps = {"num_steps": num_steps, "step_size": step_size}
         records = as_record_problems(model, times, observations, observation, initial, **steps)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
@@ -225,16 +234,6 @@ def gibbs(
     else:
         augmentation.check_paths(state.paths, theta.shape[:-1])
     return _run(run_key, sampler, state, num_iterations, thin, progress_meter)
-
-
-def _check_no_bridges(proposal: Any, *others: Any) -> None:
-    """Raise `ValueError` where bridges between complete observations are asked for."""
-    bridges, *rest = others
-    if proposal is not None or bridges != "exact" or any(each is not None for each in rest):
-        raise ValueError(
-            "`proposal`, `bridges`, `method` and `parameter_kernel` are for complete observations "
-            "without noise: leave them out where there is an `observation`."
-        )
 
 
 class GibbsInfo(NamedTuple):

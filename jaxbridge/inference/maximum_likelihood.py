@@ -36,6 +36,7 @@ from .parameters import (
     theta_of_model,
 )
 from .record_maximum import RecordMaximumLikelihood, maximum_of_records
+from .record_paths import check_no_bridges
 from .score import Score, as_score, score_at
 from .simulated_likelihood import (
     as_pulled,
@@ -193,7 +194,13 @@ def maximum_likelihood(
     optimizer = _ADAM if optimizer is None else optimizer
     if observation is not None:
         check_key(key)
-        _check_no_bridges(method, proposal)
+        check_no_bridges(
+            method=method,
+            proposal=proposal,
+            num_counts=num_counts,
+            max_proposals=max_proposals,
+            max_trials=max_trials,
+        )
         steps = {"num_steps": num_steps, "step_size": step_size}
         records = as_record_problems(model, times, observations, observation, initial, **steps)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
@@ -214,15 +221,6 @@ def maximum_likelihood(
             "with `where=`."
         )
     return _by_simulation(key, problem, proposal, budget, search, num_bridges)
-
-
-def _check_no_bridges(method: str, proposal: Any) -> None:
-    """Raise `ValueError` where bridges between complete observations are asked for."""
-    if method != "gradient" or not (isinstance(proposal, str) and proposal == "auto"):
-        raise ValueError(
-            '`proposal` and `method="em"` are for complete observations without noise: leave them '
-            "out where there is an `observation`."
-        )
 
 
 def _by_bridges(

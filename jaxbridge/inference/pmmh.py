@@ -28,6 +28,7 @@ from ..engine.checks import (
     nondifferentiable,
 )
 from ..engine.compiled import compiled
+from ..engine.keys import key_for
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
@@ -52,7 +53,7 @@ from .posterior import (
     starting_points,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
-from .record_paths import unguided
+from .record_paths import check_no_bridges, unguided
 from .warm_up import stages
 
 
@@ -75,7 +76,8 @@ class PMMHState(NamedTuple):
     - `root`: S of the covariance S Sᵀ of proposals, shape (p, p).
     - `num_done`: iterations so far, with those of the warm-up. Going on with the same key draws
         the random numbers of those that come after.
-    - `proposals`: of the paths, decided, for each group of intervals with one number of steps.
+    - `proposals`: of the paths, decided, for each group of intervals with one number of steps; none
+        for records that were seen with noise or in part.
     """
 
     theta: Float[Array, "*chains p"]
@@ -209,7 +211,7 @@ def pmmh(
         problem = as_problem(key, parameters, times, observations, num_steps, step_size)
         unknown = problem.theta
 
-        def likelihood_near(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
+        def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
             if state is not None and isinstance(proposal, str) and proposal == "auto":
                 blocks = _blocks_of_state(state, problem, model)
             else:
@@ -218,11 +220,12 @@ def pmmh(
             return TransitionLikelihood(blocks, num_proposals)
 
     else:
+        check_no_bridges(proposal=proposal, num_counts=num_counts, max_trials=max_trials)
         steps = {"num_steps": num_steps, "step_size": step_size}
         records = as_record_problems(model, times, observations, observation, initial, **steps)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
 
-        def likelihood_near(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
+        def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
             grids = unguided(records), unguided(records.coarsened())
             return RecordLikelihood(*grids, num_proposals)
 
@@ -231,7 +234,7 @@ def pmmh(
     theta, state = starting_points(parameters, unknown, init, num_chains, log_prior, PMMHState)
     if state is not None and covariance is not None:
         raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
-    likelihood = likelihood_near(parameters.bind(first_chain(theta)), state)
+    likelihood = first_likelihood(parameters.bind(first_chain(theta)), state)
     sampler = _Sampler(parameters, likelihood, log_prior)
     start = (theta, root) if state is None else state
     size = (num_warmup, num_iterations, thin)
@@ -342,36 +345,36 @@ def _run(
     p, dtype = state.chain.theta.shape[-1], state.chain.theta.dtype
 
     def begin(run, i):
-        mine = sampler.near(first_chain(run.chain.theta))
+        near = sampler.near(first_chain(run.chain.theta))
         if not fresh:
-            return run, mine
+            return run, near
         # An estimate by the guide before may be a lucky one, which a chain would hold on to.
-        mine_key = jax.random.fold_in(key, -run.num_done)  # iterations have positive numbers
-        chain = over_chains(mine.start, mine_key, (run.chain.theta, run.chain.root))
-        return run._replace(chain=chain), mine
+        first_key = jax.random.fold_in(key, -run.num_done)  # iterations have positive numbers
+        chain = over_chains(near.start, first_key, (run.chain.theta, run.chain.root))
+        return run._replace(chain=chain), near
 
-    def log_step_error(mine, i, run):
+    def log_step_error(near, i, run):
         """That of the held estimate, or one of its own for some of the draws."""
-        if mine.likelihood.tells_step_error:
+        if near.likelihood.tells_step_error:
             return run.chain.log_step_error
-        own_key = jax.random.fold_in(jax.random.fold_in(key, run.num_done), 1)
-        known = lambda chain: over_chains(mine.log_step_error, own_key, chain.theta)
+        own_key = jax.random.fold_in(key_for("step error", key), run.num_done)
+        known = lambda chain: over_chains(near.log_step_error, own_key, chain.theta)
         unknown = lambda chain: jnp.full_like(chain.log_likelihood, jnp.nan)
         called_for = (i >= skipped) & ((i - skipped) % every == 0)
         return lax.cond(called_for, known, unknown, run.chain)
 
-    def draw(mine, run, i):
+    def draw(near, run, i):
         def iterate(run, i):
             learning = jnp.minimum(1.0, p * (i + 1).astype(dtype) ** (-2 / 3))
             gain = jnp.where(i < num_warmup, learning, 0)
-            step = lambda key, chain: mine.step(key, chain, gain)
+            step = lambda key, chain: near.step(key, chain, gain)
             number = run.num_done + 1
             chain, info = over_chains(step, jax.random.fold_in(key, number), run.chain)
             counted = jax.tree.map(lambda so_far, one: so_far + one, run.counted, info)
             return _Run(chain, number, counted), info.accepted
 
         run, accepted = lax.scan(iterate, run, i * thin + jnp.arange(thin))
-        held = run.chain._replace(root=None, log_step_error=log_step_error(mine, i, run))
+        held = run.chain._replace(root=None, log_step_error=log_step_error(near, i, run))
         return run, (held, jnp.any(accepted > 0, axis=0))
 
     bounds = stages(skipped if fresh and sampler.likelihood.guided else 0, skipped + num_iterations)

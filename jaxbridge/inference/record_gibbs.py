@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.averages import proper
 from ..engine.checks import nondifferentiable
 from ..engine.compiled import compiled
+from ..engine.keys import key_for
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..records import Records, tuned
@@ -177,8 +178,8 @@ def sample_records(
         return state.num_done.reshape(-1)[0]  # 0 made the first paths
 
     def log_ratios(sampler, i, state):
-        mine = jax.random.fold_in(jax.random.fold_in(key, number(state)), 1)
-        known = lambda state: over_chains(sampler.log_ratio, mine, state)
+        own_key = jax.random.fold_in(key_for("step error", key), number(state))
+        known = lambda state: over_chains(sampler.log_ratio, own_key, state)
         unknown = lambda state: jnp.full(state.theta.shape[:-1], jnp.nan, state.theta.dtype)
         if records.stacked.num_steps == 1:
             return unknown(state)

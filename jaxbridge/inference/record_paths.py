@@ -9,7 +9,7 @@ The step error of the likelihood is that of w. From ξ steps of twice the length
 over ξ given θ and the data.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -35,6 +35,10 @@ from .parameters import Parameters
 
 # Intervals between observations that move at once.
 _BLOCK_LENGTH = 10
+
+
+# What says nothing about bridges.
+_USUAL = {"proposal": "auto", "bridges": "exact", "method": "gradient"}
 
 
 class GuidedRecords(NamedTuple):
@@ -120,6 +124,18 @@ class RecordPaths(eqx.Module):
         """log w̃ of ξ, with steps of twice the length."""
         halved = jax.vmap(lambda noise: _of_pairs(noise, self.num_steps))(noise)
         return _of_noise(self.coarse, self.parameters, theta, halved)[1]
+
+
+def check_no_bridges(**given: Any) -> None:
+    """Raise `ValueError` where one of these arguments, which are about bridges between complete
+    observations, is neither `None` nor what it is by default."""
+    usual = lambda name, value: isinstance(value, str) and value == _USUAL.get(name)
+    asked = [name for name, value in given.items() if value is not None and not usual(name, value)]
+    if asked:
+        raise ValueError(
+            f"{' and '.join(f'`{name}`' for name in asked)}: for complete observations without "
+            "noise. Leave this out where there is an `observation`."
+        )
 
 
 def movable(records: Records) -> Bool[Array, "R 2 B"]:

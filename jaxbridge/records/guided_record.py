@@ -78,9 +78,9 @@ def guided(problem: RecordProblem, model: Diffusion, points: Float[Array, "point
 
 
 def path_and_log_weight(
-    problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points m"]
+    problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
-    """The path that this noise makes, and its log weight: the first row is that of x_0."""
+    """The path that this noise makes, and its log weight: `noise[0]` makes x_0."""
     density, dynamics = problem.density, model.forward(problem.like)
     start = guide.start.point(noise[0])
     steps = flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
@@ -109,7 +109,7 @@ def noise_and_log_weight(
     model: Diffusion,
     guide: Guidance,
     path: Float[Array, "points d"],
-) -> tuple[Float[Array, "points m"], Float[Array, ""]]:
+) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
     """The inverse of `path_and_log_weight`: noise that makes this path, where none moves it drawn
     afresh."""
     density, dynamics = problem.density, model.forward(problem.like)
@@ -122,8 +122,8 @@ def noise_and_log_weight(
 
     def of_step(x, x_next, step, scalars, hidden):
         law = density.steps_from(dynamics, x).law(step.dt)
-        guided = guided_law(law, x, step, scalars)
-        return guided.noise(x_next, functools.partial(solve_law, law), hidden), guided.log_weight
+        made = guided_law(law, x, step, scalars)
+        return made.noise(x_next, functools.partial(solve_law, law), hidden), made.log_weight
 
     steps = path[:-1], path[1:], flat(guide.steps), scalars, hidden[1:]
     zeta, log_weights = _of_each_step(of_step, *steps)
