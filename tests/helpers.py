@@ -95,6 +95,23 @@ def log_abs_det_2x2(matrix):
     return jnp.sign(determinant), jnp.log(jnp.abs(determinant))
 
 
+def turning_model():
+    """σ(x) a rotation through full turns within the law's reach: as σσᵀ = I, the law is that of the
+    Ornstein–Uhlenbeck process with B = I/2."""
+
+    def turn(x, p):
+        angle = 2 * x[0]
+        return jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
+
+    return jb.Diffusion(
+        lambda x, p: -x / 2,
+        turn,
+        lambda x, p: -x @ x / 2 - float(np.log(2 * np.pi)),
+        reversible=True,
+        normalised=True,
+    )
+
+
 def swirl(y):
     """A bijection of the plane that turns each circle by its own angle."""
     angle = 0.7 * jnp.sqrt(1 + y @ y)
@@ -277,6 +294,15 @@ def assert_chain_moments(values, mean, covariance):
         error = batches.std(0, ddof=1) / np.sqrt(50)
         np.testing.assert_array_less(np.abs(batches.mean(0) - exact), 5 * error)
         assert error.max() < 0.1
+
+
+def assert_uniform_ranks(ranks, num_draws):
+    """Ranks (n, p) of n true parameters among so many draws, in eight bins (Talts et al. 2018)."""
+    expected = len(ranks) / 8
+    for rank in ranks.T:
+        counts = np.bincount(rank * 8 // (num_draws + 1), minlength=8)
+        chi_square = ((counts - expected) ** 2 / expected).sum()
+        assert chi_square < 7 + 5 * np.sqrt(14)  # five standard deviations of χ²_7
 
 
 def slow_cases(cases, everywhere):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.stats
-from helpers import PAPER_B, paper_model, run_program
+from helpers import PAPER_B, paper_model, run_program, turning_model
 
 import jaxbridge as jb
 from jaxbridge.coupling.join import Inputs, propose
@@ -398,19 +398,7 @@ def test_nearly_singular_sigma(mixing, precision):
 @pytest.mark.slow
 @in_single
 def test_rotating_sigma(precision):
-    dtype = jnp.dtype(precision)
-
-    def turn(x, p):
-        angle = 2 * x[0]  # a full turn within the law's reach
-        return jnp.array([[jnp.cos(angle), -jnp.sin(angle)], [jnp.sin(angle), jnp.cos(angle)]])
-
-    model = jb.Diffusion(
-        lambda x, p: -x / 2,
-        turn,
-        lambda x, p: -x @ x / 2 - float(np.log(2 * np.pi)),
-        reversible=True,
-        normalised=True,
-    )
+    dtype, model = jnp.dtype(precision), turning_model()
     start, end = jnp.array([0.3, -0.2], dtype), jnp.array([-0.5, 0.4], dtype)
     plain = jb.ornstein_uhlenbeck(0.5 * jnp.eye(2))
     exact = jb.ou_transition(plain, start, 2.0).log_density(end)

@@ -23,5 +23,7 @@ proposal that suits its use (`blocks`). On these are built:
 
 Of records that were seen with noise or in part the likelihood is E[w(θ, ξ)], the mean weight of
 paths that normal noise ξ makes (`record_paths`). Draws from π(θ) N(ξ; 0, I) w(θ, ξ) are `gibbs` as
-well (`record_gibbs`), and the maximum is `maximum_likelihood` (`record_maximum`).
+well (`record_gibbs`), with a guide found anew in the warm-up (`warm_up`), and the maximum is
+`maximum_likelihood` (`record_maximum`). What `pmmh` needs of L(θ), of either kind, is in
+`likelihood_estimates`.
 """

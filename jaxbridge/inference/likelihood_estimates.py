@@ -145,11 +145,10 @@ class RecordLikelihood(AbstractLikelihood):
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """log p̂ with its variance."""
         records, P = grid.records, self.num_particles
+        moving = records.moving
 
         def one(problem, key, points):
-            made = run_filters(
-                key, problem, model, guided(problem, model, points), (1, P), records.moving
-            )
+            made = run_filters(key, problem, model, guided(problem, model, points), (1, P), moving)
             return made.log_estimate[0], made.variance(P)[0]
 
         each = records.each(one, jax.random.split(key, records.number), grid.points)

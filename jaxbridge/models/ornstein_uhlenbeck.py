@@ -187,8 +187,10 @@ def _prepare(params: OrnsteinUhlenbeckParams) -> _Prepared:
     B, mean, sigma = params
     if sigma is None:
         return _Prepared(B, mean, sigma, *_stationary(B, jnp.eye(len(B), dtype=B.dtype)))
-    forth = jnp.diag(sigma) if sigma.ndim == 1 else sigma
-    back = jnp.diag(1 / sigma) if sigma.ndim == 1 else any_inverse(sigma)
+    if sigma.ndim == 1:
+        forth, back, log_det = jnp.diag(sigma), jnp.diag(1 / sigma), jnp.sum(jnp.log(abs(sigma)))
+    else:
+        forth, back, log_det = sigma, any_inverse(sigma), any_log_abs_det(sigma)
     smaller = jnp.sum((back @ B @ forth) ** 2) < jnp.sum(B**2)
     identity = jnp.eye(len(B), dtype=B.dtype)
     forth, noise = jnp.where(smaller, forth, identity), jnp.where(smaller, identity, forth)
@@ -200,7 +202,7 @@ def _prepare(params: OrnsteinUhlenbeckParams) -> _Prepared:
         sigma,
         root=forth @ root,
         precision=back.T @ precision @ back,
-        log_normaliser=log_normaliser + any_log_abs_det(forth),
+        log_normaliser=log_normaliser + jnp.where(smaller, log_det, 0),
         reverse_B=forth @ reverse_B @ back,
     )
 

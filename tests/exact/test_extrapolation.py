@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import turning_model
 
 import jaxbridge as jb
 
@@ -100,20 +101,8 @@ def test_nothing_is_left_of_a_density_that_noise_made_negative(densities):
 @pytest.mark.slow
 @pytest.mark.optimised
 def test_few_steps_of_a_sigma_that_turns():
-    """A rotation through full turns, in ten steps by default: σσᵀ = I, so the law is that of an
-    Ornstein–Uhlenbeck process."""
-
-    def turn(x, p):
-        cosine, sine = jnp.cos(2 * x[0]), jnp.sin(2 * x[0])
-        return jnp.stack([jnp.stack([cosine, -sine]), jnp.stack([sine, cosine])])
-
-    model = jb.Diffusion(
-        lambda x, p: -x / 2,
-        turn,
-        lambda x, p: -x @ x / 2 - float(np.log(2 * np.pi)),
-        reversible=True,
-        normalised=True,
-    )
+    """The default scheme, by ten."""
+    model = turning_model()
     start, end, duration = jnp.array([0.3, -0.2]), jnp.array([-0.5, 0.4]), 2.0
     law = jb.ou_transition(jb.ornstein_uhlenbeck(0.5 * jnp.eye(2)), start, duration)
     coarse, fine = (

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import assert_uniform_ranks
 from inference_oracles import ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
@@ -204,7 +205,4 @@ def test_ranks_of_true_parameters_are_uniform():
 
     keys = jax.random.split(jax.random.key(0), num_sets)
     ranks = np.asarray(jax.jit(jax.vmap(one_set))(keys))
-    for rank in ranks.T:
-        counts = np.bincount(rank * 8 // (num_draws + 1), minlength=8)
-        chi_square = ((counts - num_sets / 8) ** 2 / (num_sets / 8)).sum()
-        assert chi_square < 7 + 5 * np.sqrt(14)
+    assert_uniform_ranks(ranks, num_draws)

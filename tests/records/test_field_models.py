@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import assert_uniform_ranks
 from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
@@ -206,7 +207,4 @@ def test_ranks_of_true_parameters_are_uniform():
 
     keys = jax.random.split(jax.random.key(0), num_sets)
     ranks = np.asarray(jax.jit(jax.vmap(one_set))(keys)).reshape(num_sets, 3)
-    for rank in ranks.T:
-        counts = np.bincount(rank * 8 // (num_draws + 1), minlength=8)
-        chi_square = ((counts - num_sets / 8) ** 2 / (num_sets / 8)).sum()
-        assert chi_square < 7 + 5 * np.sqrt(14)  # five standard deviations of χ²_7
+    assert_uniform_ranks(ranks, num_draws)
