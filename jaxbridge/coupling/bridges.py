@@ -11,11 +11,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from ..engine.batch_size import default_num_lanes
 from ..engine.checks import Numbers, check_bound, check_count, check_key, without_derivatives
 from ..engine.compiled import compiled
 from ..engine.devices import over_devices
 from ..engine.keys import numbered_keys
-from ..engine.rejection import Accepted, Attempts, Search, default_num_lanes, rejection_sample
+from ..engine.rejection import Accepted, Attempts, Search, rejection_sample
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import (
     BridgeProblem,
@@ -96,7 +97,7 @@ def sample_bridges(
         kept; with several durations, fractions of them. By default the whole grid.
     - `batch_size`: proposals simulated side by side; bounds memory, and changes results by
         rounding only. By default no more than are useful, and as many as fit in 16 MiB, or 256
-        if these fit in 512 MiB.
+        if these fit in 512 MiB; on an accelerator in 1 GiB.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time where a bridge was not found, or parameters are not
         finite.

@@ -16,10 +16,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from ..engine.batch_size import default_num_lanes
 from ..engine.checks import check_bound, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled
 from ..engine.keys import key_for, numbered_keys
-from ..engine.rejection import Attempts, Search, default_num_lanes, rejection_sample
+from ..engine.rejection import Attempts, Search, rejection_sample
 from ..models.diffusion import Diffusion, check_diffusion
 from .associated import run_associated
 from .base import AbstractCoupling

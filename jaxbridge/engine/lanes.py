@@ -11,7 +11,7 @@ lanes, which XLA fuses into a few passes. Equations that have no rule here go th
 import math
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -164,25 +164,49 @@ def _apply(
     return _by_vmap(jaxpr, equation, operands, form, lanes)
 
 
+class _Loop(NamedTuple):
+    """A loop of known length: its body, and how many operands it reads as constants, carries from
+    step to step, and takes a slice of in each step; and how many results it stacks."""
+
+    body: ClosedJaxpr
+    length: int
+    num_consts: int
+    num_carried: int
+    num_read: int
+    num_stacked: int
+
+
+def _loop(equation: JaxprEqn) -> _Loop:
+    """What a `scan` is, by its shapes: what is read or stacked has an axis more than in the body.
+    (How its parameters say so changes with JAX's versions.)"""
+    body = equation.params["jaxpr"]
+    num_read, num_stacked = (
+        sum(aval(a).ndim > aval(b).ndim for a, b in zip(outside, inside, strict=True))
+        for outside, inside in (
+            (equation.invars, body.jaxpr.invars),
+            (equation.outvars, body.jaxpr.outvars),
+        )
+    )
+    num_carried = len(equation.outvars) - num_stacked
+    num_consts = len(equation.invars) - num_carried - num_read
+    return _Loop(body, equation.params["length"], num_consts, num_carried, num_read, num_stacked)
+
+
 def _is_plain_loop(equation: JaxprEqn) -> bool:
     """Whether it is a loop of known length whose steps have no inputs or outputs of their own."""
-    params = equation.params
-    inputs = len(equation.invars) - params["num_consts"] - params["num_carry"]
-    outputs = len(equation.outvars) - params["num_carry"]
-    return inputs == outputs == 0
+    loop = _loop(equation)
+    return loop.num_read == loop.num_stacked == 0
 
 
 def _repeat(equation: JaxprEqn, operands: list, form: AbstractForm, lanes: int) -> list:
-    body, num_consts = equation.params["jaxpr"], equation.params["num_consts"]
-    consts, init = operands[:num_consts], operands[num_consts:]
+    loop = _loop(equation)
+    consts, init = operands[: loop.num_consts], operands[loop.num_consts :]
 
     def step(_, arrays):
-        carry = _evaluate(body, [*consts, *map(form.split, arrays)], form, lanes)
+        carry = _evaluate(loop.body, [*consts, *map(form.split, arrays)], form, lanes)
         return [form.join(value, lanes) for value in carry]
 
-    arrays = lax.fori_loop(
-        0, equation.params["length"], step, [form.join(value, lanes) for value in init]
-    )
+    arrays = lax.fori_loop(0, loop.length, step, [form.join(value, lanes) for value in init])
     return list(map(form.split, arrays))
 
 

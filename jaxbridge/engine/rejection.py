@@ -14,10 +14,9 @@ from typing import NamedTuple
 import diffrax
 import jax
 import jax.numpy as jnp
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Int, PyTree
 
-from .devices import num_devices, over_devices
+from .devices import over_devices
 from .progress import metered_while_loop
 
 
@@ -142,6 +141,9 @@ def _add(
     )
 
 
+_PARTS = 2**23  # of all lanes
+
+
 def _assign_lanes(
     num_found: Int[Array, " P"],
     num_tried: Int[Array, " P"],
@@ -154,35 +156,13 @@ def _assign_lanes(
     found, tried = num_found.astype(jnp.float32), num_tried.astype(jnp.float32)
     rate = (found + 1) / (tried + 2)
     need = jnp.where(pending, (wanted - found) / rate, 0)
-    share = jnp.cumsum(need) / jnp.maximum(jnp.sum(need), 1)
-    # Rounded sums of floats need not increase, and a problem's lanes must not overlap the next's.
-    last = lax.cummax(jnp.round(share * num_lanes).astype(jnp.int32)).at[-1].set(num_lanes)
+    # Sums of whole parts cannot decrease, which rounded sums may: a problem's lanes must not
+    # overlap the next's.
+    part = jnp.ceil(need / jnp.maximum(jnp.sum(need), 1) * _PARTS).astype(jnp.int32)
+    sums = jnp.cumsum(part).astype(jnp.float32)
+    last = jnp.round(sums / jnp.maximum(sums[-1], 1) * num_lanes).astype(jnp.int32)
+    last = last.at[-1].set(num_lanes)
     first = jnp.concatenate([jnp.zeros(1, jnp.int32), last[:-1]])
     lanes = jnp.arange(num_lanes, dtype=jnp.int32)
     problem = jnp.searchsorted(last, lanes, side="right").astype(jnp.int32)
     return first, problem, lanes - first[problem]
-
-
-# See `linalg`: beyond this many numbers per array, reductions that a user's model may contain
-# are not safe in XLA's loops on CPU.
-_MOST_NUMBERS = 2**15
-
-# With fewer, much of the time of a step goes into what it costs however many lanes there are.
-_ENOUGH_LANES = 256
-
-
-def default_num_lanes(num_wanted: int, num_steps: int, points: Float[Array, "*axes d"]) -> int:
-    """As many lanes as successes are wanted, within a bound on the memory of their paths on each
-    device: 16 MiB, or what `_ENOUGH_LANES` need, up to 512 MiB.
-
-    A lane holds two paths and their noise.
-    """
-    d = points.shape[-1]
-    bytes_per_lane = 3 * d * (num_steps + 1) * points.dtype.itemsize
-    fitting = max(2**24 // bytes_per_lane, min(_ENOUGH_LANES, 2**29 // bytes_per_lane), 1)
-    return min(num_devices() * min(fitting, most_lanes(d)), max(num_wanted, 64))
-
-
-def most_lanes(d: int) -> int:
-    """How many lanes may run side by side, for points in R^d."""
-    return max(1, min(8_192, _MOST_NUMBERS // d))

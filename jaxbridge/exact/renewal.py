@@ -26,11 +26,12 @@ from ..coupling import (
     run_associated,
     run_is_cut,
 )
+from ..engine.batch_size import default_num_lanes, most_lanes
 from ..engine.checks import Numbers, check_key, nondifferentiable
 from ..engine.compiled import compiled
 from ..engine.keys import split_each
 from ..engine.progress import metered_while_loop
-from ..engine.rejection import Accepted, Search, default_num_lanes, most_lanes
+from ..engine.rejection import Accepted, Search
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
 from ..proposals import Budget, CoupledPairs, as_pairs, as_proposal

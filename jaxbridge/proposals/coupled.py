@@ -28,9 +28,10 @@ from ..coupling import (
     needs_burn_in,
     with_start_law,
 )
+from ..engine.batch_size import default_num_lanes
 from ..engine.checks import nondifferentiable
 from ..engine.keys import split_each
-from ..engine.rejection import Search, default_num_lanes
+from ..engine.rejection import Search
 from ..models.bridge_problem import Intervals, uniform_fractions
 from ..models.diffusion import Diffusion
 from ..schemes import check_model, log_halving_of_paths, num_looked, step_law_of

@@ -25,11 +25,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from ..engine.batch_size import most_lanes
 from ..engine.devices import num_devices
 from ..engine.lanes import join_rows, over_lanes, split_rows
 from ..engine.linalg import all_finite
 from ..engine.noise import Store, noisy_scan
-from ..engine.rejection import most_lanes
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..models.dynamics import Dynamics

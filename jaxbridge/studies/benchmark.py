@@ -26,6 +26,7 @@ from jaxtyping import Array, Key
 import jaxbridge as jb
 
 from ..coupling.join import Inputs, propose
+from ..engine.batch_size import most_lanes
 from ..models.bridge_problem import Intervals
 from .accuracy import run_sigma_costs, sigma_table
 from .clock import in_turns
@@ -37,8 +38,9 @@ from .paper import study_model
 from .report import Say, Study, Table, markdown, silent, table
 
 _NUM_STEPS = 50
-# A divisor of the number of proposals, about as many as the package runs side by side.
-_LANES = 6_250
+# Divisors of the number of proposals, about as many as the package runs side by side, on a CPU and
+# on an accelerator.
+_LANES = 6_250, 50_000
 _TARGETS = (0.1, 0.05)
 
 
@@ -80,7 +82,8 @@ def run_benchmark(
     say: Say = silent,
 ) -> Benchmark:
     """All parts; `scale` shortens them."""
-    num_proposals = max(_LANES, round(50_000 * scale / _LANES) * _LANES)
+    lanes = _lanes()
+    num_proposals = max(lanes, round(50_000 * scale / lanes) * lanes)
     ratios = []
     for gamma in (-1.0, 0.5):
         for scheme, target in ((jb.Euler(), 1.3), (jb.Heun(), 1.6)):
@@ -112,6 +115,10 @@ def run_benchmark(
     )
 
 
+def _lanes() -> int:
+    return max(lanes for lanes in _LANES if lanes <= most_lanes(2) or lanes == _LANES[0])
+
+
 def draw_floor(own_noise: bool, num_proposals: int) -> Callable[[Key[Array, ""]], Any]:
     """Draws the random numbers of so many proposals and nothing else: for each step two normals,
     one more for dU, and a uniform number for the meeting."""
@@ -132,22 +139,22 @@ def _proposals(
     key: Key[Array, ""], gamma: float, scheme: jb.AbstractScheme, num_proposals: int, target: float
 ) -> Ratio:
     """Joined paths of all proposals, met or not, against their random numbers."""
-    model, coupling = study_model(), jb.Coupling(gamma, scheme=scheme)
+    model, coupling, lanes = study_model(), jb.Coupling(gamma, scheme=scheme), _lanes()
 
     @jax.jit
     def simulate(key):
         prepared = model.prepared()
         start, end = (
-            jnp.broadcast_to(jnp.asarray(point)[:, None], (2, _LANES)) for point in UNLIKELY
+            jnp.broadcast_to(jnp.asarray(point)[:, None], (2, lanes)) for point in UNLIKELY
         )
-        intervals = Intervals(start, end, jnp.ones(_LANES))
+        intervals = Intervals(start, end, jnp.ones(lanes))
 
         def block(_, number):
-            keys = jax.random.split(jax.random.fold_in(key, number), _LANES)
+            keys = jax.random.split(jax.random.fold_in(key, number), lanes)
             made = propose(Inputs(prepared, coupling, intervals), keys, _NUM_STEPS)
             return None, (made.paths, made.meeting_step)
 
-        return lax.scan(block, None, jnp.arange(num_proposals // _LANES))[1]
+        return lax.scan(block, None, jnp.arange(num_proposals // lanes))[1]
 
     draw = draw_floor(gamma > -1, num_proposals)
     return Ratio(

@@ -27,10 +27,10 @@ from ..coupling import (
     needs_burn_in,
     sample_bridges,
 )
+from ..engine.batch_size import most_lanes
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.compiled import compiled
 from ..engine.keys import key_for
-from ..engine.rejection import most_lanes
 from ..exact import weigh_bridges
 from ..models.bridge_problem import BridgeProblem, Intervals, bridge_problem
 from ..models.diffusion import Diffusion
