@@ -20,7 +20,7 @@ from ..engine.keys import split_each
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
 from ..proposals import AbstractWeightedProposal, Budget, ModifiedDiffusionBridge, as_pairs
-from ..schemes import Form, log_likelihoods
+from ..schemes import EulerDensity, Form, log_likelihoods
 from .blocks import Block, Use, make_blocks, target_forms, with_keys
 from .bridge_kernels import AbstractBridgeKernel, BridgeInfo, ByRenewal, ByWeights, Unweighted
 from .data import Problem
@@ -73,7 +73,7 @@ class Augmentation(eqx.Module):
             intervals, num_steps = block.intervals, block.num_steps
             found_keys, other_keys = split_each(keys, 2)
             found = kernel.first(found_keys, model, intervals, num_steps)
-            other = ModifiedDiffusionBridge().draw(
+            other = ModifiedDiffusionBridge(EulerDensity()).draw(
                 other_keys[:, None], model, intervals, num_steps, None, False
             )
             done = jnp.concatenate([jnp.zeros(1), jnp.cumsum(block.fractions)]).astype(found.dtype)

@@ -85,7 +85,7 @@ def as_pulled(
     **Raises:** `ValueError` and `TypeError` for one whose weights have no derivatives.
     """
     if isinstance(proposal, str) and proposal == "auto":
-        proposal = choice_between(guided_candidates(model, like))
+        proposal = choice_between(guided_candidates())
     given = as_proposal(proposal, model, like, budget)
     if given.coupled:
         raise ValueError(

@@ -28,7 +28,6 @@ from ..engine.checks import (
 )
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..schemes import EulerDensity, ItoTaylorDensity
 from .base import AbstractProposal, AbstractSingleProposal
 from .choice import Choice
 from .coupled import CoupledPairs
@@ -70,6 +69,10 @@ class Auto(AbstractProposal):
 
     def of(self, which):
         return self
+
+    def for_model(self, model, like):
+        candidates = tuple(candidate.for_model(model, like) for candidate in self.candidates)
+        return dataclasses.replace(self, candidates=candidates)
 
     def check(self, model, intervals):
         for candidate in self.candidates:
@@ -146,9 +149,10 @@ def as_proposal(
     """What the user gave as `proposal`, for points like this one; `for_density` if the size of its
     weights matters, and not only their proportion."""
     if isinstance(proposal, str) and proposal == "auto":
-        candidates = default_candidates(model, like, for_density)
-        return choice_between(candidates, budget, left_out=why_left_out(model, for_density))
-    return _given(Coupling() if proposal is None else proposal, budget)
+        candidates = default_candidates(model, for_density)
+        given = choice_between(candidates, budget, left_out=why_left_out(model, for_density))
+        return given.for_model(model, like)
+    return _given(Coupling() if proposal is None else proposal, budget).for_model(model, like)
 
 
 def _given(proposal: Any, budget: Budget) -> AbstractProposal:
@@ -194,20 +198,16 @@ def choice_between(
     return Auto(proposals, num_pilot, left_out)  # pyright: ignore
 
 
-def guided_candidates(model: Diffusion, like: Float[Array, " d"]) -> list[AbstractSingleProposal]:
+def guided_candidates() -> list[AbstractSingleProposal]:
     """With the same order of step error as couplings, where that is to be had."""
-    density = EulerDensity() if model.sigma_varies(like) else ItoTaylorDensity()
-    guided = [Guided(along, density) for along in ("end", "path")]
-    return [ModifiedDiffusionBridge(density), *guided]
+    return [ModifiedDiffusionBridge(), Guided("end"), Guided("path")]
 
 
-def default_candidates(
-    model: Diffusion, like: Float[Array, " d"], for_density: bool = False
-) -> list[Any]:
+def default_candidates(model: Diffusion, for_density: bool = False) -> list[Any]:
     """Couplings only where the time reversal is known; and for a density, where ν is."""
     coupled = model.has_reversal and (model.normalised or not for_density)
     couplings = [Coupling(0.0), Coupling(0.5)] if coupled else []
-    return [*guided_candidates(model, like), *couplings]
+    return [*guided_candidates(), *couplings]
 
 
 def why_left_out(model: Diffusion, for_density: bool) -> str:

@@ -67,6 +67,10 @@ class AbstractProposal(eqx.Module):
         """The grid, t_i / T, from 0 to 1."""
 
     @abstractmethod
+    def for_model(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractProposal":
+        """The proposal with all decided that it leaves to the model, for points like this one."""
+
+    @abstractmethod
     def check(self, model: Diffusion, intervals: Intervals) -> None:
         """Raise `ValueError` for a model or end points that do not fit, as far as visible."""
 
@@ -154,6 +158,10 @@ class AbstractSingleProposal(AbstractWeightedProposal):
     @property
     def is_open(self):
         return False
+
+    @abstractmethod
+    def for_model(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractSingleProposal":
+        """The proposal with all decided that it leaves to the model, for points like this one."""
 
     def of(self, which):
         return self

@@ -78,6 +78,9 @@ class Choice(AbstractWeightedProposal):
         used = self.used if is_traced(chosen) else tuple(np.unique(chosen).tolist())
         return Choice(self.candidates, *told, used, self.left_out)
 
+    def for_model(self, model, like):
+        return self
+
     def check(self, model, intervals):
         for candidate in self.candidates:
             candidate.check(model, intervals)

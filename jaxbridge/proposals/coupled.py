@@ -91,6 +91,9 @@ class CoupledPairs(AbstractSingleProposal):
     def ingredients(self):
         return ingredients(self.coupling)
 
+    def for_model(self, model, like):
+        return self
+
     def most_accurate(self, model, like):
         return eqx.tree_at(lambda p: p.coupling, self, most_accurate(self.coupling))
 

@@ -36,12 +36,11 @@ from ..models.dynamics import Dynamics
 from ..schemes import (
     AbstractStepDensity,
     Euler,
-    EulerDensity,
-    ItoTaylorDensity,
     StepLaw,
     check_model,
     log_halving_of_all_steps,
     log_halving_of_pair,
+    most_accurate_density,
     num_looked,
     share_of_order,
 )
@@ -71,11 +70,12 @@ class AbstractGuidedProposal(AbstractSingleProposal):
     """Paths in steps as the target's, but pulled so that they end in b.
 
     A proposal is another law of each step, `step_law`, and what can be worked out for it before
-    any path is simulated, `guide`. `density` is that of the target's steps, and `refinement` is ρ
-    in t_i = T [1 - (1 - i/N)^ρ].
+    any path is simulated, `guide`. `density` is that of the target's steps, `None` until the model
+    is known (`for_model`) if the most accurate is wanted, and `refinement` is ρ in
+    t_i = T [1 - (1 - i/N)^ρ].
     """
 
-    density: eqx.AbstractVar[AbstractStepDensity]
+    density: eqx.AbstractVar[AbstractStepDensity | None]
     refinement: eqx.AbstractVar[float]
 
     @property
@@ -83,7 +83,8 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return None
 
     @property
-    def target(self):
+    def target(self) -> AbstractStepDensity:
+        assert self.density is not None  # decided by `for_model`
         return self.density
 
     @property
@@ -91,13 +92,15 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return 1.0
 
     def ingredients(self):
-        return type(self.density).__name__, "", np.nan
+        return type(self.target).__name__, "", np.nan
+
+    def for_model(self, model, like):
+        return self if self.density is not None else self.most_accurate(model, like)
 
     def most_accurate(self, model, like):
-        if model.sigma_varies(like):
-            return self
-        is_density = lambda leaf: isinstance(leaf, AbstractStepDensity)
-        return eqx.tree_at(lambda p: p.density, self, ItoTaylorDensity(), is_leaf=is_density)
+        density = most_accurate_density(model.sigma_varies(like))
+        is_density = lambda leaf: leaf is None or isinstance(leaf, AbstractStepDensity)
+        return eqx.tree_at(lambda p: p.density, self, density, is_leaf=is_density)
 
     def for_pilot(self):
         return self
@@ -135,7 +138,7 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return 1 - self.remaining(num_steps)
 
     def step_share(self, model, intervals):
-        return jnp.full_like(intervals.duration, share_of_order(self.density.order))
+        return jnp.full_like(intervals.duration, share_of_order(self.target.order))
 
     def remaining(self, num_steps: int) -> Float[np.ndarray, " points"]:
         """(T - t_i) / T, down to zero."""
@@ -221,7 +224,7 @@ class _Lanes:
         each = (dt, remaining, jnp.roll(dt, 1, axis=0), jnp.arange(num_steps) % 2 == 1)
         self.steps = _Steps(guide, *jax.tree.map(lambda leaf: leaf[:-1], each))
         self._last = _Steps(None, *jax.tree.map(lambda leaf: leaf[-1], each))
-        self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.density
+        self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.target
         self._of_pairs = jax.jit(self._log_halving)  # traced once, for the loop and for its end
 
     def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
@@ -510,15 +513,6 @@ def bridge_law(step: Step, target: StepLaw, mean: Float[Array, " d"]) -> StepLaw
     """With this mean and the covariance V δ (T - t_{i+1})/(T - t_i)."""
     shrunk = (step.remaining - step.dt) / step.remaining
     return target._replace(mean=mean, covariance=shrunk)
-
-
-def check_step_density(density: AbstractStepDensity | None) -> AbstractStepDensity:
-    density = EulerDensity() if density is None else density
-    if not isinstance(density, AbstractStepDensity):
-        raise TypeError(
-            f"`density` must be `EulerDensity()` or `ItoTaylorDensity()`; got {density!r}."
-        )
-    return density
 
 
 def check_refinement(refinement: float) -> float:

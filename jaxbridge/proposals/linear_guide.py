@@ -32,8 +32,8 @@ from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import inverse, matmul, matvec
 from ..models.dynamics import Dynamics
 from ..models.sigma import AbstractSigma, root_of
-from ..schemes import AbstractStepDensity, StepLaw
-from .guided import AbstractGuidedProposal, check_refinement, check_step_density, deterministic_path
+from ..schemes import AbstractStepDensity, StepLaw, check_step_density
+from .guided import AbstractGuidedProposal, check_refinement, deterministic_path
 
 # δ |F| of a step that has nothing in common with the diffusion: where long steps threw ξ far out.
 _FAR_OUT = 10.0
@@ -71,8 +71,8 @@ class Guided(AbstractGuidedProposal):
         of them linearised along the deterministic path dξ = α(ξ) dt from the start, bent so that
         it ends in b, and straight where steps are so long that they throw it far out; or a matrix
         F of shape (d, d), with α(b) and σ(b).
-    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
-        `ItoTaylorDensity()` is far closer to the diffusion.
+    - `density`: of the target's steps, by default the most accurate: `ItoTaylorDensity()` for
+        constant σ, `EulerDensity()` where σ depends on the state.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
@@ -86,7 +86,7 @@ class Guided(AbstractGuidedProposal):
     ```
     """
 
-    density: AbstractStepDensity
+    density: AbstractStepDensity | None
     refinement: float = eqx.field(static=True)
     _along: str = eqx.field(static=True)
     _matrix: Float[Array, "d d"] | None
@@ -134,7 +134,7 @@ class Guided(AbstractGuidedProposal):
             )
         points = end[None]
         if self._along == "path":
-            xi, xi_end = deterministic_path(self.density, dynamics, start, dt)
+            xi, xi_end = deterministic_path(self.target, dynamics, start, dt)
             done = jnp.concatenate([jnp.zeros_like(dt[:1]), jnp.cumsum(dt)[:-1]]) / jnp.sum(dt)
             points = xi + done[:, None] * (end - xi_end)
             straight = start + done[:, None] * (end - start)
@@ -147,7 +147,7 @@ class Guided(AbstractGuidedProposal):
             """h_i from h_{i+1}, by one step of the linear process."""
             (F, drift, V), dt = inputs
             shift, H = guess
-            step = self.density.linear_step(F, V, dt)
+            step = self.target.linear_step(F, V, dt)
             gain = inverse(jnp.eye(d, dtype=end.dtype) + matmul(H, step.covariance))
             shift = shift - matvec(H, matvec(step.integral, drift))
             shift = matvec(step.decay.T, matvec(gain, shift))
@@ -155,7 +155,7 @@ class Guided(AbstractGuidedProposal):
             return _GaussianGuess(shift, (H + H.T) / 2), guess
 
         F, drift, V = jax.tree.map(lambda leaf: leaf[-1], coefficients)
-        step = self.density.linear_step(F, V, dt[-1])
+        step = self.target.linear_step(F, V, dt[-1])
         pull = matmul(step.decay.T, inverse(step.covariance))  # from t_{N-1} to b itself
         last = _GaussianGuess(-matvec(pull, matvec(step.integral, drift)), matmul(pull, step.decay))
         num_steps = dt.shape[0]

@@ -3,8 +3,8 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..schemes import AbstractStepDensity
-from .guided import AbstractGuidedProposal, bridge_law, check_refinement, check_step_density
+from ..schemes import AbstractStepDensity, check_step_density
+from .guided import AbstractGuidedProposal, bridge_law, check_refinement
 
 
 class ModifiedDiffusionBridge(AbstractGuidedProposal):
@@ -18,8 +18,8 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
 
     **Arguments:**
 
-    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
-        `ItoTaylorDensity()` is far closer to the diffusion.
+    - `density`: of the target's steps, by default the most accurate: `ItoTaylorDensity()` for
+        constant σ, `EulerDensity()` where σ depends on the state.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
@@ -31,7 +31,7 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
     ```
     """
 
-    density: AbstractStepDensity
+    density: AbstractStepDensity | None
     refinement: float = eqx.field(static=True)
 
     def __init__(self, density: AbstractStepDensity | None = None, refinement: float = 1.0):

@@ -3,12 +3,11 @@
 import equinox as eqx
 import jax.numpy as jnp
 
-from ..schemes import AbstractStepDensity
+from ..schemes import AbstractStepDensity, check_step_density
 from .guided import (
     AbstractGuidedProposal,
     bridge_law,
     check_refinement,
-    check_step_density,
     deterministic_path,
 )
 
@@ -24,8 +23,8 @@ class ResidualBridge(AbstractGuidedProposal):
 
     **Arguments:**
 
-    - `density`: of the target's steps, by default `EulerDensity()`; for constant σ
-        `ItoTaylorDensity()` is far closer to the diffusion.
+    - `density`: of the target's steps, by default the most accurate: `ItoTaylorDensity()` for
+        constant σ, `EulerDensity()` where σ depends on the state.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
         which pays where σ varies much on the way.
 
@@ -37,7 +36,7 @@ class ResidualBridge(AbstractGuidedProposal):
     ```
     """
 
-    density: AbstractStepDensity
+    density: AbstractStepDensity | None
     refinement: float = eqx.field(static=True)
 
     def __init__(self, density: AbstractStepDensity | None = None, refinement: float = 1.0):
@@ -51,7 +50,7 @@ class ResidualBridge(AbstractGuidedProposal):
         return jnp.full_like(intervals.duration, 1.3)
 
     def guide(self, dynamics, start, end, dt):
-        xi, xi_end = deterministic_path(self.density, dynamics, start, dt)
+        xi, xi_end = deterministic_path(self.target, dynamics, start, dt)
         moved = jnp.concatenate([xi[1:], xi_end[None]]) - xi
         return moved[:-1], (xi + end - xi_end)[:-1]
 

@@ -9,8 +9,7 @@ from jaxtyping import Array, Float
 from ..coupling import Stationary
 from ..engine.checks import Numbers, is_traced
 from ..models.diffusion import Diffusion, check_diffusion
-from ..proposals.guided import check_step_density
-from ..schemes import AbstractStepDensity, EulerDensity, ItoTaylorDensity
+from ..schemes import AbstractStepDensity, check_step_density, most_accurate_density
 from .initial import Initial, as_initial, bound, check_initial
 from .observation import LinearGaussian, Observation, Scalars, check_observation
 from .record import Record, as_records, split_records
@@ -114,10 +113,10 @@ def problem_of(
         )
     check_initial(initial, model, like)
     check_domain(model, observation, record)
+    density = check_step_density(density)
     if density is None:
-        varies = model.sigma_varies(like)
-        density = EulerDensity() if varies else ItoTaylorDensity()
-    return RecordProblem(model, record, observation, initial, check_step_density(density), dim)
+        density = most_accurate_density(model.sigma_varies(like))
+    return RecordProblem(model, record, observation, initial, density, dim)
 
 
 def _check_dimension(model: Diffusion, guess: LinearGaussian, like: Float[Array, " d"]) -> None:

@@ -53,6 +53,8 @@ from .step_density import (
     EulerDensity as EulerDensity,
     ItoTaylorDensity as ItoTaylorDensity,
     StepLaw as StepLaw,
+    check_step_density as check_step_density,
+    most_accurate_density as most_accurate_density,
 )
 from .step_error import (
     StepError as StepError,

@@ -134,7 +134,7 @@ class EulerDensity(AbstractStepDensity):
     **Example:**
 
     ```python
-    proposal = jb.ModifiedDiffusionBridge(density=jb.EulerDensity())  # the default
+    proposal = jb.ModifiedDiffusionBridge(density=jb.EulerDensity())
     ```
     """
 
@@ -170,7 +170,7 @@ class ItoTaylorDensity(AbstractStepDensity):
     **Example:**
 
     ```python
-    proposal = jb.Guided(density=jb.ItoTaylorDensity())
+    proposal = jb.Guided(density=jb.ItoTaylorDensity())  # the default for constant σ
     ```
     """
 
@@ -207,6 +207,20 @@ class ItoTaylorDensity(AbstractStepDensity):
         flow = matmul(F, V)
         covariance = dt * V + dt**2 / 2 * (flow + flow.T) + dt**3 / 3 * matmul(flow, F.T)
         return LinearStep(identity + matmul(F, integral), integral, covariance)
+
+
+def check_step_density(density: AbstractStepDensity | None) -> AbstractStepDensity | None:
+    """What the user gave as `density`; `None` leaves it to the model."""
+    if not (density is None or isinstance(density, AbstractStepDensity)):
+        raise TypeError(
+            f"`density` must be `EulerDensity()` or `ItoTaylorDensity()`; got {density!r}."
+        )
+    return density
+
+
+def most_accurate_density(sigma_varies: bool) -> AbstractStepDensity:
+    """That which the model has."""
+    return EulerDensity() if sigma_varies else ItoTaylorDensity()
 
 
 def _columns(sigma: AbstractSigma, x: Float[Array, " d"]) -> list[Float[Array, " d"]]:

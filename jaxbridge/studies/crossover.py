@@ -126,7 +126,7 @@ def run_crossover(
     simulated steps of each run."""
     rates = []
     for process in processes() if chosen is None else chosen:
-        candidates = [*default_candidates(process.model, jnp.asarray(process.start)), "auto"]
+        candidates = [*default_candidates(process.model), "auto"]
         for duration in durations:
             runs = [_run(key, process, duration, candidate, work) for candidate in candidates]
             seconds = [math.inf] * len(runs)

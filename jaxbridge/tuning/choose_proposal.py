@@ -44,10 +44,9 @@ def choose_proposal(
 
     - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`.
     - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge`,
-        `Guided("end")` and `Guided("path")`, with `ItoTaylorDensity()` for constant σ, and so
-        with the same order of step error as couplings; where the time reversal of the model is
-        known `Coupling(0.0)` and `Coupling(0.5)`; and for a single interval for which one of them
-        comes near the best, one with its start law tuned.
+        `Guided("end")` and `Guided("path")`; where the time reversal of the model is known
+        `Coupling(0.0)` and `Coupling(0.5)`; and for a single interval for which one of them comes
+        near the best, one with its start law tuned.
     - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
         all intervals, at least 32 and at most 512.
     - `for_density`: for `transition_log_density` and `pmmh`. Then couplings that start from the
@@ -78,16 +77,16 @@ def choose_proposal(
         )
     if num_pilot is not None:
         num_pilot = check_count("num_pilot", num_pilot, 2)
-    like = intervals.start[0]
     left_out = ""
     if candidates is None:
-        given = default_candidates(model, like, for_density)
+        given = default_candidates(model, for_density)
         left_out = why_left_out(model, for_density)
     else:
         given = list(candidates)
 
     def choose_between(candidates, left_out=""):
         auto = choice_between(candidates, num_pilot=num_pilot, left_out=left_out)
+        auto = auto.for_model(model, intervals.start[0])
         auto.check(model, intervals)
         if for_density:
             auto.check_for_density(model)

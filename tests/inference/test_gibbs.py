@@ -238,7 +238,7 @@ def test_the_likelihood_is_that_of_the_target_of_the_bridges():
         data,
         num_iterations=12_000,
         num_steps=steps,
-        proposal=jb.ModifiedDiffusionBridge(),
+        proposal=jb.ModifiedDiffusionBridge(jb.EulerDensity()),
         **OPTIONS,
     )
     grid = np.linspace(0.01, 2.9, 3_000)

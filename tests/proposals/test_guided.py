@@ -112,7 +112,7 @@ def test_linear_drift_is_guided_without_error(x64, linearisation, refinement):
     """Every weight is the density of the Euler chain, a Gaussian recursion."""
     model = jb.ornstein_uhlenbeck(NON_REVERSIBLE, [0.2, -0.1], FULL_SIGMA)
     start, end, duration, n = jnp.array([0.8, -0.3]), jnp.array([-0.5, 0.4]), 1.5, 12
-    proposal = jb.Guided(linearisation, refinement=refinement)
+    proposal = jb.Guided(linearisation, jb.EulerDensity(), refinement)
     weighted = jb.sample_weighted_bridges(
         jax.random.key(0),
         model,
@@ -275,7 +275,8 @@ def test_noise_makes_the_path_and_the_path_gives_the_noise(precision):
     dynamics = model.forward(intervals.start[0])
     xi = jax.random.normal(jax.random.key(0), (2, 9, 2))
     tolerance = 2e-4 if precision == "float32" else 1e-11
-    for proposal in (jb.ModifiedDiffusionBridge(), jb.Guided("path", refinement=1.5)):
+    euler = jb.EulerDensity()
+    for proposal in (jb.ModifiedDiffusionBridge(euler), jb.Guided("path", euler, refinement=1.5)):
         paths, log_weights, log_halving = jax.jit(
             lambda xi, proposal=proposal: path_of(proposal, dynamics, intervals, xi)
         )(xi)
@@ -296,10 +297,11 @@ def test_without_drift_a_guess_has_the_mean_of_both_covariances(diagonal, x64):
         return scale if diagonal else jnp.diag(scale) + jnp.array([[0.0, 0.7], [-0.4, 0.0]])
 
     model, x, end = jb.Diffusion(lambda x, p: 0 * x, sigma), jnp.array([0.0, 0.3]), [1.5, -1.0]
-    proposal, dt, end = jb.Guided(), jnp.full(5, 0.2), jnp.array(end)
+    proposal = jb.Guided(density=jb.EulerDensity())
+    dt, end = jnp.full(5, 0.2), jnp.array(end)
     dynamics = model.forward(x)
     guide = jax.tree.map(lambda leaf: leaf[2], proposal.guide(dynamics, x, end, dt))
-    target = proposal.density.steps_from(dynamics, x).law(dt[0])
+    target = proposal.target.steps_from(dynamics, x).law(dt[0])
     law = proposal.step_law(Step(guide, dt[0], jnp.array(0.6), end), x, target)
 
     V, V_end = (
@@ -339,8 +341,9 @@ def test_sigma_may_turn_and_a_guess_does_not_see_it(linearisation, x64):
 
 
 @pytest.mark.slow
-def test_both_families_converge_to_one_law():
-    """The error of log p̂ against the closed form: O(δ) for the Euler target."""
+@pytest.mark.parametrize(("density", "order"), [(jb.EulerDensity(), 1), (None, 2)])
+def test_both_families_converge_to_one_law(density, order):
+    """The error of log p̂ against the closed form: O(δ) for the Euler target, O(δ²) by default."""
     model, ends = paper_model(), (jnp.array([0.785, 0.785]), jnp.array([0.5, 0.2]))
     exact = float(jb.ou_transition(model, ends[0], 1.0).log_density(ends[1]))
     sizes = np.array([10, 20, 40])
@@ -348,15 +351,15 @@ def test_both_families_converge_to_one_law():
         float(
             jb.transition_log_density(
                 jax.random.key(0), model, *ends, 1.0, num_proposals=2, num_steps=int(n),
-                proposal=jb.Guided(),
+                proposal=jb.Guided(density=density),
             ).value
         )
         - exact
         for n in sizes
     ]  # fmt: skip
-    assert abs(loglog_slope(1 / sizes, np.abs(errors)) - 1) < 0.15
+    assert abs(loglog_slope(1 / sizes, np.abs(errors)) - order) < 0.15
     # Extrapolated to no step at all, the two agree; the coupling's own error is O(δ²).
-    extrapolated = exact + 2 * errors[-1] - errors[-2]
+    extrapolated = exact + errors[-1] + (errors[-1] - errors[-2]) / (2**order - 1)
     coupled = jb.transition_log_density(
         jax.random.key(0), model, *ends, 1.0, num_proposals=30_000, num_steps=40,
         proposal=jb.Coupling(0.5),
@@ -537,3 +540,44 @@ def test_explosions_are_counted_and_never_returned(start, found):
     assert np.isnan(weighted.paths[~weighted.met]).all()
     assert np.isfinite(weighted.paths[weighted.met]).all()
     assert (np.isfinite(weighted.mean()) == (found > 0)).all()  # of none there is no mean
+
+
+def test_defaults_agree_in_what_they_are_exact_for():
+    """Fisher's identity: the mean score of bridges is that of p_T. By default bridges and the
+    likelihood of paths are of second order both; bridges of the Euler scheme are not."""
+    start, end, theta, duration = jnp.array([0.4]), jnp.array([1.5]), jnp.array(0.9), 1.0
+
+    def model(theta):
+        return jb.Diffusion(lambda x, p: -p * x, params=theta)
+
+    def log_density(theta):
+        variance = (1 - jnp.exp(-2 * theta * duration)) / (2 * theta)
+        residual = end[0] - jnp.exp(-theta * duration) * start[0]
+        return -(residual**2 / variance + jnp.log(variance)) / 2
+
+    def score(path, times):
+        return jax.grad(lambda p: jb.path_log_likelihood(model(p), times, path))(theta)
+
+    errors = {}
+    for density in (None, jb.EulerDensity()):
+        bridges = jb.sample_weighted_bridges(
+            jax.random.key(0), model(theta), start, end, duration,
+            num_bridges=200_000, num_steps=6, proposal=jb.ModifiedDiffusionBridge(density),
+        )  # fmt: skip
+        each = lambda path, times=bridges.times: score(path, times)
+        error = float(bridges.mean(each)) - float(jax.grad(log_density)(theta))
+        errors[density] = error, float(bridges.standard_error(each))
+    value, standard_error = errors[None]
+    assert abs(value) < 5 * standard_error + 0.1 / 6**2
+    assert abs(errors[jb.EulerDensity()][0]) > 5 * standard_error + 0.1 / 6**2
+
+
+def test_the_default_is_the_most_accurate_that_the_model_has():
+    arguments = (jax.random.key(0), BENT, jnp.array([0.3]), jnp.array([0.7]), 0.4)
+    made = jb.sample_weighted_bridges(*arguments, num_bridges=3, num_steps=4, proposal=jb.Guided())
+    assert made.proposal.density == jb.EulerDensity()
+    ends = jnp.array([0.3, 0.0]), jnp.array([0.7, 0.1])
+    made = jb.sample_weighted_bridges(
+        jax.random.key(0), two_wells(), *ends, 0.4, num_bridges=3, num_steps=4, proposal=jb.Guided()
+    )
+    assert made.proposal.density == jb.ItoTaylorDensity()
