@@ -34,13 +34,13 @@ from .parameter_kernels import (
 from .parameter_walk import first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
-    STEP_ERRORS,
     AbstractPosterior,
     drawn,
     first_chain,
     first_states,
     over_chains,
     starting_points,
+    step_errors_of_some,
     summed,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
@@ -55,11 +55,14 @@ class GibbsState(NamedTuple):
     - `paths`: those of all intervals, in blocks of one number of steps.
     - `found`: which of them the proposal has found, shape (I,), in the same order. The others are
         stand-ins, for a chain must start somewhere.
+    - `num_done`: draws so far. Going on with the same key draws the random numbers of those that
+        come after.
     """
 
     theta: Float[Array, "*chains p"]
     paths: tuple[Float[Array, "..."], ...]
     found: Bool[Array, "*chains I"]
+    num_done: Int[Array, "*chains"]
 
 
 class GibbsPosterior(AbstractPosterior):
@@ -83,7 +86,7 @@ class GibbsPosterior(AbstractPosterior):
     - `log_step_error`: an estimate of the step error of the log density of the completed data at
         each draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
         `step_error`, that of the posterior mean, is made of.
-    - `state`: where it ended; pass it as `init`, with another key, to go on.
+    - `state`: where it ended; pass it as `init` to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.
     """
@@ -256,7 +259,7 @@ class _Sampler(eqx.Module):
 
     def start(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> GibbsState:
         model = nondifferentiable(self.parameters.bind(theta))
-        return GibbsState(theta, *self.augmentation.first(key, model))
+        return GibbsState(theta, *self.augmentation.first(key, model), jnp.int32(0))
 
     def step(self, key: Key[Array, ""], state: GibbsState) -> tuple[GibbsState, GibbsInfo]:
         """Bridges given θ, then θ given bridges."""
@@ -267,7 +270,9 @@ class _Sampler(eqx.Module):
         data = CompleteData(self.parameters, self.augmentation, paths, self.log_prior)
         theta, accepted = self.kernel.step(parameter_key, state.theta, data)
         counted = bridges._replace(missing=bridges.missing | ~found)
-        return GibbsState(theta, paths, found), GibbsInfo(accepted, *summed(counted))
+        return GibbsState(theta, paths, found, state.num_done), GibbsInfo(
+            accepted, *summed(counted)
+        )
 
     def log_step_error(self, state: GibbsState) -> Float[Array, ""]:
         model = self.parameters.bind(state.theta)
@@ -284,29 +289,24 @@ def _run(
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> GibbsPosterior:
     sampler, state = nondifferentiable((sampler, state))
-    chains, dtype = state.theta.shape[:-1], state.theta.dtype
-    # As many draws as tell a covariance, for D takes a good part of the time of an iteration.
-    every = max(1, num_iterations // STEP_ERRORS)
-
-    def step_errors(i, state):
-        one = lambda state: sampler.log_step_error(state)  # `cond` hashes it
-        each = jax.vmap(one) if chains else one
-        unknown = jnp.full(chains, jnp.nan, dtype)
-        return lax.cond(i % every == every - 1, each, lambda _: unknown, state)
+    one = lambda state: sampler.log_step_error(state)  # `cond` hashes it
+    of_chains = jax.vmap(one) if state.theta.ndim == 2 else one
 
     def draw(state, i):
-        # Number 0 made the first paths.
-        keys = jax.random.split(jax.random.fold_in(key, i + 1), thin)
+        number = state.num_done.reshape(-1)[0] + 1  # 0 made the first paths
+        keys = jax.random.split(jax.random.fold_in(key, number), thin)
         step = lambda state, key: over_chains(sampler.step, key, state)
         state, infos = lax.scan(step, state, keys)
-        return state, (state.theta, summed(infos), step_errors(i, state))
+        state = state._replace(num_done=state.num_done + 1)
+        errors = step_errors_of_some(of_chains, state, i, num_iterations)
+        return state, (state.theta, summed(infos), errors)
 
     state, draws = metered_scan(draw, state, jnp.arange(num_iterations), progress_meter)
     fields, (info, log_step_error) = drawn(sampler.parameters, *draws)
     num_bridges = thin * sampler.augmentation.num_intervals
     info = info._replace(
         parameters_moved=info.parameters_moved > 0,
-        bridges_moved=info.bridges_moved.astype(dtype) / num_bridges,
+        bridges_moved=info.bridges_moved.astype(state.theta.dtype) / num_bridges,
     )
     return GibbsPosterior(
         **fields,

@@ -34,19 +34,29 @@ class Estimate(NamedTuple):
 
 
 class AbstractLikelihood(eqx.Module):
-    """What estimates the likelihood of the observations at given parameters."""
+    """What estimates the likelihood of the observations, exp(`estimate`) with mean L(θ).
+
+    A chain calls `estimate` once in each iteration, at the parameters that it proposes, and holds
+    on to what it gets until a proposal is accepted. While it warms up it asks for another of the
+    kind, by `near`, wherever that changes anything (`guided`). Of some draws it asks for the step
+    error: it is that of the estimate it holds where `tells_step_error`, and else is worked out by
+    `log_step_error`. All of it is traced inside one compiled loop, and under `vmap` over chains.
+    """
 
     @abstractmethod
     def estimate(self, key: Key[Array, ""], model: Diffusion) -> Estimate:
-        """The estimate for this model."""
+        """One estimate for this model, from random numbers that depend on the key only. Never NaN:
+        -inf where none is to be had, which refuses the parameters and is counted."""
 
     @abstractmethod
     def log_step_error(self, key: Key[Array, ""], model: Diffusion) -> Float[Array, ""]:
-        """The step error of the log likelihood, with noise of its own."""
+        """By how much log L(θ) is too large for the length of the steps, with noise of its own; NaN
+        where it is not known."""
 
     @abstractmethod
     def near(self, model: Diffusion) -> "AbstractLikelihood":
-        """What estimates the same, guided as is best for models like this."""
+        """What estimates the same with less variance for models like this: leaves may change, and
+        no shapes, for both are states of one loop."""
 
     @property
     @abstractmethod
@@ -56,12 +66,13 @@ class AbstractLikelihood(eqx.Module):
     @property
     @abstractmethod
     def tells_step_error(self) -> bool:
-        """Whether estimates come with theirs, at no cost worth mentioning."""
+        """Whether `log_step_error` of an `Estimate` is told at no cost worth mentioning."""
 
     @property
     @abstractmethod
     def proposals(self) -> tuple[AbstractWeightedProposal, ...]:
-        """Of the paths, decided, for each group of intervals."""
+        """Of the paths, decided, for each group of intervals: kept in the state in which a chain
+        ends, so that one that goes on has the same. Empty where there is nothing to decide."""
 
 
 class TransitionLikelihood(AbstractLikelihood):

@@ -7,14 +7,14 @@ from the acceptance rates α_i of moves S ξ.
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import any_cholesky, any_inverse
 from .priors import GivenDensity, NormalDensity
 
 # Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
-TARGET = 0.2
+_TARGET = 0.2
 
 
 def first_root(
@@ -46,9 +46,17 @@ def first_root(
     return 0.1 * jnp.diag(jnp.maximum(jnp.abs(theta), 0.1))
 
 
-def adapted(
-    root: Float[Array, "p p"], noise: Float[Array, " p"], change: Float[Array, ""]
+def learnt(
+    root: Float[Array, "p p"],
+    noise: Float[Array, " p"],
+    rate: Float[Array, ""],
+    number: Int[Array, ""],
+    learning: Bool[Array, ""],
 ) -> Float[Array, "p p"]:
-    """S after one step of Vihola's."""
+    """S after a move with this noise, accepted with probability `rate` (none where that is NaN), in
+    the iteration of this number, from one on; as it was unless the chain is still learning."""
+    gain = jnp.minimum(1.0, len(noise) * number.astype(root.dtype) ** (-2 / 3))
+    change = gain * (jnp.where(jnp.isnan(rate), 0, rate) - _TARGET)
     moved = root @ (noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6))
-    return any_cholesky(root @ root.T + change * jnp.outer(moved, moved))
+    new = any_cholesky(root @ root.T + change * jnp.outer(moved, moved))
+    return jnp.where(learning & jnp.all(jnp.isfinite(new)), new, root)

@@ -42,15 +42,15 @@ from .likelihood_estimates import (
     RecordLikelihood,
     TransitionLikelihood,
 )
-from .parameter_walk import TARGET, adapted, first_root
+from .parameter_walk import first_root, learnt
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
-    STEP_ERRORS,
     AbstractPosterior,
     drawn,
     first_chain,
     over_chains,
     starting_points,
+    step_errors_of_some,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_paths import check_no_bridges, unguided
@@ -303,9 +303,13 @@ class _Sampler(eqx.Module):
         return _Chain(theta, *self.estimate(key, theta)[:3], root)
 
     def step(
-        self, key: Key[Array, ""], state: _Chain, gain: Float[Array, ""]
+        self,
+        key: Key[Array, ""],
+        state: _Chain,
+        number: Int[Array, ""],
+        learning: Bool[Array, ""],
     ) -> tuple[_Chain, PMMHInfo]:
-        """One step, in which S moves by `gain`."""
+        """The step of this number, from one on, in which S moves while the chain is learning."""
         walk_key, estimate_key, accept_key = jax.random.split(key, 3)
         noise = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
         proposed = state.theta + state.root @ noise
@@ -316,8 +320,7 @@ class _Sampler(eqx.Module):
         new = jnp.where(inside, made.log_likelihood + self.log_prior(proposed), -jnp.inf)
         rate = acceptance_rate(state.log_likelihood + self.log_prior(state.theta), new)
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
-        root = adapted(state.root, noise, gain * (jnp.where(jnp.isnan(rate), 0, rate) - TARGET))
-        root = jnp.where((gain > 0) & jnp.all(jnp.isfinite(root)), root, state.root)
+        root = learnt(state.root, noise, rate, number, learning)
         moved = _Chain(proposed, *made[:3], root)
         without = inside & (made.log_likelihood == -jnp.inf)
         chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), moved, state)
@@ -340,9 +343,7 @@ def _run(
     num_warmup, num_iterations, thin = size
     # The warm-up counts in draws, too, so that there is one loop.
     skipped = -(-num_warmup // thin)
-    every = max(1, num_iterations // STEP_ERRORS)
     state = _not_begun(*start) if fresh else _going_on(start)
-    p, dtype = state.chain.theta.shape[-1], state.chain.theta.dtype
 
     def begin(run, i):
         near = sampler.near(first_chain(run.chain.theta))
@@ -358,16 +359,12 @@ def _run(
         if near.likelihood.tells_step_error:
             return run.chain.log_step_error
         own_key = jax.random.fold_in(key_for("step error", key), run.num_done)
-        known = lambda chain: over_chains(near.log_step_error, own_key, chain.theta)
-        unknown = lambda chain: jnp.full_like(chain.log_likelihood, jnp.nan)
-        called_for = (i >= skipped) & ((i - skipped) % every == 0)
-        return lax.cond(called_for, known, unknown, run.chain)
+        known = lambda theta: over_chains(near.log_step_error, own_key, theta)
+        return step_errors_of_some(known, run.chain.theta, i - skipped, num_iterations)
 
     def draw(near, run, i):
         def iterate(run, i):
-            learning = jnp.minimum(1.0, p * (i + 1).astype(dtype) ** (-2 / 3))
-            gain = jnp.where(i < num_warmup, learning, 0)
-            step = lambda key, chain: near.step(key, chain, gain)
+            step = lambda key, chain: near.step(key, chain, i + 1, i < num_warmup)
             number = run.num_done + 1
             chain, info = over_chains(step, jax.random.fold_in(key, number), run.chain)
             counted = jax.tree.map(lambda so_far, one: so_far + one, run.counted, info)

@@ -7,7 +7,8 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled
@@ -15,8 +16,9 @@ from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduc
 from ..schemes import StepError, dominates
 from .parameters import Parameters, init_vectors
 
-# Of about so many of the draws the step error is worked out.
-STEP_ERRORS = 256
+# Of about so many of the draws the step error is worked out: as many as tell a covariance, for it
+# takes a good part of the time of an iteration.
+_STEP_ERRORS = 256
 # Of fewer draws a covariance tells nothing.
 _FEWEST = 10
 
@@ -160,6 +162,19 @@ def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
         return function(key, state)
     keys = jax.random.split(key, len(theta))
     return jax.vmap(lambda *each: function(*each))(keys, state)
+
+
+def step_errors_of_some(
+    function: Callable[[PyTree], Float[Array, "*chains"]],
+    state: PyTree,
+    number: Int[Array, ""],
+    num_draws: int,
+) -> Float[Array, "*chains"]:
+    """`function(state)` of some of so many draws, with numbers from zero on; NaN of the others."""
+    every = max(1, num_draws // _STEP_ERRORS)
+    shape = jax.eval_shape(function, state)
+    called_for = (number >= 0) & (number % every == every - 1)
+    return lax.cond(called_for, function, lambda _: jnp.full_like(shape, jnp.nan), state)
 
 
 @compiled

@@ -29,14 +29,14 @@ from ..engine.keys import key_for
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..records import Records, tuned
-from .parameter_walk import TARGET, adapted
+from .parameter_walk import learnt
 from .parameters import Parameters
 from .posterior import (
-    STEP_ERRORS,
     AbstractPosterior,
     drawn,
     first_chain,
     over_chains,
+    step_errors_of_some,
 )
 from .priors import GivenDensity, NormalDensity
 from .record_paths import RecordPaths, as_record_paths, movable, no_paths, share_of_step_error
@@ -126,15 +126,14 @@ class RecordSampler(eqx.Module):
         rate = acceptance_rate(proper(log_weight) + self.log_prior(theta), proper(new))
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
 
-        number = (state.num_done + 1).astype(rate.dtype)
-        gain = jnp.where(learning, jnp.minimum(1.0, len(proposed) * number ** (-2 / 3)), 0)
-        root = adapted(state.root, step, gain * (rate - TARGET))
+        number = state.num_done + 1
+        scales = tuned(log_scales, taken, number.astype(rate.dtype))
         moved = RecordState(
             jnp.where(accepted, proposed, theta),
             jnp.where(accepted, new_paths, paths),
-            jnp.where((gain > 0) & jnp.all(jnp.isfinite(root)), root, state.root),
-            jnp.where(learning, tuned(log_scales, taken, number), log_scales),
-            state.num_done + 1,
+            learnt(state.root, step, rate, number, learning),
+            jnp.where(learning, scales, log_scales),
+            number,
         )
         return moved, (accepted, taken)
 
@@ -162,7 +161,6 @@ def sample_records(
     num_warmup, num_iterations, thin = size
     # The warm-up counts in draws, too, so that there is one loop.
     skipped = -(-num_warmup // thin)
-    every = max(1, num_iterations // STEP_ERRORS)
 
     def begin(state, i):
         completion = as_record_paths(parameters, records, first_chain(state.theta))
@@ -180,10 +178,9 @@ def sample_records(
     def log_ratios(sampler, i, state):
         own_key = jax.random.fold_in(key_for("step error", key), number(state))
         known = lambda state: over_chains(sampler.log_ratio, own_key, state)
-        unknown = lambda state: jnp.full(state.theta.shape[:-1], jnp.nan, state.theta.dtype)
         if records.stacked.num_steps == 1:
-            return unknown(state)
-        return lax.cond((i >= skipped) & ((i - skipped) % every == 0), known, unknown, state)
+            return jnp.full(state.theta.shape[:-1], jnp.nan, state.theta.dtype)
+        return step_errors_of_some(known, state, i - skipped, num_iterations)
 
     def draw(sampler, state, i):
         def iterate(state, i):

@@ -1,5 +1,7 @@
 """Gibbs sampling against posteriors that are known: quadrature of exact likelihoods."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -138,6 +140,19 @@ def test_chains_start_where_they_are_told_and_go_on():
     # The first θ depends on the paths it starts from, not on where chains began.
     again = jb.gibbs(jax.random.key(1), *arguments, num_iterations=5, init=made.state, **options)
     np.testing.assert_array_equal(more.theta, again.theta)
+
+
+@pytest.mark.slow
+def test_two_halves_with_one_key_are_the_whole():
+    run = functools.partial(
+        jb.gibbs, jax.random.key(0), ou_1d(), TIMES, DATA, num_steps=5, num_chains=2, thin=2,
+        proposal=jb.ModifiedDiffusionBridge(), **OPTIONS,
+    )  # fmt: skip
+    whole, first = run(num_iterations=8), run(num_iterations=4)
+    rest = run(num_iterations=4, init=first.state)
+    both = np.concatenate([first.theta, rest.theta], axis=1)
+    np.testing.assert_allclose(both, whole.theta, rtol=1e-6)
+    assert (rest.state.num_done == 8).all()
 
 
 @pytest.mark.slow
