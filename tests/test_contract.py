@@ -14,6 +14,7 @@ from helpers import PAPER_B, count_compilations, paper_model, slow_beyond
 
 import jaxbridge as jb
 
+base_model = paper_model
 PRIOR, SEEN = jb.NormalPrior(1.0, 1.0), jb.LinearGaussian(covariance=0.1)
 SIZES = dict(num_bridges=30, num_steps=4)
 
@@ -37,7 +38,7 @@ class Numbers(NamedTuple):
 
     @property
     def ends(self):
-        model = paper_model()
+        model = base_model()
         B = self.scale * jnp.asarray(PAPER_B, self.scale.dtype)
         mean = model.params.mean.astype(B.dtype)
         changed = model.with_params(model.params._replace(B=B, mean=mean))
@@ -168,6 +169,55 @@ def test_numbers(name, capfd):
     jax.effects_barrier()
     printed = capfd.readouterr().out
     assert name in SILENT or ("0.00%" in printed and "100.00%" in printed)
+
+
+class WithNetwork(NamedTuple):
+    """The paper's parameters, and what is no array."""
+
+    B: jax.Array
+    mean: jax.Array
+    sigma: jax.Array
+    network: eqx.nn.MLP
+    name: str
+    power: int
+
+    @property
+    def known(self):
+        return paper_model().params._replace(B=self.B, mean=self.mean, sigma=self.sigma)
+
+
+def drift_of_network(x, p):
+    assert p.name == "linear" and p.power == 2 and isinstance(p.power, int)
+    return paper_model().with_params(p.known).drift(x) + p.network(x)
+
+
+def silent_network():
+    """The paper's process, with a network in its drift that adds nothing."""
+    network = eqx.nn.MLP(2, 2, 3, 1, key=jax.random.key(0))
+    last = lambda net: (net.layers[-1].weight, net.layers[-1].bias)
+    network = eqx.tree_at(last, network, jax.tree.map(jnp.zeros_like, last(network)))
+    model = paper_model()
+    return jb.Diffusion(
+        drift_of_network,
+        log_stationary=lambda x, p: model.with_params(p.known).log_stationary(x),
+        params=WithNetwork(*model.params, network, "linear", 2),
+        sample_stationary=lambda key, p: model.with_params(p.known).sample_stationary(key),
+        normalised=True,
+    )
+
+
+@pytest.mark.parametrize("name", slow_beyond(1, DOORS))
+def test_parameters_may_hold_what_is_no_array(name, monkeypatch):
+    """A network with its activation, a name, a whole number: all are what they were, and the
+    numbers are those of the process without them."""
+
+    def made_by(model):
+        monkeypatch.setitem(globals(), "base_model", lambda: model)
+        made = jax.tree_util.tree_leaves_with_path(DOORS[name](numbers()))
+        own = [leaf for path, leaf in made if "network" not in jax.tree_util.keystr(path)]
+        return [leaf for leaf in own if eqx.is_inexact_array(leaf)]
+
+    assert_same(made_by(silent_network()), made_by(paper_model()))
 
 
 @pytest.mark.parametrize(

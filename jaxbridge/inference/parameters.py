@@ -116,7 +116,7 @@ def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p
     if theta.size == 0:
         raise ValueError(
             "this model has no parameters to be inferred: give `Diffusion` its unknown numbers as "
-            "`params=`."
+            "`params=`, of floating point: whole numbers stay what they are."
         )
     if not is_traced(theta) and not np.all(np.isfinite(theta)):
         raise ValueError(
@@ -138,16 +138,21 @@ def init_vectors(
 ) -> Float[Array, "*chains p"]:
     """θ of the unknown parameters that the user wants to start from, for each chain its own if
     they have such an axis."""
-    init = jax.tree.map(lambda leaf: as_floating("init", leaf), init)
     known = parameters.params
     if jax.tree.structure(init) != jax.tree.structure(known):
         raise ValueError(
             "`init` must be the `state` of earlier draws, or have the structure of the unknown "
             f"parameters, {jax.tree.structure(known)}; got {jax.tree.structure(init)}."
         )
+    init = jax.tree.map(
+        lambda leaf, given: as_floating("init", given) if eqx.is_inexact_array(leaf) else None,
+        known,
+        init,
+    )
+    floats = eqx.filter(known, eqx.is_inexact_array)
     shapes = [
         (given.shape, leaf.shape)
-        for given, leaf in zip(jax.tree.leaves(init), jax.tree.leaves(known), strict=True)
+        for given, leaf in zip(jax.tree.leaves(init), jax.tree.leaves(floats), strict=True)
     ]
     if all(given == leaf for given, leaf in shapes):
         return parameters.vector(init)

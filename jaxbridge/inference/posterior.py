@@ -108,6 +108,7 @@ class AbstractPosterior(eqx.Module):
         posterior = {
             jax.tree_util.keystr(path, simple=True, separator=".") or "theta": of_chains(leaf)
             for path, leaf in leaves
+            if eqx.is_array(leaf)
         }
         if int(arviz.__version__.split(".")[0]) >= 1:
             return arviz.from_dict({"posterior": posterior})
@@ -188,9 +189,9 @@ def drawn(
 ) -> tuple[dict[str, Any], PyTree]:
     """The fields of a posterior that θ makes, and what else was kept of each draw, with axes
     (*chains, n) in front."""
-    full = jax.vmap(parameters.full)
+    full = eqx.filter_vmap(parameters.full)  # parameters may be other things than numbers
     if theta.ndim == 3:
-        full = jax.vmap(full)
+        full = eqx.filter_vmap(full)
         theta, others = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, others))
     return {"params": full(theta), "theta": theta, "names": parameters.names}, others
 

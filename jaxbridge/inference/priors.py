@@ -100,21 +100,25 @@ def _as_array(
     name: str, value: PyTree, parameters: Parameters, theta: Float[Array, " p"]
 ) -> Float[Array, "..."]:
     """What the user gave as an array, pytrees like the parameters as a vector."""
-    like, structure = jax.tree.flatten(parameters.params)
+    everything, structure = jax.tree.flatten(parameters.params)
+    like = list(filter(eqx.is_inexact_array, everything))  # what else there is, θ leaves out
     if hasattr(value, "ndim"):
         is_matrix = name == "variance" and value.shape == (len(theta), len(theta))
         if len(like) == 1 and value.shape == like[0].shape and not is_matrix:
             value = jnp.ravel(value)
     elif jax.tree.structure(value) == structure:
-        leaves = [as_floating(f"prior.{name}", leaf) for leaf in jax.tree.leaves(value)]
-        for leaf, known in zip(leaves, like, strict=True):
+        full = []
+        for leaf, known in zip(jax.tree.leaves(value), everything, strict=True):
+            if not eqx.is_inexact_array(known):
+                continue
+            leaf = as_floating(f"prior.{name}", leaf)
             if leaf.shape not in ((), known.shape):
                 raise ValueError(
                     f"`prior.{name}` has a leaf of shape {leaf.shape} for parameters of shape "
                     f"{known.shape}."
                 )
-        full = [jnp.broadcast_to(a, b.shape) for a, b in zip(leaves, like, strict=True)]
-        value = parameters.vector(jax.tree.unflatten(structure, full))
+            full.append(jnp.broadcast_to(leaf, known.shape).ravel())
+        value = jnp.concatenate(full)
     return as_floating(f"prior.{name}", value).astype(theta.dtype)
 
 

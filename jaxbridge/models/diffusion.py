@@ -10,8 +10,10 @@ in which the normaliser of ν cancels. It is reversible if and only if α* = α,
 (timereversible).
 """
 
+import copy
 import functools
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -43,7 +45,9 @@ class Diffusion(eqx.Module):
         uses `x` is seen when it is traced: one that does not is constant as well. In space per
         square root of a unit of time. Must be invertible.
     - `log_stationary`: log ν up to a constant, `(x, params) -> ()`.
-    - `params`: any pytree; Python and NumPy numbers in it become JAX arrays.
+    - `params`: any pytree. Floating point numbers in it become JAX arrays, and whatever is no array
+        stays what it is: whole numbers, truth values, names, the activation of a neural network.
+        These are static, and another value compiles again.
     - `reverse_drift`: α*, `(x, params) -> (d,)`, where it is known in closed form. Otherwise
         it comes from `log_stationary` by automatic differentiation.
     - `sample_stationary`: an exact sampler of ν, `(key, params) -> (d,)`.
@@ -78,7 +82,8 @@ class Diffusion(eqx.Module):
     _domain: Callable | None = eqx.field(static=True)
     _coordinates: Callable | None = eqx.field(static=True)
     _constant_sigma: Inexact[Array, "..."] | None
-    params: PyTree
+    _numbers: PyTree
+    _others: "_Others" = eqx.field(static=True)
     reversible: bool = eqx.field(static=True)
     normalised: bool = eqx.field(static=True)
 
@@ -118,9 +123,15 @@ class Diffusion(eqx.Module):
             self._diffusion, self._constant_sigma = diffusion, None
         else:
             self._diffusion, self._constant_sigma = None, _check_constant_sigma(diffusion)
-        self.params = jax.tree.map(_as_leaf, params)
+        self._numbers, self._others = _parts(params)
         self.reversible = reversible
         self.normalised = normalised
+
+    @property
+    def params(self) -> PyTree:
+        """The parameters, as they were given, but for numbers that have become arrays."""
+        leaves, structure = self._others
+        return eqx.combine(self._numbers, jax.tree.unflatten(structure, leaves))
 
     def drift(self, x: Numbers) -> Float[Array, " d"]:
         """α(x), shape (d,)."""
@@ -183,8 +194,11 @@ class Diffusion(eqx.Module):
 
     def with_params(self, params: PyTree) -> "Diffusion":
         """The same functions with other parameters."""
-        params = jax.tree.map(_as_leaf, params)
-        return eqx.tree_at(lambda m: m.params, self, params, is_leaf=lambda leaf: leaf is None)
+        made = copy.copy(self)
+        # `eqx.tree_at` would not reach what is static.
+        for name, part in zip(("_numbers", "_others"), _parts(params), strict=True):
+            object.__setattr__(made, name, part)
+        return made
 
     def prepared(self) -> "Diffusion":
         """The same model with `prepare` done, so that no loop repeats it."""
@@ -430,8 +444,25 @@ def check_invertible(name: str, sigma: Array | np.ndarray) -> None:
         raise ValueError(f"`{name}` must be invertible; got the singular matrix {matrix}.")
 
 
+class _Others(NamedTuple):
+    """Of a pytree, the leaves that are no arrays, and where they stand."""
+
+    leaves: tuple
+    structure: Any
+
+
+def _parts(params: PyTree) -> tuple[PyTree, _Others]:
+    """The arrays of the parameters, and the rest of them."""
+    numbers, others = eqx.partition(jax.tree.map(_as_leaf, params), _is_number)
+    leaves, structure = jax.tree.flatten(others)
+    return numbers, _Others(tuple(leaves), structure)
+
+
+def _is_number(leaf) -> bool:
+    # What stands in for an array, as its shape does in `eval_shape`, is one.
+    return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | str)
+
+
 def _as_leaf(leaf):
     # `asarray` keeps Python numbers weakly typed, so they follow the precision of the points.
-    if isinstance(leaf, int | float) and not isinstance(leaf, bool):
-        return jnp.asarray(float(leaf))
-    return jnp.asarray(leaf) if isinstance(leaf, bool | np.ndarray | np.generic) else leaf
+    return jnp.asarray(leaf) if isinstance(leaf, float | np.ndarray | np.generic) else leaf

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -126,12 +127,8 @@ class _Lamperti:
     def spacing(self) -> float:
         return self.reach / self.num_nodes
 
-    @functools.partial(jax.jit, static_argnums=0)
     def prepare(self, params: PyTree) -> _Table:
-        params = params if self.preparation is None else self.preparation(params)
-        below, above = self._solve(-1, params), self._solve(1, params)
-        x = jnp.concatenate([below[::-1], jnp.asarray([self.origin], float), above])
-        return _Table(x, jax.vmap(lambda x: self._sigma(x, params))(x), params)
+        return _tabulated(self, params)
 
     def inverse(self, table: _Table, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
         """g(y) = x, by cubic Hermite interpolation: NaN beyond the table."""
@@ -154,7 +151,7 @@ class _Lamperti:
         cell = jnp.clip(jnp.searchsorted(ordered, x, side="right") - 1, 0, last - 1)
         half = (x - nodes[cell]) / 2
         points = nodes[cell] + half * (1 + jnp.asarray(_NODES, x.dtype)[:, None])
-        slopes = jax.vmap(lambda u: self._sigma(u, table.params))(points.ravel())
+        slopes = jax.vmap(lambda u: self.sigma_at(u, table.params))(points.ravel())
         weighted = jnp.asarray(_WEIGHTS, x.dtype)[:, None] / slopes.reshape(points.shape)
         y = (cell.astype(x.dtype) - self.num_nodes) * self.spacing
         y += half * jnp.sum(weighted, axis=0)
@@ -166,13 +163,13 @@ class _Lamperti:
                 f"`lamperti` is for a one-dimensional `model`; points have shape {y.shape}."
             )
         x = self.inverse(table, y)
-        sigma = lambda x: self._sigma(x[0], table.params)
+        sigma = lambda x: self.sigma_at(x[0], table.params)
         slope, bend = jax.jvp(sigma, (x,), (jnp.ones_like(x),))
         return self._model(table).drift(x) / slope - bend / 2
 
     def log_stationary(self, y: Float[Array, " one"], table: _Table) -> Float[Array, ""]:
         x = self.inverse(table, y)
-        return self._model(table).log_stationary(x) + jnp.log(self._sigma(x[0], table.params))
+        return self._model(table).log_stationary(x) + jnp.log(self.sigma_at(x[0], table.params))
 
     def sample_stationary(self, key: Key[Array, ""], table: _Table) -> Float[Array, " one"]:
         return self.forward(table, self._model(table).sample_stationary(key))
@@ -181,24 +178,24 @@ class _Lamperti:
         """Y depends on the parameters that σ depends on, at any point, and on those of the
         coordinates that it is made from."""
         within = self.unbound.coordinates
-        slope = self._sigma(jnp.asarray(self.origin, float), table.params)
+        slope = self.sigma_at(jnp.asarray(self.origin, float), table.params)
         return slope, () if within is None else within(table.params)
 
     def _model(self, table: _Table) -> Diffusion:
         return self.unbound.with_params(table.params)
 
-    def _sigma(self, x: Float[Array, ""], params: PyTree) -> Float[Array, ""]:
+    def sigma_at(self, x: Float[Array, ""], params: PyTree) -> Float[Array, ""]:
         """σ at one number: NaN, with derivative zero, outside the state space."""
         model = self.unbound.with_params(params)
         inside = jax.lax.stop_gradient(model.diffusion(x[None])[0, 0]) > 0
         safe = jnp.where(inside, x, jnp.asarray(self.origin, x.dtype))
         return jnp.where(inside, model.diffusion(safe[None])[0, 0], jnp.nan)
 
-    def _solve(self, direction: int, params: PyTree) -> Float[Array, " nodes"]:
+    def solve(self, direction: int, params: PyTree) -> Float[Array, " nodes"]:
         """g' = σ(g) away from a."""
         ys = np.linspace(0, direction * self.reach, self.num_nodes + 1)
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda y, x, params: self._sigma(x, params)),
+            diffrax.ODETerm(lambda y, x, params: self.sigma_at(x, params)),
             diffrax.Tsit5(),
             ys[0],
             ys[-1],
@@ -215,4 +212,12 @@ class _Lamperti:
 
 
 # The same object for the same arguments, so that its functions compile once.
+@eqx.filter_jit
+def _tabulated(functions: _Lamperti, params: PyTree) -> _Table:
+    params = params if functions.preparation is None else functions.preparation(params)
+    below, above = (functions.solve(side, params) for side in (-1, 1))
+    x = jnp.concatenate([below[::-1], jnp.asarray([functions.origin], float), above])
+    return _Table(x, jax.vmap(lambda x: functions.sigma_at(x, params))(x), params)
+
+
 _coordinates_of = functools.lru_cache(maxsize=256)(_Lamperti)
