@@ -1,5 +1,6 @@
 """A proposal for each interval: what "auto" comes to (`auto`), each drawn by its own."""
 
+import dataclasses
 from collections.abc import Callable
 
 import diffrax
@@ -79,7 +80,8 @@ class Choice(AbstractWeightedProposal):
         return Choice(self.candidates, *told, used, self.left_out)
 
     def for_model(self, model, like):
-        return self
+        candidates = tuple(candidate.for_model(model, like) for candidate in self.candidates)
+        return dataclasses.replace(self, candidates=candidates)
 
     def check(self, model, intervals):
         for candidate in self.candidates:

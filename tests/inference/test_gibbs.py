@@ -190,7 +190,7 @@ def test_four_unknown_drifts_of_a_rotating_process():
         num_steps=10,
         where=lambda params: params.B,
         constraint=stable,
-        proposal=jb.ModifiedDiffusionBridge(),
+        proposal=jb.ModifiedDiffusionBridge(jb.EulerDensity()),
     )
     assert made.exact_parameters and made.params.B.shape == (200, 2, 2)
     assert bool(jax.vmap(stable)(made.params.B).all())

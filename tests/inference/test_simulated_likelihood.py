@@ -219,7 +219,7 @@ def test_a_choice_is_made_once_or_kept(unchecked):
     auto = simulated_likelihood.as_pulled("auto", model, problem.like, (None, None, None))
     (block,) = simulated_likelihood.pulled_blocks(key, model, problem, auto)
     assert isinstance(block.proposal, jb.Guided | jb.ModifiedDiffusionBridge)
-    candidates = guided_candidates(model, problem.like)
+    candidates = guided_candidates()
     made = jb.choose_proposal(
         key, model, *problem.intervals, candidates=candidates, num_steps=5, num_pilot=32
     )
