@@ -30,6 +30,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import proper
 from ..engine.lanes import over_lanes
+from ..engine.linalg import matvec
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from .guided_record import Guidance, correction
@@ -182,18 +183,41 @@ class _Lanes(NamedTuple):
     the ends of these, and how far noise turns.
 
     - `start`, `old`: where the old paths begin, and their points, leading axes (J, N).
-    - `guides`, `scalars`: of all steps, and what is seen at the ends of segments.
+    - `end`: where the old paths end, counted from ξ.
+    - `guides`: of all steps of the B blocks, to the end ξ.
+    - `scalars`: what is seen at the ends of segments.
     - `is_first`: which begin where the record does.
     - `rho`, `beta`: √(1 - β²), and β.
     """
 
     start: Float[Array, "d lanes"]
     old: Float[Array, "J N d lanes"]
-    guides: Guide
+    end: Float[Array, "d lanes"]
+    guides: "_GuidesToEnds"
     scalars: Scalars
     is_first: Bool[Array, " lanes"]
     rho: Float[Array, " lanes"]
     beta: Float[Array, " lanes"]
+
+
+class _GuidesToEnds(NamedTuple):
+    """What guides steps to any end e: log h is quadratic in x and e together, so that its precision
+    does not depend on e, and its shift is r + Tᵀe. Chains share it, block by block.
+
+    - `guide`: for e = 0.
+    - `turn`, `next_turn`: T at the beginning and at the end of the step.
+    """
+
+    guide: Guide
+    turn: Float[Array, "d d *lanes"]
+    next_turn: Float[Array, "d d *lanes"]
+
+    def to(self, end: Float[Array, " d"]) -> Guide:
+        """The guide of one step to this end."""
+        guide = self.guide
+        h = guide.h._replace(shift=guide.h.shift + matvec(self.turn.T, end))
+        next_h = guide.next_h._replace(shift=guide.next_h.shift + matvec(self.next_turn.T, end))
+        return guide._replace(h=h, next_h=next_h)
 
 
 class _State(NamedTuple):
@@ -244,16 +268,35 @@ def _lanes_of(blocks: Blocks, scale: Float[Array, " B"], paths: Paths) -> _Lanes
     )
     old = joined(jnp.moveaxis(padded[blocks.segment + 1], 1, -2))  # (J, N, d, B C)
     start = joined(jnp.moveaxis(padded[jnp.maximum(blocks.segment[0], 0), -1], 0, -2))
-    # Unless the record has ended, the end of a block is seen exactly.
-    scalars, last = spread(blocks.scalars), jax.tree.map(lambda leaf: leaf[-1], blocks.scalars)
     end = old[-1, -1] - spread(blocks.next_points[-1, -1])
-    pinned = _seen_exactly(end, spread(last), spread(blocks.goes_on))
-    scalars = jax.tree.map(lambda leaf, pin: leaf.at[-1].set(pin), scalars, pinned)
-    h = information_filter(spread(blocks.linear), scalars, _in_lanes)
-    each = (spread(blocks.points), h, spread(blocks.next_points), following(h))
-    guides = Guide(*each, spread(blocks.dt))
+    scalars = _pinned(spread(blocks.scalars), spread(blocks.goes_on), end)
     is_first = spread(jnp.asarray(np.arange(B) == 0))
-    return _Lanes(start, old, guides, scalars, is_first, *spread((jnp.sqrt(1 - scale**2), scale)))
+    size = spread((jnp.sqrt(1 - scale**2), scale))
+    return _Lanes(start, old, end, _guides_to_ends(blocks), scalars, is_first, *size)
+
+
+def _guides_to_ends(blocks: Blocks) -> _GuidesToEnds:
+    """By the filter to the end 0 and to each of the unit vectors, side by side."""
+    d = blocks.points.shape[2]
+    ends = jnp.concatenate([jnp.zeros((d, 1)), jnp.eye(d)], axis=1).astype(blocks.points.dtype)
+    B = blocks.segment.shape[1]
+    several = functools.partial(_for_chains, d + 1)
+    pinned = _pinned(several(blocks.scalars), several(blocks.goes_on), jnp.tile(ends, (1, B)))
+    h = information_filter(several(blocks.linear), pinned, _in_lanes)
+    each = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], B, d + 1), h)
+    zero = jax.tree.map(lambda leaf: leaf[..., 0], each)
+    turn = jnp.moveaxis(each.shift[..., 1:] - each.shift[..., :1], -1, 2)
+    guide = Guide(blocks.points, zero, blocks.next_points, following(zero), blocks.dt)
+    return _GuidesToEnds(guide, turn, following(turn))
+
+
+def _pinned(
+    scalars: Scalars, goes_on: Bool[Array, " lanes"], end: Float[Array, "d lanes"]
+) -> Scalars:
+    """What is seen at the ends of segments, where unless the record has ended the last is exact."""
+    last = jax.tree.map(lambda leaf: leaf[-1], scalars)
+    exact = _seen_exactly(end, last, goes_on)
+    return jax.tree.map(lambda leaf, pin: leaf.at[-1].set(pin), scalars, exact)
 
 
 def _new_starts(
@@ -263,16 +306,17 @@ def _new_starts(
     spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
     nothing = _no_noise(blocks)
 
-    def of_start(x, mean, root, first, point, h, eta, rho, beta):
-        law = guided_start(NormalStep(mean, root), first, point, h)
+    def of_start(x, mean, root, first, step, end, eta, rho, beta):
+        guide = step.to(end)
+        law = guided_start(NormalStep(mean, root), first, guide.point, guide.h)
         zeta = law.noise(x, functools.partial(solve_root, root), nothing)
         return law.point(_turned(zeta, eta, rho, beta)), law.log_weight
 
     initial = NormalStep(blocks.mean, blocks.root[..., 0])
     means = jnp.where(lanes.is_first, initial.mean[:, None], lanes.start)
-    point, h = jax.tree.map(lambda leaf: leaf[0, 0], lanes.guides[:2])
+    step = spread(jax.tree.map(lambda leaf: leaf[0, 0], lanes.guides))
     eta = jax.random.normal(key, lanes.start.shape, lanes.start.dtype)
-    law = (means, spread(blocks.root), spread(blocks.first), point, h)
+    law = (means, spread(blocks.root), spread(blocks.first), step, lanes.end)
     arguments = (lanes.start, *law, eta, lanes.rho, lanes.beta)
     new, log_start = over_lanes(*9 * [-1])(of_start)(*arguments)
     new = jnp.where(lanes.is_first, new, lanes.start)
@@ -299,7 +343,8 @@ def _new_points(
     density, dynamics = problem.density, model.forward(problem.like)
     nothing, corrected = _no_noise(blocks), _corrections(problem, model, spread)
 
-    def step_of(old, new, old_next, eta, guide, scalars, rho, beta):
+    def step_of(old, new, old_next, eta, step, end, scalars, rho, beta):
+        guide = step.to(end)
         law = density.steps_from(dynamics, old).law(guide.dt)
         here = guided_law(law, old, guide, scalars)
         zeta = here.noise(old_next, functools.partial(solve_law, law), nothing)
@@ -307,15 +352,16 @@ def _new_points(
         there = guided_law(law, new, guide, scalars)
         return there.point(_turned(zeta, eta, rho, beta)), here.log_weight, there.log_weight
 
-    def advance(state: _State, old_next, eta, guide, scalars) -> _State:
-        axes = (-1, -1, -1, -1, -1, None if scalars is None else -1, -1, -1)
-        arguments = (state.old, state.new, old_next, eta, guide, scalars, lanes.rho, lanes.beta)
-        new, log_old, log_new = over_lanes(*axes)(step_of)(*arguments)
+    def advance(state: _State, old_next, eta, step, scalars) -> _State:
+        axes = (*6 * [-1], None if scalars is None else -1, -1, -1)
+        # Of chains no more is kept than they do not share.
+        each = (state.old, state.new, old_next, eta, spread(step), lanes.end, scalars)
+        new, log_old, log_new = over_lanes(*axes)(step_of)(*each, lanes.rho, lanes.beta)
         return _State(old_next, new, state.log_old + log_old, state.log_new + log_new)
 
     def one(state, inputs):
-        old_next, eta, guide = inputs
-        state = advance(state, old_next, eta, guide, None)
+        old_next, eta, step = inputs
+        state = advance(state, old_next, eta, step, None)
         return state, state.new
 
     def segment(state, inputs):
