@@ -62,6 +62,7 @@ traced = lambda call, *arguments: lambda: jax.eval_shape(call, *arguments)
 # is not `ValueError`.
 
 diffusion, ou = of(jb.Diffusion, DECAY), of(jb.ornstein_uhlenbeck)
+COMPLEX = lambda x, p: jax.lax.complex(x, x)
 wrong = lambda name, function, method=None: (
     f"{name} in a wrong shape",
     lambda: getattr(jb.Diffusion(**({"drift": DECAY} | {name: function})), method or name)(X),
@@ -98,6 +99,8 @@ MODELS = [
     wrong("reverse_drift", lambda x, p: x @ x),
     wrong("log_stationary", lambda x, p: x),
     wrong("log_stationary", lambda x, p: x[:1], "reverse_drift"),
+    ("i x", of(jb.Diffusion(COMPLEX).drift)(X), "`drift` .*real numbers", TypeError),
+    ("i σ", sigma(COMPLEX), "`diffusion` .*real numbers", TypeError),
     ("no reversal", of(FREE.reverse_drift)(X), "log_stationary.*reverse_drift.*reversible=True"),
     ("no ν", of(FREE.log_stationary)(X), "log_stationary="),
     ("no ν to compare with", of(FREE.reversibility_residual)(X[None]), "log_stationary="),
@@ -201,6 +204,7 @@ coupling = of(jb.Coupling)
 bridges = of(jb.sample_bridges, key=KEY, model=PAPER, start=A, end=B, duration=1.0)
 weigh = lambda bridges, model=PAPER, **how: lambda: jb.weigh_bridges(KEY, model, bridges(), **how)
 counts = lambda law: lambda: jb.hitting_counts(KEY, PAPER, approximate(), start_law=law)
+IN_HALVES = {name: np.float16(value) for name, value in (("start", A), ("end", B), ("duration", 1))}
 reversible = lambda sigma, **how: jb.Diffusion(DECAY, sigma, LOG_NORMAL, reversible=True, **how)
 OF_ROOTS, SINGULAR = (
     reversible(lambda x, p: jnp.diag(x)),
@@ -232,6 +236,8 @@ COUPLING = [
     ("cube", bridges(start=[[A]]), "`start` must be one point"),
     ("line", bridges(start=[0.0]), "points of one dimension"),
     ("3 and 2", bridges(start=[A] * 3, end=[A] * 2), "number of intervals"),
+    ("none at all", bridges(start=np.ones((0, 2))), "at least one interval"),
+    ("half precision", bridges(**IN_HALVES), "float32 or float64; got float16", TypeError),
     ("start is missing", bridges(start=[NAN, 0.0]), "`start` must be finite"),
     ("end is infinite", bridges(end=[np.inf, 0.0]), "`end` must be finite"),
     *each("duration", lambda t: bridges(duration=t), [0.0, -1.0], "`duration` must be positive"),
@@ -245,6 +251,7 @@ COUPLING = [
     ("a time", bridges(save_at=0.5), "`save_at` must be times"),
     ("no reversal", bridges(model=FREE), "time reversal of this model is unknown"),
     *each("σ", lambda m: bridges(model=m), [OF_ROOTS, SINGULAR], "must be invertible"),
+    ("α is missing", bridges(model=HYPERBOLIC.with_params(NAN)), "`params` .* not finite"),
     ("1/0", bridges(model=INFINITE), "not finite at `start`"),
     ("in space", bridges(model=IN_SPACE), r"shape \(2, 2\)"),
     ("full", bridges(model=OF_OTHERS, coupling=MILSTEIN), "needs diagonal noise"),
@@ -686,6 +693,7 @@ INTERVALS = {
     "a point that is missing": (PAPER, [NAN, 0.0], B, 1.0),
     "a point in words": (PAPER, "here", B, 1.0),
     "complex numbers": (PAPER, [1j, 0.0], B, 1.0),
+    "no interval": (PAPER, np.ones((0, 2)), B, 1.0),
     "no time at all": (PAPER, A, B, 0.0),
     "time that runs backwards": (PAPER, A, B, -1.0),
     "a model that is none": (3.0, A, B, 1.0),
@@ -732,6 +740,10 @@ KEYED = [
     of(jb.gibbs, **DATA, prior=PRIOR),
     of(jb.pmmh, **DATA, prior=PRIOR),
     of(jb.simulate, model=HYPERBOLIC, x0=A, times=TIMES),
+    *(
+        lambda key, kernel=kernel: lambda: kernel(PAPER, A, B, 1.0).step(key, None)
+        for kernel in KERNELS
+    ),
 ]
 ANY = (ValueError, TypeError)
 

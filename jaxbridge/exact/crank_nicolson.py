@@ -98,6 +98,7 @@ def crank_nicolson(
         return jax.tree.map(lambda leaf: leaf[0], state)
 
     def step(rng_key, state):
+        check_key(rng_key)
         return _step(rng_key, state, *setting, beta)
 
     return Kernel(init, step)

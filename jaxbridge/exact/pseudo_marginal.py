@@ -87,6 +87,7 @@ def pseudo_marginal(
         return _reweigh_state(rng_key, path, *setting)
 
     def step(rng_key, state):
+        check_key(rng_key)
         return _pseudo_marginal_step(rng_key, state, *setting)
 
     return Kernel(init, step)

@@ -95,6 +95,7 @@ def renewal(
         return RenewalState(check_path(position, problem))
 
     def step(rng_key, state):
+        check_key(rng_key)
         return _renewal_step(rng_key, state, *setting)
 
     return Kernel(init, step)

@@ -118,6 +118,11 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
             "`start`, `end` and `duration` must agree in the number of intervals; got shapes "
             f"{points['start'].shape}, {points['end'].shape} and {duration.shape}."
         )
+    if 0 in lengths:
+        raise ValueError(
+            "there must be at least one interval; `start`, `end` and `duration` have shapes "
+            f"{points['start'].shape}, {points['end'].shape} and {duration.shape}."
+        )
     for name, value in {**points, "duration": duration}.items():
         if not is_traced(value) and not np.all(np.isfinite(value)):
             raise ValueError(f"`{name}` must be finite; got {value}.")
@@ -180,4 +185,10 @@ def _working_dtype(*arrays: Array) -> jnp.dtype:
     floating = [
         a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating) and not a.weak_type
     ]
-    return max(floating, key=lambda dtype: dtype.itemsize, default=jnp.asarray(0.0).dtype)
+    widest = max(floating, key=lambda dtype: dtype.itemsize, default=jnp.asarray(0.0).dtype)
+    if widest.itemsize < 4:
+        raise TypeError(
+            f"`start`, `end` and `duration` must be float32 or float64; got {widest}, in which "
+            "short steps of a path are lost."
+        )
+    return widest

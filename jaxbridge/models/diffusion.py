@@ -374,7 +374,7 @@ def _as_sigma(
     if isinstance(values, AbstractSigma):  # of a model that knows the form of its σ
         sigma: AbstractSigma = cast_floats(values, x.dtype)
         return Constant(sigma.as_matrix(d, x.dtype)) if constant else sigma
-    values = jnp.asarray(values)
+    values = _as_real("diffusion", values)
     if values.shape not in ((d,), (d, d)):
         raise ValueError(
             f"`diffusion` must have shape ({d}, {d}), or ({d},) for a diagonal, at a point of "
@@ -387,13 +387,23 @@ def _as_sigma(
 
 
 def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) -> Array:
-    value = jnp.asarray(value)
+    value = _as_real(name, value)
     if value.shape != shape:
         raise ValueError(
             f"`{name}` must return shape {shape} at a point of shape {x.shape}; "
             f"it returned {value.shape}."
         )
     return value.astype(x.dtype)
+
+
+def _as_real(name: str, value: Numbers) -> Array:
+    value = jnp.asarray(value)
+    if jnp.iscomplexobj(value):
+        raise TypeError(
+            f"`{name}` must return real numbers; it returned dtype {value.dtype}: write a complex "
+            "equation in its real and imaginary parts."
+        )
+    return value
 
 
 def check_dimension(x: Float[Array, " d"], dim: int) -> None:

@@ -165,7 +165,8 @@ def smooth(
         `initial_time`, `density`: as in `innovations`.
     - `num_draws`: of each chain, after `num_warmup` in which the size of moves is learnt.
     - `num_chains`: chains, which start from guided paths that know nothing of each other.
-    - `block_length`: how many intervals between observations move at once.
+    - `block_length`: how many intervals between observations move at once: more where they are so
+        close that neighbours tell much of each other, fewer where blocks are seldom accepted.
     - `proposal`: by default paths are guided by all that was seen, as by a linear process. Across
         gaps in which the diffusion could have gone several ways (wells, many relaxation times)
         give a proposal of bridges, as `sample_exact_bridges` takes them: a `Coupling`, or "auto",

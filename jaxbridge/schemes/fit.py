@@ -4,7 +4,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..engine.checks import is_traced
+from ..engine.checks import all_finite_leaves, is_traced
 from ..engine.compiled import compiled
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion, check_invertible
@@ -26,6 +26,8 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
         drift, sigma, slopes = jax.device_get(coefficients)
         for value in (drift, sigma):
             bad = ~np.all(np.isfinite(value).reshape(len(value), -1), axis=1)
+            if bad.any() and not all_finite_leaves(model.params):
+                raise ValueError(f"the `params` of the model are not finite: {model.params}.")
             if bad.any():
                 raise ValueError(
                     f"the coefficients of the model are not finite at `{name}` = "
