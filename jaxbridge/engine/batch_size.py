@@ -50,4 +50,12 @@ def most_lanes(d: int) -> int:
 
 
 def _bounds() -> _Bounds:
-    return _CPU if jax.default_backend() == "cpu" else _ACCELERATOR
+    return _CPU if _platform() == "cpu" else _ACCELERATOR
+
+
+def _platform() -> str:
+    """Where programs run, as far as can be told while they are traced."""
+    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    if chosen is None:
+        return jax.default_backend()
+    return chosen if isinstance(chosen, str) else chosen.platform

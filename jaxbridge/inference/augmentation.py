@@ -108,13 +108,15 @@ class Augmentation(eqx.Module):
         return jnp.sum(jnp.concatenate(list(map(of_block, self.blocks, paths))))
 
     def log_step_error(self, model: Diffusion, paths: Paths) -> Float[Array, ""]:
-        """The step error of the log density of these paths, summed over the intervals: D of
-        `halving`, times the share of it that is the error."""
+        """A function of these paths whose mean, given θ, is the step error of log L(θ): half as
+        many steps make each path e^D times as likely (`halving`), so that they change log p of an
+        interval by log E[e^D], to leading order E[e^D - 1], times the share of that which is error.
+        (Not E[D], for the variance of D is of the same order.)"""
         model, form = model.prepared(), self.form
 
         def of_block(block, mine):
             halvings = block.log_halvings(model, mine, form)
-            return jnp.sum(block.step_shares(model, form) * halvings)
+            return jnp.sum(block.step_shares(model, form) * jnp.expm1(halvings))
 
         return sum(map(of_block, self.blocks, paths), start=jnp.zeros((), paths[0].dtype))
 

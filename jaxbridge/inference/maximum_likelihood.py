@@ -290,7 +290,7 @@ def _summary(
     # Where the score is too large by this, so is its zero by that times the inverse information.
     step_doubt = jnp.sqrt(covariance**2 @ score.step_uncertainty**2)
     standard, monte_carlo = (
-        parameters.select(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
+        parameters.each(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
     )
     return MaximumLikelihood(
         parameters.full(estimate),

@@ -59,6 +59,12 @@ class Parameters(eqx.Module):
         _, unravel = ravel_pytree(cast_floats(floats, theta.dtype))
         return eqx.combine(unravel(theta), others)
 
+    def each(self, values: Float[Array, " p"]) -> PyTree:
+        """What belongs to the entries of θ, as a score does, where they stand in the unknown
+        parameters; `None` for what is no entry."""
+        floats = eqx.filter(self.params, eqx.is_inexact_array)
+        return ravel_pytree(cast_floats(floats, values.dtype))[1](values)
+
     def full(self, theta: Float[Array, " p"]) -> PyTree:
         """All parameters of the model, the unknown ones from θ."""
         if self.where is None:

@@ -262,8 +262,8 @@ def _summary(
     step_error = _step_error(completion, draws, covariance)
     return RecordMaximumLikelihood(
         parameters.full(theta),
-        parameters.select(jnp.sqrt(jnp.diagonal(covariance))),
-        parameters.select(monte_carlo),
+        parameters.each(jnp.sqrt(jnp.diagonal(covariance))),
+        parameters.each(monte_carlo),
         theta,
         covariance,
         *step_error,

@@ -147,8 +147,8 @@ def as_score(
     """Of sums over the intervals."""
     error = jnp.sqrt(jnp.maximum(jnp.diagonal(sums.covariance), 0))
     return Score(
-        parameters.select(sums.gradient),
-        parameters.select(error),
+        parameters.each(sums.gradient),
+        parameters.each(error),
         sums.gradient,
         sums.covariance,
         sums.information,

@@ -47,7 +47,8 @@ class Diffusion(eqx.Module):
     - `log_stationary`: log ν up to a constant, `(x, params) -> ()`.
     - `params`: any pytree. Floating point numbers in it become JAX arrays, and whatever is no array
         stays what it is: whole numbers, truth values, names, the activation of a neural network.
-        These are static, and another value compiles again.
+        These are static: another value compiles again, and they are neither inferred nor
+        differentiated. So write 1.0 for a rate.
     - `reverse_drift`: α*, `(x, params) -> (d,)`, where it is known in closed form. Otherwise
         it comes from `log_stationary` by automatic differentiation.
     - `sample_stationary`: an exact sampler of ν, `(key, params) -> (d,)`.
@@ -130,8 +131,11 @@ class Diffusion(eqx.Module):
     @property
     def params(self) -> PyTree:
         """The parameters, as they were given, but for numbers that have become arrays."""
-        leaves, structure = self._others
-        return eqx.combine(self._numbers, jax.tree.unflatten(structure, leaves))
+        others, structure = self._others
+        leaves = structure.flatten_up_to(self._numbers)
+        for place, leaf in others:
+            leaves[place] = leaf
+        return structure.unflatten(leaves)
 
     def drift(self, x: Numbers) -> Float[Array, " d"]:
         """α(x), shape (d,)."""
@@ -455,24 +459,26 @@ def check_invertible(name: str, sigma: Array | np.ndarray) -> None:
 
 
 class _Others(NamedTuple):
-    """Of a pytree, the leaves that are no arrays, and where they stand."""
+    """Of a pytree, the leaves that are no arrays, each with its place, and its structure."""
 
-    leaves: tuple
+    leaves: tuple[tuple[int, Any], ...]
     structure: Any
 
 
 def _parts(params: PyTree) -> tuple[PyTree, _Others]:
     """The arrays of the parameters, and the rest of them."""
-    numbers, others = eqx.partition(jax.tree.map(_as_leaf, params), _is_number)
-    leaves, structure = jax.tree.flatten(others)
-    return numbers, _Others(tuple(leaves), structure)
+    leaves, structure = jax.tree.flatten(jax.tree.map(_as_leaf, params))
+    numbers = structure.unflatten([leaf if _is_number(leaf) else None for leaf in leaves])
+    others = [(i, leaf) for i, leaf in enumerate(leaves) if not _is_number(leaf)]
+    return numbers, _Others(tuple(others), structure)
 
 
 def _is_number(leaf) -> bool:
-    # What stands in for an array, as its shape does in `eval_shape`, is one.
-    return eqx.is_array_like(leaf) and not isinstance(leaf, bool | int | str)
+    return eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct)
 
 
 def _as_leaf(leaf):
-    # `asarray` keeps Python numbers weakly typed, so they follow the precision of the points.
-    return jnp.asarray(leaf) if isinstance(leaf, float | np.ndarray | np.generic) else leaf
+    if isinstance(leaf, float):
+        # `asarray` keeps Python numbers weakly typed, so they follow the precision of the points.
+        return jnp.asarray(float(leaf))
+    return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf

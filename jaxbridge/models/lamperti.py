@@ -211,7 +211,6 @@ class _Lamperti:
         return jnp.asarray(solution.ys)
 
 
-# The same object for the same arguments, so that its functions compile once.
 @eqx.filter_jit
 def _tabulated(functions: _Lamperti, params: PyTree) -> _Table:
     params = params if functions.preparation is None else functions.preparation(params)
@@ -220,4 +219,5 @@ def _tabulated(functions: _Lamperti, params: PyTree) -> _Table:
     return _Table(x, jax.vmap(lambda x: functions.sigma_at(x, params))(x), params)
 
 
+# The same object for the same arguments, so that its functions compile once.
 _coordinates_of = functools.lru_cache(maxsize=256)(_Lamperti)

@@ -99,6 +99,8 @@ class AbstractGuidedProposal(AbstractSingleProposal):
 
     def most_accurate(self, model, like):
         density = most_accurate_density(model.sigma_varies(like))
+        if self.density is not None and self.density.order >= density.order:
+            return self
         is_density = lambda leaf: leaf is None or isinstance(leaf, AbstractStepDensity)
         return eqx.tree_at(lambda p: p.density, self, density, is_leaf=is_density)
 

@@ -54,11 +54,31 @@ class Paths(NamedTuple):
     points: Float[Array, "K N d C"]
 
 
+class GuidesToEnds(NamedTuple):
+    """What guides steps to any end e: log h is quadratic in x and e together, so that its precision
+    does not depend on e, and its shift is r + Tᵀe. Chains share it, block by block.
+
+    - `guide`: for e = 0.
+    - `turn`, `next_turn`: T at the beginning and at the end of the step.
+    """
+
+    guide: Guide
+    turn: Float[Array, "d d *lanes"]
+    next_turn: Float[Array, "d d *lanes"]
+
+    def to(self, end: Float[Array, " d"]) -> Guide:
+        """The guide of one step to this end."""
+        guide = self.guide
+        h = guide.h._replace(shift=guide.h.shift + matvec(self.turn.T, end))
+        next_h = guide.next_h._replace(shift=guide.next_h.shift + matvec(self.next_turn.T, end))
+        return guide._replace(h=h, next_h=next_h)
+
+
 class Blocks(NamedTuple):
     """One cut of a record into B blocks of J segments; arrays have blocks in the last axis.
 
     - `segment`: which segments the blocks are made of, -1 before the record and K after it.
-    - `linear`, `points`, `next_points`, `dt`: of all steps, leading axes (J, N).
+    - `guides`: of all steps, leading axes (J, N), to the end ξ.
     - `scalars`, `values`: what is seen at the ends of segments, leading axis J.
     - `first`, `first_value`, `root`: what is seen of x_0, and the root of its law; of other blocks
         nothing, and zero. `mean`: that of the law of x_0, shape (d,).
@@ -66,10 +86,7 @@ class Blocks(NamedTuple):
     """
 
     segment: Int[Array, "J B"]
-    linear: LinearisedStep
-    points: Float[Array, "J N d B"]
-    next_points: Float[Array, "J N d B"]
-    dt: Float[Array, "J N B"]
+    guides: GuidesToEnds
     scalars: Scalars
     values: Float[Array, "J m B"]
     first: Scalars
@@ -153,19 +170,19 @@ def blocks_of(
     values = jnp.where(outside[..., None], jnp.nan, problem.record.values[at_end])
     # Whether a segment has a length, or one that comes after it.
     after = jnp.cumsum(has_length(problem)[::-1])[::-1] > 0
+    goes_on = jnp.append(after[1:], False)[inside[-1]]
+    scalars = lanes_last(seen(at_end, outside), 1)
+    along = lanes_last(here, 2), lanes_last(there, 2), dt
     return Blocks(
         jnp.asarray(segment),
-        lanes_last(steps, 2),
-        lanes_last(here, 2),
-        lanes_last(there, 2),
-        dt,
-        lanes_last(seen(at_end, outside), 1),
+        _guides_to_ends(lanes_last(steps, 2), scalars, goes_on, *along),
+        scalars,
         lanes_last(values, 1),
         lanes_last(seen(np.zeros(len(is_first), int), ~is_first), 0),
         jnp.where(is_first, problem.record.values[0][:, None], jnp.nan),
         jnp.where(is_first, guide.initial.root[..., None], 0),
         guide.initial.mean,
-        jnp.append(after[1:], False)[inside[-1]],
+        goes_on,
     )
 
 
@@ -184,7 +201,6 @@ class _Lanes(NamedTuple):
 
     - `start`, `old`: where the old paths begin, and their points, leading axes (J, N).
     - `end`: where the old paths end, counted from ξ.
-    - `guides`: of all steps of the B blocks, to the end ξ.
     - `scalars`: what is seen at the ends of segments.
     - `is_first`: which begin where the record does.
     - `rho`, `beta`: √(1 - β²), and β.
@@ -193,31 +209,10 @@ class _Lanes(NamedTuple):
     start: Float[Array, "d lanes"]
     old: Float[Array, "J N d lanes"]
     end: Float[Array, "d lanes"]
-    guides: "_GuidesToEnds"
     scalars: Scalars
     is_first: Bool[Array, " lanes"]
     rho: Float[Array, " lanes"]
     beta: Float[Array, " lanes"]
-
-
-class _GuidesToEnds(NamedTuple):
-    """What guides steps to any end e: log h is quadratic in x and e together, so that its precision
-    does not depend on e, and its shift is r + Tᵀe. Chains share it, block by block.
-
-    - `guide`: for e = 0.
-    - `turn`, `next_turn`: T at the beginning and at the end of the step.
-    """
-
-    guide: Guide
-    turn: Float[Array, "d d *lanes"]
-    next_turn: Float[Array, "d d *lanes"]
-
-    def to(self, end: Float[Array, " d"]) -> Guide:
-        """The guide of one step to this end."""
-        guide = self.guide
-        h = guide.h._replace(shift=guide.h.shift + matvec(self.turn.T, end))
-        next_h = guide.next_h._replace(shift=guide.next_h.shift + matvec(self.next_turn.T, end))
-        return guide._replace(h=h, next_h=next_h)
 
 
 class _State(NamedTuple):
@@ -268,26 +263,36 @@ def _lanes_of(blocks: Blocks, scale: Float[Array, " B"], paths: Paths) -> _Lanes
     )
     old = joined(jnp.moveaxis(padded[blocks.segment + 1], 1, -2))  # (J, N, d, B C)
     start = joined(jnp.moveaxis(padded[jnp.maximum(blocks.segment[0], 0), -1], 0, -2))
-    end = old[-1, -1] - spread(blocks.next_points[-1, -1])
+    end = old[-1, -1] - spread(blocks.guides.guide.next_point[-1, -1])
     scalars = _pinned(spread(blocks.scalars), spread(blocks.goes_on), end)
     is_first = spread(jnp.asarray(np.arange(B) == 0))
     size = spread((jnp.sqrt(1 - scale**2), scale))
-    return _Lanes(start, old, end, _guides_to_ends(blocks), scalars, is_first, *size)
+    return _Lanes(start, old, end, scalars, is_first, *size)
 
 
-def _guides_to_ends(blocks: Blocks) -> _GuidesToEnds:
-    """By the filter to the end 0 and to each of the unit vectors, side by side."""
-    d = blocks.points.shape[2]
-    ends = jnp.concatenate([jnp.zeros((d, 1)), jnp.eye(d)], axis=1).astype(blocks.points.dtype)
-    B = blocks.segment.shape[1]
+def _guides_to_ends(
+    linear: LinearisedStep,
+    scalars: Scalars,
+    goes_on: Bool[Array, " B"],
+    points: Float[Array, "J N d B"],
+    next_points: Float[Array, "J N d B"],
+    dt: Float[Array, "J N B"],
+) -> GuidesToEnds:
+    """By the filter to the end 0; and side by side to each of the unit vectors, with all else that
+    r is made of zero, for T."""
+    d, B = points.shape[2:]
     several = functools.partial(_for_chains, d + 1)
-    pinned = _pinned(several(blocks.scalars), several(blocks.goes_on), jnp.tile(ends, (1, B)))
-    h = information_filter(several(blocks.linear), pinned, _in_lanes)
+    whole = jnp.tile(jnp.eye(1, d + 1, dtype=points.dtype)[0], B)
+    linear, scalars = several(linear), several(scalars)
+    linear = linear._replace(shift=linear.shift * whole)
+    scalars = scalars._replace(values=scalars.values * whole)
+    ends = jnp.tile(jnp.eye(d, d + 1, 1, dtype=points.dtype), (1, B))
+    h = information_filter(linear, _pinned(scalars, several(goes_on), ends), _in_lanes)
     each = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], B, d + 1), h)
     zero = jax.tree.map(lambda leaf: leaf[..., 0], each)
-    turn = jnp.moveaxis(each.shift[..., 1:] - each.shift[..., :1], -1, 2)
-    guide = Guide(blocks.points, zero, blocks.next_points, following(zero), blocks.dt)
-    return _GuidesToEnds(guide, turn, following(turn))
+    turn = jnp.moveaxis(each.shift[..., 1:], -1, 2)
+    guide = Guide(points, zero, next_points, following(zero), dt)
+    return GuidesToEnds(guide, turn, following(turn))
 
 
 def _pinned(
@@ -314,7 +319,7 @@ def _new_starts(
 
     initial = NormalStep(blocks.mean, blocks.root[..., 0])
     means = jnp.where(lanes.is_first, initial.mean[:, None], lanes.start)
-    step = spread(jax.tree.map(lambda leaf: leaf[0, 0], lanes.guides))
+    step = spread(jax.tree.map(lambda leaf: leaf[0, 0], blocks.guides))
     eta = jax.random.normal(key, lanes.start.shape, lanes.start.dtype)
     law = (means, spread(blocks.root), spread(blocks.first), step, lanes.end)
     arguments = (lanes.start, *law, eta, lanes.rho, lanes.beta)
@@ -378,7 +383,7 @@ def _new_points(
         return state, jnp.concatenate([path, state.new[None]])
 
     numbers = jnp.arange(len(lanes.old))
-    inputs = (numbers, lanes.old, lanes.guides, lanes.scalars, blocks.values)
+    inputs = (numbers, lanes.old, blocks.guides, lanes.scalars, blocks.values)
     return lax.scan(segment, first, inputs)
 
 
@@ -394,7 +399,7 @@ def _turned(zeta, eta, rho, beta):
 
 def _no_noise(blocks: Blocks) -> Float[Array, " n"]:
     """In the place of noise that does not move a path: it stays apart from all that does."""
-    return jnp.zeros(blocks.first.values.shape[0], blocks.dt.dtype)
+    return jnp.zeros(blocks.first.values.shape[0], blocks.guides.guide.dt.dtype)
 
 
 def _corrections(
