@@ -39,3 +39,9 @@ def test_on_an_accelerator(num_wanted, num_steps, d, expected, monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     point = jnp.zeros((1, d), jnp.float32)
     assert default_num_lanes(num_wanted, num_steps, point) == expected
+
+
+def test_what_runs_on_a_cpu_beside_an_accelerator_is_bounded_as_there(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert default_num_lanes(10**7, 50, jnp.zeros((1, 2), jnp.float32)) == 2**13

@@ -265,6 +265,40 @@ def test_the_likelihood_is_that_of_the_target_of_the_bridges():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("density", [jb.EulerDensity(), TRAPEZOID], ids=["euler", "ito_taylor"])
+def test_the_step_error_of_a_posterior_is_told(density):
+    """By what half as many steps change, which has a closed form for either law of a step. The mean
+    of D alone would tell the wrong sign for Euler's."""
+    times, num_steps = np.arange(200.0), 10
+    data, grid = ou_data(2, times), np.linspace(0.3, 1.8, 4_000)
+
+    def mean_of_posterior(num_steps):
+        dt, second = 1 / num_steps, density.order == 2
+        decay = 1 - grid[:, None] * dt + (grid[:, None] * dt) ** 2 / 2 * second
+        spread = dt * (1 + second * (-grid[:, None] * dt + (grid[:, None] * dt) ** 2 / 3))
+        variance = spread * sum(decay ** (2 * i) for i in range(num_steps))
+        residual = data[1:, 0] - decay**num_steps * data[:-1, 0]
+        log_density = -(residual**2 / variance + np.log(variance)).sum(1) / 2 - (grid - 1) ** 2 / 2
+        return grid_moments(grid, log_density)[0]
+
+    change = mean_of_posterior(num_steps // 2) - mean_of_posterior(num_steps)
+    made = jb.gibbs(
+        jax.random.key(0),
+        ou_1d(),
+        times,
+        data,
+        num_iterations=1_500,
+        num_steps=num_steps,
+        num_chains=16,
+        proposal=jb.ModifiedDiffusionBridge(density),
+        **OPTIONS,
+    )
+    wanted, noise = change / (2**density.order - 1), float(made.step_uncertainty[0])
+    assert noise < 0.3 * abs(wanted)
+    assert abs(float(made.step_error[0]) - wanted) < 5 * noise
+
+
+@pytest.mark.slow
 def test_what_is_cut_off_is_counted():
     made = jb.gibbs(
         jax.random.key(0),
