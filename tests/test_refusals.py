@@ -706,6 +706,7 @@ OF_OBSERVATIONS = [
     of(jb.path_log_likelihood),
 ]
 OBSERVATIONS = {
+    "half precision": (HYPERBOLIC, np.float16(TIMES), np.float16(POINTS)),
     "one time less than points": (HYPERBOLIC, [0.0, 1.0], POINTS),
     "times that do not increase": (HYPERBOLIC, [0.0, 1.0, 1.0], POINTS),
     "a time that is missing": (HYPERBOLIC, [0.0, NAN, 2.0], POINTS),

@@ -58,6 +58,15 @@ def cast_floats(tree: PyTree, dtype) -> PyTree:
     )
 
 
+def check_precision(names: str, dtype: jnp.dtype) -> None:
+    """Raise `TypeError` where arrays of these names are of less than single precision."""
+    if dtype.itemsize < 4:
+        raise TypeError(
+            f"{names} must be float32 or float64; got {dtype}, in which short steps of a path are "
+            "lost."
+        )
+
+
 def all_finite_leaves(tree: PyTree) -> Bool[Array, ""]:
     """Whether all numbers in the tree are finite."""
     leaves = [leaf for leaf in jax.tree.leaves(tree) if eqx.is_inexact_array(leaf)]

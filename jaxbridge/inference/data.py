@@ -14,6 +14,7 @@ from ..engine.checks import (
     check_count,
     check_increasing,
     check_key,
+    check_precision,
     is_traced,
     steps_of_size,
     time_steps,
@@ -64,6 +65,9 @@ def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Inter
         )
     if times.shape[0] < 2:
         raise ValueError(f"`observations` must be two or more; got {times.shape[0]}.")
+    check_precision(
+        "`times` and `observations`", jnp.promote_types(times.dtype, observations.dtype)
+    )
     if not is_traced(times):
         check_increasing(np.asarray(times), np.asarray(duration))
     if not is_traced(observations):

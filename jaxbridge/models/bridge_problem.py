@@ -14,7 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key, PyTree, Shaped
 
-from ..engine.checks import Numbers, as_floating, as_real, check_count, is_traced
+from ..engine.checks import (
+    Numbers,
+    as_floating,
+    as_real,
+    check_count,
+    check_precision,
+    is_traced,
+)
 from ..engine.keys import numbered
 from .diffusion import Diffusion, check_diffusion
 
@@ -111,6 +118,7 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
             f"{points['start'].shape} and {points['end'].shape}."
         )
     dtype = _working_dtype(*points.values(), duration)
+    check_precision("`start`, `end` and `duration`", dtype)
     lengths = {point.shape[0] for point in points.values() if point.ndim == 2}
     lengths |= {duration.shape[0]} if duration.ndim == 1 else set()
     if len(lengths - {1}) > 1:
@@ -185,10 +193,4 @@ def _working_dtype(*arrays: Array) -> jnp.dtype:
     floating = [
         a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating) and not a.weak_type
     ]
-    widest = max(floating, key=lambda dtype: dtype.itemsize, default=jnp.asarray(0.0).dtype)
-    if widest.itemsize < 4:
-        raise TypeError(
-            f"`start`, `end` and `duration` must be float32 or float64; got {widest}, in which "
-            "short steps of a path are lost."
-        )
-    return widest
+    return max(floating, key=lambda dtype: dtype.itemsize, default=jnp.asarray(0.0).dtype)

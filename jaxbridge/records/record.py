@@ -19,6 +19,7 @@ from ..engine.checks import (
     as_floating,
     check_count,
     check_increasing,
+    check_precision,
     is_traced,
     steps_of_size,
     time_steps,
@@ -166,6 +167,7 @@ def _checked(
             "a record has two times or more, at each of which there is something to be seen: "
             f"`observations` have shape {values.shape}."
         )
+    check_precision("`times` and `observations`", jnp.promote_types(times.dtype, values.dtype))
     if not is_traced(times):
         check_increasing(np.asarray(times), np.asarray(gaps))
     if not is_traced(values):
