@@ -41,7 +41,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..engine.checks import Numbers, as_floating, is_traced, time_steps
+from ..engine.checks import Numbers, as_floating, check_precision, is_traced, time_steps
 from ..engine.compiled import compiled
 from ..engine.lanes import over_lanes
 from ..engine.linalg import dot, total
@@ -90,6 +90,7 @@ def path_log_likelihood(
             "`path` must hold two or more points in the axis before the last, shape (..., K, d); "
             f"got {path.shape}."
         )
+    check_precision("`path`", path.dtype)
     num_times = path.shape[-2]
     fits = times.shape == (num_times,) or (
         path.ndim > 2 and times.shape == (path.shape[0], num_times)
