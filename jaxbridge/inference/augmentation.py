@@ -110,13 +110,14 @@ class Augmentation(eqx.Module):
     def log_step_error(self, model: Diffusion, paths: Paths) -> Float[Array, ""]:
         """A function of these paths whose mean, given θ, is the step error of log L(θ): half as
         many steps make each path e^D times as likely (`halving`), so that they change log p of an
-        interval by log E[e^D], to leading order E[e^D - 1], times the share of that which is error.
-        (Not E[D], for the variance of D is of the same order.)"""
+        interval by log E[e^D], to leading order E[D + ½ D²]; of that a share is the error.
+        (Not E[D], for the variance of D is of the same order; nor E[e^D - 1], which is -1 however
+        far steps are out of all proportion, and would tell of no error.)"""
         model, form = model.prepared(), self.form
 
         def of_block(block, mine):
             halvings = block.log_halvings(model, mine, form)
-            return jnp.sum(block.step_shares(model, form) * jnp.expm1(halvings))
+            return jnp.sum(block.step_shares(model, form) * (halvings + halvings**2 / 2))
 
         return sum(map(of_block, self.blocks, paths), start=jnp.zeros((), paths[0].dtype))
 

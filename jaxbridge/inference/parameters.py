@@ -55,9 +55,9 @@ class Parameters(eqx.Module):
 
     def select(self, theta: Float[Array, " p"]) -> PyTree:
         """The unknown parameters of θ, in its dtype."""
-        floats, others = eqx.partition(self.params, eqx.is_inexact_array)
-        _, unravel = ravel_pytree(cast_floats(floats, theta.dtype))
-        return eqx.combine(unravel(theta), others)
+        return eqx.combine(
+            self.each(theta), eqx.filter(self.params, eqx.is_inexact_array, inverse=True)
+        )
 
     def each(self, values: Float[Array, " p"]) -> PyTree:
         """What belongs to the entries of θ, as a score does, where they stand in the unknown

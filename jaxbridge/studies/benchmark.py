@@ -116,7 +116,7 @@ def run_benchmark(
 
 
 def _lanes() -> int:
-    return max(lanes for lanes in _LANES if lanes <= most_lanes(2) or lanes == _LANES[0])
+    return max(lanes for lanes in _LANES if lanes <= most_lanes(2))
 
 
 def draw_floor(own_noise: bool, num_proposals: int) -> Callable[[Key[Array, ""]], Any]:
