@@ -81,9 +81,11 @@ from .inference.record_gibbs import RecordPosterior, RecordState
 from .inference.record_maximum import RecordMaximumLikelihood
 from .inference.score import Score, score
 from .models.diffusion import Diffusion
+from .models.fitzhugh_nagumo import FitzHughNagumoParams, fitzhugh_nagumo
 from .models.gaussian_bridge import GaussianBridge, gaussian_bridge
 from .models.gaussian_law import GaussianLaw
 from .models.hyperbolic import hyperbolic
+from .models.integrated import integrated
 from .models.lamperti import lamperti
 from .models.langevin import langevin, stationary_diffusion
 from .models.ornstein_uhlenbeck import (
@@ -92,8 +94,10 @@ from .models.ornstein_uhlenbeck import (
     ou_stationary,
     ou_transition,
 )
+from .models.seasonal import SeasonalParams, seasonal_ornstein_uhlenbeck
 from .models.simulate import simulate
 from .models.transform import Transformed, transform
+from .models.underdamped_langevin import UnderdampedLangevinParams, underdamped_langevin
 from .proposals.base import AbstractWeightedProposal
 from .proposals.choice import Choice
 from .proposals.coupled import CoupledPairs
@@ -119,9 +123,9 @@ from .schemes.step_density import (
     EulerDensity,
     ItoTaylorDensity,
     LinearStep,
-    StepLaw,
     StepsFrom,
 )
+from .schemes.step_law import DegenerateLaw, StepLaw
 from .tuning.choose_proposal import choose_proposal
 from .tuning.hitting_variation import HittingVariation, hitting_variation
 from .tuning.settings import Setting, WorkPrecision
@@ -140,6 +144,14 @@ __all__ = [
     "lamperti",
     "Transformed",
     "simulate",
+    # Models with noise in a part of the state, or of time.
+    "fitzhugh_nagumo",
+    "FitzHughNagumoParams",
+    "underdamped_langevin",
+    "UnderdampedLangevinParams",
+    "integrated",
+    "seasonal_ornstein_uhlenbeck",
+    "SeasonalParams",
     # Bridges by coupling.
     "sample_bridges",
     "Bridges",
@@ -244,6 +256,7 @@ __all__ = [
     "AbstractScheme",
     "AbstractStepDensity",
     "StepLaw",
+    "DegenerateLaw",
     "StepsFrom",
     "LinearStep",
     "AbstractGuidedProposal",

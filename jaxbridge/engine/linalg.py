@@ -150,7 +150,7 @@ def semidefinite_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
     return jnp.stack(columns, axis=1)
 
 
-def lower_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
+def lower_factor(matrix: Float[Array, "d m"]) -> Float[Array, "d d"]:
     """L of `matrix = L Q`, lower triangular with a positive diagonal, Q orthogonal: the root of
     `matrix matrixᵀ`, without squaring the condition number. By Gram and Schmidt's procedure on the
     rows, modified, which is as stable for L as any; non-finite numbers where `matrix` is singular.
@@ -169,6 +169,25 @@ def lower_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
         root = lax.rsqrt(square)
         directions.append(row * root)
         L.append([*along, square * root])
+    return _lower(L)
+
+
+def semidefinite_factor(matrix: Float[Array, "d n"]) -> Float[Array, "d d"]:
+    """`lower_factor` of a matrix whose rows may be linearly dependent, or more than its columns: a
+    row of which nothing is left, but for rounding, has a zero on the diagonal and below."""
+    d = matrix.shape[0]
+    L: list[list[Array]] = []
+    directions: list[Array] = []
+    for i in range(d):
+        row, along, whole = matrix[i], [], dot(matrix[i], matrix[i])
+        for direction in directions:
+            along.append(dot(row, direction))
+            row = row - along[-1] * direction
+        square = dot(row, row)
+        nothing = square <= (10 * d * jnp.finfo(matrix.dtype).eps) ** 2 * whole
+        root = jnp.where(nothing, 0, lax.rsqrt(jnp.where(nothing, 1, square)))
+        directions.append(row * root)
+        L.append([*along, jnp.where(nothing, 0, square * root)])
     return _lower(L)
 
 

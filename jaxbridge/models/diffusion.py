@@ -8,6 +8,10 @@ equation (reversedrift),
 
 in which the normaliser of ν cancels. It is reversible if and only if α* = α, equation
 (timereversible).
+
+Two kinds of diffusions have no such reversal that couplings could use, but can be seen with noise
+or in part all the same (`records`): those whose noise reaches only a part of the state at once, σ
+of fewer columns than rows; and those whose coefficients α(x, t) and σ(x, t) change with time.
 """
 
 import copy
@@ -22,10 +26,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
+from ..engine.linalg import lower_factor
 from . import decisions
-from .dynamics import Dynamics, stationary_flux
-from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity
-from .tracing import traced_once, uses_argument
+from .dynamics import Dynamics, DynamicsAt, stationary_flux
+from .sigma import NO_INVERSE, AbstractSigma, Constant, Diagonal, Full, Identity, Tall, Triangular
+from .tracing import takes_time, traced_once, uses_argument
+
+_NOT_HOMOGENEOUS = (
+    "the coefficients of this model depend on time, and what was asked for is for diffusions whose "
+    "do not, as are couplings, reversals, and bridges and transition densities of a duration. What "
+    "is not: `simulate`, and with an `observation` `log_likelihood`, `smooth`, `innovations`, "
+    "`gibbs`, `pmmh` and `maximum_likelihood`, whose times are absolute; a state that was seen "
+    "exactly is `jb.LinearGaussian(covariance=0.0)`. `model.drift(x, time)` is the drift at a time."
+)
 
 
 class Diffusion(eqx.Module):
@@ -39,11 +52,13 @@ class Diffusion(eqx.Module):
     **Arguments:**
 
     - `drift`: α, a function `(x, params) -> (d,)` of a point `x` of shape (d,), in space per
-        unit of time.
+        unit of time; or `(x, params, t)`, with a third argument that has no default, of time.
     - `diffusion`: σ. `None` is the identity; an array of shape (d, d), or (d,) for a
-        diagonal, is constant; a function `(x, params)` returns one of these. Whether it
-        uses `x` is seen when it is traced: one that does not is constant as well. In space per
-        square root of a unit of time. Must be invertible.
+        diagonal, is constant; a function `(x, params)` or `(x, params, t)` returns one of these.
+        Whether it uses `x` is seen when it is traced: one that does not is constant as well. In
+        space per square root of a unit of time. Of full rank. Where its shape is (d, m) with
+        m > d the root of V = σσᵀ stands in for it. With m < d noise reaches only a part of the
+        state at once; then V has no inverse, on which couplings rest.
     - `log_stationary`: log ν up to a constant, `(x, params) -> ()`.
     - `params`: any pytree. Floating point numbers in it become JAX arrays, and whatever is no array
         stays what it is: whole numbers, truth values, names, the activation of a neural network.
@@ -113,6 +128,11 @@ class Diffusion(eqx.Module):
         ]:
             if not (callable(function) or (function is None and name != "drift")):
                 raise TypeError(f"`{name}` must be a function, got {function!r}.")
+        if log_stationary is not None and (takes_time(drift) or takes_time(diffusion)):
+            raise ValueError(
+                "`drift` or `diffusion` takes a third argument, the time, and a diffusion whose "
+                "coefficients depend on time is not stationary: leave out `log_stationary`."
+            )
         self._drift = drift
         self._log_stationary = log_stationary
         self._reverse_drift = reverse_drift
@@ -137,15 +157,16 @@ class Diffusion(eqx.Module):
             leaves[place] = leaf
         return structure.unflatten(leaves)
 
-    def drift(self, x: Numbers) -> Float[Array, " d"]:
-        """α(x), shape (d,)."""
+    def drift(self, x: Numbers, time: Numbers | None = None) -> Float[Array, " d"]:
+        """α(x), shape (d,), at this time where it depends on it."""
         x = as_floating("x", x)
-        return self.forward(x).drift(x)
+        return self._at(x, time).drift(x)
 
-    def diffusion(self, x: Numbers) -> Float[Array, "d d"]:
-        """σ(x) as a dense matrix, shape (d, d)."""
+    def diffusion(self, x: Numbers, time: Numbers | None = None) -> Float[Array, "d m"]:
+        """σ(x) as a dense matrix, shape (d, d), or (d, m) where m < d; at this time where it
+        depends on it."""
         x = as_floating("x", x)
-        return self.forward(x).sigma(x).as_matrix(x.shape[0], x.dtype)
+        return self._at(x, time).sigma(x).as_matrix(x.shape[0], x.dtype)
 
     def reverse_drift(self, x: Numbers) -> Float[Array, " d"]:
         """α*(x), shape (d,): equation (reversedrift) of the paper.
@@ -279,28 +300,76 @@ class Diffusion(eqx.Module):
         """Whether α* comes by automatic differentiation."""
         return decisions.reverse_drift(self.reversible, self._reverse_drift is not None)
 
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether the drift or σ takes the time as a third argument."""
+        return takes_time(self._drift) or takes_time(self._diffusion)
+
     def forward(self, like: Float[Array, " d"]) -> Dynamics:
         """The coefficients α and σ at points like this one (only its shape and dtype count),
-        with everything done that does not depend on the point."""
+        with everything done that does not depend on the point.
+
+        **Raises:** `ValueError` where they depend on time.
+        """
+        if self.depends_on_time:
+            raise ValueError(_NOT_HOMOGENEOUS)
+        return self.forward_at(like)(None)
+
+    def forward_at(self, like: Float[Array, " d"]) -> DynamicsAt:
+        """The same as a function of time, which does not count where nothing depends on it."""
         params = self._prepared_params()
-        drift = self._inside("drift", self._drift, params)
+        drift_at = self._drift_at(params)
+        sigma_at, varies = self._sigma_at(params, like)
+        return lambda time: Dynamics(drift_at(time), sigma_at(time), varies)
 
-        if self._diffusion is not None:
-            diffusion = traced_once(self._diffusion)
+    def _at(self, x: Float[Array, " d"], time: Numbers | None) -> Dynamics:
+        if time is None:
+            return self.forward(x)
+        return self.forward_at(x)(jnp.asarray(time, x.dtype))
 
-            def sigma(x):
-                return _as_sigma(diffusion(x, params), x, constant=False)
+    def _drift_at(self, params: PyTree) -> Callable[[Any], Callable[[Array], Array]]:
+        function = traced_once(self._drift)
+        if takes_time(self._drift):
+            return lambda time: self._inside("drift", lambda x: function(x, params, time), params)
+        drift = self._inside("drift", lambda x: function(x, params), params)
+        return lambda time: drift
 
-            if uses_argument(lambda x: diffusion(x, params), like):
-                return Dynamics(drift, sigma, sigma_varies=True)
-            constant_sigma = _as_sigma(diffusion(jnp.zeros_like(like), params), like)
-        else:
+    def _sigma_at(
+        self, params: PyTree, like: Float[Array, " d"]
+    ) -> tuple[Callable[[Any], Callable[[Array], AbstractSigma]], bool]:
+        """σ as a function of time, and whether it varies with the point."""
+        if self._diffusion is None:
             constant_sigma = _as_sigma(self._constant_sigma, like)
-        return Dynamics(drift, lambda x: constant_sigma, sigma_varies=False)
+            return lambda time: lambda x: constant_sigma, False
+        function = traced_once(self._diffusion)
+        timed = takes_time(self._diffusion)
+        values = function if timed else lambda x, params, time: function(x, params)
+        now = jnp.zeros((), like.dtype)
+        varies = uses_argument(lambda x: values(x, params, now), like)
+        if not (varies or timed):
+            constant = _as_sigma(values(jnp.zeros_like(like), params, now), like)
+            return lambda time: lambda x: constant, False
+        return lambda time: lambda x: _as_sigma(values(x, params, time), x, constant=False), varies
 
     def sigma_varies(self, like: Float[Array, " d"]) -> bool:
         """Whether σ depends on the point. Nothing is computed for the answer."""
-        return eqx.filter_eval_shape(lambda model, x: model.forward(x).sigma_varies, self, like)
+        return self._sees(like)[0]
+
+    def sigma_is_invertible(self, like: Float[Array, " d"]) -> bool:
+        """Whether noise reaches the whole state at once. Nothing is computed for the answer."""
+        return self._sees(like)[1]
+
+    def check_invertible_sigma(self, like: Float[Array, " d"]) -> None:
+        """Raise `ValueError` where noise reaches only a part of the state at once."""
+        if not self.sigma_is_invertible(like):
+            raise ValueError(NO_INVERSE)
+
+    def _sees(self, like: Float[Array, " d"]) -> tuple[bool, bool]:
+        def seen(model, x):
+            dynamics = model.forward_at(x)(jnp.zeros((), x.dtype))
+            return dynamics.sigma_varies, dynamics.sigma(x).invertible
+
+        return eqx.filter_eval_shape(seen, self, like)
 
     def backward(self, like: Float[Array, " d"]) -> Dynamics:
         """The coefficients α* and σ of the time-reversed diffusion, as for `forward`."""
@@ -311,7 +380,8 @@ class Diffusion(eqx.Module):
         derived = self.reverse_drift_effect
         params, reverse_drift = self._prepared_params(), self._reverse_drift
         if reverse_drift is not None and not derived.simulated:
-            drift = self._inside("reverse_drift", reverse_drift, params)
+            function = traced_once(reverse_drift)
+            drift = self._inside("reverse_drift", lambda x: function(x, params), params)
         else:
             log_nu = self._log_stationary_function()
             divergence = decisions.divergence(derived, forward.sigma_varies).simulated
@@ -324,14 +394,14 @@ class Diffusion(eqx.Module):
         return forward._replace(drift=drift)
 
     def _inside(
-        self, name: str, function: Callable, params: PyTree
+        self, name: str, values: Callable[[Float[Array, " d"]], Array], params: PyTree
     ) -> Callable[[Float[Array, " d"]], Float[Array, " d"]]:
-        """A drift, NaN outside the state space: a path that steps out is lost with the next step,
-        and no bridge ends there."""
-        inside, function = self._state_space(params), traced_once(function)
+        """A drift with these values, NaN outside the state space: a path that steps out is lost
+        with the next step, and no bridge ends there."""
+        inside = self._state_space(params)
 
         def drift(x):
-            value = check_value(name, function(x, params), x.shape, x)
+            value = check_value(name, values(x), x.shape, x)
             return value if inside is None else jnp.where(inside(x), value, jnp.nan)
 
         return drift
@@ -379,14 +449,19 @@ def _as_sigma(
         sigma: AbstractSigma = cast_floats(values, x.dtype)
         return Constant(sigma.as_matrix(d, x.dtype)) if constant else sigma
     values = _as_real("diffusion", values)
-    if values.shape not in ((d,), (d, d)):
+    if values.shape != (d,) and not (values.ndim == 2 and values.shape[0] == d):
         raise ValueError(
-            f"`diffusion` must have shape ({d}, {d}), or ({d},) for a diagonal, at a point of "
-            f"shape ({d},); it has {values.shape}."
+            f"`diffusion` must have shape ({d}, m) for noise of m dimensions, or ({d},) for a "
+            f"diagonal, at a point of shape ({d},); it has {values.shape}."
         )
     values = values.astype(x.dtype)
     if values.ndim == 1:
         return Diagonal(values)
+    if values.shape[1] < d:
+        return Tall(values)
+    if values.shape[1] > d:
+        values = lower_factor(values)
+        return Constant(values) if constant else Triangular(values)
     return Constant(values) if constant else Full(values)
 
 
@@ -431,11 +506,10 @@ def _as_tuples(sigma: Array) -> tuple:
 
 def _check_constant_sigma(sigma: Numbers) -> Array:
     sigma = as_floating("diffusion", sigma)
-    square = sigma.ndim == 2 and sigma.shape[0] == sigma.shape[1]
-    if not (square or sigma.ndim == 1):
+    if sigma.ndim not in (1, 2) or 0 in sigma.shape:
         raise ValueError(
-            "a constant `diffusion` must have shape (d, d), or (d,) for a diagonal; "
-            f"got {sigma.shape}."
+            "a constant `diffusion` must have shape (d, m) for noise of m dimensions, or (d,) for "
+            f"a diagonal; got {sigma.shape}."
         )
     check_invertible("diffusion", sigma)
     return sigma
@@ -455,7 +529,10 @@ def check_invertible(name: str, sigma: Array | np.ndarray) -> None:
     if not np.all(np.isfinite(matrix)):
         raise ValueError(f"`{name}` must be finite; got {matrix}.")
     if np.linalg.cond(matrix) > 1 / np.finfo(matrix.dtype).eps:
-        raise ValueError(f"`{name}` must be invertible; got the singular matrix {matrix}.")
+        raise ValueError(
+            f"`{name}` must be invertible, or have fewer columns than rows where noise reaches "
+            f"only a part of the state; got the singular matrix {matrix}."
+        )
 
 
 class _Others(NamedTuple):

@@ -25,6 +25,10 @@ class Dynamics(NamedTuple):
     sigma_varies: bool
 
 
+# The coefficients at a time.
+DynamicsAt = Callable[[Float[Array, ""] | None], Dynamics]
+
+
 def ito_correction(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
     """½ Σ_jk ∂_k σ_ij σ_kj, by which Itô's drift exceeds Stratonovich's."""
 
@@ -32,7 +36,7 @@ def ito_correction(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " 
         return dynamics.sigma(y).as_matrix(y.shape[0], y.dtype)[:, j]
 
     correction = jnp.zeros_like(x)
-    for j in range(x.shape[0]):
+    for j in range(dynamics.sigma(x).as_matrix(x.shape[0], x.dtype).shape[1]):
         correction += jax.jvp(functools.partial(column, j=j), (x,), (column(x, j),))[1]
     return correction / 2
 

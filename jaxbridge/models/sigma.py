@@ -1,9 +1,9 @@
 """The diffusion coefficient σ(x) at one point, as the operator its form calls for.
 
-Five forms: the identity, a constant matrix (inverted outside the loop over time), a diagonal, a
-full matrix that changes with the state, and its lower triangular root. Whoever holds an
-`AbstractSigma` multiplies and solves without knowing which; what a form does not need is never
-computed.
+Six forms: the identity, a constant matrix (inverted outside the loop over time), a diagonal, a
+full matrix that changes with the state, its lower triangular root, and a tall matrix, of noise in
+fewer dimensions than the state has. Whoever holds an `AbstractSigma` multiplies and solves without
+knowing which; what a form does not need is never computed. A tall one solves nothing, and says so.
 
 The law of the diffusion is that of V = σσᵀ. So where only the law counts, and there is anything
 to solve, a full σ(x) = L Q gives way to its root L, which solves without elimination or pivots and
@@ -11,6 +11,7 @@ does not turn: L(x) → L(x') as V(x) → V(x'), whatever Q does.
 """
 
 from abc import abstractmethod
+from typing import ClassVar, NoReturn
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,9 +28,20 @@ from ..engine.linalg import (
     total,
 )
 
+NO_INVERSE = (
+    "σ of this model has fewer columns than rows, so noise reaches only a part of the state at "
+    "once, and what was asked for rests on an inverse of σ, as do couplings, bridges between exact "
+    "states and transition densities. What does not: `simulate`, and with an `observation` "
+    "`log_likelihood`, `smooth`, `innovations`, `gibbs`, `pmmh` and `maximum_likelihood`; a state "
+    "that was seen exactly is `jb.LinearGaussian(covariance=0.0)`."
+)
+
 
 class AbstractSigma(eqx.Module):
-    """σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,)."""
+    """σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,). `invertible`
+    says whether it has an inverse: a tall one has noise of shape (m,), m < d, and none."""
+
+    invertible: ClassVar[bool] = True
 
     @abstractmethod
     def mv(self, noise: Float[Array, " d"]) -> Float[Array, " d"]:
@@ -52,7 +64,7 @@ class AbstractSigma(eqx.Module):
         """`log |det σ|`."""
 
     @abstractmethod
-    def as_matrix(self, dim: int, dtype) -> Float[Array, "d d"]:
+    def as_matrix(self, dim: int, dtype) -> Float[Array, "d m"]:
         """`σ` as a dense matrix."""
 
     @abstractmethod
@@ -148,7 +160,7 @@ class Diagonal(AbstractSigma):
 class AbstractMatrix(AbstractSigma):
     """A matrix that changes with the state, multiplied the same whatever its form."""
 
-    matrix: eqx.AbstractVar[Float[Array, "d d"]]
+    matrix: eqx.AbstractVar[Float[Array, "d m"]]
 
     def mv(self, noise):
         return matvec(self.matrix, noise)
@@ -189,6 +201,22 @@ class Triangular(AbstractMatrix):
 
     def log_abs_det(self):
         return total(jnp.log(jnp.diagonal(self.matrix)))
+
+    def root(self):
+        return self
+
+
+class Tall(AbstractMatrix):
+    """A matrix of fewer columns than rows: V = σσᵀ has no inverse, and no density."""
+
+    matrix: Float[Array, "d m"]
+    invertible: ClassVar[bool] = False
+
+    def solve(self, vector) -> NoReturn:
+        raise ValueError(NO_INVERSE)
+
+    def log_abs_det(self) -> NoReturn:
+        raise ValueError(NO_INVERSE)
 
     def root(self):
         return self

@@ -75,24 +75,27 @@ def simulate(
 
 @compiled
 def _simulate(key, model, x0, times, num_steps, solver):
-    (num_paths, d), num_intervals = x0.shape, times.shape[0] - 1
-    dynamics = model.forward(x0[0])
+    num_paths, num_intervals = x0.shape[0], times.shape[0] - 1
+    dynamics_at = model.forward_at(x0[0])
     fractions = jnp.arange(num_steps, dtype=times.dtype) / num_steps
     grid = times[:-1, None] + fractions * jnp.diff(times)[:, None]
     grid = jnp.append(grid.reshape(-1), times[-1])
     stratonovich = isinstance(solver, diffrax.AbstractStratonovichSolver)
 
     def drift(t, x, args):
+        dynamics = dynamics_at(t)
         if stratonovich and dynamics.sigma_varies:
             return dynamics.drift(x) - ito_correction(dynamics, x)
         return dynamics.drift(x)
 
     def sigma(t, x, args):
-        return _as_operator(dynamics, x)
+        return _as_operator(dynamics_at(t), x)
+
+    num_noises = jax.eval_shape(sigma, times[0], x0[0], None).in_size()
 
     def one_path(key, x0):
         noise = diffrax.UnsafeBrownianPath(
-            jax.ShapeDtypeStruct((d,), x0.dtype),
+            jax.ShapeDtypeStruct((num_noises,), x0.dtype),
             key,
             _levy_area(solver),
         )

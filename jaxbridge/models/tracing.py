@@ -1,7 +1,9 @@
 """Tracing of the functions that make a model: once, and what is seen of them by it."""
 
 import functools
+import inspect
 from collections.abc import Callable
+from typing import Any
 
 import jax.extend
 import numpy as np
@@ -30,6 +32,18 @@ def _of_parts(function, structure, others, arrays):
     values = iter(others)
     leaves = [next(values)[1] if array is None else array for array in arrays]
     return function(*jax.tree.unflatten(structure, leaves))
+
+
+def takes_time(function: Any, num_others: int = 2) -> bool:
+    """Whether a function must be given one argument more than so many, the time. One that has a
+    default is none."""
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # no function, or one that does not tell
+        return False
+    positional = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    required = [p for p in parameters if p.kind in positional and p.default is p.empty]
+    return len(required) > num_others
 
 
 def uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:

@@ -95,6 +95,7 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return type(self.target).__name__, "", np.nan
 
     def for_model(self, model, like):
+        model.check_invertible_sigma(like)
         return self if self.density is not None else self.most_accurate(model, like)
 
     def most_accurate(self, model, like):

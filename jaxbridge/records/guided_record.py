@@ -15,6 +15,7 @@ from ..engine.lanes import over_lanes
 from ..engine.linalg import sum_of_many
 from ..engine.recursion import recursion
 from ..models.diffusion import Diffusion
+from ..schemes import solve_root
 from .guided_steps import (
     Guide,
     GuidedLaw,
@@ -22,13 +23,12 @@ from .guided_steps import (
     guided_start,
     guided_step,
     relative,
-    solve_law,
-    solve_root,
+    target_law,
 )
 from .information_filter import information_filter
 from .initial import calls_for_cover, initial_law, likeliest, log_ratio
 from .linearisation import LinearisedStep, extended_kalman_path, linear_step
-from .observation import Scalars
+from .observation import Row, Scalars
 from .problem import RecordProblem
 from .segments import at_every_step, flat, following, split_first
 from .tilted_step import NormalStep
@@ -57,21 +57,22 @@ class Guidance(NamedTuple):
 
 def guided(problem: RecordProblem, model: Diffusion, points: Float[Array, "points d"]) -> Guidance:
     """Linearised along these points."""
-    dynamics = model.forward(problem.like)
+    dynamics_at, record = model.forward_at(problem.like), problem.record.steps()
     initial = initial_law(problem.initial, model, problem.like)
     K, N = problem.num_segments, problem.num_steps
     of_segments = lambda leaf: leaf.reshape(K, N, *leaf.shape[1:])
     here, there = of_segments(points[:-1]), of_segments(points[1:])
 
-    def linear(point, next_point, dt):
-        return linear_step(problem.density, dynamics, point, next_point, dt)
+    def linear(point, next_point, step):
+        dynamics = dynamics_at(step.time)
+        return linear_step(problem.density, dynamics, point, next_point, step.dt)
 
-    steps = jax.vmap(jax.vmap(linear))(here, there, problem.record.dt)
+    steps = jax.vmap(jax.vmap(linear))(here, there, record)
     scalars = jax.vmap(relative)(problem.scalars(model), points[::N])
     first, rest = split_first(scalars)
     h = information_filter(steps, rest)
 
-    guides = Guide(here, h, there, following(h), problem.record.dt)
+    guides = Guide(here, h, there, following(h), record)
     h_first = jax.tree.map(lambda leaf: leaf[0, 0], h)
     start = guided_start(initial, first, points[0], h_first)
     return Guidance(initial, start, steps, guides, first, rest)
@@ -81,13 +82,13 @@ def path_and_log_weight(
     problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
     """The path that this noise makes, and its log weight: `noise[0]` makes x_0."""
-    density, dynamics = problem.density, model.forward(problem.like)
+    density, dynamics_at = problem.density, model.forward_at(problem.like)
     start = guide.start.point(noise[0])
     steps = flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
 
     def one(x, inputs):
         zeta, step, scalars = inputs
-        law = guided_step(density, dynamics, x, step, scalars)
+        law = guided_step(density, dynamics_at, x, step, scalars)
         return law.point(zeta), law.log_weight
 
     points, log_weights = recursion(one, start, (noise[1:], *steps))
@@ -112,7 +113,7 @@ def noise_and_log_weight(
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
     """The inverse of `path_and_log_weight`: noise that makes this path, where none moves it drawn
     afresh."""
-    density, dynamics = problem.density, model.forward(problem.like)
+    density, dynamics_at = problem.density, model.forward_at(problem.like)
     scalars = at_every_step(guide.scalars, problem.num_steps)
     hidden = jax.random.normal(key, (len(path), scalars.values.shape[1]), path.dtype)
     first = guide.start.noise(path[0], functools.partial(solve_root, guide.initial.root), hidden[0])
@@ -121,9 +122,9 @@ def noise_and_log_weight(
     fresh = jax.random.normal(jax.random.fold_in(key, 1), first.shape, path.dtype)
 
     def of_step(x, x_next, step, scalars, hidden):
-        law = density.steps_from(dynamics, x).law(step.dt)
+        law = target_law(density, dynamics_at, x, step.step)
         made = guided_law(law, x, step, scalars)
-        return made.noise(x_next, functools.partial(solve_law, law), hidden), made.log_weight
+        return made.noise(x_next, law.solve, hidden), made.log_weight
 
     steps = path[:-1], path[1:], flat(guide.steps), scalars, hidden[1:]
     zeta, log_weights = _of_each_step(of_step, *steps)
@@ -138,19 +139,19 @@ def corrections(
     """What the log weight of a path takes where observations are not of their guess, and the
     initial law is not normal."""
     each = jax.vmap(correction(problem, model))
-    at_observations = each(problem.record.values, path[:: problem.num_steps])
+    at_observations = each(problem.rows, path[:: problem.num_steps])
     return jnp.sum(at_observations) + log_ratio(problem.initial, model, guide.initial, path[0])
 
 
 def correction(
     problem: RecordProblem, model: Diffusion
-) -> Callable[[Float[Array, " m"], Float[Array, " d"]], Float[Array, ""]]:
+) -> Callable[[Row, Float[Array, " d"]], Float[Array, ""]]:
     """What the log weight takes where an observation is not of its guess, a function of it and of
     the state; NaN outside the state space, for of the last state no drift is asked."""
     inside = model.state_space()
 
-    def of(y, x):
-        value = problem.observation.correction(y, x, model.params)
+    def of(row, x):
+        value = problem.observation.correction(row, x, model.params)
         return value if inside is None else jnp.where(inside(x), value, jnp.nan)
 
     return of
@@ -169,10 +170,11 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     noise; both begin at a likely point where ν is not normal. Neither has derivatives."""
     model = without_derivatives(model)
     initial = initial_law(problem.initial, model, problem.like)
-    dynamics, scalars = model.forward(problem.like), problem.scalars(model)
+    dynamics_at, scalars = model.forward_at(problem.like), problem.scalars(model)
     begin = likeliest(problem.initial, model, initial, split_first(scalars)[0])
     first = initial._replace(mean=begin)
-    points = extended_kalman_path(problem.density, dynamics, first, problem.record.dt, scalars)
+    steps = problem.record.steps()
+    points = extended_kalman_path(problem.density, dynamics_at, first, steps, scalars)
     silence = jnp.zeros_like(points)
 
     @jax.jit  # for its shapes and in the loop traced once

@@ -14,23 +14,23 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..engine.linalg import dot, solve_lower
-from ..models.dynamics import Dynamics
-from ..schemes import AbstractStepDensity, StepLaw
-from .linearisation import root_of_law
+from ..engine.linalg import dot
+from ..models.dynamics import DynamicsAt
+from ..schemes import AbstractStepDensity, DegenerateLaw, StepLaw
 from .observation import Scalars
+from .record import Steps
 from .tilted_step import Information, NormalStep, Seen, Tilted, coordinates, given, tilted
 
 
 class Guide(NamedTuple):
     """What a step is guided by: ξ_i and h_i at its beginning, ξ_{i+1} and h_{i+1} at its end, and
-    its length."""
+    its length and time."""
 
     point: Float[Array, "d *lanes"]
     h: Information
     next_point: Float[Array, "d *lanes"]
     next_h: Information
-    dt: Float[Array, "*lanes"]
+    step: Steps
 
 
 class GuidedLaw(NamedTuple):
@@ -57,20 +57,6 @@ class GuidedLaw(NamedTuple):
         return self.tilted.noise(coordinates(displacement, self.seen, hidden[: len(self.seen)]))
 
 
-def solve_root(root: Float[Array, "d d"], displacement: Float[Array, " d"]) -> Float[Array, " d"]:
-    """Λ⁻¹ of a triangular Λ, and zero along what Λ does not move."""
-    still = jnp.diagonal(root) == 0
-    safe = root + jnp.diag(jnp.where(still, 1, 0).astype(root.dtype))
-    return jnp.where(still, 0, solve_lower(safe, displacement))
-
-
-def solve_law(law: StepLaw, displacement: Float[Array, " d"]) -> Float[Array, " d"]:
-    """Λ⁻¹ of the law of a step, zero of a step of length zero."""
-    moving = law.dt > 0
-    safe = law._replace(dt=jnp.where(moving, law.dt, 1))
-    return jnp.where(moving, safe.noise(safe.mean + displacement), 0)
-
-
 def relative(scalars: Scalars, point: Float[Array, " d"]) -> Scalars:
     """What is seen, counted from ξ."""
     at_point = jnp.stack([dot(row, point) for row in scalars.rows])
@@ -91,20 +77,27 @@ def guided_start(
 
 def guided_step(
     density: AbstractStepDensity,
-    dynamics: Dynamics,
+    dynamics_at: DynamicsAt,
     x: Float[Array, " d"],
     guide: Guide,
     scalars: Scalars | None,
 ) -> GuidedLaw:
     """The law of the step from x; `scalars` are seen at its end, counted from ξ_{i+1}."""
-    return guided_law(density.steps_from(dynamics, x).law(guide.dt), x, guide, scalars)
+    return guided_law(target_law(density, dynamics_at, x, guide.step), x, guide, scalars)
+
+
+def target_law(
+    density: AbstractStepDensity, dynamics_at: DynamicsAt, x: Float[Array, " d"], step: Steps
+) -> StepLaw | DegenerateLaw:
+    """The law of the target's step from x."""
+    return density.steps_from(dynamics_at(step.time), x).law(step.dt)
 
 
 def guided_law(
-    law: StepLaw, x: Float[Array, " d"], guide: Guide, scalars: Scalars | None
+    law: StepLaw | DegenerateLaw, x: Float[Array, " d"], guide: Guide, scalars: Scalars | None
 ) -> GuidedLaw:
     """The same, given the law of the target's step."""
-    step = NormalStep(law.mean - guide.next_point, root_of_law(law))
+    step = NormalStep(law.mean - guide.next_point, law.root)
     log_seen, seen = jnp.zeros((), x.dtype), []
     if scalars is not None:
         step, log_seen, seen = given(step, scalars)

@@ -13,11 +13,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..engine.linalg import cholesky, matmul, matvec
-from ..models.dynamics import Dynamics
-from ..schemes import AbstractStepDensity, StepLaw
+from ..engine.linalg import matmul, matvec
+from ..models.dynamics import Dynamics, DynamicsAt
+from ..schemes import AbstractStepDensity
 from .observation import Scalars
-from .segments import at_every_step, split_first
+from .record import Steps
+from .segments import at_every_step, flat, split_first
 from .tilted_step import NormalStep
 
 
@@ -27,16 +28,6 @@ class LinearisedStep(NamedTuple):
     decay: Float[Array, "d d"]
     shift: Float[Array, " d"]
     root: Float[Array, "d m"]
-
-
-def root_of_law(law: StepLaw) -> Float[Array, "d m"]:
-    """Λ of N(μ, δ σ S σᵀ) = N(μ, Λ Λᵀ)."""
-    moving = law.dt > 0  # √ has no derivative at zero, the length of steps beyond a record's end
-    length = jnp.where(moving, jnp.sqrt(jnp.where(moving, law.dt, 1)), 0)
-    root = law.sigma.as_matrix(law.mean.shape[0], law.mean.dtype) * length
-    if law.covariance.ndim == 0:
-        return root * jnp.sqrt(law.covariance)
-    return matmul(root, cholesky(law.covariance))
 
 
 def linear_step(
@@ -50,7 +41,7 @@ def linear_step(
     law = density.steps_from(dynamics, point).law(dt)
     F = jax.jacfwd(dynamics.drift)(point)
     decay = density.linear_step(F, jnp.zeros_like(F), dt).decay
-    return LinearisedStep(decay, law.mean - next_point, root_of_law(law))
+    return LinearisedStep(decay, law.mean - next_point, law.root)
 
 
 def filtered(
@@ -69,17 +60,17 @@ def filtered(
 
 def extended_kalman_path(
     density: AbstractStepDensity,
-    dynamics: Dynamics,
+    dynamics_at: DynamicsAt,
     initial: NormalStep,
-    dt: Float[Array, "K N"],
+    steps: Steps,
     scalars: Scalars,
 ) -> Float[Array, "points d"]:
     """The means of the extended Kalman filter, where these are finite, else the last ones that
     are."""
 
     def step(state, inputs):
-        (mean, covariance), (dt, seen) = state, inputs
-        law = linear_step(density, dynamics, mean, jnp.zeros_like(mean), dt)
+        (mean, covariance), ((dt, time), seen) = state, inputs
+        law = linear_step(density, dynamics_at(time), mean, jnp.zeros_like(mean), dt)
         spread = matmul(law.root, law.root.T)
         moved = matmul(matmul(law.decay, covariance), law.decay.T) + spread
         before = _finite((law.shift, moved), state)
@@ -88,7 +79,7 @@ def extended_kalman_path(
     mean, root = initial
     first, rest = split_first(scalars)
     state = filtered(mean, matmul(root, root.T), first)
-    inputs = dt.reshape(-1), at_every_step(rest, dt.shape[1])
+    inputs = flat(steps), at_every_step(rest, steps.dt.shape[1])
     (last, _), means = lax.scan(step, state, inputs)
     return jnp.concatenate([means, last[None]])
 

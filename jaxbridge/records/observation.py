@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import dot, safe_norm
 from ..models.diffusion import check_value
+from ..models.tracing import takes_time
 
 
 class Scalars(NamedTuple):
@@ -31,6 +32,13 @@ class Scalars(NamedTuple):
     seen: Bool[Array, " m"]
 
 
+class Row(NamedTuple):
+    """What is seen at one time: y, NaN where nothing is, and the time."""
+
+    y: Float[Array, "m *lanes"]
+    time: Float[Array, "*lanes"]
+
+
 class LinearGaussian(eqx.Module):
     """Linear observations with normal noise: y = L x + N(0, R).
 
@@ -41,7 +49,8 @@ class LinearGaussian(eqx.Module):
 
     - `matrix`: L, shape (m, d); `None` for all of the state.
     - `covariance`: R, shape (m, m); (m,) for its diagonal; () for a multiple of I; or a function
-        `params -> R` of the model's parameters, where it is unknown. In units of y, squared.
+        `params -> R` of the model's parameters, where it is unknown, or `(params, t)`, of time
+        as well. In units of y, squared.
 
     **Raises:** `ValueError` and `TypeError` for a matrix or a covariance that cannot be.
 
@@ -75,9 +84,17 @@ class LinearGaussian(eqx.Module):
         """By what paths are guided: itself."""
         return self
 
-    def covariance_for(self, params: PyTree, m: int, dtype) -> Float[Array, "m m"]:
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether R does."""
+        return takes_time(self._function, 1)
+
+    def covariance_for(self, params: PyTree, m: int, time: Float[Array, ""]) -> Float[Array, "m m"]:
         """R as a matrix."""
-        value = self.covariance if self._function is None else jnp.asarray(self._function(params))
+        value, dtype = self.covariance, time.dtype
+        if self._function is not None:
+            arguments = (params, time) if self.depends_on_time else (params,)
+            value = jnp.asarray(self._function(*arguments))
         assert value is not None
         if value.shape not in ((), (m,), (m, m)):
             raise ValueError(
@@ -93,8 +110,9 @@ class LinearGaussian(eqx.Module):
             return jnp.eye(d, dtype=dtype)
         return self.matrix.astype(dtype)
 
-    def check(self, d: int, m: int, like: Array, params: PyTree) -> None:
-        """Raise `ValueError` where observations of m components of a state of d do not fit."""
+    def check(self, m: int, like: Array, time: Float[Array, ""], params: PyTree) -> None:
+        """Raise `ValueError` where observations of m components of a state do not fit."""
+        (d,) = like.shape
         rows = d if self.matrix is None else self.matrix.shape[0]
         if self.matrix is not None and self.matrix.shape[1] != d:
             raise ValueError(
@@ -106,7 +124,7 @@ class LinearGaussian(eqx.Module):
                 f"`observations` must have {rows} components, as many as the observation of the "
                 f"state has; got {m}."
             )
-        matrix, R = self.matrix_for(d, m, like.dtype), self.covariance_for(params, m, like.dtype)
+        matrix, R = self.matrix_for(d, m, like.dtype), self.covariance_for(params, m, time)
         if is_traced(matrix, R):
             return
         _check_covariance(R)
@@ -119,11 +137,12 @@ class LinearGaussian(eqx.Module):
                 "variance of their own."
             )
 
-    def scalars(self, y: Float[Array, " m"], params: PyTree, d: int) -> Scalars:
-        """The same as independent numbers."""
+    def scalars(self, row: Row, params: PyTree, d: int) -> Scalars:
+        """What is seen, as independent numbers."""
+        y, time = row
         m, seen = y.shape[0], jnp.isfinite(y)
         rows = jnp.where(seen[:, None], self.matrix_for(d, m, y.dtype), 0)
-        R = self.covariance_for(params, m, y.dtype)
+        R = self.covariance_for(params, m, time)
         R = jnp.where(seen[:, None] & seen, R, 0)
         made, sizes, possible = _independent(Scalars(rows, jnp.where(seen, y, 0), R, seen))
         follows, agrees = _follows(made, sizes)
@@ -139,7 +158,7 @@ class LinearGaussian(eqx.Module):
         explained = possible & jnp.all(agrees)
         return jax.tree.map(lambda a, b: jnp.where(explained, a, b), made, never)
 
-    def correction(self, y, x, params):
+    def correction(self, row, x, params):
         """log g - log of its guess: nothing."""
         return jnp.zeros((), x.dtype)
 
@@ -150,8 +169,8 @@ class ObservationDensity(eqx.Module):
     **Arguments:**
 
     - `log_density`: log g, a function `(y, x, params) -> ()` of an observation, shape (m,), a
-        state, shape (d,), and the model's parameters. A row with a NaN in every component was not
-        seen; one with some reaches the function as it is.
+        state, shape (d,), and the model's parameters; or `(y, x, params, t)`, of time as well. A
+        row with a NaN in every component was not seen; one with some reaches the function as it is.
     - `guess`: a `LinearGaussian` like it, with positive variances, by which paths are guided. The
         law does not depend on it, but how many paths count does.
 
@@ -184,23 +203,25 @@ class ObservationDensity(eqx.Module):
         """By what paths are guided."""
         return self.guess
 
-    def check(self, d: int, m: int, like: Array, params: PyTree) -> None:
-        """Raise `ValueError` where observations of m components of a state of d do not fit."""
-        self.guess.check(d, m, like, params)
-        _check_positive(self.guess.covariance_for(params, m, like.dtype))
+    def check(self, m: int, like: Array, time: Float[Array, ""], params: PyTree) -> None:
+        """Raise `ValueError` where observations of m components of a state do not fit."""
+        self.guess.check(m, like, time, params)
+        _check_positive(self.guess.covariance_for(params, m, time))
 
-    def scalars(self, y: Float[Array, " m"], params: PyTree, d: int) -> Scalars:
+    def scalars(self, row: Row, params: PyTree, d: int) -> Scalars:
         """The guess, as independent numbers."""
-        return self.guess.scalars(y, params, d)
+        return self.guess.scalars(row, params, d)
 
-    def correction(
-        self, y: Float[Array, " m"], x: Float[Array, " d"], params: PyTree
-    ) -> Float[Array, ""]:
+    def correction(self, row: Row, x: Float[Array, " d"], params: PyTree) -> Float[Array, ""]:
         """log g(y | x) - log of the guess."""
+        y, time = row
         seen = jnp.any(jnp.isfinite(y))
         shown = jnp.where(seen, y, jnp.zeros_like(y))
-        true = check_value("log_density", self._log_density(shown, x, params), (), x)
-        guess = log_density_of(self.scalars(y, params, x.shape[0]), x)
+        arguments = (shown, x, params)
+        if takes_time(self._log_density, 3):
+            arguments = (*arguments, time)
+        true = check_value("log_density", self._log_density(*arguments), (), x)
+        guess = log_density_of(self.scalars(row, params, x.shape[0]), x)
         return jnp.where(seen, true - guess, 0)
 
 

@@ -34,7 +34,7 @@ from .initial import Initial, calls_for_cover, log_ratio
 from .observation import Observation
 from .problem import RecordProblem
 from .record import of_each, split_records
-from .segments import split_last
+from .segments import split_first, split_last
 from .several import Records, as_record_problems
 
 # Particles are resampled where fewer than this share of them count.
@@ -309,8 +309,9 @@ def run_filters(
     """R filters of P particles. Steps that are known not to be `moving`, whatever the record, take
     no time."""
     R, P = size
-    d, dtype, values = problem.dim, problem.like.dtype, problem.record.values
-    density, dynamics = problem.density, model.forward(problem.like)
+    d, dtype = problem.dim, problem.like.dtype
+    first_row, rows = split_first(problem.rows)
+    density, dynamics_at = problem.density, model.forward_at(problem.like)
     corrected = jax.vmap(correction(problem, model), in_axes=(None, -1))
     most = 0.01 / jnp.finfo(dtype).eps
 
@@ -330,7 +331,7 @@ def run_filters(
 
     def moved(x, zeta, step, scalars):
         def of_particle(x, zeta):
-            law = guided_step(density, dynamics, x, step, scalars)
+            law = guided_step(density, dynamics_at, x, step, scalars)
             return law.point(zeta), law.log_weight
 
         return over_lanes(-1, -1)(of_particle)(x, zeta)
@@ -347,21 +348,21 @@ def run_filters(
         return lax.cond(moves, taken, lambda *state: state, *state), None
 
     def segment(state: _Particles, inputs):
-        number, steps, scalars, y = inputs
+        number, steps, scalars, row = inputs
         noise_key, resampling_key = jax.random.split(jax.random.fold_in(key, number))
         noise = jax.random.normal(noise_key, (problem.num_steps, d, R * P), dtype)
         before, (zeta, last, _) = split_last((noise, steps, moving))
         (x, change), _ = lax.scan(one, (state.x, jnp.zeros(R * P, dtype)), before)
         x, final = moved(x, zeta, last, scalars)
-        change = change + final + corrected(y, x)
+        change = change + final + corrected(row, x)
         return weighed(state._replace(x=x), resampling_key, change)
 
     start_key, resampling_key = jax.random.split(jax.random.fold_in(key, 0))
     x, change = _starts(start_key, problem, model, guide, R, P)
     alike, zero = jnp.zeros((R, P), dtype), jnp.zeros(R, dtype)
     state = _Particles(x, alike, zero, jnp.zeros(R, jnp.int32))
-    state, first = weighed(state, resampling_key, change + corrected(values[0], x))
-    inputs = (1 + jnp.arange(problem.num_segments), guide.steps, guide.scalars, values[1:])
+    state, first = weighed(state, resampling_key, change + corrected(first_row, x))
+    inputs = (1 + jnp.arange(problem.num_segments), guide.steps, guide.scalars, rows)
     state, sizes = lax.scan(segment, state, inputs)
     log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
     sizes = jnp.concatenate([first[None], sizes]).T

@@ -33,13 +33,15 @@ from ..engine.lanes import over_lanes
 from ..engine.linalg import matvec
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
+from ..schemes import solve_root
 from .guided_record import Guidance, correction
-from .guided_steps import Guide, guided_law, guided_start, solve_law, solve_root
+from .guided_steps import Guide, guided_law, guided_start, target_law
 from .information_filter import information_filter
 from .initial import log_ratio
 from .linearisation import LinearisedStep
-from .observation import Scalars
+from .observation import Row, Scalars
 from .problem import RecordProblem
+from .record import Steps
 from .segments import flat, following, split_last
 from .tilted_step import NormalStep
 
@@ -79,8 +81,8 @@ class Blocks(NamedTuple):
 
     - `segment`: which segments the blocks are made of, -1 before the record and K after it.
     - `guides`: of all steps, leading axes (J, N), to the end ξ.
-    - `scalars`, `values`: what is seen at the ends of segments, leading axis J.
-    - `first`, `first_value`, `root`: what is seen of x_0, and the root of its law; of other blocks
+    - `scalars`, `rows`: what is seen at the ends of segments, leading axis J.
+    - `first`, `first_row`, `root`: what is seen of x_0, and the root of its law; of other blocks
         nothing, and zero. `mean`: that of the law of x_0, shape (d,).
     - `goes_on`: after which of them there is more of the record.
     """
@@ -88,9 +90,9 @@ class Blocks(NamedTuple):
     segment: Int[Array, "J B"]
     guides: GuidesToEnds
     scalars: Scalars
-    values: Float[Array, "J m B"]
+    rows: Row
     first: Scalars
-    first_value: Float[Array, "m B"]
+    first_row: Row
     root: Float[Array, "d d B"]
     mean: Float[Array, " d"]
     goes_on: Bool[Array, " B"]
@@ -135,8 +137,10 @@ def blocks_of(
     edge = np.where(segment < 0, 0, K * N)[:, None]
     here = points[np.where(outside[:, None], edge, number)]  # (J, N, B, d)
     there = points[np.where(outside[:, None], edge, number + 1)]
-    dt = jnp.where(outside[:, None], 0, problem.record.dt.reshape(-1)[number])
-    still = LinearisedStep(jnp.eye(d, dtype=dt.dtype), *2 * [jnp.zeros((), dt.dtype)])
+    lengths = jax.tree.map(lambda leaf: leaf.reshape(-1)[number], problem.record.steps())
+    lengths = lengths._replace(dt=jnp.where(outside[:, None], 0, lengths.dt))
+    dtype = points.dtype
+    still = LinearisedStep(jnp.eye(d, dtype=dtype), *2 * [jnp.zeros((), dtype)])
     steps = jax.tree.map(
         lambda leaf, none: jnp.where(
             outside.reshape(len(outside), 1, -1, *(leaf.ndim - 1) * [1]), none, leaf[number]
@@ -167,19 +171,22 @@ def blocks_of(
     lanes_last = lambda tree, axis: jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), tree)
     is_first = np.arange(segment.shape[1]) == 0
     at_end = np.where(outside, 0, inside + 1)
-    values = jnp.where(outside[..., None], jnp.nan, problem.record.values[at_end])
+    values, times = problem.rows
+    rows = Row(jnp.where(outside[..., None], jnp.nan, values[at_end]), times[at_end])
+    lane_times = jnp.broadcast_to(times[0], is_first.shape)
+    first_row = Row(jnp.where(is_first, values[0][:, None], jnp.nan), lane_times)
     # Whether a segment has a length, or one that comes after it.
     after = jnp.cumsum(has_length(problem)[::-1])[::-1] > 0
     goes_on = jnp.append(after[1:], False)[inside[-1]]
     scalars = lanes_last(seen(at_end, outside), 1)
-    along = lanes_last(here, 2), lanes_last(there, 2), dt
+    along = lanes_last(here, 2), lanes_last(there, 2), lengths
     return Blocks(
         jnp.asarray(segment),
         _guides_to_ends(lanes_last(steps, 2), scalars, goes_on, *along),
         scalars,
-        lanes_last(values, 1),
+        lanes_last(rows, 1),
         lanes_last(seen(np.zeros(len(is_first), int), ~is_first), 0),
-        jnp.where(is_first, problem.record.values[0][:, None], jnp.nan),
+        first_row,
         jnp.where(is_first, guide.initial.root[..., None], 0),
         guide.initial.mean,
         goes_on,
@@ -276,7 +283,7 @@ def _guides_to_ends(
     goes_on: Bool[Array, " B"],
     points: Float[Array, "J N d B"],
     next_points: Float[Array, "J N d B"],
-    dt: Float[Array, "J N B"],
+    lengths: Steps,
 ) -> GuidesToEnds:
     """By the filter to the end 0; and side by side to each of the unit vectors, with all else that
     r is made of zero, for T."""
@@ -291,7 +298,7 @@ def _guides_to_ends(
     each = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], B, d + 1), h)
     zero = jax.tree.map(lambda leaf: leaf[..., 0], each)
     turn = jnp.moveaxis(each.shift[..., 1:], -1, 2)
-    guide = Guide(points, zero, next_points, following(zero), dt)
+    guide = Guide(points, zero, next_points, following(zero), lengths)
     return GuidesToEnds(guide, turn, following(turn))
 
 
@@ -330,7 +337,7 @@ def _new_starts(
 
     def log_weight(x):
         ratio = jnp.where(lanes.is_first, jax.vmap(of_law, in_axes=-1)(x), 0)
-        return log_start + corrected(blocks.first_value, x) + ratio
+        return log_start + corrected(blocks.first_row, x) + ratio
 
     return _State(lanes.start, new, log_weight(lanes.start), log_weight(new))
 
@@ -345,15 +352,15 @@ def _new_points(
 ) -> tuple[_State, Float[Array, "J N d lanes"]]:
     """The rest of the new paths, and the weights of both."""
     spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
-    density, dynamics = problem.density, model.forward(problem.like)
+    density, dynamics_at = problem.density, model.forward_at(problem.like)
     nothing, corrected = _no_noise(blocks), _corrections(problem, model, spread)
 
     def step_of(old, new, old_next, eta, step, end, scalars, rho, beta):
         guide = step.to(end)
-        law = density.steps_from(dynamics, old).law(guide.dt)
+        law = target_law(density, dynamics_at, old, guide.step)
         here = guided_law(law, old, guide, scalars)
-        zeta = here.noise(old_next, functools.partial(solve_law, law), nothing)
-        law = density.steps_from(dynamics, new).law(guide.dt)
+        zeta = here.noise(old_next, law.solve, nothing)
+        law = target_law(density, dynamics_at, new, guide.step)
         there = guided_law(law, new, guide, scalars)
         return there.point(_turned(zeta, eta, rho, beta)), here.log_weight, there.log_weight
 
@@ -370,20 +377,20 @@ def _new_points(
         return state, state.new
 
     def segment(state, inputs):
-        number, old, guides, scalars, y = inputs
+        number, old, guides, scalars, row = inputs
         eta = jax.random.normal(jax.random.fold_in(key, number), old.shape, old.dtype)
         plain, (old_last, eta_last, guide_last) = split_last((old, eta, guides))
         state, path = lax.scan(one, state, plain)
         state = advance(state, old_last, eta_last, guide_last, scalars)
         # What is seen at a pinned end weighs both paths alike.
         state = state._replace(
-            log_old=state.log_old + corrected(y, state.old),
-            log_new=state.log_new + corrected(y, state.new),
+            log_old=state.log_old + corrected(row, state.old),
+            log_new=state.log_new + corrected(row, state.new),
         )
         return state, jnp.concatenate([path, state.new[None]])
 
     numbers = jnp.arange(len(lanes.old))
-    inputs = (numbers, lanes.old, blocks.guides, lanes.scalars, blocks.values)
+    inputs = (numbers, lanes.old, blocks.guides, lanes.scalars, blocks.rows)
     return lax.scan(segment, first, inputs)
 
 
@@ -399,15 +406,15 @@ def _turned(zeta, eta, rho, beta):
 
 def _no_noise(blocks: Blocks) -> Float[Array, " n"]:
     """In the place of noise that does not move a path: it stays apart from all that does."""
-    return jnp.zeros(blocks.first.values.shape[0], blocks.guides.guide.dt.dtype)
+    return jnp.zeros(blocks.first.values.shape[0], blocks.mean.dtype)
 
 
 def _corrections(
     problem: RecordProblem, model: Diffusion, spread: Callable[[PyTree], PyTree]
-) -> Callable[[Float[Array, "m B"], Float[Array, "d lanes"]], Float[Array, " lanes"]]:
+) -> Callable[[Row, Float[Array, "d lanes"]], Float[Array, " lanes"]]:
     """Of what blocks saw, and the states of their lanes."""
     each = jax.vmap(correction(problem, model), in_axes=-1)
-    return lambda y, x: each(spread(y), x)
+    return lambda row, x: each(spread(row), x)
 
 
 def blocks_of_both_cuts(

@@ -11,7 +11,7 @@ from ..engine.checks import Numbers, is_traced
 from ..models.diffusion import Diffusion, check_diffusion
 from ..schemes import AbstractStepDensity, check_step_density, most_accurate_density
 from .initial import Initial, as_initial, bound, check_initial
-from .observation import LinearGaussian, Observation, Scalars, check_observation
+from .observation import LinearGaussian, Observation, Row, Scalars, check_observation
 from .record import Record, as_records, split_records
 
 # Beyond twice as many, how many dimensions a state may have that are tried for what to say.
@@ -42,10 +42,15 @@ class RecordProblem(eqx.Module):
         """A point, of which only shape and dtype count."""
         return jnp.zeros(self.dim, self.record.dt.dtype)
 
-    def scalars(self, model: Diffusion) -> Scalars:
+    @property
+    def rows(self) -> Row:
         """What is seen at the ends of segments, with a leading axis K + 1."""
-        of_one = lambda y: self.observation.scalars(y, model.params, self.dim)
-        return jax.vmap(of_one)(self.record.values)
+        return Row(self.record.values, self.record.times)
+
+    def scalars(self, model: Diffusion) -> Scalars:
+        """The same as independent numbers."""
+        of_one = lambda row: self.observation.scalars(row, model.params, self.dim)
+        return jax.vmap(of_one)(self.rows)
 
 
 def as_record_problem(
@@ -95,7 +100,7 @@ def problem_of(
     dim = m if guess.matrix is None else guess.matrix.shape[1]
     like = jnp.zeros(dim, record.values.dtype)
     _check_dimension(model, guess, like)
-    observation.check(dim, m, like, model.params)
+    observation.check(m, like, record.times[0], model.params)
     if initial is None:
         if not model.has_density:
             raise ValueError(
@@ -144,14 +149,14 @@ def _has_dimension(model: Diffusion, like: Float[Array, " d"]) -> bool:
     """Whether points like this one are states of the model."""
 
     def coefficients(model, x):
-        dynamics = model.forward(x)
+        dynamics = model.forward_at(x)(jnp.zeros((), x.dtype))
         return dynamics.drift(x), dynamics.sigma(x).as_matrix(len(x), x.dtype)
 
     try:
         _, sigma = jax.eval_shape(coefficients, model, like)
     except Exception:  # whatever functions of the user's raise
         return False
-    return sigma.shape == 2 * like.shape
+    return sigma.shape[0] == like.shape[0]
 
 
 def check_domain(model: Diffusion, observation: Observation, record: Record) -> None:
@@ -160,11 +165,14 @@ def check_domain(model: Diffusion, observation: Observation, record: Record) -> 
     is_inside = model.state_space()
     if is_inside is None or not isinstance(observation, LinearGaussian):
         return
+    if observation.depends_on_time:
+        return
     d, seen = record.values.shape[-1], record.values[record.which]
     if is_traced(model, observation, seen):
         return
     matrix = np.asarray(observation.matrix_for(d, d, seen.dtype), float)
-    R = np.asarray(observation.covariance_for(model.params, d, seen.dtype))
+    at = record.times[0]
+    R = np.asarray(observation.covariance_for(model.params, d, at))
     if matrix.shape != (d, d) or np.any(R):
         return
     whole = np.all(np.isfinite(np.asarray(seen)), axis=1)

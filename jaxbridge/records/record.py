@@ -6,7 +6,7 @@ every record is K segments of N steps, whatever its times, and one program.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,6 +28,14 @@ from ..engine.compiled import compiled
 
 # What the end of a segment costs, in steps.
 _STEPS_PER_SEGMENT = 4
+
+
+class Steps(NamedTuple):
+    """Of steps, their lengths δ, and the times at their middles, where coefficients that depend on
+    time are taken."""
+
+    dt: Float[Array, "*steps"]
+    time: Float[Array, "*steps"]
 
 
 class Record(eqx.Module):
@@ -56,8 +64,15 @@ class Record(eqx.Module):
 
     def grid(self) -> Float[Array, " points"]:
         """The times of all points."""
-        within = jnp.cumsum(self.dt, axis=1) - self.dt
-        return jnp.append((self.times[:-1, None] + within).ravel(), self.times[-1])
+        return jnp.append(self._beginnings().ravel(), self.times[-1])
+
+    def steps(self) -> Steps:
+        """All steps, shape (K, N)."""
+        return Steps(self.dt, self._beginnings() + self.dt / 2)
+
+    def _beginnings(self) -> Float[Array, "K N"]:
+        """The times at which steps begin."""
+        return self.times[:-1, None] + jnp.cumsum(self.dt, axis=1) - self.dt
 
     def coarsened(self, level: int = 1) -> "Record":
         """The same with steps that are 2^level as long, the first of a segment what is left of N,

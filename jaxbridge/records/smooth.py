@@ -282,13 +282,15 @@ def _log_halving(
 ) -> Float[Array, "chains n"]:
     """D of each path: each segment is one of its own, for pairs of steps do not reach beyond."""
     (K, N), d, chains = problem.record.dt.shape, problem.dim, paths.shape[0]
-    dynamics = problem.model.forward(problem.like)
-    dt = jnp.tile(problem.record.dt, (chains, 1)).T
+    dynamics = problem.model.forward_at(problem.like)
+    dt, time = (jnp.tile(leaf, (chains, 1)).T for leaf in problem.record.steps())
+    if not problem.model.depends_on_time:
+        dynamics, time = dynamics(None), None
     place = jnp.arange(K)[:, None] * N + jnp.arange(N + 1)
 
     def of_draw(path):
         segments = path[:, place].reshape(chains * K, N + 1, d)
-        each = log_halving_of_paths(problem.density, dynamics, dt, segments)
+        each = log_halving_of_paths(problem.density, dynamics, dt, segments, time)
         return jnp.sum(each.reshape(chains, K), axis=1)
 
     return lax.map(of_draw, jnp.moveaxis(paths, 1, 0)).T

@@ -17,6 +17,7 @@ from .cover import cover, covered_start
 from .guided_record import correction, guided
 from .initial import calls_for_cover, log_ratio
 from .problem import RecordProblem
+from .segments import split_first
 
 _NUM_DRAWS = 1024
 
@@ -38,7 +39,7 @@ def start_share(
     zeta = jax.random.normal(jax.random.key(0), (problem.dim, _NUM_DRAWS), dtype)
 
     def both(x):
-        seen = of_first(problem.record.values[0], x)
+        seen = of_first(split_first(problem.rows)[0], x)
         to_cover = log_nu(x) - law.log_density(x) + start.log_weight
         to_normal = log_ratio(problem.initial, model, guide.initial, x) + guide.start.log_weight
         return proper(seen + to_cover), proper(seen + to_normal)

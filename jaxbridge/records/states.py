@@ -96,14 +96,14 @@ class StateSampler(eqx.Module):
 
     def log_target(self, x: Float[Array, "C ends d"]) -> Float[Array, "C ends"]:
         """log g(y_k|x_k), and of the first state its law."""
-        problem, values = self.problem, self.problem.record.values
+        problem = self.problem
         corrected = correction(problem, problem.model)
 
-        def seen(scalars, y, x):
-            return log_density_of(scalars, x) + corrected(y, x)
+        def seen(scalars, row, x):
+            return log_density_of(scalars, x) + corrected(row, x)
 
         of_chain = jax.vmap(seen)
-        logs = jax.vmap(lambda x: of_chain(self.scalars, values, x))(x)
+        logs = jax.vmap(lambda x: of_chain(self.scalars, problem.rows, x))(x)
         law = bound(problem.initial, problem.model)
         if isinstance(law, Stationary):
             logs = logs.at[:, 0].add(jax.vmap(self.model.log_stationary)(x[:, 0]))

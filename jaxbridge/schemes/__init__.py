@@ -5,10 +5,11 @@ points lies for that noise, by the direction u and the length of σ(x')⁻¹(x -
 Schemes are `euler` and `milstein`, `heun` of second order for constant σ, `semi_implicit` for stiff
 drift, and for a linear one its own transition (`gaussian_transition`); whether scheme, model and
 points fit is checked (`fit`); by default it is the one that the scene calls for
-(`heun_or_euler`). The density of a step, N(μ(x), δ σ S σᵀ) (`step_density`), makes the
-likelihood of a path, Σ log q(x_i, x_{i+1}) (`path_likelihood`). The same of every other point says
-what half as many steps would give (`halving`), and so how far N steps are from the limit
-(`step_error`); or estimates on coarser and coarser grids do (`coarse_grids`).
+(`heun_or_euler`). The density of a step (`step_density`), a normal law N(μ(x), δ σ S σᵀ), which is
+singular where noise does not reach the whole state (`step_law`), makes the likelihood of a path,
+Σ log q(x_i, x_{i+1}) (`path_likelihood`). The same of every other point says what half as many
+steps would give (`halving`), and so how far N steps are from the limit (`step_error`); or estimates
+on coarser and coarser grids do (`coarse_grids`).
 """
 
 # What the folders above use of this one.
@@ -52,7 +53,6 @@ from .step_density import (
     AbstractStepDensity as AbstractStepDensity,
     EulerDensity as EulerDensity,
     ItoTaylorDensity as ItoTaylorDensity,
-    StepLaw as StepLaw,
     check_step_density as check_step_density,
     most_accurate_density as most_accurate_density,
 )
@@ -65,4 +65,9 @@ from .step_error import (
     is_gross as is_gross,
     share_of_known_order as share_of_known_order,
     share_of_order as share_of_order,
+)
+from .step_law import (
+    DegenerateLaw as DegenerateLaw,
+    StepLaw as StepLaw,
+    solve_root as solve_root,
 )

@@ -27,9 +27,8 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..engine.lanes import over_lanes
-from ..engine.linalg import matmul, matvec
-from ..models.dynamics import Dynamics
-from .step_density import AbstractStepDensity, StepLaw
+from ..models.dynamics import Dynamics, DynamicsAt
+from .step_density import AbstractStepDensity
 
 # D is worked out for one in so many paths, but for so many at least.
 _LOOKED_SHARE, _LOOKED_SHARE_WHERE_SIGMA_VARIES, _FEWEST_LOOKED = 32, 2, 64
@@ -37,28 +36,28 @@ _LOOKED_SHARE, _LOOKED_SHARE_WHERE_SIGMA_VARIES, _FEWEST_LOOKED = 32, 2, 64
 
 def log_halving_of_pair(
     density: AbstractStepDensity,
-    dynamics: Dynamics,
+    dynamics: Dynamics | tuple[Dynamics, Dynamics, Dynamics],
     points: tuple[Float[Array, " d"], Float[Array, " d"], Float[Array, " d"]],
     dt: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> Float[Array, ""]:
-    """The part of D of a pair of steps of these lengths, through x, x' and x''."""
+    """The part of D of a pair of steps of these lengths, through x, x' and x''. Where coefficients
+    depend on time there are those of both steps together, of the first, and of the second."""
     (x, middle, x_next), (first, second) = points, dt
-    steps, law = density.steps_from(dynamics, x), density.steps_from(dynamics, middle).law(second)
-    twice, once, again = steps.law(first + second), steps.law(first), steps.law(second)
-    sigma, decay = again.sigma, steps.decay(second)
-
-    def carried(to):
-        """By how much further the second step leads, if the drift is linear, for this x'."""
-        return sigma.mv(matvec(decay, sigma.solve(to - x)))
-
-    covariance = first * matmul(matmul(decay, once.matrix), decay.T)
-    covariance = (covariance + second * again.matrix) / (first + second)
-    both = StepLaw(again.mean + carried(once.mean), sigma, covariance, first + second)
-    linear = again._replace(mean=again.mean + carried(middle))
+    if isinstance(dynamics, Dynamics):
+        steps = 3 * (density.steps_from(dynamics, x),)
+        law = density.steps_from(dynamics, middle).law(second)
+    else:
+        steps = [density.steps_from(each, x) for each in dynamics]
+        law = density.steps_from(dynamics[2], middle).law(second)
+    twice, once, again = steps[0].law(first + second), steps[1].law(first), steps[2].law(second)
+    # If the drift were linear, the law of both steps, and of the second from x'.
+    decay = steps[2].decay(second)
+    both = again.after(once, decay, x)
+    linear = again._replace(mean=again.mean + again.carried(decay, middle - x))
     value = twice.log_relative(x_next) - both.log_relative(x_next)
     value += linear.log_relative(x_next) - law.log_relative(x_next)
-    if dynamics.sigma_varies:
-        value += law.sigma.log_abs_det() - sigma.log_abs_det()
+    if not isinstance(dynamics, Dynamics) or dynamics.sigma_varies:
+        value += law.log_scale - linear.log_scale + both.log_scale - twice.log_scale
     return value
 
 
@@ -75,18 +74,25 @@ def log_halving_of_all_steps(
 
 def log_halving_of_paths(
     density: AbstractStepDensity,
-    dynamics: Dynamics,
+    dynamics: Dynamics | DynamicsAt,
     dt: Float[Array, "N P"],
     paths: Float[Array, "P points d"],
+    time: Float[Array, "N P"] | None = None,
 ) -> Float[Array, " P"]:
-    """D of given paths, with the lengths of their steps in the columns of `dt`."""
+    """D of given paths, with the lengths of their steps in the columns of `dt`; where coefficients
+    depend on time, there are those at a time, and `time` at the middles of steps."""
     num_steps, num_pairs = dt.shape[0], dt.shape[0] // 2
     if num_pairs == 0:
         return jnp.full(paths.shape[0], jnp.nan, paths.dtype)
     points = lax.optimization_barrier(jnp.moveaxis(paths, (0, 1), (-1, -2)))
 
-    def one(x, middle, x_next, first, second):
-        return log_halving_of_pair(density, dynamics, (x, middle, x_next), (first, second))
+    def one(x, middle, x_next, first, second, *times):
+        points, dt = (x, middle, x_next), (first, second)
+        if isinstance(dynamics, Dynamics):
+            return log_halving_of_pair(density, dynamics, points, dt)
+        early, late = times
+        each = dynamics(early + second / 2), dynamics(early), dynamics(late)
+        return log_halving_of_pair(density, each, points, dt)
 
     def every_other(leaf, shift):
         leaf = leaf[..., shift : shift + 2 * num_pairs : 2, :][..., :num_pairs, :]
@@ -95,7 +101,10 @@ def log_halving_of_paths(
     pairs = [every_other(points, shift) for shift in (0, 1)]
     pairs.append(every_other(points[:, 2:], 0))
     steps = [every_other(dt, shift) for shift in (0, 1)]
-    parts = over_lanes(-1, -1, -1, -1, -1)(one)(*pairs, *steps)
+    if time is not None:
+        steps += [every_other(time, shift) for shift in (0, 1)]
+    lanes = *pairs, *steps
+    parts = over_lanes(*len(lanes) * [-1])(one)(*lanes)
     log_halving = jnp.sum(parts.reshape(num_pairs, -1), axis=0)
     return log_halving_of_all_steps(log_halving, num_steps)
 

@@ -148,6 +148,7 @@ def log_likelihoods(
     """Those of P paths, with steps δ in the columns of `steps`."""
     like = paths[0, 0]
     model = model.prepared()
+    model.check_invertible_sigma(like)
     dynamics, form = model.forward(like), _form(model, like, form)
     # (d, K+1, P), written out: loops over lanes that are not adjacent would not vectorise.
     points = lax.optimization_barrier(jnp.moveaxis(paths, (0, 1), (-1, -2)))

@@ -14,11 +14,21 @@ coordinates of the noise, with β = σ⁻¹α and A = ∇β, the first terms of 
     x + βδ + ½δ² (Aβ + ½Δβ) + ∫_0^δ [I + (δ-s) A] dW_s,
 
 with S = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ ≥ ¼ I however long the step, and O(δ²) away from p_T.
+
+Noise that reaches only a part of the state, σ of fewer columns than rows, comes to the rest by way
+of the drift. Euler's step moves nothing else than that part. The expansion is the same, in the
+coordinates of the state: with F = ∇α its noise is
+
+    ∫_0^δ [I + (δ-s) F] σ dW_s = √δ (σ + ½δ Fσ) ζ_1 + δ^{3/2} / √12 Fσ ζ_2,    ζ ~ N(0, I),
+
+the strong scheme of order 1.5 (Kloeden & Platen, section 10.4; for hypoelliptic diffusions
+Ditlevsen & Samson 2019). Where coefficients depend on time they are taken in the middle of a step,
+which keeps both orders.
 """
 
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,69 +36,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..engine.linalg import cholesky, dot, matmul, matvec, quadratic_form, solve_lower, total
+from ..engine.linalg import matmul, semidefinite_factor, total
 from ..models.dynamics import Dynamics
 from ..models.sigma import AbstractSigma
-
-
-class StepLaw(NamedTuple):
-    """N(μ, δ σ S σᵀ), the law of a step from one point in a time δ.
-
-    - `mean`: μ, shape (d,).
-    - `sigma`: σ at the point.
-    - `covariance`: S in the coordinates of the noise, shape (d, d), or a number, shape (), for a
-        multiple of I.
-    - `dt`: δ.
-    """
-
-    mean: Float[Array, "d *lanes"]
-    sigma: AbstractSigma
-    covariance: Float[Array, "..."]
-    dt: Float[Array, "*lanes"]
-
-    @property
-    def matrix(self) -> Float[Array, "d d"]:
-        """S, also where it is a number."""
-        S, d = self.covariance, self.mean.shape[0]
-        return S * jnp.eye(d, dtype=self.mean.dtype) if S.ndim == 0 else S
-
-    def point(self, xi: Float[Array, " d"]) -> Float[Array, " d"]:
-        """μ + √δ σ L ξ, with S = L Lᵀ."""
-        S = self.covariance
-        noise = jnp.sqrt(S) * xi if S.ndim == 0 else matvec(cholesky(S), xi)
-        return self.mean + jnp.sqrt(self.dt) * self.sigma.mv(noise)
-
-    def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
-        """ξ of the step to this point."""
-        S, scaled = self.covariance, self._scaled(point)
-        return scaled / jnp.sqrt(S) if S.ndim == 0 else solve_lower(cholesky(S), scaled)
-
-    def log_relative(self, point: Float[Array, " d"]) -> Float[Array, ""]:
-        """log of the density, but for factors that all laws with this σ and δ share:
-        ½ (d - |ξ|² - log det S), of which sums along a path stay small."""
-        scaled = self._scaled(point)
-        if self.covariance.ndim == 0:
-            square, log_det = dot(scaled, scaled) / self.covariance, self._log_det()
-        else:
-            square, log_det = quadratic_form(self.covariance, scaled)
-        return (scaled.shape[0] - square - log_det) / 2
-
-    def log_relative_of_noise(self, xi: Float[Array, " d"]) -> Float[Array, ""]:
-        """The same at the point of this noise."""
-        return (xi.shape[0] - dot(xi, xi) - self._log_det()) / 2
-
-    def log_density(self, point: Float[Array, " d"]) -> Float[Array, ""]:
-        """Of the step to this point, in units of space to the power -d."""
-        scale = self.sigma.log_abs_det() + point.shape[0] * jnp.log(2 * np.pi * self.dt) / 2
-        return self.log_relative(point) - point.shape[0] / 2 - scale
-
-    def _scaled(self, point):
-        return self.sigma.solve(point - self.mean) / jnp.sqrt(self.dt)
-
-    def _log_det(self):
-        if self.covariance.ndim == 0:
-            return self.mean.shape[0] * jnp.log(self.covariance)
-        return quadratic_form(self.covariance, jnp.zeros_like(self.mean))[1]
+from .step_law import DegenerateLaw, StepLaw, root_of_length
 
 
 class LinearStep(NamedTuple):
@@ -103,11 +54,12 @@ class LinearStep(NamedTuple):
 class StepsFrom(NamedTuple):
     """Steps from one point, as functions of their length δ.
 
-    - `law`: the law of the step.
-    - `decay`: the derivative of the mean of σ⁻¹x' in σ⁻¹x, shape (d, d), where the drift is linear.
+    - `law`: the law of the step, a `DegenerateLaw` where σ has no inverse.
+    - `decay`: the derivative of the mean of σ⁻¹x' in σ⁻¹x, shape (d, d), where the drift is linear;
+        of x' in x where σ has no inverse.
     """
 
-    law: Callable[[Float[Array, ""]], StepLaw]
+    law: Callable[[Float[Array, ""]], Any]
     decay: Callable[[Float[Array, ""]], Float[Array, "d d"]]
 
 
@@ -129,7 +81,8 @@ class AbstractStepDensity(eqx.Module):
 
 
 class EulerDensity(AbstractStepDensity):
-    """The Euler scheme, N(x + α(x) δ, V(x) δ), for any σ: O(δ) along a path.
+    """The Euler scheme, N(x + α(x) δ, V(x) δ), for any σ: O(δ) along a path. What noise does not
+    reach at once is not moved by it within a step.
 
     **Example:**
 
@@ -142,6 +95,8 @@ class EulerDensity(AbstractStepDensity):
 
     def steps_from(self, dynamics, x):
         drift, sigma, d = dynamics.drift(x), dynamics.sigma(x).root(), x.shape[0]
+        if not sigma.invertible:
+            return _degenerate_euler(dynamics, x)
 
         def law(dt):
             return StepLaw(x + drift * dt, sigma, jnp.ones((), x.dtype), dt)
@@ -164,6 +119,7 @@ class ItoTaylorDensity(AbstractStepDensity):
     """Itô's and Taylor's expansion of weak order 2, for constant σ: O(δ²) along a path.
 
     It calls for the first and second derivatives of the drift along the columns of σ, by autodiff.
+    Where σ has fewer columns than rows noise comes within a step to what the drift leads it to.
 
     **Raises:** `ValueError`, when it is used, for a σ that depends on the state.
 
@@ -183,6 +139,8 @@ class ItoTaylorDensity(AbstractStepDensity):
                 "`EulerDensity()`."
             )
         sigma, d = dynamics.sigma(x), x.shape[0]
+        if not sigma.invertible:
+            return _degenerate_ito_taylor(dynamics, x)
         along = [_along(dynamics.drift, x, column) for column in _columns(sigma, x)]
         slopes, bends = zip(*along, strict=True)
         drift = dynamics.drift(x)
@@ -225,7 +183,44 @@ def most_accurate_density(sigma_varies: bool) -> AbstractStepDensity:
 
 def _columns(sigma: AbstractSigma, x: Float[Array, " d"]) -> list[Float[Array, " d"]]:
     """Those of σ."""
-    return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(x.shape[0])]
+    m = sigma.as_matrix(x.shape[0], x.dtype).shape[1]
+    return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(m)]
+
+
+def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
+    """Euler's steps where σ has no inverse."""
+    drift, sigma = dynamics.drift(x), dynamics.sigma(x).as_matrix(x.shape[0], x.dtype)
+
+    def law(dt):
+        root = semidefinite_factor(root_of_length(dt) * sigma)
+        return DegenerateLaw(x + drift * dt, root, dt)
+
+    def decay(dt):
+        return jnp.eye(x.shape[0], dtype=x.dtype) + dt * jax.jacfwd(dynamics.drift)(x)
+
+    return StepsFrom(law, decay)
+
+
+def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
+    """Those of Itô's and Taylor's expansion."""
+    sigma, drift = dynamics.sigma(x), dynamics.drift(x)
+    columns = _columns(sigma, x)
+    slopes, bends = zip(*[_along(dynamics.drift, x, column) for column in columns], strict=True)
+    # Fα + ½ Σ_k ∂²α(σ_k, σ_k), and Fσ.
+    bent = jax.jvp(dynamics.drift, (x,), (drift,))[1] + total(jnp.stack(bends)) / 2
+    direct, turned = jnp.stack(columns, axis=1), jnp.stack(slopes, axis=1)
+
+    def law(dt):
+        length = root_of_length(dt)
+        both = [direct + dt / 2 * turned, dt * np.sqrt(1 / 12).astype(x.dtype) * turned]
+        root = semidefinite_factor(length * jnp.concatenate(both, axis=1))
+        return DegenerateLaw(x + dt * drift + dt**2 / 2 * bent, root, dt)
+
+    def decay(dt):
+        F = jax.jacfwd(dynamics.drift)(x)
+        return jnp.eye(x.shape[0], dtype=x.dtype) + dt * F + dt**2 / 2 * matmul(F, F)
+
+    return StepsFrom(law, decay)
 
 
 def _along(field, x: Float[Array, " d"], direction: Float[Array, " d"]):

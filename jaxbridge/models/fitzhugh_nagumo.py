@@ -1,0 +1,64 @@
+"""FitzHugh and Nagumo's neuron, with noise in the recovery variable."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..engine.checks import Numbers, as_floating
+from .diffusion import Diffusion, check_dimension
+
+
+class FitzHughNagumoParams(NamedTuple):
+    """The parameters of `fitzhugh_nagumo`, `params` of the model: `epsilon`, how much faster the
+    voltage is than the recovery variable; `gamma` and `beta`, per unit of time; `sigma`, the noise,
+    per square root of a unit of time. Shape () each.
+
+    **Example:**
+
+    ```python
+    moved = model.with_params(model.params._replace(sigma=jnp.asarray(0.2)))
+    ```
+    """
+
+    epsilon: Float[Array, ""]
+    gamma: Float[Array, ""]
+    beta: Float[Array, ""]
+    sigma: Float[Array, ""]
+
+
+def fitzhugh_nagumo(
+    epsilon: Numbers = 0.1, gamma: Numbers = 1.5, beta: Numbers = 0.8, sigma: Numbers = 0.3
+) -> Diffusion:
+    """A neuron that spikes (FitzHugh 1961; Nagumo, Arimoto & Yoshizawa 1962), in the form of
+    Ditlevsen & Samson (2019): the state is (X, Y), voltage and recovery variable,
+
+        dX = (X - X³ - Y) / ε dt,    dY = (γX - Y + β) dt + σ dW.
+
+    Noise reaches X by way of Y only: couplings do not apply, records with an `observation` do.
+    Time is in units of the relaxation time of Y; X and Y have no units.
+
+    **Example:**
+
+    ```python
+    model = jb.fitzhugh_nagumo()
+    model.diffusion(jnp.zeros(2))  # Array([[0. ], [0.3]], dtype=float32)
+    ```
+    """
+    values = {"epsilon": epsilon, "gamma": gamma, "beta": beta, "sigma": sigma}
+    params = {name: as_floating(name, value) for name, value in values.items()}
+    for name, value in params.items():
+        if value.shape != ():
+            raise ValueError(f"`{name}` must be a number, shape (); got shape {value.shape}.")
+    return Diffusion(_drift, _sigma, params=FitzHughNagumoParams(**params))
+
+
+def _drift(x: Float[Array, " d"], p: FitzHughNagumoParams) -> Float[Array, " d"]:
+    check_dimension(x, 2)
+    voltage, recovery = x
+    fast = (voltage - voltage**3 - recovery) / p.epsilon
+    return jnp.stack([fast, p.gamma * voltage - recovery + p.beta])
+
+
+def _sigma(x: Float[Array, " d"], p: FitzHughNagumoParams) -> Float[Array, "d m"]:
+    return jnp.stack([jnp.zeros_like(p.sigma), p.sigma])[:, None]

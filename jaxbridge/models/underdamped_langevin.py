@@ -1,0 +1,95 @@
+"""Langevin's equation with inertia: noise reaches the velocities only."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from ..engine.checks import Numbers, as_floating
+from .diffusion import Diffusion, check_value
+
+
+class UnderdampedLangevinParams(NamedTuple):
+    """The parameters of `underdamped_langevin`, `params` of the model: `friction`, per unit of
+    time; `temperature`, in units of the potential; `potential`, what that receives.
+
+    **Example:**
+
+    ```python
+    hotter = model.with_params(model.params._replace(temperature=jnp.asarray(2.0)))
+    ```
+    """
+
+    friction: Float[Array, ""]
+    temperature: Float[Array, ""]
+    potential: PyTree
+
+
+def underdamped_langevin(
+    potential: Callable, friction: Numbers = 1.0, temperature: Numbers = 1.0, params: PyTree = None
+) -> Diffusion:
+    """A particle of mass 1 in a potential U, in a bath that slows and shakes it (Langevin 1908;
+    Pavliotis 2014, chapter 6): the state is (Q, P), positions and velocities, shape (2n,),
+
+        dQ = P dt,    dP = (-∇U(Q) - γP) dt + √(2γτ) dW,    log ν = -(U(q) + ½|p|²) / τ + constant.
+
+    Noise reaches Q by way of P only: couplings do not apply, records with an `observation` do.
+
+    **Arguments:** `potential`, U, `(q, params) -> ()` of positions, shape (n,); `friction`, γ, and
+    `temperature`, τ, shape (); `params`, any pytree, is what the potential receives.
+
+    **Raises:** `TypeError` for a potential that is no function; `ValueError` for shapes.
+
+    **Example:**
+
+    ```python
+    well = jb.underdamped_langevin(lambda q, p: (q @ q - 1) ** 2, friction=0.5)
+    well.drift(jnp.array([0.0, 1.0]))  # Array([ 1. , -0.5], dtype=float32)
+    ```
+    """
+    if not callable(potential):
+        raise TypeError(f"`potential` must be a function `(q, params)`; got {potential!r}.")
+    values = {"friction": friction, "temperature": temperature}
+    numbers = {name: as_floating(name, value) for name, value in values.items()}
+    for name, value in numbers.items():
+        if value.shape != ():
+            raise ValueError(f"`{name}` must be a number, shape (); got shape {value.shape}.")
+    functions = _Functions(potential)
+    made = UnderdampedLangevinParams(**numbers, potential=params)
+    return Diffusion(functions.drift, _sigma, functions.log_stationary, made)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Functions:
+    """Of one state and the parameters; equal for the same potential, so that they compile once."""
+
+    potential: Callable
+
+    def drift(self, x, p):
+        q, v = _halves(x)
+        return jnp.concatenate([v, -jax.grad(self._energy)(q, p) - p.friction * v])
+
+    def log_stationary(self, x, p):
+        q, v = _halves(x)
+        return -(self._energy(q, p) + v @ v / 2) / p.temperature
+
+    def _energy(self, q, p):
+        return check_value("potential", self.potential(q, p.potential), (), q)
+
+
+def _sigma(x, p):
+    n = len(_halves(x)[0])
+    noise = jnp.sqrt(2 * p.friction * p.temperature) * jnp.eye(n, dtype=x.dtype)
+    return jnp.concatenate([jnp.zeros((n, n), x.dtype), noise])
+
+
+def _halves(x: Float[Array, " d"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    if x.shape[0] % 2:
+        raise ValueError(
+            "the state is positions and velocities, as many of the one as of the other; got shape "
+            f"{x.shape}."
+        )
+    return jnp.split(x, 2)[0], jnp.split(x, 2)[1]

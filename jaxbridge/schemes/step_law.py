@@ -1,0 +1,181 @@
+"""The normal law of a step, from x in a time δ.
+
+Where σ has an inverse it is kept in the coordinates of the noise, N(μ, δ σ S σᵀ) with S near I
+(`StepLaw`). Where noise reaches only a part of the state at once, and the rest by way of the drift,
+it is N(μ, Λ Λᵀ) with Λ lower triangular (`DegenerateLaw`): what the step does not move at all has a
+zero on the diagonal of Λ, and then there is no density.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..engine.linalg import (
+    cholesky,
+    dot,
+    matmul,
+    matvec,
+    quadratic_form,
+    semidefinite_factor,
+    solve_lower,
+    total,
+)
+from ..models.sigma import AbstractSigma
+
+
+class StepLaw(NamedTuple):
+    """N(μ, δ σ S σᵀ), the law of a step from one point in a time δ.
+
+    - `mean`: μ, shape (d,).
+    - `sigma`: σ at the point.
+    - `covariance`: S in the coordinates of the noise, shape (d, d), or a number, shape (), for a
+        multiple of I.
+    - `dt`: δ.
+    """
+
+    mean: Float[Array, "d *lanes"]
+    sigma: AbstractSigma
+    covariance: Float[Array, "..."]
+    dt: Float[Array, "*lanes"]
+
+    @property
+    def matrix(self) -> Float[Array, "d d"]:
+        """S, also where it is a number."""
+        S, d = self.covariance, self.mean.shape[0]
+        return S * jnp.eye(d, dtype=self.mean.dtype) if S.ndim == 0 else S
+
+    @property
+    def root(self) -> Float[Array, "d d"]:
+        """Λ of N(μ, Λ Λᵀ), zero of a step of length zero."""
+        root = self.sigma.as_matrix(self.mean.shape[0], self.mean.dtype) * root_of_length(self.dt)
+        S = self.covariance
+        return root * jnp.sqrt(S) if S.ndim == 0 else matmul(root, cholesky(S))
+
+    def solve(self, displacement: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Λ⁻¹ of it, zero of a step of length zero."""
+        moving = self.dt > 0
+        safe = self._replace(dt=jnp.where(moving, self.dt, 1))
+        return jnp.where(moving, safe.noise(safe.mean + displacement), 0)
+
+    def point(self, xi: Float[Array, " d"]) -> Float[Array, " d"]:
+        """μ + √δ σ L ξ, with S = L Lᵀ."""
+        S = self.covariance
+        noise = jnp.sqrt(S) * xi if S.ndim == 0 else matvec(cholesky(S), xi)
+        return self.mean + jnp.sqrt(self.dt) * self.sigma.mv(noise)
+
+    def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
+        """ξ of the step to this point."""
+        S, scaled = self.covariance, self._scaled(point)
+        return scaled / jnp.sqrt(S) if S.ndim == 0 else solve_lower(cholesky(S), scaled)
+
+    def log_relative(self, point: Float[Array, " d"]) -> Float[Array, ""]:
+        """log of the density, but for factors that all laws with this σ and δ share:
+        ½ (d - |ξ|² - log det S), of which sums along a path stay small."""
+        scaled = self._scaled(point)
+        if self.covariance.ndim == 0:
+            square, log_det = dot(scaled, scaled) / self.covariance, self._log_det()
+        else:
+            square, log_det = quadratic_form(self.covariance, scaled)
+        return (scaled.shape[0] - square - log_det) / 2
+
+    def log_relative_of_noise(self, xi: Float[Array, " d"]) -> Float[Array, ""]:
+        """The same at the point of this noise."""
+        return (xi.shape[0] - dot(xi, xi) - self._log_det()) / 2
+
+    @property
+    def log_scale(self) -> Float[Array, ""]:
+        """log |det σ|, which `log_relative` leaves out."""
+        return self.sigma.log_abs_det()
+
+    def carried(
+        self, decay: Float[Array, "d d"], displacement: Float[Array, " d"]
+    ) -> Float[Array, " d"]:
+        """Where a linear step leads from there, with `decay` in the coordinates of the noise."""
+        return self.sigma.mv(matvec(decay, self.sigma.solve(displacement)))
+
+    def after(
+        self, first: "StepLaw", decay: Float[Array, "d d"], x: Float[Array, " d"]
+    ) -> "StepLaw":
+        """The law of two steps from x: of `first`, and of a linear step that from x has this
+        law."""
+        dt = first.dt + self.dt
+        covariance = first.dt * matmul(matmul(decay, first.matrix), decay.T)
+        covariance = (covariance + self.dt * self.matrix) / dt
+        mean = self.mean + self.carried(decay, first.mean - x)
+        return StepLaw(mean, self.sigma, covariance, dt)
+
+    def log_density(self, point: Float[Array, " d"]) -> Float[Array, ""]:
+        """Of the step to this point, in units of space to the power -d."""
+        scale = self.log_scale + point.shape[0] * jnp.log(2 * np.pi * self.dt) / 2
+        return self.log_relative(point) - point.shape[0] / 2 - scale
+
+    def _scaled(self, point):
+        return self.sigma.solve(point - self.mean) / jnp.sqrt(self.dt)
+
+    def _log_det(self):
+        if self.covariance.ndim == 0:
+            return self.mean.shape[0] * jnp.log(self.covariance)
+        return quadratic_form(self.covariance, jnp.zeros_like(self.mean))[1]
+
+
+class DegenerateLaw(NamedTuple):
+    """N(μ, Λ Λᵀ), which may be singular.
+
+    - `mean`: μ, shape (d,).
+    - `root`: Λ, lower triangular, zeros on its diagonal where nothing moves.
+    - `dt`: δ.
+    """
+
+    mean: Float[Array, "d *lanes"]
+    root: Float[Array, "d d *lanes"]
+    dt: Float[Array, "*lanes"]
+
+    @property
+    def _moves(self):
+        return jnp.diagonal(self.root) > 0
+
+    def solve(self, displacement: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Λ⁻¹ of it, zero along what Λ does not move."""
+        return solve_root(self.root, displacement)
+
+    def log_relative(self, point: Float[Array, " d"]) -> Float[Array, ""]:
+        """log of the density, but for factors that all laws share: ½ (d - |ξ|²) - log det Λ. NaN
+        where there is none."""
+        xi = self.solve(point - self.mean)
+        log_det = total(jnp.log(jnp.where(self._moves, jnp.diagonal(self.root), jnp.nan)))
+        return (xi.shape[0] - dot(xi, xi)) / 2 - log_det
+
+    @property
+    def log_scale(self) -> Float[Array, ""]:
+        """What `log_relative` leaves out: nothing."""
+        return jnp.zeros((), self.mean.dtype)
+
+    def carried(
+        self, decay: Float[Array, "d d"], displacement: Float[Array, " d"]
+    ) -> Float[Array, " d"]:
+        """Where a linear step leads from there, with `decay` in the coordinates of the state."""
+        return matvec(decay, displacement)
+
+    def after(
+        self, first: "DegenerateLaw", decay: Float[Array, "d d"], x: Float[Array, " d"]
+    ) -> "DegenerateLaw":
+        """The law of two steps from x: of `first`, and of a linear step that from x has this
+        law."""
+        mean = self.mean + self.carried(decay, first.mean - x)
+        both = jnp.concatenate([matmul(decay, first.root), self.root], axis=1)
+        return DegenerateLaw(mean, semidefinite_factor(both), first.dt + self.dt)
+
+
+def solve_root(root: Float[Array, "d d"], displacement: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Λ⁻¹ of a lower triangular Λ, and zero along what Λ does not move."""
+    still = jnp.diagonal(root) == 0
+    safe = root + jnp.diag(jnp.where(still, 1, 0).astype(root.dtype))
+    return jnp.where(still, 0, solve_lower(safe, displacement))
+
+
+def root_of_length(dt: Float[Array, ""]) -> Float[Array, ""]:
+    """√δ, whose derivative at zero is taken to be zero: a step of no length stays one."""
+    moving = dt > 0
+    return jnp.where(moving, jnp.sqrt(jnp.where(moving, dt, 1)), 0)

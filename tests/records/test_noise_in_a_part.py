@@ -1,0 +1,197 @@
+"""Noise that reaches only a part of the state: linear models against Kalman's filter."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import loglog_slope
+from kalman import euler_step, exact_step, kalman
+
+import jaxbridge as jb
+
+KEY = jax.random.key(0)
+
+
+def ito_taylor_step(A, V):
+    """Of dX = -A X dt + noise of covariance V, as the expansion of second order makes it."""
+    F = -A
+
+    def step(dt):
+        flow = F @ V
+        spread = dt * V + dt**2 / 2 * (flow + flow.T) + dt**3 / 3 * flow @ F.T
+        return np.eye(len(A)) + dt * F + dt**2 / 2 * F @ F, spread
+
+    return step
+
+
+class Case:
+    """A linear model with noise in its second coordinate, of which the first is seen."""
+
+    def __init__(self, A, model, noise, num=25):
+        rng = np.random.default_rng(0)
+        self.A, self.model = np.asarray(A), model
+        self.V = np.diag([0.0, 0.8**2])
+        self.mean, self.covariance = np.array([0.5, -0.2]), np.array([[0.4, 0.1], [0.1, 0.3]])
+        self.times = np.cumsum(rng.uniform(0.1, 0.4, num))
+        step, state = (
+            exact_step(self.A, self.V),
+            rng.multivariate_normal(self.mean, self.covariance),
+        )
+        values = []
+        for gap in np.diff(self.times, prepend=self.times[0]):
+            decay, spread = step(round(gap, 12))
+            state = rng.multivariate_normal(decay @ state, spread)
+            values.append(state[:1] + noise * rng.normal(size=1))
+        self.values = np.array(values)
+        self.values[3] = self.values[8] = np.nan
+        self.noise = np.array([[noise**2]])
+        self.matrix = np.array([[1.0, 0.0]])
+
+    @property
+    def arguments(self):
+        return self.model, self.times, self.values
+
+    @property
+    def options(self):
+        return {
+            "observation": jb.LinearGaussian(self.matrix, self.noise),
+            "initial": jb.GaussianLaw(self.mean, self.covariance),
+        }
+
+    def kalman(self, num_steps, of=exact_step, values=None, matrix=None, noise=None):
+        seen = self.values if values is None else values
+        matrix = self.matrix if matrix is None else matrix
+        noise = self.noise if noise is None else noise
+        law = self.mean, self.covariance
+        return kalman(of(self.A, self.V), self.times, seen, matrix, noise, *law, num_steps)
+
+
+def integral(noise):
+    model = jb.integrated(jb.ornstein_uhlenbeck([[1.5]], sigma=[[0.8]]))
+    return Case([[0.0, -1.0], [0.0, 1.5]], model, noise)
+
+
+def oscillator(noise):
+    drift = lambda x, p: jnp.stack([x[1], -4.0 * x[0] - 0.5 * x[1]])
+    return Case([[0.0, -1.0], [4.0, 0.5]], jb.Diffusion(drift, [[0.0], [0.8]]), noise)
+
+
+@pytest.mark.parametrize(
+    "case, noise",
+    [
+        (oscillator, 3e-4),
+        pytest.param(oscillator, 0.3, marks=pytest.mark.slow),
+        pytest.param(oscillator, 0.03, marks=pytest.mark.slow),
+        pytest.param(integral, 0.3, marks=pytest.mark.slow),
+        pytest.param(integral, 3e-4, marks=pytest.mark.slow),
+    ],
+)
+def test_the_filter_is_kalmans(case, noise, x64):
+    """Of the steps as they are, to many digits; and of the model, up to the step error told."""
+    case = case(noise)
+    made = jb.log_likelihood(
+        KEY, *case.arguments, **case.options, num_steps=10, num_particles=4, num_filters=2
+    )
+    chain = case.kalman(10, ito_taylor_step).log_likelihood
+    assert abs(made.value - chain) < 1e-6 * max(abs(chain), 1)
+    true = float(made.value) - case.kalman(1).log_likelihood
+    assert abs(true) < abs(made.step_error) + 2 * made.step_uncertainty + 1e-3
+    assert abs(made.step_error) < 5 * abs(true) + 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case, noise", [(oscillator, 0.3), (integral, 3e-4)])
+def test_the_filter_in_single_precision(case, noise):
+    case = case(noise)
+    made = jb.log_likelihood(
+        KEY, *case.arguments, **case.options, num_steps=10, num_particles=4, num_filters=2
+    )
+    chain = case.kalman(10, ito_taylor_step).log_likelihood
+    assert abs(made.value - chain) < 1e-3 * max(abs(chain), 1)
+
+
+def test_orders_of_the_steps(x64):
+    """The expansion is of second order, Euler's scheme of first, where noise comes by the drift."""
+    case, sizes = oscillator(0.1), np.array([16, 32, 64])
+    exact = case.kalman(1).log_likelihood
+
+    def slope(step):
+        errors = [case.kalman(N, step).log_likelihood - exact for N in sizes]
+        return loglog_slope(1 / sizes, np.abs(errors))
+
+    assert 1.9 < slope(ito_taylor_step) < 2.1
+    assert 0.75 < slope(euler_step) < 1.1
+    for density, step in [
+        (jb.ItoTaylorDensity(), ito_taylor_step),
+        (jb.EulerDensity(), euler_step),
+    ]:
+        options = {**case.options, "num_steps": 4, "density": density}
+        made = jb.log_likelihood(KEY, *case.arguments, **options, num_particles=2, num_filters=2)
+        chain = case.kalman(4, step).log_likelihood
+        assert abs(made.value - chain) < 1e-6 * max(abs(chain), 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case, noise", [(integral, 0.03), (oscillator, 3e-4)])
+def test_smoothed_paths_are_those_of_rauch_tung_and_striebel(case, noise, x64):
+    case = case(noise)
+    made = jb.smooth(
+        KEY, *case.arguments, **case.options, num_steps=4, num_draws=500, num_warmup=50, throw=True
+    )
+    exact = case.kalman(4, ito_taylor_step)
+    sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
+    square = lambda path: (path - exact.mean.astype(path.dtype)) ** 2
+    for value, known in [((), exact.mean), ((square,), sd**2)]:
+        z = (np.asarray(made.mean(*value)) - known) / np.asarray(made.standard_error(*value))
+        assert np.max(np.abs(z)) < 4.5 and np.std(z) < 1.5
+    assert np.all(made.accepted[made.accepted > 0] > 0.99)  # guiding is exact here
+    assert np.all(np.isfinite(made.step_error()))
+
+
+def test_a_state_that_is_seen_exactly(x64):
+    """The last step moves position and velocity both, so that both may be known there; Euler's
+    leaves the position where it was, which is then told."""
+    case = oscillator(0.0)
+    rng = np.random.default_rng(1)
+    values = np.nan_to_num(case.values[:6]) * [1.0, 0.0] + rng.normal(size=(6, 2)) * [0.01, 0.3]
+    values[0] = np.nan
+    times, exact = case.times[:6], jb.LinearGaussian(covariance=0.0)
+    options = {**case.options, "observation": exact, "num_steps": 4}
+    arguments = (KEY, case.model, times, values)
+    made = jb.log_likelihood(*arguments, **options, num_particles=4, num_filters=2)
+    law = case.mean, case.covariance
+    seen = times, values, np.eye(2), np.zeros((2, 2))
+    chain = kalman(ito_taylor_step(case.A, case.V), *seen, *law, 4).log_likelihood
+    assert abs(made.value - chain) < 1e-5 * abs(chain)
+    paths = jb.smooth(*arguments, **options, num_draws=4, num_warmup=2, num_chains=2).paths
+    np.testing.assert_allclose(paths[:, :, 4::4], np.broadcast_to(values[1:], (2, 4, 5, 2)))
+    lost = jb.log_likelihood(*arguments, **options, density=jb.EulerDensity(), num_particles=4)
+    assert lost.value == -np.inf and not lost.trustworthy and lost.unexplained >= 0
+
+
+def test_sigma_of_more_columns_than_rows_is_a_root_of_its_square():
+    """Three reactions of two species, as in the chemical Langevin equation."""
+    drift = lambda x, p: -x
+    wide = lambda x, p: jnp.array([[1.0, -1.0, 0.0], [0.0, 1.0, -1.0]]) * jnp.sqrt(1 + x[0] ** 2)
+    model, x = jb.Diffusion(drift, wide), jnp.array([0.5, -0.2])
+    sigma = model.diffusion(x)
+    assert sigma.shape == (2, 2)
+    np.testing.assert_allclose(sigma @ sigma.T, wide(x, None) @ wide(x, None).T, rtol=1e-5)
+    fixed = jb.Diffusion(drift, wide(jnp.zeros(2), None))
+    sigma = fixed.diffusion(x)
+    np.testing.assert_allclose(sigma @ sigma.T, [[2.0, -1.0], [-1.0, 2.0]], rtol=1e-5)
+    assert fixed.sigma_is_invertible(x) and model.sigma_is_invertible(x)
+
+
+def test_what_rests_on_an_inverse_of_sigma_says_what_to_use_instead():
+    model = jb.fitzhugh_nagumo()
+    assert not model.sigma_is_invertible(jnp.zeros(2))
+    ends = (KEY, model, [0.0, 0.0], [0.1, 0.0], 1.0)
+    for proposal in (jb.Guided(), jb.ModifiedDiffusionBridge(), jb.ResidualBridge(), "auto"):
+        with pytest.raises(ValueError, match=r"fewer columns than rows.*`log_likelihood`"):
+            jb.transition_log_density(*ends, num_proposals=2, num_steps=4, proposal=proposal)
+    with pytest.raises(ValueError, match="fewer columns than rows"):
+        jb.path_log_likelihood(model, jnp.arange(3.0), jnp.zeros((3, 2)))
+    known = jb.underdamped_langevin(lambda q, p: q @ q / 2)
+    with pytest.raises(ValueError, match="fewer columns than rows"):
+        jb.sample_bridges(KEY, known, *ends[2:], num_bridges=2, num_steps=4)
