@@ -124,7 +124,7 @@ MODELS = [
     # Noise in a part, and time.
     ("ν of time", lambda: jb.Diffusion(lambda x, p, t: -t * x, None, LOG_NORMAL), "not stationary"),
     ("neuron", of(jb.fitzhugh_nagumo)(sigma=np.ones(2)), r"`sigma` must be a number, shape \(\)"),
-    ("neuron in space", lambda: jb.fitzhugh_nagumo().drift(np.ones(3)), r"of shape \(2,\)"),
+    ("neuron in space", lambda: jb.fitzhugh_nagumo().drift(np.ones(3)), r"at a point of shape"),
     ("potential", of(jb.underdamped_langevin)(3.0), f"`potential` {FUNCTION}", TypeError),
     (
         "friction",

@@ -1,5 +1,7 @@
 """`effects`: what the compiled program of a scene contains, and why."""
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -37,7 +39,9 @@ def effects(
         dimensions 2, 1, 3, 4, ... that the model's functions accept.
     - `num_steps`, `save_at`: as in `sample_bridges`.
 
-    **Returns:** `Effects`, a table when printed.
+    **Returns:** `Effects`, a table when printed. Of a model to which couplings do not apply, with
+    noise in a part of the state or coefficients that depend on time, the last two rows say what
+    the paths of its records simulate.
 
     **Raises:** `ValueError` where no dimension fits, or the time reversal is unknown; `TypeError`
     for anything but a model and a coupling.
@@ -53,10 +57,17 @@ def effects(
     coupling = Coupling() if coupling is None else coupling
     check_coupling(coupling)
     num_steps = check_count("num_steps", num_steps)
-    model.check_reversal()
     like = _find_point(model) if at is None else as_floating("at", at)
     if like.ndim != 1:
         raise ValueError(f"`at` must be one point, shape (d,); got {like.shape}.")
+    invertible, depends_on_time = model.sigma_is_invertible(like), model.depends_on_time
+    noise_by_drift = decisions.noise_by_drift(invertible, model.sigma_varies(like))
+    time = decisions.time(depends_on_time)
+    if not invertible:
+        return decisions.without_pairs(noise_by_drift, time, "σ has fewer columns than rows")
+    if depends_on_time:
+        return decisions.without_pairs(noise_by_drift, time, "coefficients depend on time")
+    model.check_reversal()
     forward = model.forward(like)
     own_sigma, sigma = (
         type(eqx.filter_eval_shape(dynamics.sigma, like))
@@ -76,6 +87,8 @@ def effects(
         decisions.stratonovich(scheme.stratonovich, forward.sigma_varies),
         decisions.stored_times(None if save_at is None else as_floating("save_at", save_at).size),
         decisions.early_stop(chunks(num_steps)[0]),
+        noise_by_drift,
+        time,
     )
 
 
@@ -83,11 +96,16 @@ def _find_point(model: Diffusion) -> Float[Array, " d"]:
     for d in _DIMENSIONS:
         like = jnp.zeros(d)
         try:
-            jax.eval_shape(lambda x: (model.drift(x), model.diffusion(x)), like)
+            jax.eval_shape(functools.partial(_coefficients, model), like)
         except (IndexError, TypeError, ValueError):  # a point of a wrong shape
             continue
         return like
     raise ValueError("the dimension of this model is not visible: pass a point, `at=`, shape (d,).")
+
+
+def _coefficients(model: Diffusion, x: Float[Array, " d"]) -> tuple[Array, Array]:
+    time = jnp.zeros((), x.dtype) if model.depends_on_time else None
+    return model.drift(x, time), model.diffusion(x, time)
 
 
 def _corrector(asked_for, scheme, forward) -> decisions.Effect:

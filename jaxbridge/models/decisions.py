@@ -33,6 +33,9 @@ class Effects(NamedTuple):
     - `stratonovich`: the correction of the drift by which Itô's form exceeds Stratonovich's.
     - `stored_times`: whole paths kept, rather than the times asked for.
     - `early_stop`: associated paths looked at on the way, and stopped where all have hit.
+    - `noise_by_drift`: noise that the drift leads to the part of the state that σ does not reach,
+        within each step of the paths of a record.
+    - `time`: coefficients worked out anew for each step of the paths of a record, at its middle.
     """
 
     reverse_drift: Effect
@@ -46,6 +49,8 @@ class Effects(NamedTuple):
     stratonovich: Effect
     stored_times: Effect
     early_stop: Effect
+    noise_by_drift: Effect
+    time: Effect
 
     def __str__(self) -> str:
         lines = [f"{'effect':<18}  {'':<9}  why"]
@@ -53,6 +58,29 @@ class Effects(NamedTuple):
             word = "simulated" if effect.simulated else "left out"
             lines.append(f"{name.replace('_', ' '):<18}  {word:<9}  {effect.why}")
         return "\n".join(lines)
+
+
+def without_pairs(noise_by_drift: Effect, time: Effect, why: str) -> Effects:
+    """The effects of a model to which couplings do not apply, for this reason."""
+    nothing = Effect(False, f"no coupling applies: {why}")
+    of_records = {"noise_by_drift": noise_by_drift, "time": time}
+    return Effects(**{name: of_records.get(name, nothing) for name in Effects._fields})
+
+
+def noise_by_drift(invertible: bool, sigma_varies: bool) -> Effect:
+    """∫ (δ - s) ∇α σ dW in the part of the state that σ does not reach."""
+    if invertible:
+        return Effect(False, "σ reaches the whole state")
+    if sigma_varies:
+        return Effect(False, "σ depends on the state: Euler's steps move what σ reaches, no more")
+    return Effect(True, "σ has fewer columns than rows: noise comes to the rest by the drift")
+
+
+def time(depends_on_time: bool) -> Effect:
+    """α(x, t) and σ(x, t)."""
+    if not depends_on_time:
+        return Effect(False, "no coefficient depends on time")
+    return Effect(True, "the drift or σ takes a third argument, the time")
 
 
 def reverse_drift(reversible: bool, given: bool) -> Effect:

@@ -77,8 +77,8 @@ _functions = functools.lru_cache(maxsize=256)(_Integrated)
 def _halves(x: Float[Array, " d"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     if x.shape[0] % 2:
         raise ValueError(
-            "the state is an integral and what is integrated, as many coordinates of the one as of "
-            f"the other; got shape {x.shape}."
+            "the state `x` is an integral and what is integrated, as many coordinates of the one "
+            f"as of the other; got shape {x.shape}."
         )
     integral, velocity = jnp.split(x, 2)
     return integral, velocity

@@ -89,7 +89,8 @@ def _sigma(x, p):
 def _halves(x: Float[Array, " d"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     if x.shape[0] % 2:
         raise ValueError(
-            "the state is positions and velocities, as many of the one as of the other; got shape "
-            f"{x.shape}."
+            "the state `x` is positions and velocities, as many of the one as of the other; got "
+            f"shape {x.shape}."
         )
-    return jnp.split(x, 2)[0], jnp.split(x, 2)[1]
+    positions, velocities = jnp.split(x, 2)
+    return positions, velocities

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from ..engine.averages import proper
 from ..engine.checks import without_derivatives
 from ..engine.compiled import compiled
 from ..engine.lanes import over_lanes
@@ -33,8 +34,9 @@ from .problem import RecordProblem
 from .segments import at_every_step, flat, following, split_first
 from .tilted_step import NormalStep
 
-# How often the path along which the process is linearised is found anew from the last.
-_LINEARISATIONS = 3
+# How often the path along which the process is linearised is found anew from the last; what log
+# weights gain by it that is worth no further turn; and the shortest of its steps.
+_FEWEST_TURNS, _MOST_TURNS, _NO_GAIN, _SHORTEST = 4, 30, 0.5, 2.0**-10
 
 
 class Guidance(NamedTuple):
@@ -164,10 +166,27 @@ class Linearised(NamedTuple):
     guide: Guidance
 
 
+class _Search(NamedTuple):
+    """Of Gauss and Newton's iteration: the points of the next turn; the best so far, the log weight
+    of its path without noise, and that path; the length of the step to it, and whether it is
+    over."""
+
+    turn: Int[Array, ""]
+    points: Float[Array, "points d"]
+    best: Linearised
+    log_weight: Float[Array, ""]
+    path: Float[Array, "points d"]
+    length: Float[Array, ""]
+    over: Bool[Array, ""]
+
+
 @compiled  # a program of its own, which all who read the record share
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     """Along the path of the extended Kalman filter, and then of the path that is guided without
-    noise; both begin at a likely point where ν is not normal. Neither has derivatives."""
+    noise; both begin at a likely point where ν is not normal. Neither has derivatives.
+
+    Where that path is the less likely one, by its weight, steps to it are shortened until it is
+    not: excitable and chaotic systems throw Gauss and Newton's iteration off for good."""
     model = without_derivatives(model)
     initial = initial_law(problem.initial, model, problem.like)
     dynamics_at, scalars = model.forward_at(problem.like), problem.scalars(model)
@@ -178,19 +197,33 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     silence = jnp.zeros_like(points)
 
     @jax.jit  # for its shapes and in the loop traced once
-    def again(points):
+    def at(points):
         guide = guided(problem, model, points)
         noise = silence
         if calls_for_cover(problem.initial, model, problem.like):
             solve = functools.partial(solve_root, guide.initial.root)
             hidden = jnp.zeros_like(guide.first.values)
             noise = silence.at[0].set(guide.start.noise(begin, solve, hidden))
-        path, _ = path_and_log_weight(problem, model, guide, noise)
-        return jnp.where(jnp.all(jnp.isfinite(path)), path, points), Linearised(points, guide)
+        path, log_weight = path_and_log_weight(problem, model, guide, noise)
+        path = jnp.where(jnp.all(jnp.isfinite(path)), path, points)
+        return Linearised(points, guide), proper(log_weight), path
 
-    # The guide of the last time round is the one that is wanted.
-    _, shapes = jax.eval_shape(again, points)
+    def turn(search: _Search) -> _Search:
+        new = at(search.points)
+        gain = jnp.where(search.turn == 0, jnp.inf, new[1] - search.log_weight)
+        better = gain > -_NO_GAIN
+        old = search.best, search.log_weight, search.path
+        best, log_weight, path = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        settled = better & (gain < _NO_GAIN) & (search.length == 1)
+        length = jnp.where(better, jnp.minimum(2 * search.length, 1), search.length / 2)
+        points = best.points + length * (path - best.points)
+        points = jnp.where(length == 1, path, points)
+        over = (search.turn + 1 >= _FEWEST_TURNS) & (settled | (length < _SHORTEST))
+        return _Search(search.turn + 1, points, best, log_weight, path, length, over)
+
+    shapes, log_weight, _ = jax.eval_shape(at, points)
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    init, turns = (points, nothing), _LINEARISATIONS + 1
-    _, made = lax.fori_loop(0, turns, lambda _, state: again(state[0]), init)
-    return made
+    zero, one = jnp.zeros((), log_weight.dtype), jnp.ones((), points.dtype)
+    init = _Search(jnp.int32(0), points, nothing, zero, points, one, jnp.zeros((), bool))
+    goes_on = lambda search: ~search.over & (search.turn < _MOST_TURNS)
+    return lax.while_loop(goes_on, turn, init).best

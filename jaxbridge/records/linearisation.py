@@ -3,7 +3,8 @@
 From ξ_i a step goes to N(ξ_i + A_i u + a_i, Λ_i Λ_iᵀ), where u = x - ξ_i and A is the derivative of
 the mean: what the law of a step is for states near the path. The path is that of the extended
 Kalman filter, and then, a few times, the path without noise that is guided along the last one:
-Gauss and Newton's iteration for the most likely path (Bell 1994).
+Gauss and Newton's iteration for the most likely path (Bell 1994), with steps that are shortened
+where it would lead away (Särkkä & Svensson 2020).
 """
 
 from typing import NamedTuple

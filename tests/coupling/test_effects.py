@@ -176,7 +176,7 @@ def test_associated_paths_stop_early_where_the_table_says(num_steps):
 
 def test_the_table_reads_well():
     text = str(jb.effects(jb.hyperbolic(0.8, 2), jb.Coupling(-1.0)))
-    assert len(text.splitlines()) == 12
+    assert len(text.splitlines()) == 14
     assert "reverse drift" in text and "declared reversible" in text and "left out" in text
 
 
@@ -185,3 +185,35 @@ def test_the_dimension_is_found():
     assert jb.effects(three).reverse_drift.simulated
     full_in_three = jb.Diffusion(drift, lambda x, p: full(x[:3], p), log_density)
     assert jb.effects(full_in_three).triangular_root.simulated
+
+
+def partly(x, p):
+    return jnp.stack([jnp.sinh(x[1]), -x[0] - x[1]])
+
+
+def in_season(x, p, t):
+    return partly(x, p) + jnp.sin(t)
+
+
+COLUMN = jnp.array([[0.0], [0.5]])
+RECORDS = {
+    "constant": jb.Diffusion(partly, COLUMN),
+    "of time": jb.Diffusion(in_season, COLUMN),
+    "varying": jb.Diffusion(partly, lambda x, p: COLUMN * (1 + x[1] ** 2)),
+    "of time, all": jb.Diffusion(in_season, lambda x, p: jnp.eye(2) * (1 + x[0] ** 2)),
+}
+
+
+@pytest.mark.parametrize("name", RECORDS)
+def test_steps_of_records_contain_what_the_table_says(name):
+    """The derivative of the drift's sinh, and the sine of time."""
+    scene, table = RECORDS[name], jb.effects(RECORDS[name])
+    seen = jb.LinearGaussian([[1.0, 0.0]], 0.1)
+    paths = jb.innovations(
+        scene, [0.0, 0.5, 1.0], jnp.zeros((3, 1)), observation=seen, initial=[0.0, 0.0], num_steps=3
+    )
+    program = program_of(lambda key: paths.path(None, jax.random.normal(key, (paths.size,))))
+    in_loops = Counter(eqn.primitive.name for eqn, in_loop in program if in_loop)
+    assert table.noise_by_drift.simulated == (in_loops["cosh"] > 0)
+    assert table.time.simulated == (in_loops["sin"] > 0)
+    assert not table.rotation.simulated and "no coupling applies" in table.rotation.why
