@@ -19,7 +19,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", "".join(TEXT.values()), re.DOTALL)
 @pytest.mark.slow
 def test_code_runs():
     """The quickstart, and the blocks of the pages, which go on from those of the README."""
-    assert len(BLOCKS) == 17
+    assert len(BLOCKS) == 18
     namespace = {}
     for block in BLOCKS[:4]:
         exec(block, namespace)
@@ -45,6 +45,7 @@ def test_code_runs():
     assert bool((namespace["positive"].paths > 0).all())
     assert namespace["densities"].value.shape == (500,)
     assert namespace["noisy_posterior"].theta.shape == (300, 3)
+    assert 2 < namespace["driven"].theta.mean() < 7
     assert jnp.isfinite(namespace["value"]) and set(namespace["slope"][0]) == {
         "log_noise", "log_rate", "log_sigma"
     }  # fmt: skip

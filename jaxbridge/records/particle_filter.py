@@ -6,7 +6,9 @@ them count they are resampled, systematically, and go on with equal weights. The
 means of the weights, p̂(y), is unbiased (Del Moral 2004, theorem 7.4.2), up to the step error.
 
 Several filters that know nothing of each other make a mean, and its error is told by their spread:
-what one filter knows of its own error it has from the particles that it did not lose.
+what one filter knows of its own error it has from the particles that it did not lose. And what none
+of them knows, as where rare particles far from the guide would weigh more than all others, the
+shape k̂ of the largest weights tells at each observation.
 """
 
 from typing import NamedTuple
@@ -23,6 +25,7 @@ from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
 from ..engine.compiled import compiled
 from ..engine.lanes import over_lanes
+from ..engine.pareto import pareto_k
 from ..engine.throwing import throw_where
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
@@ -39,8 +42,9 @@ from .several import Records, as_record_problems
 
 # Particles are resampled where fewer than this share of them count.
 _FEWEST_EFFECTIVE = 0.5
-# Fewer particles that count, or a larger standard error of a log, tell nothing.
-_FEWEST_TRUSTED, _MOST_SPREAD = 5, 0.5
+# Fewer particles that count, or a larger standard error of a log, tell nothing; nor do heavier
+# tails: 0.7, and what the largest of many estimates of k exceeds it by.
+_FEWEST_TRUSTED, _MOST_SPREAD, _HEAVIEST = 5, 0.5, 0.8
 
 _UNEXPLAINED = (
     "no particle explains some observation (`unexplained` is its number): look whether it is an "
@@ -50,6 +54,11 @@ _DISAGREE = (
     "so few particles count somewhere, or filters disagree so much, that the likelihood and its "
     "error cannot be trusted: take more `num_particles`; across gaps in which the diffusion could "
     "have gone several ways more observations are needed, or `smooth` with a `proposal`."
+)
+_HEAVY = (
+    "at some observation the largest weights are so much larger than the others (`pareto_k` above "
+    "0.8) that particles which weigh more yet may never have been drawn: take more "
+    "`num_particles`, and see whether `value` stays."
 )
 _STEPS = "the step error is beyond the standard error, or not known: take more `num_steps`."
 
@@ -64,6 +73,9 @@ class LogLikelihood(eqx.Module):
     - `log_estimates`: log p̂ of each filter, shape (num_filters,).
     - `effective_sample_size`: how many particles count before each observation is followed by
         resampling, the mean over the filters, shape (n,).
+    - `pareto_k`: k̂ of the weights of the particles of all filters at each observation, shape (n,),
+        or, without an `observation`, of each transition. Above 0.7 `value` is mostly too small, by
+        more than `standard_error` tells; inf of fewer than 25 particles, unless all weigh the same.
     - `num_nonfinite`: how many particles left the finite numbers or the state space.
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, from
         half as many; `step_uncertainty` is its Monte Carlo error and what it leaves out, by a
@@ -75,6 +87,7 @@ class LogLikelihood(eqx.Module):
     standard_error: Float[Array, ""]
     log_estimates: Float[Array, " num_filters"]
     effective_sample_size: Float[Array, " n"]
+    pareto_k: Float[Array, " n"]
     num_nonfinite: Int[Array, ""]
     step_error: Float[Array, ""]
     step_uncertainty: Float[Array, ""]
@@ -94,9 +107,13 @@ class LogLikelihood(eqx.Module):
     @property
     def trustworthy(self) -> Bool[Array, ""]:
         """Whether `value` and `standard_error` are to be trusted: particles that count at all
-        observations, filters that agree, so that the delta method holds, and a step error that
-        does not dominate."""
-        return self._filters_agree & ~self.step_error_dominates
+        observations, filters that agree, so that the delta method holds, tails of the weights that
+        are not heavy, and a step error that does not dominate."""
+        return self._filters_agree & ~self._is_heavy & ~self.step_error_dominates
+
+    @property
+    def _is_heavy(self) -> Bool[Array, ""]:
+        return jnp.any(self.pareto_k > _HEAVIEST)
 
     @property
     def _filters_agree(self) -> Bool[Array, ""]:
@@ -176,6 +193,7 @@ def or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
     faults = [
         (made.unexplained >= 0, _UNEXPLAINED),
         (~made._filters_agree, _DISAGREE),
+        (made._is_heavy, _HEAVY),
         (made.step_error_dominates, _STEPS),
     ]
     return throw_where(made, "value", model, faults)
@@ -198,6 +216,7 @@ def _told(records: Records, grids: list["Filtered"]) -> LogLikelihood:
         error,
         jnp.sum(fine.log_estimate, axis=0),
         records.at_observations(jnp.mean(fine.size, axis=1)),
+        records.at_observations(fine.pareto_k),
         jnp.sum(fine.num_nonfinite),
         *step_error,
     )
@@ -238,6 +257,7 @@ def _exact(
         jnp.sqrt(jnp.sum(made.standard_error**2)),
         value[None],
         made.effective_sample_size,
+        made.pareto_k,
         jnp.sum(made.num_nonfinite),
         jnp.sum(made.step_error),
         jnp.sqrt(jnp.sum(made.step_uncertainty**2)),
@@ -257,11 +277,12 @@ def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Arr
 
 
 class Filtered(NamedTuple):
-    """What filters estimate: log p̂; the effective number of particles at the ends of segments; and
-    how many were lost."""
+    """What filters estimate: log p̂; the effective number of particles at the ends of segments, and
+    k̂ of the weights of all; and how many were lost."""
 
     log_estimate: Float[Array, " R"]
     size: Float[Array, "R ends"]
+    pareto_k: Float[Array, " ends"]
     num_nonfinite: Int[Array, " R"]
 
     def variance(self, num_particles: int) -> Float[Array, " R"]:
@@ -298,6 +319,14 @@ class _Particles(NamedTuple):
     num_nonfinite: Int[Array, " R"]
 
 
+class _Weights(NamedTuple):
+    """Of the particles of all filters at the end of a segment: how many are effective in each, and
+    log weights, those of each relative to their sum."""
+
+    size: Float[Array, " R"]
+    relative: Float[Array, " lanes"]
+
+
 def run_filters(
     key: Key[Array, ""],
     problem: RecordProblem,
@@ -315,7 +344,7 @@ def run_filters(
     corrected = jax.vmap(correction(problem, model), in_axes=(None, -1))
     most = 0.01 / jnp.finfo(dtype).eps
 
-    def weighed(state: _Particles, key, change) -> tuple[_Particles, Float[Array, " R"]]:
+    def weighed(state: _Particles, key, change) -> tuple[_Particles, _Weights]:
         """With what came to the weights, resampled where that is called for."""
         change = change.reshape(R, P)
         log_weight = state.log_weight + change
@@ -323,11 +352,12 @@ def run_filters(
         finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & (change < most)
         log_weight = jnp.where(finite, log_weight, -jnp.inf)
         lost = jnp.sum(~finite & (state.log_weight > -jnp.inf), axis=1, dtype=jnp.int32)
-        size = effective_size(normalised(log_weight))
+        weights = normalised(log_weight)
+        size, relative = effective_size(weights), jnp.log(weights).ravel()
         state = state._replace(log_weight=log_weight, num_nonfinite=state.num_nonfinite + lost)
         poor = _is_poor(size, P)
         resample = lambda: _resampled(key, state, poor)
-        return lax.cond(jnp.any(poor), resample, lambda: state), size
+        return lax.cond(jnp.any(poor), resample, lambda: state), _Weights(size, relative)
 
     def moved(x, zeta, step, scalars):
         def of_particle(x, zeta):
@@ -363,10 +393,11 @@ def run_filters(
     state = _Particles(x, alike, zero, jnp.zeros(R, jnp.int32))
     state, first = weighed(state, resampling_key, change + corrected(first_row, x))
     inputs = (1 + jnp.arange(problem.num_segments), guide.steps, guide.scalars, rows)
-    state, sizes = lax.scan(segment, state, inputs)
+    state, later = lax.scan(segment, state, inputs)
     log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
-    sizes = jnp.concatenate([first[None], sizes]).T
-    return Filtered(state.log_estimate + log_mean, sizes, state.num_nonfinite)
+    all_ends = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, later)
+    k, log_estimate = pareto_k(all_ends.relative), state.log_estimate + log_mean
+    return Filtered(log_estimate, all_ends.size.T, k, state.num_nonfinite)
 
 
 def _starts(

@@ -12,10 +12,11 @@ from jaxbridge.records.smooth import Smoothed
 MODEL = jb.Diffusion(lambda x, p: -p * x, params=1.0)
 
 
-def likelihood(error=0.1, sizes=50.0, step_error=0.0, doubt=0.01):
+def likelihood(error=0.1, sizes=50.0, k=0.4, step_error=0.0, doubt=0.01):
     value, filters = jnp.array(-3.0), jnp.full(4, -3.0)
+    of_each = jnp.full(5, sizes), jnp.full(5, k)
     told = map(jnp.array, (step_error, doubt))
-    return LogLikelihood(value, jnp.array(error), filters, jnp.full(5, sizes), jnp.int32(0), *told)
+    return LogLikelihood(value, jnp.array(error), filters, *of_each, jnp.int32(0), *told)
 
 
 @pytest.mark.parametrize(
@@ -25,6 +26,7 @@ def likelihood(error=0.1, sizes=50.0, step_error=0.0, doubt=0.01):
         (dict(sizes=4.0), "num_particles"),
         (dict(error=0.6), "num_particles"),
         (dict(error=jnp.inf), "num_particles"),
+        (dict(k=0.9), "may never have been drawn"),
         (dict(step_error=0.2), "num_steps"),
         (dict(step_error=jnp.nan, doubt=jnp.nan), "num_steps"),
         (dict(doubt=jnp.inf), "num_steps"),
