@@ -46,7 +46,7 @@ RESULTS = {
     "WorkPrecision": ["work_precision"],
 }
 # What classes of one's own are given.
-GIVEN = {"Frame", "PairStep", "Step", "StepLaw", "StepsFrom", "LinearStep"}
+GIVEN = {"Frame", "PairStep", "Step", "StepLaw", "DegenerateLaw", "StepsFrom", "LinearStep"}
 WITHOUT_EXAMPLE = {
     *RESULTS,
     *GIVEN,

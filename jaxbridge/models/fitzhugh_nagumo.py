@@ -17,6 +17,7 @@ class FitzHughNagumoParams(NamedTuple):
     **Example:**
 
     ```python
+    model = jb.fitzhugh_nagumo()
     moved = model.with_params(model.params._replace(sigma=jnp.asarray(0.2)))
     ```
     """
@@ -36,7 +37,12 @@ def fitzhugh_nagumo(
         dX = (X - X³ - Y) / ε dt,    dY = (γX - Y + β) dt + σ dW.
 
     Noise reaches X by way of Y only: couplings do not apply, records with an `observation` do.
-    Time is in units of the relaxation time of Y; X and Y have no units.
+    Time is in units of the relaxation time of Y; X and Y have no units. `params` is a
+    `FitzHughNagumoParams`.
+
+    **Arguments:** `epsilon`, ε; `gamma`, γ; `beta`, β; `sigma`, σ: numbers, shape ().
+
+    **Raises:** `ValueError` for other shapes.
 
     **Example:**
 

@@ -19,6 +19,8 @@ def integrated(model: Diffusion) -> Diffusion:
     way of X only: couplings do not apply, records with an `observation` do. `params` are those of
     the model. There is no stationary law, for Z has none: give `initial=`.
 
+    **Arguments:** `model`, that of X. A constant σ that it was given as an array must be known.
+
     **Raises:** `TypeError` for what is no model.
 
     **Example:**

@@ -18,6 +18,7 @@ class SeasonalParams(NamedTuple):
     **Example:**
 
     ```python
+    model = jb.seasonal_ornstein_uhlenbeck()
     moved = model.with_params(model.params._replace(amplitude=jnp.asarray(3.0)))
     ```
     """
@@ -43,7 +44,12 @@ def seasonal_ornstein_uhlenbeck(
 
         dX = -a (X - m(t)) dt + σ dW,    m(t) = mean + amplitude · sin(2πt / period + phase).
 
-    Times of records are absolute.
+    Times of records are absolute. `params` is a `SeasonalParams`.
+
+    **Arguments:** `rate`, a, per unit of time; `mean`; `amplitude`; `phase`, in radians; `period`,
+    in units of time; `sigma`, σ, in space per square root of a unit of time: shape () or (d,) each.
+
+    **Raises:** `ValueError` for other shapes.
 
     **Example:**
 

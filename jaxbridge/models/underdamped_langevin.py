@@ -19,6 +19,7 @@ class UnderdampedLangevinParams(NamedTuple):
     **Example:**
 
     ```python
+    model = jb.underdamped_langevin(lambda q, p: q @ q / 2)
     hotter = model.with_params(model.params._replace(temperature=jnp.asarray(2.0)))
     ```
     """
@@ -39,7 +40,8 @@ def underdamped_langevin(
     Noise reaches Q by way of P only: couplings do not apply, records with an `observation` do.
 
     **Arguments:** `potential`, U, `(q, params) -> ()` of positions, shape (n,); `friction`, γ, and
-    `temperature`, τ, shape (); `params`, any pytree, is what the potential receives.
+    `temperature`, τ, shape (); `params`, any pytree, is what the potential receives. `params` of
+    the model is an `UnderdampedLangevinParams`.
 
     **Raises:** `TypeError` for a potential that is no function; `ValueError` for shapes.
 
