@@ -176,6 +176,8 @@ def semidefinite_factor(matrix: Float[Array, "d n"]) -> Float[Array, "d d"]:
     """`lower_factor` of a matrix whose rows may be linearly dependent, or more than its columns: a
     row of which nothing is left, but for rounding, has a zero on the diagonal and below."""
     d = matrix.shape[0]
+    if d > _UNROLLED:
+        return _looped_factor(matrix)
     L: list[list[Array]] = []
     directions: list[Array] = []
     for i in range(d):
@@ -264,6 +266,22 @@ def _looped_cholesky(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
         return rest - column[:, None] * column, jnp.where(n == k, column[:, None], L)
 
     return lax.fori_loop(0, len(n), eliminate, (matrix, jnp.zeros_like(matrix)))[1]
+
+
+def _looped_factor(matrix: Float[Array, "d n"]) -> Float[Array, "d d"]:
+    """`semidefinite_factor`, in a loop over columns."""
+    d, eps = matrix.shape[0], jnp.finfo(matrix.dtype).eps
+
+    def column(k, carry):
+        rows, L = carry
+        square = jnp.sum(rows[k] ** 2)
+        nothing = square <= (10 * d * eps) ** 2 * jnp.sum(matrix[k] ** 2)
+        root = jnp.where(nothing, 0, lax.rsqrt(jnp.where(nothing, 1, square)))
+        direction = rows[k] * root
+        along = jnp.where(jnp.arange(d) < k, 0, jnp.sum(rows * direction, axis=1))
+        return rows - along[:, None] * direction, L.at[:, k].set(along)
+
+    return lax.fori_loop(0, d, column, (matrix, jnp.zeros((d, d), matrix.dtype)))[1]
 
 
 def _looped_quadratic_form(

@@ -200,6 +200,7 @@ class Problem(NamedTuple):
 
     def check_sigma_known(self, instead: str) -> None:
         """Raise `ValueError` where σ depends on the unknown parameters, that says what to do."""
+        self.parameters.model.check_invertible_sigma(self.like)
         if self.sigma_is_unknown:
             raise ValueError(
                 "σ depends on the unknown parameters, and given a whole path σ is known: " + instead

@@ -128,10 +128,17 @@ class Diffusion(eqx.Module):
         ]:
             if not (callable(function) or (function is None and name != "drift")):
                 raise TypeError(f"`{name}` must be a function, got {function!r}.")
-        if log_stationary is not None and (takes_time(drift) or takes_time(diffusion)):
+        of_stationary = {
+            "log_stationary": log_stationary is not None,
+            "reverse_drift": reverse_drift is not None,
+            "sample_stationary": sample_stationary is not None,
+            "reversible": reversible,
+        }
+        if any(of_stationary.values()) and (takes_time(drift) or takes_time(diffusion)):
+            names = ", ".join(f"`{name}`" for name, given in of_stationary.items() if given)
             raise ValueError(
                 "`drift` or `diffusion` takes a third argument, the time, and a diffusion whose "
-                "coefficients depend on time is not stationary: leave out `log_stationary`."
+                f"coefficients depend on time is not stationary: leave out {names}."
             )
         self._drift = drift
         self._log_stationary = log_stationary
@@ -287,6 +294,8 @@ class Diffusion(eqx.Module):
 
     def check_reversal(self) -> None:
         """Raise `ValueError` where the time reversal of this model is unknown."""
+        if self.depends_on_time:
+            raise ValueError(_NOT_HOMOGENEOUS)
         if not self.has_reversal:
             raise ValueError(
                 "the time reversal of this model is unknown, and couplings need it: give "
@@ -449,7 +458,7 @@ def _as_sigma(
         sigma: AbstractSigma = cast_floats(values, x.dtype)
         return Constant(sigma.as_matrix(d, x.dtype)) if constant else sigma
     values = _as_real("diffusion", values)
-    if values.shape != (d,) and not (values.ndim == 2 and values.shape[0] == d):
+    if values.shape != (d,) and not (values.ndim == 2 and values.shape[0] == d and values.size):
         raise ValueError(
             f"`diffusion` must have shape ({d}, m) for noise of m dimensions, or ({d},) for a "
             f"diagonal, at a point of shape ({d},); it has {values.shape}."
@@ -530,8 +539,8 @@ def check_invertible(name: str, sigma: Array | np.ndarray) -> None:
         raise ValueError(f"`{name}` must be finite; got {matrix}.")
     if np.linalg.cond(matrix) > 1 / np.finfo(matrix.dtype).eps:
         raise ValueError(
-            f"`{name}` must be invertible, or have fewer columns than rows where noise reaches "
-            f"only a part of the state; got the singular matrix {matrix}."
+            f"`{name}` must be invertible, or have fewer columns than rows, all independent, where "
+            f"noise reaches only a part of the state; got the singular matrix {matrix}."
         )
 
 

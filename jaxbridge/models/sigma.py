@@ -15,6 +15,7 @@ from typing import ClassVar, NoReturn
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.linalg import (
@@ -220,6 +221,12 @@ class Tall(AbstractMatrix):
 
     def root(self):
         return self
+
+
+def columns_of(sigma: AbstractSigma, x: Float[Array, " d"]) -> list[Float[Array, " d"]]:
+    """The columns of σ at x."""
+    num_columns = sigma.as_matrix(x.shape[0], x.dtype).shape[1]
+    return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(num_columns)]
 
 
 def root_of(V: Float[Array, "d d"]) -> Triangular:

@@ -17,14 +17,13 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating
 from ..engine.linalg import log_abs_det
 from .diffusion import Diffusion, check_diffusion, check_value
-from .dynamics import Dynamics
+from .sigma import columns_of
 
 Map = Callable[[Array], Any]
 _Result = TypeVar("_Result")
@@ -124,6 +123,11 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
     for name, function in [("forward", forward), ("inverse", inverse)]:
         if not callable(function):
             raise TypeError(f"`{name}` must be a function of a point; got {function!r}.")
+    if model.depends_on_time:
+        raise ValueError(
+            "the coefficients of this `model` depend on time, and `transform` is for those that do "
+            "not: write the model in its new coordinates."
+        )
     functions = _moved(model.unbound(), forward, inverse)
     moved = Diffusion(
         functions.drift,
@@ -158,9 +162,10 @@ class _Moved:
 
     def diffusion(self, y, params):
         x, model = self._at(y, params)
-        moved = [self._along(x, column) for column in _columns(x, model.forward(x))]
+        columns = columns_of(model.forward(x).sigma(x), x)
+        moved = [self._along(x, column) for column in columns]
         # In one dimension a matrix is its diagonal.
-        return moved[0] if len(moved) == 1 else jnp.stack(moved, axis=1)
+        return moved[0] if x.shape[0] == 1 else jnp.stack(moved, axis=1)
 
     def log_stationary(self, y, params):
         x, model = self._at(y, params)
@@ -183,14 +188,9 @@ class _Moved:
     def _ito(self, x, dynamics):
         """∇f α + ½ Σ_k ∂²f(σ_k, σ_k), with the columns σ_k of σ."""
         moved = self._along(x, dynamics.drift(x))
-        for column in _columns(x, dynamics):
+        for column in columns_of(dynamics.sigma(x), x):
             moved += jax.jvp(lambda x, v=column: self._along(x, v), (x,), (column,))[1] / 2
         return moved
-
-
-def _columns(x: Float[Array, " d"], dynamics: Dynamics) -> list[Float[Array, " d"]]:
-    sigma = dynamics.sigma(x)
-    return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(x.shape[0])]
 
 
 # The same object for the same arguments, so that its functions compile once.

@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -183,11 +184,12 @@ class _Search(NamedTuple):
 @compiled  # a program of its own, which all who read the record share
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     """Along the path of the extended Kalman filter, and then of the path that is guided without
-    noise; both begin at a likely point where ν is not normal. Neither has derivatives.
+    noise; both begin at a likely point where ν is not normal. The points have no derivatives, and
+    the guide none by the model.
 
     Where that path is the less likely one, by its weight, steps to it are shortened until it is
     not: excitable and chaotic systems throw Gauss and Newton's iteration off for good."""
-    model = without_derivatives(model)
+    own, (problem, model) = problem, without_derivatives((problem, model))
     initial = initial_law(problem.initial, model, problem.like)
     dynamics_at, scalars = model.forward_at(problem.like), problem.scalars(model)
     begin = likeliest(problem.initial, model, initial, split_first(scalars)[0])
@@ -211,7 +213,7 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     def turn(search: _Search) -> _Search:
         new = at(search.points)
         gain = jnp.where(search.turn == 0, jnp.inf, new[1] - search.log_weight)
-        better = gain > -_NO_GAIN
+        better = (gain > -_NO_GAIN) | (search.log_weight == -jnp.inf)
         old = search.best, search.log_weight, search.path
         best, log_weight, path = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
         settled = better & (gain < _NO_GAIN) & (search.length == 1)
@@ -226,4 +228,21 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     zero, one = jnp.zeros((), log_weight.dtype), jnp.ones((), points.dtype)
     init = _Search(jnp.int32(0), points, nothing, zero, points, one, jnp.zeros((), bool))
     goes_on = lambda search: ~search.over & (search.turn < _MOST_TURNS)
-    return lax.while_loop(goes_on, turn, init).best
+    points, guide = lax.while_loop(goes_on, turn, init).best
+    return Linearised(points, _guide_of((own, guide), model=model, points=points))
+
+
+@eqx.filter_custom_jvp
+def _guide_of(
+    known: tuple[RecordProblem, Guidance], *, model: Diffusion, points: Float[Array, "points d"]
+) -> Guidance:
+    """The guide along these points, which is known; its derivatives are those of what was seen and
+    where it began."""
+    return known[1]
+
+
+@_guide_of.def_jvp
+def _guide_derivative(primals, tangents, *, model, points):
+    ((problem, guide),), ((change, _),) = primals, tangents
+    along = lambda problem: guided(problem, model, points)
+    return guide, eqx.filter_jvp(along, (problem,), (change,))[1]

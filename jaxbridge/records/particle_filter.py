@@ -57,8 +57,8 @@ _DISAGREE = (
 )
 _HEAVY = (
     "at some observation the largest weights are so much larger than the others (`pareto_k` above "
-    "0.8) that particles which weigh more yet may never have been drawn: take more "
-    "`num_particles`, and see whether `value` stays."
+    "0.8; infinite of fewer than 25 particles) that particles which weigh more yet may never have "
+    "been drawn: take more `num_particles`, and see whether `value` stays."
 )
 _STEPS = "the step error is beyond the standard error, or not known: take more `num_steps`."
 

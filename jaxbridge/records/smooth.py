@@ -17,6 +17,8 @@ from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduc
 from ..engine.progress import metered_scan
 from ..engine.throwing import throw_where
 from ..models.diffusion import Diffusion
+from ..models.sigma import columns_of
+from ..models.tracing import uses_argument
 from ..schemes import (
     AbstractStepDensity,
     StepError,
@@ -81,12 +83,14 @@ class Smoothed(eqx.Module):
     def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """What `mean(fn)` is too large by for the length of the steps, entry by entry, to its
         leading term: from half as many steps, by which each path is e^D times as likely (`halving`
-        in `schemes`). NaN where nothing is known, with a `proposal` or of one step."""
+        in `schemes`). NaN where nothing is known, with a `proposal`, of one step, or of Euler's
+        steps where σ has fewer columns than rows."""
         return self._step_errors(fn)[0]
 
     def step_uncertainty(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """The Monte Carlo error of `step_error(fn)`, entry by entry; infinite where σ varies, for
-        then D tells no more than the size: compare two numbers of steps there."""
+        """The Monte Carlo error of `step_error(fn)`, entry by entry; infinite where σ varies, or by
+        what the drift leads its noise on, ∇α σ, for then D tells no more than the size: compare two
+        numbers of steps there."""
         return self._step_errors(fn)[1]
 
     def step_error_dominates(self, fn: PathFunction = lambda path: path) -> PyTree:
@@ -123,7 +127,7 @@ class Smoothed(eqx.Module):
             return unknown, unknown
         D = _log_halving(problem, self.paths)
         leaves, treedef = jax.tree.flatten(values)
-        varies = problem.model.sigma_varies(problem.like)
+        varies = _noise_varies(problem)
         share = share_of_order(problem.density.order)
         each = [_change(leaf, D, share, varies) for leaf in leaves]
         values, doubts = zip(*each, strict=True)
@@ -274,6 +278,20 @@ def _smooth(
     stuck = jnp.any(real & ~jnp.any(taken, axis=0), axis=(0, 1))
     share = jnp.mean(taken.astype(points.dtype), axis=(0, -1))
     return Draws(problem.record.grid(), drawn, share, stuck, jnp.int32(0))
+
+
+def _noise_varies(problem: RecordProblem) -> bool:
+    """Whether the noise of a step depends on the state in leading order."""
+    model, like = problem.model, problem.like
+    if model.sigma_varies(like) or model.sigma_is_invertible(like):
+        return model.sigma_varies(like)
+
+    def led_on(x):
+        dynamics = model.forward_at(like)(problem.record.times[0])
+        columns = columns_of(dynamics.sigma(x), x)
+        return jnp.stack([jax.jvp(dynamics.drift, (x,), (column,))[1] for column in columns])
+
+    return uses_argument(led_on, like)
 
 
 @compiled

@@ -251,6 +251,11 @@ def sample_states(
 def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars) -> None:
     """Raise `ValueError` where states cannot move with this proposal."""
     model, law = problem.model, bound(problem.initial, problem.model)
+    if model.depends_on_time or not model.sigma_is_invertible(problem.like):
+        raise ValueError(
+            "bridges of a `proposal` are for coefficients that do not depend on time and σ with an "
+            "inverse: leave out `proposal`, so that paths are guided by the whole record."
+        )
     if not (model.has_sampler or model.has_density):
         raise ValueError(
             "states at the times of observations are proposed by the moments of the stationary "

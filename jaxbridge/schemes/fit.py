@@ -17,6 +17,7 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
 
     Shapes are checked wherever the model's functions are traced, so here only values are.
     """
+    model.check_invertible_sigma(intervals.start[0])
     if is_traced(model, intervals.start, intervals.end):
         return
     for name, points in [("start", intervals.start), ("end", intervals.end)]:

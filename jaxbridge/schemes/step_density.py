@@ -38,7 +38,7 @@ from jaxtyping import Array, Float
 
 from ..engine.linalg import matmul, semidefinite_factor, total
 from ..models.dynamics import Dynamics
-from ..models.sigma import AbstractSigma
+from ..models.sigma import columns_of
 from .step_law import DegenerateLaw, StepLaw, root_of_length
 
 
@@ -141,7 +141,7 @@ class ItoTaylorDensity(AbstractStepDensity):
         sigma, d = dynamics.sigma(x), x.shape[0]
         if not sigma.invertible:
             return _degenerate_ito_taylor(dynamics, x)
-        along = [_along(dynamics.drift, x, column) for column in _columns(sigma, x)]
+        along = [_along(dynamics.drift, x, column) for column in columns_of(sigma, x)]
         slopes, bends = zip(*along, strict=True)
         drift = dynamics.drift(x)
         beta = sigma.solve(drift)
@@ -181,12 +181,6 @@ def most_accurate_density(sigma_varies: bool) -> AbstractStepDensity:
     return EulerDensity() if sigma_varies else ItoTaylorDensity()
 
 
-def _columns(sigma: AbstractSigma, x: Float[Array, " d"]) -> list[Float[Array, " d"]]:
-    """Those of σ."""
-    m = sigma.as_matrix(x.shape[0], x.dtype).shape[1]
-    return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(m)]
-
-
 def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
     """Euler's steps where σ has no inverse."""
     drift, sigma = dynamics.drift(x), dynamics.sigma(x).as_matrix(x.shape[0], x.dtype)
@@ -204,7 +198,7 @@ def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
 def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
     """Those of Itô's and Taylor's expansion."""
     sigma, drift = dynamics.sigma(x), dynamics.drift(x)
-    columns = _columns(sigma, x)
+    columns = columns_of(sigma, x)
     slopes, bends = zip(*[_along(dynamics.drift, x, column) for column in columns], strict=True)
     # Fα + ½ Σ_k ∂²α(σ_k, σ_k), and Fσ.
     bent = jax.jvp(dynamics.drift, (x,), (drift,))[1] + total(jnp.stack(bends)) / 2

@@ -101,7 +101,12 @@ class StepLaw(NamedTuple):
         """The law of two steps from x: of `first`, and of a linear step that from x has this
         law."""
         dt = first.dt + self.dt
-        covariance = first.dt * matmul(matmul(decay, first.matrix), decay.T)
+        if first.sigma is self.sigma:
+            covariance = first.dt * matmul(matmul(decay, first.matrix), decay.T)
+        else:  # at another time: the noise of the first step in the coordinates of this one
+            columns = [self.sigma.solve(column) for column in first.root.T]
+            root = matmul(decay, jnp.stack(columns, axis=1))
+            covariance = matmul(root, root.T)
         covariance = (covariance + self.dt * self.matrix) / dt
         mean = self.mean + self.carried(decay, first.mean - x)
         return StepLaw(mean, self.sigma, covariance, dt)

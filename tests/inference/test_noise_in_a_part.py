@@ -1,4 +1,4 @@
-"""Posteriors where noise reaches a part of the state only, against Kalman's likelihood on a grid."""
+"""Where noise reaches a part of the state only: posteriors, against Kalman's likelihood."""
 
 import functools
 

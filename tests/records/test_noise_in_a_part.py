@@ -8,6 +8,7 @@ from helpers import loglog_slope
 from kalman import euler_step, exact_step, kalman
 
 import jaxbridge as jb
+from jaxbridge.engine.linalg import semidefinite_factor
 
 KEY = jax.random.key(0)
 
@@ -190,8 +191,50 @@ def test_what_rests_on_an_inverse_of_sigma_says_what_to_use_instead():
     for proposal in (jb.Guided(), jb.ModifiedDiffusionBridge(), jb.ResidualBridge(), "auto"):
         with pytest.raises(ValueError, match=r"fewer columns than rows.*`log_likelihood`"):
             jb.transition_log_density(*ends, num_proposals=2, num_steps=4, proposal=proposal)
+    for call in (jb.score, jb.pmmh, jb.gibbs, jb.maximum_likelihood):
+        prior = {} if call in (jb.score, jb.maximum_likelihood) else {"prior": lambda p: 0.0}
+        with pytest.raises(ValueError, match="fewer columns than rows"):
+            call(KEY, model, jnp.arange(3.0), jnp.zeros((3, 2)), **prior)
+    with pytest.raises(ValueError, match="fewer columns than rows"):
+        jb.sample_bridges(*ends, num_bridges=2, num_steps=4)
     with pytest.raises(ValueError, match="fewer columns than rows"):
         jb.path_log_likelihood(model, jnp.arange(3.0), jnp.zeros((3, 2)))
     known = jb.underdamped_langevin(lambda q, p: q @ q / 2)
     with pytest.raises(ValueError, match="fewer columns than rows"):
         jb.sample_bridges(KEY, known, *ends[2:], num_bridges=2, num_steps=4)
+
+
+def test_a_transformed_model_has_as_many_columns(x64):
+    """Y = sinh(X) seen through arcsinh is X seen."""
+    case = oscillator(0.1)
+    moved = jb.transform(case.model, jnp.sinh, jnp.arcsinh).model
+    assert moved.diffusion(jnp.ones(2)).shape == (2, 1)
+    y = jnp.array([0.3, -0.4])
+    by_hand = jnp.cosh(jnp.arcsinh(y))[:, None] * case.model.diffusion(jnp.arcsinh(y))
+    np.testing.assert_allclose(moved.diffusion(y), by_hand)
+
+
+def test_doubt_where_noise_is_led_on_by_the_state():
+    """dX = Y + Y^2: what the drift leads the noise on by, 1 + 2Y, is not constant."""
+    straight = lambda x, p: jnp.stack([x[1], -x[1] - x[0] ** 3])
+    bent = lambda x, p: jnp.stack([x[1] + x[1] ** 2, -x[1]])
+    for drift, known in [(straight, True), (bent, False)]:
+        model = jb.Diffusion(drift, [[0.0], [0.8]])
+        made = jb.smooth(
+            KEY, model, [0.0, 0.5, 1.0], np.array([[0.1], [0.3], [0.2]]), num_steps=4,
+            observation=jb.LinearGaussian([[1.0, 0.0]], 0.1), initial=[0.0, 0.0],
+            num_draws=20, num_warmup=4, num_chains=2,
+        )  # fmt: skip
+        assert np.isfinite(made.step_uncertainty()[1:]).all() == known
+
+
+def test_a_factor_of_many_rows_is_that_of_few(x64):
+    """In a loop, beyond sixteen rows, of which some depend on others or are zero."""
+    matrix = np.random.default_rng(0).normal(size=(20, 15))
+    matrix[3] = 0
+    matrix[7] = matrix[2] - matrix[5]
+    L = semidefinite_factor(jnp.asarray(matrix))
+    np.testing.assert_allclose(L @ L.T, matrix @ matrix.T, atol=1e-10)
+    assert L[3, 3] == L[7, 7] == 0 and np.allclose(np.triu(L, 1), 0)
+    few = semidefinite_factor(jnp.asarray(matrix[:10]))
+    np.testing.assert_allclose(L[:10, :10], few, atol=1e-10)

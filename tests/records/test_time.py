@@ -8,6 +8,7 @@ from helpers import loglog_slope
 from scipy.integrate import quad
 
 import jaxbridge as jb
+from jaxbridge.schemes import log_halving_of_paths
 
 KEY = jax.random.key(0)
 TIMES = 3.0 + np.cumsum(np.random.default_rng(0).uniform(0.05, 0.3, 20))
@@ -114,13 +115,44 @@ def test_what_is_for_constant_coefficients_says_what_to_use_instead():
             *ends, num_bridges=2, num_steps=4, proposal=jb.ModifiedDiffusionBridge()
         ),
         lambda: jb.path_log_likelihood(model, jnp.arange(3.0), jnp.zeros((3, 1))),
-        lambda: jb.transform(model, jnp.sinh, jnp.arcsinh).model.drift(jnp.ones(1)),
+        lambda: jb.sample_bridges(*ends, num_bridges=2, num_steps=4),
     ]
     for call in calls:
         with pytest.raises(ValueError, match=r"depend on time.*`log_likelihood`"):
             call()
+    timed = lambda x, p, t: -t * x
     with pytest.raises(ValueError, match="not stationary: leave out `log_stationary`"):
-        jb.Diffusion(lambda x, p, t: -t * x, None, lambda x, p: -x @ x)
+        jb.Diffusion(timed, None, lambda x, p: -x @ x)
+    with pytest.raises(ValueError, match="not stationary: leave out `reversible`"):
+        jb.Diffusion(timed, reversible=True)
+    with pytest.raises(ValueError, match="write the model in its new coordinates"):
+        jb.transform(model, jnp.sinh, jnp.arcsinh)
+    with pytest.raises(ValueError, match="leave out `proposal`"):
+        jb.smooth(
+            KEY, model, TIMES, 0 * TIMES[:, None], observation=SEEN, initial=START, proposal="auto"
+        )
+
+
+def test_means_of_the_density_of_half_as_many_steps(x64):
+    """E[e^D] = 1 for pairs of steps of the chain, where the noise grows with time: D compares the
+    laws of steps at three times."""
+    model = jb.Diffusion(lambda x, p, t: -x, lambda x, p, t: jnp.exp(t) * jnp.ones(1))
+    dynamics_at, density, dt = model.forward_at(jnp.zeros(1)), jb.ItoTaylorDensity(), 0.4
+    xi = jax.random.normal(KEY, (40_000, 2, 1))
+
+    def pair(xi):
+        law = density.steps_from(dynamics_at(dt / 2), jnp.ones(1)).law(dt)
+        middle = law.point(xi[0])
+        law = density.steps_from(dynamics_at(3 * dt / 2), middle).law(dt)
+        return jnp.stack([jnp.ones(1), middle, law.point(xi[1])])
+
+    times = jnp.broadcast_to(jnp.array([[dt / 2], [3 * dt / 2]]), (2, len(xi)))
+    D = log_halving_of_paths(
+        density, dynamics_at, jnp.full((2, len(xi)), dt), jax.vmap(pair)(xi), times
+    )
+    ratios = np.exp(np.asarray(D))
+    assert abs(ratios.mean() - 1) < 5 * ratios.std() / np.sqrt(len(xi))
+    assert ratios.std() < 0.5
 
 
 def test_free_paths_are_those_of_the_season():
