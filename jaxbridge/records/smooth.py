@@ -18,7 +18,6 @@ from ..engine.progress import metered_scan
 from ..engine.throwing import throw_where
 from ..models.diffusion import Diffusion
 from ..models.sigma import columns_of
-from ..models.tracing import uses_argument
 from ..schemes import (
     AbstractStepDensity,
     StepError,
@@ -35,6 +34,8 @@ from .states import Draws, sample_states
 
 # R̂ beyond which chains disagree.
 _MOST_R_HAT = 1.1
+# What changes by no more along a path, relative to its size, is constant.
+_CONSTANT = 1e-3
 
 _STUCK = (
     "a block of the path never moved: take more `num_draws`, a shorter `block_length` or more "
@@ -127,7 +128,7 @@ class Smoothed(eqx.Module):
             return unknown, unknown
         D = _log_halving(problem, self.paths)
         leaves, treedef = jax.tree.flatten(values)
-        varies = _noise_varies(problem)
+        varies = _noise_varies(problem, self.paths[0, 0])
         share = share_of_order(problem.density.order)
         each = [_change(leaf, D, share, varies) for leaf in leaves]
         values, doubts = zip(*each, strict=True)
@@ -280,18 +281,21 @@ def _smooth(
     return Draws(problem.record.grid(), drawn, share, stuck, jnp.int32(0))
 
 
-def _noise_varies(problem: RecordProblem) -> bool:
-    """Whether the noise of a step depends on the state in leading order."""
+@compiled
+def _noise_varies(problem: RecordProblem, path: Float[Array, "K d"]) -> Bool[Array, ""]:
+    """Whether the noise of a step depends on the state in leading order: σ does, or where it has
+    fewer columns than rows ∇α σ, by which the drift leads it on, along this path."""
     model, like = problem.model, problem.like
     if model.sigma_varies(like) or model.sigma_is_invertible(like):
-        return model.sigma_varies(like)
+        return jnp.asarray(model.sigma_varies(like))
+    dynamics = model.forward_at(like)(problem.record.times[0])
 
     def led_on(x):
-        dynamics = model.forward_at(like)(problem.record.times[0])
         columns = columns_of(dynamics.sigma(x), x)
         return jnp.stack([jax.jvp(dynamics.drift, (x,), (column,))[1] for column in columns])
 
-    return uses_argument(led_on, like)
+    each = jax.vmap(led_on)(path)
+    return jnp.max(jnp.ptp(each, axis=0)) > _CONSTANT * jnp.max(jnp.abs(each))
 
 
 @compiled
@@ -315,7 +319,10 @@ def _log_halving(
 
 
 def _change(
-    values: Float[Array, "chains n ..."], D: Float[Array, "chains n"], share: float, varies: bool
+    values: Float[Array, "chains n ..."],
+    D: Float[Array, "chains n"],
+    share: float,
+    varies: Bool[Array, ""],
 ) -> StepError:
     """The share of E[e^D f] / E[e^D] - E[f] that is error, to second order in D: the covariance of
     f with D + ½ (D - ED)²."""
@@ -323,5 +330,5 @@ def _change(
     D = (D + D**2 / 2).reshape(*D.shape, *[1] * (values.ndim - 2))
     products = (values - jnp.mean(values, axis=(0, 1))) * (D - jnp.mean(D))
     error = jnp.std(products, axis=(0, 1)) / jnp.sqrt(effective_size_of_chains(products))
-    doubt = jnp.full_like(error, jnp.inf) if varies else share * error
+    doubt = jnp.where(varies, jnp.inf, share * error)
     return StepError(share * jnp.mean(products, axis=(0, 1)), doubt)
