@@ -75,7 +75,8 @@ class LogLikelihood(eqx.Module):
         resampling, the mean over the filters, shape (n,).
     - `pareto_k`: k̂ of the weights of the particles of all filters at each observation, shape (n,),
         or, without an `observation`, of each transition. Above 0.7 `value` is mostly too small, by
-        more than `standard_error` tells; inf of fewer than 25 particles, unless all weigh the same.
+        more than `standard_error` tells; rough where there are few particles, and inf of fewer than
+        25, unless all weigh the same.
     - `num_nonfinite`: how many particles left the finite numbers or the state space.
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, from
         half as many; `step_uncertainty` is its Monte Carlo error and what it leaves out, by a
