@@ -58,6 +58,18 @@ def cast_floats(tree: PyTree, dtype) -> PyTree:
     )
 
 
+def as_numbers(values: dict[str, Numbers]) -> dict[str, Array]:
+    """Numbers, shape (), by their names.
+
+    **Raises:** `ValueError` for arrays.
+    """
+    numbers = {name: as_floating(name, value) for name, value in values.items()}
+    for name, value in numbers.items():
+        if value.shape != ():
+            raise ValueError(f"`{name}` must be a number, shape (); got shape {value.shape}.")
+    return numbers
+
+
 def check_precision(names: str, dtype: jnp.dtype) -> None:
     """Raise `TypeError` where arrays of these names are of less than single precision."""
     if dtype.itemsize < 4:

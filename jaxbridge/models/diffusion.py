@@ -503,6 +503,17 @@ def check_dimension(x: Float[Array, " d"], dim: int) -> None:
         )
 
 
+def halves(x: Float[Array, " d"], what: str) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """The two halves of a state, which are `what`.
+
+    **Raises:** `ValueError` for one of an odd number of coordinates.
+    """
+    if x.shape[0] % 2:
+        raise ValueError(f"the state `x` is {what}; got shape {x.shape}.")
+    first, second = jnp.split(x, 2)
+    return first, second
+
+
 @functools.lru_cache(maxsize=256)
 def _constant_function(values: tuple) -> Callable:
     """σ as a function of a point, the same one for the same numbers."""
@@ -520,7 +531,8 @@ def _check_constant_sigma(sigma: Numbers) -> Array:
             "a constant `diffusion` must have shape (d, m) for noise of m dimensions, or (d,) for "
             f"a diagonal; got {sigma.shape}."
         )
-    check_invertible("diffusion", sigma)
+    tall = " (or have fewer columns, where noise reaches only a part of the state)"
+    check_invertible("diffusion", sigma, tall)
     return sigma
 
 
@@ -530,8 +542,9 @@ def check_diffusion(model) -> None:
         raise TypeError(f"`model` must be a `jaxbridge.Diffusion`; got {type(model).__name__}.")
 
 
-def check_invertible(name: str, sigma: Array | np.ndarray) -> None:
-    """Raise `ValueError` for a visibly singular or non-finite σ; silent while tracing."""
+def check_invertible(name: str, sigma: Array | np.ndarray, otherwise: str = "") -> None:
+    """Raise `ValueError` for a visibly singular or non-finite σ, which says what it may be
+    `otherwise`; silent while tracing."""
     if is_traced(sigma):
         return
     matrix = np.diag(sigma) if sigma.ndim == 1 else np.asarray(sigma)
@@ -539,8 +552,7 @@ def check_invertible(name: str, sigma: Array | np.ndarray) -> None:
         raise ValueError(f"`{name}` must be finite; got {matrix}.")
     if np.linalg.cond(matrix) > 1 / np.finfo(matrix.dtype).eps:
         raise ValueError(
-            f"`{name}` must be invertible, or have fewer columns than rows, all independent, where "
-            f"noise reaches only a part of the state; got the singular matrix {matrix}."
+            f"`{name}` must be invertible{otherwise}; got the singular matrix {matrix}."
         )
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..engine.checks import Numbers, as_floating
+from ..engine.checks import Numbers, as_numbers
 from .diffusion import Diffusion, check_dimension
 
 
@@ -52,11 +52,7 @@ def fitzhugh_nagumo(
     ```
     """
     values = {"epsilon": epsilon, "gamma": gamma, "beta": beta, "sigma": sigma}
-    params = {name: as_floating(name, value) for name, value in values.items()}
-    for name, value in params.items():
-        if value.shape != ():
-            raise ValueError(f"`{name}` must be a number, shape (); got shape {value.shape}.")
-    return Diffusion(_drift, _sigma, params=FitzHughNagumoParams(**params))
+    return Diffusion(_drift, _sigma, params=FitzHughNagumoParams(**as_numbers(values)))
 
 
 def _drift(x: Float[Array, " d"], p: FitzHughNagumoParams) -> Float[Array, " d"]:

@@ -6,7 +6,7 @@ import functools
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .diffusion import Diffusion, check_diffusion
+from .diffusion import Diffusion, check_diffusion, halves
 
 
 def integrated(model: Diffusion) -> Diffusion:
@@ -77,10 +77,4 @@ _functions = functools.lru_cache(maxsize=256)(_Integrated)
 
 
 def _halves(x: Float[Array, " d"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    if x.shape[0] % 2:
-        raise ValueError(
-            "the state `x` is an integral and what is integrated, as many coordinates of the one "
-            f"as of the other; got shape {x.shape}."
-        )
-    integral, velocity = jnp.split(x, 2)
-    return integral, velocity
+    return halves(x, "an integral and what is integrated, as many coordinates of each")

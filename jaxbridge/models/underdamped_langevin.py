@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..engine.checks import Numbers, as_floating
-from .diffusion import Diffusion, check_value
+from ..engine.checks import Numbers, as_numbers
+from .diffusion import Diffusion, check_value, halves
 
 
 class UnderdampedLangevinParams(NamedTuple):
@@ -54,11 +54,7 @@ def underdamped_langevin(
     """
     if not callable(potential):
         raise TypeError(f"`potential` must be a function `(q, params)`; got {potential!r}.")
-    values = {"friction": friction, "temperature": temperature}
-    numbers = {name: as_floating(name, value) for name, value in values.items()}
-    for name, value in numbers.items():
-        if value.shape != ():
-            raise ValueError(f"`{name}` must be a number, shape (); got shape {value.shape}.")
+    numbers = as_numbers({"friction": friction, "temperature": temperature})
     functions = _Functions(potential)
     made = UnderdampedLangevinParams(**numbers, potential=params)
     return Diffusion(functions.drift, _sigma, functions.log_stationary, made)
@@ -89,10 +85,4 @@ def _sigma(x, p):
 
 
 def _halves(x: Float[Array, " d"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    if x.shape[0] % 2:
-        raise ValueError(
-            "the state `x` is positions and velocities, as many of the one as of the other; got "
-            f"shape {x.shape}."
-        )
-    positions, velocities = jnp.split(x, 2)
-    return positions, velocities
+    return halves(x, "positions and velocities, as many of the one as of the other")

@@ -72,7 +72,8 @@ class Record(eqx.Module):
 
     def _beginnings(self) -> Float[Array, "K N"]:
         """The times at which steps begin."""
-        return self.times[:-1, None] + jnp.cumsum(self.dt, axis=1) - self.dt
+        within = jnp.cumsum(self.dt, axis=1) - self.dt  # first, so that a segment begins on time
+        return self.times[:-1, None] + within
 
     def coarsened(self, level: int = 1) -> "Record":
         """The same with steps that are 2^level as long, the first of a segment what is left of N,

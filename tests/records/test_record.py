@@ -6,6 +6,7 @@ import pytest
 from helpers import count_compilations
 
 import jaxbridge as jb
+from jaxbridge.records.record import as_records
 
 MODEL = jb.ornstein_uhlenbeck([[1.0, 0.5], [0.0, 1.0]])
 TIMES, VALUES = np.arange(4.0), np.zeros((4, 2))
@@ -35,3 +36,10 @@ def test_long_gaps_are_cut_into_segments():
     assert steps.max() < 0.1 * (1 + 1e-4) and steps.min() > 0
     assert len(steps) < 60
     assert np.all(np.abs(times[:, None] - np.asarray(made.times)).min(1) < 1e-6)
+
+
+def test_segments_begin_at_their_times():
+    """To the last digit, also where times are large beside steps."""
+    times = np.float32(2000) + np.cumsum(np.random.default_rng(0).uniform(0.1, 0.3, 50))
+    (record,) = as_records([(times.astype(np.float32), np.zeros((50, 1)))], 7, None)
+    np.testing.assert_array_equal(record.grid()[::7], record.times)
