@@ -39,7 +39,7 @@ def test_long_gaps_are_cut_into_segments():
 
 
 def test_segments_begin_at_their_times():
-    """To the last digit, also where times are large beside steps."""
-    times = np.float32(2000) + np.cumsum(np.random.default_rng(0).uniform(0.1, 0.3, 50))
-    (record,) = as_records([(times.astype(np.float32), np.zeros((50, 1)))], 7, None)
-    np.testing.assert_array_equal(record.grid()[::7], record.times)
+    """To the last digit, also where the first times are small beside steps."""
+    times = np.array([1e-3, 30.0, 100.0, 170.0], np.float32)
+    (record,) = as_records([(times, np.zeros((4, 1)))], 7, None)
+    np.testing.assert_array_equal(record.grid()[::7], times)
