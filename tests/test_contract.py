@@ -2,6 +2,7 @@
 and `vmap` as outside, the same numbers by the same key, an axis for intervals, the precision of
 what is given."""
 
+import inspect
 from typing import NamedTuple
 
 import diffrax
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from helpers import PAPER_B, count_compilations, paper_model, slow_beyond
 
+import jaxbridge
 import jaxbridge as jb
 
 base_model = paper_model
@@ -62,8 +64,8 @@ def bridges(given, **how):
     return jb.sample_bridges(*given.ends, **SIZES, coupling=given.pairs, **how)
 
 
-def of_bridges(call, *options):
-    return lambda given, **how: call(*given.ends[:2], bridges(given), *options, **how)
+def of_bridges(name, *options):
+    return lambda given, **how: getattr(jb, name)(*given.ends[:2], bridges(given), *options, **how)
 
 
 def expect(given):
@@ -78,15 +80,15 @@ def chain(method, proposal=None):
     )
 
 
-def of_drift(call, **options):
+def of_drift(name, **options):
     drift = dict(where=lambda params: params.B, num_steps=4)
-    return lambda given, **how: call(*given.record, **drift, **options, **how)
+    return lambda given, **how: getattr(jb, name)(*given.record, **drift, **options, **how)
 
 
 BATCHED = {
     "sample_bridges": bridges,
-    "weigh_bridges": of_bridges(jb.weigh_bridges),
-    "hitting_counts": of_bridges(jb.hitting_counts, 2),
+    "weigh_bridges": of_bridges("weigh_bridges"),
+    "hitting_counts": of_bridges("hitting_counts", 2),
 }
 OF_AN_INTERVAL = BATCHED | {
     "sample_weighted_bridges": lambda given, **how: jb.sample_weighted_bridges(
@@ -101,13 +103,13 @@ OF_AN_INTERVAL = BATCHED | {
     "expectation": expect,
 }
 OF_A_RECORD = {
-    "gibbs": of_drift(jb.gibbs, prior=PRIOR, num_iterations=2, proposal=jb.Coupling(0.5)),
+    "gibbs": of_drift("gibbs", prior=PRIOR, num_iterations=2, proposal=jb.Coupling(0.5)),
     "pmmh": of_drift(
-        jb.pmmh, prior=PRIOR, num_iterations=2, num_warmup=2, num_proposals=3, proposal=jb.Guided()
+        "pmmh", prior=PRIOR, num_iterations=2, num_warmup=2, num_proposals=3, proposal=jb.Guided()
     ),
-    "score": of_drift(jb.score, num_bridges=3, proposal=jb.Guided()),
+    "score": of_drift("score", num_bridges=3, proposal=jb.Guided()),
     "maximum_likelihood": of_drift(
-        jb.maximum_likelihood, num_iterations=2, num_bridges=3, proposal=jb.Guided(), method="em"
+        "maximum_likelihood", num_iterations=2, num_bridges=3, proposal=jb.Guided(), method="em"
     ),
     "log_likelihood": lambda given: jb.log_likelihood(
         *given.record, observation=SEEN, num_particles=3, num_filters=2, num_steps=4
@@ -131,6 +133,22 @@ BOUNDS = {  # which are numbers too
 CHAINS = ("pseudo_marginal", "renewal", "crank_nicolson")
 
 
+class Guarded:
+    """The package, its functions called where nothing may be transferred unasked, and where no NaN
+    and no infinity may come out of a program."""
+
+    def __getattr__(self, name):
+        value = getattr(jaxbridge, name)
+        if not inspect.isfunction(value):
+            return value
+
+        def guarded(*args, **kwargs):
+            with jax.transfer_guard("disallow"), jax.debug_nans(True), jax.debug_infs(True):
+                return value(*args, **kwargs)
+
+        return guarded
+
+
 def arrays(tree):
     """The numbers in it: keys are none."""
     numeric = lambda leaf: (
@@ -145,15 +163,17 @@ def assert_same(made, expected):
 
 
 @pytest.mark.parametrize("name", slow_beyond(1, DOORS))
-def test_numbers(name, capfd):
+def test_numbers(name, capfd, monkeypatch):
     """Other numbers compile nothing, the same key gives the same numbers, and so it does inside
-    `jit` and `vmap`, in batches of another size, and with progress shown."""
+    `jit` and `vmap`, in batches of another size, with progress shown, and under guards."""
     run = lambda given, bound=100_000, **how: arrays(
         DOORS[name](given, **dict.fromkeys(BOUNDS.get(name, []), bound), **how)
     )
     first = jax.block_until_ready(run(numbers(0)))
-    with count_compilations() as compiled:
-        second, again = run(numbers(1), 100_001), run(numbers(0))
+    with count_compilations() as compiled, monkeypatch.context() as patch:
+        second = run(numbers(1), 100_001)
+        patch.setitem(globals(), "jb", Guarded())
+        again = run(numbers(0))
     assert not compiled
     for one, other in zip(first, again, strict=True):
         np.testing.assert_array_equal(one, other)
@@ -169,6 +189,45 @@ def test_numbers(name, capfd):
     jax.effects_barrier()
     printed = capfd.readouterr().out
     assert name in SILENT or ("0.00%" in printed and "100.00%" in printed)
+
+
+@pytest.mark.parametrize("of", ["model", "duration"])
+def test_numbers_of_python_compile_what_arrays_do(of):
+    """As an optimiser has them, who is given 0.8 and returns an array."""
+
+    def run(number):
+        kind = dict.fromkeys(("model", "duration"), jnp.float32(0.7)) | {of: number}
+        model = jb.Diffusion(
+            drift_of_number, log_stationary=potential_of_number, params=kind["model"]
+        )
+        run = jb.transition_log_density
+        proposal = jb.ModifiedDiffusionBridge()
+        return run(jax.random.key(0), model, [0.0], [1.0], kind["duration"], proposal=proposal)
+
+    values = run(0.8).value
+    with count_compilations() as compiled:
+        again = run(jnp.float32(0.8)).value
+    assert not compiled and again == values
+
+
+def drift_of_number(x, p):
+    return -p * x
+
+
+def potential_of_number(x, p):
+    return -p * x @ x
+
+
+def test_what_is_missing_passes_guards():
+    """Bridges that were not found, and -inf for their weights."""
+    model = jb.ornstein_uhlenbeck([[1.0]])
+    far = jnp.array([[0.5], [30.0]])
+    key, start = jax.random.key(0), jnp.zeros(1)
+    with jax.debug_nans(True), jax.debug_infs(True):
+        found = jb.sample_bridges(key, model, start, far, 1.0, num_steps=4, max_proposals=64)
+        weighted = jb.weigh_bridges(key, model, found, max_trials=64)
+    assert found.met[0].all() and not found.met[1].any()
+    assert np.isnan(found.paths[1]).all() and (weighted.log_weights[1] == -np.inf).all()
 
 
 class WithNetwork(NamedTuple):

@@ -15,6 +15,7 @@ from ..engine.batch_size import default_num_lanes
 from ..engine.checks import Numbers, check_bound, check_count, check_key, without_derivatives
 from ..engine.compiled import compiled
 from ..engine.devices import over_devices
+from ..engine.doors import door
 from ..engine.keys import numbered_keys
 from ..engine.rejection import Accepted, Attempts, Search, rejection_sample
 from ..engine.throwing import throw_where_incomplete
@@ -59,6 +60,7 @@ class Bridges(eqx.Module):
     num_steps: int = eqx.field(static=True)
 
 
+@door
 def sample_bridges(
     key: Key[Array, ""],
     model: Diffusion,

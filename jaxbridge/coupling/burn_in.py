@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.keys import folded, key_for
 from ..engine.lanes import over_lanes
 from ..engine.linalg import is_finite
@@ -98,6 +99,7 @@ def _draw_law(key, model, coupling, end, duration, num_steps) -> SmoothedDraws:
     return smoothed_draws(fit_key, draws.T, end[0], model.prepared())
 
 
+@door
 def measure_burn_in(
     key: Key[Array, ""],
     model: Diffusion,

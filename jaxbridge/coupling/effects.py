@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, check_count
+from ..engine.doors import door
 from ..engine.noise import chunks
 from ..models import decisions
 from ..models.decisions import Effects
@@ -21,6 +22,7 @@ from .rotation import driven_through_root, root_effect, rotation_effect
 _DIMENSIONS = (2, 1, *range(3, 65))
 
 
+@door
 def effects(
     model: Diffusion,
     coupling: AbstractCoupling | None = None,

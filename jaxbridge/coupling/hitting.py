@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.batch_size import default_num_lanes
 from ..engine.checks import check_bound, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.keys import key_for, numbered_keys
 from ..engine.rejection import Attempts, Search, rejection_sample
 from ..models.diffusion import Diffusion, check_diffusion
@@ -109,6 +110,7 @@ class HittingCounts(eqx.Module):
         return jnp.sum(self.counts > 0, axis=-1, dtype=jnp.int32)
 
 
+@door
 def hitting_counts(
     key: Key[Array, ""],
     model: Diffusion,

@@ -11,11 +11,26 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
+from .devices import whole
+
 # Anything `jnp.asarray` takes: an array, a number, a (nested) list of numbers.
 Numbers = ArrayLike | Sequence[Any]
 
 # Trials are numbered in 32 bits.
 _MOST_TRIALS = 2**30
+
+
+def as_array(value: Numbers) -> Array:
+    """`value` as an array, whole on every device.
+
+    A number of Python's is of a weak type, which follows the precision of what it meets. In single
+    precision there is nothing to follow, and the type is not kept: programs would be compiled once
+    for numbers that are weakly typed and once more for others.
+    """
+    with jax.transfer_guard("allow"):  # what is given is meant to be handed over
+        array = whole(jnp.asarray(value))
+        settled = array.dtype == np.float32 and not jax.config.jax_enable_x64
+        return lax.convert_element_type(array, np.float32) if settled else array
 
 
 def as_real(name: str, value: Numbers) -> Array:
@@ -26,10 +41,10 @@ def as_real(name: str, value: Numbers) -> Array:
     """
     try:
         if is_traced(value):
-            array = jnp.asarray(value)
+            array = as_array(value)
         else:
             with jax.ensure_compile_time_eval():
-                array = jnp.asarray(value)
+                array = as_array(value)
     except (TypeError, ValueError) as error:
         raise TypeError(f"`{name}` must be real numbers in an array; got {value!r}.") from error
     if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer)):

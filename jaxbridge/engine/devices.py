@@ -12,10 +12,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.sharding import AxisType, PartitionSpec
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int, PyTree
 
 _Result = TypeVar("_Result")
+
+
+def whole(array: Array) -> Array:
+    """The array, handed whole to every device where its type says that they share it, as types do
+    along the explicit axes of a mesh: there a program cannot take single points out of it."""
+    sharding = jax.typeof(array).sharding
+    if all(name is None for name in sharding.spec):
+        return array
+    return jax.sharding.reshard(array, NamedSharding(sharding.mesh, PartitionSpec()))
 
 
 def num_devices() -> int:

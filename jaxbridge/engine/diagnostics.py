@@ -7,8 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .checks import Numbers, as_floating
+from .doors import door
 
 
+@door
 def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
     """How many independent draws a chain is worth: n / (1 + 2 Σ_t ρ_t), with autocorrelations
     summed as far as sums of adjacent pairs are positive, and made to decrease (Geyer 1992). NaN
@@ -83,6 +85,7 @@ def _correlation_time(correlation: Float[Array, "n ..."]) -> Float[Array, "..."]
     return jnp.maximum(2 * jnp.sum(pairs, axis=0) - 1, 1 / n)
 
 
+@door
 def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
     """R̂ from the halves of several chains (Gelman & Rubin 1992, split): near one if they agree.
 

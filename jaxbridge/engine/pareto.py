@@ -14,6 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from .doors import door
+
 # A fit to fewer weights means nothing.
 _FEWEST = 5
 
@@ -39,6 +41,7 @@ def is_reliable(
     return (k < _MOST_RELIABLE) & (effective >= _FEWEST_EFFECTIVE)
 
 
+@door
 def pareto_k(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:
     """The Pareto shape k̂ of the min(n/5, 3√n) largest of n weights, in the last axis.
 

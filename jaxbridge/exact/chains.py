@@ -15,6 +15,7 @@ import diffrax
 from jaxtyping import Array, Key
 
 from ..engine.checks import Numbers, check_count, check_key
+from ..engine.doors import door
 from ..engine.pareto import is_reliable
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import bridge_problem
@@ -27,6 +28,7 @@ from .pseudo_marginal import run_pseudo_marginal
 from .renewal import run_renewal
 
 
+@door
 def sample_exact_bridges(
     key: Key[Array, ""],
     model: Diffusion,

@@ -27,6 +27,7 @@ from ..engine.checks import (
     nondifferentiable,
 )
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.keys import split_each
 from ..engine.progress import metered_scan
 from ..models.bridge_problem import BridgeProblem, Intervals
@@ -55,6 +56,7 @@ class CrankNicolsonInfo(NamedTuple):
     log_weight: Float[Array, "*I"]
 
 
+@door
 def crank_nicolson(
     model: Diffusion,
     start: Numbers,
@@ -90,6 +92,7 @@ def crank_nicolson(
     beta = check_step_size(step_size)
     setting = (model, proposal, problem.intervals)
 
+    @door
     def init(position, rng_key):
         check_key(rng_key)
         if position is not None:
@@ -97,6 +100,7 @@ def crank_nicolson(
         state = _init(rng_key[None], position, *setting, num_steps)
         return jax.tree.map(lambda leaf: leaf[0], state)
 
+    @door
     def step(rng_key, state):
         check_key(rng_key)
         return _step(rng_key, state, *setting, beta)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.pareto import is_reliable, pareto_k
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import BridgeProblem, bridge_problem
@@ -75,6 +76,7 @@ class TransitionLogDensity(eqx.Module):
         return trusted & ~self.step_error_dominates & (self.num_met > 0)
 
 
+@door
 def transition_log_density(
     key: Key[Array, ""],
     model: Diffusion,

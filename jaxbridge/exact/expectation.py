@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import PyTree
 
 from ..engine.averages import PathFunction, filled, values_of, weighted_mean
+from ..engine.doors import door
 from ..models.diffusion import Diffusion, check_diffusion
 from ..schemes import forms_of_targets, log_likelihood_of_steps
 from .exact_bridges import AbstractExactBridges
@@ -26,6 +27,7 @@ from .importance import WeightedBridges
 from .kernels import Chain
 
 
+@door
 def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffusion) -> PyTree:
     """The mean of `fn(path)` over exact bridges, differentiable in the parameters of `model`.
 

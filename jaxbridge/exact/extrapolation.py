@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.averages import PathFunction
+from ..engine.doors import door
 from ..engine.pareto import is_reliable
 from ..schemes import StepError, dominates, share_of_known_order
 from .density import TransitionLogDensity
@@ -103,6 +104,7 @@ def extrapolate(
 ) -> ExtrapolatedLogDensity: ...
 @overload
 def extrapolate(fine: WeightedBridges, coarse: WeightedBridges) -> ExtrapolatedBridges: ...
+@door
 def extrapolate(fine: Any, coarse: Any):
     """Two estimates without the leading error of their steps: Richardson's extrapolation.
 

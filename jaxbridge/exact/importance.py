@@ -33,6 +33,7 @@ from ..engine.averages import (
 )
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.pareto import is_reliable, pareto_k
 from ..engine.throwing import throw_where_incomplete
@@ -146,6 +147,7 @@ class WeightedBridges(AbstractExactBridges):
         return jax.vmap(one_interval)(keys, self.weights, self.paths)
 
 
+@door
 def weigh_bridges(
     key: Key[Array, ""],
     model: Diffusion,
@@ -251,6 +253,7 @@ def _weigh_bridges(key, model, pairs, bridges, search):
     )
 
 
+@door
 def sample_weighted_bridges(
     key: Key[Array, ""],
     model: Diffusion,

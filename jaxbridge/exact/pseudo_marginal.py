@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_key, nondifferentiable
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.keys import split_each
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import BridgeProblem
@@ -44,6 +45,7 @@ class PseudoMarginalInfo(NamedTuple):
     num_simulated: Int[Array, ""]
 
 
+@door
 def pseudo_marginal(
     model: Diffusion,
     start: Numbers,
@@ -79,6 +81,7 @@ def pseudo_marginal(
     proposal.check_prepared(model)
     setting = (model, proposal, problem.intervals, num_steps)
 
+    @door
     def init(position, rng_key):
         check_key(rng_key)
         if position is None:
@@ -86,6 +89,7 @@ def pseudo_marginal(
         path = check_path(position, problem)
         return _reweigh_state(rng_key, path, *setting)
 
+    @door
     def step(rng_key, state):
         check_key(rng_key)
         return _pseudo_marginal_step(rng_key, state, *setting)

@@ -29,6 +29,7 @@ from ..coupling import (
 from ..engine.batch_size import default_num_lanes, most_lanes
 from ..engine.checks import Numbers, check_key, nondifferentiable
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.keys import split_each
 from ..engine.progress import metered_while_loop
 from ..engine.rejection import Accepted, Search
@@ -56,6 +57,7 @@ class RenewalInfo(NamedTuple):
     num_nonfinite: Int[Array, ""]
 
 
+@door
 def renewal(
     model: Diffusion,
     start: Numbers,
@@ -88,12 +90,14 @@ def renewal(
     pairs.check_prepared(model)
     setting = (model, pairs, problem.intervals)
 
+    @door
     def init(position, rng_key):
         check_key(rng_key)
         if position is None:
             return RenewalState(first_paths(rng_key[None], *setting, num_steps)[0][0])
         return RenewalState(check_path(position, problem))
 
+    @door
     def step(rng_key, state):
         check_key(rng_key)
         return _renewal_step(rng_key, state, *setting)

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
@@ -109,6 +110,7 @@ class GibbsPosterior(AbstractPosterior):
         return False
 
 
+@door
 def gibbs(
     key: Key[Array, ""],
     model: Diffusion,

@@ -22,6 +22,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, check_key
+from ..engine.doors import door
 from ..engine.pareto import is_reliable
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
@@ -109,6 +110,7 @@ class MaximumLikelihood(eqx.Module):
         return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
 
 
+@door
 def maximum_likelihood(
     key: Key[Array, ""],
     model: Diffusion,

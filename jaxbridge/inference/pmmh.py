@@ -28,6 +28,7 @@ from ..engine.checks import (
     nondifferentiable,
 )
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
@@ -131,6 +132,7 @@ class PMMHPosterior(AbstractPosterior):
         return False
 
 
+@door
 def pmmh(
     key: Key[Array, ""],
     model: Diffusion,

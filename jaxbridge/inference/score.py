@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.pareto import pareto_k
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
@@ -64,6 +65,7 @@ class Score(eqx.Module):
     num_truncated: Int[Array, ""]
 
 
+@door
 def score(
     key: Key[Array, ""],
     model: Diffusion,

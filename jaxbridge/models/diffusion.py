@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Key, PyTree
 
-from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
+from ..engine.checks import Numbers, as_array, as_floating, cast_floats, is_traced
 from ..engine.linalg import lower_factor
 from . import decisions
 from .dynamics import Dynamics, DynamicsAt, stationary_flux
@@ -577,6 +577,5 @@ def _is_number(leaf) -> bool:
 
 def _as_leaf(leaf):
     if isinstance(leaf, float):
-        # `asarray` keeps Python numbers weakly typed, so they follow the precision of the points.
-        return jnp.asarray(float(leaf))
-    return jnp.asarray(leaf) if isinstance(leaf, np.ndarray | np.generic) else leaf
+        return as_array(float(leaf))
+    return as_array(leaf) if isinstance(leaf, np.ndarray | np.generic | jax.Array) else leaf

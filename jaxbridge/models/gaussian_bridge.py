@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Float, Key
 
 from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.doors import door
 from ..engine.linalg import any_cholesky, any_solve
 from .diffusion import Diffusion
 from .ornstein_uhlenbeck import (
@@ -75,6 +76,7 @@ def _paths(bridge: GaussianBridge, key, num_paths):
     return params.mean + jnp.moveaxis(path[:-1], 0, 1) + correction
 
 
+@door
 def gaussian_bridge(
     model: Diffusion,
     start: Numbers,

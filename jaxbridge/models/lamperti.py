@@ -23,12 +23,14 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced
+from ..engine.doors import door
 from .diffusion import Diffusion, check_diffusion
 from .transform import Transformed, of_points
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
+@door
 def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 400) -> Transformed:
     """The one-dimensional model of Y = ∫_a^X du/σ(u), whose σ is one.
 

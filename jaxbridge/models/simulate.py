@@ -9,11 +9,13 @@ from jaxtyping import Array, Float, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from .diffusion import Diffusion, check_diffusion
 from .dynamics import Dynamics, ito_correction
 from .sigma import AbstractSigma, Diagonal
 
 
+@door
 def simulate(
     key: Key[Array, ""],
     model: Diffusion,

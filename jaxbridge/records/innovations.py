@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..engine.checks import Numbers
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
 from .guided_record import guided, linearised, path_and_log_weight
@@ -77,6 +78,7 @@ def _path_and_log_weight(problem: RecordProblem, points, params: PyTree, xi):
     return path, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
 
 
+@door
 def innovations(
     model: Diffusion,
     times: Numbers,

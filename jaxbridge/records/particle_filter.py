@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.lanes import over_lanes
 from ..engine.pareto import pareto_k
 from ..engine.throwing import throw_where
@@ -122,6 +123,7 @@ class LogLikelihood(eqx.Module):
         return counted & jnp.isfinite(self.value) & (self.standard_error < _MOST_SPREAD)
 
 
+@door
 def log_likelihood(
     key: Key[Array, ""],
     model: Diffusion,

@@ -14,6 +14,7 @@ from ..engine.averages import PathFunction
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
+from ..engine.doors import door
 from ..engine.progress import metered_scan
 from ..engine.throwing import throw_where
 from ..models.diffusion import Diffusion
@@ -140,6 +141,7 @@ class Smoothed(eqx.Module):
         )
 
 
+@door
 def smooth(
     key: Key[Array, ""],
     model: Diffusion,

@@ -43,6 +43,7 @@ from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, check_precision, is_traced, time_steps
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.lanes import over_lanes
 from ..engine.linalg import dot, total
 from ..models.diffusion import Diffusion, check_diffusion
@@ -52,6 +53,7 @@ from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
 Form = Literal["girsanov", "trapezoid", "ito_taylor", "ito", "euler"]
 
 
+@door
 def path_log_likelihood(
     model: Diffusion, times: Numbers, path: Numbers, *, form: Form | None = None
 ) -> Float[Array, "*batch"]:

@@ -8,6 +8,7 @@ from jaxtyping import Array, Key
 
 from ..coupling import Coupling
 from ..engine.checks import Numbers, check_count, check_key, is_traced
+from ..engine.doors import door
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import Choice, choice_between, default_candidates, why_left_out
@@ -21,6 +22,7 @@ _TUNING_PILOT = 500
 _GAIN_OF_TUNING = 10.0
 
 
+@door
 def choose_proposal(
     key: Key[Array, ""],
     model: Diffusion,

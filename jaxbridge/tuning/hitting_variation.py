@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Int, Key
 from ..coupling import AnyStartLaw, hitting_counts
 from ..engine.averages import normalised
 from ..engine.checks import check_count, check_key
+from ..engine.doors import door
 from ..engine.keys import key_for
 from ..exact import AbstractExactBridges, Chain, WeightedBridges
 from ..models.diffusion import Diffusion
@@ -51,6 +52,7 @@ class HittingVariation(NamedTuple):
     num_truncated: Int[Array, ""]
 
 
+@door
 def hitting_variation(
     key: Key[Array, ""],
     model: Diffusion,

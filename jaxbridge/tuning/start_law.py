@@ -30,6 +30,7 @@ from ..coupling import (
 from ..engine.batch_size import most_lanes
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.compiled import compiled
+from ..engine.doors import door
 from ..engine.keys import key_for
 from ..exact import weigh_bridges
 from ..models.bridge_problem import BridgeProblem, Intervals, bridge_problem
@@ -86,6 +87,7 @@ class Tuning(NamedTuple):
         return "\n".join(lines)
 
 
+@door
 def fit_start_law(
     key: Key[Array, ""],
     model: Diffusion,
@@ -129,6 +131,7 @@ def fit_start_law(
     return best_pilot(pilots).coupling.start_law
 
 
+@door
 def tune_coupling(
     key: Key[Array, ""],
     model: Diffusion,

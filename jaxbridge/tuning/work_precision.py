@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, Key
 
 from ..coupling import Coupling
 from ..engine.checks import Numbers, check_count, check_key
+from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.progress import as_meter
 from ..models.bridge_problem import bridge_problem
@@ -63,6 +64,7 @@ _NOTHING_TO_ESTIMATE = "`fn` at `save_at` is the same for all bridges: nothing t
 _FOR_COUPLINGS, _FOR_GUIDED = ("approximate", "renewal"), ("crank_nicolson",)
 
 
+@door
 def work_precision(
     key: Key[Array, ""],
     model: Diffusion,

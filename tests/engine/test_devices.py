@@ -125,3 +125,37 @@ with jax.set_mesh(mesh):
     split = everything(a[0])
 assert_same(alone, split)
 """)
+
+
+@pytest.mark.slow
+def test_numbers_that_devices_share_by_their_type():
+    """Along explicit axes the type of an array says how it is split: end points, observations and
+    parameters, with the mesh in force, without, and in a program."""
+    run_on_eight_devices("""
+mesh = jax.make_mesh((2, 4), ("x", "y"), axis_types=(AxisType.Explicit,) * 2)
+wide = lambda params: jb.Diffusion(
+    lambda x, p: -p @ x, log_stationary=lambda x, p: -x @ p @ x, params=params
+)
+split = lambda x: jax.device_put(x, jax.NamedSharding(mesh, P("x")))
+points = np.random.default_rng(0).normal(size=(8, 2)).astype(np.float32)
+times, seen = np.arange(8.0), jb.LinearGaussian(covariance=0.1)
+
+def everything(params, points):
+    model = wide(params)
+    record = dict(observation=seen, initial=jnp.zeros(2), num_steps=4)
+    return (
+        jb.sample_bridges(key, model, points, points[::-1], 2.0, num_bridges=2, num_steps=10),
+        jb.transition_log_density(
+            key, model, points, points, 0.2, num_proposals=20, num_steps=10, proposal=pulled
+        ),
+        jb.log_likelihood(key, model, times, points, num_particles=8, num_filters=2, **record),
+        jb.path_log_likelihood(model, times, points),
+    )
+
+alone = everything(np.eye(2, dtype=np.float32), points)
+given = split(jnp.eye(2)), split(points)
+assert_same(alone, everything(given[0], points))
+with jax.set_mesh(mesh):
+    assert_same(alone, everything(*given))
+    assert_same(alone, jax.jit(everything)(*given))
+""")

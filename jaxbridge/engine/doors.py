@@ -1,0 +1,27 @@
+"""How public functions are entered: with what the caller's guards would take for mistakes.
+
+What is given, numbers and lists among it, is put on the device here, and what is refused is looked
+at: transfers, and meant. A NaN stands here for what is missing and -inf for the log of no weight,
+and each result says which. So `jax.transfer_guard`, `jax.debug_nans` and `jax.debug_infs`, by which
+a program looks for the mistakes of its own, are off inside, and as they were outside.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec, TypeVar
+
+import jax
+
+_Arguments = ParamSpec("_Arguments")
+_Result = TypeVar("_Result")
+
+
+def door(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """`fn`, a public function, inside which the caller's guards are off."""
+
+    @functools.wraps(fn)
+    def entered(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        with jax.transfer_guard("allow"), jax.debug_nans(False), jax.debug_infs(False):
+            return fn(*args, **kwargs)
+
+    return entered
