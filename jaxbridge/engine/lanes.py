@@ -25,6 +25,8 @@ from .lane_forms import AbstractForm, Coordinates, LanesLast, aval, is_short
 # Beyond these, what is written out in coordinates takes long to compile.
 _MOST_NUMBERS = 1024
 _MOST_ROWS = 4
+# A matrix of so many, which all lanes share, is not written out.
+_LEAST_WEIGHTS = 16
 
 
 def over_lanes(*in_axes: PyTree) -> Callable[[Callable], Callable[..., Any]]:
@@ -157,7 +159,7 @@ def _apply(
         return form.moved(equation, operands)
     if name in _REDUCTIONS and is_short(equation, params["axes"]):
         return [form.reduced(_REDUCTIONS[name], operands[0], params["axes"])]
-    if name == "dot_general" and _is_plain(equation):
+    if name == "dot_general" and _is_plain(equation) and not _is_layer(equation, operands, form):
         return [form.product(equation, *operands)]
     if name == "scan" and _is_plain_loop(equation):
         return _repeat(equation, operands, form, lanes)
@@ -214,6 +216,14 @@ def _is_plain(equation: JaxprEqn) -> bool:
     """Whether it is a short sum of outer products."""
     (axes, _), batched = equation.params["dimension_numbers"]
     return not any(batched) and len(axes) == 1 and is_short(equation, axes)
+
+
+def _is_layer(equation: JaxprEqn, operands: list, form: AbstractForm) -> bool:
+    """Whether it takes a vector through a matrix that lanes share and that is large, as in a layer
+    of a network: for all lanes that is one product of two matrices, as are its derivatives, where
+    what is written out has a term for each weight."""
+    shared = [operand for operand in operands if not form.is_own(operand)]
+    return len(shared) == 1 and np.size(shared[0]) >= _LEAST_WEIGHTS
 
 
 def _by_vmap(

@@ -2,6 +2,7 @@
 
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -188,3 +189,22 @@ def test_steps_of_a_proposal_are_not_interleaved(scheme):
     assert len(made_in_steps) > 50
     whole_points = r"= f32\[(6400,2|2,6400)\]\S* (fusion|concatenate|copy)\("
     assert [line for line in made_in_steps if re.search(whole_points, line)] == []
+
+
+@pytest.mark.parametrize("width", [8, 16, 32])
+def test_layers_of_a_network_are_products_of_matrices(width):
+    """Written out, a layer has a term for each weight, of which the compiler makes derivatives."""
+    network = eqx.nn.MLP(2, 2, width, 2, activation=jnp.tanh, key=jax.random.key(0))
+    points = jax.random.normal(jax.random.key(1), (2, 5))
+
+    def total(network, over):
+        return jnp.sum(over(jax.grad(lambda x: jnp.sum(network(x))))(points) ** 2)
+
+    slopes, expected = (
+        eqx.filter_grad(total)(network, over)
+        for over in (over_lanes(-1), lambda of_point: jax.vmap(of_point, -1, -1))
+    )
+    for one, other in zip(jax.tree.leaves(slopes), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+    made = eqx.filter_make_jaxpr(eqx.filter_grad(total))(network, over_lanes(-1))[0]
+    assert len(made.jaxpr.eqns) < 100 * width
