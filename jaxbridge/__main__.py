@@ -16,6 +16,7 @@ from .studies.benchmark import BENCHMARK, Benchmark, save
 from .studies.exact import COST, EXACT, VARIATION
 from .studies.paper import APPROXIMATE
 from .studies.report import Study
+from .studies.rivals import RIVALS, Rivals, save_rivals
 
 _PARTS = {
     "approximate": (APPROXIMATE,),
@@ -23,6 +24,7 @@ _PARTS = {
     "accuracy": (ACCURACY,),
     "bayes": (BAYES,),
     "bench": (BENCHMARK,),
+    "rivals": (RIVALS,),
 }
 _QUICK = " (--quick: expect larger errors, and times of little meaning)"
 _GROUPS = {"paper": ("approximate", "exact"), "all": tuple(_PARTS)}
@@ -54,7 +56,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         default="paper",
         help="approximate or exact bridges, or both: the paper's study (the default); what "
         "accuracy costs in time; Bayesian inference, the paper's section 4; how fast it is, and "
-        "which proposal is best for which duration; or all",
+        "which proposal is best for which duration; other packages beside this one; or all",
     )
     parser.add_argument("--quick", action="store_true", help="a twenty-fifth of the bridges")
     parser.add_argument("--seed", type=_seed, default=0, help="of the random numbers (default 0)")
@@ -94,6 +96,9 @@ def _run(study: Study, options: argparse.Namespace) -> None:
     if isinstance(results, Benchmark):
         save(results, options.out / "benchmark.json")
         print(f"all figures in {options.out / 'benchmark.json'}")
+    if isinstance(results, Rivals):
+        save_rivals(results, options.out)
+        print(f"all figures in {options.out / 'rivals.json'}, and as a page beside it")
     try:
         from .studies import figures
     except ImportError as error:

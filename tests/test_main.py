@@ -8,6 +8,7 @@ import pytest
 from helpers import slow_beyond
 
 from jaxbridge.studies.benchmark import load
+from jaxbridge.studies.rivals import load_rivals
 
 
 def run(*arguments, cwd):
@@ -58,6 +59,17 @@ def test_quick_run_of_the_accuracy_part(tmp_path):
     assert done.stdout.count("accuracy 0.") == 6  # targets of three tables, and three more
     assert "Orders of the step error" in done.stdout and "Nanoseconds" in done.stdout
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 2
+
+
+@pytest.mark.slow
+def test_quick_run_beside_other_packages(tmp_path):
+    done = run("rivals", "--quick", "--out", "pictures", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for words in ("score, learnt", "cuthbert", "particles", "numpyro", "DBridge"):
+        assert words in done.stdout  # with figures, or "not installed"
+    assert len(list((tmp_path / "pictures").glob("*.png"))) == 1
+    stored = load_rivals(tmp_path / "pictures" / "rivals.json")
+    assert stored.bridges and stored.filters and stored.posteriors
 
 
 @pytest.mark.parametrize(

@@ -1,12 +1,14 @@
 """The README and the pages beside the notebooks: their code runs as it stands, their tables are
 those of the stored run, and their links lead somewhere."""
 
+import inspect
 import pathlib
 import re
 
 import jax.numpy as jnp
 import pytest
 
+import jaxbridge as jb
 from jaxbridge.studies.benchmark import in_markdown, load
 
 ROOT = pathlib.Path(__file__).parent.parent
@@ -19,7 +21,7 @@ BLOCKS = re.findall(r"```python\n(.*?)```", "".join(TEXT.values()), re.DOTALL)
 @pytest.mark.slow
 def test_code_runs():
     """The quickstart, and the blocks of the pages, which go on from those of the README."""
-    assert len(BLOCKS) == 18
+    assert len(BLOCKS) == 19
     namespace = {}
     for block in BLOCKS[:4]:
         exec(block, namespace)
@@ -79,3 +81,18 @@ def test_links_lead_somewhere(page):
         target = (page.parent / name).resolve() if name else page
         assert target.exists(), link
         assert not anchor or anchor in anchors(target), link
+
+
+def test_names_by_which_to_choose_exist():
+    """Public names, their arguments, and what results have: all that the page has as code."""
+    known = set(jb.__all__)
+    for symbol in (getattr(jb, name) for name in jb.__all__):
+        known |= {*inspect.signature(symbol).parameters, *dir(symbol)}
+        known |= set(getattr(symbol, "__dataclass_fields__", ()))
+    text = re.sub(r"```.*?```", "", TEXT[ROOT / "notebooks" / "how_to_choose.md"], flags=re.DOTALL)
+    named = {
+        word
+        for code in re.findall(r"`([^`]+)`", text)
+        for word in re.findall(r"[a-z]\w+", code, re.I)
+    }
+    assert len(named) > 30 and named <= known

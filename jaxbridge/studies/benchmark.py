@@ -105,7 +105,7 @@ def run_benchmark(
     packages = ("jaxbridge", "jax", "jaxlib", "diffrax", "equinox", "numpy")
     return Benchmark(
         jax.devices()[0].device_kind,
-        f"{platform.machine()}, {_num_cores()} cores",
+        f"{platform.machine()}, {num_cores()} cores",
         {name: version(name) for name in packages} | {"python": platform.python_version()},
         datetime.date.today().isoformat(),
         ratios,
@@ -287,7 +287,8 @@ def _against_published(key: Key[Array, ""], num_bridges: int) -> list[Ratio]:
     return ratios
 
 
-def _num_cores() -> int:
+def num_cores() -> int:
+    """Those that this process may use."""
     usable = getattr(os, "sched_getaffinity", None)  # not on every system
     return len(usable(0)) if usable else os.cpu_count() or 1
 

@@ -164,5 +164,92 @@ def bayes(example: Example) -> dict[str, Figure]:
     return {"bayes_posterior.png": density, "bayes_trace.png": trace}
 
 
+# What was seen, what is wanted, under which condition: and the call.
+_CHOICES = (
+    (
+        "seen exactly",
+        (
+            (
+                "bridges, or\ntransition densities",
+                (
+                    ("T below one\nrelaxation time", "ModifiedDiffusionBridge(), Guided()"),
+                    ("in doubt", 'proposal="auto"'),
+                    ("T many\nrelaxation times", "Coupling(0.0)"),
+                ),
+            ),
+            (
+                "parameters",
+                (
+                    ("σ known", "gibbs, maximum_likelihood, score"),
+                    ("σ unknown", "pmmh, maximum_likelihood"),
+                ),
+            ),
+        ),
+    ),
+    (
+        "seen with noise,\nor in part;\nor σ does not reach\nthe whole state, or\n"
+        "coefficients depend\non time",
+        (
+            ("likelihood", (("", "log_likelihood"),)),
+            (
+                "paths",
+                (
+                    ("gaps short beside\njumps of wells", "smooth"),
+                    ("long gaps, wells", 'smooth(proposal="auto")'),
+                ),
+            ),
+            ("parameters", (("σ or noise,\nknown or not", "gibbs, pmmh, maximum_likelihood"),)),
+        ),
+    ),
+)  # fmt: skip
+
+
+def how_to_choose() -> Figure:
+    """From how the diffusion was seen to the function, as a tree from left to right."""
+    figure = Figure(figsize=(11, 5.4), layout="constrained")
+    ax = figure.subplots()
+    ax.set_axis_off()
+    columns, height = (0.0, 0.26, 0.49, 0.68), 0.0
+    box: dict[str, Any] = {"boxstyle": "round,pad=0.45", "linewidth": 1.0}
+    asked: dict[str, Any] = {"ha": "left", "va": "center", "fontsize": "small"}
+
+    def write(column: int, y: float, text: str) -> None:
+        if column == 3:
+            shown = {**box, "facecolor": "white", "edgecolor": COLOURS[0]}
+            ax.text(columns[3], y, text, family="monospace", bbox=shown, **asked)
+        elif text:
+            shown = {**box, "facecolor": "0.94", "edgecolor": "0.7"}
+            ax.text(columns[column], y, text, bbox=shown, **asked)
+
+    def join(column: int, y: float, others: Sequence[float]) -> None:
+        for other in others:
+            ends = [columns[column], columns[column + 1]], [y, other]
+            ax.plot(*ends, color="0.6", linewidth=1.0, zorder=0)
+
+    for seen, wanted in _CHOICES:
+        middles = []
+        for what, conditions in wanted:
+            places = []
+            for condition, call in conditions:
+                write(3, height, call)
+                write(2, height, condition)
+                join(2, height, [height])
+                places.append(height)
+                height -= 1.0
+            middles.append(float(np.mean(places)))
+            write(1, middles[-1], what)
+            join(1, middles[-1], places)
+        middle = float(np.mean(middles))
+        write(0, middle, seen)
+        join(0, middle, middles)
+        height -= 0.4
+    ax.set(xlim=(-0.01, 0.93), ylim=(height + 0.5, 0.7))
+    for x, title in zip(
+        columns, ("the diffusion was", "wanted", "where", "call, or proposal"), strict=True
+    ):
+        ax.text(x, 0.75, title, fontsize="small", fontweight="bold")
+    return figure
+
+
 def _typeset(title: str) -> str:
     return title.replace("->", "→").replace("-", "−")
