@@ -4,6 +4,7 @@ The proposals of an interval are numbered attempts (`rejection`), and its j-th s
 interval's j-th bridge.
 """
 
+import functools
 from typing import NamedTuple
 
 import diffrax
@@ -17,7 +18,7 @@ from ..engine.compiled import compiled
 from ..engine.devices import over_devices
 from ..engine.doors import door
 from ..engine.keys import numbered_keys
-from ..engine.rejection import Accepted, Attempts, Search, rejection_sample
+from ..engine.rejection import Accepted, Attempts, Search, over_problems, rejection_sample
 from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import (
     BridgeProblem,
@@ -195,6 +196,13 @@ def find_bridges(
 ) -> Accepted:
     """Propose for each of P active problems, one interval and one key each, until it has its
     bridges. The outputs are `Joined`."""
+    each, shared = (keys, inputs.intervals, active), (inputs.model, inputs.coupling, stored)
+    return over_problems(functools.partial(_find_bridges, num_steps), each, shared, search)
+
+
+def _find_bridges(num_steps: int, each: tuple, shared: tuple, search: Search) -> Accepted:
+    (keys, intervals, active), (model, coupling, stored) = each, shared
+    inputs = Inputs(model, coupling, intervals)
     attempt = eqx.Partial(_attempt, inputs, keys, num_steps, stored)
     (num_problems, d), dtype = inputs.intervals.start.shape, inputs.intervals.start.dtype
     num_rows = num_problems * search.wanted

@@ -21,7 +21,7 @@ from ..engine.checks import check_bound, check_count, check_key, nondifferentiab
 from ..engine.compiled import compiled
 from ..engine.doors import door
 from ..engine.keys import key_for, numbered_keys
-from ..engine.rejection import Attempts, Search, rejection_sample
+from ..engine.rejection import Attempts, Search, over_problems, rejection_sample
 from ..models.diffusion import Diffusion, check_diffusion
 from .associated import run_associated
 from .base import AbstractCoupling
@@ -216,6 +216,11 @@ def count_hits(
     search: Search,
 ) -> HittingCounts:
     """Counts for each of P bridges that is active, from trials that share the lanes."""
+    return over_problems(_count_hits, (keys, paths, duration, active), (model, coupling), search)
+
+
+def _count_hits(each: tuple, shared: tuple, search: Search) -> HittingCounts:
+    (keys, paths, duration, active), (model, coupling) = each, shared
     num_steps, num_counts = paths.shape[1] - 1, search.wanted
     trial = eqx.Partial(_trial, keys, model, coupling, paths, duration)
     num_rows = paths.shape[0] * num_counts

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, PyTree
@@ -100,6 +101,50 @@ def rejection_sample(
     init = _State(empty, nothing)
     going_on = lambda state: jnp.any(pending(state))
     return metered_while_loop(going_on, one_round, init, progress, progress_meter).accepted
+
+
+def over_problems(
+    run: Callable[[PyTree, PyTree, Search], PyTree], each: PyTree, shared: PyTree, search: Search
+) -> PyTree:
+    """`run(each, shared, search)`, results in the order of the problems; `each` has arrays with
+    leading axis P, and all problems share the other.
+
+    Under `vmap` the problems of all batches are run as those of one, which `vmap` by itself would
+    not do: each batch would have lanes of its own, and wait for the slowest. Where batches differ
+    in what their problems share, as in parameters, it is left to do so.
+    """
+    arrays, rest = eqx.partition((shared, search.max_attempts), eqx.is_array)
+
+    def given(arrays):
+        shared, max_attempts = eqx.combine(arrays, rest)
+        return shared, search._replace(max_attempts=max_attempts)
+
+    def plain(each, arrays):
+        return run(each, *given(arrays))
+
+    def folded(axis_size, in_batched, each, arrays):
+        batched, shared_batched = in_batched
+        if any(jax.tree.leaves(shared_batched)):
+            in_axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
+            results = jax.vmap(plain, in_axes, axis_size=axis_size)(each, arrays)
+            return results, jax.tree.map(lambda _: True, results)
+
+        def fold(leaf, batched):
+            if not batched:
+                leaf = jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
+            return leaf.reshape(-1, *leaf.shape[2:])
+
+        each = jax.tree.map(fold, each, batched)
+        shared, search = given(arrays)
+        num_wanted = len(jax.tree.leaves(each)[0]) * search.wanted
+        num_lanes = min(max(num_wanted, search.num_lanes), axis_size * search.num_lanes)
+        results = over_problems(run, each, shared, search._replace(num_lanes=num_lanes))
+        results = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), results)
+        return results, jax.tree.map(lambda _: True, results)
+
+    together = jax.custom_batching.custom_vmap(plain)
+    together.def_vmap(folded)
+    return together(each, arrays)
 
 
 def _before(success: Bool[Array, " lanes"], first: Int[Array, " lanes"]) -> Int[Array, " lanes"]:

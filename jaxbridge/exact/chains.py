@@ -23,7 +23,7 @@ from ..models.diffusion import Diffusion
 from ..proposals import Budget, Guided, as_guided, as_pairs, as_proposal, resolve
 from ..schemes import is_gross
 from .crank_nicolson import check_step_size, run_crank_nicolson
-from .kernels import Chain
+from .kernels import Chain, check_position
 from .pseudo_marginal import run_pseudo_marginal
 from .renewal import run_renewal
 
@@ -38,6 +38,7 @@ def sample_exact_bridges(
     *,
     num_bridges: int = 1,
     num_steps: int = 50,
+    position: Numbers | None = None,
     proposal: Any = None,
     method: Literal["pseudo_marginal", "renewal", "crank_nicolson"] = "pseudo_marginal",
     num_counts: int | None = None,
@@ -54,7 +55,7 @@ def sample_exact_bridges(
     on the chain, so they and their counts are made ahead, thousands at a time; the renewal
     chain runs in segments that are joined where they agree. The chain is, up to rounding, that
     of the kernel: with `run_key, init_key = jax.random.split(key)`, the one that starts from
-    `init(None, init_key)` and steps with `jax.random.split(run_key, num_bridges)`.
+    `init(position, init_key)` and steps with `jax.random.split(run_key, num_bridges)`.
 
     **Arguments:**
 
@@ -62,6 +63,8 @@ def sample_exact_bridges(
         `jax.random.fold_in(key, i)`.
     - `model`, `start`, `end`, `duration`, `num_steps`, `save_at`: as in `sample_bridges`.
     - `num_bridges`: n, the number of iterations.
+    - `position`: the path from which the chain starts, shape (N+1, d), for instance the last of
+        another; (I, N+1, d) for I intervals. By default a first path is proposed.
     - `proposal`: a `Coupling`, with its start law, by default `Coupling(gamma=0.0)`; or
         `ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()` (the default of
         "crank_nicolson"), whose target is made of the densities of their steps; or "auto",
@@ -118,9 +121,10 @@ def sample_exact_bridges(
         raise ValueError(
             f'`method` must be "pseudo_marginal", "renewal" or "crank_nicolson"; got {method!r}.'
         )
+    first = check_position(position, problem)
     problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)
-    chain = run(key, model, proposal, problem, num_bridges, progress_meter)
+    chain = run(key, model, proposal, problem, num_bridges, first, progress_meter)
     if not throw:
         return chain
     # The renewal chain keeps no weights that could be cut off, but its trials may start wrongly.

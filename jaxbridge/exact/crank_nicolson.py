@@ -33,7 +33,7 @@ from ..engine.progress import metered_scan
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractGuidedProposal, Guided, as_guided, as_proposal, noise_of, path_of
-from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_path, one_interval
+from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_position, one_interval
 
 
 class CrankNicolsonState(NamedTuple):
@@ -95,9 +95,8 @@ def crank_nicolson(
     @door
     def init(position, rng_key):
         check_key(rng_key)
-        if position is not None:
-            position = check_path(position, problem)[None]
-        state = _init(rng_key[None], position, *setting, num_steps)
+        paths = check_position(position, problem)
+        state = _init(rng_key[None], paths, *setting, num_steps)
         return jax.tree.map(lambda leaf: leaf[0], state)
 
     @door
@@ -171,15 +170,16 @@ def run_crank_nicolson(
     proposal: AbstractGuidedProposal,
     problem: BridgeProblem,
     num_bridges: int,
+    position: Float[Array, "I points d"] | None,
     progress_meter: diffrax.AbstractProgressMeter | None,
     beta: Float[Array, ""],
 ) -> Chain:
-    """The chain of each interval, side by side."""
-    model, problem = nondifferentiable((model.prepared(), problem))
+    """The chain of each interval, side by side, from its `position` if there is one."""
+    model, problem, position = nondifferentiable((model.prepared(), problem, position))
     intervals, num_steps = problem.intervals, problem.num_steps
     dynamics = model.forward(problem.like)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)
-    first = _init(init_keys, None, model, proposal, intervals, num_steps)
+    first = _init(init_keys, position, model, proposal, intervals, num_steps)
 
     def step(state, keys):
         state, info = _move(keys, state, proposal, dynamics, intervals, beta)

@@ -138,16 +138,23 @@ def one_interval(
     return problem
 
 
-def check_path(position: Numbers, problem: BridgeProblem) -> Array:
-    """A path of the problem."""
+def check_position(
+    position: Numbers | None, problem: BridgeProblem
+) -> Float[Array, "I points d"] | None:
+    """A path of each interval, or none."""
+    if position is None:
+        return None
     path, intervals = as_floating("position", position), problem.intervals
-    shape = (problem.num_steps + 1, intervals.start.shape[1])
-    if path.shape != shape:
-        raise ValueError(f"`position` must be a path, shape {shape}, or `None`; got {path.shape}.")
-    if not is_traced(path, intervals):
-        ends = np.stack([intervals.start[0], intervals.end[0]])
-        if not (
-            np.all(np.isfinite(path)) and np.allclose(path[np.array([0, -1])], ends, atol=1e-3)
-        ):
-            raise ValueError(f"`position` must be a finite path from and to {ends}.")
-    return path.astype(intervals.start.dtype)
+    num_intervals, d = intervals.start.shape
+    shape = (num_intervals, problem.num_steps + 1, d)
+    wanted = shape if problem.batched else shape[1:]
+    if path.shape != wanted:
+        what = "paths, one of each interval" if problem.batched else "a path"
+        raise ValueError(f"`position` must be {what}, shape {wanted}, or `None`; got {path.shape}.")
+    paths = path.reshape(shape)
+    if not is_traced(paths, intervals):
+        ends = np.stack([intervals.start, intervals.end], axis=1)
+        mine = np.asarray(paths)
+        if not (np.all(np.isfinite(mine)) and np.allclose(mine[:, [0, -1]], ends, atol=1e-3)):
+            raise ValueError(f"`position` must be finite, from and to {problem.result(ends)}.")
+    return paths.astype(intervals.start.dtype)

@@ -21,7 +21,7 @@ from ..engine.pareto import pareto_k
 from ..models.bridge_problem import BridgeProblem
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractProposal, Budget, WeightedPaths, as_proposal
-from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_path, one_interval
+from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_position, one_interval
 
 
 class PseudoMarginalState(NamedTuple):
@@ -84,10 +84,10 @@ def pseudo_marginal(
     @door
     def init(position, rng_key):
         check_key(rng_key)
-        if position is None:
+        paths = check_position(position, problem)
+        if paths is None:
             return _draw_state(rng_key, *setting)[0]
-        path = check_path(position, problem)
-        return _reweigh_state(rng_key, path, *setting)
+        return _reweigh_state(rng_key, paths, *setting)
 
     @door
     def step(rng_key, state):
@@ -105,9 +105,9 @@ def _draw_state(rng_key, model, proposal, intervals, num_steps):
 
 
 @compiled
-def _reweigh_state(rng_key, path, model, proposal, intervals, num_steps):
-    model, intervals, path = nondifferentiable((model.prepared(), intervals, path))
-    return _first(proposal.reweigh(rng_key[None], model, intervals, path[None]))
+def _reweigh_state(rng_key, paths, model, proposal, intervals, num_steps):
+    model, intervals, paths = nondifferentiable((model.prepared(), intervals, paths))
+    return _first(proposal.reweigh(rng_key[None], model, intervals, paths))
 
 
 def _first(drawn: WeightedPaths) -> PseudoMarginalState:
@@ -132,18 +132,26 @@ def run_pseudo_marginal(
     proposal: AbstractProposal,
     problem: BridgeProblem,
     num_bridges: int,
+    first: Float[Array, "I points d"] | None,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Chain:
-    model, problem = nondifferentiable((model.prepared(), problem))
+    """The chain of each interval, from its `first` path if there is one."""
+    model, problem, first = nondifferentiable((model.prepared(), problem, first))
     intervals, num_steps = problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)
     draw_keys, accept_keys = split_each(step_keys.reshape(-1), 2)
+    draw_keys = draw_keys.reshape(step_keys.shape)
     # Row 0 of each interval is its first state, and row i the candidate of step i.
-    draw_keys = jnp.concatenate([init_keys[:, None], draw_keys.reshape(step_keys.shape)], axis=1)
+    if first is None:
+        draw_keys = jnp.concatenate([init_keys[:, None], draw_keys], axis=1)
     drawn = proposal.draw(
         draw_keys, model, intervals, num_steps, problem.stored, False, progress_meter=progress_meter
     )
+    if first is not None:
+        weighed = proposal.reweigh(init_keys, model, intervals, first)
+        weighed = weighed._replace(paths=problem.kept(weighed.paths))
+        drawn = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=1), weighed, drawn)
     uniform = jax.vmap(lambda k: jax.random.uniform(k, dtype=intervals.start.dtype))(accept_keys)
     row, accepted = accept_reject(drawn.log_weights, uniform.reshape(step_keys.shape))
     interval = jnp.arange(problem.num_intervals)[:, None]

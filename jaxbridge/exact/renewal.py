@@ -36,7 +36,7 @@ from ..engine.rejection import Accepted, Search
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
 from ..proposals import Budget, CoupledPairs, as_pairs, as_proposal
-from .kernels import Chain, Kernel, chain_keys, check_path, one_interval
+from .kernels import Chain, Kernel, chain_keys, check_position, one_interval
 
 
 class RenewalState(NamedTuple):
@@ -93,9 +93,10 @@ def renewal(
     @door
     def init(position, rng_key):
         check_key(rng_key)
-        if position is None:
-            return RenewalState(first_paths(rng_key[None], *setting, num_steps)[0][0])
-        return RenewalState(check_path(position, problem))
+        paths = check_position(position, problem)
+        if paths is None:
+            paths, *_ = first_paths(rng_key[None], *setting, num_steps)
+        return RenewalState(paths[0])
 
     @door
     def step(rng_key, state):
@@ -231,6 +232,7 @@ def run_renewal(
     pairs: CoupledPairs,
     problem: BridgeProblem,
     num_bridges: int,
+    first: Float[Array, "I points d"] | None,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Chain:
     """Segments of the chain start from guesses, and are run again from where the segment before
@@ -238,7 +240,7 @@ def run_renewal(
     one, since a proposal depends on the key of its step only: from there on they are one, and
     the rest of the record holds. So a repair is short, and the result that of one long run.
     """
-    model, problem = nondifferentiable((model.prepared(), problem))
+    model, problem, first = nondifferentiable((model.prepared(), problem, first))
     intervals, num_steps, num_intervals = (
         problem.intervals,
         problem.num_steps,
@@ -246,7 +248,9 @@ def run_renewal(
     )
     pairs = pairs.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)
-    first, num_tried, num_failed = first_paths(init_keys, model, pairs, intervals, num_steps)
+    num_tried = num_failed = jnp.zeros(num_intervals, jnp.int32)
+    if first is None:
+        first, num_tried, num_failed = first_paths(init_keys, model, pairs, intervals, num_steps)
     most_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
     num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, most_segments))
     length = -(-num_bridges // num_segments)

@@ -1,6 +1,7 @@
 """Chains have the exact law, batched or step by step, and run in BlackJAX."""
 
 import functools
+import re
 
 import blackjax.util
 import jax
@@ -112,6 +113,64 @@ def test_batched_chain_is_the_kernel_stepped(method, law):
     else:
         assert chain.log_weights is None
         assert (infos.is_accepted <= infos.is_hit).all() and infos.is_accepted.any()
+
+
+@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal", "crank_nicolson"])
+def test_a_chain_goes_on_from_a_path(method):
+    """As the kernel does from the same position; of several intervals each from its own."""
+    coupled = method != "crank_nicolson"
+    options = dict(num_steps=20, proposal=jb.Coupling(0.5) if coupled else jb.Guided())
+    key, n = jax.random.key(5), 12
+    bend = jnp.sin(jnp.linspace(0.0, jnp.pi, 21))[:, None]
+    start, end = (jnp.asarray(point) for point in ARGUMENTS[1:3])
+    path = start + jnp.linspace(0.0, 1.0, 21)[:, None] * (end - start) + 0.1 * bend
+    run = functools.partial(jb.sample_exact_bridges, num_bridges=n, method=method, **options)
+    chain = run(key, *ARGUMENTS, position=path)
+
+    kernel = getattr(jb, method)(*ARGUMENTS, **options)
+    run_key, init_key = jax.random.split(key)
+    step = lambda state, key: (lambda new: (new[0], new[0].position))(kernel.step(key, state))
+    first = kernel.init(path, init_key)
+    _, stepped = jax.jit(lambda state, keys: jax.lax.scan(step, state, keys))(
+        first, jax.random.split(run_key, n)
+    )
+    np.testing.assert_allclose(chain.paths, stepped, atol=1e-5)
+
+    ends = jnp.stack([end, end])
+    both = run(key, ARGUMENTS[0], start, ends, 1.0, position=jnp.stack([path, path - 0.2 * bend]))
+    assert both.paths.shape == (2, n, 21, 2) and both.met.all()
+    if not bool(both.accepted[0, 0]):
+        np.testing.assert_allclose(both.paths[0, 0], path, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
+def test_chains_under_vmap_share_their_lanes(method):
+    """As many lanes as chains, in place of 64 or more for each; and the numbers of each alone."""
+    kernel = getattr(jb, method)(*ARGUMENTS, num_steps=7, proposal=jb.Coupling(0.5))
+    chains = jax.vmap(lambda key: run_kernel(kernel, key, 3)[0].position)
+    keys = jax.random.split(jax.random.key(1), 70)
+    text = jax.jit(chains).lower(keys).as_text()
+    lanes = {int(n) for n in re.findall(r"<7x2x(\d+)xf32>", text)}
+    assert 70 in lanes and max(lanes) <= 70
+    together = jax.jit(chains)(keys[:2])
+    for i in range(2):
+        np.testing.assert_array_equal(together[i], run_kernel(kernel, keys[i], 3)[0].position)
+
+
+def test_chains_of_several_models_under_vmap():
+    """Of which each has lanes of its own."""
+    keys = jax.random.split(jax.random.key(1), 2)
+
+    def chain(key, scale):
+        model = ARGUMENTS[0]
+        model = model.with_params(model.params._replace(B=scale * model.params.B))
+        kernel = jb.renewal(model, *ARGUMENTS[1:], num_steps=7, proposal=jb.Coupling(0.5))
+        return run_kernel(kernel, key, 3)[0].position
+
+    scales = jnp.array([1.0, 2.0])
+    together = jax.jit(jax.vmap(chain))(keys, scales)
+    for i in range(2):
+        np.testing.assert_allclose(together[i], chain(keys[i], scales[i]), atol=1e-5)
 
 
 @slow
