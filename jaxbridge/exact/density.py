@@ -22,7 +22,7 @@ from ..engine.throwing import throw_where_incomplete
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractProposal, AbstractWeightedProposal, Budget, as_proposal, resolve
-from ..schemes import StepError, dominates, error_of_log_mean, is_gross
+from ..schemes import StepError, dominates, error_of_log_mean, is_gross, with_rounding
 
 
 class TransitionLogDensity(eqx.Module):
@@ -42,7 +42,9 @@ class TransitionLogDensity(eqx.Module):
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
     - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` can be trusted.
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, with
-        a standard error of it, `step_uncertainty`. NaN where it is not known, as of one step.
+        a standard error of it, `step_uncertainty`; with it is what rounding may add where steps
+        are very many, N d ε/2, ten thousand in single precision. NaN where it is not known, as of
+        one step.
     - `step_share`: the step error as a share of what half as many steps change, infinite where that
         says little of it (couplings with a σ(x) that varies); `num_steps`: N.
     """
@@ -181,6 +183,8 @@ def estimate_log_density(
     cut = jnp.any(drawn.truncated, axis=1)
     share = proposal.step_share(model, intervals)
     step_error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
+    if proposal.by_coupling is None:  # whose weights are no sums over steps
+        step_error = with_rounding(step_error, num_steps, problem.like.shape[0])
     value, error, size, shape, step_error, share = problem.result(
         (
             log_mean,

@@ -65,6 +65,7 @@ from .step_error import (
     is_gross as is_gross,
     share_of_known_order as share_of_known_order,
     share_of_order as share_of_order,
+    with_rounding as with_rounding,
 )
 from .step_law import (
     DegenerateLaw as DegenerateLaw,
