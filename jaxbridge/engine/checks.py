@@ -21,16 +21,17 @@ _MOST_TRIALS = 2**30
 
 
 def as_array(value: Numbers) -> Array:
-    """`value` as an array, whole on every device.
-
-    A number of Python's is of a weak type, which follows the precision of what it meets. In single
-    precision there is nothing to follow, and the type is not kept: programs would be compiled once
-    for numbers that are weakly typed and once more for others.
-    """
+    """`value` as an array, whole on every device; a number of Python's keeps its weak type, which
+    follows the precision of what it meets."""
     with jax.transfer_guard("allow"):  # what is given is meant to be handed over
-        array = whole(jnp.asarray(value))
-        settled = array.dtype == np.float32 and not jax.config.jax_enable_x64
-        return lax.convert_element_type(array, np.float32) if settled else array
+        return whole(jnp.asarray(value))
+
+
+def settled(array: Array) -> Array:
+    """The array without a weak type where all is of single precision, so that there is nothing to
+    follow: programs would be compiled once for numbers of Python's and once more for others."""
+    single = array.dtype == np.float32 and not jax.config.jax_enable_x64
+    return lax.convert_element_type(array, np.float32) if single else array
 
 
 def as_real(name: str, value: Numbers) -> Array:

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Key, PyTree
 
-from ..engine.checks import Numbers, as_array, as_floating, cast_floats, is_traced
+from ..engine.checks import Numbers, as_array, as_floating, cast_floats, is_traced, settled
 from ..engine.linalg import lower_factor
 from . import decisions
 from .dynamics import Dynamics, DynamicsAt, stationary_flux
@@ -577,5 +577,6 @@ def _is_number(leaf) -> bool:
 
 def _as_leaf(leaf):
     if isinstance(leaf, float):
-        return as_array(float(leaf))
-    return as_array(leaf) if isinstance(leaf, np.ndarray | np.generic | jax.Array) else leaf
+        return settled(as_array(float(leaf)))
+    arrays = np.ndarray | np.generic | jax.Array
+    return settled(as_array(leaf)) if isinstance(leaf, arrays) else leaf
