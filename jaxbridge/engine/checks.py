@@ -30,7 +30,7 @@ def as_array(value: Numbers) -> Array:
 def settled(array: Array) -> Array:
     """The array without a weak type where all is of single precision, so that there is nothing to
     follow: programs would be compiled once for numbers of Python's and once more for others."""
-    single = array.dtype == np.float32 and not jax.config.jax_enable_x64
+    single = array.dtype == jax.dtypes.canonicalize_dtype(np.float64) == np.float32
     return lax.convert_element_type(array, np.float32) if single else array
 
 

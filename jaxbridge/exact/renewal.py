@@ -248,16 +248,18 @@ def run_renewal(
     )
     pairs = pairs.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)
-    num_tried = num_failed = jnp.zeros(num_intervals, jnp.int32)
     if first is None:
-        first, num_tried, num_failed = first_paths(init_keys, model, pairs, intervals, num_steps)
+        begin, num_tried, num_failed = first_paths(init_keys, model, pairs, intervals, num_steps)
+    else:
+        begin, num_tried = first, jnp.zeros(num_intervals, jnp.int32)
+        num_failed = num_tried
     most_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
     num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, most_segments))
     length = -(-num_bridges // num_segments)
     steps = jnp.minimum(jnp.arange(num_segments * length), num_bridges - 1)
     keys = step_keys[:, steps].reshape(num_intervals * num_segments, length)
     each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_segments, axis=0), intervals)
-    runner = _Runner(model, pairs, problem, first, keys, each)
+    runner = _Runner(model, pairs, problem, begin, keys, each)
     segments = runner.run(runner.begin(), jnp.arange(len(keys)), progress_meter)
     # The first stale segment starts from where the chain is, so each pass settles it at least.
     segments = lax.while_loop(lambda s: jnp.any(s.stale), runner.repair, segments)
