@@ -31,6 +31,7 @@ from ..engine.checks import Numbers, check_key, nondifferentiable
 from ..engine.compiled import compiled
 from ..engine.doors import door
 from ..engine.keys import split_each
+from ..engine.lanes import over_lanes, over_points
 from ..engine.progress import metered_while_loop
 from ..engine.rejection import Accepted, Search
 from ..models.bridge_problem import BridgeProblem, Intervals
@@ -317,7 +318,7 @@ def renew(
     def ratio(x):
         return log_ratio(pairs.coupling.start_law, model, x)
 
-    log_rate = jax.vmap(ratio)(new_start) - jax.vmap(ratio)(associated.start.T)
+    log_rate = over_points(ratio)(new_start) - over_lanes(-1)(ratio)(associated.start)
     uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=paths.dtype))(accept_keys)
     accepted = found & (missing | (uniform < jnp.exp(jnp.minimum(log_rate, 0))))
     info = RenewalInfo(

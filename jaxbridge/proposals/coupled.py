@@ -31,6 +31,7 @@ from ..coupling import (
 from ..engine.batch_size import default_num_lanes
 from ..engine.checks import nondifferentiable
 from ..engine.keys import split_each
+from ..engine.lanes import over_points
 from ..engine.rejection import Search
 from ..models.bridge_problem import Intervals, uniform_fractions
 from ..models.diffusion import Diffusion
@@ -262,10 +263,10 @@ def pair_log_weights(
     mean_count: Float[Array, " P"],
 ) -> Float[Array, " P"]:
     """log [ν(b)/ν(x_0) · μ(x_0) · ρ̂]; without ν(b), a constant, where the model has no ν."""
-    log_weights = jax.vmap(lambda x: log_ratio(law, model, x))(reverse_start)
+    log_weights = over_points(lambda x: log_ratio(law, model, x))(reverse_start)
     log_weights += jnp.log(mean_count)
     if model.has_density:
-        log_weights += jax.vmap(model.log_stationary)(end)
+        log_weights += over_points(model.log_stationary)(end)
     return log_weights
 
 

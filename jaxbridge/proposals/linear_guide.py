@@ -29,6 +29,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.lanes import over_points
 from ..engine.linalg import inverse, matmul, matvec
 from ..models.dynamics import Dynamics
 from ..models.sigma import AbstractSigma, root_of
@@ -138,10 +139,10 @@ class Guided(AbstractGuidedProposal):
             done = jnp.concatenate([jnp.zeros_like(dt[:1]), jnp.cumsum(dt)[:-1]]) / jnp.sum(dt)
             points = xi + done[:, None] * (end - xi_end)
             straight = start + done[:, None] * (end - start)
-            rates = jax.vmap(jax.jacfwd(dynamics.drift))(lax.stop_gradient(points))
+            rates = over_points(jax.jacfwd(dynamics.drift))(lax.stop_gradient(points))
             near = dt * jnp.max(jnp.abs(rates), axis=(1, 2)) < _FAR_OUT
             points = jnp.where(near[:, None], points, straight)
-        coefficients = jax.vmap(lambda x: self._linear(dynamics, x, end))(points)
+        coefficients = over_points(lambda x: self._linear(dynamics, x, end))(points)
 
         def back(guess: _GaussianGuess, inputs) -> tuple[_GaussianGuess, _GaussianGuess]:
             """h_i from h_{i+1}, by one step of the linear process."""
@@ -163,7 +164,7 @@ class Guided(AbstractGuidedProposal):
             lambda leaf: jnp.broadcast_to(leaf, (num_steps, *leaf.shape[1:]))[:-1], coefficients
         )
         _, (shift, H) = lax.scan(back, last, (each, dt[:-1]), reverse=True)
-        roots = jax.vmap(lambda x: dynamics.sigma(x).root().as_matrix(d, x.dtype))(points)
+        roots = over_points(lambda x: dynamics.sigma(x).root().as_matrix(d, x.dtype))(points)
         roots = jnp.broadcast_to(roots, (num_steps, d, d))[:-1]
         pull_back = jnp.swapaxes(roots, 1, 2)
         shift = jax.vmap(matvec)(pull_back, shift)

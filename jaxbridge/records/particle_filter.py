@@ -344,7 +344,7 @@ def run_filters(
     d, dtype = problem.dim, problem.like.dtype
     first_row, rows = split_first(problem.rows)
     density, dynamics_at = problem.density, model.forward_at(problem.like)
-    corrected = jax.vmap(correction(problem, model), in_axes=(None, -1))
+    corrected = over_lanes(None, -1)(correction(problem, model))
     most = 0.01 / jnp.finfo(dtype).eps
 
     def weighed(state: _Particles, key, change) -> tuple[_Particles, _Weights]:
@@ -415,7 +415,7 @@ def _starts(
     if not calls_for_cover(problem.initial, model, problem.like):
         x = over_lanes(-1)(guide.start.point)(zeta)
         ratio = lambda x: log_ratio(problem.initial, model, guide.initial, x)
-        return x, guide.start.log_weight + jax.vmap(ratio, in_axes=-1)(x)
+        return x, guide.start.log_weight + over_lanes(-1)(ratio)(x)
     law = cover(model, guide.initial)
     h = jax.tree.map(lambda leaf: leaf[0, 0], guide.steps.h)
     start = covered_start(law, guide.first, guide.start.origin, h)
@@ -424,7 +424,7 @@ def _starts(
     x = start.points(positions.ravel(), zeta)
     log_nu = model.prepared().log_stationary
     ratio = lambda x: log_nu(x) - law.log_density(x)
-    return x, start.log_weight + jax.vmap(ratio, in_axes=-1)(x)
+    return x, start.log_weight + over_lanes(-1)(ratio)(x)
 
 
 def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) -> _Particles:

@@ -336,7 +336,7 @@ def _new_starts(
     of_law = lambda x: log_ratio(problem.initial, model, initial, x)
 
     def log_weight(x):
-        ratio = jnp.where(lanes.is_first, jax.vmap(of_law, in_axes=-1)(x), 0)
+        ratio = jnp.where(lanes.is_first, over_lanes(-1)(of_law)(x), 0)
         return log_start + corrected(blocks.first_row, x) + ratio
 
     return _State(lanes.start, new, log_weight(lanes.start), log_weight(new))
@@ -413,7 +413,7 @@ def _corrections(
     problem: RecordProblem, model: Diffusion, spread: Callable[[PyTree], PyTree]
 ) -> Callable[[Row, Float[Array, "d lanes"]], Float[Array, " lanes"]]:
     """Of what blocks saw, and the states of their lanes."""
-    each = jax.vmap(correction(problem, model), in_axes=-1)
+    each = over_lanes(-1, -1)(correction(problem, model))
     return lambda row, x: each(spread(row), x)
 
 

@@ -11,9 +11,10 @@ from jax import lax
 
 import jaxbridge as jb
 from jaxbridge.coupling.join import Inputs, propose
-from jaxbridge.engine.lanes import join_rows, over_lanes, split_rows
+from jaxbridge.engine.lanes import join_rows, over_lanes, over_points, split_rows
 from jaxbridge.engine.linalg import cholesky, inverse, polar_factor, safe_norm
 from jaxbridge.models.bridge_problem import Intervals
+from jaxbridge.proposals.coupled import pair_log_weights
 
 B = np.array([[1.5, 1.0, 0.2], [0.3, -1.0, 1.5], [0.0, 0.5, 2.0]])
 
@@ -208,3 +209,19 @@ def test_layers_of_a_network_are_products_of_matrices(width):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
     made = eqx.filter_make_jaxpr(eqx.filter_grad(total))(network, over_lanes(-1))[0]
     assert len(made.jaxpr.eqns) < 100 * width
+
+
+@pytest.mark.optimised
+def test_sums_of_features_at_very_many_points():
+    """Of which XLA's CPU compiler (JAX 0.10.2) leaves those beyond the first 32,768 numbers
+    uncomputed under `vmap`: six features at 8,000 points. In weights of bridges, and by itself."""
+    rng = np.random.default_rng(0)
+    W, shift = rng.normal(size=(6, 2)).astype(np.float32), rng.normal(size=6).astype(np.float32)
+    points = rng.normal(size=(8000, 2)).astype(np.float32)
+    log_nu = lambda x: jnp.sum(jnp.cos(jnp.sum(W * x, axis=1) + shift))
+    expected = np.sum(np.cos(points @ W.T + shift), axis=1)
+    np.testing.assert_allclose(jax.jit(over_points(log_nu))(points), expected, atol=1e-5)
+
+    model = jb.Diffusion(lambda x, p: -x, log_stationary=lambda x, p: log_nu(x))
+    weigh = jax.jit(lambda end, x: pair_log_weights(jb.Stationary(), model, end, x, jnp.ones(8000)))
+    np.testing.assert_allclose(weigh(points, points), expected, atol=1e-5)
