@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 from jax import lax
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
@@ -20,10 +21,13 @@ _Result = TypeVar("_Result")
 
 def whole(array: Array) -> Array:
     """The array, handed whole to every device where its type says that they share it, as types do
-    along the explicit axes of a mesh: there a program cannot take single points out of it."""
+    along the explicit axes of a mesh: there a program cannot take single points out of it. Where no
+    mesh is in force, to the first device, for nothing else has such a type."""
     sharding = jax.typeof(array).sharding
-    if all(name is None for name in sharding.spec):
+    if AxisType.Explicit not in sharding.mesh.axis_types:
         return array
+    if jax.sharding.get_abstract_mesh().empty and not isinstance(array, jax.core.Tracer):
+        return jnp.asarray(jax.device_get(array))  # by the host, for `device_put` keeps the type
     return jax.sharding.reshard(array, NamedSharding(sharding.mesh, PartitionSpec()))
 
 
