@@ -395,6 +395,12 @@ EXACT = [
     ("proposal", exact(proposal=0.5), "`proposal` must be", TypeError),
     ("counts", exact(method="renewal", num_counts=2), "counts nothing"),
     ("step", exact(step_size=0.5), '`step_size` is for method="crank_nicolson"'),
+    ("shape", exact(position=np.zeros((3, 2))), r"`position` must be a path, shape \(51, 2\)"),
+    (
+        "elsewhere",
+        exact(position=np.zeros((51, 2)) + 9.0),
+        "`position` must be finite, from and to",
+    ),
     ("intervals", kernel(PAPER, [A] * 3, [B] * 3, 1.0), "for one interval"),
     ("another grid", of(renewal.init)(jnp.zeros((5, 2)), KEY), r"shape \(21, 2\), or `None`"),
     ("no sampler", kernel(NO_SAMPLER, A, B, 1.0), r"Stationary\(burn_in"),

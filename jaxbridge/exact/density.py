@@ -183,7 +183,7 @@ def estimate_log_density(
     cut = jnp.any(drawn.truncated, axis=1)
     share = proposal.step_share(model, intervals)
     step_error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
-    if proposal.by_coupling is None:  # whose weights are no sums over steps
+    if proposal.by_coupling is None:  # weights of coupled pairs are no sums over steps
         step_error = with_rounding(step_error, num_steps, problem.like.shape[0])
     value, error, size, shape, step_error, share = problem.result(
         (

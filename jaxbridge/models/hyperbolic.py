@@ -12,10 +12,12 @@ from jax import lax
 from jaxtyping import Array, Float, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced
+from ..engine.doors import door
 from ..engine.linalg import dot
 from .diffusion import Diffusion, check_dimension
 
 
+@door
 def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     """The hyperbolic diffusion `dX = -α X / √(1+|X|²) dt + dW` in R^dim: equation
     (hyperbolicsde). Reversible; its log stationary density is the normalised one of equation

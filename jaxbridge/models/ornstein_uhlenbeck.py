@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.doors import door
 from ..engine.linalg import any_cholesky, any_inverse, any_log_abs_det, dot, matvec, solve
 from .bridge_problem import as_intervals
 from .diffusion import Diffusion, check_dimension, check_invertible
@@ -55,6 +56,7 @@ class _Prepared(NamedTuple):
     reverse_B: Float[Array, "d d"]
 
 
+@door
 def ornstein_uhlenbeck(
     B: Numbers, mean: Numbers | None = None, sigma: Numbers | None = None
 ) -> Diffusion:

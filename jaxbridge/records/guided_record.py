@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.averages import proper
 from ..engine.checks import without_derivatives
 from ..engine.compiled import compiled
-from ..engine.lanes import over_lanes
+from ..engine.lanes import over_lanes, over_points
 from ..engine.linalg import sum_of_many
 from ..engine.recursion import recursion
 from ..models.diffusion import Diffusion
@@ -70,7 +70,7 @@ def guided(problem: RecordProblem, model: Diffusion, points: Float[Array, "point
         dynamics = dynamics_at(step.time)
         return linear_step(problem.density, dynamics, point, next_point, step.dt)
 
-    steps = jax.vmap(jax.vmap(linear))(here, there, record)
+    steps = jax.vmap(over_points(linear))(here, there, record)
     scalars = jax.vmap(relative)(problem.scalars(model), points[::N])
     first, rest = split_first(scalars)
     h = information_filter(steps, rest)
@@ -141,7 +141,7 @@ def corrections(
 ) -> Float[Array, ""]:
     """What the log weight of a path takes where observations are not of their guess, and the
     initial law is not normal."""
-    each = jax.vmap(correction(problem, model))
+    each = over_points(correction(problem, model))
     at_observations = each(problem.rows, path[:: problem.num_steps])
     return jnp.sum(at_observations) + log_ratio(problem.initial, model, guide.initial, path[0])
 

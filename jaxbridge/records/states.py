@@ -32,6 +32,7 @@ from ..engine.averages import proper
 from ..engine.checks import is_traced, nondifferentiable
 from ..engine.compiled import compiled
 from ..engine.keys import key_for
+from ..engine.lanes import over_points
 from ..engine.linalg import any_cholesky, any_inverse, dot, semidefinite_cholesky, solve_lower
 from ..engine.progress import metered_scan
 from ..exact import acceptance_rate
@@ -102,7 +103,7 @@ class StateSampler(eqx.Module):
         def seen(scalars, row, x):
             return log_density_of(scalars, x) + corrected(row, x)
 
-        of_chain = jax.vmap(seen)
+        of_chain = over_points(seen)
         logs = jax.vmap(lambda x: of_chain(self.scalars, problem.rows, x))(x)
         law = bound(problem.initial, problem.model)
         if isinstance(law, Stationary):

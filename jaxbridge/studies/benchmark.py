@@ -13,7 +13,6 @@ import math
 import os
 import platform
 from collections.abc import Callable, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,6 +34,7 @@ from .exact import UNLIKELY
 from .first_calls import ENTRIES, FirstCall, first_calls_table, run_first_calls
 from .numpy_reference import approximate_bridges
 from .paper import study_model
+from .peers import versions
 from .report import Say, Study, Table, markdown, silent, table
 
 _NUM_STEPS = 50
@@ -106,7 +106,7 @@ def run_benchmark(
     return Benchmark(
         jax.devices()[0].device_kind,
         f"{platform.machine()}, {num_cores()} cores",
-        {name: version(name) for name in packages} | {"python": platform.python_version()},
+        versions(packages) | {"python": platform.python_version()},
         datetime.date.today().isoformat(),
         ratios,
         sigmas,

@@ -211,12 +211,11 @@ def run_bridges(
     for task in bridge_tasks(quick):
         say(f"bridges: {task.name}")
         rows += [_library_row(key, task, num_paths)]
-        learnt_from = (task.model, task.start)
-        name = str(learnt_from)
-        if name not in networks:
+        learnt_from = id(task.model), task.start
+        if learnt_from not in networks:
             say(f"bridges: {task.name}, learning a score")
-            networks[name] = timed(lambda task=task: learn_score(key, task, num_iterations))
-        rows += [_learnt_row(key, task, *networks[name], num_paths)]
+            networks[learnt_from] = timed(lambda task=task: learn_score(key, task, num_iterations))
+        rows += [_learnt_row(key, task, *networks[learnt_from], num_paths)]
         rows += _r_rows(task, num_paths)
     return rows
 

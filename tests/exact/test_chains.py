@@ -139,8 +139,11 @@ def test_a_chain_goes_on_from_a_path(method):
     ends = jnp.stack([end, end])
     both = run(key, ARGUMENTS[0], start, ends, 1.0, position=jnp.stack([path, path - 0.2 * bend]))
     assert both.paths.shape == (2, n, 21, 2) and both.met.all()
-    if not bool(both.accepted[0, 0]):
-        np.testing.assert_allclose(both.paths[0, 0], path, atol=1e-6)
+    given = np.stack([path, path - 0.2 * bend])
+    for i, moved in enumerate(np.cumsum(both.accepted, axis=1)):
+        still = np.asarray(both.paths[i])[moved == 0]
+        np.testing.assert_allclose(still, np.broadcast_to(given[i], still.shape), atol=1e-6)
+    assert not coupled or not both.accepted[:, 0].all()  # guided moves of this process all succeed
 
 
 @pytest.mark.parametrize("method", ["pseudo_marginal", "renewal"])
