@@ -1,6 +1,7 @@
 """The normal law."""
 
 import functools
+import math
 from collections.abc import Iterator
 
 import equinox as eqx
@@ -75,4 +76,4 @@ def _draw(mean, covariance, key):
 def _log_density(mean, covariance, x):
     root = any_cholesky(covariance)
     white = matvec(any_inverse(root), (x - mean).astype(root.dtype))
-    return -dot(white, white) / 2 - jnp.sum(jnp.log(jnp.sqrt(2 * np.pi) * jnp.diag(root)))
+    return -dot(white, white) / 2 - jnp.sum(jnp.log(math.sqrt(2 * math.pi) * jnp.diag(root)))

@@ -63,7 +63,7 @@ class _PrepareHyperbolic:
     def __call__(self, alpha: Float[Array, ""]) -> _Hyperbolic:
         log_bessel = _log_bessel_k((self.dim + 1) / 2, 2 * alpha)
         power = (self.dim - 1) / 2 * jnp.log(np.pi / alpha)
-        return _Hyperbolic(alpha, np.log(2) + log_bessel + power)
+        return _Hyperbolic(alpha, math.log(2) + log_bessel + power)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +133,7 @@ class _HyperbolicSampler:
         power = int(np.ceil(a))  # (t+2)^power by the binomial theorem
         j = np.arange(power + 1)
         expansion = np.array([math.comb(power, k) for k in j]) * 2.0 ** (power - j)
-        lift, factor = (1.0, 1.0) if self.dim % 2 == 0 else (0.5, np.sqrt(2))
+        lift, factor = (1.0, 1.0) if self.dim % 2 == 0 else (0.5, math.sqrt(2))
         weights = np.concatenate([factor * expansion, expansion])
         return weights, np.concatenate([a + j, a + lift + j])
 
@@ -147,5 +147,5 @@ def _log_bessel_k(order: float, z: Float[Array, ""]) -> Float[Array, ""]:
     reach = lax.stop_gradient(jnp.arcsinh((order + 40) / z) + 2)
     t = reach * jnp.linspace(0, 1, 257, dtype=jnp.result_type(z))
     weights = jnp.full(t.shape, t[1]).at[0].mul(0.5)
-    log_cosh = jnp.logaddexp(order * t, -order * t) - np.log(2)
+    log_cosh = jnp.logaddexp(order * t, -order * t) - math.log(2)
     return special.logsumexp(log_cosh - z * jnp.cosh(t), b=weights)

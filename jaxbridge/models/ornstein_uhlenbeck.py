@@ -12,6 +12,7 @@ that cancel, and a Γ beyond the precision of numbers, in the first; another the
 """
 
 import functools
+import math
 from typing import NamedTuple
 
 import jax
@@ -214,7 +215,7 @@ def _stationary(B: Float[Array, "d d"], sigma: Float[Array, "d d"]) -> tuple[Arr
     covariance = _lyapunov(B, sigma @ sigma.T)
     root, precision = any_cholesky(covariance), any_inverse(covariance)
     precision = (precision + precision.T) / 2
-    log_normaliser = jnp.sum(jnp.log(jnp.diagonal(root))) + len(B) / 2 * float(np.log(2 * np.pi))
+    log_normaliser = jnp.sum(jnp.log(jnp.diagonal(root))) + len(B) / 2 * math.log(2 * math.pi)
     return root, precision, log_normaliser, covariance @ B.T @ precision
 
 

@@ -7,6 +7,7 @@ last, at fixed noise: a smooth function of the parameters. Where so few points c
 no covariance, as in many dimensions, that at the mode is added.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -91,7 +92,7 @@ def log_ratio(
 def log_normal(law: NormalStep, x: Float[Array, " d"]) -> Float[Array, ""]:
     """The log density of a normal law that has one."""
     white = solve_lower(law.root, x - law.mean)
-    log_scale = jnp.sum(jnp.log(np.sqrt(2 * np.pi) * jnp.diagonal(law.root)))
+    log_scale = jnp.sum(jnp.log(math.sqrt(2 * math.pi) * jnp.diagonal(law.root)))
     return -dot(white, white) / 2 - log_scale
 
 

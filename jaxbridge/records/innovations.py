@@ -6,10 +6,10 @@ guided paths; so (θ, ξ) has the posterior density π(θ) N(ξ; 0, I) w(θ, ξ)
 with θ, and θ may be a parameter of σ, of the noise or of the initial law, however small the steps.
 """
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..engine.checks import Numbers
@@ -57,7 +57,7 @@ class Innovations(NamedTuple):
     def log_density(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, ""]:
         """log of the joint density of ξ and of what was seen, given the parameters: with a prior's
         log density it is the target of any sampler."""
-        return self.log_weight(params, xi) - (xi @ xi + self.size * np.log(2 * np.pi)) / 2
+        return self.log_weight(params, xi) - (xi @ xi + self.size * math.log(2 * math.pi)) / 2
 
     def start_share(self) -> Float[Array, ""]:
         """The share of draws of x_0 by normal noise that count, at the parameters of the model: one

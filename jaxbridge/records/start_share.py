@@ -4,9 +4,10 @@ With f the density of x_0 times what it is tilted by, n the normal law in its pl
 the cover, tilted, the share is (∫f)² / ∫ f²/n = (E_q f/q)² / E_q (f/q)(f/n).
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
@@ -45,6 +46,6 @@ def start_share(
         return proper(seen + to_cover), proper(seen + to_normal)
 
     to_cover, to_normal = jax.vmap(both, in_axes=-1)(start.points(positions, zeta))
-    log_num = np.log(_NUM_DRAWS)
+    log_num = math.log(_NUM_DRAWS)
     log_mean = logsumexp(to_cover) - log_num
     return jnp.exp(2 * log_mean - logsumexp(to_cover + to_normal) + log_num)

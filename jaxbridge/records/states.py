@@ -13,6 +13,7 @@ sides is accepted with probability
 
     min{1, ŵ'_left ŵ'_right g(y_k|x_k') q(x_k) / (ŵ_left ŵ_right g(y_k|x_k) q(x_k'))},
 
+import math
 from a random walk, where q falls out, and every other time from a normal law q, the stationary
 mean and covariance as the observation corrects them. Then each segment is offered a new path
 between the same two states.
@@ -133,7 +134,7 @@ class StateSampler(eqx.Module):
         log_weights = proper(drawn.log_weights)
         picked = jax.random.categorical(pick_key, log_weights)
         paths = jnp.take_along_axis(drawn.paths, picked[:, None, None, None], axis=1)[:, 0]
-        log_mean = jax.nn.logsumexp(log_weights, axis=1) - np.log(self.num_proposals)
+        log_mean = jax.nn.logsumexp(log_weights, axis=1) - math.log(self.num_proposals)
         paths, log_mean = paths.reshape(C, ends - 1, -1, d), log_mean.reshape(C, ends - 1)
         return States(x, paths, log_mean, jnp.sum(drawn.truncated, dtype=jnp.int32))
 

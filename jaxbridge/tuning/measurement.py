@@ -216,7 +216,7 @@ def closed_form(
 
 def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
     """A fine run by the best scheme there is; to its error belongs what half the steps change."""
-    best = run.proposal.most_accurate(scene.model, jnp.asarray(scene.start))
+    best = run.proposal.most_accurate(*scene.interval("float64")[:2])
     limit = run._replace(proposal=best)
     half = limit._replace(num_steps=max(run.num_steps // 2, 1))
     fine = _estimate(scene, run.method, limit.result(key, scene))
