@@ -175,9 +175,26 @@ def _apply(
         return [form.reduced(_REDUCTIONS[name], operands[0], params["axes"])]
     if name == "dot_general" and _is_plain(equation) and not _is_layer(equation, operands, form):
         return [form.product(equation, *operands)]
+    if name == "optimization_barrier":
+        return [
+            form.split(_held(form.join(operand, lanes))) if form.is_own(operand) else operand
+            for operand in operands
+        ]
     if name == "scan" and _is_plain_loop(equation):
         return _repeat(equation, operands, form, lanes)
     return _by_vmap(jaxpr, equation, operands, form, lanes)
+
+
+def _held(array: Array) -> Array:
+    """The array as a value of its own. XLA's CPU compiler drops barriers before it fuses, and then
+    computes a function of a function's value anew for each number that the outer one reads; through
+    a product of matrices it does not fuse, and I x is x."""
+
+    def times_identity(array):
+        rows = array.reshape(-1, array.shape[-1])
+        return jnp.dot(jnp.eye(len(rows), dtype=rows.dtype), rows).reshape(array.shape)
+
+    return lax.platform_dependent(array, cpu=times_identity, default=lax.optimization_barrier)
 
 
 class _Loop(NamedTuple):

@@ -2,6 +2,7 @@
 
 from typing import ClassVar
 
+from jax import lax
 from jaxtyping import Array, Float
 
 from ..models import decisions
@@ -35,7 +36,8 @@ class Heun(AbstractScheme):
 
     def step(self, dynamics, x, dt, dw):
         drift, sigma = self._stratonovich_drift(dynamics, x), dynamics.sigma(x)
-        predicted = x + drift * dt + sigma.mv(dw)
+        # Computed before the drift there is, which would else compute it anew for each part.
+        predicted = lax.optimization_barrier(x + drift * dt + sigma.mv(dw))
         drift = (drift + self._stratonovich_drift(dynamics, predicted)) / 2
         return x + drift * dt + sigma.average(dynamics.sigma(predicted)).mv(dw)
 

@@ -171,8 +171,10 @@ def test_rows():
     assert len(jax.tree.leaves(split_rows(tree))) == 4
 
 
-@pytest.mark.parametrize("scheme", [jb.Euler(), jb.Heun()])
-def test_steps_of_a_proposal_are_not_interleaved(scheme):
+@pytest.mark.parametrize(["scheme", "num_held"], [(jb.Euler(), 0), (jb.Heun(), 2)])
+def test_steps_of_a_proposal_are_not_interleaved(scheme, num_held):
+    """But for the predicted points of Heun's steps, each held once: in the reversed path, and in
+    the one that is driven by it."""
     lanes, B = 6400, jnp.array([[1.5, 1.0], [1.0, 1.5]])
     model = jb.Diffusion(
         lambda x, p: -B @ x, log_stationary=lambda x, p: -x @ B @ x, reversible=True
@@ -189,7 +191,35 @@ def test_steps_of_a_proposal_are_not_interleaved(scheme):
     made_in_steps = [line for line in text.splitlines() if "while/body" in line]
     assert len(made_in_steps) > 50
     whole_points = r"= f32\[(6400,2|2,6400)\]\S* (fusion|concatenate|copy)\("
-    assert [line for line in made_in_steps if re.search(whole_points, line)] == []
+    whole = [line for line in made_in_steps if re.search(whole_points, line)]
+    held = [line for line in whole if "dot_general" in line]
+    # Each is a product, of what is joined in one fusion.
+    assert len(held) == num_held and len(whole) <= 3 * num_held
+    assert not any("[6400,2]" in line for line in whole)
+
+
+def test_a_function_of_a_held_value_computes_that_once():
+    """XLA's CPU compiler would compute it anew for each number that is read of it."""
+
+    def nested(hold):
+        def function(x):
+            y = jnp.sum(jnp.sin(jnp.outer(jnp.arange(1.0, 7.0), x)), axis=0)
+            return jnp.sum(jnp.cos(jnp.outer(jnp.arange(1.0, 7.0), hold(y))), axis=0)
+
+        return jax.jit(over_lanes(-1)(function))
+
+    held, plain = nested(jax.lax.optimization_barrier), nested(lambda y: y)
+    points = _points()
+    _assert_close(held(points), plain(points))
+    where_made = [
+        re.findall(r"^(\S+ [^\n]*\{.*?)^\}", text, re.MULTILINE | re.DOTALL)
+        for text in (f.lower(points).compile().as_text() for f in (held, plain))
+    ]
+    both = [[" sine(" in body and " cosine(" in body for body in bodies] for bodies in where_made]
+    assert any(both[1]) and not any(both[0])
+    for function in (held, plain):
+        slope = jax.grad(lambda x, function=function: jnp.sum(function(x)))(points)
+        _assert_close(slope, jax.grad(lambda x: jnp.sum(plain(x)))(points))
 
 
 @pytest.mark.parametrize("width", [8, 16, 32])
