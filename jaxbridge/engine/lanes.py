@@ -176,25 +176,37 @@ def _apply(
     if name == "dot_general" and _is_plain(equation) and not _is_layer(equation, operands, form):
         return [form.product(equation, *operands)]
     if name == "optimization_barrier":
-        return [
-            form.split(_held(form.join(operand, lanes))) if form.is_own(operand) else operand
-            for operand in operands
-        ]
+        return _held(operands, form, lanes)
     if name == "scan" and _is_plain_loop(equation):
         return _repeat(equation, operands, form, lanes)
     return _by_vmap(jaxpr, equation, operands, form, lanes)
 
 
-def _held(array: Array) -> Array:
-    """The array as a value of its own. XLA's CPU compiler drops barriers before it fuses, and then
-    computes a function of a function's value anew for each number that the outer one reads; through
-    a product of matrices it does not fuse, and I x is x."""
+def _held(operands: list, form: AbstractForm, lanes: int) -> list:
+    """The operands as values of their own, those of them that are of one floating dtype. XLA's CPU
+    compiler drops barriers before it fuses, and then computes a function of a function's value
+    anew for each number that the outer one reads; through a product of matrices it does not fuse,
+    and I x is x."""
+    arrays = [form.join(operand, lanes) if form.is_own(operand) else None for operand in operands]
+    floats = [a for a in arrays if a is not None and jnp.issubdtype(a.dtype, jnp.floating)]
+    alike = [a for a in floats if a.dtype == floats[0].dtype]
+    if not alike:
+        return operands
 
-    def times_identity(array):
-        rows = array.reshape(-1, array.shape[-1])
-        return jnp.dot(jnp.eye(len(rows), dtype=rows.dtype), rows).reshape(array.shape)
+    def times_identity(*arrays):
+        rows = jnp.concatenate([array.reshape(-1, lanes) for array in arrays])
+        rows = jnp.dot(jnp.eye(len(rows), dtype=rows.dtype), rows)
+        each = jnp.split(rows, np.cumsum([array.size // lanes for array in arrays])[:-1])
+        return tuple(row.reshape(array.shape) for row, array in zip(each, arrays, strict=True))
 
-    return lax.platform_dependent(array, cpu=times_identity, default=lax.optimization_barrier)
+    def barrier(*arrays):
+        return lax.optimization_barrier(arrays)
+
+    held = iter(lax.platform_dependent(*alike, cpu=times_identity, default=barrier))
+    return [
+        form.split(next(held)) if any(array is other for other in alike) else operand
+        for operand, array in zip(operands, arrays, strict=True)
+    ]
 
 
 class _Loop(NamedTuple):
