@@ -174,8 +174,9 @@ def pmmh(
     - `proposal`: as in `transition_log_density`, but "auto" by default. Densities by a
         coupling from the stationary law rest on a normalised `log_stationary`, whose constant
         depends on the parameters.
-    - `covariance`: of the first proposals, shape (p,) for a diagonal or (p, p); by default a tenth
-        of the prior's standard deviations, or a tenth of θ where the prior is not normal.
+    - `covariance`: of the first proposals, shape (p,) for a diagonal or (p, p), in the order of the
+        result's `names`, which is that of `jax.tree.leaves(params)`; by default a tenth of the
+        prior's standard deviations, or a tenth of θ where the prior is not normal.
     - `init`: unknown parameters to start from, or the `state` of earlier draws, which go on with
         the proposals of paths, and their bounds, that they had. Another `proposal` than "auto"
         takes their place; the estimate that the chain holds is still one of theirs.
