@@ -292,20 +292,19 @@ In the run that is kept here:
   and a new start or duration costs no more. Once learnt, a score is faster, as a rule several
   times, for "auto" tries proposals in each call. The Euler scheme's error is in its log p, most
   plainly from 3 to 4.
-- **Filters.** By variance and time together all others take from some twenty times as much to
+- **Filters.** By variance and time together all others take from some thirty times as much to
   very much more. Of the linear process all weights are equal here, and log p is Kalman's. A
   bootstrap filter with so few particles is of little use where the noise is small. What limits
   the guided ones of the peers is what was written for them: they look one observation ahead, and
   Euler's steps shift log p of the double well by half. The peers win before the first result:
-  particles compiles nothing, and has one filter in some tenths of a second, where JAX compiles
-  for some ten seconds, here for longer than with cuthbert.
+  particles compiles nothing, and has one filter in some hundredths of a second, where JAX compiles
+  for seconds, here for two or three times as many as with cuthbert.
 - **Posteriors.** The unit step is the fastest by far, and the wrong law: off by 1.6 to 2.5
   posterior standard deviations, and too sure of it. With latent points it is off by what Euler's
   ten steps are. `gibbs`, of second order in as many steps, is not visibly off, with more draws a
-  second. Where σ is unknown and varies numpyro is somewhat ahead at equal steps: both are off
-  alike, and NUTS makes more independent draws a second than `pmmh`. In logarithms, with four
-  times as many steps, most of that is gone, at as many draws a second; a part is left, of which
-  its `step_error` tells.
+  second. Where σ is unknown and varies the two are level at equal steps: off alike, with about as
+  many independent draws a second. In logarithms, with four times as many steps, most of that is
+  gone, at half as many draws a second; a part is left, of which its `step_error` tells.
 """
 
 
