@@ -380,3 +380,20 @@ def test_prepare_runs_outside_every_loop():
     assert "lu" in primitives(jaxpr.jaxpr)
     assert "scan" in primitives(jaxpr.jaxpr, inside="while")
     assert "lu" not in primitives(jaxpr.jaxpr, inside="while")
+
+
+@pytest.mark.parametrize(
+    "make",
+    [jb.hyperbolic, lambda _, d: jb.ornstein_uhlenbeck(jnp.eye(d, dtype=jnp.float32))],
+    ids=["hyperbolic", "Ornstein-Uhlenbeck"],
+)
+@pytest.mark.parametrize("d", [2, 3])
+def test_single_precision_serves_where_double_is_on(make, d):
+    """No constant of a model is a NumPy number, which would not be promoted, or promote."""
+    model, point = make(0.8, d), jnp.ones(d, jnp.float32)
+    with jax.enable_x64(True):
+        law, key = model.log_stationary(point), jax.random.key(0)
+        assert law.dtype == model.drift(point).dtype == jnp.float32
+        assert model.sample_stationary(key).dtype == jnp.float32
+        normal = jb.GaussianLaw(jnp.zeros_like(point), jnp.eye(len(point), dtype=jnp.float32))
+        assert normal.log_density(point).dtype == jnp.float32
