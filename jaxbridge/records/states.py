@@ -13,12 +13,12 @@ sides is accepted with probability
 
     min{1, ŵ'_left ŵ'_right g(y_k|x_k') q(x_k) / (ŵ_left ŵ_right g(y_k|x_k) q(x_k'))},
 
-import math
 from a random walk, where q falls out, and every other time from a normal law q, the stationary
 mean and covariance as the observation corrects them. Then each segment is offered a new path
 between the same two states.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import diffrax
