@@ -106,8 +106,8 @@ from .proposals.linear_guide import Guided
 from .proposals.modified_bridge import ModifiedDiffusionBridge
 from .proposals.residual_bridge import ResidualBridge
 from .records.innovations import Innovations, innovations
+from .records.log_likelihood import LogLikelihood, log_likelihood
 from .records.observation import LinearGaussian, ObservationDensity
-from .records.particle_filter import LogLikelihood, log_likelihood
 from .records.smooth import Smoothed, smooth
 from .schemes.base import AbstractScheme
 from .schemes.euler import Euler

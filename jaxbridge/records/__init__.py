@@ -15,7 +15,7 @@ all equal where the model is linear; the density of a bridge's guided proposal (
 Schauer 2017; Mider, Schauer & van der Meulen 2021) with data on the way. On it are built
 
 * `log_likelihood`: particles that are resampled where data are (`particle_filter`), an unbiased
-  estimate, however long the record is;
+  estimate, however long the record is, and its errors;
 * `innovations`: path and weight as smooth functions of parameters and of normal noise;
 * `smooth`: paths given the whole record, by moves of the noise in blocks (`path_blocks`), or across
   long gaps by moves of the states with new bridges on both sides (`states`).

@@ -1,282 +1,32 @@
-"""The guided particle filter: the likelihood of a record, however long it is.
+"""The guided particle filter: an unbiased estimate of the likelihood of a record.
 
 P particles take guided steps. At the end of each segment their weights are those of paths that end
 here, tilted by h: of what is seen later they know as much as the linear process does. Where few of
 them count they are resampled, systematically, and go on with equal weights. The product of the
 means of the weights, p̂(y), is unbiased (Del Moral 2004, theorem 7.4.2), up to the step error.
-
-Several filters that know nothing of each other make a mean, and its error is told by their spread:
-what one filter knows of its own error it has from the particles that it did not lose. And what none
-of them knows, as where rare particles far from the guide would weigh more than all others, the
-shape k̂ of the largest weights tells at each observation.
 """
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
-from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
-from ..engine.compiled import compiled
-from ..engine.doors import door
 from ..engine.lanes import over_lanes
 from ..engine.pareto import pareto_k
-from ..engine.throwing import throw_where
-from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
-from ..schemes import AbstractStepDensity, StepError, dominates, error_of_grids, num_coarse_grids
 from .cover import cover, covered_start
-from .guided_record import Guidance, correction, linearised
+from .guided_record import Guidance, correction
 from .guided_steps import guided_step
-from .initial import Initial, calls_for_cover, log_ratio
-from .observation import Observation
+from .initial import calls_for_cover, log_ratio
 from .problem import RecordProblem
-from .record import of_each, split_records
 from .segments import split_first, split_last
-from .several import Records, as_record_problems
 
 # Particles are resampled where fewer than this share of them count.
 _FEWEST_EFFECTIVE = 0.5
-# Fewer particles that count, or a larger standard error of a log, tell nothing; nor do heavier
-# tails: 0.7, and what the largest of many estimates of k exceeds it by.
-_FEWEST_TRUSTED, _MOST_SPREAD, _HEAVIEST = 5, 0.5, 0.8
-
-_UNEXPLAINED = (
-    "no particle explains some observation (`unexplained` is its number): look whether it is an "
-    "outlier that the noise of `observation` has no room for, or take more steps or particles."
-)
-_DISAGREE = (
-    "so few particles count somewhere, or filters disagree so much, that the likelihood and its "
-    "error cannot be trusted: take more `num_particles`; across gaps in which the diffusion could "
-    "have gone several ways more observations are needed, or `smooth` with a `proposal`."
-)
-_HEAVY = (
-    "at some observation the largest weights are so much larger than the others (`pareto_k` above "
-    "0.8; infinite of fewer than 25 particles) that particles which weigh more yet may never have "
-    "been drawn: take more `num_particles`, and see whether `value` stays."
-)
-_STEPS = "the step error is beyond the standard error, or not known: take more `num_steps`."
-
-
-class LogLikelihood(eqx.Module):
-    """What `log_likelihood` returns.
-
-    - `value`: log p̂(y); `exp(value)` is unbiased up to the step error. -inf where no particle
-        explains what was seen.
-    - `standard_error`: that of `value`, from the spread of the filters by the delta method;
-        infinite of a single one.
-    - `log_estimates`: log p̂ of each filter, shape (num_filters,).
-    - `effective_sample_size`: how many particles count before each observation is followed by
-        resampling, the mean over the filters, shape (n,).
-    - `pareto_k`: k̂ of the weights of the particles of all filters at each observation, shape (n,),
-        or, without an `observation`, of each transition. Above 0.7 `value` is mostly too small, by
-        more than `standard_error` tells; rough where there are few particles, and inf of fewer than
-        25, unless all weigh the same.
-    - `num_nonfinite`: how many particles left the finite numbers or the state space.
-    - `step_error`: an estimate of what `value` is too large by for the length of the steps, from
-        half as many; `step_uncertainty` is its Monte Carlo error and what it leaves out, by a
-        quarter as many, infinite where what steps change does not shrink with them. NaN of one
-        step.
-    """
-
-    value: Float[Array, ""]
-    standard_error: Float[Array, ""]
-    log_estimates: Float[Array, " num_filters"]
-    effective_sample_size: Float[Array, " n"]
-    pareto_k: Float[Array, " n"]
-    num_nonfinite: Int[Array, ""]
-    step_error: Float[Array, ""]
-    step_uncertainty: Float[Array, ""]
-
-    @property
-    def unexplained(self) -> Int[Array, ""]:
-        """The number of the first observation that no particle explains; -1 where there is none."""
-        lost = self.effective_sample_size == 0
-        return jnp.where(jnp.any(lost), jnp.argmax(lost), -1)
-
-    @property
-    def step_error_dominates(self) -> Bool[Array, ""]:
-        """Whether the step error is beyond the standard error, or not known well enough to say:
-        then more steps help, and more particles do not."""
-        return dominates(StepError(self.step_error, self.step_uncertainty), self.standard_error)
-
-    @property
-    def trustworthy(self) -> Bool[Array, ""]:
-        """Whether `value` and `standard_error` are to be trusted: particles that count at all
-        observations, filters that agree, so that the delta method holds, tails of the weights that
-        are not heavy, and a step error that does not dominate."""
-        return self._filters_agree & ~self._is_heavy & ~self.step_error_dominates
-
-    @property
-    def _is_heavy(self) -> Bool[Array, ""]:
-        return jnp.any(self.pareto_k > _HEAVIEST)
-
-    @property
-    def _filters_agree(self) -> Bool[Array, ""]:
-        counted = jnp.all(self.effective_sample_size >= _FEWEST_TRUSTED)
-        return counted & jnp.isfinite(self.value) & (self.standard_error < _MOST_SPREAD)
-
-
-@door
-def log_likelihood(
-    key: Key[Array, ""],
-    model: Diffusion,
-    times: Numbers,
-    observations: Numbers,
-    *,
-    observation: Observation | None = None,
-    initial: Initial = None,
-    num_particles: int = 100,
-    num_filters: int = 8,
-    num_steps: int | None = None,
-    step_size: float | None = None,
-    initial_time: Numbers | None = None,
-    density: AbstractStepDensity | None = None,
-    throw: bool = False,
-) -> LogLikelihood:
-    """log p(y) of a record that was seen with noise or in part, unbiased on the natural scale.
-
-    **Arguments:**
-
-    - `key`: a typed key.
-    - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
-        `initial_time`, `density`: as in `innovations`. Lists of `times` and of `observations`, or
-        a leading axis, are several records, independent given the parameters.
-        Without an `observation` the state was seen whole and exactly: the sum of the log transition
-        densities by `transition_log_density(proposal="auto")`, given the first.
-    - `num_particles`: of each filter.
-    - `num_filters`: filters that know nothing of each other, whose spread tells the error.
-    - `throw`: raise an error at run time where the result is not `trustworthy`.
-
-    **Returns:** `LogLikelihood`. For a linear model all weights are equal, and `value` is that of
-    the Kalman filter of the steps. A stationary law that is not normal is covered by a mixture of
-    normal laws at draws of it, and wider ones beyond: `effective_sample_size` says how well in its
-    first number. Not differentiable where particles are resampled:
-    `innovations` is.
-
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
-
-    **Example:**
-
-    ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    made = jb.log_likelihood(key, model, times, observations, observation=seen)
-    made.value, made.standard_error
-    ```
-    """
-    check_key(key)
-    num_particles = check_count("num_particles", num_particles)
-    num_filters = check_count("num_filters", num_filters)
-    if observation is None:
-        if initial is not None or initial_time is not None or density is not None:
-            raise ValueError(
-                "without an `observation` the first state is given, and steps are those of "
-                "`transition_log_density`: leave out `initial`, `initial_time` and `density`."
-            )
-        made = _exact(key, model, times, observations, num_particles, num_steps, step_size)
-        return or_throw(made, model) if throw else made
-    arguments = (model, times, observations, observation, initial)
-    options = {"step_size": step_size, "initial_time": initial_time, "density": density}
-    records = as_record_problems(*arguments, num_steps=num_steps, **options)
-    size = num_filters, num_particles
-    levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
-    grids = [records, *map(records.coarsened, levels)]
-    made = _told(records, [_estimates(key, grid, _guides(grid), *size) for grid in grids])
-    return or_throw(made, model) if throw else made
-
-
-def or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
-    """The same, whose value raises `RuntimeError` where it is not to be trusted."""
-    faults = [
-        (made.unexplained >= 0, _UNEXPLAINED),
-        (~made._filters_agree, _DISAGREE),
-        (made._is_heavy, _HEAVY),
-        (made.step_error_dominates, _STEPS),
-    ]
-    return throw_where(made, "value", model, faults)
-
-
-@compiled
-def _told(records: Records, grids: list["Filtered"]) -> LogLikelihood:
-    """What filters on the grid, and on coarser ones, say of all records together."""
-    means = [log_mean_and_error(each.log_estimate) for each in grids]
-    values = jnp.stack([jnp.sum(log_mean) for log_mean, _, _ in means])
-    errors = jnp.stack([jnp.sqrt(jnp.sum(error**2)) for _, error, _ in means])
-    (value, *_), (error, *_), fine = values, errors, grids[0]
-    # What rounding leaves of the sum over all steps is no change, either.
-    rounding = np.sqrt(records.stacked.record.dt.size) * jnp.finfo(value.dtype).eps
-    rounding = rounding.astype(value.dtype) * jnp.maximum(1, jnp.abs(value))
-    order, num_steps = records.stacked.density.order, records.stacked.num_steps
-    step_error = error_of_grids(values, jnp.hypot(errors, rounding), order, num_steps)
-    return LogLikelihood(
-        value,
-        error,
-        jnp.sum(fine.log_estimate, axis=0),
-        records.at_observations(jnp.mean(fine.size, axis=1)),
-        records.at_observations(fine.pareto_k),
-        jnp.sum(fine.num_nonfinite),
-        *step_error,
-    )
-
-
-def _guides(records: Records) -> Guidance:
-    """Of each record, at the parameters of the model."""
-    return records.each(lambda problem: linearised(problem, problem.model).guide)
-
-
-def _exact(
-    key: Key[Array, ""],
-    model: Diffusion,
-    times: Numbers,
-    observations: Numbers,
-    num_proposals: int,
-    num_steps: int | None,
-    step_size: float | None,
-) -> LogLikelihood:
-    """Of observations of the whole state without noise."""
-    if step_size is not None:
-        raise ValueError("`step_size` is for records with an `observation`: pass `num_steps`.")
-    intervals = of_each(_intervals, split_records(times, observations))
-    start, end, duration = (jnp.concatenate(each) for each in zip(*intervals, strict=True))
-    made = transition_log_density(
-        key,
-        model,
-        start,
-        end,
-        duration,
-        num_proposals=num_proposals,
-        num_steps=50 if num_steps is None else num_steps,
-        proposal="auto",
-    )
-    value = jnp.sum(made.value)
-    return LogLikelihood(
-        value,
-        jnp.sqrt(jnp.sum(made.standard_error**2)),
-        value[None],
-        made.effective_sample_size,
-        made.pareto_k,
-        jnp.sum(made.num_nonfinite),
-        jnp.sum(made.step_error),
-        jnp.sqrt(jnp.sum(made.step_uncertainty**2)),
-    )
-
-
-def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Array]:
-    """Start, end and duration of each."""
-    times, gaps = time_steps("times", times)
-    points = as_floating("observations", observations)
-    if points.ndim != 2 or points.shape[0] != times.shape[0]:
-        raise ValueError(
-            f"`observations` must have shape ({times.shape[0]}, d), a row for each of `times`; got "
-            f"{points.shape}."
-        )
-    return points[:-1], points[1:], gaps
 
 
 class Filtered(NamedTuple):
@@ -300,17 +50,6 @@ class Filtered(NamedTuple):
 def _is_poor(size: Float[Array, "..."], num_particles: int) -> Bool[Array, "..."]:
     """Whether so few particles count that they are resampled."""
     return size < _FEWEST_EFFECTIVE * num_particles
-
-
-@compiled
-def _estimates(key: Key[Array, ""], records: Records, guides: Guidance, R: int, P: int) -> Filtered:
-    """Of each record."""
-    moving = records.moving
-
-    def filters(problem, key, guide):
-        return run_filters(key, problem, problem.model, guide, (R, P), moving)
-
-    return records.each(filters, jax.random.split(key, records.number), guides)
 
 
 class _Particles(NamedTuple):

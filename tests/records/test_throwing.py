@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import pytest
 
 import jaxbridge as jb
-from jaxbridge.records import particle_filter, smooth
-from jaxbridge.records.particle_filter import LogLikelihood
+from jaxbridge.records import log_likelihood, smooth
+from jaxbridge.records.log_likelihood import LogLikelihood
 from jaxbridge.records.smooth import Smoothed
 
 MODEL = jb.Diffusion(lambda x, p: -p * x, params=1.0)
@@ -36,7 +36,7 @@ def test_likelihoods(changed, message):
     made = likelihood(**changed)
     assert not made.trustworthy
     with pytest.raises(Exception, match=message):
-        particle_filter.or_throw(made, MODEL)
+        log_likelihood.or_throw(made, MODEL)
 
 
 def smoothed(apart=0.0, stuck=False, num_truncated=0):
@@ -61,7 +61,7 @@ def test_smoothed_paths(changed, message):
 
 
 def test_what_is_trusted_is_not_thrown():
-    assert particle_filter.or_throw(likelihood(), MODEL).value == -3
+    assert log_likelihood.or_throw(likelihood(), MODEL).value == -3
     made = smoothed()
     assert jnp.all(smooth.or_throw(made, MODEL).paths == made.paths)
     with pytest.raises(Exception, match="not finite"):
