@@ -29,6 +29,14 @@ _PRIOR_COUNT, _PRIOR_SHAPE = 10, 0.5
 
 # Above, the error of a mean falls too slowly with the number of weights, and is not seen in them.
 _MOST_RELIABLE = 0.7
+
+
+def most_reliable(number: int) -> float:
+    """The largest shape with which the mean of so many weights is to be trusted: that of few is
+    not where the tail is lighter (Vehtari et al. 2024, section 3.2)."""
+    return min(_MOST_RELIABLE, 1 - 1 / math.log10(number)) if number > 10 else 0.0
+
+
 # A few weights far beyond many others hardly move the fit, but fewer effective ones tell nothing.
 _FEWEST_EFFECTIVE = 5
 

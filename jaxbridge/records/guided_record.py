@@ -187,8 +187,11 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     noise; both begin at a likely point where ν is not normal. The points have no derivatives, and
     the guide none by the model.
 
-    Where that path is the less likely one, by its weight, steps to it are shortened until it is
-    not: excitable and chaotic systems throw Gauss and Newton's iteration off for good."""
+    What counts is the weight of the path without noise: where it is large, weights fall off as
+    noise leads away from it, and where it is small paths that weigh more are missed. So a turn
+    counts that raises it, and steps are shortened until one does: excitable and chaotic systems
+    throw Gauss and Newton's iteration off for good, and between two wells its fixed point, the
+    likeliest path, guides worse than the filter's means."""
     own, (problem, model) = problem, without_derivatives((problem, model))
     initial = initial_law(problem.initial, model, problem.like)
     dynamics_at, scalars = model.forward_at(problem.like), problem.scalars(model)
@@ -213,10 +216,10 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     def turn(search: _Search) -> _Search:
         new = at(search.points)
         gain = jnp.where(search.turn == 0, jnp.inf, new[1] - search.log_weight)
-        better = (gain > -_NO_GAIN) | (search.log_weight == -jnp.inf)
+        better = (gain > _NO_GAIN) | (search.log_weight == -jnp.inf)
         old = search.best, search.log_weight, search.path
         best, log_weight, path = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
-        settled = better & (gain < _NO_GAIN) & (search.length == 1)
+        settled = (jnp.abs(gain) < _NO_GAIN) & (search.length == 1)
         length = jnp.where(better, jnp.minimum(2 * search.length, 1), search.length / 2)
         points = best.points + length * (path - best.points)
         points = jnp.where(length == 1, path, points)

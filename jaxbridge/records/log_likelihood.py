@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
 from ..engine.compiled import compiled
 from ..engine.doors import door
+from ..engine.pareto import most_reliable
 from ..engine.throwing import throw_where
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
@@ -26,9 +27,9 @@ from .particle_filter import Filtered, run_filters
 from .record import of_each, split_records
 from .several import Records, as_record_problems
 
-# Fewer particles that count, or a larger standard error of a log, tell nothing; nor do heavier
-# tails: 0.7, and what the largest of many estimates of k exceeds it by.
-_FEWEST_TRUSTED, _MOST_SPREAD, _HEAVIEST = 5, 0.5, 0.8
+# Fewer particles that count, or a larger standard error of a log, tell nothing; nor do tails that
+# are heavier than so many weights can show by more than the largest of many estimates of k is off.
+_FEWEST_TRUSTED, _MOST_SPREAD, _LARGEST_OF_MANY = 5, 0.5, 0.1
 
 _UNEXPLAINED = (
     "no particle explains some observation (`unexplained` is its number): look whether it is an "
@@ -41,8 +42,8 @@ _DISAGREE = (
 )
 _HEAVY = (
     "at some observation the largest weights are so much larger than the others (`pareto_k` above "
-    "0.8; infinite of fewer than 25 particles) that particles which weigh more yet may never have "
-    "been drawn: take more `num_particles`, and see whether `value` stays."
+    "0.8, of few particles above less, and infinite of fewer than 25) that particles which weigh "
+    "more yet may never have been drawn: take more `num_particles`, and see whether `value` stays."
 )
 _STEPS = "the step error is beyond the standard error, or not known: take more `num_steps`."
 
@@ -58,9 +59,10 @@ class LogLikelihood(eqx.Module):
     - `effective_sample_size`: how many particles count before each observation is followed by
         resampling, the mean over the filters, shape (n,).
     - `pareto_k`: k̂ of the weights of the particles of all filters at each observation, shape (n,),
-        or, without an `observation`, of each transition. Above 0.7 `value` is mostly too small, by
-        more than `standard_error` tells; rough where there are few particles, and inf of fewer than
-        25, unless all weigh the same.
+        or, without an `observation`, of each transition. Above 0.7, or with fewer than a thousand
+        particles in all above less, `value` is mostly too small, by more than `standard_error`
+        tells; inf of fewer than 25, unless all weigh the same.
+    - `num_weights`: how many weights each k̂ is of.
     - `num_nonfinite`: how many particles left the finite numbers or the state space.
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, from
         half as many; `step_uncertainty` is its Monte Carlo error and what it leaves out, by a
@@ -73,6 +75,7 @@ class LogLikelihood(eqx.Module):
     log_estimates: Float[Array, " num_filters"]
     effective_sample_size: Float[Array, " n"]
     pareto_k: Float[Array, " n"]
+    num_weights: int = eqx.field(static=True)
     num_nonfinite: Int[Array, ""]
     step_error: Float[Array, ""]
     step_uncertainty: Float[Array, ""]
@@ -98,7 +101,7 @@ class LogLikelihood(eqx.Module):
 
     @property
     def _is_heavy(self) -> Bool[Array, ""]:
-        return jnp.any(self.pareto_k > _HEAVIEST)
+        return jnp.any(self.pareto_k > most_reliable(self.num_weights) + _LARGEST_OF_MANY)
 
     @property
     def _filters_agree(self) -> Bool[Array, ""]:
@@ -170,7 +173,8 @@ def log_likelihood(
     size = num_filters, num_particles
     levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
     grids = [records, *map(records.coarsened, levels)]
-    made = _told(records, [_estimates(key, grid, _guides(grid), *size) for grid in grids])
+    filtered = [_estimates(key, grid, _guides(grid), *size) for grid in grids]
+    made = _told(records, filtered, num_filters * num_particles)
     return or_throw(made, model) if throw else made
 
 
@@ -186,7 +190,7 @@ def or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
 
 
 @compiled
-def _told(records: Records, grids: list[Filtered]) -> LogLikelihood:
+def _told(records: Records, grids: list[Filtered], num_weights: int) -> LogLikelihood:
     """What filters on the grid, and on coarser ones, say of all records together."""
     means = [log_mean_and_error(each.log_estimate) for each in grids]
     values = jnp.stack([jnp.sum(log_mean) for log_mean, _, _ in means])
@@ -203,6 +207,7 @@ def _told(records: Records, grids: list[Filtered]) -> LogLikelihood:
         jnp.sum(fine.log_estimate, axis=0),
         records.at_observations(jnp.mean(fine.size, axis=1)),
         records.at_observations(fine.pareto_k),
+        num_weights,
         jnp.sum(fine.num_nonfinite),
         *step_error,
     )
@@ -244,6 +249,7 @@ def _exact(
         value[None],
         made.effective_sample_size,
         made.pareto_k,
+        num_proposals,
         jnp.sum(made.num_nonfinite),
         jnp.sum(made.step_error),
         jnp.sqrt(jnp.sum(made.step_uncertainty**2)),

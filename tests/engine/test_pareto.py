@@ -134,3 +134,9 @@ def test_enormous_spreads(spread):
 def test_no_derivative():
     gradient = jax.grad(lambda x: pareto_k(x))(jnp.linspace(0.0, 1.0, 100))
     np.testing.assert_array_equal(gradient, 0)
+
+
+def test_few_weights_are_trusted_with_lighter_tails_only():
+    assert pareto.most_reliable(10) == 0
+    np.testing.assert_allclose(pareto.most_reliable(100), 0.5)
+    assert pareto.most_reliable(10**4) == pareto.most_reliable(10**6) == 0.7

@@ -65,21 +65,24 @@ def by_bootstrap(values, noise, num=16):
 @pytest.mark.optimised
 def test_the_likelihood_is_that_of_a_bootstrap_filter():
     values, options = record(0.0316)
-    made = jb.log_likelihood(jax.random.key(0), MODEL, TIMES, values, num_particles=100, **options)
+    made = jb.log_likelihood(jax.random.key(0), MODEL, TIMES, values, num_particles=300, **options)
     exact, error = by_bootstrap(values, 0.0316)
     error = np.hypot(error, made.standard_error)
     assert made.trustworthy and error < 0.5
     assert abs(made.value - exact) < 4.5 * error
-    assert made.log_estimates.std() < 0.4  # of a tenth of the particles
+    assert made.log_estimates.std() < 0.3  # of a third of the particles
 
 
 @pytest.mark.slow
 @pytest.mark.optimised
-def test_heavy_tails_are_told():
+@pytest.mark.parametrize("noise, num_particles", [(0.5, 100), (0.316, 30)])
+def test_heavy_tails_are_told(noise, num_particles):
     """With as much noise as the voltage has range paths leave the one along which they are guided,
-    and few find their way: what a hundred particles say is too small by many standard errors."""
-    values, options = record(0.316)
-    made = jb.log_likelihood(jax.random.key(0), MODEL, TIMES, values, num_particles=100, **options)
-    exact, error = by_bootstrap(values, 0.316)
-    assert error < 0.3 and abs(made.value - exact) > 1
-    assert made.pareto_k.max() > 0.8 and not made.trustworthy
+    and few find their way: what a hundred particles say is too small by many standard errors. Where
+    there are fewer lighter tails suffice for that."""
+    values, options = record(noise)
+    options["num_particles"] = num_particles
+    made = jb.log_likelihood(jax.random.key(0), MODEL, TIMES, values, **options)
+    exact, error = by_bootstrap(values, noise)
+    assert error < 0.3 and made.value - exact < -4 * made.standard_error
+    assert made.pareto_k.max() > 0.7 and not made.trustworthy
