@@ -37,7 +37,7 @@ from .tilted_step import NormalStep
 
 # How often the path along which the process is linearised is found anew from the last; what log
 # weights gain by it that is worth no further turn; and the shortest of its steps.
-_FEWEST_TURNS, _MOST_TURNS, _NO_GAIN, _SHORTEST = 4, 30, 0.5, 2.0**-10
+_MOST_TURNS, _NO_GAIN, _SHORTEST = 30, 0.5, 2.0**-10
 
 
 class Guidance(NamedTuple):
@@ -219,11 +219,11 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
         better = (gain > _NO_GAIN) | (search.log_weight == -jnp.inf)
         old = search.best, search.log_weight, search.path
         best, log_weight, path = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
-        settled = (jnp.abs(gain) < _NO_GAIN) & (search.length == 1)
+        settled = jnp.abs(gain) < _NO_GAIN
         length = jnp.where(better, jnp.minimum(2 * search.length, 1), search.length / 2)
         points = best.points + length * (path - best.points)
         points = jnp.where(length == 1, path, points)
-        over = (search.turn + 1 >= _FEWEST_TURNS) & (settled | (length < _SHORTEST))
+        over = settled | (length < _SHORTEST)
         return _Search(search.turn + 1, points, best, log_weight, path, length, over)
 
     shapes, log_weight, _ = jax.eval_shape(at, points)

@@ -13,6 +13,10 @@ from scipy.optimize import minimize_scalar
 from scipy.special import gammaln
 
 import jaxbridge as jb
+from jaxbridge.records import guided, linearised, path_and_log_weight
+from jaxbridge.records.initial import initial_law
+from jaxbridge.records.linearisation import extended_kalman_path
+from jaxbridge.records.problem import as_record_problem
 
 KEY = jax.random.key(0)
 
@@ -120,6 +124,27 @@ def recorded(name):
 def options(case):
     law = jb.GaussianLaw([case.start], [[0.25]])
     return {"observation": case.observation, "initial": law}
+
+
+def test_a_path_that_guides_worse_is_not_taken():
+    """From the filter's means, with a well on either side of a gap, to the likeliest path."""
+    case, values, _ = recorded("double well")
+    given = case.model, case.times, values, case.observation, options(case)["initial"]
+    problem = as_record_problem(*given, num_steps=20)
+
+    @jax.jit
+    def log_weight(points):
+        guide = guided(problem, problem.model, points)
+        return path_and_log_weight(problem, problem.model, guide, jnp.zeros_like(points))
+
+    initial = initial_law(problem.initial, problem.model, problem.like)
+    begun = extended_kalman_path(
+        problem.density, problem.model.forward_at(problem.like), initial, problem.record.steps(),
+        problem.scalars(problem.model),
+    )  # fmt: skip
+    path, first = log_weight(begun)
+    assert log_weight(path)[1] < first - 1
+    assert log_weight(linearised(problem, problem.model).points)[1] >= first - 1e-3
 
 
 @pytest.mark.slow
