@@ -111,7 +111,8 @@ def over_problems(
 
     Under `vmap` the problems of all batches are run as those of one, which `vmap` by itself would
     not do: each batch would have lanes of its own, and wait for the slowest. Where batches differ
-    in what their problems share, as in parameters, it is left to do so.
+    in what their problems share, as in parameters, it is left to do so; also in what functions of
+    a model close over.
     """
     arrays, rest = eqx.partition((shared, search.max_attempts), eqx.is_array)
 
@@ -119,14 +120,18 @@ def over_problems(
         shared, max_attempts = eqx.combine(arrays, rest)
         return shared, search._replace(max_attempts=max_attempts)
 
-    def plain(each, arrays):
-        return run(each, *given(arrays))
+    # What `run` closes over is an argument, too: the rule is told whether it is batched.
+    converted = eqx.filter_closure_convert(lambda *a: run(a[0], *given(a[1])), each, arrays)
+    closed_over, converted = eqx.partition(converted, eqx.is_array)
 
-    def folded(axis_size, in_batched, each, arrays):
-        batched, shared_batched = in_batched
-        if any(jax.tree.leaves(shared_batched)):
+    def plain(closed_over, each, arrays):
+        return eqx.combine(closed_over, converted)(each, arrays)
+
+    def folded(axis_size, in_batched, closed_over, each, arrays):
+        differ, batched, shared_differ = in_batched
+        if any(jax.tree.leaves((differ, shared_differ))):
             in_axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
-            results = jax.vmap(plain, in_axes, axis_size=axis_size)(each, arrays)
+            results = jax.vmap(plain, in_axes, axis_size=axis_size)(closed_over, each, arrays)
             return results, jax.tree.map(lambda _: True, results)
 
         def fold(leaf, batched):
@@ -144,7 +149,7 @@ def over_problems(
 
     together = jax.custom_batching.custom_vmap(plain)
     together.def_vmap(folded)
-    return together(each, arrays)
+    return together(closed_over, each, arrays)
 
 
 def _before(success: Bool[Array, " lanes"], first: Int[Array, " lanes"]) -> Int[Array, " lanes"]:
