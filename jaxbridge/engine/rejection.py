@@ -121,7 +121,8 @@ def over_problems(
         return shared, search._replace(max_attempts=max_attempts)
 
     # What `run` closes over is an argument, too: the rule is told whether it is batched.
-    converted = eqx.filter_closure_convert(lambda *a: run(a[0], *given(a[1])), each, arrays)
+    traced = lambda each, arrays: run(each, *given(arrays))
+    converted = eqx.filter_closure_convert(traced, each, arrays)
     closed_over, converted = eqx.partition(converted, eqx.is_array)
 
     def plain(closed_over, each, arrays):
