@@ -122,6 +122,9 @@ class Coordinates(AbstractForm):
         "squeeze": lambda value, *, dimensions: value.squeeze(dimensions),
         "stack": lambda *values, axis: np.stack(values, axis),
         "transpose": lambda value, *, permutation: value.transpose(permutation),
+        "unstack": lambda value, *, axis: [
+            row.squeeze(axis) for row in np.split(value, value.shape[axis], axis)
+        ],
     }
 
 
@@ -188,6 +191,7 @@ class LanesLast(AbstractForm):
         "squeeze": lambda array, *, dimensions: array.squeeze(dimensions),
         "stack": lambda *arrays, axis: jnp.stack(_wide(arrays), axis),
         "transpose": lambda array, *, permutation: array.transpose(*permutation, array.ndim - 1),
+        "unstack": lambda array, *, axis: list(jnp.moveaxis(array, axis, 0)),
     }
 
 

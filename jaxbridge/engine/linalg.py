@@ -379,7 +379,7 @@ def polar_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
 
     def newton(_, factor):
         inverse_transpose = inverse(factor).T
-        scale = jnp.sqrt(safe_norm(inverse_transpose.ravel()) / safe_norm(factor.ravel()))
+        scale = jnp.sqrt(jnp.sqrt(total(total(inverse_transpose**2)) / total(total(factor**2))))
         return (scale * factor + inverse_transpose / scale) / 2
 
     return lax.fori_loop(0, _NEWTON_STEPS, newton, matrix)

@@ -20,7 +20,7 @@ from ..proposals import AbstractWeightedProposal
 from ..records import guided, run_filters
 from ..schemes import share_of_grid
 from .blocks import Block, with_keys
-from .record_paths import GuidedRecords, guided_near
+from .record_paths import GuidedRecords, guided_near, on_both_grids
 
 
 class Estimate(NamedTuple):
@@ -130,18 +130,18 @@ class RecordLikelihood(AbstractLikelihood):
         return Estimate(proper(value), variance, jnp.full_like(value, jnp.nan), jnp.int32(0))
 
     def log_step_error(self, key, model):
-        fine, variance = self._filtered(key, model, self.fine)
         problem = self.fine.records.stacked
         if problem.num_steps == 1:
-            return jnp.full_like(fine, jnp.nan)
-        coarse, coarse_variance = self._filtered(key, model, self.coarse)
+            return jnp.full((), jnp.nan, problem.like.dtype)
+        filtered = lambda grid: self._filtered(key, model, grid)
+        log_p, variance = on_both_grids(filtered, self.fine, self.coarse)
         # The mean of log p̂ is too small by half its variance.
-        ratio = coarse - fine + (coarse_variance - variance) / 2
-        return share_of_grid(problem.density.order, problem.num_steps) * ratio
+        fine, coarse = log_p + variance / 2
+        return share_of_grid(problem.density.order, problem.num_steps) * (coarse - fine)
 
     def near(self, model):
-        fine, coarse = (guided_near(each.records, model) for each in (self.fine, self.coarse))
-        return RecordLikelihood(fine, coarse, self.num_particles)
+        grids = guided_near(self.fine.records, self.coarse.records, model)
+        return RecordLikelihood(*grids, self.num_particles)
 
     @property
     def guided(self):

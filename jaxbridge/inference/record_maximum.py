@@ -12,6 +12,10 @@ Chains of paths move given the current θ, are read as ξ, and θ makes a step o
 the mean of ∇ log w, which takes the paths along (Gu & Kong 1998). From the average of the second
 half of the iterates, where the chains run on with θ fixed, one step of Newton's method is made.
 
+∇² log w is the difference of ∇ log w at θ ± h e_j, which takes a third of the time to compile that
+its derivative takes. h is a share of 1 / √D_j, with D_j the mean of -∂²_j log w: of what a standard
+error would be, were ξ known.
+
 The step error e = log L_N - log L of the likelihood, about a share of log L_{N/2} - log L_N, moves
 the maximum by I⁻¹ ∇e, and with the weight w̃ of half as many steps and D = log w̃ / w,
 
@@ -28,6 +32,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import all_finite_leaves, nondifferentiable
@@ -43,6 +48,8 @@ from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 _CHAINS = 8
 # Of the chains before θ moves.
 _SWEEPS = 50
+# h of differences, as a share; and by how many draws before those that count it is learnt.
+_DIFFERENCE, _LEARNING = 0.05, 10
 
 
 class RecordMaximumLikelihood(eqx.Module):
@@ -132,8 +139,8 @@ def maximum_of_records(
     rough = jnp.mean(iterates[len(iterates) // 2 :], axis=0)
     # What guides well at the first θ need not do so at the last.
     completion = as_record_paths(parameters, records, rough)
-    draws = _draws_at(last_key, completion, rough, chains, num_draws, search.progress_meter)
-    return _summary(completion, rough, iterates, info, draws)
+    draws, h = _draws_at(last_key, completion, rough, chains, num_draws, search.progress_meter)
+    return _summary(completion, rough, iterates, info, draws, h)
 
 
 def _of_chains(function: Callable, key: Key[Array, ""], *mapped: PyTree) -> PyTree:
@@ -208,30 +215,42 @@ def _draws_at(
     chains: _Chains,
     num_draws: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
-) -> _Draw:
-    """Of all chains, axes (chains, n), at θ."""
+) -> tuple[_Draw, Float[Array, " p"]]:
+    """Of all chains, axes (chains, n), at θ; and h."""
     completion, theta = nondifferentiable((completion, theta))
+    p = len(theta)
 
-    def derivatives(key, paths, taken):
+    def derivatives(key, paths, taken, h):
         noise, log_weight = completion.noise(key, theta, paths)
+        log_w = lambda theta, coarse: completion.either_log_weight(theta, noise, coarse)
+        apart = jnp.diag(h)
+        around = theta + jnp.concatenate([jnp.zeros((2, p), h.dtype), apart, -apart])
+        is_coarse = jnp.arange(2 * p + 2) == 1
+        values, slopes = lax.map(lambda at: jax.value_and_grad(log_w)(*at), (around, is_coarse))
+        hessian = (slopes[2 : 2 + p] - slopes[2 + p :]) / (2 * h[:, None])
+        hessian = (hessian + hessian.T) / 2
+        return _Draw(slopes[0], hessian, values[1] - log_weight, slopes[1], taken)
 
-        def gradient(theta):
-            made = jax.grad(lambda theta: completion.of_noise(theta, noise)[1])(theta)
-            return made, made
-
-        hessian, fine = jax.jacfwd(gradient, has_aux=True)(theta)
-        coarse_log_weight = lambda theta: completion.coarse_log_weight(theta, noise)
-        value, coarse = jax.value_and_grad(coarse_log_weight)(theta)
-        return _Draw(fine, hessian, value - log_weight, coarse, taken)
-
-    def draw(chains, i):
+    def draw(state, i):
+        chains, h = state
         sweep_key, noise_key = jax.random.split(jax.random.fold_in(key, i))
         moved, taken = _swept(sweep_key, completion, theta, chains, i)
         chains = chains._replace(paths=moved.paths)
-        return chains, _of_chains(derivatives, noise_key, chains.paths, taken)
+        each = lambda key, paths, taken: derivatives(key, paths, taken, h)
+        made = _of_chains(each, noise_key, chains.paths, taken)
+        curvature = -jnp.diagonal(jnp.nanmean(made.hessian, axis=0))
+        return (chains, jnp.where(i < _LEARNING, _nearer(h, curvature), h)), made
 
-    _, draws = metered_scan(draw, chains, jnp.arange(num_draws), progress_meter)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), draws)
+    first = jnp.where(theta == 0, 0.01, 0.01 * jnp.abs(theta))
+    numbers = jnp.arange(_LEARNING + num_draws)
+    (_, h), draws = metered_scan(draw, (chains, first), numbers, progress_meter)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf[_LEARNING:], 0, 1), draws), h
+
+
+def _nearer(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> Float[Array, " p"]:
+    """The h that suits such a curvature, or what is nearer to it than the last one."""
+    wanted = _DIFFERENCE * lax.rsqrt(jnp.abs(curvature))
+    return jnp.where(jnp.isfinite(wanted), jnp.clip(wanted, h / 8, h * 8), h / 8)
 
 
 def _summary(
@@ -240,17 +259,20 @@ def _summary(
     iterates: Float[Array, "n p"],
     info: SearchInfo,
     draws: _Draw,
+    h: Float[Array, " p"],
 ) -> RecordMaximumLikelihood:
     """One step of Newton's method, and the errors of where it leads."""
     parameters, p = completion.parameters, len(rough)
     gradients = draws.gradient.reshape(-1, p)
     gradient, spread = jnp.mean(gradients, axis=0), jnp.cov(gradients.T).reshape(p, p)
-    information = -jnp.mean(draws.hessian, axis=(0, 1)) - spread
+    curvature = -jnp.mean(draws.hessian, axis=(0, 1))
+    information = curvature - spread
     covariance = jnp.linalg.inv(information)
     step = covariance @ gradient
     definite = jnp.all(jnp.linalg.eigvalsh(information) > 0)
+    learnt = jnp.all(jnp.abs(jnp.log(_nearer(h, jnp.diagonal(curvature)) / h)) < jnp.log(2.0))
     # Further off the likelihood need not be near its quadratic approximation.
-    ok = definite & (gradient @ step < p) & parameters.allowed(rough + step)
+    ok = definite & learnt & (gradient @ step < p) & parameters.allowed(rough + step)
     theta = jnp.where(ok, rough + step, rough)
     size = effective_size_of_chains(draws.gradient)
     left = covariance @ (spread / jnp.sqrt(size[:, None] * size)) @ covariance

@@ -9,14 +9,17 @@ The step error of the likelihood is that of w. From ξ steps of twice the length
 over ξ given θ and the data.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Key
+from jax import lax
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from ..engine.compiled import compiled
 from ..models.diffusion import Diffusion
 from ..records import (
     Paths,
@@ -122,8 +125,19 @@ class RecordPaths(eqx.Module):
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
     ) -> Float[Array, ""]:
         """log w̃ of ξ, with steps of twice the length."""
-        halved = jax.vmap(lambda noise: _of_pairs(noise, self.num_steps))(noise)
-        return _of_noise(self.coarse, self.parameters, theta, halved)[1]
+        return _of_noise(self.coarse, self.parameters, theta, self._of_pairs(noise))[1]
+
+    def either_log_weight(
+        self, theta: Float[Array, " p"], noise: Float[Array, "R points d"], coarse: Bool[Array, ""]
+    ) -> Float[Array, ""]:
+        """log w̃ of ξ or log w, as `coarse` says: one program for both."""
+        choose = lambda a, b: jnp.where(coarse, a, b) if eqx.is_array(a) else b
+        guide = jax.tree.map(choose, self.coarse, self.fine)
+        noise = jnp.where(coarse, self._of_pairs(noise), noise)
+        return _of_noise(guide, self.parameters, theta, noise)[1]
+
+    def _of_pairs(self, noise: Float[Array, "R points d"]) -> Float[Array, "R points d"]:
+        return jax.vmap(lambda noise: _of_pairs(noise, self.num_steps))(noise)
 
 
 def check_no_bridges(**given: Any) -> None:
@@ -155,9 +169,20 @@ def unguided(records: Records) -> GuidedRecords:
     return GuidedRecords(records, jnp.zeros(shape, problem.like.dtype))
 
 
-def guided_near(records: Records, model: Diffusion) -> GuidedRecords:
+def on_both_grids(function: Callable, fine: PyTree, coarse: PyTree) -> Any:
+    """`function` of what has fine and of what has coarse steps, in arrays of one shape: one after
+    the other, in a leading axis, and compiled once."""
+    (of_fine, rest), (of_coarse, _) = (eqx.partition(x, eqx.is_array) for x in (fine, coarse))
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), of_fine, of_coarse)
+    return lax.map(lambda arrays: function(eqx.combine(arrays, rest)), both)
+
+
+def guided_near(
+    fine: Records, coarse: Records, model: Diffusion
+) -> tuple[GuidedRecords, GuidedRecords]:
     """Linearised at the parameters of this model."""
-    return GuidedRecords(records, linearisations(records, model))
+    points = on_both_grids(lambda records: linearisations(records, model), fine, coarse)
+    return GuidedRecords(fine, points[0]), GuidedRecords(coarse, points[1])
 
 
 def no_paths(records: Records) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:
@@ -167,13 +192,13 @@ def no_paths(records: Records) -> tuple[Float[Array, "R points d"], Float[Array,
     return points, jnp.zeros((records.number, 2, num_blocks), points.dtype)
 
 
+@compiled
 def as_record_paths(
     parameters: Parameters, records: Records, theta: Float[Array, " p"]
 ) -> RecordPaths:
     """Linearised at θ."""
-    model = parameters.bind(theta)
-    fine, coarse = (guided_near(each, model) for each in (records, records.coarsened()))
-    return RecordPaths(parameters, fine, coarse)
+    grids = guided_near(records, records.coarsened(), parameters.bind(theta))
+    return RecordPaths(parameters, *grids)
 
 
 def _of_noise(

@@ -52,6 +52,7 @@ FUNCTIONS = {
     "column by column": lambda x: jnp.outer(x, jnp.arange(2.0, dtype=x.dtype)).reshape(
         -1, order="F"
     ),
+    "row by row": lambda x: jnp.stack([sum(jnp.unstack(_matrix(x), axis=1)), *[x * a for a in x]]),
     "nothing": lambda x: (jnp.sum(x[3:] ** 2), x[3:] @ x[3:], x[:0]),
     "extremes": lambda x: (jnp.maximum(x, 0.5), jnp.clip(x, -0.1, 0.2), jax.nn.logsumexp(x)),
     "roll": lambda x: jnp.roll(x, 1) - jnp.diff(x, append=x[:1]),
