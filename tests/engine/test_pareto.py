@@ -23,16 +23,26 @@ def pareto_weights(seed, shape, size):
     return np.log1p(np.expm1(shape * draws) / shape)
 
 
+def by_arviz(log_weights):
+    """By its first versions, or by the later ones, which take the negative."""
+    if hasattr(arviz, "psislw"):
+        return arviz.psislw(log_weights.copy())[1]
+    from arviz_stats.base import array_stats
+
+    return array_stats.psislw(-log_weights)[1]
+
+
 def of_weights(weights):
     with np.errstate(divide="ignore"):
         return float(pareto_k(jnp.asarray(np.log(np.asarray(weights, float)), jnp.float32)))
 
 
-@pytest.mark.parametrize("n", [30, 250, 2000])
+# Where 3√n is a whole number: versions of ArviZ round it differently.
+@pytest.mark.parametrize("n", [30, 225, 2025])
 @pytest.mark.parametrize("shape", [-0.3, 0.2, 0.5, 0.9, 1.2])
 def test_agrees_with_arviz(shape, n, precision):
     log_weights = pareto_weights(0, shape, (30, n)).astype(precision)
-    expected = arviz.psislw(log_weights.astype(float))[1]
+    expected = by_arviz(log_weights.astype(float))
     made = pareto_k(jnp.asarray(log_weights))
     assert made.dtype == precision
     np.testing.assert_allclose(made, expected, atol=3e-3 if precision == "float32" else 1e-10)
@@ -62,9 +72,10 @@ def test_constants_zeros_and_axes_do_not_matter():
 
 def test_more_zeros_than_fit_beside_the_tail():
     """Then the threshold is zero, as ArviZ has it."""
-    log_weights = np.full((10, 1000), -np.inf)
-    log_weights[:, :60] = pareto_weights(3, 0.8, (10, 60))
-    expected = arviz.psislw(log_weights.copy())[1]
+    positive = pareto_weights(3, 0.8, (10, 60))
+    with_zeros = lambda n, zero: np.append(positive, np.full((10, n - 60), zero), axis=1)
+    expected = by_arviz(with_zeros(400, -1e5))  # whose tail has 60
+    log_weights = with_zeros(1000, -np.inf)
     np.testing.assert_allclose(pareto_k(jnp.asarray(log_weights, jnp.float32)), expected, atol=0.01)
 
 

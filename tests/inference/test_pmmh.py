@@ -44,7 +44,7 @@ def test_posterior_is_exact(proposal):
         ou_1d(0.8, 0.7),
         TIMES,
         DATA,
-        num_iterations=4_000,
+        num_iterations=7_000,
         num_proposals=20,
         num_chains=2,
         proposal=proposal,
