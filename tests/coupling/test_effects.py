@@ -7,6 +7,7 @@ import jax
 import jax.extend
 import jax.numpy as jnp
 import pytest
+from helpers import slow_beyond
 from jax.scipy.special import gammaln
 
 import jaxbridge as jb
@@ -204,7 +205,7 @@ RECORDS = {
 }
 
 
-@pytest.mark.parametrize("name", RECORDS)
+@pytest.mark.parametrize("name", slow_beyond(1, RECORDS))
 def test_steps_of_records_contain_what_the_table_says(name):
     """The derivative of the drift's sinh, and the sine of time."""
     scene, table = RECORDS[name], jb.effects(RECORDS[name])

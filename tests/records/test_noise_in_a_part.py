@@ -149,6 +149,7 @@ def test_smoothed_paths_are_those_of_rauch_tung_and_striebel(case, noise, x64):
     assert np.all(np.isfinite(made.step_error()))
 
 
+@pytest.mark.slow
 def test_a_state_that_is_seen_exactly(x64):
     """The last step moves position and velocity both, so that both may be known there; Euler's
     leaves the position where it was, which is then told."""
@@ -214,6 +215,7 @@ def test_a_transformed_model_has_as_many_columns(x64):
     np.testing.assert_allclose(moved.diffusion(y), by_hand)
 
 
+@pytest.mark.slow
 def test_doubt_where_noise_is_led_on_by_the_state():
     """dX = Y + Y^2: what the drift leads the noise on by, 1 + 2Y, is not constant."""
     straight = lambda x, p: jnp.stack([x[1], -x[1] - x[0] ** 3])

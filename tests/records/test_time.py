@@ -76,6 +76,7 @@ def test_a_constant_function_of_time_gives_the_very_numbers():
     np.testing.assert_allclose(a.step_error, b.step_error, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_noise_of_observations_may_depend_on_time():
     """Seen well before time 5, and hardly after: as two kinds of rows."""
     model = jb.ornstein_uhlenbeck([[1.0]])
