@@ -28,7 +28,7 @@ from ..engine.compiled import compiled
 from ..engine.keys import key_for
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
-from ..records import Records, tuned
+from ..records import Guidance, Records, tuned
 from .parameter_walk import learnt
 from .parameters import Parameters
 from .posterior import (
@@ -39,7 +39,15 @@ from .posterior import (
     step_errors_of_some,
 )
 from .priors import GivenDensity, NormalDensity
-from .record_paths import RecordPaths, as_record_paths, movable, no_paths, share_of_step_error
+from .record_paths import (
+    At,
+    RecordPaths,
+    as_record_paths,
+    movable,
+    no_paths,
+    share_of_step_error,
+    unguided,
+)
 from .warm_up import stages
 
 
@@ -58,6 +66,13 @@ class RecordState(NamedTuple):
     root: Float[Array, "*chains p p"]
     log_scales: Float[Array, "*chains R 2 B"]
     num_done: Int[Array, "*chains"]
+
+
+class GuidedState(NamedTuple):
+    """The same, with what guides paths at θ, which is worked out once for each θ."""
+
+    state: RecordState
+    guides: Guidance
 
 
 class RecordPosterior(AbstractPosterior):
@@ -105,42 +120,52 @@ class RecordSampler(eqx.Module):
         self, key: Key[Array, ""], start: tuple[Float[Array, " p"], Float[Array, "p p"]]
     ) -> RecordState:
         theta, root = start
-        paths, log_scales = self.completion.first(key, theta)
+        paths, log_scales = self.completion.first(key, self.completion.at(theta))
         return RecordState(theta, paths, root, log_scales, jnp.int32(0))
 
+    def guided(self, state: RecordState) -> GuidedState:
+        """Of one chain, or of several."""
+        return GuidedState(state, _guides_of(self.completion, state.theta))
+
     def step(
-        self, key: Key[Array, ""], state: RecordState, learning: Bool[Array, ""]
-    ) -> tuple[RecordState, tuple[Bool[Array, ""], Bool[Array, "R 2 B 1"]]]:
+        self, key: Key[Array, ""], guided: GuidedState, learning: Bool[Array, ""]
+    ) -> tuple[GuidedState, tuple[Bool[Array, ""], Bool[Array, "R 2 B 1"]]]:
         """The paths given θ, then θ given ξ; both learn the size of their moves. Whether θ moved,
         and which blocks."""
         path_key, noise_key, walk_key, accept_key = jax.random.split(key, 4)
+        state, guides = guided
         theta, log_scales = state.theta, state.log_scales
-        paths, taken = self.completion.renewed(path_key, theta, state.paths, log_scales)
-        noise, log_weight = self.completion.noise(noise_key, theta, paths)
+        here = At(theta, guides)
+        paths, taken = self.completion.renewed(path_key, here, state.paths, log_scales)
+        noise, log_weight = self.completion.noise(noise_key, here, paths)
         step = jax.random.normal(walk_key, theta.shape, theta.dtype)
         proposed = theta + state.root @ step
         inside = self.parameters.allowed(proposed)
-        proposed = jnp.where(inside, proposed, theta)
-        new_paths, new_weight = self.completion.of_noise(proposed, noise)
-        new = jnp.where(inside, new_weight + self.log_prior(proposed), -jnp.inf)
+        there = self.completion.at(jnp.where(inside, proposed, theta))
+        new_paths, new_weight = self.completion.of_noise(there, noise)
+        new = jnp.where(inside, new_weight + self.log_prior(there.theta), -jnp.inf)
         rate = acceptance_rate(proper(log_weight) + self.log_prior(theta), proper(new))
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
 
         number = state.num_done + 1
         scales = tuned(log_scales, taken, number.astype(rate.dtype))
+        (theta, guides), paths = jax.tree.map(
+            lambda new, old: jnp.where(accepted, new, old), (there, new_paths), (here, paths)
+        )
         moved = RecordState(
-            jnp.where(accepted, proposed, theta),
-            jnp.where(accepted, new_paths, paths),
+            theta,
+            paths,
             learnt(state.root, step, rate, number, learning),
             jnp.where(learning, scales, log_scales),
             number,
         )
-        return moved, (accepted, taken)
+        return GuidedState(moved, guides), (accepted, taken)
 
-    def log_ratio(self, key: Key[Array, ""], state: RecordState) -> Float[Array, ""]:
+    def log_ratio(self, key: Key[Array, ""], guided: GuidedState) -> Float[Array, ""]:
         """log w̃ / w, of steps of twice the length."""
-        noise, log_weight = self.completion.noise(key, state.theta, state.paths)
-        return self.completion.coarse_log_weight(state.theta, noise) - log_weight
+        (state, guides), completion = guided, self.completion
+        noise, log_weight = completion.noise(key, At(state.theta, guides), state.paths)
+        return completion.coarse_log_weight(state.theta, noise) - log_weight
 
 
 @compiled
@@ -162,39 +187,43 @@ def sample_records(
     # The warm-up counts in draws, too, so that there is one loop.
     skipped = -(-num_warmup // thin)
 
-    def begin(state, i):
+    def begin(guided, i):
+        state = guided.state
         completion = as_record_paths(parameters, records, first_chain(state.theta))
         sampler = RecordSampler(completion, log_prior)
-        if not fresh:
-            return state, sampler
-        first = lambda state: over_chains(
-            sampler.start, jax.random.fold_in(key, 0), (state.theta, state.root)
-        )
-        return lax.cond(i == 0, first, lambda state: state, state), sampler
+        if fresh:
+            first = lambda state: over_chains(
+                sampler.start, jax.random.fold_in(key, 0), (state.theta, state.root)
+            )
+            state = lax.cond(i == 0, first, lambda state: state, state)
+        return sampler.guided(state), sampler
 
-    def number(state):
-        return state.num_done.reshape(-1)[0]  # 0 made the first paths
+    def number(guided):
+        return guided.state.num_done.reshape(-1)[0]  # 0 made the first paths
 
-    def log_ratios(sampler, i, state):
-        own_key = jax.random.fold_in(key_for("step error", key), number(state))
-        known = lambda state: over_chains(sampler.log_ratio, own_key, state)
+    def log_ratios(sampler, i, guided):
+        theta = guided.state.theta
+        own_key = jax.random.fold_in(key_for("step error", key), number(guided))
+        known = lambda guided: over_chains(sampler.log_ratio, own_key, guided)
         if records.stacked.num_steps == 1:
-            return jnp.full(state.theta.shape[:-1], jnp.nan, state.theta.dtype)
-        return step_errors_of_some(known, state, i - skipped, num_iterations)
+            return jnp.full(theta.shape[:-1], jnp.nan, theta.dtype)
+        return step_errors_of_some(known, guided, i - skipped, num_iterations)
 
-    def draw(sampler, state, i):
-        def iterate(state, i):
-            step = lambda key, state: sampler.step(key, state, i < num_warmup)
-            return over_chains(step, jax.random.fold_in(key, number(state) + 1), state)
+    def draw(sampler, guided, i):
+        def iterate(guided, i):
+            step = lambda key, guided: sampler.step(key, guided, i < num_warmup)
+            return over_chains(step, jax.random.fold_in(key, number(guided) + 1), guided)
 
-        state, (moved, taken) = lax.scan(iterate, state, i * thin + jnp.arange(thin))
-        share = jnp.mean(taken.astype(state.theta.dtype), axis=0)
-        made = state.theta, jnp.any(moved, axis=0), share[..., 0], log_ratios(sampler, i, state)
-        return state, made
+        guided, (moved, taken) = lax.scan(iterate, guided, i * thin + jnp.arange(thin))
+        theta = guided.state.theta
+        share = jnp.mean(taken.astype(theta.dtype), axis=0)
+        made = theta, jnp.any(moved, axis=0), share[..., 0], log_ratios(sampler, i, guided)
+        return guided, made
 
     bounds = stages(skipped if fresh else 0, skipped + num_iterations)
     state = _not_begun(records, *start) if fresh else start
-    state, draws = metered_stages(begin, draw, state, bounds, num_iterations, progress_meter)
+    init = GuidedState(state, _no_guides(parameters, records, state.theta))
+    (state, _), draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
     fields, (moved, taken, log_ratio) = drawn(parameters, *draws)
     real = movable(records)
     ever = jnp.any(taken > 0, axis=-4)  # of all draws
@@ -219,3 +248,17 @@ def _not_begun(
         for leaf in (*no_paths(records), root, jnp.int32(0))
     )
     return RecordState(theta, paths, root, log_scales, num_done)
+
+
+def _guides_of(completion: RecordPaths, theta: Float[Array, "*chains p"]) -> Guidance:
+    of_chain = lambda theta: completion.at(theta).guides
+    return of_chain(theta) if theta.ndim == 1 else jax.vmap(of_chain)(theta)
+
+
+def _no_guides(
+    parameters: Parameters, records: Records, theta: Float[Array, "*chains p"]
+) -> Guidance:
+    """What stands in for the guides before there are any."""
+    completion = RecordPaths(parameters, unguided(records), unguided(records))
+    shapes = jax.eval_shape(lambda theta: _guides_of(completion, theta), theta)
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

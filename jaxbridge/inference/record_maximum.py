@@ -42,7 +42,7 @@ from ..engine.progress import metered_scan
 from ..records import Records, tuned
 from ..schemes import StepError, dominates
 from .parameters import Parameters
-from .record_paths import RecordPaths, as_record_paths, movable, share_of_step_error
+from .record_paths import At, RecordPaths, as_record_paths, movable, share_of_step_error
 from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 
 _CHAINS = 8
@@ -150,15 +150,15 @@ def _of_chains(function: Callable, key: Key[Array, ""], *mapped: PyTree) -> PyTr
 def _swept(
     key: Key[Array, ""],
     completion: RecordPaths,
-    theta: Float[Array, " p"],
+    at: At,
     chains: _Chains,
     number: Int[Array, ""],
 ) -> tuple[_Chains, Bool[Array, "chains R 2 B"]]:
     """The paths after a sweep given θ, the `number`-th in which moves learn their size; and which
     blocks moved."""
-    renewed = lambda key, *each: completion.renewed(key, theta, *each)
+    renewed = lambda key, *each: completion.renewed(key, at, *each)
     paths, taken = _of_chains(renewed, key, *chains)
-    log_scales = tuned(chains.log_scales, taken, (number + 1).astype(theta.dtype))
+    log_scales = tuned(chains.log_scales, taken, (number + 1).astype(at.theta.dtype))
     return _Chains(paths, log_scales), taken[..., 0]
 
 
@@ -175,8 +175,9 @@ def _approximate(
 
     def propose(i, theta, memory, chains):
         sweep_key, noise_key = jax.random.split(jax.random.fold_in(run_key, i))
-        chains, _ = _swept(sweep_key, completion, theta, chains, i)
-        read = lambda key, paths: completion.noise(key, theta, paths)[0]
+        at = completion.at(theta)
+        chains, _ = _swept(sweep_key, completion, at, chains, i)
+        read = lambda key, paths: completion.noise(key, at, paths)[0]
         noise = _of_chains(read, noise_key, chains.paths)
         gradient = jax.grad(_mean_log_weight)(theta, completion, noise) / number_seen
         new = rule.ascend(theta, memory, gradient)
@@ -186,13 +187,14 @@ def _approximate(
         )
         # As `iterate` decides it: paths follow θ where that moves.
         moves = parameters.allowed(new_theta) & all_finite_leaves(new_memory)
-        goal = jnp.where(moves, new_theta, theta)
+        goal = completion.at(jnp.where(moves, new_theta, theta))
         paths, log_weights = jax.vmap(lambda noise: completion.of_noise(goal, noise))(noise)
         good = jnp.isfinite(log_weights)[:, None, None, None]
         chains = chains._replace(paths=jnp.where(good, paths, chains.paths))
         return (new_theta, new_memory), chains, (jnp.int32(0), jnp.int32(0))
 
-    first = _Chains(*_of_chains(lambda key: completion.first(key, theta), first_key))
+    at_start = completion.at(theta)
+    first = _Chains(*_of_chains(lambda key: completion.first(key, at_start), first_key))
     search = search._replace(num_iterations=_SWEEPS + search.num_iterations)
     iterates, chains, info = iterate(propose, parameters, search, theta, first)
     return iterates[_SWEEPS:], chains, info
@@ -202,7 +204,8 @@ def _mean_log_weight(
     theta: Float[Array, " p"], completion: RecordPaths, noise: Float[Array, "chains R points d"]
 ) -> Float[Array, ""]:
     """The mean over chains, of those with a path that has weight."""
-    each = jax.vmap(lambda noise: completion.of_noise(theta, noise)[1])(noise)
+    at = completion.at(theta)
+    each = jax.vmap(lambda noise: completion.of_noise(at, noise)[1])(noise)
     good = jnp.isfinite(each)
     return jnp.sum(jnp.where(good, each, 0)) / jnp.maximum(jnp.sum(good.astype(each.dtype)), 1)
 
@@ -218,10 +221,10 @@ def _draws_at(
 ) -> tuple[_Draw, Float[Array, " p"]]:
     """Of all chains, axes (chains, n), at θ; and h."""
     completion, theta = nondifferentiable((completion, theta))
-    p = len(theta)
+    p, here = len(theta), completion.at(theta)
 
     def derivatives(key, paths, taken, h):
-        noise, log_weight = completion.noise(key, theta, paths)
+        noise, log_weight = completion.noise(key, here, paths)
         log_w = lambda theta, coarse: completion.either_log_weight(theta, noise, coarse)
         apart = jnp.diag(h)
         around = theta + jnp.concatenate([jnp.zeros((2, p), h.dtype), apart, -apart])
@@ -234,7 +237,7 @@ def _draws_at(
     def draw(state, i):
         chains, h = state
         sweep_key, noise_key = jax.random.split(jax.random.fold_in(key, i))
-        moved, taken = _swept(sweep_key, completion, theta, chains, i)
+        moved, taken = _swept(sweep_key, completion, here, chains, i)
         chains = chains._replace(paths=moved.paths)
         each = lambda key, paths, taken: derivatives(key, paths, taken, h)
         made = _of_chains(each, noise_key, chains.paths, taken)

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from ..engine.compiled import compiled
 from ..models.diffusion import Diffusion
 from ..records import (
+    Guidance,
     Paths,
     Records,
     blocks_of_both_cuts,
@@ -51,6 +52,13 @@ class GuidedRecords(NamedTuple):
     points: Float[Array, "R points d"]
 
 
+class At(NamedTuple):
+    """θ, and what guides the paths of each record there."""
+
+    theta: Float[Array, " p"]
+    guides: Guidance
+
+
 class RecordPaths(eqx.Module):
     """What makes and moves the paths of R records, of one chain; `coarse` have half as many
     steps."""
@@ -64,77 +72,82 @@ class RecordPaths(eqx.Module):
         """N, of each segment."""
         return self.fine.records.stacked.num_steps
 
+    def at(self, theta: Float[Array, " p"]) -> At:
+        """θ, and what guides paths there."""
+        return At(theta, _guides(self.fine, self.parameters.bind(theta)))
+
     def first(
-        self, key: Key[Array, ""], theta: Float[Array, " p"]
+        self, key: Key[Array, ""], at: At
     ) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:
         """Paths to begin with, and log β of the moves of their blocks."""
-        model, (records, points) = self.parameters.bind(theta), self.fine
+        model, (records, points) = self.parameters.bind(at.theta), self.fine
 
-        def one(problem, key, points):
+        def one(problem, key, points, guide):
             noise = jax.random.normal(key, points.shape, points.dtype)
-            guide = guided(problem, model, points)
             path, log_weight = path_and_log_weight(problem, model, guide, noise)
             return jnp.where(jnp.isfinite(log_weight), path, points)
 
-        paths = records.each(one, jax.random.split(key, records.number), points)
+        paths = records.each(one, jax.random.split(key, records.number), points, at.guides)
         return paths, no_paths(records)[1]
 
     def renewed(
         self,
         key: Key[Array, ""],
-        theta: Float[Array, " p"],
+        at: At,
         paths: Float[Array, "R points d"],
         log_scales: Float[Array, "R 2 B"],
     ) -> tuple[Float[Array, "R points d"], Bool[Array, "R 2 B 1"]]:
         """The paths after a sweep given θ, and which blocks moved."""
-        model, (records, points) = self.parameters.bind(theta), self.fine
+        model, (records, points) = self.parameters.bind(at.theta), self.fine
 
-        def one(problem, key, points, log_scales, path):
+        def one(problem, key, points, guide, log_scales, path):
             (K, N), d = problem.record.dt.shape, problem.dim
-            both = blocks_of_both_cuts(
-                problem, points, guided(problem, model, points), _BLOCK_LENGTH
-            )
+            both = blocks_of_both_cuts(problem, points, guide, _BLOCK_LENGTH)
             old = Paths(path[0][:, None], path[1:].reshape(K, N, d, 1))
             made, taken = sweep(key, problem, model, both, log_scales, old)
             return jnp.concatenate([made.start.T, made.points.reshape(K * N, d)]), taken
 
         keys = jax.random.split(key, records.number)
-        return records.each(one, keys, points, log_scales, paths)
+        return records.each(one, keys, points, at.guides, log_scales, paths)
 
     def noise(
-        self, key: Key[Array, ""], theta: Float[Array, " p"], paths: Float[Array, "R points d"]
+        self, key: Key[Array, ""], at: At, paths: Float[Array, "R points d"]
     ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
         """ξ of these paths, and log w."""
-        model, (records, points) = self.parameters.bind(theta), self.fine
+        model, records = self.parameters.bind(at.theta), self.fine.records
 
-        def one(problem, key, points, path):
-            guide = guided(problem, model, points)
+        def one(problem, key, guide, path):
             return noise_and_log_weight(key, problem, model, guide, path)
 
         keys = jax.random.split(key, records.number)
-        noise, log_weight = records.each(one, keys, points, paths)
+        noise, log_weight = records.each(one, keys, at.guides, paths)
         return noise, jnp.sum(log_weight)
 
     def of_noise(
-        self, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
+        self, at: At, noise: Float[Array, "R points d"]
     ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
         """The paths of ξ, and log w."""
-        return _of_noise(self.fine, self.parameters, theta, noise)
+        return _of_noise(self.fine.records, self.parameters.bind(at.theta), at.guides, noise)
 
     def coarse_log_weight(
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
     ) -> Float[Array, ""]:
         """log w̃ of ξ, with steps of twice the length."""
-        return _of_noise(self.coarse, self.parameters, theta, self._of_pairs(noise))[1]
+        return self._log_weight(self.coarse, theta, self._of_pairs(noise))
 
     def either_log_weight(
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"], coarse: Bool[Array, ""]
     ) -> Float[Array, ""]:
         """log w̃ of ξ or log w, as `coarse` says: one program for both."""
         choose = lambda a, b: jnp.where(coarse, a, b) if eqx.is_array(a) else b
-        guide = jax.tree.map(choose, self.coarse, self.fine)
-        noise = jnp.where(coarse, self._of_pairs(noise), noise)
-        return _of_noise(guide, self.parameters, theta, noise)[1]
+        grid = jax.tree.map(choose, self.coarse, self.fine)
+        return self._log_weight(grid, theta, jnp.where(coarse, self._of_pairs(noise), noise))
+
+    def _log_weight(
+        self, grid: GuidedRecords, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
+    ) -> Float[Array, ""]:
+        model = self.parameters.bind(theta)
+        return _of_noise(grid.records, model, _guides(grid, model), noise)[1]
 
     def _of_pairs(self, noise: Float[Array, "R points d"]) -> Float[Array, "R points d"]:
         return jax.vmap(lambda noise: _of_pairs(noise, self.num_steps))(noise)
@@ -201,18 +214,18 @@ def as_record_paths(
     return RecordPaths(parameters, *grids)
 
 
+def _guides(grid: GuidedRecords, model: Diffusion) -> Guidance:
+    """What guides the paths of each record."""
+    return grid.records.each(lambda problem, points: guided(problem, model, points), grid.points)
+
+
 def _of_noise(
-    guide: GuidedRecords,
-    parameters: Parameters,
-    theta: Float[Array, " p"],
-    noise: Float[Array, "R points d"],
+    records: Records, model: Diffusion, guides: Guidance, noise: Float[Array, "R points d"]
 ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
-    model = parameters.bind(theta)
+    def one(problem, guide, noise):
+        return path_and_log_weight(problem, model, guide, noise)
 
-    def one(problem, points, noise):
-        return path_and_log_weight(problem, model, guided(problem, model, points), noise)
-
-    paths, log_weight = guide.records.each(one, guide.points, noise)
+    paths, log_weight = records.each(one, guides, noise)
     return paths, jnp.sum(log_weight)
 
 

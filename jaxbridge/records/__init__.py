@@ -23,6 +23,7 @@ Schauer 2017; Mider, Schauer & van der Meulen 2021) with data on the way. On it 
 
 # What the folders above use of this one.
 from .guided_record import (
+    Guidance as Guidance,
     guided as guided,
     linearised as linearised,
     noise_and_log_weight as noise_and_log_weight,
