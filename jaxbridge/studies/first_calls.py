@@ -95,6 +95,36 @@ def _pulled() -> jb.Diffusion:
     )
 
 
+@functools.cache
+def _record() -> dict[str, Any]:
+    """A coordinate of two, seen fifty times with noise; its rate, σ and noise are parameters."""
+    model = jb.Diffusion(
+        lambda x, p: jnp.stack([x[1] - x[0], -x[0] - jnp.exp(p[0]) * x[1]]),
+        lambda x, p: jnp.exp(p[1]) * jnp.eye(2, dtype=x.dtype),
+        params=jnp.array([0.0, 0.0, -1.0]),
+    )
+    times = jnp.arange(1, 51) * 0.4
+    path = jb.simulate(jax.random.key(1), model, jnp.zeros(2), times)[0]
+    noise = 0.4 * jax.random.normal(jax.random.key(2), times.shape)
+    return {
+        "model": model,
+        "times": times,
+        "observations": path[:, :1] + noise[:, None],
+        "observation": jb.LinearGaussian([[1.0, 0.0]], lambda p: jnp.exp(2 * p[2])),
+        "initial": jb.GaussianLaw([0.0, 0.0], jnp.eye(2)),
+        "num_steps": 5,
+    }
+
+
+def _of_record(method: Callable[..., Any], **options: Any) -> Any:
+    return method(jax.random.key(0), **_record(), **options)
+
+
+def _posterior(method: Callable[..., Any]) -> Any:
+    prior = jb.NormalPrior(3 * [0.0], 3 * [1.0])
+    return _of_record(method, prior=prior, num_iterations=500)
+
+
 ENTRIES: Mapping[str, Callable[[], Any]] = {
     "`sample_bridges`": lambda: jb.sample_bridges(*_interval(study_model()), num_bridges=1_000),
     "weights, coupling": lambda: _weights(study_model(), jb.Coupling(0.5)),
@@ -106,6 +136,10 @@ ENTRIES: Mapping[str, Callable[[], Any]] = {
     "full σ(x): weights, coupling": lambda: _weights(_full_sigma(), jb.Coupling(0.5)),
     'full σ(x): weights, "auto"': lambda: _weights(_full_sigma(), "auto"),
     'gibbs, "auto"': _gibbs,
+    "a record: `log_likelihood`": lambda: _of_record(jb.log_likelihood),
+    "a record: `gibbs`": lambda: _posterior(jb.gibbs),
+    "a record: `pmmh`": lambda: _posterior(jb.pmmh),
+    "a record: `maximum_likelihood`": lambda: _of_record(jb.maximum_likelihood),
 }
 
 
