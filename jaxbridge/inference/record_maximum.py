@@ -71,9 +71,10 @@ class RecordMaximumLikelihood(eqx.Module):
     - `num_refused`: iterations whose step led out of the constraint, or to what is not finite, and
         was not made.
     - `newton`: whether the last step was made. Not so if the information was not positive definite,
-        or the step longer than about a standard error, or out of the constraint: then the average
-        of the iterates is returned, which is not the maximum, and more iterations are needed, or
-        longer steps.
+        or nothing was found that suits as the step of the differences it is made of, or the last
+        step longer than about a standard error, or out of the constraint: then the average of the
+        iterates is returned, which is not the maximum, and more iterations are needed, or longer
+        steps.
     """
 
     params: PyTree
