@@ -123,10 +123,6 @@ class RecordSampler(eqx.Module):
         paths, log_scales = self.completion.first(key, self.completion.at(theta))
         return RecordState(theta, paths, root, log_scales, jnp.int32(0))
 
-    def guided(self, state: RecordState) -> GuidedState:
-        """Of one chain, or of several."""
-        return GuidedState(state, _guides_of(self.completion, state.theta))
-
     def step(
         self, key: Key[Array, ""], guided: GuidedState, learning: Bool[Array, ""]
     ) -> tuple[GuidedState, tuple[Bool[Array, ""], Bool[Array, "R 2 B 1"]]]:
@@ -196,7 +192,7 @@ def sample_records(
                 sampler.start, jax.random.fold_in(key, 0), (state.theta, state.root)
             )
             state = lax.cond(i == 0, first, lambda state: state, state)
-        return sampler.guided(state), sampler
+        return GuidedState(state, _guides_of(completion, state.theta)), sampler
 
     def number(guided):
         return guided.state.num_done.reshape(-1)[0]  # 0 made the first paths
@@ -251,6 +247,7 @@ def _not_begun(
 
 
 def _guides_of(completion: RecordPaths, theta: Float[Array, "*chains p"]) -> Guidance:
+    """At θ of one chain, or of each of several."""
     of_chain = lambda theta: completion.at(theta).guides
     return of_chain(theta) if theta.ndim == 1 else jax.vmap(of_chain)(theta)
 

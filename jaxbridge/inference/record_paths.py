@@ -133,7 +133,7 @@ class RecordPaths(eqx.Module):
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
     ) -> Float[Array, ""]:
         """log w̃ of ξ, with steps of twice the length."""
-        return self._log_weight(self.coarse, theta, self._of_pairs(noise))
+        return self._log_weight(self.coarse, theta, self._coarsened(noise))
 
     def either_log_weight(
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"], coarse: Bool[Array, ""]
@@ -141,7 +141,7 @@ class RecordPaths(eqx.Module):
         """log w̃ of ξ or log w, as `coarse` says: one program for both."""
         choose = lambda a, b: jnp.where(coarse, a, b) if eqx.is_array(a) else b
         grid = jax.tree.map(choose, self.coarse, self.fine)
-        return self._log_weight(grid, theta, jnp.where(coarse, self._of_pairs(noise), noise))
+        return self._log_weight(grid, theta, jnp.where(coarse, self._coarsened(noise), noise))
 
     def _log_weight(
         self, grid: GuidedRecords, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
@@ -149,7 +149,7 @@ class RecordPaths(eqx.Module):
         model = self.parameters.bind(theta)
         return _of_noise(grid.records, model, _guides(grid, model), noise)[1]
 
-    def _of_pairs(self, noise: Float[Array, "R points d"]) -> Float[Array, "R points d"]:
+    def _coarsened(self, noise: Float[Array, "R points d"]) -> Float[Array, "R points d"]:
         return jax.vmap(lambda noise: _of_pairs(noise, self.num_steps))(noise)
 
 
