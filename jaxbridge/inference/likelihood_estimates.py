@@ -17,10 +17,13 @@ from ..engine.averages import proper
 from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
-from ..records import guided, run_filters
+from ..records import Filtered, chosen_rate, guided, run_filters
 from ..schemes import share_of_grid
 from .blocks import Block, with_keys
 from .record_paths import GuidedRecords, guided_near, on_both_grids
+
+# How many particles pilots have in all.
+_NUM_PILOTS = 512
 
 
 class Estimate(NamedTuple):
@@ -54,7 +57,7 @@ class AbstractLikelihood(eqx.Module):
         where it is not known."""
 
     @abstractmethod
-    def near(self, model: Diffusion) -> "AbstractLikelihood":
+    def near(self, key: Key[Array, ""], model: Diffusion) -> "AbstractLikelihood":
         """What estimates the same with less variance for models like this: leaves may change, and
         no shapes, for both are states of one loop."""
 
@@ -101,7 +104,7 @@ class TransitionLikelihood(AbstractLikelihood):
     def log_step_error(self, key, model):
         return self.estimate(key, model).log_step_error
 
-    def near(self, model):
+    def near(self, key, model):
         return self
 
     @property
@@ -118,30 +121,34 @@ class TransitionLikelihood(AbstractLikelihood):
 
 
 class RecordLikelihood(AbstractLikelihood):
-    """Guided particle filters of all records, linearised along the same points at all parameters;
-    and with half as many steps, which tell the step error."""
+    """Guided particle filters of all records, linearised along the same points at all parameters,
+    with one rate at which guides forget; and with half as many steps, which tell the step error."""
 
     fine: GuidedRecords
     coarse: GuidedRecords
+    rate: Float[Array, ""]
     num_particles: int = eqx.field(static=True)
 
     def estimate(self, key, model):
-        value, variance = self._filtered(key, model, self.fine)
+        value, variance = self._estimate(key, model, self.fine)
         return Estimate(proper(value), variance, jnp.full_like(value, jnp.nan), jnp.int32(0))
 
     def log_step_error(self, key, model):
         problem = self.fine.records.stacked
         if problem.num_steps == 1:
             return jnp.full((), jnp.nan, problem.like.dtype)
-        filtered = lambda grid: self._filtered(key, model, grid)
-        log_p, variance = on_both_grids(filtered, self.fine, self.coarse)
+        estimate = lambda grid: self._estimate(key, model, grid)
+        log_p, variance = on_both_grids(estimate, self.fine, self.coarse)
         # The mean of log p̂ is too small by half its variance.
         fine, coarse = log_p + variance / 2
         return share_of_grid(problem.density.order, problem.num_steps) * (coarse - fine)
 
-    def near(self, model):
-        grids = guided_near(self.fine.records, self.coarse.records, model)
-        return RecordLikelihood(*grids, self.num_particles)
+    def near(self, key, model):
+        records, P = self.fine.records, self.num_particles
+        fine, coarse = guided_near(records, self.coarse.records, model)
+        num_filters = max(4, _NUM_PILOTS // P)
+        pilot = lambda rate: self._filtered(key, model, coarse, rate, num_filters)
+        return RecordLikelihood(fine, coarse, chosen_rate(pilot, records, P), P)
 
     @property
     def guided(self):
@@ -151,19 +158,31 @@ class RecordLikelihood(AbstractLikelihood):
     def tells_step_error(self):
         return False
 
-    def _filtered(
+    def _estimate(
         self, key: Key[Array, ""], model: Diffusion, grid: GuidedRecords
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """log p̂ with its variance."""
-        records, P = grid.records, self.num_particles
+        made = self._filtered(key, model, grid, self.rate, 1)
+        variance = jax.vmap(lambda each: each.variance(self.num_particles))(made)
+        return jnp.sum(made.log_estimate), jnp.sum(variance)
+
+    def _filtered(
+        self,
+        key: Key[Array, ""],
+        model: Diffusion,
+        grid: GuidedRecords,
+        rate: Float[Array, ""],
+        num_filters: int,
+    ) -> Filtered:
+        """So many filters of each record, whose guides forget at this rate."""
+        (records, points), size = grid, (num_filters, self.num_particles)
         moving = records.moving
 
         def one(problem, key, points):
-            made = run_filters(key, problem, model, guided(problem, model, points), (1, P), moving)
-            return made.log_estimate[0], made.variance(P)[0]
+            guide = guided(problem, model, points, rate)
+            return run_filters(key, problem, model, guide, size, moving)
 
-        each = records.each(one, jax.random.split(key, records.number), grid.points)
-        return jnp.sum(each[0]), jnp.sum(each[1])
+        return records.each(one, jax.random.split(key, records.number), points)
 
     @property
     def proposals(self):

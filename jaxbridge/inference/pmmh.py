@@ -230,7 +230,7 @@ def pmmh(
 
         def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
             grids = unguided(records), unguided(records.coarsened())
-            return RecordLikelihood(*grids, num_proposals)
+            return RecordLikelihood(*grids, jnp.zeros((), unknown.dtype), num_proposals)
 
     log_prior = as_log_prior(prior, parameters, unknown)
     root = first_root(covariance, log_prior, unknown)
@@ -289,8 +289,8 @@ class _Sampler(eqx.Module):
     likelihood: AbstractLikelihood
     log_prior: NormalDensity | GivenDensity
 
-    def near(self, theta: Float[Array, " p"]) -> "_Sampler":
-        likelihood = self.likelihood.near(self.parameters.bind(theta))
+    def near(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> "_Sampler":
+        likelihood = self.likelihood.near(key, self.parameters.bind(theta))
         return _Sampler(self.parameters, likelihood, self.log_prior)
 
     def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Estimate:
@@ -349,7 +349,8 @@ def _run(
     state = _not_begun(*start) if fresh else _going_on(start)
 
     def begin(run, i):
-        near = sampler.near(first_chain(run.chain.theta))
+        pilot_key = jax.random.fold_in(key_for("pilots", key), run.num_done)
+        near = sampler.near(pilot_key, first_chain(run.chain.theta))
         if not fresh:
             return run, near
         # An estimate by the guide before may be a lucky one, which a chain would hold on to.

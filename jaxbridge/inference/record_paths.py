@@ -32,6 +32,7 @@ from ..records import (
     linearisations,
     noise_and_log_weight,
     path_and_log_weight,
+    stacked,
     sweep,
 )
 from ..schemes import share_of_grid
@@ -185,9 +186,8 @@ def unguided(records: Records) -> GuidedRecords:
 def on_both_grids(function: Callable, fine: PyTree, coarse: PyTree) -> Any:
     """`function` of what has fine and of what has coarse steps, in arrays of one shape: one after
     the other, in a leading axis, and compiled once."""
-    (of_fine, rest), (of_coarse, _) = (eqx.partition(x, eqx.is_array) for x in (fine, coarse))
-    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), of_fine, of_coarse)
-    return lax.map(lambda arrays: function(eqx.combine(arrays, rest)), both)
+    arrays, rest = stacked(fine, coarse)
+    return lax.map(lambda arrays: function(eqx.combine(arrays, rest)), arrays)
 
 
 def guided_near(

@@ -15,13 +15,15 @@ all equal where the model is linear; the density of a bridge's guided proposal (
 Schauer 2017; Mider, Schauer & van der Meulen 2021) with data on the way. On it are built
 
 * `log_likelihood`: particles that are resampled where data are (`particle_filter`), an unbiased
-  estimate, however long the record is, and its errors;
+  estimate, however long the record is, and its errors; guides that trust what is seen much later
+  too much forget it (`forgetting`);
 * `innovations`: path and weight as smooth functions of parameters and of normal noise;
 * `smooth`: paths given the whole record, by moves of the noise in blocks (`path_blocks`), or across
   long gaps by moves of the states with new bridges on both sides (`states`).
 """
 
 # What the folders above use of this one.
+from .forgetting import chosen_rate as chosen_rate
 from .guided_record import (
     Guidance as Guidance,
     guided as guided,
@@ -31,7 +33,7 @@ from .guided_record import (
 )
 from .initial import Initial as Initial
 from .observation import Observation as Observation
-from .particle_filter import run_filters as run_filters
+from .particle_filter import Filtered as Filtered, run_filters as run_filters
 from .path_blocks import (
     Paths as Paths,
     blocks_of_both_cuts as blocks_of_both_cuts,
@@ -46,4 +48,5 @@ from .several import (
     Records as Records,
     as_record_problems as as_record_problems,
     linearisations as linearisations,
+    stacked as stacked,
 )

@@ -32,6 +32,7 @@ from .initial import calls_for_cover, initial_law, likeliest, log_ratio
 from .linearisation import LinearisedStep, extended_kalman_path, linear_step
 from .observation import Row, Scalars
 from .problem import RecordProblem
+from .record import Steps
 from .segments import at_every_step, flat, following, split_first
 from .tilted_step import NormalStep
 
@@ -58,8 +59,13 @@ class Guidance(NamedTuple):
     scalars: Scalars
 
 
-def guided(problem: RecordProblem, model: Diffusion, points: Float[Array, "points d"]) -> Guidance:
-    """Linearised along these points."""
+def guided(
+    problem: RecordProblem,
+    model: Diffusion,
+    points: Float[Array, "points d"],
+    rate: Float[Array, ""] | None = None,
+) -> Guidance:
+    """Linearised along these points; `rate` is that at which it forgets, if it does."""
     dynamics_at, record = model.forward_at(problem.like), problem.record.steps()
     initial = initial_law(problem.initial, model, problem.like)
     K, N = problem.num_segments, problem.num_steps
@@ -73,12 +79,32 @@ def guided(problem: RecordProblem, model: Diffusion, points: Float[Array, "point
     steps = jax.vmap(over_points(linear))(here, there, record)
     scalars = jax.vmap(relative)(problem.scalars(model), points[::N])
     first, rest = split_first(scalars)
-    h = information_filter(steps, rest)
+    return _with_h(initial, steps, first, rest, (here, there, record), rate)
 
-    guides = Guide(here, h, there, following(h), record)
+
+def forgetful(guide: Guidance, rate: Float[Array, ""]) -> Guidance:
+    """The same, which forgets at this rate (`forgetting`)."""
+    steps = guide.steps
+    path = steps.point, steps.next_point, steps.step
+    return _with_h(guide.initial, guide.linear, guide.first, guide.scalars, path, rate)
+
+
+def _with_h(
+    initial: NormalStep,
+    linear: LinearisedStep,
+    first: Scalars,
+    scalars: Scalars,
+    path: tuple[Float[Array, "K N d"], Float[Array, "K N d"], Steps],
+    rate: Float[Array, ""] | None,
+) -> Guidance:
+    """A linear process along a path, and what is seen of it, with what follows of them."""
+    here, there, steps = path
+    kept = None if rate is None else jnp.exp(-rate * steps.dt)
+    h = information_filter(linear, scalars, kept=kept)
+    guides = Guide(here, h, there, following(h), steps)
     h_first = jax.tree.map(lambda leaf: leaf[0, 0], h)
-    start = guided_start(initial, first, points[0], h_first)
-    return Guidance(initial, start, steps, guides, first, rest)
+    start = guided_start(initial, first, here[0, 0], h_first)
+    return Guidance(initial, start, linear, guides, first, scalars)
 
 
 def path_and_log_weight(

@@ -13,6 +13,8 @@ What h_i owes to h_{i+1} needs no derivative of this. Given all that is seen lat
     Ḣ_i = Γᵀ Ḣ Γ,   ṙ_i = Γᵀ (ṙ - Ḣ m),   Γ = (I - G H) E,   m = (I - G H) f + G r,
 
 with G = Λ (ℛ ℛᵀ)⁻¹ Λᵀ, the covariance of u' given all that.
+
+Where a guide forgets (`forgetting`), it is h_{i+1} to a power below one that goes through the step.
 """
 
 from collections.abc import Callable
@@ -68,9 +70,16 @@ def _seen(step: LinearisedStep, scalars: Scalars) -> tuple[_Mean, Information]:
     return _Mean(E, f, root), Information(shift, precision)
 
 
-def _tilted_mean(h: Information, inputs: tuple[LinearisedStep, Scalars]):
-    """Γ and m."""
-    (E, f, root), _ = _seen(*inputs)
+def _remembered(h: Information, kept: Float[Array, ""] | None) -> Information:
+    """h to this power; all of it where there is none."""
+    return h if kept is None else Information(kept * h.shift, kept * h.precision)
+
+
+def _tilted_mean(h: Information, inputs: tuple[LinearisedStep, Scalars, Array | None]):
+    """Γ and m, and what is left of h."""
+    step, scalars, kept = inputs
+    (E, f, root), _ = _seen(step, scalars)
+    h = _remembered(h, kept)
     factor, half = tilt_factor(root, h)
 
     def pulled(v):
@@ -79,12 +88,13 @@ def _tilted_mean(h: Information, inputs: tuple[LinearisedStep, Scalars]):
 
     gain = jnp.stack([pulled(row) for row in half])  # H G
     m = f - matvec(gain.T, f) + pulled(matvec(root.T, h.shift))
-    return E - matmul(gain.T, E), m
+    return E - matmul(gain.T, E), m, kept
 
 
-def _through_mean(mean: tuple[Array, Array], h_dot: Information) -> Information:
+def _through_mean(mean: tuple[Array, Array, Array | None], h_dot: Information) -> Information:
     """Of a change of h_{i+1}, that of h_i."""
-    slope, shift = mean
+    slope, shift, kept = mean
+    h_dot = _remembered(h_dot, kept)
     r = matvec(slope.T, h_dot.shift - matvec(h_dot.precision, shift))
     return Information(r, matmul(slope.T, matmul(h_dot.precision, slope)))
 
@@ -93,17 +103,24 @@ def information_filter(
     steps: LinearisedStep,
     scalars: Scalars,
     over_lanes: Callable[[Callable], Callable] | None = None,
+    kept: Float[Array, "K N"] | None = None,
 ) -> Information:
     """h at the beginning of every step, for steps with leading axes (K, N), and what is seen at the
     ends of segments, leading axis K. Where there are lanes, in the last axis, `over_lanes` maps a
-    function of one point over them; then there are no derivatives."""
+    function of one point over them; then there are no derivatives. `kept` is the power of h that
+    goes through each step, by default all of it."""
     K, N = steps.shift.shape[:2]
     last = Information(jnp.zeros_like(steps.shift[0, 0]), jnp.zeros_like(steps.decay[0, 0]))
-    inputs = jax.tree.map(lambda leaf: leaf[::-1], (flat(steps), at_every_step(scalars, N)))
+    each_step = flat(steps), at_every_step(scalars, N), None if kept is None else kept.ravel()
+    inputs = jax.tree.map(lambda leaf: leaf[::-1], each_step)
+
+    def one(h, inputs):
+        step, scalars, kept = inputs
+        return back(_remembered(h, kept), step, scalars), None
+
     if over_lanes is None:
-        one = lambda h, inputs: (back(h, *inputs), None)
         h, _ = recursion(one, last, inputs, StateDerivative(_tilted_mean, _through_mean))
     else:
         each = over_lanes(back)
-        h = lax.scan(lambda h, inputs: 2 * (each(h, *inputs),), last, inputs)[1]
+        h = lax.scan(lambda h, inputs: 2 * (each(h, *inputs[:2]),), last, inputs)[1]
     return jax.tree.map(lambda leaf: leaf[::-1].reshape(K, N, *leaf.shape[1:]), h)

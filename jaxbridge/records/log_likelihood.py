@@ -10,22 +10,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
 from ..engine.compiled import compiled
 from ..engine.doors import door
+from ..engine.keys import key_for
 from ..engine.pareto import most_reliable
 from ..engine.throwing import throw_where
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity, StepError, dominates, error_of_grids, num_coarse_grids
-from .guided_record import Guidance, linearised
+from .forgetting import chosen_of, rates_for, undecided
+from .guided_record import Guidance, forgetful, linearised
 from .initial import Initial
 from .observation import Observation
 from .particle_filter import Filtered, run_filters
 from .record import of_each, split_records
-from .several import Records, as_record_problems
+from .several import Records, as_record_problems, stacked
 
 # Fewer particles that count, or a larger standard error of a log, tell nothing; nor do tails that
 # are heavier than so many weights can show by more than the largest of many estimates of k is off.
@@ -68,6 +71,8 @@ class LogLikelihood(eqx.Module):
         half as many; `step_uncertainty` is its Monte Carlo error and what it leaves out, by a
         quarter as many, infinite where what steps change does not shrink with them. NaN of one
         step.
+    - `forgetting`: γ, the rate at which what guides the particles forgets what is seen later, in
+        units of one over time: zero where all of it is a help, as it is where the model is linear.
     """
 
     value: Float[Array, ""]
@@ -79,6 +84,7 @@ class LogLikelihood(eqx.Module):
     num_nonfinite: Int[Array, ""]
     step_error: Float[Array, ""]
     step_uncertainty: Float[Array, ""]
+    forgetting: Float[Array, ""]
 
     @property
     def unexplained(self) -> Int[Array, ""]:
@@ -173,8 +179,8 @@ def log_likelihood(
     size = num_filters, num_particles
     levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
     grids = [records, *map(records.coarsened, levels)]
-    filtered = [_estimates(key, grid, _guides(grid), *size) for grid in grids]
-    made = _told(records, filtered, num_filters * num_particles)
+    filtered, rate = _filtered(key, grids, [_guides(grid) for grid in grids], *size)
+    made = _told(records, filtered, rate, num_filters * num_particles)
     return or_throw(made, model) if throw else made
 
 
@@ -190,12 +196,14 @@ def or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
 
 
 @compiled
-def _told(records: Records, grids: list[Filtered], num_weights: int) -> LogLikelihood:
+def _told(
+    records: Records, grids: Filtered, rate: Float[Array, ""], num_weights: int
+) -> LogLikelihood:
     """What filters on the grid, and on coarser ones, say of all records together."""
-    means = [log_mean_and_error(each.log_estimate) for each in grids]
-    values = jnp.stack([jnp.sum(log_mean) for log_mean, _, _ in means])
-    errors = jnp.stack([jnp.sqrt(jnp.sum(error**2)) for _, error, _ in means])
-    (value, *_), (error, *_), fine = values, errors, grids[0]
+    log_mean, each_error, _ = jax.vmap(log_mean_and_error)(grids.log_estimate)
+    values, errors = jnp.sum(log_mean, axis=1), jnp.sqrt(jnp.sum(each_error**2, axis=1))
+    fine = jax.tree.map(lambda leaf: leaf[0], grids)
+    value, error = values[0], errors[0]
     # What rounding leaves of the sum over all steps is no change, either.
     rounding = np.sqrt(records.stacked.record.dt.size) * jnp.finfo(value.dtype).eps
     rounding = rounding.astype(value.dtype) * jnp.maximum(1, jnp.abs(value))
@@ -210,6 +218,7 @@ def _told(records: Records, grids: list[Filtered], num_weights: int) -> LogLikel
         num_weights,
         jnp.sum(fine.num_nonfinite),
         *step_error,
+        rate,
     )
 
 
@@ -253,6 +262,7 @@ def _exact(
         jnp.sum(made.num_nonfinite),
         jnp.sum(made.step_error),
         jnp.sqrt(jnp.sum(made.step_uncertainty**2)),
+        jnp.zeros_like(value),
     )
 
 
@@ -269,11 +279,41 @@ def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Arr
 
 
 @compiled
-def _estimates(key: Key[Array, ""], records: Records, guides: Guidance, R: int, P: int) -> Filtered:
-    """Of each record."""
-    moving = records.moving
+def _filtered(
+    key: Key[Array, ""], grids: list[Records], guides: list[Guidance], R: int, P: int
+) -> tuple[Filtered, Float[Array, ""]]:
+    """Filters of all records on each grid, in a leading axis, and the rate at which their guides
+    forget: chosen by pilots with half as many steps, in the same loop, so that there is one body."""
+    (arrays, rest), number = stacked(*zip(grids, guides, strict=True)), grids[0].number
+    rates = rates_for(grids[0])
+    keys = jnp.stack([key_for("forgetting", key), key])
 
-    def filters(problem, key, guide):
-        return run_filters(key, problem, problem.model, guide, (R, P), moving)
+    @jax.jit  # for its shapes and in the loop traced once
+    def run(grid, rate, key):
+        records, guides = eqx.combine(jax.tree.map(lambda leaf: leaf[grid], arrays), rest)
+        moving = records.moving
 
-    return records.each(filters, jax.random.split(key, records.number), guides)
+        def filters(problem, key, guide):
+            guide = forgetful(guide, rate)
+            return run_filters(key, problem, problem.model, guide, (R, P), moving)
+
+        return records.each(filters, jax.random.split(key, number), guides)
+
+    def stage(best, inputs):
+        grid, rate, is_pilot = inputs
+        left_out = is_pilot & best.settled
+        rate = jnp.where(is_pilot, rate, best.rate)
+        given = grid, rate, keys[jnp.where(is_pilot, 0, 1)]
+        shapes = jax.eval_shape(run, *given)
+        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        made = lax.cond(left_out, lambda *given: nothing, run, *given)
+        tried = chosen_of(best, rate, made, P)
+        replace = lambda new, old: jnp.where(is_pilot & ~left_out, new, old)
+        return jax.tree.map(replace, tried, best), made
+
+    num_pilots, num_grids = len(rates), len(grids)
+    grid = np.concatenate([np.full(num_pilots, min(1, num_grids - 1)), np.arange(num_grids)])
+    rates = jnp.pad(rates, (0, num_grids))
+    is_pilot = np.arange(len(grid)) < num_pilots
+    best, made = lax.scan(stage, undecided(rates.dtype), (grid, rates, is_pilot))
+    return jax.tree.map(lambda leaf: leaf[num_pilots:], made), best.rate

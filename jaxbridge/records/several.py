@@ -127,6 +127,13 @@ def _padded(record: Record, num_segments: int, num_times: int) -> Record:
     )
 
 
+def stacked(*alike: PyTree) -> tuple[PyTree, PyTree]:
+    """The arrays of what is of one form, for instance on several grids, in a leading axis; and all
+    else, which `equinox.combine` joins to those of one: so that they go through one program."""
+    arrays, rest = zip(*(eqx.partition(each, eqx.is_array) for each in alike), strict=True)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays), rest[0]
+
+
 def linearisations(records: Records, model: Diffusion) -> Float[Array, "R points d"]:
     """The points along which each record is linearised."""
     return records.each(lambda problem: linearised(problem, model).points)

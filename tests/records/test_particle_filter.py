@@ -58,7 +58,7 @@ def test_states_seen_exactly():
 def test_what_is_not_to_be_trusted():
     good = jb.LogLikelihood(
         jnp.array(-3.0), jnp.array(0.1), jnp.full(8, -3.0), jnp.full(5, 30.0),
-        jnp.full(5, 0.73), 4000, jnp.int32(0), jnp.array(0.05), jnp.array(0.02),
+        jnp.full(5, 0.73), 4000, jnp.int32(0), jnp.array(0.05), jnp.array(0.02), jnp.array(0.0),
     )  # fmt: skip
     assert good.trustworthy
     for change in (

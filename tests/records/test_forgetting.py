@@ -1,0 +1,115 @@
+"""Guides that forget what is seen later: any is a right one, and the better is chosen."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.scipy.special import logsumexp
+
+import jaxbridge as jb
+from jaxbridge.records import Filtered, as_record_problem, linearised, run_filters
+from jaxbridge.records.forgetting import chosen_of, undecided
+from jaxbridge.records.guided_record import forgetful
+
+MODEL = jb.ornstein_uhlenbeck([[1.0]])
+SEEN, LAW = jb.LinearGaussian(covariance=0.04), jb.GaussianLaw([0.0], [[0.5]])
+TIMES, VALUES = np.arange(6) * 0.5, np.array([0.1, 0.7, -0.2, np.nan, -0.9, 0.3])[:, None]
+
+
+def test_likelihoods_are_unbiased_whatever_is_forgotten():
+    """Of a linear model: all weights are equal where nothing is."""
+    problem = as_record_problem(MODEL, TIMES, VALUES, SEEN, LAW, num_steps=4)
+    guide = linearised(problem, MODEL).guide
+
+    @jax.jit
+    def filters(rate):
+        return run_filters(jax.random.key(0), problem, MODEL, forgetful(guide, rate), (1000, 20))
+
+    exact = filters(jnp.float32(0)).log_estimate
+    assert np.ptp(exact) < 1e-4
+    for rate in (0.5, 4.0, 1000.0):
+        ratio = np.exp(np.asarray(filters(jnp.float32(rate)).log_estimate - exact[0], float))
+        error = ratio.std() / np.sqrt(len(ratio))
+        assert 1e-4 < error and abs(ratio.mean() - 1) < 5 * error < 0.2
+
+
+def pilot(log_estimates, size):
+    """Of one record, with one end of a segment, where so many of ten particles count."""
+    logs = jnp.asarray(log_estimates, jnp.float32)[None]
+    sizes = jnp.full((1, logs.shape[1], 1), size, jnp.float32)
+    return Filtered(logs, sizes, jnp.zeros((1, 1)), jnp.zeros((1, logs.shape[1]), jnp.int32))
+
+
+def test_the_rate_with_the_larger_mean_is_chosen():
+    better = functools.partial(chosen_of, num_particles=10)
+    first = better(undecided(jnp.float32), jnp.float32(0), pilot([-3.0, -5.0], 2.0))
+    assert first.rate == 0 and not first.settled
+    np.testing.assert_allclose(first.score, -4 - 2 * np.sqrt(2 / 2), rtol=1e-6)  # its spread
+    second = better(first, jnp.float32(1), pilot([-2.0, -2.0], 2.0))
+    assert second.rate == 1 and not second.settled
+    np.testing.assert_allclose(second.score, -2 - 2 * np.sqrt(0.4 / 2), rtol=1e-6)  # what it knows
+    for worse in ([-2.2, -2.2], [-jnp.inf, 3.0], [jnp.nan, 3.0]):
+        assert better(second, jnp.float32(2), pilot(worse, 2.0)).rate == 1
+    assert better(undecided(jnp.float32), jnp.float32(0), pilot([-3.0, -3.1], 9.9)).settled
+    nothing = better(undecided(jnp.float32), jnp.float32(0), pilot([-jnp.inf, -jnp.inf], 0.0))
+    assert nothing.rate == 0 and not nothing.settled
+
+
+def neuron():
+    """FitzHugh and Nagumo's equations, whose spikes are hidden in noise."""
+    noise, times = 0.316, np.arange(100) * 0.2
+    drift = lambda x, p: jnp.stack([(x[0] - x[0] ** 3 - x[1]) / 0.1, 1.5 * x[0] - x[1] + 0.8])
+    model = jb.Diffusion(drift, lambda x, p: jnp.array([[0.0], [0.3]], x.dtype))
+    start = jnp.array([0.3, -1.0])
+    hidden = jb.simulate(jax.random.key(5), model, start, jnp.asarray(times), num_steps=200)[0]
+    values = np.asarray(hidden[:, :1]) + noise * np.random.default_rng(0).normal(size=(100, 1))
+    return model, times, values, noise
+
+
+def bootstrap_filter(key, drift, values, noise, num_particles=30_000, num_steps=100):
+    """log p̂ of particles that know nothing of what is coming, by Euler's steps."""
+    dt = 0.2 / num_steps
+
+    def step(x, key):
+        dW = np.sqrt(dt) * jax.random.normal(key, (num_particles,))
+        return x + drift(x, None) * dt + jnp.stack([jnp.zeros_like(dW), 0.3 * dW]), None
+
+    def seen(x, y, uniform):
+        log_weight = -(((y - x[0]) / noise) ** 2) / 2 - np.log(noise * np.sqrt(2 * np.pi))
+        bounds = jnp.cumsum(jax.nn.softmax(log_weight))
+        positions = (jnp.arange(num_particles, dtype=uniform.dtype) + uniform) / num_particles
+        ancestors = jnp.minimum(jnp.searchsorted(bounds, positions), num_particles - 1)
+        return x[:, ancestors], logsumexp(log_weight) - np.log(num_particles)
+
+    def one(x, inputs):
+        key, y = inputs
+        x, log_mean = seen(x, y, jax.random.uniform(key))
+        return jax.lax.scan(step, x, jax.random.split(key, num_steps))[0], log_mean
+
+    start_key, key = jax.random.split(key)
+    x = jax.random.normal(start_key, (2, num_particles)) + jnp.array([[0.0], [-0.8]])
+    return jnp.sum(jax.lax.scan(one, x, (jax.random.split(key, len(values)), values))[1])
+
+
+@pytest.mark.slow
+def test_spikes_that_are_hidden_in_noise():
+    """A guide that believes all that is seen later misses the likely paths, and its log p̂ is too
+    small by three."""
+    model, times, values, noise = neuron()
+    bootstrap = jax.jit(lambda key: bootstrap_filter(key, model.drift, values[:, 0], noise))
+    each = np.array([bootstrap(key) for key in jax.random.split(jax.random.key(1), 8)])
+    exact, error = each.mean(), each.std() / np.sqrt(len(each))
+    assert error < 0.1
+    seen = jb.LinearGaussian([[1.0, 0.0]], noise**2)
+    law = jb.GaussianLaw([0.0, -0.8], np.eye(2))
+    given = {"observation": seen, "initial": law, "num_steps": 20}
+    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=400, **given)
+    assert made.forgetting > 0
+    allowed = 5 * np.hypot(made.standard_error, error)
+    assert abs(made.value - exact) < allowed < 1.5
+    problem = as_record_problem(model, times, values, seen, law, num_steps=20)
+    guide = linearised(problem, model).guide
+    sure = run_filters(jax.random.key(2), problem, model, guide, (8, 400))
+    assert logsumexp(sure.log_estimate) - np.log(8) < exact - allowed
