@@ -68,7 +68,7 @@ def neuron():
     return model, times, values, noise
 
 
-def bootstrap_filter(key, drift, values, noise, num_particles=30_000, num_steps=100):
+def bootstrap_filter(key, drift, values, noise, num_particles=10_000, num_steps=40):
     """log p̂ of particles that know nothing of what is coming, by Euler's steps."""
     dt = 0.2 / num_steps
 
