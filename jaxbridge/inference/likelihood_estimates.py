@@ -130,14 +130,18 @@ class RecordLikelihood(AbstractLikelihood):
     num_particles: int = eqx.field(static=True)
 
     def estimate(self, key, model):
-        value, variance = self._estimate(key, model, self.fine)
+        made = self._filtered(key, model, self.fine, self.rate, 1)
+        value, variance = self._estimate(made)
         return Estimate(proper(value), variance, jnp.full_like(value, jnp.nan), jnp.int32(0))
 
     def log_step_error(self, key, model):
         problem = self.fine.records.stacked
         if problem.num_steps == 1:
             return jnp.full((), jnp.nan, problem.like.dtype)
-        estimate = lambda grid: self._estimate(key, model, grid)
+
+        def estimate(grid: GuidedRecords):
+            return self._estimate(self._filtered(key, model, grid, self.rate, 1, skips=True))
+
         log_p, variance = on_both_grids(estimate, self.fine, self.coarse)
         # The mean of log p̂ is too small by half its variance.
         fine, coarse = log_p + variance / 2
@@ -147,7 +151,7 @@ class RecordLikelihood(AbstractLikelihood):
         records, P = self.fine.records, self.num_particles
         fine, coarse = guided_near(records, self.coarse.records, model)
         num_filters = max(4, _NUM_PILOTS // P)
-        pilot = lambda rate: self._filtered(key, model, coarse, rate, num_filters)
+        pilot = lambda rate: self._filtered(key, model, coarse, rate, num_filters, skips=True)
         return RecordLikelihood(fine, coarse, chosen_rate(pilot, records, P), P)
 
     @property
@@ -158,11 +162,8 @@ class RecordLikelihood(AbstractLikelihood):
     def tells_step_error(self):
         return False
 
-    def _estimate(
-        self, key: Key[Array, ""], model: Diffusion, grid: GuidedRecords
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def _estimate(self, made: Filtered) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """log p̂ with its variance."""
-        made = self._filtered(key, model, grid, self.rate, 1)
         variance = jax.vmap(lambda each: each.variance(self.num_particles))(made)
         return jnp.sum(made.log_estimate), jnp.sum(variance)
 
@@ -173,10 +174,12 @@ class RecordLikelihood(AbstractLikelihood):
         grid: GuidedRecords,
         rate: Float[Array, ""],
         num_filters: int,
+        skips: bool = False,
     ) -> Filtered:
-        """So many filters of each record, whose guides forget at this rate."""
+        """So many filters of each record, whose guides forget at this rate. To skip steps of no
+        length takes a decision at each, which pays where there are many: on the coarse grid."""
         (records, points), size = grid, (num_filters, self.num_particles)
-        moving = records.moving
+        moving = records.moving if skips else None
 
         def one(problem, key, points):
             guide = guided(problem, model, points, rate)

@@ -283,7 +283,7 @@ def _filtered(
     key: Key[Array, ""], grids: list[Records], guides: list[Guidance], R: int, P: int
 ) -> tuple[Filtered, Float[Array, ""]]:
     """Filters of all records on each grid, in a leading axis, and the rate at which their guides
-    forget: chosen by pilots with half as many steps, in the same loop, so that there is one body."""
+    forget: chosen by pilots with half as many steps, in the same loop, for there to be one body."""
     (arrays, rest), number = stacked(*zip(grids, guides, strict=True)), grids[0].number
     rates = rates_for(grids[0])
     keys = jnp.stack([key_for("forgetting", key), key])
