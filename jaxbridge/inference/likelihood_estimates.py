@@ -6,6 +6,7 @@ what a guided particle filter makes.
 """
 
 from abc import abstractmethod
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -17,13 +18,13 @@ from ..engine.averages import proper
 from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
-from ..records import Filtered, chosen_rate, guided, run_filters
+from ..records import Filtered, guided, rate_for_several, run_filters
 from ..schemes import share_of_grid
 from .blocks import Block, with_keys
 from .record_paths import GuidedRecords, guided_near, on_both_grids
 
-# How many particles pilots have in all.
-_NUM_PILOTS = 512
+# At least so many filters at each of several parameters, and so many particles, are a pilot.
+_FEWEST_FILTERS, _FEWEST_PARTICLES = 8, 128
 
 
 class Estimate(NamedTuple):
@@ -57,9 +58,16 @@ class AbstractLikelihood(eqx.Module):
         where it is not known."""
 
     @abstractmethod
-    def near(self, key: Key[Array, ""], model: Diffusion) -> "AbstractLikelihood":
-        """What estimates the same with less variance for models like this: leaves may change, and
-        no shapes, for both are states of one loop."""
+    def near(
+        self,
+        key: Key[Array, ""],
+        at: Callable[[Float[Array, " p"]], Diffusion],
+        theta: Float[Array, " p"],
+        around: Float[Array, "n p"],
+    ) -> "AbstractLikelihood":
+        """What estimates the same with less variance where a chain is, at θ, and where it may come
+        to, `around` it, for the models `at` these: leaves may change, and no shapes, for both are
+        states of one loop."""
 
     @property
     @abstractmethod
@@ -104,7 +112,7 @@ class TransitionLikelihood(AbstractLikelihood):
     def log_step_error(self, key, model):
         return self.estimate(key, model).log_step_error
 
-    def near(self, key, model):
+    def near(self, key, at, theta, around):
         return self
 
     @property
@@ -147,12 +155,19 @@ class RecordLikelihood(AbstractLikelihood):
         fine, coarse = log_p + variance / 2
         return share_of_grid(problem.density.order, problem.num_steps) * (coarse - fine)
 
-    def near(self, key, model):
+    def near(self, key, at, theta, around):
         records, P = self.fine.records, self.num_particles
-        fine, coarse = guided_near(records, self.coarse.records, model)
-        num_filters = max(4, _NUM_PILOTS // P)
-        pilot = lambda rate: self._filtered(key, model, coarse, rate, num_filters, skips=True)
-        return RecordLikelihood(fine, coarse, chosen_rate(pilot, records, P), P)
+        fine, coarse = guided_near(records, self.coarse.records, at(theta))
+        num_filters = max(_FEWEST_FILTERS, _FEWEST_PARTICLES // P)
+        keys = jax.random.split(key, len(around))
+
+        def pilots(rate):
+            def one(key, theta):
+                return self._filtered(key, at(theta), coarse, rate, num_filters, skips=True)
+
+            return jax.vmap(one)(keys, around)
+
+        return RecordLikelihood(fine, coarse, rate_for_several(pilots, records, P), P)
 
     @property
     def guided(self):

@@ -18,6 +18,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
@@ -30,6 +31,7 @@ from ..engine.checks import (
 from ..engine.compiled import compiled
 from ..engine.doors import door
 from ..engine.keys import key_for
+from ..engine.linalg import matvec
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
@@ -56,6 +58,9 @@ from .posterior import (
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_paths import check_no_bridges, unguided
 from .warm_up import stages
+
+# For so many parameters it is decided how likelihoods are estimated.
+_NUM_LIKELY = 8
 
 
 class _Chain(NamedTuple):
@@ -182,7 +187,8 @@ def pmmh(
         takes their place; the estimate that the chain holds is still one of theirs.
     - `observation`, `initial`: for a record that was seen with noise or in part, as in
         `innovations`; `num_proposals` is then how many particles the filter has, of which few do.
-        What guides them is found anew in the warm-up. By default the state was seen whole and
+        What guides them, and how soon that forgets what is seen later, is found anew in the
+        warm-up, by pilots. By default the state was seen whole and
         without noise. Unknown parameters of the noise are parameters of
         the model that `LinearGaussian(covariance=)` is a function of.
     - `num_counts`, `max_trials`: as in `transition_log_density`.
@@ -230,7 +236,8 @@ def pmmh(
 
         def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
             grids = unguided(records), unguided(records.coarsened())
-            return RecordLikelihood(*grids, jnp.zeros((), unknown.dtype), num_proposals)
+            no_rate = jnp.zeros((), unknown.dtype)  # stands in until there are pilots
+            return RecordLikelihood(*grids, no_rate, num_proposals)
 
     log_prior = as_log_prior(prior, parameters, unknown)
     root = first_root(covariance, log_prior, unknown)
@@ -289,9 +296,27 @@ class _Sampler(eqx.Module):
     likelihood: AbstractLikelihood
     log_prior: NormalDensity | GivenDensity
 
-    def near(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> "_Sampler":
-        likelihood = self.likelihood.near(key, self.parameters.bind(theta))
+    def near(self, key: Key[Array, ""], chain: _Chain) -> "_Sampler":
+        """With what estimates best where the first chain is, and not much worse where any of them
+        may come to."""
+        parameters = self.parameters
+        walk_key, pilot_key = jax.random.split(key)
+        around = self._likely(walk_key, chain)
+        theta = first_chain(chain.theta)
+        likelihood = self.likelihood.near(pilot_key, parameters.bind, theta, around)
         return _Sampler(self.parameters, likelihood, self.log_prior)
+
+    def _likely(self, key: Key[Array, ""], chain: _Chain) -> Float[Array, "n p"]:
+        """Parameters that are about as likely as those of the chains: proposals are as wide as the
+        posterior but for a factor of 2.4 / √p (Roberts & Rosenthal 2001)."""
+        p = chain.theta.shape[-1]
+        theta, root = chain.theta.reshape(-1, p), chain.root.reshape(-1, p, p)
+        which = jnp.arange(_NUM_LIKELY) % len(theta)
+        noise = jax.random.normal(key, (_NUM_LIKELY, p), theta.dtype)
+        wide = (np.sqrt(p) / 2).astype(theta.dtype) * jax.vmap(matvec)(root[which], noise)
+        moved = theta[which] + wide
+        allowed = jax.vmap(self.parameters.allowed)(moved)
+        return jnp.where(allowed[:, None], moved, theta[which])
 
     def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Estimate:
         return self.likelihood.estimate(key, self.parameters.bind(theta))
@@ -350,7 +375,7 @@ def _run(
 
     def begin(run, i):
         pilot_key = jax.random.fold_in(key_for("pilots", key), run.num_done)
-        near = sampler.near(pilot_key, first_chain(run.chain.theta))
+        near = sampler.near(pilot_key, run.chain)
         if not fresh:
             return run, near
         # An estimate by the guide before may be a lucky one, which a chain would hold on to.

@@ -9,27 +9,41 @@ By Jensen's inequality E log p̂ is below log p, by about half the variance of l
 particles miss (Maddison et al. 2017). So the rate is the one of several with the largest mean of
 log p̂ of pilot filters, less two standard errors: of a linear model, whose weights are equal without
 forgetting, it is zero.
+
+A chain over parameters has one rate for all of them, and must not miss what weighs most at any:
+where nearly every p̂ is too small it will not go, and then knows nothing of it; what varies about
+the right mean only slows it down. So at several parameters, those that are likely, it is asked how
+far the log of the mean of p̂ of pilots is below that at the best rate; and the rate is the least
+that loses hardly more than another.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jax.scipy.special import logsumexp
+from jaxtyping import Array, Bool, Float, Int
 
 from ..engine.averages import proper
 from .particle_filter import Filtered
 from .several import Records
 
-# γ times the mean time between observations; and a variance of log p̂ that is worth no pilot.
-_RATES, _SMALL = (0.0, 0.5, 2.0, 8.0, 64.0), 0.04
+# γ times the mean time between observations; and a variance of log p̂ by which all weights are
+# equal, and nothing is missed: a larger one says nothing of what all filters miss.
+_RATES, _ALL_EQUAL = (0.0, 0.5, 2.0, 8.0, 64.0), 1e-4
+# By how much log p̂ may be below the largest where parameters count, what is lost at any of them at
+# most, and what is no loss, for pilots are few.
+_LIKELY, _LARGEST_LOSS, _NO_LOSS = 10.0, 5.0, 0.25
+# By how much a filter that lost all its particles is below the best beside it.
+_LOST = 50.0
 
 
 class Choice(NamedTuple):
-    """The best rate so far, and its mean of log p̂ less two standard errors; whether no other can
-    be better by much."""
+    """The best rate so far, and its mean of log p̂ less two standard errors; and whether all
+    weights were equal at one, and no other is worth a pilot."""
 
     rate: Float[Array, ""]
     score: Float[Array, ""]
@@ -37,9 +51,11 @@ class Choice(NamedTuple):
 
 
 def rates_for(records: Records) -> Float[Array, " rates"]:
-    """Those that are tried, from zero on."""
-    dt = records.stacked.record.dt
-    return jnp.asarray(_RATES, dt.dtype) * sum(records.num_times) / jnp.sum(dt)
+    """Those that may be tried, from zero on."""
+    record = records.stacked.record
+    num_seen = jnp.sum(jnp.any(jnp.isfinite(record.values), axis=-1))
+    rates = jnp.asarray(_RATES, record.dt.dtype)
+    return rates * jnp.maximum(num_seen, 1).astype(rates.dtype) / jnp.sum(record.dt)
 
 
 def undecided(dtype) -> Choice:
@@ -51,28 +67,62 @@ def chosen_of(
     best: Choice, rate: Float[Array, ""], filtered: Filtered, num_particles: int
 ) -> Choice:
     """The better one, where filters of all records at this rate made this of them."""
-    R = filtered.log_estimate.shape[1]
-    told = jnp.mean(jax.vmap(lambda each: each.variance(num_particles))(filtered), axis=1)
-    spread = jnp.var(filtered.log_estimate, axis=1, ddof=min(1, R - 1))
-    variance = jnp.sum(jnp.maximum(told, spread))
-    score = jnp.sum(jnp.mean(filtered.log_estimate, axis=1)) - 2 * jnp.sqrt(variance / R)
-    score = proper(score)
-    better = score > best.score
+    log_estimate, R = _not_lost(filtered.log_estimate), filtered.log_estimate.shape[1]
+    variance = _variance(log_estimate, filtered, num_particles)
+    mean = jnp.sum(jnp.mean(log_estimate, axis=1))
+    score = proper(mean - 2 * jnp.sqrt(variance / R))
     return Choice(
-        jnp.where(better, rate, best.rate),
+        jnp.where(score > best.score, rate, best.rate),
         jnp.maximum(score, best.score),
-        best.settled | (variance < _SMALL),
+        best.settled | (variance < _ALL_EQUAL),
     )
 
 
-def chosen_rate(
+def _not_lost(log_estimate: Float[Array, "records R"]) -> Float[Array, "records R"]:
+    """With a floor for filters that lost all particles, beside others."""
+    best = jnp.max(log_estimate, axis=1, keepdims=True)
+    return jnp.maximum(log_estimate, best - _LOST)
+
+
+def _variance(
+    log_estimate: Float[Array, "records R"], filtered: Filtered, num_particles: int
+) -> Float[Array, ""]:
+    """That of log p̂ of all records: what filters tell of themselves, or their spread."""
+    told = jnp.mean(jax.vmap(lambda each: each.variance(num_particles))(filtered), axis=1)
+    spread = jnp.var(log_estimate, axis=1, ddof=min(1, log_estimate.shape[1] - 1))
+    return jnp.sum(jnp.maximum(told, spread))
+
+
+def rate_for_several(
     run: Callable[[Float[Array, ""]], Filtered], records: Records, num_particles: int
 ) -> Float[Array, ""]:
-    """The best rate, where `run` makes filters of all records at one."""
+    """The rate for several models, which are an axis in front of what `run` makes at one. Where
+    all weights are equal at all of them without forgetting, nothing else is tried."""
 
-    def tried(best: Choice, rate):
-        try_it = lambda best: chosen_of(best, rate, run(rate), num_particles)
-        return lax.cond(best.settled, lambda best: best, try_it, best), None
+    def log_mean_and_equal(filtered: Filtered):
+        log_estimate = filtered.log_estimate
+        log_mean = logsumexp(log_estimate, axis=1) - math.log(log_estimate.shape[1])
+        variance = _variance(_not_lost(log_estimate), filtered, num_particles)
+        return proper(jnp.sum(log_mean)), variance < _ALL_EQUAL
+
+    def tried(settled, rate):
+        def try_it():
+            log_means, equal = jax.vmap(log_mean_and_equal)(run(rate))
+            return jnp.all(equal) & (rate == 0), log_means
+
+        left_out = lambda: (settled, jnp.full(shape, -jnp.inf, rates.dtype))
+        return lax.cond(settled, left_out, try_it)
 
     rates = rates_for(records)
-    return lax.scan(tried, undecided(rates.dtype), rates)[0].rate
+    shape = jax.eval_shape(run, rates[0]).log_estimate.shape[:1]
+    _, log_means = lax.scan(tried, jnp.zeros((), bool), rates)
+    return rates[least_that_misses_nothing(log_means)]
+
+
+def least_that_misses_nothing(log_means: Float[Array, "rates models"]) -> Int[Array, ""]:
+    """Which rate is the least at which hardly more is lost than at another."""
+    best = jnp.max(log_means, axis=0)
+    likely = best > jnp.max(best) - _LIKELY
+    loss = jnp.where(likely, jnp.minimum(best - log_means, _LARGEST_LOSS), 0)
+    loss = jnp.sum(loss, axis=1) / jnp.maximum(jnp.sum(likely.astype(loss.dtype)), 1)
+    return jnp.argmax(loss <= jnp.min(loss) + _NO_LOSS)

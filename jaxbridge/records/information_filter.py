@@ -121,6 +121,6 @@ def information_filter(
     if over_lanes is None:
         h, _ = recursion(one, last, inputs, StateDerivative(_tilted_mean, _through_mean))
     else:
-        each = over_lanes(back)
-        h = lax.scan(lambda h, inputs: 2 * (each(h, *inputs[:2]),), last, inputs)[1]
+        each = over_lanes(lambda h, inputs: one(h, inputs)[0])
+        h = lax.scan(lambda h, inputs: 2 * (each(h, inputs),), last, inputs)[1]
     return jax.tree.map(lambda leaf: leaf[::-1].reshape(K, N, *leaf.shape[1:]), h)

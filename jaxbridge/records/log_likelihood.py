@@ -33,6 +33,8 @@ from .several import Records, as_record_problems, stacked
 # Fewer particles that count, or a larger standard error of a log, tell nothing; nor do tails that
 # are heavier than so many weights can show by more than the largest of many estimates of k is off.
 _FEWEST_TRUSTED, _MOST_SPREAD, _LARGEST_OF_MANY = 5, 0.5, 0.1
+# With so few steps pilots have as many; else half as many do.
+_FEW_STEPS = 4
 
 _UNEXPLAINED = (
     "no particle explains some observation (`unexplained` is its number): look whether it is an "
@@ -301,18 +303,22 @@ def _filtered(
 
     def stage(best, inputs):
         grid, rate, is_pilot = inputs
-        left_out = is_pilot & best.settled
-        rate = jnp.where(is_pilot, rate, best.rate)
-        given = grid, rate, keys[jnp.where(is_pilot, 0, 1)]
-        shapes = jax.eval_shape(run, *given)
-        nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        made = lax.cond(left_out, lambda *given: nothing, run, *given)
-        tried = chosen_of(best, rate, made, P)
-        replace = lambda new, old: jnp.where(is_pilot & ~left_out, new, old)
-        return jax.tree.map(replace, tried, best), made
+
+        def make(best):
+            made = run(grid, jnp.where(is_pilot, rate, best.rate), keys[jnp.where(is_pilot, 0, 1)])
+            tried = chosen_of(best, rate, made, P)
+            return jax.tree.map(lambda new, old: jnp.where(is_pilot, new, old), tried, best), made
+
+        def left_out(best):
+            shapes = jax.eval_shape(make, best)[1]
+            return best, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+        return lax.cond(is_pilot & best.settled, left_out, make, best)
 
     num_pilots, num_grids = len(rates), len(grids)
-    grid = np.concatenate([np.full(num_pilots, min(1, num_grids - 1)), np.arange(num_grids)])
+    grid = np.concatenate(
+        [np.full(num_pilots, grids[0].stacked.num_steps > _FEW_STEPS), np.arange(num_grids)]
+    )
     rates = jnp.pad(rates, (0, num_grids))
     is_pilot = np.arange(len(grid)) < num_pilots
     best, made = lax.scan(stage, undecided(rates.dtype), (grid, rates, is_pilot))

@@ -10,7 +10,7 @@ from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
 from jaxbridge.records import Filtered, as_record_problem, linearised, run_filters
-from jaxbridge.records.forgetting import chosen_of, undecided
+from jaxbridge.records.forgetting import chosen_of, least_that_misses_nothing, undecided
 from jaxbridge.records.guided_record import forgetful
 
 MODEL = jb.ornstein_uhlenbeck([[1.0]])
@@ -52,9 +52,50 @@ def test_the_rate_with_the_larger_mean_is_chosen():
     np.testing.assert_allclose(second.score, -2 - 2 * np.sqrt(0.4 / 2), rtol=1e-6)  # what it knows
     for worse in ([-2.2, -2.2], [-jnp.inf, 3.0], [jnp.nan, 3.0]):
         assert better(second, jnp.float32(2), pilot(worse, 2.0)).rate == 1
-    assert better(undecided(jnp.float32), jnp.float32(0), pilot([-3.0, -3.1], 9.9)).settled
+    equal = pilot([-3.0, -3.001], 10.0)
+    assert better(undecided(jnp.float32), jnp.float32(0), equal).settled
     nothing = better(undecided(jnp.float32), jnp.float32(0), pilot([-jnp.inf, -jnp.inf], 0.0))
     assert nothing.rate == 0 and not nothing.settled
+
+
+def test_the_least_rate_that_misses_nothing_is_chosen():
+    """At one of the models that are likely much is missed at the first, at the second little."""
+    log_means = np.array([[-10.0, -13.0, -90.0], [-10.1, -10.3, -95.0], [-10.4, -10.0, -70.0]])
+    assert least_that_misses_nothing(jnp.asarray(log_means, jnp.float32)) == 1
+    assert least_that_misses_nothing(jnp.asarray(log_means[:, :1], jnp.float32)) == 0
+    lost = jnp.array([[-jnp.inf, -3.0], [-4.0, -3.0]])
+    assert least_that_misses_nothing(lost) == 1
+    assert least_that_misses_nothing(jnp.full((3, 2), -jnp.inf)) == 0
+
+
+def test_nothing_is_forgotten_where_all_weights_are_equal():
+    given = {"observation": SEEN, "initial": LAW, "num_steps": 4}
+    made = jb.log_likelihood(jax.random.key(0), MODEL, TIMES, VALUES, **given)
+    assert made.forgetting == 0 and made.standard_error < 1e-5
+
+
+@pytest.mark.slow
+def test_a_side_that_all_filters_miss_is_found():
+    """Which of two wells X is in is not seen, only its square, by what follows it. Along a path in
+    one well all filters agree, and their mean is half of the likelihood."""
+    drift = lambda x, p: jnp.stack([2 * (x[0] - x[0] ** 3), x[0] ** 2 - x[1]])
+    model = jb.Diffusion(drift, jnp.diag(jnp.array([0.5, 0.2])))
+    times = np.arange(13) * 0.5
+    path = jb.simulate(jax.random.key(4), model, jnp.zeros(2), jnp.asarray(times), num_steps=50)[0]
+    values = np.asarray(path)[:, 1:] + 0.1 * np.random.default_rng(0).normal(size=(13, 1))
+    law, seen = jb.GaussianLaw([0.15, 0.0], np.diag([0.5, 0.01])), jb.LinearGaussian([[0, 1]], 0.01)
+    given = {"observation": seen, "initial": law, "num_steps": 10}
+    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=400, **given)
+    problem = as_record_problem(model, times, values, seen, law, num_steps=10)
+    guide = linearised(problem, model).guide
+    run = jax.jit(lambda key, rate, P: run_filters(
+        key, problem, model, forgetful(guide, rate), (8, P)
+    ).log_estimate, static_argnums=2)  # fmt: skip
+    free = run(jax.random.key(3), jnp.float32(1000), 8000)
+    error = np.hypot(np.std(free) / np.sqrt(8), made.standard_error)
+    assert made.forgetting > 0 and abs(made.value - np.mean(free)) < 5 * error < 0.4
+    sure = run(jax.random.key(2), jnp.float32(0), 400)
+    assert np.std(sure) < 0.2 and np.mean(sure) < np.mean(free) - 0.5
 
 
 def neuron():
