@@ -18,7 +18,7 @@ from ..engine.averages import proper
 from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
-from ..records import Filtered, guided, rate_for_several, run_filters
+from ..records import Filtered, guided, half_will_do, rate_for_several, run_filters
 from ..schemes import share_of_grid
 from .blocks import Block, with_keys
 from .record_paths import GuidedRecords, guided_near, on_both_grids
@@ -160,10 +160,11 @@ class RecordLikelihood(AbstractLikelihood):
         fine, coarse = guided_near(records, self.coarse.records, at(theta))
         num_filters = max(_FEWEST_FILTERS, _FEWEST_PARTICLES // P)
         keys = jax.random.split(key, len(around))
+        grid = coarse if half_will_do(records) else fine
 
         def pilots(rate):
             def one(key, theta):
-                return self._filtered(key, at(theta), coarse, rate, num_filters, skips=True)
+                return self._filtered(key, at(theta), grid, rate, num_filters, skips=True)
 
             return jax.vmap(one)(keys, around)
 

@@ -23,7 +23,7 @@ Schauer 2017; Mider, Schauer & van der Meulen 2021) with data on the way. On it 
 """
 
 # What the folders above use of this one.
-from .forgetting import rate_for_several as rate_for_several
+from .forgetting import half_will_do as half_will_do, rate_for_several as rate_for_several
 from .guided_record import (
     Guidance as Guidance,
     guided as guided,

@@ -37,6 +37,8 @@ _RATES, _ALL_EQUAL = (0.0, 0.5, 2.0, 8.0, 64.0), 1e-4
 # By how much log p̂ may be below the largest where parameters count, what is lost at any of them at
 # most, and what is no loss, for pilots are few.
 _LIKELY, _LARGEST_LOSS, _NO_LOSS = 10.0, 5.0, 0.25
+# With so few steps between observations nearly all is forgotten, or nothing, at the last.
+_FEW_STEPS = 4
 # By how much a filter that lost all its particles is below the best beside it.
 _LOST = 50.0
 
@@ -56,6 +58,11 @@ def rates_for(records: Records) -> Float[Array, " rates"]:
     num_seen = jnp.sum(jnp.any(jnp.isfinite(record.values), axis=-1))
     rates = jnp.asarray(_RATES, record.dt.dtype)
     return rates * jnp.maximum(num_seen, 1).astype(rates.dtype) / jnp.sum(record.dt)
+
+
+def half_will_do(records: Records) -> bool:
+    """Whether pilots may have half as many steps."""
+    return records.stacked.num_steps > _FEW_STEPS
 
 
 def undecided(dtype) -> Choice:

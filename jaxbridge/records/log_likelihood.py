@@ -22,7 +22,7 @@ from ..engine.throwing import throw_where
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity, StepError, dominates, error_of_grids, num_coarse_grids
-from .forgetting import chosen_of, rates_for, undecided
+from .forgetting import chosen_of, half_will_do, rates_for, undecided
 from .guided_record import Guidance, forgetful, linearised
 from .initial import Initial
 from .observation import Observation
@@ -33,8 +33,6 @@ from .several import Records, as_record_problems, stacked
 # Fewer particles that count, or a larger standard error of a log, tell nothing; nor do tails that
 # are heavier than so many weights can show by more than the largest of many estimates of k is off.
 _FEWEST_TRUSTED, _MOST_SPREAD, _LARGEST_OF_MANY = 5, 0.5, 0.1
-# With so few steps pilots have as many; else half as many do.
-_FEW_STEPS = 4
 
 _UNEXPLAINED = (
     "no particle explains some observation (`unexplained` is its number): look whether it is an "
@@ -285,7 +283,7 @@ def _filtered(
     key: Key[Array, ""], grids: list[Records], guides: list[Guidance], R: int, P: int
 ) -> tuple[Filtered, Float[Array, ""]]:
     """Filters of all records on each grid, in a leading axis, and the rate at which their guides
-    forget: chosen by pilots with half as many steps, in the same loop, for there to be one body."""
+    forget: chosen by pilots, in the same loop, so that there is one body."""
     (arrays, rest), number = stacked(*zip(grids, guides, strict=True)), grids[0].number
     rates = rates_for(grids[0])
     keys = jnp.stack([key_for("forgetting", key), key])
@@ -316,9 +314,8 @@ def _filtered(
         return lax.cond(is_pilot & best.settled, left_out, make, best)
 
     num_pilots, num_grids = len(rates), len(grids)
-    grid = np.concatenate(
-        [np.full(num_pilots, grids[0].stacked.num_steps > _FEW_STEPS), np.arange(num_grids)]
-    )
+    pilot_grid = np.full(num_pilots, half_will_do(grids[0]), int)
+    grid = np.concatenate([pilot_grid, np.arange(num_grids)])
     rates = jnp.pad(rates, (0, num_grids))
     is_pilot = np.arange(len(grid)) < num_pilots
     best, made = lax.scan(stage, undecided(rates.dtype), (grid, rates, is_pilot))
