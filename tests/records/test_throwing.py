@@ -15,7 +15,7 @@ MODEL = jb.Diffusion(lambda x, p: -p * x, params=1.0)
 def likelihood(error=0.1, sizes=50.0, k=0.4, step_error=0.0, doubt=0.01):
     value, filters = jnp.array(-3.0), jnp.full(4, -3.0)
     of_each = jnp.full(5, sizes), jnp.full(5, k)
-    told = map(jnp.array, (step_error, doubt))
+    told = map(jnp.array, (step_error, doubt, 0.0))
     return LogLikelihood(value, jnp.array(error), filters, *of_each, 4000, jnp.int32(0), *told)
 
 
