@@ -138,18 +138,14 @@ class RecordLikelihood(AbstractLikelihood):
     num_particles: int = eqx.field(static=True)
 
     def estimate(self, key, model):
-        made = self._filtered(key, model, self.fine, self.rate, 1)
-        value, variance = self._estimate(made)
+        value, variance = self._estimate(key, model, self.fine)
         return Estimate(proper(value), variance, jnp.full_like(value, jnp.nan), jnp.int32(0))
 
     def log_step_error(self, key, model):
         problem = self.fine.records.stacked
         if problem.num_steps == 1:
             return jnp.full((), jnp.nan, problem.like.dtype)
-
-        def estimate(grid: GuidedRecords):
-            return self._estimate(self._filtered(key, model, grid, self.rate, 1, skips=True))
-
+        estimate = lambda grid: self._estimate(key, model, grid, skips=True)
         log_p, variance = on_both_grids(estimate, self.fine, self.coarse)
         # The mean of log p̂ is too small by half its variance.
         fine, coarse = log_p + variance / 2
@@ -178,8 +174,11 @@ class RecordLikelihood(AbstractLikelihood):
     def tells_step_error(self):
         return False
 
-    def _estimate(self, made: Filtered) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """log p̂ with its variance."""
+    def _estimate(
+        self, key: Key[Array, ""], model: Diffusion, grid: GuidedRecords, skips: bool = False
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """log p̂ with its variance, of one filter of each record."""
+        made = self._filtered(key, model, grid, self.rate, 1, skips)
         variance = jax.vmap(lambda each: each.variance(self.num_particles))(made)
         return jnp.sum(made.log_estimate), jnp.sum(variance)
 
@@ -190,7 +189,7 @@ class RecordLikelihood(AbstractLikelihood):
         grid: GuidedRecords,
         rate: Float[Array, ""],
         num_filters: int,
-        skips: bool = False,
+        skips: bool,
     ) -> Filtered:
         """So many filters of each record, whose guides forget at this rate. To skip steps of no
         length takes a decision at each, which pays where there are many: on the coarse grid."""

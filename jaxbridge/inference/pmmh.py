@@ -188,9 +188,9 @@ def pmmh(
     - `observation`, `initial`: for a record that was seen with noise or in part, as in
         `innovations`; `num_proposals` is then how many particles the filter has, of which few do.
         What guides them, and how soon that forgets what is seen later, is found anew in the
-        warm-up, by pilots. By default the state was seen whole and
-        without noise. Unknown parameters of the noise are parameters of
-        the model that `LinearGaussian(covariance=)` is a function of.
+        warm-up, by pilots. By default the state was seen whole and without noise. Unknown
+        parameters of the noise are parameters of the model that `LinearGaussian(covariance=)` is a
+        function of.
     - `num_counts`, `max_trials`: as in `transition_log_density`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
@@ -299,11 +299,12 @@ class _Sampler(eqx.Module):
     def near(self, key: Key[Array, ""], chain: _Chain) -> "_Sampler":
         """With what estimates best where the first chain is, and not much worse where any of them
         may come to."""
-        parameters = self.parameters
+        if not self.likelihood.guided:
+            return self
         walk_key, pilot_key = jax.random.split(key)
         around = self._likely(walk_key, chain)
         theta = first_chain(chain.theta)
-        likelihood = self.likelihood.near(pilot_key, parameters.bind, theta, around)
+        likelihood = self.likelihood.near(pilot_key, self.parameters.bind, theta, around)
         return _Sampler(self.parameters, likelihood, self.log_prior)
 
     def _likely(self, key: Key[Array, ""], chain: _Chain) -> Float[Array, "n p"]:

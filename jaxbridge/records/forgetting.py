@@ -17,17 +17,16 @@ far the log of the mean of p̂ of pilots is below that at the best rate; and the
 that loses hardly more than another.
 """
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..engine.averages import proper
+from ..exact import log_mean_and_error
 from .particle_filter import Filtered
 from .several import Records
 
@@ -108,7 +107,7 @@ def rate_for_several(
 
     def log_mean_and_equal(filtered: Filtered):
         log_estimate = filtered.log_estimate
-        log_mean = logsumexp(log_estimate, axis=1) - math.log(log_estimate.shape[1])
+        log_mean, _, _ = log_mean_and_error(log_estimate)
         variance = _variance(_not_lost(log_estimate), filtered, num_particles)
         return proper(jnp.sum(log_mean)), variance < _ALL_EQUAL
 
