@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.batch_size import default_num_lanes
 from ..engine.checks import Numbers, check_bound, check_count, check_key, without_derivatives
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_for
 from ..engine.devices import over_devices
 from ..engine.doors import door
 from ..engine.keys import numbered_keys
@@ -141,7 +141,7 @@ def sample_bridges(
     return throw_where_incomplete(bridges, "paths", model, ~bridges.met) if throw else bridges
 
 
-@compiled
+@compiled_for(lambda key, model, coupling, problem, search: problem.num_path_steps(search.wanted))
 def _sample_bridges(
     key: Key[Array, ""],
     model: Diffusion,

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.batch_size import default_num_lanes
 from ..engine.checks import check_bound, check_count, check_key, nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_for
 from ..engine.doors import door
 from ..engine.keys import key_for, numbered_keys
 from ..engine.rejection import Attempts, Search, over_problems, rejection_sample
@@ -154,7 +154,7 @@ def hitting_counts(
     return _hitting_counts(key_for("hitting counts", key), model, coupling, bridges, search)
 
 
-@compiled
+@compiled_for(lambda key, model, coupling, bridges, search: bridges.paths.size)
 def _hitting_counts(key, model, coupling, bridges, search):
     return counts_of(key, model, coupling, bridges, search)[0]
 

@@ -1,27 +1,88 @@
 """How our programs are compiled: `equinox.filter_jit`, with keys that take less of the compiler's
-time (`generator`), and an eye on the room that is left for programs (`memory_maps`)."""
+time (`generator`), and an eye on the room that is left for programs (`memory_maps`).
+
+On CPUs XLA can make its kernels in two ways. Those of its fusion emitters, the default, are up to
+twice as fast in a loop that works on many lanes, for they are vectorised where a number is
+overwritten by a function of itself; its former emitters take a third less time, and their programs
+a third of the memory maps. So what takes longer to compile than to run, as chains of parameters and
+all that is done once for each model, is `compiled_sooner`, and proposals are `compiled_for` their
+number.
+"""
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
+import jax
+from jax.extend.core import get_opaque_trace_state
 
-from .checks import is_traced
 from .generator import with_keys_written_out
 from .memory_maps import mind_memory_maps
+
+_SOONER = {
+    "xla_cpu_use_fusion_emitters": False,
+    "xla_cpu_parallel_codegen_split_count": 2,  # files of kernels, of which each takes memory maps
+}
+
+# Steps of paths, at some 10 ns more for each: 20 ms a call for .5 s to the first.
+_MANY = 2_000_000
 
 
 def compiled(fn: Callable) -> Callable:
     """`fn`, compiled for each structure of its arguments; arrays in them are traced."""
+    program = _program(fn)
 
-    @eqx.filter_jit
+    @functools.wraps(fn)
+    def call(*args, **kwargs):
+        mind_memory_maps(is_outermost)
+        return program(*args, **kwargs)
+
+    return call
+
+
+def compiled_sooner(fn: Callable) -> Callable:
+    """As `compiled`, for what takes longer to compile than to run."""
+    sooner, within = _program(fn, compiler_options=_SOONER), _program(fn)
+
+    @functools.wraps(fn)
+    def call(*args, **kwargs):
+        mind_memory_maps(is_outermost)
+        # JAX takes options for none but outermost programs.
+        program = sooner if is_outermost() and jax.default_backend() == "cpu" else within
+        return program(*args, **kwargs)
+
+    return call
+
+
+def compiled_for(num_path_steps: Callable[..., int]) -> Callable[[Callable], Callable]:
+    """As `compiled` where that many steps of paths, a function of `fn`'s arguments, are no fewer
+    than some millions, and else as `compiled_sooner`."""
+
+    def decorate(fn: Callable) -> Callable:
+        few, many = compiled_sooner(fn), compiled(fn)
+
+        @functools.wraps(fn)
+        def call(*args, **kwargs):
+            chosen = few if num_path_steps(*args, **kwargs) < _MANY else many
+            return chosen(*args, **kwargs)
+
+        return call
+
+    return decorate
+
+
+def is_outermost() -> bool:
+    """Whether what is called now is run, and not traced or transformed."""
+    now = get_opaque_trace_state(convention="jaxbridge")
+    with jax.core.eval_context():
+        return now == get_opaque_trace_state(convention="jaxbridge")
+
+
+def _program(fn: Callable, **options: Any) -> Callable:
+    @eqx.filter_jit(**options)
     @functools.wraps(fn)
     def program(*args, **kwargs):
         return fn(*with_keys_written_out(args), **with_keys_written_out(kwargs))
 
-    @functools.wraps(fn)
-    def call(*args, **kwargs):
-        mind_memory_maps(lambda: is_traced(args, kwargs))
-        return program(*args, **kwargs)
-
-    return call
+    return program

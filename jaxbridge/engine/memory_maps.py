@@ -17,7 +17,7 @@ _NEAR, _TOO_NEAR = 0.75, 0.9
 _SECONDS = 1.0
 
 
-def mind_memory_maps(is_tracing: Callable[[], bool]) -> None:
+def mind_memory_maps(is_outermost: Callable[[], bool]) -> None:
     """Warn where compiled programs have taken three quarters of the memory maps that there are, and
     drop them all where it is nine tenths: to compile again is better than to end. Not in the midst
     of tracing."""
@@ -25,7 +25,7 @@ def mind_memory_maps(is_tracing: Callable[[], bool]) -> None:
     if not most or num <= _NEAR * most:
         return
     what_is_done = "beyond nine tenths they will be dropped"
-    if num > _TOO_NEAR * most and not is_tracing():
+    if num > _TOO_NEAR * most and is_outermost():
         jax.clear_caches()
         _num_maps.cache_clear()
         what_is_done = "they were dropped, and what is called again will be compiled again"

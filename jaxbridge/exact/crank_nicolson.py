@@ -26,7 +26,7 @@ from ..engine.checks import (
     is_traced,
     nondifferentiable,
 )
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_for, compiled_sooner
 from ..engine.doors import door
 from ..engine.keys import split_each
 from ..engine.progress import metered_scan
@@ -107,7 +107,7 @@ def crank_nicolson(
     return Kernel(init, step)
 
 
-@compiled
+@compiled_sooner
 def _init(
     keys: Key[Array, " I"],
     paths: Float[Array, "I points d"] | None,
@@ -127,7 +127,7 @@ def _init(
     return CrankNicolsonState(paths, noise, _finite(log_weights), log_halving)
 
 
-@compiled
+@compiled_sooner
 def _step(rng_key, state, model, proposal, intervals, beta):
     model, intervals = nondifferentiable((model.prepared(), intervals))
     dynamics = model.forward(intervals.start[0])
@@ -163,7 +163,7 @@ def _move(
     return jax.tree.map(choose, candidate, state), info
 
 
-@compiled
+@compiled_for(lambda key, model, proposal, problem, num, *_, beta: problem.num_path_steps(num))
 def run_crank_nicolson(
     key: Key[Array, ""],
     model: Diffusion,

@@ -15,7 +15,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_for
 from ..engine.doors import door
 from ..engine.pareto import is_reliable, pareto_k
 from ..engine.throwing import throw_where_incomplete
@@ -157,7 +157,7 @@ def transition_log_density(
     )
 
 
-@compiled
+@compiled_for(lambda key, model, proposal, problem, num, *_: problem.num_path_steps(num))
 def estimate_log_density(
     key: Key[Array, ""],
     model: Diffusion,

@@ -32,7 +32,7 @@ from ..engine.averages import (
     weighted_mean,
 )
 from ..engine.checks import Numbers, check_count, check_key
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_for
 from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.pareto import is_reliable, pareto_k
@@ -217,7 +217,7 @@ def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
     )
 
 
-@compiled
+@compiled_for(lambda key, model, pairs, bridges, search: bridges.paths.size)
 def _weigh_bridges(key, model, pairs, bridges, search):
     paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
     ends, durations = paths[:, -1], durations_of(bridges)
@@ -312,7 +312,7 @@ def sample_weighted_bridges(
     return _or_throw(weighted, model) if throw else weighted
 
 
-@compiled
+@compiled_for(lambda key, model, proposal, problem, num, *_: problem.num_path_steps(num))
 def _sample_weighted(
     key: Key[Array, ""],
     model: Diffusion,

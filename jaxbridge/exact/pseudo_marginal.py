@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_key, nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_for, compiled_sooner
 from ..engine.doors import door
 from ..engine.keys import split_each
 from ..engine.pareto import pareto_k
@@ -97,14 +97,14 @@ def pseudo_marginal(
     return Kernel(init, step)
 
 
-@compiled
+@compiled_sooner
 def _draw_state(rng_key, model, proposal, intervals, num_steps):
     model, intervals = nondifferentiable((model.prepared(), intervals))
     drawn = proposal.draw(rng_key[None, None], model, intervals, num_steps, None, False)
     return _first(drawn), drawn.num_simulated[0, 0]
 
 
-@compiled
+@compiled_sooner
 def _reweigh_state(rng_key, paths, model, proposal, intervals, num_steps):
     model, intervals, paths = nondifferentiable((model.prepared(), intervals, paths))
     return _first(proposal.reweigh(rng_key[None], model, intervals, paths))
@@ -114,7 +114,7 @@ def _first(drawn: WeightedPaths) -> PseudoMarginalState:
     return PseudoMarginalState(drawn.paths[0, 0], drawn.log_weights[0, 0], drawn.truncated[0, 0])
 
 
-@compiled
+@compiled_sooner
 def _pseudo_marginal_step(rng_key, state, *setting):
     draw_key, accept_key = jax.random.split(rng_key)
     candidate, num_simulated = _draw_state(draw_key, *setting)
@@ -125,7 +125,7 @@ def _pseudo_marginal_step(rng_key, state, *setting):
     return kept, PseudoMarginalInfo(rate, accepted, candidate.log_weight, num_simulated)
 
 
-@compiled
+@compiled_for(lambda key, model, proposal, problem, num, *_: problem.num_path_steps(num))
 def run_pseudo_marginal(
     key: Key[Array, ""],
     model: Diffusion,

@@ -28,7 +28,7 @@ from ..coupling import (
 )
 from ..engine.batch_size import default_num_lanes, most_lanes
 from ..engine.checks import Numbers, check_key, nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_for, compiled_sooner
 from ..engine.doors import door
 from ..engine.keys import split_each
 from ..engine.lanes import over_lanes, over_points
@@ -107,7 +107,7 @@ def renewal(
     return Kernel(init, step)
 
 
-@compiled
+@compiled_sooner
 def _renewal_step(rng_key, state, model, pairs, intervals):
     everything = jnp.ones(1, bool)
     model, intervals, path = nondifferentiable((model.prepared(), intervals, state.position))
@@ -226,7 +226,7 @@ class _Runner(NamedTuple):
         return jnp.where(self.head[:, None, None], first, segments.ends[before])
 
 
-@compiled
+@compiled_for(lambda key, model, proposal, problem, num, *_: problem.num_path_steps(num))
 def run_renewal(
     key: Key[Array, ""],
     model: Diffusion,
@@ -348,7 +348,7 @@ def propose_paths(
     return find_bridges(keys, inputs, active, num_steps, None, search)
 
 
-@compiled
+@compiled_sooner
 def first_paths(
     keys: Key[Array, " I"],
     model: Diffusion,

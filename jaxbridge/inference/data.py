@@ -19,7 +19,7 @@ from ..engine.checks import (
     steps_of_size,
     time_steps,
 )
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
@@ -126,7 +126,7 @@ def _check_state_space(model: Diffusion, observations: Array) -> None:
         )
 
 
-@compiled
+@compiled_sooner
 def _inside(model: Diffusion, observations: Float[Array, "n d"]) -> Bool[Array, " n"]:
     """At which points coefficients and stationary density are finite."""
 

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.progress import metered_scan
 from ..models.diffusion import Diffusion
@@ -281,7 +281,7 @@ class _Sampler(eqx.Module):
         return self.augmentation.log_step_error(model, state.paths)
 
 
-@compiled
+@compiled_sooner
 def _run(
     key: Key[Array, ""],
     sampler: _Sampler,

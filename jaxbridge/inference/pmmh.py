@@ -28,7 +28,7 @@ from ..engine.checks import (
     check_key,
     nondifferentiable,
 )
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.linalg import matvec
@@ -358,7 +358,7 @@ class _Sampler(eqx.Module):
         return chain._replace(root=root), info
 
 
-@compiled
+@compiled_sooner
 def _run(
     key: Key[Array, ""],
     sampler: _Sampler,

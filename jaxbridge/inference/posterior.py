@@ -11,7 +11,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import check_count, is_traced
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..schemes import StepError, dominates
 from .parameters import Parameters, init_vectors
@@ -178,7 +178,7 @@ def step_errors_of_some(
     return lax.cond(called_for, function, lambda _: jnp.full_like(shape, jnp.nan), state)
 
 
-@compiled
+@compiled_sooner
 def first_states(start: Callable, key: Key[Array, ""], state: PyTree) -> Any:
     """The states that chains start from: key number 0 is theirs, and iterations have the others."""
     return over_chains(start, jax.random.fold_in(key, 0), state)

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import proper
 from ..engine.checks import nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.keys import key_for
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
@@ -164,7 +164,7 @@ class RecordSampler(eqx.Module):
         return completion.coarse_log_weight(state.theta, noise) - log_weight
 
 
-@compiled
+@compiled_sooner
 def sample_records(
     key: Key[Array, ""],
     parameters: Parameters,

@@ -36,7 +36,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import all_finite_leaves, nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.progress import metered_scan
 from ..records import Records, tuned
@@ -163,7 +163,7 @@ def _swept(
     return _Chains(paths, log_scales), taken[..., 0]
 
 
-@compiled
+@compiled_sooner
 def _approximate(
     key: Key[Array, ""], completion: RecordPaths, search: Search, theta: Float[Array, " p"]
 ) -> tuple[Float[Array, "n p"], _Chains, SearchInfo]:
@@ -211,7 +211,7 @@ def _mean_log_weight(
     return jnp.sum(jnp.where(good, each, 0)) / jnp.maximum(jnp.sum(good.astype(each.dtype)), 1)
 
 
-@compiled
+@compiled_sooner
 def _draws_at(
     key: Key[Array, ""],
     completion: RecordPaths,

@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
 from ..records import (
     Guidance,
@@ -205,7 +205,7 @@ def no_paths(records: Records) -> tuple[Float[Array, "R points d"], Float[Array,
     return points, jnp.zeros((records.number, 2, num_blocks), points.dtype)
 
 
-@compiled
+@compiled_sooner
 def as_record_paths(
     parameters: Parameters, records: Records, theta: Float[Array, " p"]
 ) -> RecordPaths:

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import Numbers, check_count, nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.pareto import pareto_k
 from ..engine.progress import metered_scan
@@ -221,7 +221,7 @@ def _draw(
     return _Bridges(drawn.log_weights, drawn.truncated, *derivatives, *halvings)
 
 
-@compiled
+@compiled_sooner
 def _of_block(
     key: Key[Array, ""],
     parameters: Parameters,

@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractProposal, Budget, as_proposal, choice_between, guided_candidates
@@ -179,7 +179,7 @@ def simulated(
     return over_intervals(blocks, made)
 
 
-@compiled
+@compiled_sooner
 def step_error_of_score(
     key: Key[Array, ""],
     parameters: Parameters,
@@ -281,7 +281,7 @@ class _Ascent(NamedTuple):
     done: Bool[Array, ""]
 
 
-@compiled
+@compiled_sooner
 def newton_ascent(
     key: Key[Array, ""],
     parameters: Parameters,
@@ -344,7 +344,7 @@ def newton_ascent(
     return Maximum(last.theta, made, found)
 
 
-@compiled
+@compiled_sooner
 def stochastic_ascent(
     key: Key[Array, ""],
     parameters: Parameters,

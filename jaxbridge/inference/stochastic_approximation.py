@@ -20,7 +20,7 @@ import optax
 from jaxtyping import Array, Float, Int, Key, PyTree
 
 from ..engine.checks import all_finite_leaves, nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.linalg import any_solve
 from ..engine.progress import metered_scan
 from .augmentation import Augmentation
@@ -85,7 +85,7 @@ class Search(NamedTuple):
     progress_meter: diffrax.AbstractProgressMeter | None
 
 
-@compiled
+@compiled_sooner
 def approximate(
     key: Key[Array, ""],
     parameters: Parameters,

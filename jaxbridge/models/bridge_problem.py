@@ -52,6 +52,10 @@ class BridgeProblem(eqx.Module):
     def num_intervals(self) -> int:
         return self.intervals.start.shape[0]
 
+    def num_path_steps(self, num_bridges: int) -> int:
+        """The steps of so many paths of each interval."""
+        return num_bridges * self.num_intervals * self.num_steps
+
     @property
     def like(self) -> Float[Array, " d"]:
         """A point, of which only shape and dtype count."""

@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import is_traced
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.keys import key_for
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import Intervals
@@ -55,6 +55,10 @@ class _Seen(NamedTuple):
     num_simulated: Int[Array, " I"]
 
 
+def _rate(seen: _Seen, seconds: Float[Array, "..."]) -> Float[Array, "..."]:
+    return value_rates(seen.efficiency, seconds, seen.step_error, seen.pareto_k)
+
+
 class _Pilot(NamedTuple):
     """A candidate, prepared; its pilot run, if there was one, and what that gave; and the seconds
     per path that it should take."""
@@ -63,11 +67,6 @@ class _Pilot(NamedTuple):
     run: Callable[[], Any] | None
     seen: _Seen
     seconds: Float[Array, " I"]
-
-    @property
-    def rate(self) -> Float[Array, " I"]:
-        efficiency, step_error, shape, _ = self.seen
-        return value_rates(efficiency, self.seconds, step_error, shape)
 
 
 def run_pilots(
@@ -86,15 +85,13 @@ def run_pilots(
     best = jnp.zeros(num_intervals, intervals.start.dtype)
     pilots = []
     for i, candidate in enumerate(candidates):
-        pilot_key = key_for(f"pilot {i}", key)
+        purpose = f"pilot {i}"
         pilots.append(
-            _run_pilot((key, pilot_key), model, candidate, intervals, num_steps, num_paths, best)
+            _run_pilot(key, purpose, model, candidate, intervals, num_steps, num_paths, best)
         )
-        best = jnp.fmax(best, pilots[-1].rate)
-    seconds = jnp.stack(_measured(pilots, best) if timed else [p.seconds for p in pilots])
-    seen: _Seen = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(p.seen for p in pilots))
-    rates = value_rates(seen.efficiency, seconds, seen.step_error, seen.pareto_k)
-    chosen = jnp.argmax(jnp.where(jnp.isnan(rates), -1, rates), axis=0).astype(jnp.int32)
+        best = _better(best, pilots[-1].seen, pilots[-1].seconds)
+    seconds = _measured(pilots, best) if timed else [pilot.seconds for pilot in pilots]
+    seen, seconds, chosen = _compared([pilot.seen for pilot in pilots], seconds)
     used = range(len(candidates)) if is_traced(chosen) else np.unique(chosen).tolist()
     return Choice(
         tuple(pilot.candidate for pilot in pilots),
@@ -107,8 +104,26 @@ def run_pilots(
     )
 
 
+@compiled_sooner
+def _better(best: Float[Array, " I"], seen: _Seen, seconds: Float[Array, " I"]):
+    """The best rate of each interval so far."""
+    return jnp.fmax(best, _rate(seen, seconds))
+
+
+@compiled_sooner
+def _compared(seen: list[_Seen], seconds: list[Float[Array, " I"]]):
+    """What was seen of all candidates, their seconds, and which is best in each interval."""
+    stacked, seconds = jax.tree.map(
+        lambda *leaves: jnp.stack(leaves), *zip(seen, seconds, strict=True)
+    )
+    rates = _rate(stacked, seconds)
+    chosen = jnp.argmax(jnp.where(jnp.isnan(rates), -1, rates), axis=0).astype(jnp.int32)
+    return stacked, seconds, chosen
+
+
 def _run_pilot(
-    keys: tuple[Key[Array, ""], Key[Array, ""]],
+    key: Key[Array, ""],
+    purpose: str,
     model: Diffusion,
     candidate: AbstractSingleProposal,
     intervals: Intervals,
@@ -125,20 +140,21 @@ def _run_pilot(
 
     seconds, active, called_for = look_at(candidate)
     if called_for:
-        candidate = candidate.prepared(keys[0], model, intervals, num_steps)
+        candidate = candidate.prepared(key, model, intervals, num_steps)
         seconds, active, called_for = look_at(candidate)
     if not called_for:
         nothing = jnp.full_like(best, jnp.nan)
         seen = _Seen(nothing, nothing, nothing, jnp.zeros(len(best), jnp.int32))
         return _Pilot(candidate, None, seen, seconds)
     arguments = (model, candidate, intervals, active, num_steps, num_pilot)
-    run = functools.partial(_look, keys[1], *arguments)
+    run = functools.partial(_look, key, purpose, *arguments)
     return _Pilot(candidate, run, run(), seconds)
 
 
-@compiled
+@compiled_sooner
 def _look(
     key: Key[Array, ""],
+    purpose: str,
     model: Diffusion,
     candidate: AbstractSingleProposal,
     intervals: Intervals,
@@ -148,7 +164,7 @@ def _look(
 ) -> _Seen:
     """What a pilot run shows of each active interval, NaN of the others."""
     candidate = candidate.for_pilot()
-    keys = jax.random.split(key, (len(intervals.duration), num_pilot))
+    keys = jax.random.split(key_for(purpose, key), (len(intervals.duration), num_pilot))
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
     model = model.prepared()
     drawn = candidate.draw(keys, model, intervals, num_steps, nothing, True, active)
@@ -185,7 +201,8 @@ def _measured(pilots: list[_Pilot], best: Float[Array, " I"]) -> list[Float[Arra
     """Seconds per path by the clock, where that could change the choice; else by rule."""
 
     def contends(pilot: _Pilot) -> bool:
-        return pilot.run is not None and bool(np.any(pilot.rate * _CONTENDS > best))
+        rate = _rate(pilot.seen, pilot.seconds)
+        return pilot.run is not None and bool(np.any(rate * _CONTENDS > best))
 
     contenders = [pilot for pilot in pilots if contends(pilot)]
     if len(contenders) < 2:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import proper
 from ..engine.checks import without_derivatives
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.lanes import over_lanes, over_points
 from ..engine.linalg import sum_of_many
 from ..engine.recursion import recursion
@@ -207,7 +207,7 @@ class _Search(NamedTuple):
     over: Bool[Array, ""]
 
 
-@compiled  # a program of its own, which all who read the record share
+@compiled_sooner  # a program of its own, which all who read the record share
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     """Along the path of the extended Kalman filter, and then of the path that is guided without
     noise; both begin at a likely point where ν is not normal. The points have no derivatives, and

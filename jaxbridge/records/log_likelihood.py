@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.pareto import most_reliable
@@ -195,7 +195,7 @@ def or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
     return throw_where(made, "value", model, faults)
 
 
-@compiled
+@compiled_sooner
 def _told(
     records: Records, grids: Filtered, rate: Float[Array, ""], num_weights: int
 ) -> LogLikelihood:
@@ -278,7 +278,7 @@ def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Arr
     return points[:-1], points[1:], gaps
 
 
-@compiled
+@compiled_sooner
 def _filtered(
     key: Key[Array, ""], grids: list[Records], guides: list[Guidance], R: int, P: int
 ) -> tuple[Filtered, Float[Array, ""]]:

@@ -24,7 +24,7 @@ from ..engine.checks import (
     steps_of_size,
     time_steps,
 )
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 
 # What the end of a segment costs, in steps.
 _STEPS_PER_SEGMENT = 4
@@ -194,7 +194,7 @@ def _checked(
     return times, gaps, values
 
 
-@compiled
+@compiled_sooner
 def _cut(
     times: Float[Array, " n"],
     gaps: Float[Array, " gaps"],

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.checks import Numbers
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
 from .guided_record import linearised
@@ -92,7 +92,7 @@ def as_record_problems(
 
 
 # One program each, where there would be one for every array.
-@compiled
+@compiled_sooner
 def _stacked(records: list[Record]) -> Record:
     """Records of one length, with an axis in front."""
     num_segments = max(len(record.dt) for record in records)
@@ -101,17 +101,17 @@ def _stacked(records: list[Record]) -> Record:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *same)
 
 
-@compiled
+@compiled_sooner
 def _coarsened(stacked: Record, level: int) -> Record:
     return jax.vmap(lambda record: record.coarsened(level))(stacked)
 
 
-@compiled
+@compiled_sooner
 def _without_axis(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
-@compiled
+@compiled_sooner
 def _with_axis(tree: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[None], tree)
 

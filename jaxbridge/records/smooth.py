@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import PathFunction
 from ..engine.checks import Numbers, check_count, check_key
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.doors import door
 from ..engine.progress import metered_scan
@@ -230,7 +230,7 @@ def or_throw(smoothed: Smoothed, model: Diffusion) -> Smoothed:
     return throw_where(smoothed, "paths", model, faults)
 
 
-@compiled
+@compiled_sooner
 def _guided_paths(
     key: Key[Array, ""], problem: RecordProblem, made: Linearised, num_chains: int
 ) -> Float[Array, "chains points d"]:
@@ -246,7 +246,7 @@ def _guided_paths(
     return jax.vmap(first)(jax.random.split(key, num_chains))
 
 
-@compiled
+@compiled_sooner
 def _smooth(
     key: Key[Array, ""],
     problem: RecordProblem,
@@ -283,7 +283,7 @@ def _smooth(
     return Draws(problem.record.grid(), drawn, share, stuck, jnp.int32(0))
 
 
-@compiled
+@compiled_sooner
 def _noise_varies(problem: RecordProblem, path: Float[Array, "K d"]) -> Bool[Array, ""]:
     """Whether the noise of a step depends on the state in leading order: σ does, or where it has
     fewer columns than rows ∇α σ, by which the drift leads it on, along this path."""
@@ -300,7 +300,7 @@ def _noise_varies(problem: RecordProblem, path: Float[Array, "K d"]) -> Bool[Arr
     return jnp.max(jnp.ptp(each, axis=0)) > _CONSTANT * jnp.max(jnp.abs(each))
 
 
-@compiled
+@compiled_sooner
 def _log_halving(
     problem: RecordProblem, paths: Float[Array, "chains n K d"]
 ) -> Float[Array, "chains n"]:

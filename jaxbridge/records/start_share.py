@@ -12,7 +12,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
 from ..engine.averages import proper
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
 from .cover import cover, covered_start
 from .guided_record import correction, guided
@@ -23,7 +23,7 @@ from .segments import split_first
 _NUM_DRAWS = 1024
 
 
-@compiled
+@compiled_sooner
 def start_share(
     problem: RecordProblem, model: Diffusion, points: Float[Array, "points d"]
 ) -> Float[Array, ""]:

@@ -31,7 +31,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..coupling import Coupling, Stationary, with_start_law
 from ..engine.averages import proper
 from ..engine.checks import is_traced, nondifferentiable
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..engine.keys import key_for
 from ..engine.lanes import over_points
 from ..engine.linalg import any_cholesky, any_inverse, dot, semidefinite_cholesky, solve_lower
@@ -340,7 +340,7 @@ def _normal_laws(
     return NormalLaws(*jax.vmap(of_one)(scalars))
 
 
-@compiled
+@compiled_sooner
 def _run(
     key: Key[Array, ""],
     sampler: StateSampler,

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.checks import all_finite_leaves, is_traced
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled_sooner
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion, check_invertible
 from .base import AbstractScheme
@@ -46,7 +46,7 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
             )
 
 
-@compiled
+@compiled_sooner
 def _coefficients(model: Diffusion, points: Float[Array, "n d"], with_slopes: bool):
     """α and σ at the points, a constant σ only once; ∂σ where it is asked for and varies."""
     varies = model.sigma_varies(points[0])

@@ -6,10 +6,14 @@ import operator
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax import lax
 
+from jaxbridge.engine.compiled import compiled, compiled_sooner
 
-def test_small_loops_are_compiled_correctly(x64):
+
+@pytest.mark.parametrize("compiled", [compiled, compiled_sooner])
+def test_small_loops_are_compiled_correctly(compiled, x64):
     """From 0.11.1 to 0.12.0.1 jaxlib's CPU compiler makes one function of a small loop, in which
     the tangent here is written over while the scalars that it is made of are still read: a
     derivative 20 % off. Where this fails, so may whatever runs in small loops, as records do:
@@ -28,7 +32,7 @@ def test_small_loops_are_compiled_correctly(x64):
         return lax.fori_loop(0, 2, lambda _, matrix: normed(matrix), matrix)
 
     def slope(function):
-        return jax.jit(lambda x: jax.jvp(function, (x,), (jnp.sin(x),))[1])(matrix)
+        return compiled(lambda x: jax.jvp(function, (x,), (jnp.sin(x),))[1])(matrix)
 
     twice = slope(lambda matrix: normed(normed(matrix)))
     np.testing.assert_allclose(slope(twice_by_a_loop), twice, atol=1e-12)
