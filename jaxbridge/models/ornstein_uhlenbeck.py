@@ -84,7 +84,7 @@ def ornstein_uhlenbeck(
     if B.ndim != 2 or B.shape[0] != B.shape[1]:
         raise ValueError(f"`B` must be a square matrix, shape (d, d); got {B.shape}.")
     d = B.shape[0]
-    mean = jnp.zeros(d, B.dtype) if mean is None else as_floating("mean", mean)
+    mean = jnp.asarray(np.zeros(d, B.dtype)) if mean is None else as_floating("mean", mean)
     if mean.shape != (d,):
         raise ValueError(f"`mean` must have shape ({d},) to fit `B`; got {mean.shape}.")
     if not is_traced(mean) and not np.all(np.isfinite(mean)):
