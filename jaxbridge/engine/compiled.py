@@ -15,6 +15,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+from jax.core import eval_context
 from jax.extend.core import get_opaque_trace_state
 
 from .generator import with_keys_written_out
@@ -75,7 +76,7 @@ def compiled_for(num_path_steps: Callable[..., int]) -> Callable[[Callable], Cal
 def is_outermost() -> bool:
     """Whether what is called now is run, and not traced or transformed."""
     now = get_opaque_trace_state(convention="jaxbridge")
-    with jax.core.eval_context():
+    with eval_context():
         return now == get_opaque_trace_state(convention="jaxbridge")
 
 

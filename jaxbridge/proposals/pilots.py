@@ -113,12 +113,11 @@ def _better(best: Float[Array, " I"], seen: _Seen, seconds: Float[Array, " I"]):
 @compiled_sooner
 def _compared(seen: list[_Seen], seconds: list[Float[Array, " I"]]):
     """What was seen of all candidates, their seconds, and which is best in each interval."""
-    stacked, seconds = jax.tree.map(
-        lambda *leaves: jnp.stack(leaves), *zip(seen, seconds, strict=True)
-    )
-    rates = _rate(stacked, seconds)
+    stacked: _Seen = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen)
+    of_all = jnp.stack(seconds)
+    rates = _rate(stacked, of_all)
     chosen = jnp.argmax(jnp.where(jnp.isnan(rates), -1, rates), axis=0).astype(jnp.int32)
-    return stacked, seconds, chosen
+    return stacked, of_all, chosen
 
 
 def _run_pilot(
