@@ -154,7 +154,7 @@ def hitting_counts(
     return _hitting_counts(key_for("hitting counts", key), model, coupling, bridges, search)
 
 
-@compiled_for(lambda key, model, coupling, bridges, search: bridges.paths.size)
+@compiled_for(lambda key, model, coupling, bridges, search: bridges.met.size * bridges.num_steps)
 def _hitting_counts(key, model, coupling, bridges, search):
     return counts_of(key, model, coupling, bridges, search)[0]
 

@@ -32,45 +32,32 @@ _MANY = 2_000_000
 
 def compiled(fn: Callable) -> Callable:
     """`fn`, compiled for each structure of its arguments; arrays in them are traced."""
-    program = _program(fn)
-
-    @functools.wraps(fn)
-    def call(*args, **kwargs):
-        mind_memory_maps(is_outermost)
-        return program(*args, **kwargs)
-
-    return call
+    return _compiled(fn, lambda *_, **__: False)
 
 
 def compiled_sooner(fn: Callable) -> Callable:
     """As `compiled`, for what takes longer to compile than to run."""
-    sooner, within = _program(fn, compiler_options=_SOONER), _program(fn)
-
-    @functools.wraps(fn)
-    def call(*args, **kwargs):
-        mind_memory_maps(is_outermost)
-        # JAX takes options for none but outermost programs.
-        program = sooner if is_outermost() and jax.default_backend() == "cpu" else within
-        return program(*args, **kwargs)
-
-    return call
+    return _compiled(fn, lambda *_, **__: True)
 
 
 def compiled_for(num_path_steps: Callable[..., int]) -> Callable[[Callable], Callable]:
     """As `compiled` where that many steps of paths, a function of `fn`'s arguments, are no fewer
     than some millions, and else as `compiled_sooner`."""
+    return lambda fn: _compiled(fn, lambda *args, **kwargs: num_path_steps(*args, **kwargs) < _MANY)
 
-    def decorate(fn: Callable) -> Callable:
-        few, many = compiled_sooner(fn), compiled(fn)
 
-        @functools.wraps(fn)
-        def call(*args, **kwargs):
-            chosen = few if num_path_steps(*args, **kwargs) < _MANY else many
-            return chosen(*args, **kwargs)
+def _compiled(fn: Callable, is_wanted_sooner: Callable[..., bool]) -> Callable:
+    fast, sooner = _program(fn), _program(fn, compiler_options=_SOONER)
 
-        return call
+    @functools.wraps(fn)
+    def call(*args, **kwargs):
+        mind_memory_maps(is_outermost)
+        # JAX takes options for none but outermost programs.
+        may_choose = is_outermost() and jax.default_backend() == "cpu"
+        program = sooner if may_choose and is_wanted_sooner(*args, **kwargs) else fast
+        return program(*args, **kwargs)
 
-    return decorate
+    return call
 
 
 def is_outermost() -> bool:

@@ -217,7 +217,7 @@ def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
     )
 
 
-@compiled_for(lambda key, model, pairs, bridges, search: bridges.paths.size)
+@compiled_for(lambda key, model, pairs, bridges, search: bridges.met.size * bridges.num_steps)
 def _weigh_bridges(key, model, pairs, bridges, search):
     paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
     ends, durations = paths[:, -1], durations_of(bridges)
