@@ -121,6 +121,7 @@ from .schemes.semi_implicit import SemiImplicit
 from .schemes.step_density import (
     AbstractStepDensity,
     EulerDensity,
+    HypoellipticDensity,
     ItoTaylorDensity,
     LinearStep,
     StepsFrom,
@@ -174,6 +175,7 @@ __all__ = [
     "Guided",
     "ResidualBridge",
     "EulerDensity",
+    "HypoellipticDensity",
     "ItoTaylorDensity",
     # Exact bridges, by Markov chains or weights.
     "sample_exact_bridges",

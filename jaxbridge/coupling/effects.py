@@ -63,7 +63,7 @@ def effects(
     if like.ndim != 1:
         raise ValueError(f"`at` must be one point, shape (d,); got {like.shape}.")
     invertible, depends_on_time = model.sigma_is_invertible(like), model.depends_on_time
-    noise_by_drift = decisions.noise_by_drift(invertible, model.sigma_varies(like))
+    noise_by_drift = decisions.noise_by_drift(invertible)
     time = decisions.time(depends_on_time)
     if not invertible:
         return decisions.without_pairs(noise_by_drift, time, "σ has fewer columns than rows")

@@ -67,12 +67,10 @@ def without_pairs(noise_by_drift: Effect, time: Effect, why: str) -> Effects:
     return Effects(**{name: of_records.get(name, nothing) for name in Effects._fields})
 
 
-def noise_by_drift(invertible: bool, sigma_varies: bool) -> Effect:
+def noise_by_drift(invertible: bool) -> Effect:
     """∫ (δ - s) ∇α σ dW in the part of the state that σ does not reach."""
     if invertible:
         return Effect(False, "σ reaches the whole state")
-    if sigma_varies:
-        return Effect(False, "σ depends on the state: Euler's steps move what σ reaches, no more")
     return Effect(True, "σ has fewer columns than rows: noise comes to the rest by the drift")
 
 

@@ -108,7 +108,7 @@ def innovations(
     - `num_steps`: steps between two times, by default 10; or `step_size`, how long a step may be.
     - `initial_time`: of `initial`, where that is before the first of `times`.
     - `density`: of the steps, by default `ItoTaylorDensity()` for constant σ, else
-        `EulerDensity()`.
+        `EulerDensity()`, or `HypoellipticDensity()` where σ has fewer columns than rows.
 
     **Returns:** `Innovations`, differentiable in parameters and noise.
 

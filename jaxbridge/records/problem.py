@@ -120,7 +120,7 @@ def problem_of(
     check_domain(model, observation, record)
     density = check_step_density(density)
     if density is None:
-        density = most_accurate_density(model.sigma_varies(like))
+        density = most_accurate_density(model.sigma_varies(like), model.sigma_is_invertible(like))
     return RecordProblem(model, record, observation, initial, density, dim)
 
 

@@ -52,6 +52,7 @@ from .relative_frame import (
 from .step_density import (
     AbstractStepDensity as AbstractStepDensity,
     EulerDensity as EulerDensity,
+    HypoellipticDensity as HypoellipticDensity,
     ItoTaylorDensity as ItoTaylorDensity,
     check_step_density as check_step_density,
     most_accurate_density as most_accurate_density,

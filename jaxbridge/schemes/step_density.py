@@ -22,8 +22,15 @@ coordinates of the state: with F = ∇α its noise is
     ∫_0^δ [I + (δ-s) F] σ dW_s = √δ (σ + ½δ Fσ) ζ_1 + δ^{3/2} / √12 Fσ ζ_2,    ζ ~ N(0, I),
 
 the strong scheme of order 1.5 (Kloeden & Platen, section 10.4; for hypoelliptic diffusions
-Ditlevsen & Samson 2019). Where coefficients depend on time they are taken in the middle of a step,
-which keeps both orders.
+Ditlevsen & Samson 2019). Such a σ that depends on the state adds L⁰σ (∫ s dW_s), with L⁰σ = ∇σ α:
+
+    √δ (σ + ½δ [Fσ + L⁰σ]) ζ_1 + δ^{3/2} / √12 [Fσ - L⁰σ] ζ_2,
+
+`HypoellipticDensity`. What is left out, ½ Σ ∇σ_k σ_j (ΔW_j ΔW_k - δ 1_jk), is not normal: O(δ)
+along a path, but O(δ²) where it vanishes, as where σ depends only on what noise does not reach at
+once.
+
+Where coefficients depend on time they are taken in the middle of a step, which keeps both orders.
 """
 
 from abc import abstractmethod
@@ -162,30 +169,70 @@ class ItoTaylorDensity(AbstractStepDensity):
         return StepsFrom(law, decay)
 
     def linear_step(self, F, V, dt):
-        identity = jnp.eye(F.shape[0], dtype=F.dtype)
-        integral = dt * identity + dt**2 / 2 * F
-        flow = matmul(F, V)
-        covariance = dt * V + dt**2 / 2 * (flow + flow.T) + dt**3 / 3 * matmul(flow, F.T)
-        return LinearStep(identity + matmul(F, integral), integral, covariance)
+        return _linear_ito_taylor(F, V, dt)
+
+
+class HypoellipticDensity(AbstractStepDensity):
+    """Itô's and Taylor's expansion for a σ(x) of fewer columns than rows, whose noise the drift
+    leads on within the step: O(δ) along a path, O(δ²) where noise does not change σ at once, as
+    where the noise of velocities depends on positions. Step errors are told as for O(δ). Where σ is
+    constant it is `ItoTaylorDensity`.
+
+    It calls for the first and second derivatives of the drift along the columns of σ, and for the
+    first of σ along the drift, by autodiff.
+
+    **Raises:** `ValueError`, when it is used, for a σ that has an inverse.
+
+    **Example:**
+
+    ```python
+    volatility = jb.integrated(jb.Diffusion(lambda x, p: 1 - x, lambda x, p: jnp.sqrt(x)))
+    proposal = jb.HypoellipticDensity()  # the default for records of such models
+    ```
+    """
+
+    order: ClassVar[int] = 1
+
+    def steps_from(self, dynamics, x):
+        if dynamics.sigma(x).invertible:
+            raise ValueError(
+                "`HypoellipticDensity` is for σ of fewer columns than rows, but this one has as "
+                "many: choose `ItoTaylorDensity()` for constant σ, else `EulerDensity()`."
+            )
+        return _degenerate_ito_taylor(dynamics, x)
+
+    def linear_step(self, F, V, dt):
+        return _linear_ito_taylor(F, V, dt)
+
+
+def _linear_ito_taylor(F, V, dt) -> LinearStep:
+    identity = jnp.eye(F.shape[0], dtype=F.dtype)
+    integral = dt * identity + dt**2 / 2 * F
+    flow = matmul(F, V)
+    covariance = dt * V + dt**2 / 2 * (flow + flow.T) + dt**3 / 3 * matmul(flow, F.T)
+    return LinearStep(identity + matmul(F, integral), integral, covariance)
 
 
 def check_step_density(density: AbstractStepDensity | None) -> AbstractStepDensity | None:
     """What the user gave as `density`; `None` leaves it to the model."""
     if not (density is None or isinstance(density, AbstractStepDensity)):
         raise TypeError(
-            f"`density` must be `EulerDensity()` or `ItoTaylorDensity()`; got {density!r}."
+            "`density` must be `EulerDensity()`, `ItoTaylorDensity()` or `HypoellipticDensity()`; "
+            f"got {density!r}."
         )
     return density
 
 
-def most_accurate_density(sigma_varies: bool) -> AbstractStepDensity:
+def most_accurate_density(sigma_varies: bool, invertible: bool = True) -> AbstractStepDensity:
     """That which the model has."""
-    return EulerDensity() if sigma_varies else ItoTaylorDensity()
+    if not sigma_varies:
+        return ItoTaylorDensity()
+    return EulerDensity() if invertible else HypoellipticDensity()
 
 
 def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
     """Euler's steps where σ has no inverse."""
-    drift, sigma = dynamics.drift(x), dynamics.sigma(x).as_matrix(x.shape[0], x.dtype)
+    drift, sigma = dynamics.drift(x), _matrix(dynamics, x)
 
     def law(dt):
         root = semidefinite_factor(root_of_length(dt) * sigma)
@@ -198,18 +245,22 @@ def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
 
 
 def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
-    """Those of Itô's and Taylor's expansion."""
+    """Those of Itô's and Taylor's expansion, but for ∇σ σ."""
     sigma, drift = dynamics.sigma(x), dynamics.drift(x)
     columns = columns_of(sigma, x)
     slopes, bends = zip(*[_along(dynamics.drift, x, column) for column in columns], strict=True)
     # Fα + ½ Σ_k ∂²α(σ_k, σ_k), and Fσ.
     bent = jax.jvp(dynamics.drift, (x,), (drift,))[1] + total(jnp.stack(bends)) / 2
-    direct, turned = jnp.stack(columns, axis=1), jnp.stack(slopes, axis=1)
+    direct, early = jnp.stack(columns, axis=1), jnp.stack(slopes, axis=1)
+    both, apart = early, early  # Fσ + L⁰σ and Fσ - L⁰σ, with L⁰σ = ∇σ α
+    if dynamics.sigma_varies:
+        late = jax.jvp(lambda y: _matrix(dynamics, y), (x,), (drift,))[1]
+        both, apart = early + late, early - late
 
     def law(dt):
         length = root_of_length(dt)
-        both = [direct + dt / 2 * turned, dt * np.sqrt(1 / 12).astype(x.dtype) * turned]
-        root = semidefinite_factor(length * jnp.concatenate(both, axis=1))
+        spread = [direct + dt / 2 * both, dt * np.sqrt(1 / 12).astype(x.dtype) * apart]
+        root = semidefinite_factor(length * jnp.concatenate(spread, axis=1))
         return DegenerateLaw(x + dt * drift + dt**2 / 2 * bent, root, dt)
 
     def decay(dt):
@@ -217,6 +268,10 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
         return jnp.eye(x.shape[0], dtype=x.dtype) + dt * F + dt**2 / 2 * matmul(F, F)
 
     return StepsFrom(law, decay)
+
+
+def _matrix(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, "d m"]:
+    return dynamics.sigma(x).as_matrix(x.shape[0], x.dtype)
 
 
 def _along(field, x: Float[Array, " d"], direction: Float[Array, " d"]):

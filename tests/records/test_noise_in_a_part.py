@@ -132,6 +132,45 @@ def test_orders_of_the_steps(x64):
         assert abs(made.value - chain) < 1e-6 * max(abs(chain), 1)
 
 
+SCALE = lambda position: 1 + jnp.tanh(position) / 2
+SPEEDS = {  # other coordinates of the speed, in which σ depends on the position, or on the speed
+    "position": (lambda x: x[1] * SCALE(x[0]), lambda y: y[1] / SCALE(y[0])),
+    "speed": (lambda x: 2 * jnp.sinh(x[1] / 2), lambda y: 2 * jnp.arcsinh(y[1] / 2)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("of, errors", [("position", (0.08, 0.02)), ("speed", (0.1, 0.06))])
+def test_orders_where_sigma_depends_on_the_state(of, errors, x64):
+    """The likelihood is that of other coordinates, in which the model is linear. Second order where
+    noise does not change σ at once; Euler's error is twenty times as large."""
+    case, start = oscillator(0.1), np.array([0.5, -0.2])
+    speed, back = SPEEDS[of]
+    there = lambda x: jnp.stack([x[0], speed(x)])
+    moved = jb.transform(case.model, there, lambda y: jnp.stack([y[0], back(y)])).model
+    times, values = 0.5 * np.arange(9), np.full((9, 1), np.nan)
+    law, step = (start, np.zeros((2, 2))), exact_step(case.A, case.V)
+    rng, state = np.random.default_rng(0), start
+    for i in range(1, 9):
+        decay, spread = step(0.5)
+        state = rng.multivariate_normal(decay @ state, spread)
+        values[i] = state[0] + 0.1 * rng.normal()
+    exact = kalman(step, times, values, case.matrix, case.noise, *law, 1).log_likelihood
+    options = {
+        "observation": jb.LinearGaussian(case.matrix, case.noise),
+        "initial": there(jnp.asarray(start)),
+        "num_particles": 1000,
+        "num_filters": 8,
+    }
+    for num_steps, most in zip((4, 8), errors, strict=True):
+        made = jb.log_likelihood(KEY, moved, times, values, num_steps=num_steps, **options)
+        assert abs(made.value - exact) < most + 5 * made.standard_error
+        assert made.standard_error < most
+    euler = jb.EulerDensity()
+    made = jb.log_likelihood(KEY, moved, times, values, num_steps=8, density=euler, **options)
+    assert abs(made.value - exact) > 0.9
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case, noise", [(integral, 0.03), (oscillator, 3e-4)])
 def test_smoothed_paths_are_those_of_rauch_tung_and_striebel(case, noise, x64):

@@ -327,3 +327,27 @@ def test_guides_along_a_path_that_explodes_are_finite(precision):
     )  # fmt: skip
     assert estimate.num_met == 100
     assert estimate.effective_sample_size > 5
+
+
+def test_noise_that_grows_with_a_clock(x64):
+    """dC = dt, dX = (1 + rC) dW, dY = X dt: var X = ∫ (1 + rs)² ds and, but for δ³ and beyond,
+    cov(X, Y) = ½δ² and var Y = ⅓δ³."""
+    rate, dt = 0.7, 0.1
+    drift = lambda x, p: jnp.stack([jnp.ones(()), jnp.zeros(()), x[1]])
+    sigma = lambda x, p: (1 + rate * x[0]) * jnp.array([[0.0], [1.0], [0.0]])
+    x = jnp.array([0.0, 0.3, -0.2])
+    dynamics = jb.Diffusion(drift, sigma).forward(x)
+    law = jb.HypoellipticDensity().steps_from(dynamics, x).law(dt)
+    covariance = np.asarray(law.root @ law.root.T)
+    np.testing.assert_allclose(law.mean, [dt, 0.3, -0.2 + 0.3 * dt])
+    assert covariance[0, 0] == 0
+    np.testing.assert_allclose(covariance[1, 1], ((1 + rate * dt) ** 3 - 1) / (3 * rate))
+    assert abs(covariance[1, 2] - dt**2 / 2) < rate * dt**3 / 2
+    assert abs(covariance[2, 2] - dt**3 / 3) < rate * dt**4
+
+    constant = jb.Diffusion(drift, sigma(x, None)).forward(x)
+    each = [
+        density.steps_from(constant, x).law(dt)
+        for density in (jb.HypoellipticDensity(), jb.ItoTaylorDensity())
+    ]
+    np.testing.assert_array_equal(each[0].root, each[1].root)
