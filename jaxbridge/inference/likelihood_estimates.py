@@ -27,6 +27,15 @@ from .record_paths import GuidedRecords, guided_near, on_both_grids
 _FEWEST_FILTERS, _FEWEST_PARTICLES = 8, 128
 
 
+class Guide(NamedTuple):
+    """What guides the filters of R records: the points along which each is linearised, on the grid
+    and on one of half as many steps, and the rate at which it forgets."""
+
+    fine: Float[Array, "R points d"]
+    coarse: Float[Array, "R coarse_points d"]
+    rate: Float[Array, ""]
+
+
 class Estimate(NamedTuple):
     """log of an unbiased estimate of the likelihood, -inf where there is none, with its variance
     and its step error; and how many of its weights were cut off."""
@@ -42,7 +51,7 @@ class AbstractLikelihood(eqx.Module):
 
     A chain calls `estimate` once in each iteration, at the parameters that it proposes, and holds
     on to what it gets until a proposal is accepted. While it warms up it asks for another of the
-    kind, by `near`, wherever that changes anything (`guided`). Of some draws it asks for the step
+    kind, by `near`, wherever there is a `guide`. Of some draws it asks for the step
     error: it is that of the estimate it holds where `tells_step_error`, and else is worked out by
     `log_step_error`. All of it is traced inside one compiled loop, and under `vmap` over chains.
     """
@@ -71,8 +80,13 @@ class AbstractLikelihood(eqx.Module):
 
     @property
     @abstractmethod
-    def guided(self) -> bool:
-        """Whether `near` changes anything."""
+    def guide(self) -> Guide | None:
+        """What `near` finds anew, for one that goes on with the same; `None` where that is
+        nothing."""
+
+    @abstractmethod
+    def guided_by(self, guide: Guide | None) -> "AbstractLikelihood":
+        """The same with what another has as `guide`."""
 
     @property
     @abstractmethod
@@ -116,8 +130,11 @@ class TransitionLikelihood(AbstractLikelihood):
         return self
 
     @property
-    def guided(self):
-        return False
+    def guide(self):
+        return None
+
+    def guided_by(self, guide):
+        return self
 
     @property
     def tells_step_error(self):
@@ -167,8 +184,12 @@ class RecordLikelihood(AbstractLikelihood):
         return RecordLikelihood(fine, coarse, rate_for_several(pilots, records, P), P)
 
     @property
-    def guided(self):
-        return True
+    def guide(self):
+        return Guide(self.fine.points, self.coarse.points, self.rate)
+
+    def guided_by(self, guide):
+        grids = self.fine._replace(points=guide.fine), self.coarse._replace(points=guide.coarse)
+        return RecordLikelihood(*grids, guide.rate, self.num_particles)
 
     @property
     def tells_step_error(self):

@@ -42,6 +42,7 @@ from .data import Problem, as_problem
 from .likelihood_estimates import (
     AbstractLikelihood,
     Estimate,
+    Guide,
     RecordLikelihood,
     TransitionLikelihood,
 )
@@ -84,6 +85,7 @@ class PMMHState(NamedTuple):
         the random numbers of those that come after.
     - `proposals`: of the paths, decided, for each group of intervals with one number of steps; none
         for records that were seen with noise or in part.
+    - `guide`: what guides the filters of such records, and was found in the warm-up; else `None`.
     """
 
     theta: Float[Array, "*chains p"]
@@ -93,6 +95,7 @@ class PMMHState(NamedTuple):
     root: Float[Array, "*chains p p"]
     num_done: Int[Array, ""]
     proposals: tuple[AbstractWeightedProposal, ...]
+    guide: Guide | None
 
 
 class PMMHPosterior(AbstractPosterior):
@@ -237,7 +240,8 @@ def pmmh(
         def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
             grids = unguided(records), unguided(records.coarsened())
             no_rate = jnp.zeros((), unknown.dtype)  # stands in until there are pilots
-            return RecordLikelihood(*grids, no_rate, num_proposals)
+            likelihood = RecordLikelihood(*grids, no_rate, num_proposals)
+            return likelihood if state is None else _guided_by_state(likelihood, state)
 
     log_prior = as_log_prior(prior, parameters, unknown)
     root = first_root(covariance, log_prior, unknown)
@@ -272,6 +276,20 @@ def _blocks_of_state(
     return tuple(map(block_of, groups, state.proposals))
 
 
+def _guided_by_state(likelihood: AbstractLikelihood, state: PMMHState) -> AbstractLikelihood:
+    """With the guide of earlier draws.
+
+    **Raises:** `ValueError` where that was for other records.
+    """
+    shapes = [jax.tree.map(jnp.shape, each) for each in (state.guide, likelihood.guide)]
+    if shapes[0] != shapes[1]:
+        raise ValueError(
+            "`init` is a state of draws from other records: go on with the same `times`, "
+            "`num_steps` and `step_size`, or start anew from `init=` unknown parameters."
+        )
+    return likelihood.guided_by(state.guide)
+
+
 class PMMHInfo(NamedTuple):
     """Counted in one step: whether it was accepted; was refused because no estimate was to be had;
     and how many weights of the estimate were cut off."""
@@ -282,9 +300,11 @@ class PMMHInfo(NamedTuple):
 
 
 class _Run(NamedTuple):
-    """A chain, how many iterations it has done, and what was counted in those of this call."""
+    """A chain, what guides its likelihood, how many iterations it has done, and what was counted in
+    those of this call."""
 
     chain: _Chain
+    guide: Guide | None
     num_done: Int[Array, ""]
     counted: PMMHInfo
 
@@ -299,8 +319,6 @@ class _Sampler(eqx.Module):
     def near(self, key: Key[Array, ""], chain: _Chain) -> "_Sampler":
         """With what estimates best where the first chain is, and not much worse where any of them
         may come to."""
-        if not self.likelihood.guided:
-            return self
         walk_key, pilot_key = jax.random.split(key)
         around = self._likely(walk_key, chain)
         theta = first_chain(chain.theta)
@@ -372,17 +390,20 @@ def _run(
     num_warmup, num_iterations, thin = size
     # The warm-up counts in draws, too, so that there is one loop.
     skipped = -(-num_warmup // thin)
-    state = _not_begun(*start) if fresh else _going_on(start)
+    guide = sampler.likelihood.guide
+    state = _not_begun(*start, guide) if fresh else _going_on(start)
 
     def begin(run, i):
-        pilot_key = jax.random.fold_in(key_for("pilots", key), run.num_done)
-        near = sampler.near(pilot_key, run.chain)
         if not fresh:
-            return run, near
+            return run, sampler
+        near = sampler
+        if guide is not None:
+            pilot_key = jax.random.fold_in(key_for("pilots", key), run.num_done)
+            near = sampler.near(pilot_key, run.chain)
         # An estimate by the guide before may be a lucky one, which a chain would hold on to.
         first_key = jax.random.fold_in(key, -run.num_done)  # iterations have positive numbers
         chain = over_chains(near.start, first_key, (run.chain.theta, run.chain.root))
-        return run._replace(chain=chain), near
+        return run._replace(chain=chain, guide=near.likelihood.guide), near
 
     def log_step_error(near, i, run):
         """That of the held estimate, or one of its own for some of the draws."""
@@ -398,13 +419,14 @@ def _run(
             number = run.num_done + 1
             chain, info = over_chains(step, jax.random.fold_in(key, number), run.chain)
             counted = jax.tree.map(lambda so_far, one: so_far + one, run.counted, info)
-            return _Run(chain, number, counted), info.accepted
+            return _Run(chain, run.guide, number, counted), info.accepted
 
         run, accepted = lax.scan(iterate, run, i * thin + jnp.arange(thin))
         held = run.chain._replace(root=None, log_step_error=log_step_error(near, i, run))
         return run, (held, jnp.any(accepted > 0, axis=0))
 
-    bounds = stages(skipped if fresh and sampler.likelihood.guided else 0, skipped + num_iterations)
+    to_guide = skipped if fresh and guide is not None else 0
+    bounds = stages(to_guide, skipped + num_iterations)
     run, draws = metered_stages(begin, draw, state, bounds, num_iterations, progress_meter)
     held, accepted = draws
     others = (held.log_likelihood, held.log_step_error, accepted)
@@ -418,17 +440,21 @@ def _run(
         accepted=accepted,
         num_without_estimate=run.counted.num_without_estimate,
         num_truncated=run.counted.num_truncated,
-        state=PMMHState(**run.chain._asdict(), num_done=run.num_done, proposals=()),
+        state=PMMHState(
+            **run.chain._asdict(), num_done=run.num_done, proposals=(), guide=run.guide
+        ),
     )
 
 
-def _not_begun(theta: Float[Array, "*chains p"], root: Float[Array, "p p"]) -> _Run:
+def _not_begun(
+    theta: Float[Array, "*chains p"], root: Float[Array, "p p"], guide: Guide | None
+) -> _Run:
     """Before there is an estimate."""
     chains = theta.shape[:-1]
     nothing, none = jnp.zeros(chains, theta.dtype), jnp.zeros(chains, jnp.int32)
     root = jnp.broadcast_to(root, (*chains, *root.shape))
     chain = _Chain(theta, nothing, nothing, nothing, root)
-    return _Run(chain, jnp.int32(0), PMMHInfo(none, none, none))
+    return _Run(chain, guide, jnp.int32(0), PMMHInfo(none, none, none))
 
 
 def _going_on(state: PMMHState) -> _Run:
@@ -436,4 +462,4 @@ def _going_on(state: PMMHState) -> _Run:
         state.theta, state.log_likelihood, state.variance, state.log_step_error, state.root
     )
     none = jnp.zeros(chain.log_likelihood.shape, jnp.int32)
-    return _Run(chain, state.num_done, PMMHInfo(none, none, none))
+    return _Run(chain, state.guide, state.num_done, PMMHInfo(none, none, none))
