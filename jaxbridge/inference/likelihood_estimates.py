@@ -85,7 +85,7 @@ class AbstractLikelihood(eqx.Module):
         nothing."""
 
     @abstractmethod
-    def guided_by(self, guide: Guide | None) -> "AbstractLikelihood":
+    def guided_by(self, guide: Guide) -> "AbstractLikelihood":
         """The same with what another has as `guide`."""
 
     @property

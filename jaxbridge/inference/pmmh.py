@@ -282,7 +282,7 @@ def _guided_by_state(likelihood: AbstractLikelihood, state: PMMHState) -> Abstra
     **Raises:** `ValueError` where that was for other records.
     """
     shapes = [jax.tree.map(jnp.shape, each) for each in (state.guide, likelihood.guide)]
-    if shapes[0] != shapes[1]:
+    if state.guide is None or shapes[0] != shapes[1]:
         raise ValueError(
             "`init` is a state of draws from other records: go on with the same `times`, "
             "`num_steps` and `step_size`, or start anew from `init=` unknown parameters."
@@ -391,7 +391,7 @@ def _run(
     # The warm-up counts in draws, too, so that there is one loop.
     skipped = -(-num_warmup // thin)
     guide = sampler.likelihood.guide
-    state = _not_begun(*start, guide) if fresh else _going_on(start)
+    state = _not_begun(guide, *start) if fresh else _going_on(start)
 
     def begin(run, i):
         if not fresh:
@@ -447,7 +447,7 @@ def _run(
 
 
 def _not_begun(
-    theta: Float[Array, "*chains p"], root: Float[Array, "p p"], guide: Guide | None
+    guide: Guide | None, theta: Float[Array, "*chains p"], root: Float[Array, "p p"]
 ) -> _Run:
     """Before there is an estimate."""
     chains = theta.shape[:-1]
