@@ -24,7 +24,7 @@ from .blocks import Block, with_keys
 from .record_paths import GuidedRecords, guided_near, on_both_grids
 
 # At least so many filters at each of several parameters, and so many particles, are a pilot.
-_FEWEST_FILTERS, _FEWEST_PARTICLES = 8, 128
+_FEWEST_FILTERS, _FEWEST_PARTICLES = 16, 128
 
 
 class Guide(NamedTuple):

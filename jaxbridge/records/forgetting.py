@@ -11,10 +11,11 @@ log p̂ of pilot filters, less two standard errors: of a linear model, whose wei
 forgetting, it is zero.
 
 A chain over parameters has one rate for all of them, and must not miss what weighs most at any:
-where nearly every p̂ is too small it will not go, and then knows nothing of it; what varies about
-the right mean only slows it down. So at several parameters, those that are likely, it is asked how
-far the log of the mean of p̂ of pilots is below that at the best rate; and the rate is the least
-that loses hardly more than another.
+where nearly every p̂ is too small it will not go, and then knows nothing of it. So what the mean of
+log p̂ is below that at the best rate is worked out at several parameters, all about as likely as
+those where the chains are, and the rate is the one that loses least in the mean over these. (The
+log of the mean of p̂ is a worse criterion: of few pilots one that is lucky decides it, and a rate
+too low, at which chains stay where it is good enough, is confirmed there by what they see.)
 """
 
 from collections.abc import Callable
@@ -26,16 +27,15 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..engine.averages import proper
-from ..exact import log_mean_and_error
 from .particle_filter import Filtered
 from .several import Records
 
 # γ times the mean time between observations; and a variance of log p̂ by which all weights are
 # equal, and nothing is missed: a larger one says nothing of what all filters miss.
 _RATES, _ALL_EQUAL = (0.0, 0.5, 2.0, 8.0, 64.0), 1e-4
-# By how much log p̂ may be below the largest where parameters count, what is lost at any of them at
-# most, and what is no loss, for pilots are few.
-_LIKELY, _LARGEST_LOSS, _NO_LOSS = 10.0, 5.0, 0.25
+# By how much log p̂ may be below the largest where parameters count, and what is lost at any of them
+# at most.
+_LIKELY, _LARGEST_LOSS = 10.0, 5.0
 # With so few steps between observations nearly all is forgotten, or nothing, at the last.
 _FEW_STEPS = 4
 # By how much a filter that lost all its particles is below the best beside it.
@@ -105,30 +105,29 @@ def rate_for_several(
     """The rate for several models, which are an axis in front of what `run` makes at one. Where
     all weights are equal at all of them without forgetting, nothing else is tried."""
 
-    def log_mean_and_equal(filtered: Filtered):
-        log_estimate = filtered.log_estimate
-        log_mean, _, _ = log_mean_and_error(log_estimate)
-        variance = _variance(_not_lost(log_estimate), filtered, num_particles)
-        return proper(jnp.sum(log_mean)), variance < _ALL_EQUAL
+    def mean_and_equal(filtered: Filtered):
+        log_estimate = _not_lost(filtered.log_estimate)
+        variance = _variance(log_estimate, filtered, num_particles)
+        return proper(jnp.sum(jnp.mean(log_estimate, axis=1))), variance < _ALL_EQUAL
 
     def tried(settled, rate):
         def try_it():
-            log_means, equal = jax.vmap(log_mean_and_equal)(run(rate))
-            return jnp.all(equal) & (rate == 0), log_means
+            means, equal = jax.vmap(mean_and_equal)(run(rate))
+            return jnp.all(equal) & (rate == 0), means
 
         left_out = lambda: (settled, jnp.full(shape, -jnp.inf, rates.dtype))
         return lax.cond(settled, left_out, try_it)
 
     rates = rates_for(records)
     shape = jax.eval_shape(run, rates[0]).log_estimate.shape[:1]
-    _, log_means = lax.scan(tried, jnp.zeros((), bool), rates)
-    return rates[least_that_misses_nothing(log_means)]
+    _, means = lax.scan(tried, jnp.zeros((), bool), rates)
+    return rates[loses_least(means)]
 
 
-def least_that_misses_nothing(log_means: Float[Array, "rates models"]) -> Int[Array, ""]:
-    """Which rate is the least at which hardly more is lost than at another."""
-    best = jnp.max(log_means, axis=0)
+def loses_least(means: Float[Array, "rates models"]) -> Int[Array, ""]:
+    """At which rate the mean of log p̂ is least below that at the best, over models that are
+    likely."""
+    best = jnp.max(means, axis=0)
     likely = best > jnp.max(best) - _LIKELY
-    loss = jnp.where(likely, jnp.minimum(best - log_means, _LARGEST_LOSS), 0)
-    loss = jnp.sum(loss, axis=1) / jnp.maximum(jnp.sum(likely.astype(loss.dtype)), 1)
-    return jnp.argmax(loss <= jnp.min(loss) + _NO_LOSS)
+    loss = jnp.where(likely, jnp.minimum(best - means, _LARGEST_LOSS), 0)
+    return jnp.argmin(jnp.sum(loss, axis=1))

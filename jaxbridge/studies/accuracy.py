@@ -4,7 +4,7 @@ The paper's unlikely bridge, by Euler's scheme with the sign test in a radius, a
 then with another meeting rule and other schemes. With exact Gaussian transitions the meeting rule
 is the only error of discretisation, and none is left with the Brownian crossing. The same for a
 process with a full σ(x), whose bridges are known because it is an Ornstein–Uhlenbeck process in
-other coordinates.
+other coordinates, on one grid and extrapolated from two.
 """
 
 import functools
@@ -99,7 +99,7 @@ def run_accuracy(
         1.0,
         proposals=better[1:3],
         num_steps=all_steps[:3],
-        methods=("weights",),
+        methods=("weights", "extrapolated_weights"),
         reference=reference,
         num_bridges=num_bridges,
         repeats=1,

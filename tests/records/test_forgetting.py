@@ -10,7 +10,7 @@ from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
 from jaxbridge.records import Filtered, as_record_problem, linearised, run_filters
-from jaxbridge.records.forgetting import chosen_of, least_that_misses_nothing, undecided
+from jaxbridge.records.forgetting import chosen_of, loses_least, undecided
 from jaxbridge.records.guided_record import forgetful
 
 MODEL = jb.ornstein_uhlenbeck([[1.0]])
@@ -58,14 +58,15 @@ def test_the_rate_with_the_larger_mean_is_chosen():
     assert nothing.rate == 0 and not nothing.settled
 
 
-def test_the_least_rate_that_misses_nothing_is_chosen():
-    """At one of the models that are likely much is missed at the first, at the second little."""
-    log_means = np.array([[-10.0, -13.0, -90.0], [-10.1, -10.3, -95.0], [-10.4, -10.0, -70.0]])
-    assert least_that_misses_nothing(jnp.asarray(log_means, jnp.float32)) == 1
-    assert least_that_misses_nothing(jnp.asarray(log_means[:, :1], jnp.float32)) == 0
-    lost = jnp.array([[-jnp.inf, -3.0], [-4.0, -3.0]])
-    assert least_that_misses_nothing(lost) == 1
-    assert least_that_misses_nothing(jnp.full((3, 2), -jnp.inf)) == 0
+def test_the_rate_that_loses_least_is_chosen():
+    """At one of the models that are likely much is missed at the first, at the second little; a
+    third does not count."""
+    means = np.array([[-10.0, -13.0, -90.0], [-10.1, -10.3, -95.0], [-10.6, -10.0, -70.0]])
+    assert loses_least(jnp.asarray(means, jnp.float32)) == 1
+    assert loses_least(jnp.asarray(means[:, :1], jnp.float32)) == 0
+    assert loses_least(jnp.array([[-jnp.inf, -3.0], [-4.0, -3.0]])) == 1
+    assert loses_least(jnp.full((3, 2), -jnp.inf)) == 0
+    assert loses_least(jnp.zeros((3, 2))) == 0  # the least of several
 
 
 def test_nothing_is_forgotten_where_all_weights_are_equal():
