@@ -186,8 +186,9 @@ def pmmh(
         result's `names`, which is that of `jax.tree.leaves(params)`; by default a tenth of the
         prior's standard deviations, or a tenth of θ where the prior is not normal.
     - `init`: unknown parameters to start from, or the `state` of earlier draws, which go on with
-        the proposals of paths, and their bounds, that they had, or with what guided their filters. Another `proposal` than "auto"
-        takes their place; the estimate that the chain holds is still one of theirs.
+        the proposals of paths, and their bounds, that they had, or with what guided their filters.
+        Another `proposal` than "auto" takes the place of theirs; the estimate that the chain holds
+        is still one of theirs.
     - `observation`, `initial`: for a record that was seen with noise or in part, as in
         `innovations`; `num_proposals` is then how many particles the filter has, of which few do.
         What guides them, and how soon that forgets what is seen later, is found anew in the
