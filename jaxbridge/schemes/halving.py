@@ -16,8 +16,8 @@ mean linear in x', both steps together a normal density n_2(x''| x), and r = q_�
 
 Where σ is constant its variance is O(δ²), or O(δ) where σ has fewer columns than rows and leads
 noise on by a ∇α σ that is constant: differences are known to a fraction of a standard error.
-Otherwise it is of O(1), like log weights themselves; and of Euler's steps of such a σ there is no
-density. An error of O(δ^p) is the (2^p - 1)-th part of the difference (`step_error`).
+Otherwise it is of O(1), like log weights themselves, or little less; and of Euler's steps of such a
+σ there is no density. An error of O(δ^p) is the (2^p - 1)-th part of the difference (`step_error`).
 
 Of an odd number of steps the last is left as it is, and D counts for a little more; of one step
 nothing is known.

@@ -22,13 +22,14 @@ coordinates of the state: with F = ∇α its noise is
     ∫_0^δ [I + (δ-s) F] σ dW_s = √δ (σ + ½δ Fσ) ζ_1 + δ^{3/2} / √12 Fσ ζ_2,    ζ ~ N(0, I),
 
 the strong scheme of order 1.5 (Kloeden & Platen, section 10.4; for hypoelliptic diffusions
-Ditlevsen & Samson 2019). Such a σ that depends on the state adds L⁰σ (∫ s dW_s), with L⁰σ = ∇σ α:
+Ditlevsen & Samson 2019). Such a σ that depends on the state adds l (∫ s dW_s), with l = ∇σ α:
 
-    √δ (σ + ½δ [Fσ + L⁰σ]) ζ_1 + δ^{3/2} / √12 [Fσ - L⁰σ] ζ_2,
+    √δ (σ + ½δ [Fσ + l]) ζ_1 + δ^{3/2} / √12 [Fσ - l] ζ_2,
 
-`HypoellipticDensity`. What is left out, ½ Σ ∇σ_k σ_j (ΔW_j ΔW_k - δ 1_jk), is not normal: O(δ)
-along a path, but O(δ²) where it vanishes, as where σ depends only on what noise does not reach at
-once.
+`HypoellipticDensity`. What is left out, Σ ∇σ_k σ_j ∫∫ dW_j dW_k, is not normal: O(δ) along a path,
+but O(δ²) where each ∇σ_k σ_j vanishes, as where σ depends only on what noise does not reach at
+once; with them vanish the second derivatives of σ that would belong to l. In place of l_k stands
+l_k / √(1 + δ² |l_k|² / |σ_k|²), which is as near, so that σ + δl is nowhere zero where σ is not.
 
 Where coefficients depend on time they are taken in the middle of a step, which keeps both orders.
 """
@@ -144,7 +145,7 @@ class ItoTaylorDensity(AbstractStepDensity):
         if dynamics.sigma_varies:
             raise ValueError(
                 "`ItoTaylorDensity` is for constant σ, but this one depends on the state: choose "
-                "`EulerDensity()`."
+                "`EulerDensity()`, or `HypoellipticDensity()` for σ of fewer columns than rows."
             )
         sigma, d = dynamics.sigma(x), x.shape[0]
         if not sigma.invertible:
@@ -176,7 +177,8 @@ class HypoellipticDensity(AbstractStepDensity):
     """Itô's and Taylor's expansion for a σ(x) of fewer columns than rows, whose noise the drift
     leads on within the step: O(δ) along a path, O(δ²) where noise does not change σ at once, as
     where the noise of velocities depends on positions. Step errors are told as for O(δ). Where σ is
-    constant it is `ItoTaylorDensity`.
+    constant it is `ItoTaylorDensity`; near a boundary at which σ has no slope, as of a square root,
+    Euler's step may be nearer.
 
     It calls for the first and second derivatives of the drift along the columns of σ, and for the
     first of σ along the drift, by autodiff.
@@ -252,13 +254,15 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
     # Fα + ½ Σ_k ∂²α(σ_k, σ_k), and Fσ.
     bent = jax.jvp(dynamics.drift, (x,), (drift,))[1] + total(jnp.stack(bends)) / 2
     direct, early = jnp.stack(columns, axis=1), jnp.stack(slopes, axis=1)
-    both, apart = early, early  # Fσ + L⁰σ and Fσ - L⁰σ, with L⁰σ = ∇σ α
+    late = None  # ∇σ α
     if dynamics.sigma_varies:
         late = jax.jvp(lambda y: _matrix(dynamics, y), (x,), (drift,))[1]
-        both, apart = early + late, early - late
 
     def law(dt):
-        length = root_of_length(dt)
+        length, both, apart = root_of_length(dt), early, early
+        if late is not None:
+            bounded = _bounded(late, direct, dt)
+            both, apart = early + bounded, early - bounded
         spread = [direct + dt / 2 * both, dt * np.sqrt(1 / 12).astype(x.dtype) * apart]
         root = semidefinite_factor(length * jnp.concatenate(spread, axis=1))
         return DegenerateLaw(x + dt * drift + dt**2 / 2 * bent, root, dt)
@@ -272,6 +276,16 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
 
 def _matrix(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, "d m"]:
     return dynamics.sigma(x).as_matrix(x.shape[0], x.dtype)
+
+
+def _bounded(
+    slopes: Float[Array, "d m"], columns: Float[Array, "d m"], dt: Float[Array, ""]
+) -> Float[Array, "d m"]:
+    """Slopes by which no column changes in a step of length δ by more than it is."""
+    square = jnp.sum(columns**2, axis=0)
+    some = square > 0
+    change = dt**2 * jnp.sum(slopes**2, axis=0) / jnp.where(some, square, 1)
+    return slopes * jnp.where(some, 1 / jnp.sqrt(1 + change), 0)
 
 
 def _along(field, x: Float[Array, " d"], direction: Float[Array, " d"]):
