@@ -11,6 +11,13 @@ from jaxtyping import config as jaxtyping_config, install_import_hook
 
 install_import_hook("jaxbridge", "beartype.beartype")
 
+# Tests compile for longer than they run, and so as `engine.compiled_sooner` does, what they write
+# themselves, too. Programs of their own (`helpers.run_program`, the command line) are as users'.
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=2",
+)
+
 import jax  # noqa: E402
 import pytest  # noqa: E402
 
@@ -32,7 +39,7 @@ jax.config.update("jax_disable_most_optimizations", True)  # of what is made whi
 @pytest.fixture(autouse=True)
 def compiled_in_haste(request):
     """Most of the time of tests goes into compilation, of which optimisation is half. Tests marked
-    as `optimised`, which run for longer, are compiled as for users, as what `helpers.run_program`
+    as `optimised`, which run for longer, are optimised as for users, as what `helpers.run_program`
     runs is."""
     haste = "optimised" not in request.keywords
     jax.config.update("jax_disable_most_optimizations", haste)

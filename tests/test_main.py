@@ -13,7 +13,7 @@ from jaxbridge.studies.rivals import load_rivals
 
 def run(*arguments, cwd):
     command = [sys.executable, "-m", "jaxbridge", *arguments]
-    in_haste = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    in_haste = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": ""}
     options = dict(capture_output=True, text=True, timeout=600)
     return subprocess.run(command, cwd=cwd, env=in_haste, **options)
 

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 from jax import lax
 
-from jaxbridge.engine.compiled import compiled, compiled_sooner
 
-
-@pytest.mark.parametrize("compiled", [compiled, compiled_sooner])
-def test_small_loops_are_compiled_correctly(compiled, x64):
+@pytest.mark.parametrize("fusion_emitters", [True, False])
+def test_small_loops_are_compiled_correctly(fusion_emitters, x64):
     """From 0.11.1 to 0.12.0.1 jaxlib's CPU compiler makes one function of a small loop, in which
     the tangent here is written over while the scalars that it is made of are still read: a
     derivative 20 % off. Where this fails, so may whatever runs in small loops, as records do:
@@ -32,7 +30,9 @@ def test_small_loops_are_compiled_correctly(compiled, x64):
         return lax.fori_loop(0, 2, lambda _, matrix: normed(matrix), matrix)
 
     def slope(function):
-        return compiled(lambda x: jax.jvp(function, (x,), (jnp.sin(x),))[1])(matrix)
+        program = lambda x: jax.jvp(function, (x,), (jnp.sin(x),))[1]
+        options = {"xla_cpu_use_fusion_emitters": fusion_emitters}
+        return jax.jit(program, compiler_options=options)(matrix)
 
     twice = slope(lambda matrix: normed(normed(matrix)))
     np.testing.assert_allclose(slope(twice_by_a_loop), twice, atol=1e-12)
