@@ -81,8 +81,7 @@ def run_filters(
     no time."""
     R, P = size
     d, dtype = problem.dim, problem.like.dtype
-    first_row, rows = split_first(problem.rows)
-    density, dynamics_at = problem.density, model.forward_at(problem.like)
+    (first_row, rows), dynamics_at = split_first(problem.rows), model.forward_at(problem.like)
     corrected = over_lanes(None, -1)(correction(problem, model))
     most = 0.01 / jnp.finfo(dtype).eps
 
@@ -103,7 +102,7 @@ def run_filters(
 
     def moved(x, zeta, step, scalars):
         def of_particle(x, zeta):
-            law = guided_step(density, dynamics_at, x, step, scalars)
+            law = guided_step(problem.density, dynamics_at, x, step, scalars)
             return law.point(zeta), law.log_weight
 
         return over_lanes(-1, -1)(of_particle)(x, zeta)

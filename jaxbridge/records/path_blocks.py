@@ -152,12 +152,7 @@ def blocks_of(
         lambda first, rest: jnp.concatenate([first[None], rest]), guide.first, guide.scalars
     )
     everything = _filled(everything, d)
-    nothing = Scalars(
-        jnp.zeros_like(everything.rows[0]),
-        jnp.zeros_like(everything.values[0]),
-        jnp.ones_like(everything.variances[0]),
-        jnp.zeros_like(everything.seen[0]),
-    )
+    nothing = _nothing_like(jax.tree.map(lambda leaf: leaf[0], everything))
 
     def seen(place: np.ndarray, absent: np.ndarray) -> Scalars:
         """At these ends of segments, nothing where it is absent; their axes first."""
@@ -190,6 +185,16 @@ def blocks_of(
         jnp.where(is_first, guide.initial.root[..., None], 0),
         guide.initial.mean,
         goes_on,
+    )
+
+
+def _nothing_like(scalars: Scalars) -> Scalars:
+    """Of as many rows, of which nothing is seen."""
+    return Scalars(
+        jnp.zeros_like(scalars.rows),
+        jnp.zeros_like(scalars.values),
+        jnp.ones_like(scalars.variances),
+        jnp.zeros_like(scalars.seen),
     )
 
 

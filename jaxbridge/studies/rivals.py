@@ -208,6 +208,31 @@ is the fastest of a few more.
 
 {_where(rivals)}
 
+{_about_bridges(sizes)}
+{bridges}
+
+{_about_filters(sizes)}
+{filters}
+
+{_about_posteriors(sizes)}
+{posteriors}
+
+## What to see
+
+{_WHAT_TO_SEE}
+## Peers
+
+What is not installed is left out with a word. `pip install ".[rivals]"` installs cuthbert,
+numpyro, and what particles needs. particles 0.4 itself asks for a NumPy below 2, which JAX no
+longer takes, but runs with later ones: `pip install --no-deps particles`. In R,
+`install.packages(c("sde", "Sim.DiffProc"))`; these make approximate bridges without weights, of
+which only the mean half way is compared.
+"""
+
+
+def _about_bridges(sizes: Sizes) -> str:
+    """Which bridges, and by what."""
+    return f"""\
 ## Bridges
 
 {sizes.paths:,} paths each, of
@@ -231,9 +256,12 @@ with two hidden layers of 128 is fitted by {sizes.iterations:,} iterations of Ad
 0.01, with 100 paths each, weights averaged, to the score of the time reversal from the start. It
 serves for any end, so the two bridges from 1.5 share a training. Its weights are for the Euler
 scheme, whose step error is in its log p; steps are of second order here.
+"""
 
-{bridges}
 
+def _about_filters(sizes: Sizes) -> str:
+    """Which records, and by what."""
+    return f"""\
 ## Filters
 
 {sizes.filters} filters with {sizes.particles} particles each, in {NUM_STEPS} steps between two
@@ -255,9 +283,12 @@ page, once for both: Euler's steps ("bootstrap"), or these bent towards the next
 of second order where σ is constant, paths are bent by a linear process that knows all that is
 still to be seen, and the seconds include the step error, by half as many steps and a quarter.
 "variance × ms" is what one filter of variance one would take: the less the better.
+"""
 
-{filters}
 
+def _about_posteriors(sizes: Sizes) -> str:
+    """Which parameters, and by what."""
+    return f"""\
 ## Posteriors
 
 {sizes.draws:,} draws of one chain, given exact observations at unit intervals: of the rate of an
@@ -268,19 +299,6 @@ as its one step, or with latent points that make {NUM_STEPS} steps of it. Here, 
 where σ is known, `pmmh` where it is not, in raw coordinates and in logarithms. "Again" is another
 call, with another key, less what XLA compiled in it: each chain of numpyro's compiles its start
 anew, and `gibbs` does where a pilot run chooses otherwise.
-
-{posteriors}
-
-## What to see
-
-{_WHAT_TO_SEE}
-## Peers
-
-What is not installed is left out with a word. `pip install ".[rivals]"` installs cuthbert,
-numpyro, and what particles needs. particles 0.4 itself asks for a NumPy below 2, which JAX no
-longer takes, but runs with later ones: `pip install --no-deps particles`. In R,
-`install.packages(c("sde", "Sim.DiffProc"))`; these make approximate bridges without weights, of
-which only the mean half way is compared.
 """
 
 
