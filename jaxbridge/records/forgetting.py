@@ -8,7 +8,8 @@ exact whatever h is: only their variance depends on γ.
 By Jensen's inequality E log p̂ is below log p, by about half the variance of log p̂ and by all that
 particles miss (Maddison et al. 2017). So the rate is the one of several with the largest mean of
 log p̂ of pilot filters, less two standard errors: of a linear model, whose weights are equal without
-forgetting, it is zero.
+forgetting, it is zero. Of several the luckiest is best, so it must be better than none on another
+look, too.
 
 A chain over parameters has one rate for all of them, and must not miss what weighs most at any:
 where nearly every p̂ is too small it will not go, and then knows nothing of it. So what the mean of
@@ -43,11 +44,12 @@ _LOST = 50.0
 
 
 class Choice(NamedTuple):
-    """The best rate so far, and its mean of log p̂ less two standard errors; and whether all
-    weights were equal at one, and no other is worth a pilot."""
+    """The best rate so far, and its mean of log p̂ less two standard errors; the same without
+    forgetting; and whether all weights were equal at one rate, and no other is worth a pilot."""
 
     rate: Float[Array, ""]
     score: Float[Array, ""]
+    of_none: Float[Array, ""]
     settled: Bool[Array, ""]
 
 
@@ -66,22 +68,36 @@ def half_will_do(records: Records) -> bool:
 
 def undecided(dtype) -> Choice:
     """Before anything was tried."""
-    return Choice(jnp.zeros((), dtype), jnp.full((), -jnp.inf, dtype), jnp.zeros((), bool))
+    nothing = jnp.full((), -jnp.inf, dtype)
+    return Choice(jnp.zeros((), dtype), nothing, nothing, jnp.zeros((), bool))
 
 
 def chosen_of(
     best: Choice, rate: Float[Array, ""], filtered: Filtered, num_particles: int
 ) -> Choice:
     """The better one, where filters of all records at this rate made this of them."""
-    log_estimate, R = _not_lost(filtered.log_estimate), filtered.log_estimate.shape[1]
-    variance = _variance(log_estimate, filtered, num_particles)
-    mean = jnp.sum(jnp.mean(log_estimate, axis=1))
-    score = proper(mean - 2 * jnp.sqrt(variance / R))
+    score, variance = _score_and_variance(filtered, num_particles)
     return Choice(
         jnp.where(score > best.score, rate, best.rate),
         jnp.maximum(score, best.score),
+        jnp.where(rate == 0, score, best.of_none),
         best.settled | (variance < _ALL_EQUAL),
     )
+
+
+def confirmed(best: Choice, filtered: Filtered, num_particles: int) -> Choice:
+    """With its rate where other filters at it say that it is better than none, else with none."""
+    score, _ = _score_and_variance(filtered, num_particles)
+    return best._replace(rate=jnp.where(score > best.of_none, best.rate, 0))
+
+
+def _score_and_variance(
+    filtered: Filtered, num_particles: int
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    log_estimate, R = _not_lost(filtered.log_estimate), filtered.log_estimate.shape[1]
+    variance = _variance(log_estimate, filtered, num_particles)
+    mean = jnp.sum(jnp.mean(log_estimate, axis=1))
+    return proper(mean - 2 * jnp.sqrt(variance / R)), variance
 
 
 def _not_lost(log_estimate: Float[Array, "records R"]) -> Float[Array, "records R"]:

@@ -22,7 +22,7 @@ from ..engine.throwing import throw_where
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity, StepError, dominates, error_of_grids, num_coarse_grids
-from .forgetting import chosen_of, half_will_do, rates_for, undecided
+from .forgetting import chosen_of, confirmed, half_will_do, rates_for, undecided
 from .guided_record import Guidance, forgetful, linearised
 from .initial import Initial
 from .observation import Observation
@@ -278,6 +278,10 @@ def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Arr
     return points[:-1], points[1:], gaps
 
 
+# Kinds of stages, in this order.
+_PILOT, _ANOTHER_LOOK, _RUN = range(3)
+
+
 @compiled_sooner
 def _filtered(
     key: Key[Array, ""], grids: list[Records], guides: list[Guidance], R: int, P: int
@@ -286,7 +290,8 @@ def _filtered(
     forget: chosen by pilots, in the same loop, so that there is one body."""
     (arrays, rest), number = stacked(*zip(grids, guides, strict=True)), grids[0].number
     rates = rates_for(grids[0])
-    keys = jnp.stack([key_for("forgetting", key), key])
+    pilot_key = key_for("forgetting", key)
+    keys = jnp.stack([pilot_key, key_for("confirmed", pilot_key), key])  # by kind of stage
 
     @jax.jit  # for its shapes and in the loop traced once
     def run(grid, rate, key):
@@ -300,23 +305,23 @@ def _filtered(
         return records.each(filters, jax.random.split(key, number), guides)
 
     def stage(best, inputs):
-        grid, rate, is_pilot = inputs
+        grid, rate, kind = inputs
 
         def make(best):
-            made = run(grid, jnp.where(is_pilot, rate, best.rate), keys[jnp.where(is_pilot, 0, 1)])
-            tried = chosen_of(best, rate, made, P)
-            return jax.tree.map(lambda new, old: jnp.where(is_pilot, new, old), tried, best), made
+            made = run(grid, jnp.where(kind == _PILOT, rate, best.rate), keys[kind])
+            each = chosen_of(best, rate, made, P), confirmed(best, made, P), best
+            return jax.tree.map(lambda *leaves: jnp.stack(leaves)[kind], *each), made
 
         def left_out(best):
             shapes = jax.eval_shape(make, best)[1]
             return best, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-        return lax.cond(is_pilot & best.settled, left_out, make, best)
+        known = (kind == _PILOT) & best.settled | (kind == _ANOTHER_LOOK) & (best.rate == 0)
+        return lax.cond(known, left_out, make, best)
 
-    num_pilots, num_grids = len(rates), len(grids)
-    pilot_grid = np.full(num_pilots, half_will_do(grids[0]), int)
-    grid = np.concatenate([pilot_grid, np.arange(num_grids)])
-    rates = jnp.pad(rates, (0, num_grids))
-    is_pilot = np.arange(len(grid)) < num_pilots
-    best, made = lax.scan(stage, undecided(rates.dtype), (grid, rates, is_pilot))
-    return jax.tree.map(lambda leaf: leaf[num_pilots:], made), best.rate
+    kinds = np.array([*len(rates) * [_PILOT], _ANOTHER_LOOK, *len(grids) * [_RUN]])
+    on_grid = np.where(kinds == _RUN, 0, int(half_will_do(grids[0])))
+    on_grid[kinds == _RUN] = np.arange(len(grids))
+    rates = jnp.pad(rates, (0, len(kinds) - len(rates)))
+    best, made = lax.scan(stage, undecided(rates.dtype), (on_grid, rates, kinds))
+    return jax.tree.map(lambda leaf: leaf[kinds == _RUN], made), best.rate

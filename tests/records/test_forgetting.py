@@ -10,7 +10,7 @@ from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
 from jaxbridge.records import Filtered, as_record_problem, linearised, run_filters
-from jaxbridge.records.forgetting import chosen_of, loses_least, undecided
+from jaxbridge.records.forgetting import chosen_of, confirmed, loses_least, undecided
 from jaxbridge.records.guided_record import forgetful
 
 MODEL = jb.ornstein_uhlenbeck([[1.0]])
@@ -54,6 +54,9 @@ def test_the_rate_with_the_larger_mean_is_chosen():
         assert better(second, jnp.float32(2), pilot(worse, 2.0)).rate == 1
     equal = pilot([-3.0, -3.001], 10.0)
     assert better(undecided(jnp.float32), jnp.float32(0), equal).settled
+    assert second.of_none == first.score
+    assert confirmed(second, pilot([-3.0, -3.0], 2.0), 10).rate == 1
+    assert confirmed(second, pilot([-6.0, -6.0], 2.0), 10).rate == 0  # it was luck
     nothing = better(undecided(jnp.float32), jnp.float32(0), pilot([-jnp.inf, -jnp.inf], 0.0))
     assert nothing.rate == 0 and not nothing.settled
 
