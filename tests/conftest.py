@@ -81,11 +81,11 @@ def checked_by_default(request):
 
 @pytest.fixture(autouse=True)
 def few_compiled_programs_stay():
-    """Compiled programs hold memory maps, of which a process may have 65,530 on Linux: a suite of
-    some thousand programs would run out of them, and the compiler would crash."""
+    """Compiled programs hold memory, and maps of it, of which a process may have 65,530 on Linux: a
+    suite of some thousand programs would run out of them, and the compiler would crash."""
     yield
     maps = pathlib.Path("/proc/self/maps")
-    if not maps.exists() or maps.read_bytes().count(b"\n") > 25_000:
+    if not maps.exists() or maps.read_bytes().count(b"\n") > 10_000:
         jax.clear_caches()
 
 
