@@ -51,8 +51,8 @@ class AbstractLikelihood(eqx.Module):
 
     A chain calls `estimate` once in each iteration, at the parameters that it proposes, and holds
     on to what it gets until a proposal is accepted. While it warms up it asks for another of the
-    kind, by `near`, wherever there is a `guide`. Of some draws it asks for the step
-    error: it is that of the estimate it holds where `tells_step_error`, and else is worked out by
+    kind, by `near`, wherever there is a `guide`. Of some draws it asks for the step error: it is
+    that of the estimate it holds where `tells_step_error`, and else is worked out by
     `log_step_error`. All of it is traced inside one compiled loop, and under `vmap` over chains.
     """
 
@@ -83,10 +83,6 @@ class AbstractLikelihood(eqx.Module):
     def guide(self) -> Guide | None:
         """What `near` finds anew, for one that goes on with the same; `None` where that is
         nothing."""
-
-    @abstractmethod
-    def guided_by(self, guide: Guide) -> "AbstractLikelihood":
-        """The same with what another has as `guide`."""
 
     @property
     @abstractmethod
@@ -132,9 +128,6 @@ class TransitionLikelihood(AbstractLikelihood):
     @property
     def guide(self):
         return None
-
-    def guided_by(self, guide):
-        return self
 
     @property
     def tells_step_error(self):
@@ -187,7 +180,8 @@ class RecordLikelihood(AbstractLikelihood):
     def guide(self):
         return Guide(self.fine.points, self.coarse.points, self.rate)
 
-    def guided_by(self, guide):
+    def guided_by(self, guide: Guide) -> "RecordLikelihood":
+        """The same with what another has as `guide`."""
         grids = self.fine._replace(points=guide.fine), self.coarse._replace(points=guide.coarse)
         return RecordLikelihood(*grids, guide.rate, self.num_particles)
 

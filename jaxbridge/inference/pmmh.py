@@ -277,7 +277,7 @@ def _blocks_of_state(
     return tuple(map(block_of, groups, state.proposals))
 
 
-def _guided_by_state(likelihood: AbstractLikelihood, state: PMMHState) -> AbstractLikelihood:
+def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLikelihood:
     """With the guide of earlier draws.
 
     **Raises:** `ValueError` where that was for other records.

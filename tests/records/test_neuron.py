@@ -82,7 +82,7 @@ def test_the_likelihood_is_that_of_a_bootstrap_filter():
 def test_heavy_tails_are_told(noise, num_particles):
     """With as much noise as the voltage has range paths leave the one along which they are guided,
     and few find their way: what a hundred particles say whose guide forgets nothing is too small by
-    three standard errors. Where there are fewer lighter tails suffice for that. If the guide
+    many standard errors. Where there are fewer lighter tails suffice for that. If the guide
     forgets what is seen later they find it."""
     values, options = record(noise)
     made = jb.log_likelihood(
@@ -94,8 +94,8 @@ def test_heavy_tails_are_told(noise, num_particles):
 
     problem = as_record_problem(MODEL, TIMES, values, **options)
     guide = linearised(problem, MODEL).guide
-    sure = run_filters(jax.random.key(0), problem, MODEL, guide, (8, num_particles))
+    sure = run_filters(jax.random.key(0), problem, MODEL, guide, (16, num_particles))
     (value,), (standard_error,), _ = log_mean_and_error(sure.log_estimate[None])
-    assert error < 0.3 and value - exact < -3 * standard_error
+    assert error < 0.3 and value - exact < -4 * standard_error
     assert sure.pareto_k.max() > 0.7
     assert not eqx.tree_at(lambda made: made.pareto_k, made, sure.pareto_k).trustworthy
