@@ -11,22 +11,24 @@ from jaxbridge.studies.benchmark import load
 from jaxbridge.studies.rivals import load_rivals
 
 
-def run(*arguments, cwd):
+def run(*arguments, cwd, **environment):
     command = [sys.executable, "-m", "jaxbridge", *arguments]
-    in_haste = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": ""}
+    in_haste = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": "", **environment}
     options = dict(capture_output=True, text=True, timeout=600)
     return subprocess.run(command, cwd=cwd, env=in_haste, **options)
 
 
 @pytest.mark.slow
 def test_quick_run_prints_a_table_and_writes_pictures(tmp_path):
-    done = run("approximate", "--quick", "--out", "pictures", "--seed", "3", cwd=tmp_path)
+    arguments = ("approximate", "--quick", "--out", "pictures", "--seed", "3")
+    done = run(*arguments, cwd=tmp_path, JAX_COMPILATION_CACHE_DIR="")
     assert done.returncode == 0, done.stderr
     assert "(--quick: expect larger errors" in done.stdout
     assert "2,000 bridges a case" in done.stdout
     assert done.stdout.count("as published") >= 8
     assert "[16/16]" in done.stderr
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 9
+    assert len(list((tmp_path / "pictures" / "programs").iterdir())) > 20
 
 
 @pytest.mark.slow

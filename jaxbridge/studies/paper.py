@@ -74,8 +74,7 @@ class Result(NamedTuple):
     """One case by one method.
 
     `samples`, shape (n, 2), are the bridges at time 1/2 and `law` the exact law there.
-    `acceptance` is the share of proposals that met. `seconds` is the time of the run once
-    compiled; `compile_seconds` that of a first call that compiles it, if it was not at hand.
+    `acceptance` is the share of proposals that met. `seconds` are those of the run once compiled.
     """
 
     case: Case
@@ -85,7 +84,6 @@ class Result(NamedTuple):
     fit: Fit
     acceptance: float
     seconds: float
-    compile_seconds: float
 
 
 def study_model() -> jb.Diffusion:
@@ -130,7 +128,7 @@ def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> 
         )
 
     # The bound is traced: with one proposal the very program of the run is compiled, hardly run.
-    _, compile_seconds = timed(lambda: bridges(1))
+    timed(lambda: bridges(1))
     result, seconds = timed(lambda: bridges(None))
     first, middle, last = np.moveaxis(np.asarray(result.paths), 1, 0)
     ends = np.array([case.start, case.end], first.dtype)
@@ -145,7 +143,6 @@ def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> 
         compare(middle, law),
         num_bridges / int(result.num_proposals),
         seconds,
-        compile_seconds,
     )
 
 

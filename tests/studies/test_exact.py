@@ -51,7 +51,7 @@ def made_up_results():
     bridges = ("(0.785, 0.785) -> (1.091, 1.091)", "(2, -2) -> (3, -3)")
     results = [
         ExactResult(
-            bridge, method, 2_000, samples, LAW, pair, abs(pair), pair, 900.0, 4.2, 0.5, 3.0, "44"
+            bridge, method, 2_000, samples, LAW, pair, abs(pair), pair, 900.0, 4.2, 0.5, "44"
         )
         for bridge in bridges
         for method in ("pseudo-marginal", "renewal")
