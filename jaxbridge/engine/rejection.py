@@ -8,7 +8,7 @@ or succeed less often. So results do not depend on the number of lanes, and no l
 the slowest problem.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import diffrax
@@ -90,8 +90,11 @@ def rejection_sample(
         rank = accepted.num_found[problem] + _before(success, first[problem])
         needed = tried & (rank < wanted) & active[problem]
         row = jnp.where(success & needed, problem * wanted + rank, num_rows)
-        accepted = _add(accepted, made, problem, number, needed, row)
-        return _State(accepted, num_tried + _count(jnp.ones_like(tried), problem, len(active)))
+        everyone = jnp.ones_like(tried)
+        counted = (row < num_rows, needed, needed & ~made.finite, everyone)
+        *counts, num_run = _count(counted, problem, len(active))
+        accepted = _add(accepted, made.outputs, number, row, counts)
+        return _State(accepted, num_tried + num_run)
 
     def progress(state: _State):
         return jnp.sum(state.accepted.num_found).astype(jnp.float32) / num_rows
@@ -161,34 +164,32 @@ def _before(success: Bool[Array, " lanes"], first: Int[Array, " lanes"]) -> Int[
 
 
 def _count(
-    lanes: Bool[Array, " lanes"], problem: Int[Array, " lanes"], num_problems: int
-) -> Int[Array, " P"]:
-    """How many of these lanes each problem has."""
-    return jax.ops.segment_sum(
-        lanes.astype(jnp.int32), problem, num_problems, indices_are_sorted=True
-    )
+    lanes: tuple[Bool[Array, " lanes"], ...], problem: Int[Array, " lanes"], num_problems: int
+) -> Int[Array, "kinds P"]:
+    """How many of the lanes of each kind each problem has."""
+    each = jnp.stack(lanes, axis=1).astype(jnp.int32)  # one loop over lanes for all
+    return jax.ops.segment_sum(each, problem, num_problems, indices_are_sorted=True).T
 
 
 def _add(
     accepted: Accepted,
-    made: Attempts,
-    problem: Int[Array, " lanes"],
+    outputs: PyTree,
     number: Int[Array, " lanes"],
-    needed: Bool[Array, " lanes"],
     row: Int[Array, " lanes"],
+    counts: Sequence[Int[Array, " P"]],
 ) -> Accepted:
-    """With the attempts that were needed, of which those that are kept have a row."""
-    num_problems, num_rows = len(accepted.num_found), len(accepted.number)
+    """With the attempts that are kept, those with a row, and what was counted of all."""
+    found, needed, nonfinite = counts
 
     def keep(rows, values):
         return rows.at[row].set(values, mode="drop")
 
     return Accepted(
-        jax.tree.map(keep, accepted.outputs, made.outputs),
+        jax.tree.map(keep, accepted.outputs, outputs),
         keep(accepted.number, number),
-        accepted.num_found + _count(row < num_rows, problem, num_problems),
-        accepted.num_trials + _count(needed, problem, num_problems),
-        accepted.num_nonfinite + _count(needed & ~made.finite, problem, num_problems),
+        accepted.num_found + found,
+        accepted.num_trials + needed,
+        accepted.num_nonfinite + nonfinite,
     )
 
 

@@ -156,7 +156,8 @@ class _Runner(NamedTuple):
         return jnp.arange(len(self.keys)) % num_segments == 0
 
     def begin(self) -> _Segments:
-        """No steps, and for each segment a guess of where the one before it ends."""
+        """No steps, so that all are stale, and for each segment a guess of where the one before it
+        ends."""
         num, length = self.keys.shape
         points, d = self.first.shape[1:]
         num_kept = points if self.problem.stored is None else len(self.problem.stored)
@@ -164,7 +165,7 @@ class _Runner(NamedTuple):
             jnp.zeros((length, num, num_kept, d), self.first.dtype),
             jnp.zeros((length, num), bool),
             jnp.repeat(self.first, num // self.problem.num_intervals, axis=0),
-            jnp.zeros(num, bool),
+            jnp.ones(num, bool),
             jnp.zeros(num, jnp.int32),
             jnp.zeros(num, jnp.int32),
         )
@@ -261,8 +262,11 @@ def run_renewal(
     keys = step_keys[:, steps].reshape(num_intervals * num_segments, length)
     each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_segments, axis=0), intervals)
     runner = _Runner(model, pairs, problem, begin, keys, each)
-    segments = runner.run(runner.begin(), jnp.arange(len(keys)), progress_meter)
-    # The first stale segment starts from where the chain is, so each pass settles it at least.
+    segments = runner.begin()
+    if len(keys) > _REPAIR_WIDTH or progress_meter is not None:
+        segments = runner.run(segments, jnp.arange(len(keys)), progress_meter)
+    # Few segments are all run by the first repair, so that a step is compiled once. The first that
+    # is stale starts from where the chain is, so each pass settles it at least.
     segments = lax.while_loop(lambda s: jnp.any(s.stale), runner.repair, segments)
 
     def of_steps(leaf):

@@ -65,22 +65,25 @@ class Augmentation(eqx.Module):
 
     def first(self, key: Key[Array, ""], model: Diffusion) -> tuple[Paths, Bool[Array, " I"]]:
         """Paths to start from, and which of them the proposal itself has found, in the order of the
-        blocks. Where it finds none, whatever its weight, a modified diffusion bridge serves, or a
-        straight line: a chain may start anywhere."""
+        blocks. Where it finds none, whatever its weight, a straight line serves, or in place of a
+        coupling a modified diffusion bridge: a chain may start anywhere."""
         model = model.prepared()
 
         def of_block(block, kernel, keys):
             intervals, num_steps = block.intervals, block.num_steps
             found_keys, other_keys = split_each(keys, 2)
             found = kernel.first(found_keys, model, intervals, num_steps)
-            other = ModifiedDiffusionBridge(EulerDensity()).draw(
-                other_keys[:, None], model, intervals, num_steps, None, False
-            )
+            better = [found]
+            if block.proposal.coupled:
+                other = ModifiedDiffusionBridge(EulerDensity()).draw(
+                    other_keys[:, None], model, intervals, num_steps, None, False
+                )
+                better = [other.paths[:, 0], found]
             done = jnp.concatenate([jnp.zeros(1), jnp.cumsum(block.fractions)]).astype(found.dtype)
             start, end = intervals.start[:, None], intervals.end[:, None]
             path = start + done[:, None] * (end - start)
-            for better in (other.paths[:, 0], found):
-                path = jnp.where(is_there(better)[:, None, None], better, path)
+            for each in better:
+                path = jnp.where(is_there(each)[:, None, None], each, path)
             return path, is_there(found)
 
         paths, found = zip(*map(of_block, self.blocks, self.kernels, self._keys(key)), strict=True)

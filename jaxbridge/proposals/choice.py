@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import is_traced, nondifferentiable_choice
@@ -20,6 +21,11 @@ from .base import AbstractSingleProposal, AbstractWeightedProposal, WeightedPath
 _WORK = 10_000
 # What weights of heavy tails are worth beside others.
 _HEAVY = 1e-6
+# Above this share of effective paths, as foreseen for a larger sample, no tail is of account.
+_NEARLY_EQUAL = 0.9
+# Each candidate in use is compiled, in pilot runs and runs: one that is worth less than this share
+# of the work on all intervals is left out.
+_SPARED = 0.05
 
 
 class Choice(AbstractWeightedProposal):
@@ -258,6 +264,37 @@ def best_at_worst(choice: Choice, num: int) -> Choice:
     return whole.of(np.arange(0, len(chosen), num))
 
 
+def worth_a_pilot(potential: Float[Array, " I"], best: Float[Array, " I"]) -> Bool[Array, " I"]:
+    """On which intervals to try what could at most have this rate; on none where that would hardly
+    gain anything over all of them."""
+    gain = jnp.where(potential > best, potential / jnp.maximum(best, _least(best)), 1)
+    return (potential > best) & (jnp.mean(gain) > 1 + _SPARED)
+
+
+def best_of_few(rates: Float[Array, "C I"]) -> Int[Array, " I"]:
+    """The best candidate of each interval, among as few as hardly lose anything together: one after
+    the other is left out that the others replace best."""
+    rates = jnp.where(jnp.isnan(rates), 0, rates)
+    best, num = jnp.max(rates, axis=0), len(rates)
+
+    def loss(kept: Bool[Array, " C"]) -> Float[Array, ""]:
+        left = jnp.max(jnp.where(kept[:, None], rates, 0), axis=0)
+        return jnp.mean(jnp.where(best > 0, best / jnp.maximum(left, _least(left)), 1))
+
+    def leave_out(_, kept: Bool[Array, " C"]) -> Bool[Array, " C"]:
+        without = kept & ~jnp.eye(num, dtype=bool)
+        losses = jnp.where(kept, jax.vmap(loss)(without), jnp.inf)
+        least = jnp.argmin(losses)
+        return jnp.where(losses[least] <= 1 + _SPARED, without[least], kept)
+
+    kept = lax.fori_loop(0, num - 1, leave_out, jnp.ones(num, bool))
+    return jnp.argmax(jnp.where(kept[:, None], rates, -1), axis=0).astype(jnp.int32)
+
+
+def _least(rates: Float[Array, " I"]) -> float:
+    return float(jnp.finfo(rates.dtype).tiny)
+
+
 @jax.jit  # one program where it is called outside of any
 def value_rates(
     efficiency: Float[Array, "*C I"],
@@ -265,8 +302,10 @@ def value_rates(
     step_error: Float[Array, "*C I"],
     shape: Float[Array, "*C I"],
 ) -> Float[Array, "*C I"]:
-    """Effective samples per second after the deductions for step errors and heavy tails."""
+    """Effective samples per second after the deductions for step errors and heavy tails. (Of
+    weights that are nearly equal k̂ of a small pilot run is a matter of chance.)"""
     cheapest = jnp.min(seconds, axis=0) if seconds.ndim == 2 else 1.0
     rate = efficiency / seconds
     rate /= 1 + _WORK * cheapest * rate * step_error**2
-    return rate * jnp.where(is_reliable(shape) | jnp.isnan(shape), 1, _HEAVY)
+    light = is_reliable(shape) | jnp.isnan(shape) | (efficiency > _NEARLY_EQUAL)
+    return rate * jnp.where(light, 1, _HEAVY)

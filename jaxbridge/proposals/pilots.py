@@ -10,10 +10,12 @@ that of a rate of
     rate / (1 + W rate (step error)²),
 
 with W the seconds of ten thousand of the cheapest paths, and the step error as far as it is seen
-beyond two of its own standard errors. And weights with a Pareto shape above 0.7 come last.
+beyond two of its own standard errors. And weights with a Pareto shape above 0.7 come last, unless
+they are nearly equal.
 
 A candidate makes no pilot run where it could not win: of a coupling's simulated paths at most one
-in 1 + N is an effective sample, for each proposal needs N hitting counts. Seconds go by a rule, so
+in 1 + N is an effective sample, for each proposal needs N hitting counts. Nor where it would win
+next to nothing over all intervals, for each candidate is to be compiled. Seconds go by a rule, so
 that one key gives one choice; or by the clock, where `choose_proposal` makes the choice.
 """
 
@@ -36,7 +38,7 @@ from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..schemes import error_of_log_mean, guessed
 from .base import AbstractSingleProposal
-from .choice import Choice, value_rates
+from .choice import Choice, best_of_few, value_rates, worth_a_pilot
 
 # A pilot run draws about so many paths of each candidate in all, and so many of each interval.
 _PILOT_PATHS = 4_096
@@ -115,9 +117,7 @@ def _compared(seen: list[_Seen], seconds: list[Float[Array, " I"]]):
     """What was seen of all candidates, their seconds, and which is best in each interval."""
     stacked: _Seen = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen)
     of_all = jnp.stack(seconds)
-    rates = _rate(stacked, of_all)
-    chosen = jnp.argmax(jnp.where(jnp.isnan(rates), -1, rates), axis=0).astype(jnp.int32)
-    return stacked, of_all, chosen
+    return stacked, of_all, best_of_few(_rate(stacked, of_all))
 
 
 def _run_pilot(
@@ -134,7 +134,7 @@ def _run_pilot(
 
     def look_at(candidate):
         seconds = candidate.relative_seconds(model, intervals)
-        active = best < candidate.efficiency_bound / seconds
+        active = worth_a_pilot(candidate.efficiency_bound / seconds, best)
         return seconds, active, is_traced(active) or bool(np.any(active))
 
     seconds, active, called_for = look_at(candidate)

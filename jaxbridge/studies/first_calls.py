@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import jaxbridge as jb
 
@@ -70,13 +71,12 @@ def _density() -> Any:
 
 def _gibbs() -> Any:
     """200 intervals, 500 iterations."""
-    times = jnp.arange(201) * 0.5
-    record = jb.simulate(jax.random.key(1), _pulled(), jnp.zeros(2), times)[0]
+    times, values = _seen(-np.eye(2), np.arange(201) * 0.5)
     return jb.gibbs(
         jax.random.key(0),
         _pulled(),
         times,
-        record,
+        values,
         prior=jb.NormalPrior(1.0, 1.0),
         num_iterations=500,
         num_steps=10,
@@ -103,17 +103,28 @@ def _record() -> dict[str, Any]:
         lambda x, p: jnp.exp(p[1]) * jnp.eye(2, dtype=x.dtype),
         params=jnp.array([0.0, 0.0, -1.0]),
     )
-    times = jnp.arange(1, 51) * 0.4
-    path = jb.simulate(jax.random.key(1), model, jnp.zeros(2), times)[0]
-    noise = 0.4 * jax.random.normal(jax.random.key(2), times.shape)
+    times, values = _seen(np.array([[-1.0, 1.0], [-1.0, -1.0]]), np.arange(1, 51) * 0.4)
+    noise = 0.4 * np.random.default_rng(2).standard_normal((50, 1))
     return {
         "model": model,
         "times": times,
-        "observations": path[:, :1] + noise[:, None],
+        "observations": values[:, :1] + noise,
         "observation": jb.LinearGaussian([[1.0, 0.0]], lambda p: jnp.exp(2 * p[2])),
         "initial": jb.GaussianLaw([0.0, 0.0], jnp.eye(2)),
         "num_steps": 5,
     }
+
+
+def _seen(drift: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """dX = BX dt + dW from 0, in Euler steps of NumPy's: data are at hand before a first call
+    begins."""
+    rng, step, x = np.random.default_rng(1), 0.02, np.zeros(2)
+    values = []
+    for duration in np.diff(times, prepend=0.0):
+        for _ in range(round(duration / step)):
+            x = x + step * drift @ x + step**0.5 * rng.standard_normal(2)
+        values.append(x)
+    return times, np.stack(values)
 
 
 def _of_record(method: Callable[..., Any], **options: Any) -> Any:
