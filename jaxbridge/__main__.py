@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the studies, print their tables and write their pictures."""
     options = _parse(arguments)
     begin = time.perf_counter()
-    if options.part in _PROGRAMS_KEPT and not jax.config.jax_compilation_cache_dir:
+    if options.part in _PROGRAMS_KEPT and not jax.config.values["jax_compilation_cache_dir"]:
         _keep_programs(options.out / "programs")
     print(f"JAX {jax.__version__} on {jax.devices()[0].device_kind}\n")
     for part in _GROUPS.get(options.part, (options.part,)):

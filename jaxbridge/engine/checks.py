@@ -67,6 +67,13 @@ def is_traced(*trees) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def taken(values: Array, index: Any) -> Array:
+    """`values[index]`: of numbers that are known without compiling a program for it."""
+    if is_traced(values, index):
+        return values[index]
+    return jnp.asarray(np.asarray(values)[index])
+
+
 def cast_floats(tree: PyTree, dtype) -> PyTree:
     """The tree with all its floating point arrays in one precision."""
     return jax.tree.map(

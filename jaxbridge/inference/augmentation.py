@@ -188,10 +188,10 @@ def _quadratic_form(
 ) -> Form | None:
     """The first of these forms in which the log likelihood is quadratic in θ, if there is one."""
     like, parameters = problem.like, problem.parameters
-    steps, paths = jnp.ones((1, 1), like.dtype), jnp.stack([like, like])[None]
     for form in forms:
 
         def log_likelihood(theta, form: Form = form):
+            steps, paths = jnp.ones((1, 1), like.dtype), jnp.stack([like, like])[None]
             return log_likelihoods(parameters.bind(theta), steps, paths, form)[0]
 
         if not uses_argument(jax.jacfwd(jax.jacfwd(log_likelihood)), theta):

@@ -17,6 +17,7 @@ from ..engine.checks import (
     check_precision,
     is_traced,
     steps_of_size,
+    taken,
     time_steps,
 )
 from ..engine.compiled import compiled_sooner
@@ -73,7 +74,8 @@ def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Inter
     if not is_traced(observations):
         _check_finite(np.asarray(observations))
         _check_state_space(model, observations)
-    intervals, _, _ = as_intervals(observations[:-1], observations[1:], duration)
+    before, after = taken(observations, slice(-1)), taken(observations, slice(1, None))
+    intervals, _, _ = as_intervals(before, after, duration)
     return intervals
 
 
@@ -118,7 +120,7 @@ def _check_state_space(model: Diffusion, observations: Array) -> None:
         return
 
     good = _inside(model, observations)
-    if not is_traced(good) and not np.all(good):
+    if not is_traced(good) and not np.all(np.asarray(good)):
         i = int(np.argmin(good))
         raise ValueError(
             f"`observations[{i}]` = {np.asarray(observations[i])} is outside the state space: the "
@@ -145,7 +147,9 @@ def step_groups(
     `step_size`, in groups that are worth their compilation."""
 
     def group(which: Int[np.ndarray, " I"], num_steps: int) -> Group:
-        return Group(jax.tree.map(lambda leaf: leaf[which], intervals), which, num_steps)
+        if len(which) == len(durations):
+            return Group(intervals, which, num_steps)
+        return Group(jax.tree.map(lambda leaf: taken(leaf, which), intervals), which, num_steps)
 
     durations = intervals.duration
     if step_size is None:
@@ -190,7 +194,7 @@ class Problem(NamedTuple):
     @property
     def like(self) -> Float[Array, " d"]:
         """A point of the state space."""
-        return self.intervals.start[0]
+        return taken(self.intervals.start, 0)
 
     @property
     def sigma_is_unknown(self) -> bool:

@@ -22,6 +22,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, check_key
+from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.pareto import is_reliable
 from ..models.diffusion import Diffusion
@@ -240,10 +241,21 @@ def _by_bridges(
     iterates, info = approximate(run_key, parameters, augmentation, search, theta)
     rough = iterates[-1] if isinstance(search.rule, EM) else _mean_of_later(iterates)
     at_rough = score_at(score_key, problem, rough, proposal, budget, num_bridges, None)
+    return _newton_step(parameters, rough, iterates, at_rough, info)
+
+
+@compiled_sooner
+def _newton_step(
+    parameters: Parameters,
+    rough: Float[Array, " p"],
+    iterates: Float[Array, "n p"],
+    at_rough: Score,
+    info: SearchInfo,
+) -> MaximumLikelihood:
     step = jnp.linalg.inv(at_rough.information) @ at_rough.gradient
     definite = jnp.all(jnp.linalg.eigvalsh(at_rough.information) > 0)
     # Further off the likelihood need not be near its quadratic approximation.
-    near = at_rough.gradient @ step < theta.shape[0]
+    near = at_rough.gradient @ step < rough.shape[0]
     ok = definite & near & parameters.allowed(rough + step)
     estimate = jnp.where(ok, rough + step, rough)
     return _summary(parameters, estimate, iterates, at_rough, info, ok)
@@ -274,10 +286,12 @@ def _by_simulation(
     return _summary(parameters, maximum.theta, iterates, at_maximum, info, maximum.found)
 
 
+@compiled_sooner
 def _mean_of_later(iterates: Float[Array, "n p"]) -> Float[Array, " p"]:
     return jnp.mean(iterates[len(iterates) // 2 :], axis=0)
 
 
+@compiled_sooner
 def _summary(
     parameters: Parameters,
     estimate: Float[Array, " p"],

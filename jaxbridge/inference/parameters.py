@@ -17,6 +17,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.checks import as_floating, cast_floats, is_traced
+from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.tracing import uses_argument
 
@@ -90,11 +91,17 @@ class Parameters(eqx.Module):
 
     def check_allowed(self, theta: Float[Array, "*chains p"]) -> None:
         """Raise `ValueError` where a visible θ does not satisfy the constraint."""
-        for row in theta.reshape(-1, theta.shape[-1]):
-            ok = self.allowed(row)
-            if not is_traced(ok) and not bool(ok):
-                why = "are not finite" if self.constraint is None else "do not satisfy `constraint`"
-                raise ValueError(f"the parameters to start from, {self.select(row)}, {why}.")
+        ok = of_rows(self.allowed, theta)
+        if not is_traced(ok) and not np.all(np.asarray(ok)):
+            row = theta.reshape(-1, theta.shape[-1])[int(np.argmin(ok))]
+            why = "are not finite" if self.constraint is None else "do not satisfy `constraint`"
+            raise ValueError(f"the parameters to start from, {self.select(row)}, {why}.")
+
+
+@compiled_sooner
+def of_rows(function: Callable, theta: Float[Array, "*chains p"]) -> Array:
+    """`function` at θ of each chain, in one axis."""
+    return jax.vmap(lambda row: function(row))(theta.reshape(-1, theta.shape[-1]))
 
 
 def as_parameters(

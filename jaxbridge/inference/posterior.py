@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
@@ -14,7 +15,7 @@ from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..schemes import StepError, dominates
-from .parameters import Parameters, init_vectors
+from .parameters import Parameters, init_vectors, of_rows
 
 # Of about so many of the draws the step error is worked out: as many as tell a covariance, for it
 # takes a good part of the time of an iteration.
@@ -141,12 +142,14 @@ def starting_points(
     if theta.ndim == 1:
         theta = jnp.broadcast_to(theta, (*chains, *theta.shape))
     parameters.check_allowed(theta)
-    for row in theta.reshape(-1, theta.shape[-1]):
-        if not is_traced(value := log_prior(row)) and not jnp.isfinite(value):
-            raise ValueError(
-                f"`prior` is {value} at the parameters to start from, {parameters.select(row)}: "
-                "start where its density is positive, by `init=`."
-            )
+    values = of_rows(log_prior, theta)
+    if not is_traced(values) and not np.all(good := np.isfinite(np.asarray(values))):
+        i = int(np.argmin(good))
+        row = theta.reshape(-1, theta.shape[-1])[i]
+        raise ValueError(
+            f"`prior` is {values[i]} at the parameters to start from, {parameters.select(row)}: "
+            "start where its density is positive, by `init=`."
+        )
     return theta, state
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..engine.checks import as_floating, is_traced
+from ..engine.compiled import compiled_sooner
 from ..engine.linalg import any_inverse, dot, matvec
 from .parameters import Parameters
 
@@ -82,12 +83,18 @@ def as_normal(
             f"({p}, {p}) or a pytree like the unknown parameters; got shape {variance.shape}."
         )
     if not is_traced(mean, variance):
-        least = np.linalg.eigvalsh(variance).min() if variance.ndim == 2 else np.min(variance)
-        if not (np.all(np.isfinite(mean)) and np.isfinite(least) and least > 0):
+        values = np.asarray(variance)
+        least = np.linalg.eigvalsh(values).min() if values.ndim == 2 else np.min(values)
+        if not (np.all(np.isfinite(np.asarray(mean))) and np.isfinite(least) and least > 0):
             raise ValueError(
                 "`prior` must have a finite mean and a positive (definite) variance; got "
                 f"{prior.mean} and {prior.variance}."
             )
+    return _normal(mean, variance, p)
+
+
+@compiled_sooner
+def _normal(mean: Float[Array, "..."], variance: Float[Array, "..."], p: int) -> NormalDensity:
     if variance.ndim == 2:
         precision = any_inverse(variance)
         precision = (precision + precision.T) / 2

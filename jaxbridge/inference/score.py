@@ -8,7 +8,7 @@ With Z the exact bridge of an interval and f_θ the density of its path,
 the latter by Louis (1982); both are sums over the intervals. Means are over weighted bridges.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -133,10 +133,7 @@ def score_at(
         _of_block(block_key, problem.parameters, theta, block, form, num_bridges, progress_meter)
         for block_key, block in with_keys(key, blocks)
     ]
-    sums = over_intervals(blocks, made)
-    step_error = StepError(sums.step_error, jnp.sqrt(sums.step_variance))
-    num_missing = jnp.sum(sums.effective_sample_size == 0, dtype=jnp.int32)
-    return as_score(problem.parameters, sums, step_error, num_missing, sums.num_truncated)
+    return _over_all(problem.parameters, blocks, made)
 
 
 def as_score(
@@ -175,6 +172,14 @@ class _Sums(NamedTuple):
     step_error: Float[Array, " p"]
     step_variance: Float[Array, " p"]
     num_truncated: Int[Array, ""]
+
+
+@compiled_sooner
+def _over_all(parameters: Parameters, blocks: tuple[Block, ...], made: Sequence[_Sums]) -> Score:
+    sums = over_intervals(blocks, made)
+    step_error = StepError(sums.step_error, jnp.sqrt(sums.step_variance))
+    num_missing = jnp.sum(sums.effective_sample_size == 0, dtype=jnp.int32)
+    return as_score(parameters, sums, step_error, num_missing, sums.num_truncated)
 
 
 class _Bridges(NamedTuple):

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.checks import is_traced, nondifferentiable_choice
+from ..engine.checks import is_traced, nondifferentiable_choice, taken
 from ..engine.pareto import is_reliable
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
@@ -38,7 +38,7 @@ class Choice(AbstractWeightedProposal):
     - `efficiency`: effective samples per simulated path in the pilot run, extrapolated to
         a larger one, shape (C, I); NaN where none was needed because the candidate could not win.
     - `step_error`: of log p̂, as far as it was seen, and `pareto_k`, k̂ of the weights, both in the
-        pilot run and of shape (C, I).
+        pilot run and of shape (C, I); k̂ is NaN where too few paths were drawn to tell.
     - `chosen`: the number of each interval's candidate, shape (I,).
     - `used`: the numbers of those that were chosen for any interval; inside `jit`, where that is
         not known, of all. Only they are compiled, so that another set compiles again.
@@ -78,7 +78,7 @@ class Choice(AbstractWeightedProposal):
 
     def of(self, which):
         seconds, efficiency, step_error, shape, chosen = (
-            leaf[..., which]
+            taken(leaf, (..., which))
             for leaf in (self.seconds, self.efficiency, self.step_error, self.pareto_k, self.chosen)
         )
         told = (seconds, efficiency, step_error, shape, chosen)
@@ -182,7 +182,7 @@ class Choice(AbstractWeightedProposal):
                 seen = [
                     f"{np.median(efficiency[i, known]):.3g}",
                     f"{np.median(np.abs(step_error[i, known])):.3g}",
-                    f"{np.median(shape[i, known]):.2f}",
+                    "-" if np.isnan(shape[i]).all() else f"{np.nanmedian(shape[i]):.2f}",
                     f"{np.median(rates[i, known] / best[known]):.2f}",
                 ]
             cost = f"{np.median(seconds[i] / seconds[0]):.2f}"

@@ -10,8 +10,8 @@ that of a rate of
     rate / (1 + W rate (step error)²),
 
 with W the seconds of ten thousand of the cheapest paths, and the step error as far as it is seen
-beyond two of its own standard errors. And weights with a Pareto shape above 0.7 come last, unless
-they are nearly equal.
+beyond two of its own standard errors. And weights with a Pareto shape above 0.7 come last, where
+there are enough of them to tell and they are not nearly equal.
 
 A candidate makes no pilot run where it could not win: of a coupling's simulated paths at most one
 in 1 + N is an effective sample, for each proposal needs N hitting counts. Nor where it would win
@@ -43,6 +43,8 @@ from .choice import Choice, best_of_few, value_rates, worth_a_pilot
 # A pilot run draws about so many paths of each candidate in all, and so many of each interval.
 _PILOT_PATHS = 4_096
 _PILOT_RANGE = (32, 512)
+# Of fewer paths k̂ is a matter of chance: of many intervals some would seem to have heavy tails.
+_FEWEST_FOR_TAIL = 128
 # The rule for seconds may be wrong by this factor.
 _CONTENDS = 3.0
 
@@ -84,7 +86,7 @@ def run_pilots(
     num_intervals = len(intervals.duration)
     enough = int(np.clip(_PILOT_PATHS // num_intervals, *_PILOT_RANGE))
     num_paths = enough if num_pilot is None else num_pilot
-    best = jnp.zeros(num_intervals, intervals.start.dtype)
+    best = jnp.asarray(np.zeros(num_intervals, intervals.start.dtype))
     pilots = []
     for i, candidate in enumerate(candidates):
         purpose = f"pilot {i}"
@@ -133,9 +135,8 @@ def _run_pilot(
     """The pilot run of one candidate, on the intervals where it could beat the best so far."""
 
     def look_at(candidate):
-        seconds = candidate.relative_seconds(model, intervals)
-        active = worth_a_pilot(candidate.efficiency_bound / seconds, best)
-        return seconds, active, is_traced(active) or bool(np.any(active))
+        seconds, active = _worth(candidate, model, intervals, best)
+        return seconds, active, is_traced(active) or bool(np.any(np.asarray(active)))
 
     seconds, active, called_for = look_at(candidate)
     if called_for:
@@ -148,6 +149,18 @@ def _run_pilot(
     arguments = (model, candidate, intervals, active, num_steps, num_pilot)
     run = functools.partial(_look, key, purpose, *arguments)
     return _Pilot(candidate, run, run(), seconds)
+
+
+@compiled_sooner
+def _worth(
+    candidate: AbstractSingleProposal,
+    model: Diffusion,
+    intervals: Intervals,
+    best: Float[Array, " I"],
+) -> tuple[Float[Array, " I"], Bool[Array, " I"]]:
+    """Seconds per path, and on which intervals to try it."""
+    seconds = candidate.relative_seconds(model, intervals)
+    return seconds, worth_a_pilot(candidate.efficiency_bound / seconds, best)
 
 
 @compiled_sooner
@@ -175,7 +188,10 @@ def _look(
     error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
     seen_error = jnp.maximum(jnp.abs(error.value) - 2 * error.uncertainty, 0)
     seen_error = jnp.where(jnp.isnan(seen_error), 0, seen_error)  # nothing is known of one step
-    told = (efficiency, seen_error, pareto_k(drawn.log_weights))
+    shape = jnp.full_like(efficiency, jnp.nan)
+    if num_pilot >= _FEWEST_FOR_TAIL:
+        shape = pareto_k(drawn.log_weights)
+    told = (efficiency, seen_error, shape)
     efficiency, seen_error, shape = (jnp.where(active, value, jnp.nan) for value in told)
     return _Seen(efficiency, seen_error, shape, num_simulated)
 
