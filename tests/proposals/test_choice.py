@@ -8,7 +8,7 @@ from helpers import assert_weighted_moments, chosen_of, count_compilations, pape
 
 import jaxbridge as jb
 from jaxbridge.proposals.auto import as_proposal
-from jaxbridge.proposals.choice import Choice, best_at_worst
+from jaxbridge.proposals.choice import Choice, best_at_worst, best_of_few, worth_a_pilot
 
 slow = pytest.mark.slow
 HYPERBOLIC = jb.hyperbolic(0.8, 2)
@@ -39,6 +39,47 @@ def test_best_where_it_is_worst():
     told = (seconds, jnp.asarray(efficiency, jnp.float32), nothing, nothing)
     choice = best_at_worst(Choice(proposals, *told, jnp.zeros(6, jnp.int32), (0, 1, 2)), 3)
     assert list(choice.chosen) == [1, 0] and choice.used == (0, 1)
+
+
+def test_few_candidates_serve_many_intervals():
+    """All together lose a twentieth of the work at most, and none more could be left out; but a
+    candidate that some intervals cannot do without stays."""
+    rng = np.random.default_rng(0)
+    rates = jnp.asarray(np.exp(0.3 * rng.normal(size=(50, 4, 30))), jnp.float32)
+    chosen = np.asarray(jax.vmap(best_of_few)(rates))
+    numbers = []
+    for each, of_interval in zip(np.asarray(rates, float), chosen, strict=True):
+        used = np.unique(of_interval)
+        best, numbers = each.max(axis=0), [*numbers, len(used)]
+        np.testing.assert_array_equal(of_interval, used[each[used].argmax(axis=0)])
+        assert np.mean(best / each[of_interval, np.arange(30)]) <= 1.05
+        for i in used if len(used) > 1 else ():
+            assert np.mean(best / each[used[used != i]].max(axis=0)) > 1.05
+    assert set(numbers) >= {3, 4}
+    nearly = jnp.array([[1.0, 1.0, 1.0], [1.04, 0.9, 1.1], [np.nan, np.nan, 0.1]])
+    assert list(best_of_few(nearly)) == [0, 0, 0]
+    needed = jnp.array([[1.0, 1.0, 1e-6], [0.5, 0.5, 0.5], [np.nan, np.nan, 0.4]])
+    assert list(best_of_few(needed)) == [0, 0, 1]
+
+
+def test_a_candidate_that_would_gain_next_to_nothing_makes_no_pilot_run():
+    potential = jnp.array([0.77, 0.77, 0.77, 0.77])
+    assert not worth_a_pilot(potential, jnp.array([0.95, 0.9, 0.7, 0.8])).any()
+    assert list(worth_a_pilot(potential, jnp.array([0.95, 0.9, 0.4, 0.8]))) == [0, 0, 1, 0]
+    assert worth_a_pilot(potential, jnp.zeros(4)).all()
+
+
+@slow
+def test_many_intervals_of_one_kind_take_one_proposal():
+    """Of so many pilot runs some show heavy tails by chance, which called for other programs."""
+    rng = np.random.default_rng(0)
+    starts, ends = rng.normal(size=(2, 200, 2)).astype(np.float32) * 0.7
+    model = jb.Diffusion(lambda x, p: -x, log_stationary=lambda x, p: -x @ x)
+    choice = jb.transition_log_density(
+        jax.random.key(0), model, starts, ends, 0.5, num_proposals=10, num_steps=10, proposal="auto"
+    ).proposal
+    assert choice.used == (0,) and np.isnan(choice.pareto_k).all()
+    assert "ModifiedDiffusionBridge" in str(choice) and "200 of 200" in str(choice)
 
 
 @slow
