@@ -40,6 +40,11 @@ class Augmentation(eqx.Module):
     is_quadratic: bool = eqx.field(static=True)
 
     @property
+    def like(self) -> Float[Array, " d"]:
+        """A point, of which only shape and dtype count."""
+        return self.blocks[0].problem.like
+
+    @property
     def num_intervals(self) -> int:
         return sum(len(block.index) for block in self.blocks)
 

@@ -87,6 +87,7 @@ class GibbsPosterior(AbstractPosterior):
     - `log_step_error`: an estimate of the step error of the log density of the completed data at
         each draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
         `step_error`, that of the posterior mean, is made of.
+    - `sigma_varies`: whether σ depends on the state.
     - `state`: where it ended; pass it as `init` to go on.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
     - `completion`: how the observations were completed, with the proposals that were chosen.
@@ -101,6 +102,7 @@ class GibbsPosterior(AbstractPosterior):
     num_missing: Int[Array, "*chains n"]
     num_truncated: Int[Array, "*chains n"]
     log_step_error: Float[Array, "*chains n"]
+    sigma_varies: bool = eqx.field(static=True)
     state: GibbsState
     completion: Augmentation
     exact_parameters: bool = eqx.field(static=True)
@@ -314,6 +316,7 @@ def _run(
         **fields,
         **info._asdict(),
         log_step_error=log_step_error,
+        sigma_varies=sampler.parameters.model.sigma_varies(sampler.augmentation.like),
         state=state,
         completion=sampler.augmentation,
         exact_parameters=isinstance(sampler.kernel, NormalDraw),

@@ -91,6 +91,11 @@ class AbstractLikelihood(eqx.Module):
 
     @property
     @abstractmethod
+    def like(self) -> Float[Array, " d"]:
+        """A point of the state space, of which only shape and dtype count."""
+
+    @property
+    @abstractmethod
     def proposals(self) -> tuple[AbstractWeightedProposal, ...]:
         """Of the paths, decided, for each group of intervals: kept in the state in which a chain
         ends, so that one that goes on has the same. Empty where there is nothing to decide."""
@@ -104,7 +109,7 @@ class TransitionLikelihood(AbstractLikelihood):
 
     def estimate(self, key, model):
         model = model.prepared()
-        zero = jnp.zeros((), self.blocks[0].problem.like.dtype)
+        zero = jnp.zeros((), self.like.dtype)
         total = Estimate(zero, zero, zero, jnp.int32(0))
         for block_key, block in with_keys(key, self.blocks):
             arguments = (model, block.proposal, block.problem, self.num_proposals)
@@ -132,6 +137,10 @@ class TransitionLikelihood(AbstractLikelihood):
     @property
     def tells_step_error(self):
         return True
+
+    @property
+    def like(self):
+        return self.blocks[0].problem.like
 
     @property
     def proposals(self):
@@ -216,6 +225,10 @@ class RecordLikelihood(AbstractLikelihood):
             return run_filters(key, problem, model, guide, size, moving)
 
         return records.each(one, jax.random.split(key, records.number), points)
+
+    @property
+    def like(self):
+        return self.fine.records.stacked.like
 
     @property
     def proposals(self):

@@ -115,6 +115,7 @@ class PMMHPosterior(AbstractPosterior):
         where weights were cut off (`num_truncated`), and with one proposal.
     - `log_step_error`: an estimate of the step error of each of these, NaN where none was worked
         out, shape (*chains, n): what `step_error`, that of the posterior mean, is made of.
+    - `sigma_varies`: whether σ depends on the state.
     - `accepted`: shape (*chains, n).
     - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
         parameters were refused because no estimate was to be had, shape (*chains,). With couplings
@@ -130,6 +131,7 @@ class PMMHPosterior(AbstractPosterior):
     log_likelihood: Float[Array, "*chains n"]
     log_likelihood_variance: Float[Array, "*chains"]
     log_step_error: Float[Array, "*chains n"]
+    sigma_varies: bool = eqx.field(static=True)
     accepted: Bool[Array, "*chains n"]
     num_without_estimate: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
@@ -438,6 +440,7 @@ def _run(
         log_likelihood=log_likelihood,
         log_likelihood_variance=jnp.median(held.variance, axis=0),
         log_step_error=of_likelihood,
+        sigma_varies=sampler.parameters.model.sigma_varies(sampler.likelihood.like),
         accepted=accepted,
         num_without_estimate=run.counted.num_without_estimate,
         num_truncated=run.counted.num_truncated,

@@ -31,6 +31,7 @@ class AbstractPosterior(eqx.Module):
     theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
     names: eqx.AbstractVar[tuple[str, ...]]
     log_step_error: eqx.AbstractVar[Float[Array, "*chains n"]]
+    sigma_varies: eqx.AbstractVar[bool]
 
     @property
     @abstractmethod
@@ -60,8 +61,10 @@ class AbstractPosterior(eqx.Module):
 
     @property
     def step_uncertainty(self) -> Float[Array, " p"]:
-        """A standard error of `step_error`."""
-        return self._step_error.uncertainty
+        """A standard error of `step_error`; where σ varies with the state no less than that itself,
+        for there half as many steps tell hardly more than its size."""
+        value, noise = self._step_error
+        return jnp.hypot(noise, value) if self.sigma_varies else noise
 
     @property
     def standard_error(self) -> Float[Array, " p"]:

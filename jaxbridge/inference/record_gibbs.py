@@ -89,6 +89,7 @@ class RecordPosterior(AbstractPosterior):
     - `log_step_error`: an estimate of the step error of the log density of data and noise at each
         draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
         `step_error`, that of the posterior mean, is made of.
+    - `sigma_varies`: whether σ depends on the state.
     - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
     """
 
@@ -99,6 +100,7 @@ class RecordPosterior(AbstractPosterior):
     blocks_moved: Float[Array, "*chains n"]
     stuck: Bool[Array, "*chains"]
     log_step_error: Float[Array, "*chains n"]
+    sigma_varies: bool = eqx.field(static=True)
     state: RecordState
 
     @property
@@ -230,6 +232,7 @@ def sample_records(
         blocks_moved=jnp.mean(taken, axis=(-3, -2, -1), where=real),
         stuck=jnp.any(real & ~ever, axis=(-3, -2, -1)),
         log_step_error=share_of_step_error(records) * (log_ratio + deviation**2 / 2),
+        sigma_varies=parameters.model.sigma_varies(records.stacked.like),
         state=state,
     )
 

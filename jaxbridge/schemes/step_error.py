@@ -53,7 +53,9 @@ def error_of_log_mean(
     # Normalised before they are squared, for beside a large D the others are tiny.
     coarse = weights * factors / ratio[..., None]
     spread = jnp.sqrt(jnp.sum((coarse - weights) ** 2, axis=-1))
-    change = jnp.log(ratio) + largest[..., 0]
+    # The mean of the log of a mean is too small by half its relative variance, and here are two.
+    bias = (jnp.sum(coarse**2, axis=-1) - jnp.sum(weights**2, axis=-1)) / 2
+    change = jnp.log(ratio) + largest[..., 0] + bias
     overlap = _overlap(weights, coarse)
     spread = jnp.where(overlap, spread, jnp.inf)
     return _told(share, change, spread, some)

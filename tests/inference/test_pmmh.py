@@ -9,6 +9,7 @@ from inference_oracles import ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
 from jaxbridge.inference.parameters import Parameters
+from jaxbridge.studies.rival_posteriors import data_sets, exact_posterior
 
 TIMES = np.arange(0, 12, 0.5)
 DATA = ou_data(7, TIMES, rate=0.8, sigma=0.7)
@@ -226,3 +227,25 @@ def test_ranks_of_true_parameters_are_uniform():
     keys = jax.random.split(jax.random.key(0), num_sets)
     ranks = np.asarray(jax.jit(jax.vmap(one_set))(keys))
     assert_uniform_ranks(ranks, num_draws)
+
+
+@pytest.mark.slow
+def test_the_step_error_where_sigma_varies_is_doubted():
+    """σ√x (Cox, Ingersoll & Ross 1985) in raw coordinates: the posterior mean of σ by ten steps is
+    .9 standard deviations off, and what half as many steps tell is more than that."""
+    data = data_sets(quick=False)[1]
+    exact, params = exact_posterior(data), {"rate": 1.0, "sigma": 1.0}
+    model = jb.Diffusion(data.drift, data.sigma, params=params, domain=lambda x, p: jnp.all(x > 0))
+    made = jb.pmmh(
+        jax.random.key(1), model, np.arange(len(data.values)), data.values[:, None],
+        prior=jb.NormalPrior(1.0, 1.0), constraint=lambda p: (p["rate"] > 0) & (p["sigma"] > 0),
+        num_iterations=2000, num_steps=10, num_proposals=30, num_chains=4,
+    )  # fmt: skip
+    off = (np.asarray(made.theta).reshape(-1, 2).mean(axis=0) - exact.mean) / exact.sd
+    told, doubt, error = (
+        np.asarray(each) / exact.sd
+        for each in (made.step_error, made.step_uncertainty, made.standard_error)
+    )
+    assert made.sigma_varies and made.step_error_dominates.all()
+    assert off[1] < -5 * error[1] and np.all(told < 0)
+    assert np.all(doubt >= np.abs(told)) and np.all(np.abs(told - off) < 2 * np.hypot(doubt, error))

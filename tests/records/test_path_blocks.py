@@ -70,7 +70,7 @@ def test_parameters_that_never_moved_have_no_error():
     state = RecordState(theta[:, 0], *4 * [share[:, :0]])
 
     def error(stuck):
-        draws = (theta, theta, ("a", "b"), moved, share, jnp.asarray(stuck), share, state)
+        draws = (theta, theta, ("a", "b"), moved, share, jnp.asarray(stuck), share, False, state)
         return RecordPosterior(*draws).standard_error
 
     assert 0 < error([False, False])[0] < 1 and error([False, False])[1] == np.inf
