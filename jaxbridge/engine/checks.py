@@ -68,8 +68,9 @@ def is_traced(*trees) -> bool:
 
 
 def taken(values: Array, index: Any) -> Array:
-    """`values[index]`: of numbers that are known without compiling a program for it."""
-    if is_traced(values, index):
+    """`values[index]`: of numbers that are known without compiling a program for it, unless they
+    were put on a device."""
+    if is_traced(values, index) or values.committed:
         return values[index]
     return jnp.asarray(np.asarray(values)[index])
 

@@ -179,7 +179,7 @@ def _add(
     counts: Sequence[Int[Array, " P"]],
 ) -> Accepted:
     """With the attempts that are kept, those with a row, and what was counted of all."""
-    found, needed, nonfinite = counts
+    num_found, num_needed, num_nonfinite = counts
 
     def keep(rows, values):
         return rows.at[row].set(values, mode="drop")
@@ -187,9 +187,9 @@ def _add(
     return Accepted(
         jax.tree.map(keep, accepted.outputs, outputs),
         keep(accepted.number, number),
-        accepted.num_found + found,
-        accepted.num_trials + needed,
-        accepted.num_nonfinite + nonfinite,
+        accepted.num_found + num_found,
+        accepted.num_trials + num_needed,
+        accepted.num_nonfinite + num_nonfinite,
     )
 
 

@@ -165,8 +165,10 @@ def estimate_log_density(
     problem: BridgeProblem,
     num_proposals: int,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
+    held: bool = False,
 ) -> TransitionLogDensity:
-    """The estimates, for arguments that have been checked."""
+    """The estimates, for arguments that have been checked; `held` if a pseudo-marginal chain is to
+    hold on to them."""
     model, intervals, num_steps = model.prepared(), problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
@@ -182,7 +184,7 @@ def estimate_log_density(
     log_mean, error, size = log_mean_and_error(drawn.log_weights)
     cut = jnp.any(drawn.truncated, axis=1)
     share = proposal.step_share(model, intervals)
-    step_error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
+    step_error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share, held)
     if proposal.by_coupling is None:  # weights of coupled pairs are no sums over steps
         step_error = with_rounding(step_error, num_steps, problem.like.shape[0])
     value, error, size, shape, step_error, share = problem.result(

@@ -70,8 +70,9 @@ class Augmentation(eqx.Module):
 
     def first(self, key: Key[Array, ""], model: Diffusion) -> tuple[Paths, Bool[Array, " I"]]:
         """Paths to start from, and which of them the proposal itself has found, in the order of the
-        blocks. Where it finds none, whatever its weight, a straight line serves, or in place of a
-        coupling a modified diffusion bridge: a chain may start anywhere."""
+        blocks. Where it finds none, whatever its weight, a straight line serves, or, if couplings
+        may be used (inside `jit` all of a choice), a modified diffusion bridge: a chain may start
+        anywhere."""
         model = model.prepared()
 
         def of_block(block, kernel, keys):

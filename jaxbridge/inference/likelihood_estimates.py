@@ -113,7 +113,7 @@ class TransitionLikelihood(AbstractLikelihood):
         total = Estimate(zero, zero, zero, jnp.int32(0))
         for block_key, block in with_keys(key, self.blocks):
             arguments = (model, block.proposal, block.problem, self.num_proposals)
-            made = estimate_log_density(block_key, *arguments)
+            made = estimate_log_density(block_key, *arguments, held=True)
             mine = Estimate(
                 jnp.sum(made.value),
                 jnp.sum(made.standard_error**2),

@@ -101,7 +101,8 @@ class Parameters(eqx.Module):
 @compiled_sooner
 def of_rows(function: Callable, theta: Float[Array, "*chains p"]) -> Array:
     """`function` at θ of each chain, in one axis."""
-    return jax.vmap(lambda row: function(row))(theta.reshape(-1, theta.shape[-1]))
+    each = lambda row: function(row)  # `vmap` wants a function, and this may be a module
+    return jax.vmap(each)(theta.reshape(-1, theta.shape[-1]))
 
 
 def as_parameters(

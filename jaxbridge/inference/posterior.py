@@ -61,8 +61,8 @@ class AbstractPosterior(eqx.Module):
 
     @property
     def step_uncertainty(self) -> Float[Array, " p"]:
-        """A standard error of `step_error`; where σ varies with the state no less than that itself,
-        for there half as many steps tell hardly more than its size."""
+        """A standard error of `step_error`; where σ varies with the state not below `step_error`
+        itself, of which what half as many steps tell may there be two or three times too large."""
         value, noise = self._step_error
         return jnp.hypot(noise, value) if self.sigma_varies else noise
 
@@ -80,6 +80,7 @@ class AbstractPosterior(eqx.Module):
     def step_error_dominates(self) -> Bool[Array, " p"]:
         """Whether the step error is beyond the Monte Carlo error, or not known well enough to say:
         then more steps help, and more iterations do not."""
+        # Not by `step_uncertainty`: beside a doubt of its own size no error would be seen.
         return dominates(self._step_error, self.standard_error)
 
     @property

@@ -36,7 +36,8 @@ class Choice(AbstractWeightedProposal):
     - `seconds`: per simulated path, shape (C, I): by rule relative to those of a modified
         diffusion bridge, or measured where that could change the choice.
     - `efficiency`: effective samples per simulated path in the pilot run, extrapolated to
-        a larger one, shape (C, I); NaN where none was needed because the candidate could not win.
+        a larger one, shape (C, I); NaN where none was made because the candidate could not win, or
+        would gain next to nothing over all intervals.
     - `step_error`: of log p̂, as far as it was seen, and `pareto_k`, k̂ of the weights, both in the
         pilot run and of shape (C, I); k̂ is NaN where too few paths were drawn to tell.
     - `chosen`: the number of each interval's candidate, shape (I,).
@@ -153,10 +154,8 @@ class Choice(AbstractWeightedProposal):
 
     def for_all(self):
         """The candidate that leaves the least variance, Σ 1/(effective paths), for its cost."""
-        # No pilot run was made of what could not win even if all its paths were effective.
-        efficiency = np.nan_to_num(np.asarray(self.efficiency), nan=1.0)
-        cost = np.asarray(self.seconds) / np.maximum(efficiency, 1e-6)
-        return self.candidates[int(np.argmin(cost.sum(axis=1)))]
+        rates = np.asarray(_presumed_rates(self), float)
+        return self.candidates[int(np.argmin(np.sum(1 / np.maximum(rates, 1e-6), axis=1)))]
 
     def split(self):
         mine = [(np.flatnonzero(np.asarray(self.chosen) == i), i) for i in self.used]
@@ -253,12 +252,8 @@ def _pick(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
 def best_at_worst(choice: Choice, num: int) -> Choice:
     """One way for each of the groups of `num` intervals that follow each other: that which is best
     where it is worst. For chains in which end points move, whose pilot runs were from several."""
-    rates = value_rates(choice.efficiency, choice.seconds, choice.step_error, choice.pareto_k)
-    # Where no pilot run was needed, because another way was better, by what it could at best be.
-    bounds = jnp.array([each.efficiency_bound for each in choice.candidates], rates.dtype)
-    rates = jnp.where(jnp.isnan(rates), bounds[:, None] / choice.seconds, rates)
-    worst = jnp.min(rates.reshape(len(choice.candidates), -1, num), axis=2)
-    chosen = jnp.repeat(jnp.argmax(worst, axis=0).astype(jnp.int32), num)
+    worst = jnp.min(_presumed_rates(choice).reshape(len(choice.candidates), -1, num), axis=2)
+    chosen = jnp.repeat(best_of_few(worst), num)
     told = (choice.seconds, choice.efficiency, choice.step_error, choice.pareto_k)
     whole = Choice(choice.candidates, *told, chosen, choice.used, choice.left_out)
     return whole.of(np.arange(0, len(chosen), num))
@@ -267,28 +262,49 @@ def best_at_worst(choice: Choice, num: int) -> Choice:
 def worth_a_pilot(potential: Float[Array, " I"], best: Float[Array, " I"]) -> Bool[Array, " I"]:
     """On which intervals to try what could at most have this rate; on none where that would hardly
     gain anything over all of them."""
-    gain = jnp.where(potential > best, potential / jnp.maximum(best, _least(best)), 1)
-    return (potential > best) & (jnp.mean(gain) > 1 + _SPARED)
+    gain = _loss(best, jnp.maximum(best, potential))
+    return (potential > best) & (gain > 1 + _SPARED)
 
 
 def best_of_few(rates: Float[Array, "C I"]) -> Int[Array, " I"]:
     """The best candidate of each interval, among as few as hardly lose anything together: one after
-    the other is left out that the others replace best."""
+    the other is left out that the others replace best, of equals the last."""
     rates = jnp.where(jnp.isnan(rates), 0, rates)
     best, num = jnp.max(rates, axis=0), len(rates)
 
     def loss(kept: Bool[Array, " C"]) -> Float[Array, ""]:
-        left = jnp.max(jnp.where(kept[:, None], rates, 0), axis=0)
-        return jnp.mean(jnp.where(best > 0, best / jnp.maximum(left, _least(left)), 1))
+        return _loss(jnp.max(jnp.where(kept[:, None], rates, 0), axis=0), best)
 
     def leave_out(_, kept: Bool[Array, " C"]) -> Bool[Array, " C"]:
         without = kept & ~jnp.eye(num, dtype=bool)
         losses = jnp.where(kept, jax.vmap(loss)(without), jnp.inf)
-        least = jnp.argmin(losses)
+        least = num - 1 - jnp.argmin(losses[::-1])
         return jnp.where(losses[least] <= 1 + _SPARED, without[least], kept)
 
     kept = lax.fori_loop(0, num - 1, leave_out, jnp.ones(num, bool))
     return jnp.argmax(jnp.where(kept[:, None], rates, -1), axis=0).astype(jnp.int32)
+
+
+def _loss(rates: Float[Array, " I"], best: Float[Array, " I"]) -> Float[Array, ""]:
+    """How many times as much work these rates take as the best: on an interval, in the mean; or on
+    all together, where hard ones count for more."""
+    some, rates = best > 0, jnp.maximum(rates, _least(rates))
+    each = jnp.mean(jnp.where(some, best / rates, 1))
+    work = jnp.sum(jnp.where(some, 1 / rates, 0))
+    least = jnp.sum(jnp.where(some, 1 / jnp.where(some, best, 1), 0))
+    return jnp.maximum(each, work / jnp.where(least > 0, least, 1))
+
+
+def _presumed_rates(choice: Choice) -> Float[Array, "C I"]:
+    """Those of pilot runs; where a candidate had none no more than the best that had, and nothing
+    of a candidate that had none at all."""
+    rates = value_rates(choice.efficiency, choice.seconds, choice.step_error, choice.pareto_k)
+    known = ~jnp.isnan(rates)
+    bounds = jnp.array([each.efficiency_bound for each in choice.candidates], rates.dtype)
+    best = jnp.max(jnp.where(known, rates, 0), axis=0)
+    tried = jnp.any(known, axis=1, keepdims=True)
+    presumed = jnp.where(tried, jnp.minimum(bounds[:, None] / choice.seconds, best), 0)
+    return jnp.where(known, rates, presumed)
 
 
 def _least(rates: Float[Array, " I"]) -> float:

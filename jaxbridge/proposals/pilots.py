@@ -143,8 +143,9 @@ def _run_pilot(
         candidate = candidate.prepared(key, model, intervals, num_steps)
         seconds, active, called_for = look_at(candidate)
     if not called_for:
-        nothing = jnp.full_like(best, jnp.nan)
-        seen = _Seen(nothing, nothing, nothing, jnp.zeros(len(best), jnp.int32))
+        nothing: Any = np.full(len(best), np.nan, best.dtype)
+        none: Any = np.zeros(len(best), np.int32)
+        seen = _Seen(nothing, nothing, nothing, none)
         return _Pilot(candidate, None, seen, seconds)
     arguments = (model, candidate, intervals, active, num_steps, num_pilot)
     run = functools.partial(_look, key, purpose, *arguments)

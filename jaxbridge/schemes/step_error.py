@@ -8,7 +8,8 @@ an estimate changes by when it takes those is (2^p - 1) times its error, where t
 in its leading term. The two share their paths, and so the difference has far less Monte Carlo
 error than either where D is small; what it has is told beside it. Where a few of the paths have
 nearly all of the weights w e^D, the two laws have little in common: steps are too long for this, or
-for anything, and the uncertainty is infinite.
+for anything, and the uncertainty is infinite. The log of a mean of few weights is on average too
+small, by half its relative variance to leading order, and that is made up for.
 """
 
 import math
@@ -40,8 +41,10 @@ def error_of_log_mean(
     log_weights: Float[Array, "*I n"],
     log_halving: Float[Array, "*I n"],
     share: Float[Array, "*I"],
+    held: bool = False,
 ) -> StepError:
-    """Of the log of the mean of the weights."""
+    """Of the log of the mean of the weights; `held` if a pseudo-marginal chain holds on to them,
+    for then their law is tilted by that mean."""
     weights, known = _known(log_weights, log_halving)
     D = jnp.where(known, log_halving, 0)
     largest = jnp.max(jnp.where(weights > 0, D, -jnp.inf), axis=-1, keepdims=True)
@@ -53,10 +56,13 @@ def error_of_log_mean(
     # Normalised before they are squared, for beside a large D the others are tiny.
     coarse = weights * factors / ratio[..., None]
     spread = jnp.sqrt(jnp.sum((coarse - weights) ** 2, axis=-1))
-    # The mean of the log of a mean is too small by half its relative variance, and here are two.
-    bias = (jnp.sum(coarse**2, axis=-1) - jnp.sum(weights**2, axis=-1)) / 2
-    change = jnp.log(ratio) + largest[..., 0] + bias
+    # The mean of the log of a mean is too small by half its relative variance, and here are two;
+    # under the law that the mean of the weights tilts, that of the log of their ratio by half its
+    # variance.
+    fresh = jnp.sum(coarse**2, axis=-1) - jnp.sum(weights**2, axis=-1)
     overlap = _overlap(weights, coarse)
+    bias = jnp.where(overlap, spread**2 if held else fresh, 0) / 2
+    change = jnp.log(ratio) + largest[..., 0] + bias
     spread = jnp.where(overlap, spread, jnp.inf)
     return _told(share, change, spread, some)
 

@@ -2,6 +2,7 @@
 
 import functools
 import re
+import sys
 
 import blackjax.util
 import jax
@@ -178,12 +179,15 @@ def test_chains_of_several_models_under_vmap():
 
 
 @slow
-def test_segments_of_hard_bridges_are_mended_to_one_chain():
-    """Few renewals: trajectories seldom rejoin within their segment."""
+@pytest.mark.parametrize("width, num_bridges", [(128, 1500), (8, 1400)])
+def test_segments_of_hard_bridges_are_mended_to_one_chain(width, num_bridges, monkeypatch):
+    """Few renewals: trajectories seldom rejoin within their segment. All segments are run and
+    mended by one body, or, where there are more than are mended at a time, by two."""
+    monkeypatch.setattr(sys.modules["jaxbridge.exact.renewal"], "_REPAIR_WIDTH", width)
     arguments = (paper_model(), *PAPER_CASES["very unlikely"], 1.0)
     options = dict(num_steps=10, proposal=jb.Coupling(0.5))
     kernel = jb.renewal(*arguments, **options)
-    key, num_bridges = jax.random.key(2), 1500
+    key = jax.random.key(2)
     states, infos = jax.jit(functools.partial(run_kernel, kernel), static_argnums=1)(
         key, num_bridges
     )

@@ -41,6 +41,18 @@ def test_best_where_it_is_worst():
     assert list(choice.chosen) == [1, 0] and choice.used == (0, 1)
 
 
+def test_what_was_never_tried_is_not_chosen():
+    """A candidate without a pilot run may be anything: neither for groups nor for all."""
+    proposals = tuple(
+        as_proposal(candidate, paper_model(), jnp.zeros(2)) for candidate in CANDIDATES
+    )
+    efficiency = np.full((3, 6), np.nan)
+    efficiency[0] = [0.9, 0.9, 0.2, 0.9, 0.9, 0.9]
+    told = (jnp.ones((3, 6)), jnp.asarray(efficiency, jnp.float32), *2 * [jnp.zeros((3, 6))])
+    choice = Choice(proposals, *told, jnp.zeros(6, jnp.int32), (0,))
+    assert best_at_worst(choice, 3).used == (0,) and choice.for_all() is proposals[0]
+
+
 def test_few_candidates_serve_many_intervals():
     """All together lose a twentieth of the work at most, and none more could be left out; but a
     candidate that some intervals cannot do without stays."""
@@ -52,21 +64,31 @@ def test_few_candidates_serve_many_intervals():
         used = np.unique(of_interval)
         best, numbers = each.max(axis=0), [*numbers, len(used)]
         np.testing.assert_array_equal(of_interval, used[each[used].argmax(axis=0)])
-        assert np.mean(best / each[of_interval, np.arange(30)]) <= 1.05
+        loss = lambda rates, best=best: max(
+            np.mean(best / rates), np.sum(1 / rates) / np.sum(1 / best)
+        )
+        assert loss(each[of_interval, np.arange(30)]) <= 1.05
         for i in used if len(used) > 1 else ():
-            assert np.mean(best / each[used[used != i]].max(axis=0)) > 1.05
+            assert loss(each[used[used != i]].max(axis=0)) > 1.05
     assert set(numbers) >= {3, 4}
     nearly = jnp.array([[1.0, 1.0, 1.0], [1.04, 0.9, 1.1], [np.nan, np.nan, 0.1]])
-    assert list(best_of_few(nearly)) == [0, 0, 0]
+    assert list(best_of_few(nearly)) == [1, 1, 1]
     needed = jnp.array([[1.0, 1.0, 1e-6], [0.5, 0.5, 0.5], [np.nan, np.nan, 0.4]])
     assert list(best_of_few(needed)) == [0, 0, 1]
+    hard = jnp.ones((2, 1000)).at[1].set(0.5).at[:, 7].set(jnp.array([1e-4, 4e-3]))
+    assert np.flatnonzero(best_of_few(hard)).tolist() == [7]  # it takes a tenth of the work
+    for equal in (jnp.zeros((5, 3)), jnp.full((5, 3), jnp.nan), jnp.ones((5, 3))):
+        assert list(best_of_few(equal)) == [0, 0, 0]
 
 
 def test_a_candidate_that_would_gain_next_to_nothing_makes_no_pilot_run():
     potential = jnp.array([0.77, 0.77, 0.77, 0.77])
     assert not worth_a_pilot(potential, jnp.array([0.95, 0.9, 0.7, 0.8])).any()
-    assert list(worth_a_pilot(potential, jnp.array([0.95, 0.9, 0.4, 0.8]))) == [0, 0, 1, 0]
+    few = np.asarray(worth_a_pilot(potential, jnp.array([0.95, 0.9, 0.4, 0.8])))
+    assert few.tolist() == [False, False, True, False]
     assert worth_a_pilot(potential, jnp.zeros(4)).all()
+    one_is_hard = jnp.full(1000, 0.9).at[7].set(0.005)
+    assert np.flatnonzero(worth_a_pilot(jnp.full(1000, 0.14), one_is_hard)).tolist() == [7]
 
 
 @slow

@@ -120,6 +120,25 @@ def test_few_paths_do_not_bias_the_log_of_a_mean():
     assert np.mean(plain) < -8e-3
 
 
+@pytest.mark.parametrize("held", [False, True])
+def test_few_paths_do_not_bias_it_where_they_are_held_either(held):
+    """Of weights and factors that are correlated; those that a chain holds are as likely as their
+    mean is large."""
+    rng, n, s, t, rho = np.random.default_rng(4), 30, 0.7, 0.4, -0.7
+    z = rng.normal(size=(2, 300_000, n))
+    log_w, D = s * z[0], t * (rho * z[0] + np.sqrt(1 - rho**2) * z[1])
+    exact = t**2 / 2 + s * t * rho
+    w = np.exp(log_w).mean(axis=1)
+    likelihood = w / w.mean() if held else np.ones_like(w)
+
+    def bias(made):
+        return np.mean(likelihood * (np.asarray(made, float) - exact))
+
+    told = error_of_log_mean(jnp.asarray(log_w), jnp.asarray(D), jnp.ones(len(D)), held)
+    other = error_of_log_mean(jnp.asarray(log_w), jnp.asarray(D), jnp.ones(len(D)), not held)
+    assert abs(bias(told.value)) < 1.5e-3 < 3e-3 < abs(bias(other.value))
+
+
 def test_uncertainty_is_the_spread_of_repetitions():
     rng = np.random.default_rng(1)
     log_w = jnp.asarray(0.5 * rng.normal(size=(4000, 200)))
