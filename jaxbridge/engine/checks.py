@@ -70,7 +70,7 @@ def is_traced(*trees) -> bool:
 def taken(values: Array, index: Any) -> Array:
     """`values[index]`: of numbers that are known without compiling a program for it, unless they
     were put on a device."""
-    if is_traced(values, index) or values.committed:
+    if is_traced(values, index) or getattr(values, "committed", False):
         return values[index]
     return jnp.asarray(np.asarray(values)[index])
 

@@ -155,7 +155,7 @@ class Choice(AbstractWeightedProposal):
     def for_all(self):
         """The candidate that leaves the least variance, Σ 1/(effective paths), for its cost."""
         rates = np.asarray(_presumed_rates(self), float)
-        return self.candidates[int(np.argmin(np.sum(1 / np.maximum(rates, 1e-6), axis=1)))]
+        return self.candidates[int(np.argmin(np.sum(1 / np.maximum(rates, 1e-30), axis=1)))]
 
     def split(self):
         mine = [(np.flatnonzero(np.asarray(self.chosen) == i), i) for i in self.used]
