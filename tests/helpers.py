@@ -159,6 +159,7 @@ def count_compilations():
         if event.endswith("backend_compile_duration"):
             compiled.append(duration)
 
+    jax.effects_barrier()  # callbacks of programs before may compile, too
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         yield compiled
