@@ -110,7 +110,7 @@ def test_changes_are_those_of_weights_and_factors():
 
 def test_few_paths_do_not_bias_the_log_of_a_mean():
     """Of log-normal e^D with mean one nothing changes; of 30 of them the log of the mean is
-    .0105 too small, and by a tenth of that or less with half of its variance."""
+    some .01 too small, and with half of its variance by a fifth of that or less."""
     rng, sd = np.random.default_rng(3), 0.7
     D = jnp.asarray(sd * rng.normal(size=(200_000, 30)) - sd**2 / 2)
     made = error_of_log_mean(jnp.zeros_like(D), D, jnp.ones(len(D)))
