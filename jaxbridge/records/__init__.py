@@ -24,10 +24,14 @@ Schauer 2017; Mider, Schauer & van der Meulen 2021) with data on the way. On it 
 
 # What the folders above use of this one.
 from .forgetting import half_will_do as half_will_do, rate_for_several as rate_for_several
+from .guide_search import (
+    GuideCheck as GuideCheck,
+    check_guide as check_guide,
+    linearised as linearised,
+)
 from .guided_record import (
     Guidance as Guidance,
     guided as guided,
-    linearised as linearised,
     noise_and_log_weight as noise_and_log_weight,
     path_and_log_weight as path_and_log_weight,
 )

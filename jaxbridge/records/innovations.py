@@ -17,7 +17,8 @@ from ..engine.compiled import compiled
 from ..engine.doors import door
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
-from .guided_record import guided, linearised, path_and_log_weight
+from .guide_search import linearised
+from .guided_record import guided, path_and_log_weight
 from .initial import Initial
 from .observation import Observation
 from .problem import RecordProblem, as_record_problem

@@ -23,7 +23,8 @@ from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity, StepError, dominates, error_of_grids, num_coarse_grids
 from .forgetting import chosen_of, confirmed, half_will_do, rates_for, undecided
-from .guided_record import Guidance, forgetful, linearised
+from .guide_search import linearised
+from .guided_record import Guidance, forgetful
 from .initial import Initial
 from .observation import Observation
 from .particle_filter import Filtered, run_filters

@@ -18,7 +18,7 @@ from ..engine.checks import Numbers
 from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
-from .guided_record import linearised
+from .guide_search import linearised
 from .initial import Initial
 from .observation import Observation
 from .problem import RecordProblem, check_domain, problem_of

@@ -26,7 +26,8 @@ from ..schemes import (
     log_halving_of_paths,
     share_of_order,
 )
-from .guided_record import Linearised, linearised, path_and_log_weight
+from .guide_search import Linearised, linearised
+from .guided_record import path_and_log_weight
 from .initial import Initial
 from .observation import Observation
 from .path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep, tuned
