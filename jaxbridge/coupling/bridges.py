@@ -19,7 +19,7 @@ from ..engine.devices import over_devices
 from ..engine.doors import door
 from ..engine.keys import numbered_keys
 from ..engine.rejection import Accepted, Attempts, Search, over_problems, rejection_sample
-from ..engine.throwing import throw_where_incomplete
+from ..engine.verdict import AbstractResult, Verdict, missing_bridges, throw_where_untrustworthy
 from ..models.bridge_problem import (
     BridgeProblem,
     Intervals,
@@ -33,7 +33,7 @@ from .gamma import Coupling
 from .join import Inputs, Proposals, propose
 
 
-class Bridges(eqx.Module):
+class Bridges(AbstractResult):
     """What `sample_bridges` returns. With I intervals arrays have a leading axis I; `times` has
     it only where there are I durations.
 
@@ -59,6 +59,11 @@ class Bridges(eqx.Module):
     num_nonfinite: Int[Array, "*I"]
     coupling: AbstractCoupling
     num_steps: int = eqx.field(static=True)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the only fault of approximate bridges: some were not found."""
+        return Verdict((missing_bridges(jnp.any(~self.met, axis=-1)),))
 
 
 @door
@@ -138,7 +143,7 @@ def sample_bridges(
     batch_size = check_count("batch_size", batch_size)
     search = Search(num_bridges, max_proposals, batch_size, progress_meter)
     bridges = _sample_bridges(key, model, coupling, problem, search)
-    return throw_where_incomplete(bridges, "paths", model, ~bridges.met) if throw else bridges
+    return throw_where_untrustworthy(bridges, "paths", model) if throw else bridges
 
 
 @compiled_for(lambda key, model, coupling, problem, search: problem.num_path_steps(search.wanted))

@@ -22,6 +22,7 @@ from ..engine.compiled import compiled_for
 from ..engine.doors import door
 from ..engine.keys import key_for, numbered_keys
 from ..engine.rejection import Attempts, Search, over_problems, rejection_sample
+from ..engine.verdict import AbstractResult, Verdict, missing_bridges, truncated_weights
 from ..models.diffusion import Diffusion, check_diffusion
 from .associated import run_associated
 from .base import AbstractCoupling
@@ -47,7 +48,7 @@ class BridgePaths(Protocol):
         ...
 
 
-class HittingCounts(eqx.Module):
+class HittingCounts(AbstractResult):
     """What `hitting_counts` returns: counts of n bridges, or of I × n with a leading axis I.
 
     - `counts`: N independent counts for each bridge, shape (n, N); -1 where the trials ran out
@@ -64,6 +65,11 @@ class HittingCounts(eqx.Module):
     num_trials: Int[Array, "*I n"]
     num_nonfinite: Int[Array, "*I n"]
     start: Float[Array, "*I n d"]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the faults of each bridge: it is missing, or its trials ran out."""
+        return Verdict((missing_bridges(self.num_trials == 0), truncated_weights(self.truncated)))
 
     @property
     def mean(self) -> Float[Array, "*I n"]:

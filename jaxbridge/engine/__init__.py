@@ -11,6 +11,6 @@ tell how far they are (`progress`).
 
 Of what comes out means are taken, Σ w h / Σ w (`averages`), whose weights have tails that allow it
 or not (`pareto`), and whose draws are worth so many independent ones (`diagnostics`). What is
-missing is an error at run time for those who ask for it (`throwing`). A process that has compiled
-more than it can hold is warned (`memory_maps`).
+missing is a fault of the result, and an error at run time for those who ask for it (`verdict`). A
+process that has compiled more than it can hold is warned (`memory_maps`).
 """

@@ -16,12 +16,10 @@ from jaxtyping import Array, Key
 
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.doors import door
-from ..engine.pareto import is_reliable
-from ..engine.throwing import throw_where_incomplete
+from ..engine.verdict import throw_where_untrustworthy
 from ..models.bridge_problem import bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import Budget, Guided, as_guided, as_pairs, as_proposal, resolve
-from ..schemes import is_gross
 from .crank_nicolson import check_step_size, run_crank_nicolson
 from .kernels import Chain, check_position
 from .pseudo_marginal import run_pseudo_marginal
@@ -81,8 +79,8 @@ def sample_exact_bridges(
         count. See `Chain.truncated`. It and `num_counts` are not for the renewal chain.
     - `step_size`: β in (0, 1] of "crank_nicolson", by default 0.5; see `crank_nicolson`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, k̂ is
-        above 0.7, the step error is above 0.1 standard deviations, or parameters are not finite.
+    - `throw`: raise an error at run time where the result is not `trustworthy`, or parameters are
+        not finite.
 
     **Returns:** `Chain`. Not differentiable.
 
@@ -125,17 +123,4 @@ def sample_exact_bridges(
     problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     chain = run(key, model, proposal, problem, num_bridges, first, progress_meter)
-    if not throw:
-        return chain
-    # The renewal chain keeps no weights that could be cut off, but its trials may start wrongly.
-    truncated = chain.num_truncated > 0 if chain.truncated is None else chain.truncated
-    return throw_where_incomplete(
-        chain,
-        "paths",
-        model,
-        ~chain.met,
-        truncated,
-        coupled=chain.proposal.coupled,
-        heavy=None if chain.pareto_k is None else ~is_reliable(chain.pareto_k),
-        gross=is_gross(chain.step_error_in_sds()),
-    )
+    return throw_where_untrustworthy(chain, "paths", model) if throw else chain

@@ -17,15 +17,23 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_for
 from ..engine.doors import door
-from ..engine.pareto import is_reliable, pareto_k
-from ..engine.throwing import throw_where_incomplete
+from ..engine.pareto import pareto_k
+from ..engine.verdict import (
+    AbstractResult,
+    Fault,
+    Verdict,
+    heavy_tails,
+    missing_bridges,
+    throw_where_untrustworthy,
+    truncated_weights,
+)
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractProposal, AbstractWeightedProposal, Budget, as_proposal, resolve
-from ..schemes import StepError, dominates, error_of_log_mean, is_gross, with_rounding
+from ..schemes import StepError, dominates, error_of_log_mean, step_fault, with_rounding
 
 
-class TransitionLogDensity(eqx.Module):
+class TransitionLogDensity(AbstractResult):
     """What `transition_log_density` returns: estimates for one pair of points, shape (), or for I
     of them.
 
@@ -67,15 +75,25 @@ class TransitionLogDensity(eqx.Module):
     def step_error_dominates(self) -> Bool[Array, "*I"]:
         """Whether the step error is beyond the standard error, or not known well enough to say:
         then more steps help, and more proposals do not."""
-        error = StepError(self.step_error, self.step_uncertainty)
-        return dominates(error, self.standard_error)
+        return dominates(self._step_error, self.standard_error)
 
     @property
-    def trustworthy(self) -> Bool[Array, "*I"]:
-        """Whether `value` and `standard_error` are to be trusted: a mean that few large weights do
-        not decide, no weight cut off, and a step error that does not dominate."""
-        trusted = is_reliable(self.pareto_k, self.effective_sample_size) & (self.num_truncated == 0)
-        return trusted & ~self.step_error_dominates & (self.num_met > 0)
+    def verdict(self) -> Verdict:
+        """Return the faults: no bridge, weights cut off or with heavy tails, a step error that
+        dominates and is beyond 0.05."""
+        return Verdict((*self._weight_faults, step_fault(self._step_error, self.standard_error)))
+
+    @property
+    def _weight_faults(self) -> tuple[Fault, ...]:
+        return (
+            missing_bridges(self.num_met == 0, self.proposal.coupled),
+            truncated_weights(self.num_truncated > 0),
+            heavy_tails(self.pareto_k, self.effective_sample_size),
+        )
+
+    @property
+    def _step_error(self) -> StepError:
+        return StepError(self.step_error, self.step_uncertainty)
 
 
 @door
@@ -113,9 +131,8 @@ def transition_log_density(
     - `num_counts`: N hitting counts for each proposal, by default one.
     - `max_trials`: bounds the trials of each proposal; by default 10,000 for each count.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where no proposal became a bridge, a weight was cut off,
-        k̂ is above 0.7, the step error is above the standard error and 0.1, or parameters are not
-        finite.
+    - `throw`: raise an error at run time where the result is not `trustworthy`, or parameters are
+        not finite.
 
     **Returns:** `TransitionLogDensity`. With proposals that are pulled to the end point `value` is
     differentiable, forward and reverse: an estimate of the score. So it is with a choice between
@@ -142,19 +159,7 @@ def transition_log_density(
     proposal.check_for_density(model)
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     estimate = estimate_log_density(key, model, proposal, problem, num_proposals, progress_meter)
-    if not throw:
-        return estimate
-    error = StepError(estimate.step_error, estimate.step_uncertainty)
-    return throw_where_incomplete(
-        estimate,
-        "value",
-        model,
-        estimate.num_met == 0,
-        estimate.num_truncated > 0,
-        coupled=estimate.proposal.coupled,
-        heavy=~is_reliable(estimate.pareto_k, estimate.effective_sample_size),
-        gross=estimate.step_error_dominates & is_gross(error),
-    )
+    return throw_where_untrustworthy(estimate, "value", model) if throw else estimate
 
 
 @compiled_for(lambda key, model, proposal, problem, num, *_: problem.num_path_steps(num))

@@ -16,11 +16,12 @@ from ..engine.averages import (
     values_of,
     weighted_mean,
 )
+from ..engine.verdict import AbstractResult
 from ..proposals import AbstractWeightedProposal
 from ..schemes import StepError, dominates, error_of_mean
 
 
-class AbstractExactBridges(eqx.Module):
+class AbstractExactBridges(AbstractResult):
     """Bridges with the exact law, up to the step error. Arrays have a leading axis I if there are
     several intervals.
 

@@ -15,20 +15,24 @@ nothing is assumed but the order.
 
 from typing import Any, overload
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.averages import PathFunction
 from ..engine.doors import door
-from ..engine.pareto import is_reliable
-from ..schemes import StepError, dominates, share_of_known_order
+from ..engine.verdict import AbstractResult, Fault, Verdict
+from ..schemes import StepError, dominates, share_of_known_order, step_fault
 from .density import TransitionLogDensity
 from .importance import WeightedBridges
 
+_NEGATIVE = (
+    "Noise made the combination of the two estimates negative, or one of them is zero. Take more "
+    "`num_proposals`."
+)
 
-class ExtrapolatedLogDensity(eqx.Module):
+
+class ExtrapolatedLogDensity(AbstractResult):
     """What `extrapolate` makes of two `TransitionLogDensity`.
 
     - `value`: the log of the combination, unbiased on the natural scale but for an error of higher
@@ -48,20 +52,22 @@ class ExtrapolatedLogDensity(eqx.Module):
     def step_error_dominates(self) -> Bool[Array, "*I"]:
         """Whether half of what was removed, taken for a bound of what is left, is beyond three
         standard errors. Of the next order two grids tell nothing: a third does."""
-        left = StepError(jnp.zeros_like(self.removed), jnp.abs(self.removed) / 2)
-        return dominates(left, self.standard_error)
+        return dominates(self._left, self.standard_error)
 
     @property
-    def trustworthy(self) -> Bool[Array, "*I"]:
-        """Whether `value` and `standard_error` are to be trusted, as in `TransitionLogDensity`."""
-        trusted = ~self.step_error_dominates & jnp.isfinite(self.value)
-        for one in (self.fine, self.coarse):
-            trusted &= is_reliable(one.pareto_k, one.effective_sample_size)
-            trusted &= (one.num_truncated == 0) & (one.num_met > 0)
-        return trusted
+    def verdict(self) -> Verdict:
+        """Return the faults of both estimates, as in `TransitionLogDensity`, but for their step
+        errors; of these, the fault of what is left."""
+        weights = (*self.fine._weight_faults, *self.coarse._weight_faults)
+        left = step_fault(self._left, self.standard_error)
+        return Verdict((*weights, Fault(~jnp.isfinite(self.value), _NEGATIVE), left))
+
+    @property
+    def _left(self) -> StepError:
+        return StepError(jnp.zeros_like(self.removed), jnp.abs(self.removed) / 2)
 
 
-class ExtrapolatedBridges(eqx.Module):
+class ExtrapolatedBridges(AbstractResult):
     """What `extrapolate` makes of two `WeightedBridges`, `fine` and `coarse`: their means,
     combined."""
 
@@ -82,6 +88,12 @@ class ExtrapolatedBridges(eqx.Module):
     def removed(self, fn: PathFunction = lambda path: path) -> PyTree:
         """What `mean(fn)` is smaller by than that of the finer grid."""
         return jax.tree.map(jnp.subtract, self.fine.mean(fn), self.mean(fn))
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the faults of the weights of both. Of the step error only `removed(fn)` tells:
+        compare half of it with the standard error."""
+        return Verdict((*self.fine._weight_faults, *self.coarse._weight_faults))
 
     def _combined(self, fn, fine, coarse, combine):
         share = share_of_known_order(self.fine.step_share)

@@ -35,8 +35,15 @@ from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_for
 from ..engine.doors import door
 from ..engine.keys import key_for
-from ..engine.pareto import is_reliable, pareto_k
-from ..engine.throwing import throw_where_incomplete
+from ..engine.pareto import pareto_k
+from ..engine.verdict import (
+    Fault,
+    Verdict,
+    heavy_tails,
+    missing_bridges,
+    throw_where_untrustworthy,
+    truncated_weights,
+)
 from ..models.bridge_problem import BridgeProblem, Intervals, bridge_problem
 from ..models.diffusion import Diffusion, check_diffusion
 from ..proposals import (
@@ -49,7 +56,7 @@ from ..proposals import (
     resolve,
     usable,
 )
-from ..schemes import is_gross
+from ..schemes import step_fault
 from .exact_bridges import AbstractExactBridges
 
 
@@ -125,6 +132,21 @@ class WeightedBridges(AbstractExactBridges):
         """k̂ of the weights. Above 0.7 neither means nor their standard errors can be trusted."""
         return pareto_k(self.log_weights)
 
+    @property
+    def verdict(self) -> Verdict:
+        """Return the faults: missing bridges, weights cut off or with heavy tails, a step error of
+        the mean path that dominates and is beyond 0.05 standard deviations."""
+        error = 1 / jnp.sqrt(jnp.maximum(self.effective_sample_size, 1))  # in the same units
+        return Verdict((*self._weight_faults, step_fault(self.step_error_in_sds(), error)))
+
+    @property
+    def _weight_faults(self) -> tuple[Fault, ...]:
+        return (
+            missing_bridges(jnp.any(~self.met, axis=-1), self.proposal.coupled),
+            truncated_weights(jnp.any(self.truncated, axis=-1)),
+            heavy_tails(self.pareto_k, self.effective_sample_size),
+        )
+
     def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:
         """Equally weighted paths by systematic resampling, shape (m, K, d): many effective ones
         are needed for few repetitions. NaN where no bridge was found."""
@@ -174,8 +196,8 @@ def weigh_bridges(
         `WeightedBridges.truncated`.
     - `batch_size`: trials simulated side by side; changes results by rounding only.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, k̂ is
-        above 0.7, the step error is above 0.1 standard deviations, or parameters are not finite.
+    - `throw`: raise an error at run time where the result is not `trustworthy`, or parameters are
+        not finite.
 
     **Returns:** `WeightedBridges`. Not differentiable.
 
@@ -201,20 +223,7 @@ def weigh_bridges(
     like = bridges.reverse_start.reshape(-1, bridges.paths.shape[-1])[0]
     pairs = as_proposal(coupling, model, like, Budget(search.wanted, None, max_trials))
     weighted = _weigh_bridges(key_for("weights", key), model, pairs, bridges, search)
-    return _or_throw(weighted, model) if throw else weighted
-
-
-def _or_throw(weighted: WeightedBridges, model: Diffusion) -> WeightedBridges:
-    return throw_where_incomplete(
-        weighted,
-        "log_weights",
-        model,
-        ~weighted.met,
-        weighted.truncated,
-        coupled=weighted.proposal.coupled,
-        heavy=~is_reliable(weighted.pareto_k, weighted.effective_sample_size),
-        gross=is_gross(weighted.step_error_in_sds()),
-    )
+    return throw_where_untrustworthy(weighted, "log_weights", model) if throw else weighted
 
 
 @compiled_for(lambda key, model, pairs, bridges, search: bridges.met.size * bridges.num_steps)
@@ -279,8 +288,8 @@ def sample_weighted_bridges(
     - `num_bridges`: n, for each interval.
     - `proposal`, `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where a bridge was not found, a weight was cut off, k̂ is
-        above 0.7, the step error is above 0.1 standard deviations, or parameters are not finite.
+    - `throw`: raise an error at run time where the result is not `trustworthy`, or parameters are
+        not finite.
 
     **Returns:** `WeightedBridges`.
 
@@ -309,7 +318,7 @@ def sample_weighted_bridges(
     problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     weighted = _sample_weighted(key, model, proposal, problem, num_bridges, progress_meter)
-    return _or_throw(weighted, model) if throw else weighted
+    return throw_where_untrustworthy(weighted, "log_weights", model) if throw else weighted
 
 
 @compiled_for(lambda key, model, proposal, problem, num, *_: problem.num_path_steps(num))

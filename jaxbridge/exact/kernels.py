@@ -1,6 +1,7 @@
 """What the Markov chains on bridges have in common: kernels of two functions, their keys, and the
 chain that many steps make."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -21,10 +22,19 @@ from ..engine.averages import (
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.diagnostics import effective_sample_size
 from ..engine.keys import split_each
+from ..engine.verdict import Fault, Verdict, heavy_tails, missing_bridges, truncated_weights
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
+from ..schemes import step_fault
 from .exact_bridges import AbstractExactBridges
+
+# Of fewer moves a mean, and its error, mean nothing.
+_FEWEST_MOVES = 5
+_STILL = (
+    "The chain hardly moves, so that its mean and its error rest on a few paths. Take more "
+    '`num_bridges`, another proposal, or `method="crank_nicolson"`.'
+)
 
 
 class Kernel(NamedTuple):
@@ -89,6 +99,29 @@ class Chain(AbstractExactBridges):
     def log_mean_weights(self) -> Float[Array, "*I n"]:
         """All states count alike."""
         return jnp.where(self.met, 0.0, -jnp.inf).astype(self.paths.dtype)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the faults: missing bridges, weights cut off or with heavy tails, a chain that
+        hardly moves, a step error of the mean path that dominates and is beyond 0.05 standard
+        deviations."""
+        moves = jnp.sum(self.accepted, axis=-1)
+        # The renewal chain keeps no weights to be cut off, but its trials may start wrongly.
+        cut = self.num_truncated > 0
+        if self.truncated is not None:
+            cut = jnp.any(self.truncated, axis=-1)
+        heavy = () if self.pareto_k is None else (heavy_tails(self.pareto_k, math.inf),)
+        # Each move is a new path at best.
+        error = 1 / jnp.sqrt(jnp.maximum(moves, 1).astype(self.paths.dtype))
+        return Verdict(
+            (
+                missing_bridges(jnp.any(~self.met, axis=-1), self.proposal.coupled),
+                truncated_weights(cut),
+                *heavy,
+                Fault(moves < min(_FEWEST_MOVES, self.accepted.shape[-1] / 2), _STILL),
+                step_fault(self.step_error_in_sds(), error),
+            )
+        )
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """That of `mean(fn)`, from the effective sample size of the chain, of at least four states,

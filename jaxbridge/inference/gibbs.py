@@ -20,6 +20,7 @@ from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.progress import metered_scan
+from ..engine.verdict import Fault
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
 from ..records import Initial, Observation, as_record_problems
@@ -47,6 +48,17 @@ from .posterior import (
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_gibbs import RecordPosterior, RecordState, sample_records
 from .record_paths import check_no_bridges
+
+# Weights that are cut off in a larger share of iterations spoil the law.
+_MOST_TRUNCATED = 0.01
+_MISSING = (
+    "Some intervals have no bridge of the proposal (`num_missing` does not go to zero), and the "
+    "posterior is given stand-ins. Choose another `proposal`, or allow more `max_proposals`."
+)
+_CUT_OFF = (
+    "Weights were cut off by `max_trials` in more than 1 % of the iterations, so that the law is "
+    "not exact. Allow more trials, or choose another `proposal`."
+)
 
 
 class GibbsState(NamedTuple):
@@ -110,6 +122,13 @@ class GibbsPosterior(AbstractPosterior):
     @property
     def _stuck(self):
         return False
+
+    @property
+    def _faults(self):
+        # Counted in every iteration: a stand-in that no proposal has replaced.
+        late = self.num_missing[..., self.num_missing.shape[-1] // 2 :]
+        often = jnp.mean(self.num_truncated > 0, axis=-1) > _MOST_TRUNCATED
+        return Fault(jnp.any(jnp.min(late, axis=-1) > 0), _MISSING), Fault(jnp.any(often), _CUT_OFF)
 
 
 @door

@@ -15,7 +15,6 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
@@ -24,11 +23,11 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
-from ..engine.pareto import is_reliable
+from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
 from ..records import Initial, Observation, as_record_problems
-from ..schemes import StepError, dominates
+from ..schemes import StepError, dominates, step_fault
 from .augmentation import augment
 from .data import Problem, as_problem
 from .parameters import (
@@ -52,8 +51,13 @@ from .stochastic_approximation import EM, Gradient, Search, SearchInfo, approxim
 # Made once, for optimisers are compared by identity.
 _ADAM = optax.adam(1e-2)
 
+_NO_MAXIMUM = (
+    "No maximum was found (`newton` is false). Take more `num_iterations`, a larger learning rate, "
+    "more `num_bridges`, or check that the likelihood has a maximum inside the constraint."
+)
 
-class MaximumLikelihood(eqx.Module):
+
+class MaximumLikelihood(AbstractResult):
     """The maximum likelihood estimate, from `maximum_likelihood`.
 
     - `params`: all parameters of the model, the unknown ones estimated.
@@ -97,11 +101,18 @@ class MaximumLikelihood(eqx.Module):
     newton: Bool[Array, ""]
 
     @property
-    def trustworthy(self) -> Bool[Array, ""]:
-        """Whether a maximum was found, by weights of no interval that a few large ones decide (k̂
-        below 0.7, five effective ones), and with a step error that does not dominate."""
-        weights = is_reliable(self.score.pareto_k, self.score.effective_sample_size)
-        return self.newton & jnp.all(weights) & ~jnp.any(self.step_error_dominates)
+    def verdict(self) -> Verdict:
+        """Return the faults: no maximum, the faults of the weights of `score`, a step error that
+        dominates and is beyond 0.05 standard errors."""
+        sd = jnp.sqrt(jnp.diagonal(self.covariance))
+        steps = step_fault(StepError(self.step_error, self.step_uncertainty), sd, sd)
+        return Verdict(
+            (
+                Fault(~self.newton, _NO_MAXIMUM),
+                *self.score._weight_faults,
+                Fault(jnp.any(steps.present), steps.sentence),
+            )
+        )
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:

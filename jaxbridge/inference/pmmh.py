@@ -33,6 +33,7 @@ from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.linalg import matvec
 from ..engine.progress import metered_stages
+from ..engine.verdict import Fault
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal, Budget
@@ -60,6 +61,16 @@ from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_paths import check_no_bridges, unguided
 from .warm_up import stages
 
+# A noisier estimate, or weights that are cut off in a larger share of iterations, spoil the chain.
+_MOST_VARIANCE, _MOST_TRUNCATED = 5.0, 0.01
+_NOISY = (
+    "The variance of the log-likelihood estimates (`log_likelihood_variance`) is above 5, so that "
+    "the chain holds on to lucky ones. Take more `num_proposals`, or a better `proposal`."
+)
+_TRUNCATED = (
+    "Weights were cut off by `max_trials` in more than 1 % of the iterations, so that the law is "
+    "not exact. Allow more trials, or choose another `proposal`."
+)
 # For so many parameters it is decided how likelihoods are estimated.
 _NUM_LIKELY = 8
 
@@ -140,6 +151,12 @@ class PMMHPosterior(AbstractPosterior):
     @property
     def _stuck(self):
         return False
+
+    @property
+    def _faults(self):
+        noisy = ~jnp.all(self.log_likelihood_variance < _MOST_VARIANCE)
+        often = jnp.any(self.num_truncated > _MOST_TRUNCATED * self.accepted.shape[-1])
+        return Fault(noisy, _NOISY), Fault(often, _TRUNCATED)
 
 
 @door

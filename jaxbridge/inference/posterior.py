@@ -14,7 +14,8 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
-from ..schemes import StepError, dominates
+from ..engine.verdict import AbstractResult, Fault, Verdict
+from ..schemes import StepError, dominates, step_fault
 from .parameters import Parameters, init_vectors, of_rows
 
 # Of about so many of the draws the step error is worked out: as many as tell a covariance, for it
@@ -22,9 +23,23 @@ from .parameters import Parameters, init_vectors, of_rows
 _STEP_ERRORS = 256
 # Of fewer draws a covariance tells nothing.
 _FEWEST = 10
+# Limits of chains that agree, and of draws that are worth an error.
+_MOST_R_HAT, _FEWEST_EFFECTIVE = 1.1, 25
+_APART = (
+    "Chains, or halves of one, disagree (R̂ above 1.1 for some parameter): they have not converged. "
+    "Take more `num_iterations` and `num_warmup`, or start nearer by `init=`."
+)
+_FEW = (
+    "Fewer than 25 effective draws of some parameter: its mean and its error are not determined. "
+    "Take more `num_iterations`."
+)
+_STUCK = (
+    "A parameter, or a block of the path, never moved. Take more `num_iterations`, or start from "
+    "likelier parameters by `init=`."
+)
 
 
-class AbstractPosterior(eqx.Module):
+class AbstractPosterior(AbstractResult):
     """Draws of unknown parameters, and their errors by their number and by the steps."""
 
     params: eqx.AbstractVar[PyTree]
@@ -37,6 +52,28 @@ class AbstractPosterior(eqx.Module):
     @abstractmethod
     def _stuck(self) -> Bool[Array, "*chains"] | bool:
         """Whether a path that is drawn with them never moved."""
+
+    @property
+    @abstractmethod
+    def _faults(self) -> tuple[Fault, ...]:
+        """Return the faults that only this kind of sampler has."""
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the faults: something that never moved, chains that disagree, few effective draws,
+        a step error that dominates and is beyond 0.05 posterior standard deviations, and those of
+        the sampler."""
+        sd = jnp.std(self.theta, axis=tuple(range(self.theta.ndim - 1)))
+        steps = step_fault(self._step_error, self.standard_error, sd)
+        return Verdict(
+            (
+                Fault(jnp.any(jnp.isinf(self.standard_error)), _STUCK),
+                Fault(~jnp.all(self.r_hat < _MOST_R_HAT), _APART),
+                Fault(~jnp.all(self.effective_sample_size >= _FEWEST_EFFECTIVE), _FEW),
+                *self._faults,
+                Fault(jnp.any(steps.present), steps.sentence),
+            )
+        )
 
     @property
     def _chains(self) -> Float[Array, "chains n p"]:

@@ -107,6 +107,10 @@ class RecordPosterior(AbstractPosterior):
     def _stuck(self):
         return self.stuck
 
+    @property
+    def _faults(self):
+        return ()
+
 
 class RecordSampler(eqx.Module):
     """What does not change from iteration to iteration, and the steps of one chain."""

@@ -29,7 +29,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -39,8 +38,9 @@ from ..engine.checks import all_finite_leaves, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.progress import metered_scan
+from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..records import Records, tuned
-from ..schemes import StepError, dominates
+from ..schemes import StepError, dominates, step_fault
 from .parameters import Parameters
 from .record_paths import At, RecordPaths, as_record_paths, movable, share_of_step_error
 from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
@@ -51,8 +51,16 @@ _SWEEPS = 50
 # h of differences, as a share; and by how many draws before those that count it is learnt.
 _DIFFERENCE, _LEARNING = 0.05, 10
 
+_MOST_R_HAT = 1.1
+_NO_MAXIMUM = (
+    "No maximum was found (`newton` is false). Take more `num_iterations`, a larger learning rate, "
+    "more `num_bridges`, or check that the likelihood has a maximum inside the constraint."
+)
+_STUCK = "A block of a path never moved. Take more `num_bridges` or more steps."
+_APART = "Chains of paths disagree (R̂ above 1.1 of the gradient). Take more `num_bridges`."
 
-class RecordMaximumLikelihood(eqx.Module):
+
+class RecordMaximumLikelihood(AbstractResult):
     """The maximum likelihood estimate, from `maximum_likelihood`, of records that were seen with
     noise or in part.
 
@@ -93,11 +101,19 @@ class RecordMaximumLikelihood(eqx.Module):
     newton: Bool[Array, ""]
 
     @property
-    def trustworthy(self) -> Bool[Array, ""]:
-        """Whether a maximum was found by chains that agree (R̂ below 1.1) and move, with a step
-        error that does not dominate."""
-        agree = jnp.all(self.r_hat < 1.1) & ~jnp.any(self.stuck)
-        return self.newton & agree & ~jnp.any(self.step_error_dominates)
+    def verdict(self) -> Verdict:
+        """Return the faults: no maximum, a block of a path that never moved, chains that disagree,
+        a step error that dominates and is beyond 0.05 standard errors."""
+        sd = jnp.sqrt(jnp.diagonal(self.covariance))
+        steps = step_fault(StepError(self.step_error, self.step_uncertainty), sd, sd)
+        return Verdict(
+            (
+                Fault(~self.newton, _NO_MAXIMUM),
+                Fault(jnp.any(self.stuck), _STUCK),
+                Fault(~jnp.all(self.r_hat < _MOST_R_HAT), _APART),
+                Fault(jnp.any(steps.present), steps.sentence),
+            )
+        )
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:

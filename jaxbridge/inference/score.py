@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
@@ -23,9 +22,17 @@ from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.pareto import pareto_k
 from ..engine.progress import metered_scan
+from ..engine.verdict import (
+    AbstractResult,
+    Fault,
+    Verdict,
+    heavy_tails,
+    missing_bridges,
+    truncated_weights,
+)
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
-from ..schemes import Form, StepError, error_of_mean, log_likelihoods, num_looked
+from ..schemes import Form, StepError, error_of_mean, log_likelihoods, num_looked, step_fault
 from .blocks import Block, make_blocks, over_intervals, target_forms, with_keys
 from .data import Problem, as_problem
 from .parameters import Parameters, as_parameters
@@ -34,7 +41,7 @@ from .parameters import Parameters, as_parameters
 _PATHS = 8_192
 
 
-class Score(eqx.Module):
+class Score(AbstractResult):
     """What `score` returns: the gradient of the log likelihood at the model's parameters, with
     Monte Carlo errors.
 
@@ -63,6 +70,24 @@ class Score(eqx.Module):
     step_uncertainty: Float[Array, " p"]
     num_missing: Int[Array, ""]
     num_truncated: Int[Array, ""]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the faults: intervals without a bridge, weights cut off or with heavy tails, a
+        step error that dominates and is beyond 0.05 standard deviations of the score."""
+        error = jnp.sqrt(jnp.maximum(jnp.diagonal(self.covariance), 0))
+        sd = jnp.sqrt(jnp.maximum(jnp.diagonal(self.information), 0))
+        steps = step_fault(StepError(self.step_error, self.step_uncertainty), error, sd)
+        return Verdict((*self._weight_faults, Fault(jnp.any(steps.present), steps.sentence)))
+
+    @property
+    def _weight_faults(self) -> tuple[Fault, ...]:
+        heavy = heavy_tails(self.pareto_k, self.effective_sample_size)
+        return (
+            missing_bridges(self.num_missing > 0),
+            truncated_weights(self.num_truncated > 0),
+            Fault(jnp.any(heavy.present), heavy.sentence),
+        )
 
 
 @door

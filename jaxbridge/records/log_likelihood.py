@@ -18,10 +18,17 @@ from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.pareto import most_reliable
-from ..engine.throwing import throw_where
+from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
-from ..schemes import AbstractStepDensity, StepError, dominates, error_of_grids, num_coarse_grids
+from ..schemes import (
+    AbstractStepDensity,
+    StepError,
+    dominates,
+    error_of_grids,
+    num_coarse_grids,
+    step_fault,
+)
 from .forgetting import chosen_of, confirmed, half_will_do, rates_for, undecided
 from .guide_search import linearised
 from .guided_record import Guidance, forgetful
@@ -36,23 +43,22 @@ from .several import Records, as_record_problems, stacked
 _FEWEST_TRUSTED, _MOST_SPREAD, _LARGEST_OF_MANY = 5, 0.5, 0.1
 
 _UNEXPLAINED = (
-    "no particle explains some observation (`unexplained` is its number): look whether it is an "
-    "outlier that the noise of `observation` has no room for, or take more steps or particles."
+    "No particle explains some observation (`unexplained` is its number). Check whether it is an "
+    "outlier for the noise of `observation`, or take more steps or particles."
 )
 _DISAGREE = (
-    "so few particles count somewhere, or filters disagree so much, that the likelihood and its "
-    "error cannot be trusted: take more `num_particles`; across gaps in which the diffusion could "
-    "have gone several ways more observations are needed, or `smooth` with a `proposal`."
+    "So few particles are effective somewhere, or filters disagree so much, that the likelihood "
+    "and its error cannot be trusted. Take more `num_particles`; across gaps in which the "
+    "diffusion could have gone several ways add observations, or use `smooth` with a `proposal`."
 )
 _HEAVY = (
-    "at some observation the largest weights are so much larger than the others (`pareto_k` above "
-    "0.8, of few particles above less, and infinite of fewer than 25) that particles which weigh "
-    "more yet may never have been drawn: take more `num_particles`, and see whether `value` stays."
+    "At some observation the largest weights are so much larger than the others (`pareto_k` above "
+    "0.8, of few particles above less, and infinite of fewer than 25) that particles of larger "
+    "weight may never have been drawn. Take more `num_particles`, and check that `value` stays."
 )
-_STEPS = "the step error is beyond the standard error, or not known: take more `num_steps`."
 
 
-class LogLikelihood(eqx.Module):
+class LogLikelihood(AbstractResult):
     """What `log_likelihood` returns.
 
     - `value`: log p̂(y); `exp(value)` is unbiased up to the step error. -inf where no particle
@@ -100,11 +106,19 @@ class LogLikelihood(eqx.Module):
         return dominates(StepError(self.step_error, self.step_uncertainty), self.standard_error)
 
     @property
-    def trustworthy(self) -> Bool[Array, ""]:
-        """Whether `value` and `standard_error` are to be trusted: particles that count at all
-        observations, filters that agree, so that the delta method holds, tails of the weights that
-        are not heavy, and a step error that does not dominate."""
-        return self._filters_agree & ~self._is_heavy & ~self.step_error_dominates
+    def verdict(self) -> Verdict:
+        """Return the faults: an observation that no particle explains, few effective particles or
+        filters that disagree, so that the delta method fails, heavy tails of the weights, and a
+        step error that dominates and is beyond 0.05."""
+        error = StepError(self.step_error, self.step_uncertainty)
+        return Verdict(
+            (
+                Fault(self.unexplained >= 0, _UNEXPLAINED),
+                Fault(~self._filters_agree, _DISAGREE),
+                Fault(self._is_heavy, _HEAVY),
+                step_fault(error, self.standard_error),
+            )
+        )
 
     @property
     def _is_heavy(self) -> Bool[Array, ""]:
@@ -173,7 +187,7 @@ def log_likelihood(
                 "`transition_log_density`: leave out `initial`, `initial_time` and `density`."
             )
         made = _exact(key, model, times, observations, num_particles, num_steps, step_size)
-        return or_throw(made, model) if throw else made
+        return throw_where_untrustworthy(made, "value", model) if throw else made
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     records = as_record_problems(*arguments, num_steps=num_steps, **options)
@@ -182,18 +196,7 @@ def log_likelihood(
     grids = [records, *map(records.coarsened, levels)]
     filtered, rate = _filtered(key, grids, [_guides(grid) for grid in grids], *size)
     made = _told(records, filtered, rate, num_filters * num_particles)
-    return or_throw(made, model) if throw else made
-
-
-def or_throw(made: LogLikelihood, model: Diffusion) -> LogLikelihood:
-    """The same, whose value raises `RuntimeError` where it is not to be trusted."""
-    faults = [
-        (made.unexplained >= 0, _UNEXPLAINED),
-        (~made._filters_agree, _DISAGREE),
-        (made._is_heavy, _HEAVY),
-        (made.step_error_dominates, _STEPS),
-    ]
-    return throw_where(made, "value", model, faults)
+    return throw_where_untrustworthy(made, "value", model) if throw else made
 
 
 @compiled_sooner

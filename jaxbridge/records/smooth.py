@@ -4,7 +4,6 @@ states and the bridges between them (`states`)."""
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -16,7 +15,7 @@ from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.doors import door
 from ..engine.progress import metered_scan
-from ..engine.throwing import throw_where
+from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
 from ..models.sigma import columns_of
 from ..schemes import (
@@ -40,17 +39,17 @@ _MOST_R_HAT = 1.1
 _CONSTANT = 1e-3
 
 _STUCK = (
-    "a block of the path never moved: take more `num_draws`, a shorter `block_length` or more "
+    "A block of the path never moved. Take more `num_draws`, a shorter `block_length` or more "
     "steps; where the diffusion could have gone several ways, a `proposal`."
 )
 _CUT_OFF = (
-    "some weights of the `proposal` were cut off at its bound on the work: allow more trials, or "
+    "Some weights of the `proposal` were cut off at its bound on the work. Allow more trials, or "
     "choose another."
 )
-_APART = "chains disagree (R̂ above 1.1 at some points): take more `num_draws` and `num_warmup`."
+_APART = "Chains disagree (R̂ above 1.1 at some points). Take more `num_draws` and `num_warmup`."
 
 
-class Smoothed(eqx.Module):
+class Smoothed(AbstractResult):
     """What `smooth` returns: draws of the path given all that was seen.
 
     - `times`: of the points, shape (K,).
@@ -113,10 +112,16 @@ class Smoothed(eqx.Module):
         return jax.tree.map(potential_scale_reduction, self._values(fn))
 
     @property
-    def trustworthy(self) -> Bool[Array, ""]:
-        """Whether means of the path, with their errors, are to be trusted: no block that never
-        moved, no weight cut off, and chains that agree at all points."""
-        return self._chains_agree & ~jnp.any(self.stuck) & (self.num_truncated == 0)
+    def verdict(self) -> Verdict:
+        """Return the faults: a block that never moved, weights cut off, chains that disagree at
+        some points."""
+        return Verdict(
+            (
+                Fault(jnp.any(self.stuck), _STUCK),
+                Fault(self.num_truncated > 0, _CUT_OFF),
+                Fault(~self._chains_agree, _APART),
+            )
+        )
 
     @property
     def _chains_agree(self) -> Bool[Array, ""]:
@@ -218,17 +223,7 @@ def smooth(
     paths = jnp.moveaxis(drawn.paths, 1, 0)
     found = (drawn.accepted, drawn.stuck, drawn.num_truncated)
     smoothed = Smoothed(drawn.times, paths, *found, told_by)
-    return or_throw(smoothed, model) if throw else smoothed
-
-
-def or_throw(smoothed: Smoothed, model: Diffusion) -> Smoothed:
-    """The same, whose paths raise `RuntimeError` where they are not to be trusted."""
-    faults = [
-        (smoothed.stuck, _STUCK),
-        (smoothed.num_truncated > 0, _CUT_OFF),
-        (~smoothed._chains_agree, _APART),
-    ]
-    return throw_where(smoothed, "paths", model, faults)
+    return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
 
 
 @compiled_sooner

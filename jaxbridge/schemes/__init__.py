@@ -63,9 +63,9 @@ from .step_error import (
     error_of_log_mean as error_of_log_mean,
     error_of_mean as error_of_mean,
     guessed as guessed,
-    is_gross as is_gross,
     share_of_known_order as share_of_known_order,
     share_of_order as share_of_order,
+    step_fault as step_fault,
     with_rounding as with_rounding,
 )
 from .step_law import (

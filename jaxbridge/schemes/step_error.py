@@ -20,13 +20,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Inexact
 
 from ..engine.averages import effective_size, expanded, normalised, weighted_mean
+from ..engine.verdict import Fault
 
 # Fewer effective paths than this, or than this share of those without e^D, tell nothing.
 _FEWEST_EFFECTIVE, _LEAST_OVERLAP = 5, 0.1
-# Where steps are so long, in standard deviations or in log p, more paths do not help.
-_GROSS = 0.1
+# A smaller step error, in log p or in standard deviations, does not matter to users.
+_MATTERS = 0.05
 # What rounding adds to log p is no matter below this.
 _FELT = 1e-3
+_STEPS = (
+    "The step error (`step_error`, `step_uncertainty`) is beyond the standard error and beyond "
+    "0.05 (of a log density, or of a standard deviation), or it is not known well enough. Take "
+    "more `num_steps`; for stiff drift use the scheme `SemiImplicit()`; for couplings whose σ(x) "
+    "varies run two grids and `extrapolate`."
+)
 
 
 class StepError(NamedTuple):
@@ -115,11 +122,16 @@ def with_rounding(error: StepError, num_steps: int, d: int) -> StepError:
     return error._replace(uncertainty=jnp.hypot(error.uncertainty, rounding))
 
 
-def is_gross(error: StepError) -> Bool[Array, "..."]:
-    """Whether a step error, of a log or in standard deviations, is large, whatever the number of
-    paths. Where the uncertainty is infinite the size alone decides, or no error would be large."""
-    doubt = jnp.where(jnp.isinf(error.uncertainty), 0, error.uncertainty)
-    return ~(jnp.abs(error.value) <= _GROSS + 2 * doubt)
+def step_fault(
+    error: StepError,
+    standard_error: Inexact[Array, "..."],
+    sd: Inexact[Array, "..."] | float = 1.0,
+) -> Fault:
+    """Return the fault of a step error that dominates and that matters: it, or its uncertainty, is
+    beyond 0.05 in the log of a density, or 0.05 of a standard deviation `sd`."""
+    size, doubt, floor = jnp.abs(error.value), error.uncertainty, _MATTERS * sd
+    matters = ~((size <= floor) & (doubt <= floor))
+    return Fault(dominates(error, standard_error) & matters, _STEPS)
 
 
 def share_of_order(order: int) -> float:

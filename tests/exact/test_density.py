@@ -240,4 +240,4 @@ def test_rounding_of_very_many_steps_is_told():
     off = abs(made.value - exact)
     assert off > 3 * made.standard_error and off > 10 * abs(made.step_error)  # but for rounding
     assert off < 2 * made.step_uncertainty < 0.02
-    assert made.step_error_dominates and not made.trustworthy
+    assert made.step_error_dominates

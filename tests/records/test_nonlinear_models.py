@@ -187,7 +187,7 @@ def test_what_no_particle_explains_is_said():
     options = {"observation": flat, "num_particles": 10}
     made = jb.log_likelihood(*arguments, **options)
     assert made.value == -jnp.inf and made.unexplained == 0
-    with pytest.raises(Exception, match="no particle explains"):
+    with pytest.raises(Exception, match="No particle explains"):
         jax.block_until_ready(jb.log_likelihood(*arguments, **options, throw=True).value)
 
 

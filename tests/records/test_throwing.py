@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxbridge as jb
-from jaxbridge.records import log_likelihood, smooth
+from jaxbridge.engine.verdict import throw_where_untrustworthy
 from jaxbridge.records.log_likelihood import LogLikelihood
 from jaxbridge.records.smooth import Smoothed
 
@@ -22,7 +22,7 @@ def likelihood(error=0.1, sizes=50.0, k=0.4, step_error=0.0, doubt=0.01):
 @pytest.mark.parametrize(
     "changed, message",
     [
-        (dict(sizes=0.0), "no particle explains"),
+        (dict(sizes=0.0), "No particle explains"),
         (dict(sizes=4.0), "num_particles"),
         (dict(error=0.6), "num_particles"),
         (dict(error=jnp.inf), "num_particles"),
@@ -34,9 +34,9 @@ def likelihood(error=0.1, sizes=50.0, k=0.4, step_error=0.0, doubt=0.01):
 )
 def test_likelihoods(changed, message):
     made = likelihood(**changed)
-    assert not made.trustworthy
+    assert not made.trustworthy and message in made.why()
     with pytest.raises(Exception, match=message):
-        log_likelihood.or_throw(made, MODEL)
+        throw_where_untrustworthy(made, "value", MODEL)
 
 
 def smoothed(apart=0.0, stuck=False, num_truncated=0):
@@ -50,19 +50,19 @@ def smoothed(apart=0.0, stuck=False, num_truncated=0):
     [
         (dict(stuck=True), "never moved"),
         (dict(num_truncated=2), "cut off"),
-        (dict(apart=3.0), "chains"),
+        (dict(apart=3.0), "Chains disagree"),
     ],
 )
 def test_smoothed_paths(changed, message):
     made = smoothed(**changed)
-    assert not made.trustworthy
+    assert not made.trustworthy and message in made.why()
     with pytest.raises(Exception, match=message):
-        smooth.or_throw(made, MODEL)
+        throw_where_untrustworthy(made, "paths", MODEL)
 
 
 def test_what_is_trusted_is_not_thrown():
-    assert log_likelihood.or_throw(likelihood(), MODEL).value == -3
+    assert throw_where_untrustworthy(likelihood(), "value", MODEL).value == -3
     made = smoothed()
-    assert jnp.all(smooth.or_throw(made, MODEL).paths == made.paths)
+    assert jnp.all(throw_where_untrustworthy(made, "paths", MODEL).paths == made.paths)
     with pytest.raises(Exception, match="not finite"):
-        smooth.or_throw(made, MODEL.with_params(jnp.nan))
+        throw_where_untrustworthy(made, "paths", MODEL.with_params(jnp.nan))

@@ -14,8 +14,8 @@ from jaxbridge.schemes.step_error import (
     dominates,
     error_of_log_mean,
     error_of_mean,
-    is_gross,
     share_of_order,
+    step_fault,
 )
 
 
@@ -39,7 +39,8 @@ def test_error_of_a_log_density(density, refinement, curl, x64):
     noise = 5 * float(estimate.step_uncertainty)
     assert noise < abs(error)
     assert abs(float(estimate.step_error) - error) < 0.25 * abs(error) + noise
-    assert estimate.step_error_dominates and not estimate.trustworthy
+    assert estimate.step_error_dominates
+    assert bool(estimate.trustworthy) is (abs(float(estimate.step_error)) < 0.05)
 
 
 @pytest.mark.slow
@@ -77,6 +78,7 @@ def test_of_one_step_nothing_is_known():
     )  # fmt: skip
     assert np.isnan(estimate.step_error) and np.isnan(estimate.step_uncertainty)
     assert estimate.step_error_dominates and not estimate.trustworthy
+    assert "num_steps" in estimate.why()
 
 
 def test_share_of_what_half_as_many_steps_change():
@@ -169,15 +171,24 @@ def test_when_step_errors_dominate(value, uncertainty, standard_error, expected)
 
 
 @pytest.mark.parametrize(
-    "value, uncertainty, expected",
+    "value, uncertainty, sd, expected",
     [
-        (0.05, 0.0, False),
-        (-0.2, 0.0, True),
-        (0.2, 0.1, False),
-        (0.2, np.inf, True),
-        (0.05, np.inf, False),
-        (np.nan, np.nan, True),
+        (0.04, 0.01, 1.0, False),  # too small to matter
+        (0.04, 0.06, 1.0, True),
+        (-0.2, 0.0, 1.0, True),
+        (-0.2, 0.0, 10.0, False),  # in standard deviations
+        (0.0, np.inf, 1.0, True),
+        (np.nan, np.nan, 1.0, True),
     ],
 )
-def test_when_step_errors_are_gross(value, uncertainty, expected):
-    assert bool(is_gross(StepError(jnp.asarray(value), jnp.asarray(uncertainty)))) is expected
+def test_faults_are_step_errors_that_matter(value, uncertainty, sd, expected):
+    """Beside no Monte Carlo error at all, as where a model is linear."""
+    fault = step_fault(
+        StepError(jnp.asarray(value), jnp.asarray(uncertainty)), jnp.asarray(0.0), sd
+    )
+    assert bool(fault.present) is expected
+
+
+def test_large_step_errors_beside_larger_noise_are_no_fault():
+    error = StepError(jnp.asarray(0.2), jnp.asarray(0.01))
+    assert not step_fault(error, jnp.asarray(0.5)).present

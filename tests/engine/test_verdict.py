@@ -1,0 +1,72 @@
+"""Verdicts name each fault that is present, and only these."""
+
+import inspect
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxbridge as jb
+from jaxbridge.engine.verdict import (
+    AbstractResult,
+    Fault,
+    Verdict,
+    heavy_tails,
+    throw_where_untrustworthy,
+)
+
+
+class _Result(AbstractResult):
+    value: jax.Array
+    few: jax.Array
+
+    @property
+    def verdict(self):
+        return Verdict((Fault(self.few, "Too few."), Fault(self.value < 0, "Negative.")))
+
+
+def test_one_result():
+    good, bad = _Result(jnp.array(1.0), jnp.array(False)), _Result(jnp.array(-1.0), jnp.array(True))
+    assert good.trustworthy and good.why() == "No fault was found."
+    assert not bad.trustworthy and bad.why() == "Too few.\nNegative."
+
+
+def test_of_several_intervals_it_says_which():
+    result = _Result(jnp.array([1.0, -1.0, -2.0]), jnp.array(False))
+    assert result.trustworthy.tolist() == [True, False, False]
+    assert result.why() == "In 2 of 3 (first [1]): Negative."
+
+
+def test_inside_jit():
+    result = _Result(jnp.array(-1.0), jnp.array(False))
+    assert not eqx.filter_jit(lambda result: result.trustworthy)(result)
+    with pytest.raises(TypeError, match="return the result"):
+        eqx.filter_jit(lambda result: result.why())(result)
+
+
+def test_throwing_says_the_first_fault():
+    result = _Result(jnp.array(-1.0), jnp.array(False))
+    with pytest.raises(Exception, match="Negative"):
+        throw_where_untrustworthy(result, "value", jnp.ones(2))
+    with pytest.raises(Exception, match="parameters of the model are not finite"):
+        throw_where_untrustworthy(result, "value", jnp.array(jnp.nan))
+    good = _Result(jnp.array(1.0), jnp.array(False))
+    assert throw_where_untrustworthy(good, "value", jnp.ones(2)).value == 1
+
+
+def test_heavy_tails():
+    k = jnp.array([0.2, 0.9, 0.2, jnp.nan])
+    assert heavy_tails(k, jnp.array([99.0, 99.0, 4.0, 99.0])).present.tolist() == [0, 1, 1, 1]
+
+
+def test_every_result_has_a_verdict():
+    """All public classes with a Monte Carlo error."""
+    classes = [getattr(jb, name) for name in jb.__all__ if inspect.isclass(getattr(jb, name))]
+    estimates = [
+        cls
+        for cls in classes
+        if hasattr(cls, "standard_error") or "standard_error" in getattr(cls, "__annotations__", {})
+    ]
+    assert {"Chain", "Score", "LogLikelihood"} <= {cls.__name__ for cls in estimates}
+    assert all(issubclass(cls, AbstractResult) for cls in estimates)
