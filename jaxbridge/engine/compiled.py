@@ -1,12 +1,13 @@
 """How our programs are compiled: `equinox.filter_jit`, with keys that take less of the compiler's
-time (`generator`), and an eye on the room that is left for programs (`memory_maps`).
+time (`generator`), options that the installed compiler accepts (`compiler`), and an eye on the room
+that is left for programs (`memory_maps`).
 
-On CPUs XLA can make its kernels in two ways. Those of its fusion emitters, the default, are up to
-twice as fast in a loop that works on many lanes, for they are vectorised where a number is
-overwritten by a function of itself; its former emitters take a third less time, and their programs
-a third of the memory maps. So what takes longer to compile than to run, as chains of parameters and
-all that is done once for each model, is `compiled_sooner`, and proposals are `compiled_for` their
-number.
+On CPUs XLA up to JAX 0.11.0 can make its kernels in two ways. Those of its fusion emitters, the
+default, are up to twice as fast in a loop that works on many lanes, for they are vectorised where a
+number is overwritten by a function of itself; its former emitters take a third less time, and their
+programs a third of the memory maps. So what takes longer to compile than to run, as chains of
+parameters and all that is done once for each model, is `compiled_sooner`, and proposals are
+`compiled_for` their number.
 """
 
 import functools
@@ -18,13 +19,9 @@ import jax
 from jax.core import eval_context
 from jax.extend.core import get_opaque_trace_state
 
+from .compiler import cpu_options, warn_of_loop_fault
 from .generator import with_keys_written_out
 from .memory_maps import mind_memory_maps
-
-_SOONER = {
-    "xla_cpu_use_fusion_emitters": False,
-    "xla_cpu_parallel_codegen_split_count": 2,  # files of kernels, of which each takes memory maps
-}
 
 # Steps of paths, at some 10 ns more for each: 20 ms a call for .5 s to the first.
 _MANY = 2_000_000
@@ -47,15 +44,18 @@ def compiled_for(num_path_steps: Callable[..., int]) -> Callable[[Callable], Cal
 
 
 def _compiled(fn: Callable, is_wanted_sooner: Callable[..., bool]) -> Callable:
-    fast, sooner = _program(fn), _program(fn, compiler_options=_SOONER)
+    within = _program(fn)  # JAX takes options for none but outermost programs
+    on_cpu = functools.cache(lambda sooner: _program(fn, compiler_options=cpu_options(sooner)))
 
     @functools.wraps(fn)
     def call(*args, **kwargs):
         mind_memory_maps(is_outermost)
-        # JAX takes options for none but outermost programs.
-        may_choose = is_outermost() and jax.default_backend() == "cpu"
-        program = sooner if may_choose and is_wanted_sooner(*args, **kwargs) else fast
-        return program(*args, **kwargs)
+        if jax.default_backend() != "cpu":
+            return within(*args, **kwargs)
+        warn_of_loop_fault()
+        if not is_outermost():
+            return within(*args, **kwargs)
+        return on_cpu(is_wanted_sooner(*args, **kwargs))(*args, **kwargs)
 
     return call
 
