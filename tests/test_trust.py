@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import random_models
 from jax.scipy.special import logsumexp
+from scipy import special
 
 import jaxbridge as jb
 from jaxbridge.coupling.burn_in import with_burn_in
@@ -467,6 +468,81 @@ def test_no_likelihood_runs_away_along_the_ridge(coordinates, proposal, which):
         assert abs(total) < 4 * np.sqrt(variance) + np.sum(told, where=trusted)
         assert off.sum() < 1
         assert trusted.sum() > (230 if coordinates == "roots" else 100)
+
+
+# Boundaries that are attained: no proposal has paths that touch them.
+
+
+def attained(coordinates, ratio):
+    """A CIR process with 2κθ = ratio × σ²: its model, and the map to the coordinates."""
+    params = (1.0, ratio / 2, 1.0)
+    if coordinates == "raw":
+        return cir.model(params), np.asarray, lambda x: 0.0
+    moved = {"roots": cir.in_roots, "logarithms": cir.in_logarithms}[coordinates](params)
+    return moved.model, moved.forward, moved.log_jacobian
+
+
+@pytest.mark.parametrize(
+    "coordinates, ratio, start, end, proposal",
+    [
+        ("raw", 0.1, 0.05, 0.01, jb.ModifiedDiffusionBridge()),
+        pytest.param("raw", 0.56, 0.1, 0.01, jb.Guided(), marks=slow),
+        pytest.param("roots", 0.1, 0.05, 0.01, jb.Guided(), marks=slow),
+        pytest.param("roots", 0.56, 0.3, 0.1, jb.Guided(), marks=slow),
+        pytest.param("logarithms", 0.56, 0.1, 0.01, "auto", marks=slow),
+        pytest.param("logarithms", 0.3, 0.3, 0.1, jb.Guided(), marks=slow),
+    ],
+)
+def test_lost_paths_are_missing_mass(coordinates, ratio, start, end, proposal):
+    """Where 2κθ < σ²: the estimate is too small by far more than its standard error, and so are
+    the faults of weights and steps not what shows it."""
+    model, forward, log_jacobian = attained(coordinates, ratio)
+    options = dict(num_proposals=2_000, num_steps=100, proposal=proposal)
+    ends = forward(np.array([start], np.float32)), forward(np.array([end], np.float32))
+    estimate = jb.transition_log_density(jax.random.key(0), model, *ends, 1.0, **options)
+    exact = cir.log_density((1.0, ratio / 2, 1.0), start, end, 1.0)
+    off = float(estimate.value) + float(log_jacobian([end])) - exact
+    assert off < -0.2 - 4 * float(estimate.standard_error)
+    assert not estimate.trustworthy and "attains its boundary" in estimate.why()
+
+
+@slow
+def test_lost_paths_of_a_jacobi_diffusion():
+    """Between two boundaries that are attained: the spectral expansion in Jacobi's polynomials."""
+    shape, start, end = 0.3, 0.02, 0.98
+    model = jb.Diffusion(
+        lambda x, p: p * (0.5 - x),
+        lambda x, p: jnp.sqrt(x * (1 - x)),
+        params=shape,
+        domain=lambda x, p: jnp.all((x > 0) & (x < 1)),
+    )
+    options = dict(num_proposals=2_000, num_steps=100)
+    for proposal in (jb.ModifiedDiffusionBridge(), jb.Guided()):
+        arguments = (jax.random.key(0), model, [start], [end], 1.0)
+        estimate = jb.transition_log_density(*arguments, proposal=proposal, **options)
+        assert float(estimate.value) - jacobi_log_density(shape, start, end, 1.0) < -0.5
+        assert "attains its boundary" in estimate.why()
+    weighted = jb.sample_weighted_bridges(
+        *arguments, num_bridges=2_000, num_steps=100, proposal=proposal
+    )
+    chain = jb.sample_exact_bridges(*arguments, num_bridges=2_000, num_steps=100, proposal=proposal)
+    for bridges in (weighted, chain):
+        assert not bridges.trustworthy and "attains its boundary" in bridges.why()
+    assert "max_proposals" not in weighted.why()  # nothing was sought
+
+
+def jacobi_log_density(shape, start, end, duration, num_terms=40):
+    """log p_T of dX = shape (1/2 - X) dt + √(X(1 - X)) dW, whose ν is a symmetric beta law."""
+    total = 0.0
+    for n in range(num_terms):
+        one, other = (special.eval_jacobi(n, shape - 1, shape - 1, 2 * x - 1) for x in (start, end))
+        logs = 2 * special.gammaln(n + shape) - special.gammaln(n + 1)
+        square = special.beta(shape, shape)
+        if n > 0:
+            logs -= special.gammaln(n + 2 * shape - 1)
+            square = np.exp(logs) / (2 * n + 2 * shape - 1)
+        total += np.exp(-n * ((n - 1) / 2 + shape) * duration) * one * other / square
+    return np.log(total) + (shape - 1) * np.log(end * (1 - end))
 
 
 @slow

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .checks import all_finite_leaves, is_traced
 from .pareto import is_reliable
@@ -44,6 +44,16 @@ _HEAVY = (
     "weights) that their mean and its error cannot be trusted. Choose another proposal, more "
     'proposals, shorter intervals, or `method="crank_nicolson"`.'
 )
+_LOST = (
+    "More than 2 % of the simulated paths left the state space or the finite numbers "
+    "(`num_nonfinite`). Their mass is missing, so that densities are too small and bridges keep "
+    "away from the boundary. Take more steps, or coordinates in which steps cannot leave. Where "
+    "the diffusion attains its boundary (of dX = κ(θ - X) dt + σ√X dW where 2κθ < σ²) neither is a "
+    "remedy: no proposal of this package has paths that touch it."
+)
+# A larger share of lost paths is a fault. They are proposals, of which the diffusion has more than
+# the proposal where the boundary is attained: with 3 % lost half of the mass may be missing.
+_MOST_LOST = 0.02
 
 
 class Fault(eqx.Module):
@@ -125,6 +135,13 @@ def missing_bridges(missing: Bool[Array, "*I"], coupled: bool = True) -> Fault:
 def truncated_weights(truncated: Bool[Array, "*I"]) -> Fault:
     """Return the fault of weights that a bound on the work cut off."""
     return Fault(truncated, _TRUNCATED)
+
+
+def lost_paths(num_lost: Int[Array, "*I"], num_simulated: Int[Array, "*I"]) -> Fault:
+    """Return the fault of paths that left the state space or the finite numbers: too large a share
+    of those that were simulated."""
+    share = num_lost / jnp.maximum(num_simulated, 1)
+    return Fault(share > _MOST_LOST, _LOST)
 
 
 def heavy_tails(k: Float[Array, "*I"], effective: Float[Array, "*I"] | float) -> Fault:

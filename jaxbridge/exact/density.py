@@ -23,6 +23,7 @@ from ..engine.verdict import (
     Fault,
     Verdict,
     heavy_tails,
+    lost_paths,
     missing_bridges,
     throw_where_untrustworthy,
     truncated_weights,
@@ -46,7 +47,9 @@ class TransitionLogDensity(AbstractResult):
     - `num_truncated`: how many of their weights were cut off by `max_trials`. Each makes the
         estimate too small on average; more trials, or a start law that hits sooner, avoid it.
     - `num_simulated`: paths simulated in all.
-    - `num_nonfinite`: how many of them left the finite numbers.
+    - `num_nonfinite`: how many of them left the state space or the finite numbers. Their mass is
+        missing: `value` is too small by -log(1 - share lost) at least where the boundary is
+        attained, and with more than 2 % of them it is not `trustworthy`.
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
     - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` can be trusted.
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, with
@@ -79,8 +82,8 @@ class TransitionLogDensity(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: no bridge, weights cut off or with heavy tails, a step error that
-        dominates and is beyond 0.05."""
+        """Return the faults: no bridge, weights cut off or with heavy tails, more than 2 % of the
+        paths lost, a step error that dominates and is beyond 0.05."""
         return Verdict((*self._weight_faults, step_fault(self._step_error, self.standard_error)))
 
     @property
@@ -88,6 +91,7 @@ class TransitionLogDensity(AbstractResult):
         return (
             missing_bridges(self.num_met == 0, self.proposal.coupled),
             truncated_weights(self.num_truncated > 0),
+            lost_paths(self.num_nonfinite, self.num_simulated),
             heavy_tails(self.pareto_k, self.effective_sample_size),
         )
 

@@ -22,7 +22,14 @@ from ..engine.averages import (
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.diagnostics import effective_sample_size
 from ..engine.keys import split_each
-from ..engine.verdict import Fault, Verdict, heavy_tails, missing_bridges, truncated_weights
+from ..engine.verdict import (
+    Fault,
+    Verdict,
+    heavy_tails,
+    lost_paths,
+    missing_bridges,
+    truncated_weights,
+)
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
@@ -62,7 +69,8 @@ class Chain(AbstractExactBridges):
     - `truncated`: whether the state's counts were cut off by `max_trials`: then it has too
         little weight, and the chain's law is not exact. Shape (n,), or `None` as `log_weights`.
     - `num_simulated`: paths simulated in all, shape ().
-    - `num_nonfinite`: how many of them left the finite numbers.
+    - `num_nonfinite`: how many of them left the state space or the finite numbers; of more than
+        2 % the mass that is missing is a fault.
     - `num_truncated`: how many proposals, accepted or not, had counts cut off; for the renewal
         chain all its steps where the run that replaces a sampler of ν was (see `Stationary`).
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
@@ -102,9 +110,9 @@ class Chain(AbstractExactBridges):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: missing bridges, weights cut off or with heavy tails, a chain that
-        hardly moves, a step error of the mean path that dominates and is beyond 0.05 standard
-        deviations."""
+        """Return the faults: missing bridges, weights cut off or with heavy tails, more than 2 % of
+        the paths lost, a chain that hardly moves, a step error of the mean path that dominates and
+        is beyond 0.05 standard deviations."""
         moves = jnp.sum(self.accepted, axis=-1)
         # The renewal chain keeps no weights to be cut off, but its trials may start wrongly.
         cut = self.num_truncated > 0
@@ -117,6 +125,7 @@ class Chain(AbstractExactBridges):
             (
                 missing_bridges(jnp.any(~self.met, axis=-1), self.proposal.coupled),
                 truncated_weights(cut),
+                lost_paths(self.num_nonfinite, self.num_simulated),
                 *heavy,
                 Fault(moves < min(_FEWEST_MOVES, self.accepted.shape[-1] / 2), _STILL),
                 step_fault(self.step_error_in_sds(), error),

@@ -56,6 +56,14 @@ _HEAVY = (
     "0.8, of few particles above less, and infinite of fewer than 25) that particles of larger "
     "weight may never have been drawn. Take more `num_particles`, and check that `value` stays."
 )
+_LOST = (
+    "So many particles left the state space or the finite numbers (`num_nonfinite`) that the mass "
+    "that is missing may make the likelihood too small by more than its standard error and 0.05. "
+    "Take more steps, or coordinates in which steps cannot leave; where the diffusion attains its "
+    "boundary (of dX = κ(θ - X) dt + σ√X dW where 2κθ < σ²) no particle touches it."
+)
+# In units of log L.
+_MOST_LOST = 0.05
 
 
 class LogLikelihood(AbstractResult):
@@ -108,14 +116,15 @@ class LogLikelihood(AbstractResult):
     @property
     def verdict(self) -> Verdict:
         """Return the faults: an observation that no particle explains, few effective particles or
-        filters that disagree, so that the delta method fails, heavy tails of the weights, and a
-        step error that dominates and is beyond 0.05."""
+        filters that disagree, so that the delta method fails, heavy tails of the weights, lost
+        particles, and a step error that dominates and is beyond 0.05."""
         error = StepError(self.step_error, self.step_uncertainty)
         return Verdict(
             (
                 Fault(self.unexplained >= 0, _UNEXPLAINED),
                 Fault(~self._filters_agree, _DISAGREE),
                 Fault(self._is_heavy, _HEAVY),
+                Fault(self._missing > jnp.maximum(self.standard_error, _MOST_LOST), _LOST),
                 step_fault(error, self.standard_error),
             )
         )
@@ -123,6 +132,12 @@ class LogLikelihood(AbstractResult):
     @property
     def _is_heavy(self) -> Bool[Array, ""]:
         return jnp.any(self.pareto_k > most_reliable(self.num_weights) + _LARGEST_OF_MANY)
+
+    @property
+    def _missing(self) -> Float[Array, ""]:
+        """Return by how much `value` is too small if lost particles had weights like the others:
+        the sum over segments of -log(1 - share lost) ≈ share lost."""
+        return self.num_nonfinite.astype(self.value.dtype) / self.num_weights
 
     @property
     def _filters_agree(self) -> Bool[Array, ""]:

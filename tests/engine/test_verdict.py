@@ -13,6 +13,7 @@ from jaxbridge.engine.verdict import (
     Fault,
     Verdict,
     heavy_tails,
+    lost_paths,
     throw_where_untrustworthy,
 )
 
@@ -70,3 +71,7 @@ def test_every_result_has_a_verdict():
     ]
     assert {"Chain", "Score", "LogLikelihood"} <= {cls.__name__ for cls in estimates}
     assert all(issubclass(cls, AbstractResult) for cls in estimates)
+
+
+def test_lost_paths():
+    assert lost_paths(jnp.array([0, 20, 21]), jnp.array(3 * [1000])).present.tolist() == [0, 0, 1]
