@@ -208,7 +208,7 @@ SCHEMES = [
     ("a point", path([0.0, 1.0], (2,)), "`path` must hold"),
     ("times", path([0.0, 1.0], (3, 2)), "`times` must have shape"),
     *each("times", lambda t: path(t, (3, 2)), [[0.0, 0.0, 1.0], [0.0, NAN, 1.0]], "increase"),
-    ("times since 1970", path(days, (6, 2)), "`times` are too large"),
+    ("times since 1970", path(days, (6, 2)), "`times` are too far from zero"),
     ("form", path(TIMES, (3, 2), form="other"), "`form` must be one of"),
     ("no gradient", likelihood(ROTATING, form="ito"), "gradient"),
     ("varying σ", likelihood(VARYING, form="ito_taylor"), "constant σ"),
@@ -601,14 +601,24 @@ RATED = jb.Diffusion(
 UNKNOWN_RATE = jb.Diffusion(lambda x, p: -p * x, params=1.0, reversible=True)
 with_pairs = of(jb.pmmh, KEY, times=TIMES, observations=LINE, prior=PRIOR, proposal=PAIRS)
 
+DAYS = ["2024-02-28", "2024-02-29", "2024-03-01"]
+
 INFERENCE = [
     ("times", gibbs(times=[0.0, 2.0, 1.0]), r"`times\[1\]`.*sort them"),
     ("missing time", gibbs(times=[0.0, NAN, 1.0]), r"`times\[1\]` = nan is missing"),
     ("two times", gibbs(times=[0.0, 1.0]), "`observations` must have shape"),
     ("one time", gibbs(times=[0.0], observations=[[1.0]]), "must be two or more"),
     ("missing", gibbs(observations=[[0.0], [NAN], [1.0]]), r"`observations\[1\]`.*leave out"),
-    ("flat", gibbs(observations=[0.0, 1.0, 2.0]), "`observations` must have shape"),
-    ("late", gibbs(times=np.float32([7e4, 70_000.01, 70_000.02])), "`times` are too large"),
+    ("no shape", gibbs(observations=1.0), "`observations` must have shape"),
+    ("twice", gibbs(times=[0.0, 1.0, 1.0]), r"`times\[1\]` = 1.0 .* equal: merge the observations"),
+    (
+        "a start",
+        gibbs(initial=[0.0], initial_time=0.0),
+        "`initial` and `initial_time`: for records",
+    ),
+    ("dates", gibbs(times=np.array(DAYS, "datetime64[D]")), "got dates. Convert them", TypeError),
+    ("days", gibbs(times=np.array([0, 1, 2], "timedelta64[D]")), "differences of dates", TypeError),
+    ("late", gibbs(times=np.float32([7e4, 70_000.01, 70_000.02])), "`times` are too far from zero"),
     (
         "outside",
         gibbs(observations=OUTSIDE, **IN_ROOTS),

@@ -1,6 +1,8 @@
 """What is given: numbers, which become arrays, keys and counts; and what has no derivative."""
 
+import datetime
 from collections.abc import Sequence
+from numbers import Real
 from typing import Any
 
 import equinox as eqx
@@ -22,9 +24,30 @@ _MOST_TRIALS = 2**30
 
 def as_array(value: Numbers) -> Array:
     """`value` as an array, whole on every device; a number of Python's keeps its weak type, which
-    follows the precision of what it meets."""
+    follows the precision of what it meets. Integers that JAX's integers cannot hold, which would
+    wrap, become floating point numbers."""
     with jax.transfer_guard("allow"):  # what is given is meant to be handed over
-        return whole(jnp.asarray(value))
+        return whole(jnp.asarray(_without_wide_integers(value)))
+
+
+def _without_wide_integers(value: Numbers) -> Numbers:
+    """Return `value`, as a NumPy array of double precision if it has integers that would wrap, or
+    real numbers as objects of Python."""
+    if isinstance(value, jax.Array | float) or is_traced(value):
+        return value
+    known = np.asarray(value)
+    if known.dtype == object and all(_is_real(entry) for entry in known.flat):
+        return known.astype(float)
+    if known.dtype.kind not in "iu" or known.size == 0:
+        return value
+    fits = np.iinfo(jax.dtypes.canonicalize_dtype(known.dtype))
+    if fits.min <= known.min() and known.max() <= fits.max:
+        return value
+    return known.astype(float)
+
+
+def _is_real(entry: Any) -> bool:
+    return isinstance(entry, Real) and not isinstance(entry, bool)
 
 
 def settled(array: Array) -> Array:
@@ -40,6 +63,7 @@ def as_real(name: str, value: Numbers) -> Array:
     A value that is known stays known while a program around it is traced, so it can be checked.
     Raises `TypeError`, naming the argument, for anything else.
     """
+    _refuse_dates(name, value)
     try:
         if is_traced(value):
             array = as_array(value)
@@ -51,6 +75,54 @@ def as_real(name: str, value: Numbers) -> Array:
     if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer)):
         raise TypeError(f"`{name}` must be real numbers; got dtype {array.dtype}.")
     return array
+
+
+def _refuse_dates(name: str, value: Any) -> None:
+    """Raise `TypeError` for dates and for differences of dates, with the line that converts them: a
+    model has a unit of time of its own, which is not guessed."""
+    first = value
+    if getattr(getattr(value, "dtype", None), "kind", None) == "O":
+        first = np.asarray(value, object).ravel().tolist()
+    while isinstance(first, list | tuple) and first:
+        first = first[0]
+    kind = getattr(getattr(first, "dtype", None), "kind", None)
+    if kind == "m" or isinstance(first, datetime.timedelta):
+        raise TypeError(
+            f"`{name}` must be real numbers, in the model's unit of time; got differences of "
+            "dates. Convert them to numbers, for instance of days: "
+            f"`np.asarray({name}, 'timedelta64[us]') / np.timedelta64(1, 'D')`."
+        )
+    if kind == "M" or isinstance(first, datetime.date):
+        raise TypeError(
+            f"`{name}` must be real numbers, in the model's unit of time; got dates. Convert them "
+            "to numbers, for instance of days since a date of your choice: "
+            f"`(np.asarray({name}, 'datetime64[us]') - np.datetime64('2000-01-01')) / "
+            "np.timedelta64(1, 'D')`."
+        )
+
+
+def missing_as_nan(values: Numbers) -> Numbers:
+    """Return observations in which `None` and the `NA` of pandas are NaN; all else as it is."""
+    leaves = jax.tree.leaves(values, is_leaf=lambda leaf: leaf is None)
+    if any(isinstance(leaf, jax.Array) or _has_plain_type(leaf) for leaf in leaves):
+        return values
+    try:
+        entries = np.asarray(values, object)
+    except (TypeError, ValueError):  # of no rectangular shape
+        return values
+    missing = np.array(
+        [entry is None or type(entry).__name__ == "NAType" for entry in entries.flat]
+    )
+    if not missing.any():
+        return values
+    filled = entries.copy()
+    filled[missing.reshape(entries.shape)] = np.nan
+    return filled
+
+
+def _has_plain_type(values: Any) -> bool:
+    """Whether these are arrays of NumPy's own types, in which nothing can be missing but NaN."""
+    return isinstance(values, np.ndarray) and values.dtype != object
 
 
 def as_floating(name: str, value: Numbers) -> Array:
@@ -146,43 +218,6 @@ def _refuse_choice(primals, tangents):
         "that are pulled to the end point, `choice = choose_proposal(..., candidates="
         "[ModifiedDiffusionBridge(), Guided()])`, and pass `proposal=choice`: it is differentiable."
     )
-
-
-def time_steps(name: str, times: Numbers) -> tuple[Array, Array]:
-    """Times as an array, and the differences of successive ones, in the last axis. Where times are
-    known these are taken before they are rounded to the array's precision.
-
-    **Raises:** `ValueError` where they are so large that rounding has spoilt the differences.
-    """
-    array = as_floating(name, times)
-    if is_traced(times):
-        return array, jnp.diff(array)
-    known = np.asarray(times)
-    known = known if np.issubdtype(known.dtype, np.floating) else known.astype(float)
-    steps = np.diff(known.astype(float))
-    smallest = np.min(np.abs(steps[steps != 0]), initial=np.inf)
-    if np.finfo(known.dtype).eps * np.max(np.abs(known), initial=0) > 0.05 * smallest:
-        raise ValueError(
-            f"`{name}` are too large for their differences to be known in {known.dtype}: count "
-            "them from a later zero, or pass them as a NumPy array of float64."
-        )
-    with jax.ensure_compile_time_eval():
-        return array, jnp.asarray(steps, array.dtype)
-
-
-def check_increasing(times: np.ndarray, steps: np.ndarray) -> None:
-    """Raise `ValueError` where a time is missing, or is not after the one before it; `steps` are
-    their differences."""
-    missing = np.flatnonzero(~np.isfinite(times))
-    if missing.size:
-        raise ValueError(f"`times[{missing[0]}]` = {times[missing[0]]} is missing.")
-    back = np.flatnonzero(steps <= 0)
-    if back.size:
-        i = back[0]
-        raise ValueError(
-            f"`times` must increase, but `times[{i}]` = {times[i]} and `times[{i + 1}]` = "
-            f"{times[i + 1]}: sort them, with their observations."
-        )
 
 
 def steps_of_size(

@@ -10,21 +10,19 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import (
     Numbers,
-    as_floating,
     check_count,
-    check_increasing,
     check_key,
     check_precision,
     is_traced,
     steps_of_size,
     taken,
-    time_steps,
 )
 from ..engine.compiled import compiled_sooner
+from ..engine.times import as_times, check_increasing
 from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
-from ..records import of_each, split_records
+from ..records import as_rows, of_each, split_records
 from .parameters import Parameters, theta_of_model
 
 # Numbers of steps are looked at as so many per factor of two.
@@ -55,27 +53,26 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
 
 def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Intervals:
     """Those of one record."""
-    times, duration = time_steps("times", _unmasked("times", times))
-    observations = as_floating("observations", _unmasked("observations", observations))
-    if times.ndim != 1:
-        raise ValueError(f"`times` must have shape (n + 1,); got {times.shape}.")
-    if observations.ndim != 2 or observations.shape[0] != times.shape[0]:
+    known = as_times("times", _unmasked("times", times))
+    observations = as_rows(_unmasked("observations", observations))
+    if len(known.shape) != 1:
+        raise ValueError(f"`times` must have shape (n + 1,); got {known.shape}.")
+    if observations.ndim != 2 or observations.shape[0] != known.shape[0]:
         raise ValueError(
-            f"`observations` must have shape ({times.shape[0]}, d), a row for each of `times`; got "
+            f"`observations` must have shape ({known.shape[0]}, d), a row for each of `times`; got "
             f"{observations.shape}."
         )
-    if times.shape[0] < 2:
-        raise ValueError(f"`observations` must be two or more; got {times.shape[0]}.")
+    if known.shape[0] < 2:
+        raise ValueError(f"`observations` must be two or more; got {known.shape[0]}.")
     check_precision(
-        "`times` and `observations`", jnp.promote_types(times.dtype, observations.dtype)
+        "`times` and `observations`", jnp.promote_types(known.dtype, observations.dtype)
     )
-    if not is_traced(times):
-        check_increasing(np.asarray(times), np.asarray(duration))
+    check_increasing(known)
     if not is_traced(observations):
         _check_finite(np.asarray(observations))
         _check_state_space(model, observations)
     before, after = taken(observations, slice(-1)), taken(observations, slice(1, None))
-    intervals, _, _ = as_intervals(before, after, duration)
+    intervals, _, _ = as_intervals(before, after, known.gaps)
     return intervals
 
 

@@ -47,7 +47,7 @@ from .posterior import (
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_gibbs import RecordPosterior, RecordState, sample_records
-from .record_paths import check_no_bridges
+from .record_paths import check_no_bridges, check_no_record
 
 # Weights that are cut off in a larger share of iterations spoil the law.
 _MOST_TRUNCATED = 0.01
@@ -153,6 +153,7 @@ def gibbs(
     init: PyTree | GibbsState | RecordState = None,
     observation: Observation | None = None,
     initial: Initial = None,
+    initial_time: Numbers | None = None,
     num_warmup: int | None = None,
     covariance: Numbers | None = None,
     num_counts: int | None = None,
@@ -168,8 +169,9 @@ def gibbs(
     - `model`: its `params` are where chains start. σ must not depend on those that are unknown,
         unless there is an `observation`.
     - `times`: increasing, shape (n + 1,), in the model's units of time.
-    - `observations`: of the diffusion at these times, shape (n + 1, d). Several records, which are
-        independent given the parameters, are lists of both, or have a leading axis.
+    - `observations`: of the diffusion at these times, shape (n + 1, d), or (n + 1,) in one
+        dimension. Several records, which are independent given the parameters, are lists of both,
+        or have a leading axis.
     - `prior`: a `NormalPrior`, or a function that maps the unknown parameters to the log of a
         density. It is restricted to `constraint`.
     - `num_iterations`: draws that are kept; between two of them are `thin` iterations.
@@ -193,8 +195,8 @@ def gibbs(
     - `num_chains`: several chains at once, which then have a leading axis in all results.
     - `init`: unknown parameters to start from, with a leading axis of chains if there are
         several and they differ; or the `state` of earlier draws, to go on from there.
-    - `observation`, `initial`: for a record that was seen with noise or in part, as in
-        `innovations`. Then parameters of σ and of the noise may be unknown too, and `num_warmup`
+    - `observation`, `initial`, `initial_time`: for a record that was seen with noise or in part, as
+        in `innovations`. Then parameters of σ and of the noise may be unknown too, and `num_warmup`
         iterations before, by default 500, learn the size of moves and what guides paths;
         `covariance` as in `pmmh`.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
@@ -229,8 +231,8 @@ def gibbs(
             max_proposals=max_proposals,
             max_trials=max_trials,
         )
-        steps = {"num_steps": num_steps, "step_size": step_size}
-        records = as_record_problems(model, times, observations, observation, initial, **steps)
+        options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
+        records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
         log_prior = as_log_prior(prior, parameters, unknown)
         theta, state = starting_points(
@@ -240,8 +242,8 @@ def gibbs(
         num_warmup = check_count("num_warmup", 500 if num_warmup is None else num_warmup, 0)
         size = (num_warmup, num_iterations, thin)
         return sample_records(key, parameters, records, log_prior, start, size, progress_meter)
-    if num_warmup is not None or covariance is not None:
-        raise ValueError("`num_warmup` and `covariance` are for records with an `observation`.")
+    for_records = {"initial": initial, "initial_time": initial_time}
+    check_no_record(num_warmup=num_warmup, covariance=covariance, **for_records)
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
     problem.check_sigma_known("use `pmmh`, which needs no path, or pick the others with `where=`.")
     check_kernel(parameter_kernel)

@@ -37,7 +37,7 @@ from .parameters import (
     theta_of_model,
 )
 from .record_maximum import RecordMaximumLikelihood, maximum_of_records
-from .record_paths import check_no_bridges
+from .record_paths import check_no_bridges, check_no_record
 from .score import Score, as_score, score_at
 from .simulated_likelihood import (
     as_pulled,
@@ -140,6 +140,7 @@ def maximum_likelihood(
     constraint: Constraint | None = None,
     observation: Observation | None = None,
     initial: Initial = None,
+    initial_time: Numbers | None = None,
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
@@ -162,9 +163,9 @@ def maximum_likelihood(
     - `num_iterations`: of the stochastic approximation.
     - `num_bridges`: weighted bridges of each interval for the last step and the errors; where σ
         is unknown, for the likelihood whose maximum is the estimate.
-    - `observation`, `initial`: for records that were seen with noise or in part, as in
-        `innovations`. Any parameters may be unknown there, and `num_bridges` are draws of each of
-        eight chains of paths.
+    - `observation`, `initial`, `initial_time`: for records that were seen with noise or in part, as
+        in `innovations`. Any parameters may be unknown there, and `num_bridges` are draws of each
+        of eight chains of paths.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
 
@@ -215,11 +216,12 @@ def maximum_likelihood(
             max_proposals=max_proposals,
             max_trials=max_trials,
         )
-        steps = {"num_steps": num_steps, "step_size": step_size}
-        records = as_record_problems(model, times, observations, observation, initial, **steps)
+        options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
+        records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
         search = Search(Gradient(optimizer), num_iterations, progress_meter)
         return maximum_of_records(key, parameters, records, unknown, search, num_bridges)
+    check_no_record(initial=initial, initial_time=initial_time)
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
     parameters.check_allowed(problem.theta)
     rule = EM() if method == "em" else Gradient(optimizer)

@@ -58,7 +58,7 @@ from .posterior import (
     step_errors_of_some,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
-from .record_paths import check_no_bridges, unguided
+from .record_paths import check_no_bridges, check_no_record, unguided
 from .warm_up import stages
 
 # A noisier estimate, or weights that are cut off in a larger share of iterations, spoil the chain.
@@ -181,6 +181,7 @@ def pmmh(
     init: PyTree | PMMHState = None,
     observation: Observation | None = None,
     initial: Initial = None,
+    initial_time: Numbers | None = None,
     num_counts: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
@@ -208,8 +209,8 @@ def pmmh(
         the proposals of paths, and their bounds, that they had, or with what guided their filters.
         Another `proposal` than "auto" takes the place of theirs; the estimate that the chain holds
         is still one of theirs.
-    - `observation`, `initial`: for a record that was seen with noise or in part, as in
-        `innovations`; `num_proposals` is then how many particles the filter has, of which few do.
+    - `observation`, `initial`, `initial_time`: for a record that was seen with noise or in part, as
+        in `innovations`; `num_proposals` is then the number of particles, of which few do.
         What guides them, and how soon that forgets what is seen later, is found anew in the
         warm-up, by pilots. By default the state was seen whole and without noise. Unknown
         parameters of the noise are parameters of the model that `LinearGaussian(covariance=)` is a
@@ -240,6 +241,7 @@ def pmmh(
     check_key(key)
     pilot_key, run_key = jax.random.split(key)
     if observation is None:
+        check_no_record(initial=initial, initial_time=initial_time)
         problem = as_problem(key, parameters, times, observations, num_steps, step_size)
         unknown = problem.theta
 
@@ -253,8 +255,8 @@ def pmmh(
 
     else:
         check_no_bridges(proposal=proposal, num_counts=num_counts, max_trials=max_trials)
-        steps = {"num_steps": num_steps, "step_size": step_size}
-        records = as_record_problems(model, times, observations, observation, initial, **steps)
+        options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
+        records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
 
         def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:

@@ -166,6 +166,17 @@ def check_no_bridges(**given: Any) -> None:
         )
 
 
+def check_no_record(**given: Any) -> None:
+    """Raise `ValueError` where one of these arguments, which are about records with an
+    `observation`, is not `None`."""
+    asked = [f"`{name}`" for name, value in given.items() if value is not None]
+    if asked:
+        raise ValueError(
+            f"{' and '.join(asked)}: for records with an `observation`. Pass one, for instance "
+            "`observation=jb.LinearGaussian(covariance=0.01)`, or leave this out."
+        )
+
+
 def movable(records: Records) -> Bool[Array, "R 2 B"]:
     """Which blocks hold a part of a record."""
     return records.each(lambda problem: has_segments(problem, _BLOCK_LENGTH))

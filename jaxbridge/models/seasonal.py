@@ -44,7 +44,7 @@ def seasonal_ornstein_uhlenbeck(
 
         dX = -a (X - m(t)) dt + σ dW,    m(t) = mean + amplitude · sin(2πt / period + phase).
 
-    Times of records are absolute. `params` is a `SeasonalParams`.
+    t is the time of the caller, as `times` has it. `params` is a `SeasonalParams`.
 
     **Arguments:** `rate`, a, per unit of time; `mean`; `amplitude`; `phase`, in radians; `period`,
     in units of time; `sigma`, σ, in space per square root of a unit of time: shape () or (d,) each.
@@ -67,7 +67,9 @@ def seasonal_ornstein_uhlenbeck(
 
 
 def _drift(x: Float[Array, " d"], p: SeasonalParams, t: Float[Array, ""]) -> Float[Array, " d"]:
-    season = jnp.sin(2 * np.pi * t / p.period + p.phase)
+    # The remainder is exact, where t / period is rounded: by much, after many periods.
+    since = jnp.fmod(t, p.period)
+    season = jnp.sin(2 * np.pi * since / p.period + p.phase)
     return -p.rate * (x - p.mean - p.amplitude * season)
 
 

@@ -5,11 +5,13 @@ import jax
 import jax.numpy as jnp
 import lineax as lx
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Key
 
-from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
+from ..engine.checks import Numbers, as_floating, check_count, check_key
 from ..engine.compiled import compiled
 from ..engine.doors import door
+from ..engine.times import as_times, check_increasing, check_resolved
 from .diffusion import Diffusion, check_diffusion
 from .dynamics import Dynamics, ito_correction
 from .sigma import AbstractSigma, Diagonal
@@ -34,7 +36,9 @@ def simulate(
     - `model`: the diffusion. Neither its reversal nor its stationary law is called for.
     - `x0`: the start, shape (d,), or one for each path, (num_paths, d), or `None` to draw from
         the stationary law by the model's sampler.
-    - `times`: increasing, shape (K,), in units of time.
+    - `times`: increasing, shape (K,), in units of time. Their zero does not matter: differences
+        are taken in double precision. Coefficients that depend on time get these times; where
+        single precision cannot resolve them beside a step, that is refused, but not of traced ones.
     - `num_paths`: how many paths.
     - `num_steps`: solver steps between one time and the next.
     - `solver`: a diffrax solver that takes fixed steps; by default `diffrax.Heun()`. A solver
@@ -57,11 +61,10 @@ def simulate(
     check_diffusion(model)
     num_paths = check_count("num_paths", num_paths)
     num_steps = check_count("num_steps", num_steps)
-    times = as_floating("times", times)
-    if times.ndim != 1 or times.shape[0] < 2:
-        raise ValueError(f"`times` must have shape (K,) with K ≥ 2; got {times.shape}.")
-    if not is_traced(times) and not np.all(np.diff(times) > 0):
-        raise ValueError(f"`times` must increase; got {times}.")
+    known = as_times("times", times)
+    if len(known.shape) != 1 or known.shape[0] < 2:
+        raise ValueError(f"`times` must have shape (K,) with K ≥ 2; got {known.shape}.")
+    check_increasing(known)
     start_key, path_key = jax.random.split(key)
     if x0 is None:
         x0 = jax.vmap(model.prepared().sample_stationary)(jax.random.split(start_key, num_paths))
@@ -72,51 +75,59 @@ def simulate(
         )
     x0 = jnp.broadcast_to(x0, (num_paths, x0.shape[-1]))
     solver = diffrax.Heun() if solver is None else solver
-    return _simulate(path_key, model, x0, times.astype(x0.dtype), num_steps, solver)
+    clock, since = known.clock(x0.dtype)
+    gaps = known.gaps.astype(x0.dtype)
+    if model.depends_on_time:
+        check_resolved(clock, since, gaps / num_steps)
+    return _simulate(path_key, model, x0, clock, since[:-1], gaps, num_steps, solver)
 
 
 @compiled
-def _simulate(key, model, x0, times, num_steps, solver):
-    num_paths, num_intervals = x0.shape[0], times.shape[0] - 1
+def _simulate(key, model, x0, clock, starts, gaps, num_steps, solver):
+    """Paths by one solution for each interval, on a clock of its own that begins with zero: noise
+    is drawn by the times of steps, which must be distinct, and is scaled by their differences."""
     dynamics_at = model.forward_at(x0[0])
-    fractions = jnp.arange(num_steps, dtype=times.dtype) / num_steps
-    grid = times[:-1, None] + fractions * jnp.diff(times)[:, None]
-    grid = jnp.append(grid.reshape(-1), times[-1])
+    fractions = np.arange(1 + num_steps) / num_steps
     stratonovich = isinstance(solver, diffrax.AbstractStratonovichSolver)
 
-    def drift(t, x, args):
-        dynamics = dynamics_at(t)
+    def drift(t, x, start):
+        dynamics = dynamics_at(clock(start + t))
         if stratonovich and dynamics.sigma_varies:
             return dynamics.drift(x) - ito_correction(dynamics, x)
         return dynamics.drift(x)
 
-    def sigma(t, x, args):
-        return _as_operator(dynamics_at(t), x)
+    def sigma(t, x, start):
+        return _as_operator(dynamics_at(clock(start + t)), x)
 
-    num_noises = jax.eval_shape(sigma, times[0], x0[0], None).in_size()
+    num_noises = jax.eval_shape(sigma, starts[0], x0[0], starts[0]).in_size()
+    shape = jax.ShapeDtypeStruct((num_noises,), x0.dtype)
 
-    def one_path(key, x0):
-        noise = diffrax.UnsafeBrownianPath(
-            jax.ShapeDtypeStruct((num_noises,), x0.dtype),
-            key,
-            _levy_area(solver),
-        )
+    def over_interval(x, interval):
+        key, start, gap = interval
+        noise = diffrax.UnsafeBrownianPath(shape, key, _levy_area(solver))
         solution = diffrax.diffeqsolve(
             diffrax.MultiTerm(diffrax.ODETerm(drift), diffrax.ControlTerm(sigma, noise)),
             solver,
-            times[0],
-            times[-1],
+            jnp.zeros_like(gap),
+            gap,
             None,
-            x0,
-            saveat=diffrax.SaveAt(ts=times),
-            stepsize_controller=diffrax.StepTo(ts=grid),
+            x,
+            start,
+            saveat=diffrax.SaveAt(t1=True),
+            stepsize_controller=diffrax.StepTo(ts=jnp.asarray(fractions, gap.dtype) * gap),
             adjoint=diffrax.ForwardMode(),
-            max_steps=num_intervals * num_steps,
+            max_steps=num_steps,
             throw=False,
         )
-        return jnp.asarray(solution.ys)
+        x = jnp.asarray(solution.ys)[0]
+        return x, x
 
-    return jax.vmap(one_path)(jax.random.split(key, num_paths), x0)
+    def one_path(key, x0):
+        keys = jax.random.split(key, len(gaps))
+        _, path = lax.scan(over_interval, x0, (keys, starts, gaps))
+        return jnp.concatenate([x0[None], path])
+
+    return jax.vmap(one_path)(jax.random.split(key, len(x0)), x0)
 
 
 def _levy_area(solver: diffrax.AbstractSolver):

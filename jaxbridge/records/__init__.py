@@ -47,7 +47,7 @@ from .path_blocks import (
     tuned as tuned,
 )
 from .problem import as_record_problem as as_record_problem
-from .record import of_each as of_each, split_records as split_records
+from .record import as_rows as as_rows, of_each as of_each, split_records as split_records
 from .several import (
     Records as Records,
     as_record_problems as as_record_problems,

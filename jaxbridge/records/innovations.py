@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..engine.checks import Numbers
@@ -42,9 +43,11 @@ class Innovations(NamedTuple):
         return self.points.size
 
     @property
-    def times(self) -> Float[Array, " points"]:
-        """Of the points of paths, shape (M + 1,)."""
-        return self.problem.record.grid()
+    def times(self) -> Float[Array | np.ndarray, " points"]:
+        """Times of the points of paths, shape (M + 1,); a NumPy array of double precision where
+        they are too far from zero for the precision of paths."""
+        record = self.problem.record
+        return record.clock.exactly(record.grid())
 
     def path(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, "points d"]:
         """The path that this noise makes at these parameters of the model."""
@@ -98,8 +101,12 @@ def innovations(
 
     - `model`: along its paths at its `params` the guide is linearised, once: what is made at other
         parameters is as exact, but guided best near these.
-    - `times`: of the observations, shape (n,), increasing.
-    - `observations`: shape (n, m), NaN where a component was not seen.
+    - `times`: of the observations, shape (n,), increasing numbers in the model's unit of time.
+        Their zero does not matter: differences are taken in double precision. Coefficients that
+        depend on time get these times; where single precision cannot resolve them beside a step,
+        that is refused. Of traced times neither is possible: subtract a constant from them.
+    - `observations`: shape (n, m), or (n,) of one component; NaN or `None` where a component was
+        not seen.
     - `observation`: how the state was seen, a `LinearGaussian` or an `ObservationDensity`.
     - `initial`: the law of the state at the first time: a point, shape (d,), a `GaussianLaw`,
         whose covariance is singular where part of the state is known, `Stationary()`, which is the

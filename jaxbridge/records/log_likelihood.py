@@ -13,11 +13,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.checks import Numbers, as_floating, check_count, check_key, time_steps
+from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.pareto import most_reliable
+from ..engine.times import as_times, check_increasing
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
@@ -35,7 +36,7 @@ from .guided_record import Guidance, forgetful
 from .initial import Initial
 from .observation import Observation
 from .particle_filter import Filtered, run_filters
-from .record import of_each, split_records
+from .record import as_rows, of_each, split_records
 from .several import Records, as_record_problems, stacked
 
 # Fewer particles that count, or a larger standard error of a log, tell nothing; nor do tails that
@@ -287,14 +288,14 @@ def _exact(
 
 def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Array]:
     """Start, end and duration of each."""
-    times, gaps = time_steps("times", times)
-    points = as_floating("observations", observations)
-    if points.ndim != 2 or points.shape[0] != times.shape[0]:
+    known, points = as_times("times", times), as_rows(observations)
+    if len(known.shape) != 1 or points.ndim != 2 or points.shape[0] != known.shape[0]:
         raise ValueError(
-            f"`observations` must have shape ({times.shape[0]}, d), a row for each of `times`; got "
-            f"{points.shape}."
+            "`times` must have shape (n,) and `observations` (n, d), a row for each of them; got "
+            f"{known.shape} and {points.shape}."
         )
-    return points[:-1], points[1:], gaps
+    check_increasing(known)
+    return points[:-1], points[1:], known.gaps
 
 
 # Kinds of stages, in this order.

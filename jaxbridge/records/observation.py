@@ -203,6 +203,11 @@ class ObservationDensity(eqx.Module):
         """By what paths are guided."""
         return self.guess
 
+    @property
+    def depends_on_time(self) -> bool:
+        """Whether g or its guess does."""
+        return takes_time(self._log_density, 3) or self.guess.depends_on_time
+
     def check(self, m: int, like: Array, time: Float[Array, ""], params: PyTree) -> None:
         """Raise `ValueError` where observations of m components of a state do not fit."""
         self.guess.check(m, like, time, params)

@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from ..coupling import Stationary
 from ..engine.checks import Numbers, is_traced
+from ..engine.times import check_resolved
 from ..models.diffusion import Diffusion, check_diffusion
 from ..schemes import AbstractStepDensity, check_step_density, most_accurate_density
 from .initial import Initial, as_initial, bound, check_initial
@@ -118,6 +119,7 @@ def problem_of(
         )
     check_initial(initial, model, like)
     check_domain(model, observation, record)
+    check_clock(model, observation, record)
     density = check_step_density(density)
     if density is None:
         density = most_accurate_density(model.sigma_varies(like), model.sigma_is_invertible(like))
@@ -157,6 +159,15 @@ def _has_dimension(model: Diffusion, like: Float[Array, " d"]) -> bool:
     except Exception:  # whatever functions of the user's raise
         return False
     return sigma.shape[0] == like.shape[0]
+
+
+def check_clock(model: Diffusion, observation: Observation, record: Record) -> None:
+    """Raise `ValueError` where something depends on times that are too far from zero for their
+    precision."""
+    if model.depends_on_time:
+        check_resolved(record.clock, record.since, record.dt)
+    elif observation.depends_on_time:
+        check_resolved(record.clock, record.since, record.durations)
 
 
 def check_domain(model: Diffusion, observation: Observation, record: Record) -> None:

@@ -18,13 +18,13 @@ from ..engine.checks import (
     Numbers,
     as_floating,
     check_count,
-    check_increasing,
     check_precision,
     is_traced,
+    missing_as_nan,
     steps_of_size,
-    time_steps,
 )
 from ..engine.compiled import compiled_sooner
+from ..engine.times import Clock, Times, as_times, check_increasing
 
 # What the end of a segment costs, in steps.
 _STEPS_PER_SEGMENT = 4
@@ -41,13 +41,15 @@ class Steps(NamedTuple):
 class Record(eqx.Module):
     """K segments of N steps.
 
-    - `times`: t of their ends, shape (K + 1,).
+    - `clock`: the caller's, whose origin is the first time.
+    - `since`: times of the ends of segments since then, shape (K + 1,).
     - `dt`: the lengths of the steps of each, shape (K, N); a step of length zero stays where it is.
     - `values`: what is seen at these times, shape (K + 1, m), NaN where nothing is.
     - `which`: the place of each observation among the ends of segments.
     """
 
-    times: Float[Array, " ends"]
+    clock: Clock
+    since: Float[Array, " ends"]
     dt: Float[Array, "K N"]
     values: Float[Array, "ends m"]
     which: Int[Array, " n"]
@@ -62,18 +64,23 @@ class Record(eqx.Module):
         """How long segments are: of times that are large rounding would leave little."""
         return jnp.sum(self.dt, axis=1)
 
+    @property
+    def times(self) -> Float[Array, " ends"]:
+        """Return the caller's times of the ends of segments."""
+        return self.clock(self.since)
+
     def grid(self) -> Float[Array, " points"]:
-        """The times of all points."""
-        return jnp.append(self._beginnings().ravel(), self.times[-1])
+        """Return the times of all points since the first."""
+        return jnp.append(self._beginnings().ravel(), self.since[-1])
 
     def steps(self) -> Steps:
         """All steps, shape (K, N)."""
-        return Steps(self.dt, self._beginnings() + self.dt / 2)
+        return Steps(self.dt, self.clock(self._beginnings() + self.dt / 2))
 
     def _beginnings(self) -> Float[Array, "K N"]:
-        """The times at which steps begin."""
+        """Return the times at which steps begin, since the first."""
         within = jnp.cumsum(self.dt, axis=1) - self.dt  # first, so that a segment begins on time
-        return self.times[:-1, None] + within
+        return self.since[:-1, None] + within
 
     def coarsened(self, level: int = 1) -> "Record":
         """The same with steps that are 2^level as long, the first of a segment what is left of N,
@@ -99,20 +106,22 @@ def as_records(
     """
     check = lambda times, values: _checked(times, values, initial_time)
     each = of_each(check, seen)
-    widths = [values.shape[1] for _, _, values in each]
+    widths = [values.shape[1] for _, values in each]
     if len(set(widths)) > 1:
         raise ValueError(
             "several records must be seen alike, with as many columns of `observations`; got "
             f"{widths}."
         )
     with jax.ensure_compile_time_eval():  # so that gaps that are known stay so
-        gaps = jnp.concatenate([gaps for _, gaps, _ in each])
+        gaps = jnp.concatenate([times.gaps for times, _ in each])
     num_steps, segments = _segments(gaps, num_steps, step_size)
-    ends = np.cumsum([len(gaps) for _, gaps, _ in each])[:-1]
+    ends = np.cumsum([len(times.gaps) for times, _ in each])[:-1]
     counts = np.split(segments, ends)
     return [
-        _cut(times, gaps, values, num_steps, tuple(mine.tolist()))
-        for (times, gaps, values), mine in zip(each, counts, strict=True)
+        _cut(
+            *times.clock(_dtype(times, values)), times.gaps, values, num_steps, tuple(mine.tolist())
+        )
+        for (times, values), mine in zip(each, counts, strict=True)
     ]
 
 
@@ -161,58 +170,70 @@ def _num_axes(value: Any) -> int:
     return 1 + _num_axes(value[0]) if is_list and value else int(is_list)
 
 
+def as_rows(observations: Numbers) -> Float[Array, "n m"]:
+    """Return observations as an array, a row for each time; what is `None` or masked is NaN, and a
+    series of numbers is one column."""
+    values = as_floating("observations", missing_as_nan(_filled("observations", observations)))
+    return values[:, None] if values.ndim == 1 else values
+
+
+def _dtype(times: Times, values: Array) -> jnp.dtype:
+    return jnp.promote_types(times.dtype, values.dtype)
+
+
 def _checked(
     times: Numbers, observations: Numbers, initial_time: Numbers | None
-) -> tuple[Float[Array, " n"], Float[Array, " gaps"], Float[Array, "n m"]]:
-    """Times, the gaps between them, and values.
+) -> tuple[Times, Float[Array, "n m"]]:
+    """Times and values.
 
     **Raises:** `ValueError` that says what is wrong with which time or observation.
     """
-    values = as_floating("observations", _filled("observations", observations))
-    times = _filled("times", times)
+    values = as_rows(observations)
+    known = as_times("times", _filled("times", times))
     if initial_time is not None:
-        times, values = _from_initial(initial_time, times, values)
-    times, gaps = time_steps("times", times)
-    if times.ndim != 1 or values.ndim != 2 or values.shape[0] != times.shape[0]:
+        seen = known
+        known = seen.preceded("initial_time", initial_time)
+        nothing = jnp.full((len(known.gaps) - len(seen.gaps), *values.shape[1:]), jnp.nan)
+        values = jnp.concatenate([nothing.astype(values.dtype), values])
+    if len(known.shape) != 1 or values.ndim != 2 or values.shape[0] != known.shape[0]:
         raise ValueError(
             "`times` must have shape (n,) and `observations` (n, m), a row for each of them; got "
-            f"{times.shape} and {values.shape}."
+            f"{known.shape} and {values.shape}."
         )
-    if times.shape[0] < 2 or values.shape[1] == 0:
+    if known.shape[0] < 2 or values.shape[1] == 0:
         raise ValueError(
             "a record has two times or more, at each of which there is something to be seen: "
             f"`observations` have shape {values.shape}."
         )
-    check_precision("`times` and `observations`", jnp.promote_types(times.dtype, values.dtype))
-    if not is_traced(times):
-        check_increasing(np.asarray(times), np.asarray(gaps))
+    check_precision("`times` and `observations`", _dtype(known, values))
+    check_increasing(known)
     if not is_traced(values):
         infinite = np.argwhere(np.isinf(values))
         if infinite.size:
             i, j = infinite[0]
             raise ValueError(f"`observations[{i}, {j}]` is infinite: NaN says it was not seen.")
-    return times, gaps, values
+    return known, values
 
 
 @compiled_sooner
 def _cut(
-    times: Float[Array, " n"],
+    clock: Clock,
+    since: Float[Array, " n"],
     gaps: Float[Array, " gaps"],
     values: Float[Array, "n m"],
     num_steps: int,
     segments: tuple[int, ...],
 ) -> Record:
     """The record, with so many segments to each gap."""
-    dtype = jnp.promote_types(times.dtype, values.dtype)
+    dtype = since.dtype
     which = np.concatenate([[0], np.cumsum(segments)])
     ends = jnp.full((which[-1] + 1, values.shape[1]), jnp.nan, dtype).at[which].set(values)
     gap = np.repeat(np.arange(len(segments)), segments)
     within = np.concatenate([np.arange(n) for n in segments])
-    dt = (gaps / jnp.asarray(np.array(segments) * num_steps, gaps.dtype))[gap]
-    start = times[gap] + jnp.asarray(within * num_steps, dt.dtype) * dt
-    all_times = jnp.append(start, times[-1])
+    dt = (gaps / jnp.asarray(np.array(segments) * num_steps, gaps.dtype))[gap].astype(dtype)
+    start = since[gap] + jnp.asarray(within * num_steps, dtype) * dt
     dt = jnp.broadcast_to(dt[:, None], (len(dt), num_steps))
-    return Record(all_times.astype(dtype), dt.astype(dtype), ends, jnp.asarray(which))
+    return Record(clock, jnp.append(start, since[-1]), dt, ends, jnp.asarray(which))
 
 
 def _filled(name: str, values: Numbers) -> Numbers:
@@ -222,21 +243,6 @@ def _filled(name: str, values: Numbers) -> Numbers:
     if name == "times" and np.ma.getmaskarray(values).any():
         raise ValueError("`times` has masked entries: leave them out, with their observations.")
     return np.ma.filled(values.astype(float), np.nan)
-
-
-def _from_initial(initial_time: Numbers, times: Numbers, values: Array) -> tuple[Numbers, Array]:
-    """With a time of its own for the initial law, where that is before all that is seen."""
-    if is_traced(times, initial_time):
-        raise ValueError("`initial_time` must be known when compiling, and so must `times`.")
-    known, first = np.asarray(times), float(np.asarray(initial_time))
-    if not np.isfinite(first) or (known.size and known.flat[0] < first):
-        raise ValueError(
-            f"`times` must begin at `initial_time` = {first} or later; they do at {known.flat[0]}."
-        )
-    if known.ndim != 1 or known.size == 0 or known[0] == first:
-        return times, values
-    nothing = jnp.full((1, *values.shape[1:]), jnp.nan, values.dtype)
-    return np.concatenate([[first], known]), jnp.concatenate([nothing, values])
 
 
 def _segments(

@@ -21,7 +21,7 @@ from ..schemes import AbstractStepDensity
 from .guide_search import linearised
 from .initial import Initial
 from .observation import Observation
-from .problem import RecordProblem, check_domain, problem_of
+from .problem import RecordProblem, check_clock, check_domain, problem_of
 from .record import Record, as_records, split_records
 
 
@@ -87,6 +87,7 @@ def as_record_problems(
     problem = problem_of(model, records[0], observation, initial, density)
     for record in records[1:]:
         check_domain(model, observation, record)
+        check_clock(model, observation, record)
     num_times = tuple(len(record.which) for record in records)
     return Records(dataclasses.replace(problem, record=_stacked(records)), num_times)
 
@@ -118,9 +119,10 @@ def _with_axis(tree: PyTree) -> PyTree:
 
 def _padded(record: Record, num_segments: int, num_times: int) -> Record:
     """With so many segments, the last of which have no length and nothing to be seen."""
-    more, last = num_segments - record.dt.shape[0], record.times[-1]
+    more, last = num_segments - record.dt.shape[0], record.since[-1]
     return Record(
-        jnp.pad(record.times, (0, more), constant_values=last),
+        record.clock,
+        jnp.pad(record.since, (0, more), constant_values=last),
         jnp.pad(record.dt, ((0, more), (0, 0))),
         jnp.pad(record.values, ((0, more), (0, 0)), constant_values=jnp.nan),
         jnp.pad(record.which, (0, num_times - len(record.which))),

@@ -6,6 +6,7 @@ from typing import Any
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
@@ -52,7 +53,8 @@ _APART = "Chains disagree (R̂ above 1.1 at some points). Take more `num_draws` 
 class Smoothed(AbstractResult):
     """What `smooth` returns: draws of the path given all that was seen.
 
-    - `times`: of the points, shape (K,).
+    - `times`: of the points, shape (K,); a NumPy array of double precision where they are too far
+        from zero for the precision of paths.
     - `paths`: shape (chains, n, K, d).
     - `accepted`: the share of moves that were accepted, of each block in both ways to cut the
         record into blocks, shape (2, B); or of each state, shape (ends,), with a `proposal`.
@@ -62,7 +64,7 @@ class Smoothed(AbstractResult):
         which draws are not exact.
     """
 
-    times: Float[Array, " K"]
+    times: Float[Array | np.ndarray, " K"]
     paths: Float[Array, "chains n K d"]
     accepted: Float[Array, "..."]
     stuck: Bool[Array, " chains"]
@@ -222,7 +224,8 @@ def smooth(
         told_by = None
     paths = jnp.moveaxis(drawn.paths, 1, 0)
     found = (drawn.accepted, drawn.stuck, drawn.num_truncated)
-    smoothed = Smoothed(drawn.times, paths, *found, told_by)
+    times = problem.record.clock.exactly(drawn.since)
+    smoothed = Smoothed(times, paths, *found, told_by)
     return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
 
 

@@ -199,10 +199,11 @@ class StateSampler(eqx.Module):
 
 
 class Draws(NamedTuple):
-    """`times` of the points, draws of whole paths, the share of moves `accepted`, of each state or
-    block, the chains in which one was `stuck`, and how many weights were cut off."""
+    """Times of the points `since` the first, draws of whole paths, the share of moves `accepted`,
+    of each state or block, the chains in which one was `stuck`, and the number of weights that were
+    cut off."""
 
-    times: Float[Array, " points"]
+    since: Float[Array, " points"]
     paths: Float[Array, "n C points d"]
     accepted: Float[Array, "..."]
     stuck: Bool[Array, " C"]
@@ -241,8 +242,8 @@ def sample_states(
     model = nondifferentiable(model.prepared())
     sampler = StateSampler(problem, model, proposal, laws, scalars, movable, num_proposals)
     within = jnp.asarray(proposal.fractions(problem.num_steps)[:-1], durations.dtype)
-    times = problem.record.times
-    grid = jnp.append((times[:-1, None] + durations[:, None] * within).ravel(), times[-1])
+    since = problem.record.since
+    grid = jnp.append((since[:-1, None] + durations[:, None] * within).ravel(), since[-1])
     paths, moved, cut = _run(key, sampler, guided, (num_draws, num_warmup), progress_meter)
     ever = jnp.all(jnp.any(moved.states, axis=0) | ~movable, axis=1)
     ever &= jnp.all(jnp.any(moved.paths, axis=0), axis=1)

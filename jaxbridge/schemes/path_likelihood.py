@@ -41,11 +41,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..engine.checks import Numbers, as_floating, check_precision, is_traced, time_steps
+from ..engine.checks import Numbers, as_floating, check_precision, is_traced
 from ..engine.compiled import compiled
 from ..engine.doors import door
 from ..engine.lanes import over_lanes
 from ..engine.linalg import dot, total
+from ..engine.times import as_times
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.dynamics import Dynamics
 from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
@@ -86,7 +87,7 @@ def path_log_likelihood(
     ```
     """
     check_diffusion(model)
-    (times, steps), path = time_steps("times", times), as_floating("path", path)
+    (times, steps), path = as_times("times", times), as_floating("path", path)
     if path.ndim < 2 or path.shape[-2] < 2:
         raise ValueError(
             "`path` must hold two or more points in the axis before the last, shape (..., K, d); "

@@ -164,3 +164,35 @@ def test_paths_are_differentiable_in_forward_mode():
     end = lambda x: jb.simulate(jax.random.key(0), process(), x, TIMES, num_steps=50)[0, -1]
     jacobian = jax.jit(jax.jacfwd(end))(jnp.asarray(START, jnp.float32))
     np.testing.assert_allclose(jacobian, scipy.linalg.expm(-B), atol=2e-3)
+
+
+BROWNIAN = jb.Diffusion(lambda x, p: 0 * x)
+WAVE = jb.Diffusion(lambda x, p, t: jnp.cos(2 * jnp.pi * t) + 0 * x)
+
+
+def test_paths_do_not_depend_on_the_zero_of_time(precision):
+    """Nor do increments: their variance is the gap, and there are no copies among them, though
+    these times are equal in single precision."""
+    gap = 1 / 16  # exact beside the offset
+    start, days = jnp.zeros(1, precision), gap * np.arange(201)
+    run = lambda times: jb.simulate(
+        jax.random.key(0), BROWNIAN, start, times, num_paths=50, num_steps=1
+    )
+    near, far = run(days), run(2_460_000 + days)
+    np.testing.assert_array_equal(near, far)
+    increments = np.diff(np.asarray(far, float)[..., 0], axis=1) / np.sqrt(gap)
+    assert abs(increments.var() - 1) < 5 * np.sqrt(2 / increments.size)
+    correlations = np.corrcoef(increments.T)
+    assert np.abs(correlations - np.eye(200)).max() < 0.75  # of copies it is 1
+
+
+def test_coefficients_get_the_callers_time_or_nothing():
+    """Whole periods change nothing; what single precision cannot resolve is refused."""
+    times = np.arange(5) / 4
+    run = lambda shift: jb.simulate(jax.random.key(0), WAVE, [0.0], shift + times, num_steps=5)
+    np.testing.assert_allclose(run(0), run(100), atol=1e-4)
+    assert np.abs(run(0) - run(0.25)).max() > 0.1  # the time counts
+    with pytest.raises(ValueError, match="too far from zero for coefficients that depend on time"):
+        run(2_460_000)
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(run(0), run(2_460_000), atol=1e-8)

@@ -1,7 +1,9 @@
 """What of a record is seen, and the grid between its times."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from helpers import count_compilations
 
@@ -42,4 +44,59 @@ def test_segments_begin_at_their_times():
     """To the last digit, also where the first times are small beside steps."""
     times = np.array([1e-3, 30.0, 100.0, 170.0], np.float32)
     (record,) = as_records([(times, np.zeros((4, 1)))], 7, None)
-    np.testing.assert_array_equal(record.grid()[::7], times)
+    np.testing.assert_array_equal(record.clock(record.grid()[::7]), times)
+
+
+ONE = jb.ornstein_uhlenbeck([[1.0]])
+SEASONAL = jb.seasonal_ornstein_uhlenbeck(1.5, period=0.5)
+READINGS = np.array([[0.3], [np.nan], [-0.2], [0.5]])
+
+
+def log_weight(times, values=READINGS, model=ONE, **options):
+    options = {"observation": SEEN, "initial": jb.GaussianLaw([0.0], [[1.0]]), **options}
+    made = jb.innovations(model, times, values, num_steps=4, **options)
+    return float(made.log_weight(model.params, jnp.zeros(made.size)))
+
+
+def test_a_record_does_not_depend_on_the_zero_of_time():
+    """Whole periods change nothing, or are refused: where the model depends on time, or how it is
+    seen does."""
+    assert log_weight(TIMES) == log_weight(2_460_000 + TIMES)
+    near, far = log_weight(TIMES, model=SEASONAL), log_weight(500 + TIMES, model=SEASONAL)
+    assert abs(near - far) < 1e-3
+    assert abs(near - log_weight(0.2 + TIMES, model=SEASONAL)) > 0.1  # the time counts
+    noise = jb.LinearGaussian(covariance=lambda p, t: 0.2 + 0.1 * jnp.sin(t))
+    for options in ({"model": SEASONAL}, {"observation": noise}):
+        with pytest.raises(ValueError, match="too far from zero for coefficients"):
+            log_weight(2_460_000 + TIMES, **options)
+    with jax.enable_x64(True):
+        double = jb.seasonal_ornstein_uhlenbeck(1.5, period=0.5)
+        near, far = (log_weight(shift + TIMES, model=double) for shift in (0, 2_460_000))
+        assert abs(near - far) < 1e-6
+
+
+def test_times_of_paths_are_the_callers():
+    """Also where single precision would round them, and where they are integers of 64 bits."""
+    days = 2_460_000 + TIMES
+    made = jb.innovations(ONE, days, READINGS, observation=SEEN, num_steps=4)
+    np.testing.assert_array_equal(made.times, 2_460_000 + np.arange(13) / 4)
+    milliseconds = 1_700_000_000_000 + 1000 * np.arange(4)
+    slow = jb.ornstein_uhlenbeck([[1e-3]])
+    made = jb.innovations(slow, milliseconds, READINGS, observation=SEEN, num_steps=4)
+    np.testing.assert_array_equal(made.times[::4], milliseconds)
+
+
+def test_one_series_of_numbers_is_one_column():
+    expected = log_weight(TIMES)
+    missing = [0.3, None, -0.2, 0.5]
+    given = [READINGS[:, 0], missing, [[value] for value in missing]]
+    given += [pd.Series(missing, dtype="Float64"), pd.DataFrame({"y": [0.3, pd.NA, -0.2, 0.5]})]
+    for values in given:
+        assert log_weight(TIMES, values) == expected
+    assert log_weight(pd.Series(range(4), dtype="Int64")) == expected
+
+
+def test_a_record_may_begin_before_its_first_time():
+    later = np.concatenate([[[np.nan]], READINGS])
+    expected = log_weight(1e6 + np.array([-0.5, *TIMES]), later)
+    assert log_weight(1e6 + TIMES, initial_time=1e6 - 0.5) == expected != log_weight(TIMES)
