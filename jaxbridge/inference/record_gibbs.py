@@ -9,8 +9,9 @@ The guide is linearised along a path that is likely at some θ, and may be a bad
 off. Neither the law of the path given θ nor that of θ given ξ depends on it; so a warm-up finds it
 anew (`warm_up`).
 
-The step error of the likelihood is that of E[w̃ / w] (`record_paths`), and with D = log w̃ / w, to
-second order, log E[w̃ / w] = E[D + ½ (D - ED)²].
+The step error of the likelihood is that of E[w̃ / w] (`record_paths`), with D = log w̃ / w and
+`relative_change` in the place of e^D. Where half as many steps are too long for the drift a path
+may leave the finite numbers: its w̃ is zero.
 """
 
 from typing import NamedTuple
@@ -29,6 +30,7 @@ from ..engine.keys import key_for
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..records import Guidance, Records, tuned
+from ..schemes import relative_change
 from .parameter_walk import learnt
 from .parameters import Parameters
 from .posterior import (
@@ -167,7 +169,8 @@ class RecordSampler(eqx.Module):
         """log w̃ / w, of steps of twice the length."""
         (state, guides), completion = guided, self.completion
         noise, log_weight = completion.noise(key, At(state.theta, guides), state.paths)
-        return completion.coarse_log_weight(state.theta, noise) - log_weight
+        ratio = proper(completion.coarse_log_weight(state.theta, noise)) - log_weight
+        return jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
 
 
 @compiled_sooner
@@ -229,13 +232,13 @@ def sample_records(
     fields, (moved, taken, log_ratio) = drawn(parameters, *draws)
     real = movable(records)
     ever = jnp.any(taken > 0, axis=-4)  # of all draws
-    deviation = log_ratio - jnp.nanmean(log_ratio)
+    change = relative_change(log_ratio, jnp.nanmedian(log_ratio))
     return RecordPosterior(
         **fields,
         parameters_moved=moved,
         blocks_moved=jnp.mean(taken, axis=(-3, -2, -1), where=real),
         stuck=jnp.any(real & ~ever, axis=(-3, -2, -1)),
-        log_step_error=share_of_step_error(records) * (log_ratio + deviation**2 / 2),
+        log_step_error=share_of_step_error(records) * change,
         sigma_varies=parameters.model.sigma_varies(records.stacked.like),
         state=state,
     )

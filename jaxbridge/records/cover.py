@@ -66,7 +66,7 @@ class CoveredStart(NamedTuple):
     log_shares: Float[Array, " J"]
 
     @property
-    def log_weight(self) -> Float[Array, ""]:
+    def log_integral(self) -> Float[Array, ""]:
         """The log of the integral of the cover times what it is tilted by."""
         return logsumexp(self.log_shares)
 
@@ -76,7 +76,8 @@ class CoveredStart(NamedTuple):
         """Draws of x_0, from uniform positions and normal noise."""
 
         def one(j, zeta):
-            return jax.tree.map(lambda leaf: leaf[j], self.laws).point(zeta)
+            law = jax.tree.map(lambda leaf: leaf[j], self.laws)
+            return law.point_and_log_weight(zeta)[0]
 
         return jax.vmap(one, in_axes=(0, -1), out_axes=-1)(chosen(self.log_shares, positions), zeta)
 
@@ -143,4 +144,4 @@ def covered_start(
 ) -> CoveredStart:
     """The cover given what is seen at t_0, counted from the point, and h_0."""
     laws = jax.vmap(lambda each: guided_start(each, scalars, point, h))(law.laws)
-    return CoveredStart(laws, law.log_shares + laws.log_weight)
+    return CoveredStart(laws, law.log_shares + laws.log_integral)

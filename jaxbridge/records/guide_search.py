@@ -87,7 +87,7 @@ def _path_without_noise(
     if calls_for_cover(problem.initial, model, problem.like):
         solve = functools.partial(solve_root, guide.initial.root)
         hidden = jnp.zeros_like(guide.first.values)
-        noise = noise.at[0].set(guide.start.noise(begin, solve, hidden))
+        noise = noise.at[0].set(guide.start.noise_and_log_weight(begin, solve, hidden)[0])
     path, log_weight = path_and_log_weight(problem, model, guide, noise)
     return path, proper(log_weight)
 

@@ -35,7 +35,7 @@ from .tilted_step import NormalStep
 class Guidance(NamedTuple):
     """What guides paths at some parameters.
 
-    - `initial`: the normal law of X(t_0); `start`: the guided one, with its log weight.
+    - `initial`: the normal law of X(t_0); `start`: the guided one.
     - `linear`: the steps of the linear process, and `steps`: the guides of all steps, leading axes
         (K, N).
     - `first`, `scalars`: what is seen of X(t_0), and at the ends of the segments, leading axis K,
@@ -103,17 +103,16 @@ def path_and_log_weight(
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
     """The path that this noise makes, and its log weight: `noise[0]` makes x_0."""
     density, dynamics_at = problem.density, model.forward_at(problem.like)
-    start = guide.start.point(noise[0])
+    start, log_start = guide.start.point_and_log_weight(noise[0])
     steps = flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
 
     def one(x, inputs):
         zeta, step, scalars = inputs
-        law = guided_step(density, dynamics_at, x, step, scalars)
-        return law.point(zeta), law.log_weight
+        return guided_step(density, dynamics_at, x, step, scalars).point_and_log_weight(zeta)
 
     points, log_weights = recursion(one, start, (noise[1:], *steps))
     path = jnp.concatenate([start[None], points])
-    log_weight = guide.start.log_weight + sum_of_many(log_weights)
+    log_weight = log_start + sum_of_many(log_weights)
     return path, log_weight + corrections(problem, model, guide, path)
 
 
@@ -136,20 +135,21 @@ def noise_and_log_weight(
     density, dynamics_at = problem.density, model.forward_at(problem.like)
     scalars = at_every_step(guide.scalars, problem.num_steps)
     hidden = jax.random.normal(key, (len(path), scalars.values.shape[1]), path.dtype)
-    first = guide.start.noise(path[0], functools.partial(solve_root, guide.initial.root), hidden[0])
+    solve = functools.partial(solve_root, guide.initial.root)
+    first, log_start = guide.start.noise_and_log_weight(path[0], solve, hidden[0])
     # What the law of x_0 does not leave to noise is not moved by it, either.
     still = jnp.diagonal(guide.initial.root) == 0
     fresh = jax.random.normal(jax.random.fold_in(key, 1), first.shape, path.dtype)
 
     def of_step(x, x_next, step, scalars, hidden):
         law = target_law(density, dynamics_at, x, step.step)
-        made = guided_law(law, x, step, scalars)
-        return made.noise(x_next, law.solve, hidden), made.log_weight
+        made = guided_law(law, step, scalars)
+        return made.noise_and_log_weight(x_next, law.solve, hidden)
 
     steps = path[:-1], path[1:], flat(guide.steps), scalars, hidden[1:]
     zeta, log_weights = _of_each_step(of_step, *steps)
     noise = jnp.concatenate([jnp.where(still, fresh, first)[None], zeta])
-    log_weight = guide.start.log_weight + sum_of_many(log_weights)
+    log_weight = log_start + sum_of_many(log_weights)
     return noise, log_weight + corrections(problem, model, guide, path)
 
 

@@ -1,17 +1,26 @@
 """The steps of a path that is guided through a record, and their inverse.
 
-From x at the beginning of a step, where h is h_i, the target's step N(μ(x), Λ Λᵀ) is made that of
-the path given what is seen at its end and h_{i+1} (`tilted_step`), and its weight is
+From x at the beginning of a step the target's step N(μ(x), Λ Λᵀ) is made that of the path given
+what is seen at its end and h_{i+1} (`tilted_step`). Its weight is the density of the target's step
+over that of the guided one. With z the noise that makes the target's step go where the noise ζ
+makes the guided one go,
 
-    ∫ p(x'| x) g(y| x') h_{i+1}(x') dx' / h_i(x),
+    w = p(y| x) N(z; 0, I) / (N(ζ; 0, I) det ℛ),    det ℛ ≥ 1,
 
-which does not depend on where the step goes: where the model is linear it is constant.
+with p(y| x) the density of what is seen at the end of the step. So log w of a whole path is at most
+½|ζ|² plus the largest log density of what is seen, and rounding cannot lift it beyond that.
+
+The same weight is ∫ p(x'| x) g(y| x') h_{i+1}(x') dx' / h_i(x) times h_i(x) / h_{i+1}(x'), whose
+product over a path telescopes. It must not be summed in that form: explicit steps that are far too
+long for the drift (δ |∇drift| above two) carry a path to where log h is -1e30, differences of such
+numbers are rounded to ±1e14, and a path that hardly any noise makes gets a weight of e^{1e14}.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Float
 
 from ..engine.linalg import dot
@@ -34,27 +43,40 @@ class Guide(NamedTuple):
 
 
 class GuidedLaw(NamedTuple):
-    """The law of a guided step, its log weight, and what was seen on the way."""
+    """The law of a guided step, the log density of what is seen at its end given its beginning, and
+    what was seen on the way."""
 
     origin: Float[Array, " d"]
     tilted: Tilted
-    log_weight: Float[Array, ""]
+    log_seen: Float[Array, ""]
     seen: list[Seen]
 
-    def point(self, zeta: Float[Array, " m"]) -> Float[Array, " d"]:
-        """Where the noise ζ ~ N(0, I) leads."""
-        return self.origin + self.tilted.point(zeta)
+    @property
+    def log_integral(self) -> Float[Array, ""]:
+        """Return log ∫ p(x'| x) g(y| x') h(x') dx', with h at the end of the step."""
+        return self.log_seen + self.tilted.log_integral
 
-    def noise(
+    def point_and_log_weight(
+        self, zeta: Float[Array, " m"]
+    ) -> tuple[Float[Array, " d"], Float[Array, ""]]:
+        """Return where the noise ζ ~ N(0, I) leads, and the log weight of the step."""
+        # Point and weight would else compute it twice.
+        pulled = lax.optimization_barrier(self.tilted.pulled(zeta))
+        point = self.origin + self.tilted.point(pulled)
+        return point, self.log_seen + self.tilted.log_ratio(zeta, pulled)
+
+    def noise_and_log_weight(
         self,
         point: Float[Array, " d"],
         solve: Callable[[Float[Array, " d"]], Float[Array, " m"]],
         hidden: Float[Array, " n"],
-    ) -> Float[Array, " m"]:
-        """Noise that leads to this point, where `solve` is Λ⁻¹ of the step before anything is
-        seen; `hidden` as in `coordinates`."""
+    ) -> tuple[Float[Array, " m"], Float[Array, ""]]:
+        """Return noise that leads to this point, and the log weight of the step. `solve` is Λ⁻¹ of
+        the step before anything is seen; `hidden` as in `coordinates`."""
         displacement = solve(point - self.origin - self.tilted.step.mean)
-        return self.tilted.noise(coordinates(displacement, self.seen, hidden[: len(self.seen)]))
+        pulled = coordinates(displacement, self.seen, hidden[: len(self.seen)])
+        zeta = self.tilted.noise(pulled)
+        return zeta, self.log_seen + self.tilted.log_ratio(zeta, pulled)
 
 
 def relative(scalars: Scalars, point: Float[Array, " d"]) -> Scalars:
@@ -72,7 +94,7 @@ def guided_start(
     of_rows = jnp.stack([dot(jnp.abs(row), size) for row in scalars.rows])
     step, log_seen, seen = given(step, scalars, 100 * eps * (of_rows + jnp.abs(scalars.values)))
     bent = tilted(step, h)
-    return GuidedLaw(point, bent, log_seen + bent.log_integral, seen)
+    return GuidedLaw(point, bent, log_seen, seen)
 
 
 def guided_step(
@@ -83,7 +105,7 @@ def guided_step(
     scalars: Scalars | None,
 ) -> GuidedLaw:
     """The law of the step from x; `scalars` are seen at its end, counted from ξ_{i+1}."""
-    return guided_law(target_law(density, dynamics_at, x, guide.step), x, guide, scalars)
+    return guided_law(target_law(density, dynamics_at, x, guide.step), guide, scalars)
 
 
 def target_law(
@@ -93,14 +115,10 @@ def target_law(
     return density.steps_from(dynamics_at(step.time), x).law(step.dt)
 
 
-def guided_law(
-    law: StepLaw | DegenerateLaw, x: Float[Array, " d"], guide: Guide, scalars: Scalars | None
-) -> GuidedLaw:
+def guided_law(law: StepLaw | DegenerateLaw, guide: Guide, scalars: Scalars | None) -> GuidedLaw:
     """The same, given the law of the target's step."""
     step = NormalStep(law.mean - guide.next_point, law.root)
-    log_seen, seen = jnp.zeros((), x.dtype), []
+    log_seen, seen = jnp.zeros((), law.mean.dtype), []
     if scalars is not None:
         step, log_seen, seen = given(step, scalars)
-    bent = tilted(step, guide.next_h)
-    log_weight = log_seen + bent.log_integral - guide.h.log(x - guide.point)
-    return GuidedLaw(guide.next_point, bent, log_weight, seen)
+    return GuidedLaw(guide.next_point, tilted(step, guide.next_h), log_seen, seen)

@@ -4,6 +4,9 @@ P particles take guided steps. At the end of each segment their weights are thos
 here, tilted by h: of what is seen later they know as much as the linear process does. Where few of
 them count they are resampled, systematically, and go on with equal weights. The product of the
 means of the weights, p̂(y), is unbiased (Del Moral 2004, theorem 7.4.2), up to the step error.
+
+Within a segment weights are those of paths (`guided_steps`), to which no h comes in; at its end a
+particle takes h there, and gives back h at its beginning.
 """
 
 from typing import NamedTuple
@@ -89,7 +92,7 @@ def run_filters(
         """With what came to the weights, resampled where that is called for."""
         change = change.reshape(R, P)
         log_weight = state.log_weight + change
-        # Of a path that has exploded h is so small that what it is divided by is lost to rounding.
+        # Of a path that had exploded h was so small that what it gives back is lost to rounding.
         finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & (change < most)
         log_weight = jnp.where(finite, log_weight, -jnp.inf)
         lost = jnp.sum(~finite & (state.log_weight > -jnp.inf), axis=1, dtype=jnp.int32)
@@ -103,9 +106,12 @@ def run_filters(
     def moved(x, zeta, step, scalars):
         def of_particle(x, zeta):
             law = guided_step(problem.density, dynamics_at, x, step, scalars)
-            return law.point(zeta), law.log_weight
+            return law.point_and_log_weight(zeta)
 
         return over_lanes(-1, -1)(of_particle)(x, zeta)
+
+    def log_h(h, point, x):
+        return over_lanes(-1)(lambda x: h.log(x - point))(x)
 
     def one(state, inputs):
         zeta, step, moves = inputs
@@ -123,9 +129,11 @@ def run_filters(
         noise_key, resampling_key = jax.random.split(jax.random.fold_in(key, number))
         noise = jax.random.normal(noise_key, (problem.num_steps, d, R * P), dtype)
         before, (zeta, last, _) = split_last((noise, steps, moving))
-        (x, change), _ = lax.scan(one, (state.x, jnp.zeros(R * P, dtype)), before)
+        here, first = state.x, jax.tree.map(lambda leaf: leaf[0], steps)
+        (x, change), _ = lax.scan(one, (here, jnp.zeros(R * P, dtype)), before)
         x, final = moved(x, zeta, last, scalars)
-        change = change + final + corrected(row, x)
+        tilt = log_h(last.next_h, last.next_point, x) - log_h(first.h, first.point, here)
+        change = change + final + tilt + corrected(row, x)
         return weighed(state._replace(x=x), resampling_key, change)
 
     start_key, resampling_key = jax.random.split(jax.random.fold_in(key, 0))
@@ -151,9 +159,9 @@ def _starts(
     noise_key, position_key = jax.random.split(key)
     zeta = jax.random.normal(noise_key, (problem.dim, R * P), dtype)
     if not calls_for_cover(problem.initial, model, problem.like):
-        x = over_lanes(-1)(guide.start.point)(zeta)
+        x, _ = over_lanes(-1)(guide.start.point_and_log_weight)(zeta)
         ratio = lambda x: log_ratio(problem.initial, model, guide.initial, x)
-        return x, guide.start.log_weight + over_lanes(-1)(ratio)(x)
+        return x, guide.start.log_integral + over_lanes(-1)(ratio)(x)
     law = cover(model, guide.initial)
     h = jax.tree.map(lambda leaf: leaf[0, 0], guide.steps.h)
     start = covered_start(law, guide.first, guide.start.origin, h)
@@ -162,7 +170,7 @@ def _starts(
     x = start.points(positions.ravel(), zeta)
     log_nu = model.prepared().log_stationary
     ratio = lambda x: log_nu(x) - law.log_density(x)
-    return x, start.log_weight + over_lanes(-1)(ratio)(x)
+    return x, start.log_integral + over_lanes(-1)(ratio)(x)
 
 
 def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) -> _Particles:

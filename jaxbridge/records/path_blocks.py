@@ -326,8 +326,10 @@ def _new_starts(
     def of_start(x, mean, root, first, step, end, eta, rho, beta):
         guide = step.to(end)
         law = guided_start(NormalStep(mean, root), first, guide.point, guide.h)
-        zeta = law.noise(x, functools.partial(solve_root, root), nothing)
-        return law.point(_turned(zeta, eta, rho, beta)), law.log_weight
+        solve = functools.partial(solve_root, root)
+        zeta, log_old = law.noise_and_log_weight(x, solve, nothing)
+        new, log_new = law.point_and_log_weight(_turned(zeta, eta, rho, beta))
+        return new, log_old, log_new
 
     initial = NormalStep(blocks.mean, blocks.root[..., 0])
     means = jnp.where(lanes.is_first, initial.mean[:, None], lanes.start)
@@ -335,16 +337,17 @@ def _new_starts(
     eta = jax.random.normal(key, lanes.start.shape, lanes.start.dtype)
     law = (means, spread(blocks.root), spread(blocks.first), step, lanes.end)
     arguments = (lanes.start, *law, eta, lanes.rho, lanes.beta)
-    new, log_start = over_lanes(*9 * [-1])(of_start)(*arguments)
+    new, log_old, log_new = over_lanes(*9 * [-1])(of_start)(*arguments)
     new = jnp.where(lanes.is_first, new, lanes.start)
     corrected = _corrections(problem, model, spread)
     of_law = lambda x: log_ratio(problem.initial, model, initial, x)
 
-    def log_weight(x):
+    def log_weight(x, log_start):
         ratio = jnp.where(lanes.is_first, over_lanes(-1)(of_law)(x), 0)
         return log_start + corrected(blocks.first_row, x) + ratio
 
-    return _State(lanes.start, new, log_weight(lanes.start), log_weight(new))
+    log_weights = log_weight(lanes.start, log_old), log_weight(new, log_new)
+    return _State(lanes.start, new, *log_weights)
 
 
 def _new_points(
@@ -363,11 +366,12 @@ def _new_points(
     def step_of(old, new, old_next, eta, step, end, scalars, rho, beta):
         guide = step.to(end)
         law = target_law(density, dynamics_at, old, guide.step)
-        here = guided_law(law, old, guide, scalars)
-        zeta = here.noise(old_next, law.solve, nothing)
+        here = guided_law(law, guide, scalars)
+        zeta, log_old = here.noise_and_log_weight(old_next, law.solve, nothing)
         law = target_law(density, dynamics_at, new, guide.step)
-        there = guided_law(law, new, guide, scalars)
-        return there.point(_turned(zeta, eta, rho, beta)), here.log_weight, there.log_weight
+        there = guided_law(law, guide, scalars)
+        new, log_new = there.point_and_log_weight(_turned(zeta, eta, rho, beta))
+        return new, log_old, log_new
 
     def advance(state: _State, old_next, eta, step, scalars) -> _State:
         axes = (*6 * [-1], None if scalars is None else -1, -1, -1)

@@ -41,8 +41,8 @@ def start_share(
 
     def both(x):
         seen = of_first(split_first(problem.rows)[0], x)
-        to_cover = log_nu(x) - law.log_density(x) + start.log_weight
-        to_normal = log_ratio(problem.initial, model, guide.initial, x) + guide.start.log_weight
+        to_cover = log_nu(x) - law.log_density(x) + start.log_integral
+        to_normal = log_ratio(problem.initial, model, guide.initial, x) + guide.start.log_integral
         return proper(seen + to_cover), proper(seen + to_normal)
 
     to_cover, to_normal = jax.vmap(both, in_axes=-1)(start.points(positions, zeta))

@@ -100,17 +100,33 @@ def given(
 
 
 class Tilted(NamedTuple):
-    """A step tilted by h: its mean e and root Λ before, ℛ and v, and log ∫ h dN."""
+    """A step tilted by h: its mean e and root Λ before, ℛ and v, and log h(e) + ½ |v|²."""
 
     step: NormalStep
     factor: Float[Array, "m m"]
     shift: Float[Array, " m"]
-    log_integral: Float[Array, ""]
+    exponent: Float[Array, ""]
 
-    def point(self, zeta: Float[Array, " m"]) -> Float[Array, " d"]:
-        """e + Λ ℛ⁻ᵀ (v + ζ)."""
-        pulled = solve_lower_transposed(self.factor, self.shift + zeta)
+    @property
+    def log_integral(self) -> Float[Array, ""]:
+        """log ∫ h dN."""
+        return self.exponent - self._log_det()
+
+    def pulled(self, zeta: Float[Array, " m"]) -> Float[Array, " m"]:
+        """z = ℛ⁻ᵀ (v + ζ), the noise of the same step before it is tilted."""
+        return solve_lower_transposed(self.factor, self.shift + zeta)
+
+    def point(self, pulled: Float[Array, " m"]) -> Float[Array, " d"]:
+        """e + Λ z."""
         return self.step.mean + matvec(self.step.root, pulled)
+
+    def log_ratio(self, zeta: Float[Array, " m"], pulled: Float[Array, " m"]) -> Float[Array, ""]:
+        """Return log N(z; 0, I) - log N(ζ; 0, I) - log det ℛ: the density of the step before it is
+        tilted over that of the tilted step. At most ½|ζ|², for det ℛ is at least one."""
+        return dot(zeta - pulled, zeta + pulled) / 2 - self._log_det()
+
+    def _log_det(self) -> Float[Array, ""]:
+        return log_of_product([self.factor[j, j] for j in range(self.factor.shape[0])])
 
     def noise(self, pulled: Float[Array, " m"]) -> Float[Array, " m"]:
         """ζ of ℛ⁻ᵀ (v + ζ)."""
@@ -131,8 +147,7 @@ def tilted(step: NormalStep, h: Information) -> Tilted:
     e, root = step
     factor, _ = tilt_factor(root, h)
     v = solve_lower(factor, matvec(root.T, h.shift - matvec(h.precision, e)))
-    log_det = log_of_product([factor[j, j] for j in range(factor.shape[0])])
-    return Tilted(step, factor, v, h.log(e) + dot(v, v) / 2 - log_det)
+    return Tilted(step, factor, v, h.log(e) + dot(v, v) / 2)
 
 
 def coordinates(

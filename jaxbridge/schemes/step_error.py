@@ -102,6 +102,18 @@ def error_of_mean(
     return _told(share, change, jnp.where(some, spread, 0), some)
 
 
+def relative_change(D: Float[Array, "..."], typical: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return e^(D - typical) - 1 to second order, of which a covariance tells what a mean changes
+    by under the weights e^D.
+
+    It is exact below zero: a draw that half as many steps lose, D = -∞, counts as missing, -1, and
+    no more. Above zero e^D would have no finite variance where D has a normal law.
+    """
+    D = D - typical
+    above = jnp.maximum(D, 0)
+    return jnp.where(D < 0, jnp.expm1(jnp.minimum(D, 0)), above + above**2 / 2)
+
+
 @jax.jit  # one program where it is called outside of any
 def dominates(error: StepError, standard_error: Inexact[Array, "..."]) -> Bool[Array, "..."]:
     """Whether the step error is beyond the standard error, or could be without being seen."""

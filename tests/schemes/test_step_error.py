@@ -14,6 +14,7 @@ from jaxbridge.schemes.step_error import (
     dominates,
     error_of_log_mean,
     error_of_mean,
+    relative_change,
     share_of_order,
     step_fault,
 )
@@ -192,3 +193,9 @@ def test_faults_are_step_errors_that_matter(value, uncertainty, sd, expected):
 def test_large_step_errors_beside_larger_noise_are_no_fault():
     error = StepError(jnp.asarray(0.2), jnp.asarray(0.01))
     assert not step_fault(error, jnp.asarray(0.5)).present
+
+
+def test_draws_that_half_as_many_steps_lose_are_missing_and_no_more():
+    D = jnp.array([-jnp.inf, -1e20, -0.01, 0.0, 0.02, 3.0])
+    made = relative_change(D, jnp.zeros(()))
+    np.testing.assert_allclose(made, [-1, -1, np.expm1(-0.01), 0, 0.0202, 7.5], rtol=1e-5)
