@@ -91,6 +91,22 @@ def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1)), 0)
 
 
+def spectral_radius(matrix: Float[Array, "d d"]) -> Float[Array, ""]:
+    """Return the largest absolute value of eigenvalues, up to a few per cent: ‖Aⁿ‖^{1/n} at n = 32,
+    which hardly depends on the units of coordinates."""
+    scale = jnp.max(jnp.abs(matrix))
+    log_size = jnp.zeros((), matrix.dtype)
+    power = matrix
+    for _ in range(5):
+        size = jnp.max(jnp.abs(power))
+        power = power / jnp.where(size > 0, size, 1)
+        power = matmul(power, power)
+        log_size = 2 * (log_size + jnp.log(jnp.where(size > 0, size, 1)))
+    norm = jnp.sqrt(jnp.sum(power**2))
+    radius = jnp.exp((log_size + jnp.log(norm)) / 32)
+    return jnp.where(scale > 0, radius, 0)
+
+
 def solve(matrix: Float[Array, "d d"], right: Float[Array, "d *m"]) -> Float[Array, "d *m"]:
     """`matrix⁻¹ right`, by Cramer's rule for d ≤ 2, otherwise by Gauss–Jordan elimination with
     partial pivoting.

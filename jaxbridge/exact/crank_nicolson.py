@@ -204,7 +204,7 @@ def run_crank_nicolson(
         proposal=proposal,
         pareto_k=None,
         log_halving=problem.result(states.log_halving),
-        step_share=problem.result(proposal.step_share(model, intervals)),
+        step_share=problem.result(proposal.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )
 

@@ -192,7 +192,7 @@ def estimate_log_density(
     )
     log_mean, error, size = log_mean_and_error(drawn.log_weights)
     cut = jnp.any(drawn.truncated, axis=1)
-    share = proposal.step_share(model, intervals)
+    share = proposal.share_in_regime(model, intervals, num_steps)
     step_error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share, held)
     if proposal.by_coupling is None:  # weights of coupled pairs are no sums over steps
         step_error = with_rounding(step_error, num_steps, problem.like.shape[0])

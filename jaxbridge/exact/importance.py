@@ -251,7 +251,8 @@ def _weigh_bridges(key, model, pairs, bridges, search):
     log_weights, unusable = usable(log_weights, bridges.met)
     intervals = Intervals(paths[:, 0], ends, durations)
     log_halving = pairs.log_halving(model, intervals, paths, shape[-1]).reshape(shape)
-    share = pairs.step_share(model, intervals).reshape(shape)[..., 0]
+    share = pairs.share_in_regime(model, intervals, bridges.num_steps)
+    share = share.reshape(shape)[..., 0]
     num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)
     num_nonfinite = jnp.sum(counts.num_nonfinite, axis=-1, dtype=jnp.int32)
     return WeightedBridges(
@@ -359,6 +360,6 @@ def _sample_weighted(
         num_nonfinite=problem.total(drawn.num_nonfinite),
         proposal=proposal,
         log_halving=of_interval.log_halving,
-        step_share=problem.result(proposal.step_share(model, intervals)),
+        step_share=problem.result(proposal.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )

@@ -169,7 +169,7 @@ def run_pseudo_marginal(
         proposal=proposal,
         pareto_k=problem.result(pareto_k(drawn.log_weights)),
         log_halving=states.log_halving,
-        step_share=problem.result(proposal.step_share(model, intervals)),
+        step_share=problem.result(proposal.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )
 

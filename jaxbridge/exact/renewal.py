@@ -294,7 +294,7 @@ def run_renewal(
         proposal=pairs,
         pareto_k=None,
         log_halving=problem.result(log_halving),
-        step_share=problem.result(pairs.step_share(model, intervals)),
+        step_share=problem.result(pairs.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )
 

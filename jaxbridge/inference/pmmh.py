@@ -443,7 +443,7 @@ def _run(
             counted = jax.tree.map(lambda so_far, one: so_far + one, run.counted, info)
             return _Run(chain, run.guide, number, counted), info.accepted
 
-        run, accepted = lax.scan(iterate, run, i * thin + jnp.arange(thin))
+        run, accepted = lax.scan(iterate, run, i * thin + jnp.arange(thin, dtype=i.dtype))
         held = run.chain._replace(root=None, log_step_error=log_step_error(near, i, run))
         return run, (held, jnp.any(accepted > 0, axis=0))
 

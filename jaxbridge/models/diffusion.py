@@ -334,7 +334,7 @@ class Diffusion(eqx.Module):
     def _at(self, x: Float[Array, " d"], time: Numbers | None) -> Dynamics:
         if time is None:
             return self.forward(x)
-        return self.forward_at(x)(jnp.asarray(time, x.dtype))
+        return self.forward_at(x)(as_floating("time", time).astype(x.dtype))
 
     def _drift_at(self, params: PyTree) -> Callable[[Any], Callable[[Array], Array]]:
         function = traced_once(self._drift)

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..coupling import AbstractCoupling
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..schemes import AbstractStepDensity
+from ..schemes import AbstractStepDensity, share_in_regime
 
 
 class WeightedPaths(NamedTuple):
@@ -116,6 +116,12 @@ class AbstractWeightedProposal(AbstractProposal):
     @abstractmethod
     def step_share(self, model: Diffusion, intervals: Intervals) -> Float[Array, " I"]:
         """The step error as a share of what half as many steps change (`step_error`)."""
+
+    def share_in_regime(
+        self, model: Diffusion, intervals: Intervals, num_steps: int
+    ) -> Float[Array, " I"]:
+        """Return that share, infinite where steps are too long for it to say anything."""
+        return share_in_regime(self.step_share(model, intervals), model, intervals, num_steps)
 
     @abstractmethod
     def draw(

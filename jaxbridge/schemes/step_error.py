@@ -8,7 +8,8 @@ an estimate changes by when it takes those is (2^p - 1) times its error, where t
 in its leading term. The two share their paths, and so the difference has far less Monte Carlo
 error than either where D is small; what it has is told beside it. Where a few of the paths have
 nearly all of the weights w e^D, the two laws have little in common: steps are too long for this, or
-for anything, and the uncertainty is infinite. The log of a mean of few weights is on average too
+for anything, and the uncertainty is infinite. So it is where steps are longer than the relaxation
+time of the drift. The log of a mean of few weights is on average too
 small, by half its relative variance to leading order, and that is made up for.
 """
 
@@ -20,10 +21,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Inexact
 
 from ..engine.averages import effective_size, expanded, normalised, weighted_mean
+from ..engine.linalg import spectral_radius
 from ..engine.verdict import Fault
+from ..models.bridge_problem import Intervals
+from ..models.diffusion import Diffusion
 
 # Fewer effective paths than this, or than this share of those without e^D, tell nothing.
 _FEWEST_EFFECTIVE, _LEAST_OVERLAP = 5, 0.1
+# In units of relaxation times. Steps that are twice as long are then unstable.
+_LONGEST_STEP = 1.0
 # A smaller step error, in log p or in standard deviations, does not matter to users.
 _MATTERS = 0.05
 # What rounding adds to log p is no matter below this.
@@ -159,6 +165,25 @@ _GUESS = 3.0
 def guessed(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
     """The share, with a guess on the safe side of those that are not known."""
     return jnp.where(share == UNKNOWN_SHARE, _GUESS, share)
+
+
+def share_in_regime(
+    share: Float[Array, "*I"], model: Diffusion, intervals: Intervals, num_steps: int
+) -> Float[Array, "*I"]:
+    """Return the share, infinite for intervals in which a leading term has no meaning, as two steps
+    are longer than the relaxation time at both ends; zero stays zero.
+
+    The mean of a step of length δ is a polynomial of δ∇α in the place of an exponential function.
+    That of half as many steps is unstable where the spectral radius ρ of ∇α has 2δρ > 2. There
+    changes can have any size and either sign, and nearly none by chance.
+    """
+
+    def rate(x):
+        return spectral_radius(jax.jacfwd(model.drift)(x))
+
+    rates = jnp.minimum(jax.vmap(rate)(intervals.start), jax.vmap(rate)(intervals.end))
+    too_long = rates * intervals.duration / num_steps > _LONGEST_STEP
+    return jnp.where(too_long & (share > 0), UNKNOWN_SHARE, share)
 
 
 def share_of_known_order(share: Float[Array, "*I"]) -> Float[Array, "*I"]:

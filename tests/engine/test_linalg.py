@@ -21,6 +21,7 @@ from jaxbridge.engine.linalg import (
     solve,
     solve_lower,
     solve_lower_transposed,
+    spectral_radius,
 )
 
 DIMENSIONS = [1, 2, 3, 5]
@@ -351,3 +352,18 @@ def test_no_simulation_calls_lapack(d, what):
 
     compiled = jax.jit(simulate).lower(jax.random.key(0)).compile().as_text()
     assert "fusion" in compiled and 'custom_call_target="lapack' not in compiled
+
+
+def test_spectral_radius():
+    rng = np.random.default_rng(0)
+    for matrix in (
+        np.diag([1.0, -3e8]),
+        rng.normal(size=(6, 6)),
+        [[0.0, 10.0], [-10.0, 0.0]],
+        [[-1.0, 1e3], [0.0, -2.0]],
+    ):
+        matrix = np.asarray(matrix)
+        exact = np.abs(np.linalg.eigvals(matrix)).max()
+        np.testing.assert_allclose(spectral_radius(jnp.asarray(matrix)), exact, rtol=0.3)
+    assert spectral_radius(jnp.array([[0.0, 1.0], [0.0, 0.0]])) == 0
+    assert spectral_radius(jnp.zeros((2, 2))) == 0

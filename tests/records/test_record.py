@@ -100,3 +100,35 @@ def test_a_record_may_begin_before_its_first_time():
     later = np.concatenate([[[np.nan]], READINGS])
     expected = log_weight(1e6 + np.array([-0.5, *TIMES]), later)
     assert log_weight(1e6 + TIMES, initial_time=1e6 - 0.5) == expected != log_weight(TIMES)
+
+
+def test_all_that_take_a_record_refuse_times_that_cannot_be_resolved():
+    """Where the season counts, and where it would have to be `initial_time` that is resolved."""
+    key, prior = jax.random.key(0), jb.NormalPrior(1.0, 1.0)
+    options = {"observation": SEEN, "initial": [0.0], "initial_time": 2_459_999.5}
+    inference = {"prior": prior, "where": lambda p: p.rate}
+    for function, more in (
+        (jb.log_likelihood, {}),
+        (jb.smooth, {}),
+        (jb.gibbs, inference),
+        (jb.pmmh, inference),
+        (jb.maximum_likelihood, {"where": lambda p: p.rate}),
+    ):
+        with pytest.raises(ValueError, match="too far from zero for coefficients"):
+            function(key, SEASONAL, 2_460_000 + TIMES, READINGS, **options, **more)
+
+
+@pytest.mark.slow
+def test_a_posterior_does_not_depend_on_the_zero_of_time(x64):
+    """Nor the time of the initial law."""
+    times = np.arange(40) / 4
+    values = np.sin(2 * times)[:, None]
+    options = {"observation": SEEN, "initial": [0.0], "num_steps": 4, "num_iterations": 20}
+    options |= {"prior": jb.NormalPrior(1.0, 1.0), "where": lambda p: p.rate, "num_warmup": 20}
+    model = jb.seasonal_ornstein_uhlenbeck(1.5, period=0.5)
+
+    def draws(shift):
+        arguments = (jax.random.key(0), model, shift + times, values)
+        return jb.pmmh(*arguments, **options, initial_time=shift - 0.5).theta
+
+    np.testing.assert_allclose(draws(0), draws(1e7), atol=1e-6)

@@ -199,3 +199,27 @@ def test_draws_that_half_as_many_steps_lose_are_missing_and_no_more():
     D = jnp.array([-jnp.inf, -1e20, -0.01, 0.0, 0.02, 3.0])
     made = relative_change(D, jnp.zeros(()))
     np.testing.assert_allclose(made, [-1, -1, np.expm1(-0.01), 0, 0.0202, 7.5], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "method",
+    ["density", *(pytest.param(name, marks=pytest.mark.slow) for name in ("weighted", "chain"))],
+)
+def test_of_steps_beyond_the_relaxation_time_nothing_is_known(method):
+    """Of four relaxation times the error is -32, and half as many steps change next to nothing."""
+    model, ends, num_steps = jb.ornstein_uhlenbeck([[1.0]]), ([0.5], [0.3]), 20
+    options = {"num_steps": num_steps, "proposal": jb.Guided()}
+    for steps, known in ((0.2, True), (4.02, False)):
+        arguments = (jax.random.key(0), model, *ends, steps * num_steps)
+        if method == "density":
+            made = jb.transition_log_density(*arguments, num_proposals=500, **options)
+            exact = jb.ou_transition(model, jnp.array(ends[0]), arguments[-1])
+            error = float(made.value - exact.log_density(jnp.array(ends[1])))
+            assert (abs(error) < 0.02) is known and (error < -30) is not known
+            assert bool(made.trustworthy) is known
+            doubt = made.step_uncertainty
+        else:
+            sample = jb.sample_weighted_bridges if method == "weighted" else jb.sample_exact_bridges
+            made = sample(*arguments, num_bridges=500, **options)
+            doubt = made.step_uncertainty(lambda path: path[num_steps // 2, 0])
+        assert bool(np.isfinite(doubt)) is known
