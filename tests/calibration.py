@@ -154,7 +154,13 @@ def constant_sigma() -> Iterator[Model]:
     durations = (0.1, 0.5, 1.0, 2.0, 5.0)
     laws = {
         "double well": (lambda x: 2 * x**2 - x**4, lambda x: 2 * x - 2 * x**3, -4, 4, (-1.8, 1.8)),
-        "steep wells": (lambda x: 12 * x**2 - 6 * x**4, lambda x: 12 * x - 12 * x**3, -3, 3, (-1.5, 1.5)),
+        "steep wells": (
+            lambda x: 12 * x**2 - 6 * x**4,
+            lambda x: 12 * x - 12 * x**3,
+            -3,
+            3,
+            (-1.5, 1.5),
+        ),
         "quartic": (lambda x: -(x**4), lambda x: -2 * x**3, -3, 3, (-1.5, 1.5)),
         "hyperbolic": (
             lambda x: -2 * jnp.sqrt(1 + x**2),
@@ -191,7 +197,10 @@ def _cir_model(params, coordinates) -> Model:
         ends = jnp.asarray(end[:, None], jnp.float32)
         value -= np.asarray(made.log_jacobian(ends), float)
         return (
-            *(np.asarray(made.forward(jnp.asarray(x[:, None], jnp.float32)))[:, 0] for x in (start, end)),
+            *(
+                np.asarray(made.forward(jnp.asarray(x[:, None], jnp.float32)))[:, 0]
+                for x in (start, end)
+            ),
             value,
         )
 
@@ -225,10 +234,10 @@ def varying_sigma() -> Iterator[Model]:
             reversible=True,
             domain=lambda x, p: jnp.all((x > 0) & (x < 1)),
         )
-        yield Model(f"Jacobi, shape {shape}", model, on_line(grid, durations), (0.02, 0.98), durations)
-    grid = line(
-        lambda x: x * (1 - x), lambda x: 0.4 * x, np.log(0.02), np.log(6.0), 801, np.exp
-    )
+        yield Model(
+            f"Jacobi, shape {shape}", model, on_line(grid, durations), (0.02, 0.98), durations
+        )
+    grid = line(lambda x: x * (1 - x), lambda x: 0.4 * x, np.log(0.02), np.log(6.0), 801, np.exp)
     model = jb.Diffusion(
         lambda x, p: x * (1 - x),
         lambda x, p: 0.4 * x,
@@ -237,9 +246,7 @@ def varying_sigma() -> Iterator[Model]:
         domain=lambda x, p: jnp.all(x > 0),
     )
     yield Model("logistic", model, on_line(grid, durations), (0.3, 2.0), durations)
-    grid = line(
-        lambda x: -x, lambda x: 0.6 * np.sqrt(1 + x**2), -5.0, 5.0, 801, np.sinh
-    )
+    grid = line(lambda x: -x, lambda x: 0.6 * np.sqrt(1 + x**2), -5.0, 5.0, 801, np.sinh)
     model = jb.Diffusion(
         lambda x, p: -x,
         lambda x, p: 0.6 * jnp.sqrt(1 + x**2),
@@ -250,8 +257,8 @@ def varying_sigma() -> Iterator[Model]:
 
 
 def _intervals(model: Model, rng, count: int):
-    """Start, end, duration and log p of intervals: as likely as data for every other, else anywhere;
-    none so unlikely that the exact numbers have no digits left."""
+    """Start, end, duration and log p of intervals: every other as likely as data, else anywhere,
+    but not so unlikely that the exact numbers have no digits left."""
     size = 200
     start, end = rng.uniform(*model.points, size=(2, size * count))
     duration = np.repeat(rng.choice(model.durations, size=count), size)
@@ -369,7 +376,9 @@ def linear_means(seed, count) -> Iterator[Case]:
         for num_steps in (10, 50):
             for method in ("weights", "chain"):
                 key = jax.random.key(rng.integers(2**31))
-                sample = jb.sample_weighted_bridges if method == "weights" else jb.sample_exact_bridges
+                sample = (
+                    jb.sample_weighted_bridges if method == "weights" else jb.sample_exact_bridges
+                )
                 result = sample(
                     key, model, start, end, duration, num_steps=num_steps, num_bridges=1000,
                     proposal=proposal,
@@ -413,7 +422,11 @@ def linear_records(seed, count) -> Iterator[Case]:
     rng = np.random.default_rng(seed)
     models = {
         "relaxation": (np.array([[1.0]]), np.array([[1.0]]), np.array([[1.0]])),
-        "oscillator": (np.array([[0.0, -1.0], [9.0, 0.4]]), np.diag([0.3, 1.0]), np.array([[1.0, 0.0]])),
+        "oscillator": (
+            np.array([[0.0, -1.0], [9.0, 0.4]]),
+            np.diag([0.3, 1.0]),
+            np.array([[1.0, 0.0]]),
+        ),
         "fast oscillator": (
             np.array([[0.0, -1.0], [100.0, 1.0]]),
             np.diag([0.3, 3.0]),
@@ -448,7 +461,9 @@ def linear_records(seed, count) -> Iterator[Case]:
                     "linear records", f"log p, {title}", result, result.value, exact.log_likelihood,
                     result.standard_error, result.step_error, jnp.max(result.pareto_k),
                 )  # fmt: skip
-                smoothed = jb.smooth(key, model, times, values, num_draws=300, num_warmup=100, **record)
+                smoothed = jb.smooth(
+                    key, model, times, values, num_draws=300, num_warmup=100, **record
+                )
                 sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
                 off = np.abs(np.asarray(smoothed.mean(), float) - exact.mean) / sd
                 told = 4 * np.asarray(smoothed.standard_error(), float) / sd

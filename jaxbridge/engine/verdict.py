@@ -40,7 +40,7 @@ _TRUNCATED = (
     "a density."
 )
 _HEAVY = (
-    "Some weights have tails so heavy (a Pareto shape k̂ above 0.7, or fewer than five effective "
+    "Some weights have tails so heavy (a Pareto shape k̂ above 0.7, or fewer than 20 effective "
     "weights) that their mean and its error cannot be trusted. Choose another proposal, more "
     'proposals, shorter intervals, or `method="crank_nicolson"`.'
 )

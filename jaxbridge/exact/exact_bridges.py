@@ -18,7 +18,7 @@ from ..engine.averages import (
 )
 from ..engine.verdict import AbstractResult
 from ..proposals import AbstractWeightedProposal
-from ..schemes import StepError, dominates, error_of_mean
+from ..schemes import StepError, dominates, error_of_mean, root_mean_square_in_sds
 
 
 class AbstractExactBridges(AbstractResult):
@@ -86,14 +86,7 @@ class AbstractExactBridges(AbstractResult):
         paths, error = filled(self.paths, self.met), self._step_errors(lambda path: path)
         deviation = paths - jnp.expand_dims(weighted_mean(weights, paths), axis)
         variance = weighted_mean(weights, deviation**2)
-        varies = variance > 1e-6 * jnp.max(variance, axis=(-2, -1), keepdims=True)
-
-        def root_mean_square(value):
-            squares = jnp.where(varies, value**2 / jnp.where(varies, variance, 1), 0)
-            number = jnp.maximum(jnp.sum(varies, axis=(-2, -1)), 1).astype(value.dtype)
-            return jnp.sqrt(jnp.sum(squares, axis=(-2, -1)) / number)
-
-        return StepError(*map(root_mean_square, error))
+        return StepError(*(root_mean_square_in_sds(value, variance) for value in error))
 
     def _step_errors(self, fn: PathFunction) -> PyTree:
         def error(value):

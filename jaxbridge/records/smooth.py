@@ -1,6 +1,7 @@
 """Paths given a whole record: a Markov chain of paths, which move in blocks (`path_blocks`), or of
 states and the bridges between them (`states`)."""
 
+import dataclasses
 from typing import Any
 
 import diffrax
@@ -24,7 +25,9 @@ from ..schemes import (
     StepError,
     dominates,
     log_halving_of_paths,
+    root_mean_square_in_sds,
     share_of_order,
+    step_fault,
 )
 from .guide_search import Linearised, linearised
 from .guided_record import path_and_log_weight
@@ -36,6 +39,10 @@ from .states import Draws, sample_states
 
 # R̂ beyond which chains disagree.
 _MOST_R_HAT = 1.1
+# A spread of so many units in the last place is rounding.
+_ROUNDING = 64.0
+# The variance of D of one segment beyond which its second order says nothing of the step error.
+_MOST_VARIANCE = 1.0
 # What changes by no more along a path, relative to its size, is constant.
 _CONSTANT = 1e-3
 
@@ -69,7 +76,7 @@ class Smoothed(AbstractResult):
     accepted: Float[Array, "..."]
     stuck: Bool[Array, " chains"]
     num_truncated: Int[Array, ""]
-    _problem: RecordProblem | None
+    _problem: RecordProblem
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
         """The mean of `fn(path)`, a function of one path of shape (K, d), by default itself."""
@@ -85,16 +92,19 @@ class Smoothed(AbstractResult):
         return jax.tree.map(error, self._values(fn))
 
     def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """What `mean(fn)` is too large by for the length of the steps, entry by entry, to its
-        leading term: from half as many steps, by which each path is e^D times as likely (`halving`
-        in `schemes`). NaN where nothing is known, with a `proposal`, of one step, or of Euler's
-        steps where σ has fewer columns than rows."""
+        """Estimate the discretisation bias of `mean(fn)`, entry by entry, to its leading term.
+
+        With half as many steps each path is e^D times as likely (`halving` in `schemes`). NaN where
+        nothing is known: one step, Euler's steps where σ has fewer columns than rows, and steps so
+        long that in some interval the variance of D is above 1. With a `proposal` of a scheme that
+        is more accurate than `density` the estimate is too large.
+        """
         return self._step_errors(fn)[0]
 
     def step_uncertainty(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """The Monte Carlo error of `step_error(fn)`, entry by entry; infinite where σ varies, or by
-        what the drift leads its noise on, ∇α σ, for then D tells no more than the size: compare two
-        numbers of steps there."""
+        """Estimate the standard error of `step_error(fn)`, entry by entry. Where σ varies, or the
+        noise ∇α σ that the drift leads on, it is at least `step_error` itself, which is known
+        there up to a factor only."""
         return self._step_errors(fn)[1]
 
     def step_error_dominates(self, fn: PathFunction = lambda path: path) -> PyTree:
@@ -116,26 +126,42 @@ class Smoothed(AbstractResult):
     @property
     def verdict(self) -> Verdict:
         """Return the faults: a block that never moved, weights cut off, chains that disagree at
-        some points."""
+        some points, a step error of the mean path that dominates and is beyond 0.05 standard
+        deviations (root mean square)."""
+        error, standard_error = self._errors_in_sds
         return Verdict(
             (
                 Fault(jnp.any(self.stuck), _STUCK),
                 Fault(self.num_truncated > 0, _CUT_OFF),
                 Fault(~self._chains_agree, _APART),
+                step_fault(error, standard_error),
             )
         )
 
     @property
     def _chains_agree(self) -> Bool[Array, ""]:
-        moves = jnp.var(self.paths, axis=(0, 1)) > 0
-        return jnp.all((self.r_hat() < _MOST_R_HAT) | ~moves)
+        return jnp.all((self.r_hat() < _MOST_R_HAT) | ~self._varies)
+
+    @property
+    def _varies(self) -> Bool[Array, "K d"]:
+        """Where the path is not known but for rounding: what was observed exactly is."""
+        sd, size = jnp.std(self.paths, axis=(0, 1)), jnp.max(jnp.abs(self.paths), axis=(0, 1))
+        return sd > _ROUNDING * float(jnp.finfo(sd.dtype).eps) * size
+
+    @property
+    def _errors_in_sds(self) -> tuple[StepError, Float[Array, ""]]:
+        """The step error of the mean path, and its standard error, in standard deviations of its
+        points, root mean square."""
+        variance = jnp.where(self._varies, jnp.var(self.paths, axis=(0, 1)), 0)
+        in_sds = lambda value: root_mean_square_in_sds(value, variance)
+        error = StepError(*map(in_sds, self._step_errors(lambda path: path)))
+        return error, in_sds(self.standard_error())
 
     def _step_errors(self, fn: PathFunction) -> tuple[PyTree, PyTree]:
         values, problem = self._values(fn), self._problem
-        if problem is None or problem.num_steps == 1:
-            unknown = jax.tree.map(lambda leaf: jnp.full(leaf.shape[2:], jnp.nan), values)
-            return unknown, unknown
         D = _log_halving(problem, self.paths)
+        known = jnp.max(jnp.var(D, axis=(0, 1))) <= _MOST_VARIANCE
+        D = jnp.where(known, jnp.sum(D, axis=-1), jnp.nan)
         leaves, treedef = jax.tree.flatten(values)
         varies = _noise_varies(problem, self.paths[0, 0])
         share = share_of_order(problem.density.order)
@@ -215,17 +241,16 @@ def smooth(
     if proposal is None:
         sizes = counts, num_chains, block_length
         drawn = _smooth(key, problem, made, *sizes, progress_meter)
-        told_by = problem
     else:
         start_key, key = jax.random.split(key)
         firsts = _guided_paths(start_key, problem, made, num_chains)
         sizes = (*counts, num_proposals)
         drawn = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
-        told_by = None
     paths = jnp.moveaxis(drawn.paths, 1, 0)
     found = (drawn.accepted, drawn.stuck, drawn.num_truncated)
     times = problem.record.clock.exactly(drawn.since)
-    smoothed = Smoothed(times, paths, *found, told_by)
+    problem = dataclasses.replace(problem, record=drawn.record)
+    smoothed = Smoothed(times, paths, *found, problem)
     return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
 
 
@@ -279,7 +304,8 @@ def _smooth(
     real = has_segments(problem, block_length)[..., None]
     stuck = jnp.any(real & ~jnp.any(taken, axis=0), axis=(0, 1))
     share = jnp.mean(taken.astype(points.dtype), axis=(0, -1))
-    return Draws(problem.record.grid(), drawn, share, stuck, jnp.int32(0))
+    record = problem.record
+    return Draws(record.grid(), drawn, share, stuck, jnp.int32(0), record)
 
 
 @compiled_sooner
@@ -301,9 +327,10 @@ def _noise_varies(problem: RecordProblem, path: Float[Array, "K d"]) -> Bool[Arr
 
 @compiled_sooner
 def _log_halving(
-    problem: RecordProblem, paths: Float[Array, "chains n K d"]
-) -> Float[Array, "chains n"]:
-    """D of each path: each segment is one of its own, for pairs of steps do not reach beyond."""
+    problem: RecordProblem, paths: Float[Array, "chains n points d"]
+) -> Float[Array, "chains n K"]:
+    """Return D of each segment of each path: pairs of steps do not reach beyond one. NaN of one
+    step."""
     (K, N), d, chains = problem.record.dt.shape, problem.dim, paths.shape[0]
     dynamics = problem.model.forward_at(problem.like)
     dt, time = (jnp.tile(leaf, (chains, 1)).T for leaf in problem.record.steps())
@@ -314,9 +341,9 @@ def _log_halving(
     def of_draw(path):
         segments = path[:, place].reshape(chains * K, N + 1, d)
         each = log_halving_of_paths(problem.density, dynamics, dt, segments, time)
-        return jnp.sum(each.reshape(chains, K), axis=1)
+        return each.reshape(chains, K)
 
-    return lax.map(of_draw, jnp.moveaxis(paths, 1, 0)).T
+    return jnp.moveaxis(lax.map(of_draw, jnp.moveaxis(paths, 1, 0)), 0, 1)
 
 
 def _change(
@@ -331,5 +358,5 @@ def _change(
     D = (D + D**2 / 2).reshape(*D.shape, *[1] * (values.ndim - 2))
     products = (values - jnp.mean(values, axis=(0, 1))) * (D - jnp.mean(D))
     error = jnp.std(products, axis=(0, 1)) / jnp.sqrt(effective_size_of_chains(products))
-    doubt = jnp.where(varies, jnp.inf, share * error)
-    return StepError(share * jnp.mean(products, axis=(0, 1)), doubt)
+    told = share * jnp.mean(products, axis=(0, 1))
+    return StepError(told, jnp.hypot(share * error, jnp.where(varies, told, 0)))

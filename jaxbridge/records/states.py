@@ -18,6 +18,7 @@ mean and covariance as the observation corrects them. Then each segment is offer
 between the same two states.
 """
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -53,6 +54,7 @@ from .initial import bound
 from .observation import Scalars, log_density_of
 from .path_blocks import tuned
 from .problem import RecordProblem
+from .record import Record
 
 # Draws of ν for the moments of q, which is made so much wider, for tails that are not normal.
 _NUM_DRAWS, _WIDER = 512, 1.3
@@ -200,14 +202,15 @@ class StateSampler(eqx.Module):
 
 class Draws(NamedTuple):
     """Times of the points `since` the first, draws of whole paths, the share of moves `accepted`,
-    of each state or block, the chains in which one was `stuck`, and the number of weights that were
-    cut off."""
+    of each state or block, the chains in which one was `stuck`, the number of weights that were cut
+    off, and the record on the grid of the paths."""
 
     since: Float[Array, " points"]
     paths: Float[Array, "n C points d"]
     accepted: Float[Array, "..."]
     stuck: Bool[Array, " C"]
     num_truncated: Int[Array, ""]
+    record: Record
 
 
 def sample_states(
@@ -241,14 +244,15 @@ def sample_states(
     num_draws, num_warmup, num_proposals = counts
     model = nondifferentiable(model.prepared())
     sampler = StateSampler(problem, model, proposal, laws, scalars, movable, num_proposals)
-    within = jnp.asarray(proposal.fractions(problem.num_steps)[:-1], durations.dtype)
-    since = problem.record.since
-    grid = jnp.append((since[:-1, None] + durations[:, None] * within).ravel(), since[-1])
+    within = np.diff(proposal.fractions(problem.num_steps))
+    dt = durations[:, None] * jnp.asarray(within, durations.dtype)
+    record = dataclasses.replace(problem.record, dt=dt)
+    grid = record.grid()
     paths, moved, cut = _run(key, sampler, guided, (num_draws, num_warmup), progress_meter)
     ever = jnp.all(jnp.any(moved.states, axis=0) | ~movable, axis=1)
     ever &= jnp.all(jnp.any(moved.paths, axis=0), axis=1)
     accepted = jnp.mean(moved.states.astype(grid.dtype), axis=(0, 1))
-    return Draws(grid, paths, accepted, ~ever, cut)
+    return Draws(grid, paths, accepted, ~ever, cut, record)
 
 
 def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars) -> None:

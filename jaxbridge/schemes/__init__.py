@@ -64,6 +64,7 @@ from .step_error import (
     error_of_mean as error_of_mean,
     guessed as guessed,
     relative_change as relative_change,
+    root_mean_square_in_sds as root_mean_square_in_sds,
     share_in_regime as share_in_regime,
     share_of_known_order as share_of_known_order,
     share_of_order as share_of_order,

@@ -140,6 +140,17 @@ def with_rounding(error: StepError, num_steps: int, d: int) -> StepError:
     return error._replace(uncertainty=jnp.hypot(error.uncertainty, rounding))
 
 
+def root_mean_square_in_sds(
+    value: Float[Array, "*I K d"], variance: Float[Array, "*I K d"]
+) -> Float[Array, "*I"]:
+    """Return the root mean square of errors at points of a path, in standard deviations of these
+    points, over those that vary."""
+    varies = variance > 1e-6 * jnp.max(variance, axis=(-2, -1), keepdims=True)
+    squares = jnp.where(varies, value**2 / jnp.where(varies, variance, 1), 0)
+    number = jnp.maximum(jnp.sum(varies, axis=(-2, -1)), 1).astype(value.dtype)
+    return jnp.sqrt(jnp.sum(squares, axis=(-2, -1)) / number)
+
+
 def step_fault(
     error: StepError,
     standard_error: Inexact[Array, "..."],

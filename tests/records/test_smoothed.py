@@ -3,14 +3,25 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from kalman import exact_step, kalman
 
+import jaxbridge as jb
+from jaxbridge.records.problem import as_record_problem
 from jaxbridge.records.smooth import Smoothed
 
+SEEN = jb.LinearGaussian(covariance=1.0)
 
-def smoothed(paths, stuck=False):
-    chains = len(paths)
-    flags = jnp.full(chains, stuck)
-    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, jnp.int32(0), None)
+
+def smoothed(paths, stuck=False, num_truncated=0, model=None):
+    """A result with these paths of two steps; by default of a Brownian motion, whose steps are
+    exact."""
+    model = jb.Diffusion(lambda x, p: 0 * x) if model is None else model
+    values, law = jnp.zeros((2, paths.shape[-1])), jnp.zeros(paths.shape[-1])
+    problem = as_record_problem(model, jnp.array([0.0, 2.0]), values, SEEN, law, num_steps=2)
+    flags = jnp.full(len(paths), stuck)
+    truncated = jnp.int32(num_truncated)
+    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, truncated, problem)
 
 
 def test_chains_in_two_wells_know_little():
@@ -27,3 +38,53 @@ def test_chains_in_two_wells_know_little():
 def test_a_point_that_never_moves_is_no_disagreement():
     paths = jax.random.normal(jax.random.key(0), (4, 500, 3, 1)).at[:, :, 0].set(1.0)
     assert smoothed(paths).trustworthy
+
+
+def test_rounding_of_what_was_observed_exactly_is_no_disagreement():
+    """Chains differ by a unit in the last place, each by its own, and R̂ of that is large."""
+    paths = jax.random.normal(jax.random.key(0), (4, 500, 3, 1))
+    units = jnp.arange(4.0)[:, None, None] * 2e-7
+    noise = 1e-8 * jax.random.normal(jax.random.key(1), (4, 500, 1))
+    result = smoothed(paths.at[:, :, 0].set(1.0 + units + noise))
+    assert jnp.max(result.r_hat()) > 1.1 and result.trustworthy
+
+
+def oscillator(rate, gap, num_steps):
+    """The result, and the largest and the root mean square error of means, in posterior sds."""
+    A = np.array([[0.0, -1.0], [rate**2, 0.1 * rate]])
+    sigma, matrix = np.diag([0.3, 0.3 * rate]), np.array([[1.0, 0.0]])
+    rng, times = np.random.default_rng(0), gap * np.arange(8)
+    values = np.cos(rate * times)[:, None] + 0.2 * rng.normal(size=(8, 1))
+    start = np.zeros(2), np.eye(2)
+    exact = kalman(
+        exact_step(A, sigma @ sigma.T), times, values, matrix, 0.04 * np.eye(1), *start, num_steps
+    )
+    result = jb.smooth(
+        jax.random.key(1),
+        jb.Diffusion(lambda x, p: -p @ x, jnp.asarray(sigma, jnp.float32), params=jnp.asarray(A)),
+        times,
+        values,
+        observation=jb.LinearGaussian(matrix=matrix, covariance=0.04),
+        initial=jb.GaussianLaw(*start),
+        num_draws=300,
+        num_warmup=100,
+        num_steps=num_steps,
+    )
+    sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
+    return result, (np.asarray(result.mean(), float) - exact.mean) / sd, sd
+
+
+@pytest.mark.slow
+def test_step_errors_of_a_fast_oscillator():
+    """Means off by a tenth of a posterior sd are told, within a half of it; off by two nothing
+    is known, and a number would mislead; and where they are right they are trusted."""
+    coarse, off, sd = oscillator(10.0, 0.3, 16)
+    assert not coarse.trustworthy and "step error" in coarse.why()
+    told = np.asarray(coarse.step_error(), float) / sd
+    assert np.sqrt(np.mean(off**2)) > 0.06
+    assert np.sqrt(np.mean((off - told) ** 2)) < 0.7 * np.sqrt(np.mean(off**2))
+    hopeless, off, _ = oscillator(10.0, 1.0, 8)
+    assert np.max(np.abs(off)) > 2 and not hopeless.trustworthy
+    assert np.all(np.isnan(hopeless.step_error()))
+    fine, off, _ = oscillator(10.0, 0.1, 8)
+    assert np.sqrt(np.mean(off**2)) < 0.1 and fine.trustworthy

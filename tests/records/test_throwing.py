@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 import pytest
+from test_smoothed import smoothed
 
 import jaxbridge as jb
 from jaxbridge.engine.verdict import throw_where_untrustworthy
 from jaxbridge.records.log_likelihood import LogLikelihood
-from jaxbridge.records.smooth import Smoothed
 
 MODEL = jb.Diffusion(lambda x, p: -p * x, params=1.0)
 
@@ -39,10 +39,9 @@ def test_likelihoods(changed, message):
         throw_where_untrustworthy(made, "value", MODEL)
 
 
-def smoothed(apart=0.0, stuck=False, num_truncated=0):
+def draws(apart=0.0, **options):
     paths = jax.random.normal(jax.random.key(0), (4, 100, 3, 1)).at[::2].add(apart)
-    flags = jnp.full(4, stuck)
-    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, jnp.int32(num_truncated), None)
+    return smoothed(paths, **options)
 
 
 @pytest.mark.parametrize(
@@ -54,7 +53,7 @@ def smoothed(apart=0.0, stuck=False, num_truncated=0):
     ],
 )
 def test_smoothed_paths(changed, message):
-    made = smoothed(**changed)
+    made = draws(**changed)
     assert not made.trustworthy and message in made.why()
     with pytest.raises(Exception, match=message):
         throw_where_untrustworthy(made, "paths", MODEL)
@@ -62,7 +61,7 @@ def test_smoothed_paths(changed, message):
 
 def test_what_is_trusted_is_not_thrown():
     assert throw_where_untrustworthy(likelihood(), "value", MODEL).value == -3
-    made = smoothed()
+    made = draws()
     assert jnp.all(throw_where_untrustworthy(made, "paths", MODEL).paths == made.paths)
     with pytest.raises(Exception, match="not finite"):
         throw_where_untrustworthy(made, "paths", MODEL.with_params(jnp.nan))
