@@ -12,6 +12,8 @@ from typing import ParamSpec, TypeVar
 
 import jax
 
+from .devices import on_whole_batches
+
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
@@ -22,6 +24,6 @@ def door(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     @functools.wraps(fn)
     def entered(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         with jax.transfer_guard("allow"), jax.debug_nans(False), jax.debug_infs(False):
-            return fn(*args, **kwargs)
+            return on_whole_batches(fn, *args, **kwargs)
 
     return entered

@@ -159,3 +159,28 @@ with jax.set_mesh(mesh):
     assert_same(alone, everything(*given))
     assert_same(alone, jax.jit(everything)(*given))
 """)
+
+
+@pytest.mark.slow
+def test_batches_along_the_default_axes_of_a_mesh():
+    """These are explicit. JAX has no `vmap` of some loops there, even of its own."""
+    run_on_eight_devices("""
+mesh = jax.make_mesh((8,), ("x",))
+points = np.random.default_rng(0).normal(size=(8, 2)).astype(np.float32)
+split = jax.device_put(points, jax.NamedSharding(mesh, P("x")))
+
+def density(end):  # the rest of the result is rounding of this exact law
+    options = dict(num_proposals=20, num_steps=4, proposal=jb.Guided())
+    return jb.transition_log_density(key, model, a[0], end, 0.5, **options).value
+
+def total(ends):
+    return jnp.sum(jax.vmap(lambda end: density(end) + end[0])(ends))
+
+over_batch, slope = jax.jit(jax.vmap(density)), jax.jit(jax.grad(total))
+alone = over_batch(points), slope(points)
+assert_same(alone, (over_batch(split), slope(split)))
+assert_same(alone[0], jax.vmap(density)(split))
+with jax.set_mesh(mesh):
+    assert_same(alone, (over_batch(split), slope(split)))
+    assert over_batch(split).sharding.spec == P("x")
+""")
