@@ -55,7 +55,7 @@ class TransitionLogDensity(AbstractResult):
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, with
         a standard error of it, `step_uncertainty`; with it is what rounding may add where steps
         are very many, N d ε/2, ten thousand in single precision. NaN where it is not known, as of
-        one step.
+        one step, or of couplings whose σ(x) varies: run two grids and `extrapolate`.
     - `step_share`: the step error as a share of what half as many steps change, infinite where that
         says little of it (couplings with a σ(x) that varies); `num_steps`: N.
     """
@@ -236,9 +236,11 @@ def log_mean_and_error(
     log_squares = logsumexp(2 * (log_weights - largest), axis=1)
     some = log_sum > -jnp.inf
     inverse_size = jnp.where(some, jnp.exp(log_squares - 2 * log_sum), jnp.inf)
-    # The variance of the mean, in squares of the mean: (Σw²/(Σw)² - 1/n) n/(n-1).
-    variance = jnp.maximum(inverse_size - 1 / n, 0)
-    variance *= n / max(n - 1, 1)
+    # The variance of the mean, in squares of the mean. Σw²/(Σw)² - 1/n would be lost to rounding
+    # where weights are nearly equal.
+    log_mean = jnp.where(some, log_sum - math.log(n), 0)
+    deviation = jnp.expm1(log_weights - largest - log_mean[:, None])
+    variance = jnp.sum(deviation**2, axis=1) / n / max(n - 1, 1)
     error = jnp.sqrt(variance) if n > 1 else jnp.full_like(variance, jnp.inf)
     size = jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0)
     return log_sum + largest[:, 0] - math.log(n), jnp.where(some, error, jnp.inf), size

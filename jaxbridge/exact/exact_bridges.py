@@ -29,7 +29,7 @@ class AbstractExactBridges(AbstractResult):
     - `log_halving`: log of the factor by which the weight of a path would change with half as many
         steps, NaN where none was worked out, shape (n,).
     - `step_share`: the step error as a share of what that changes, shape (); infinite where that
-        says little of it, and then its uncertainty is, too: of couplings with a σ(x) that varies.
+        says nothing of it, and then its uncertainty is, too: of couplings with a σ(x) that varies.
     - `proposal`: what they were made with.
     """
 
@@ -60,7 +60,7 @@ class AbstractExactBridges(AbstractResult):
 
     def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """What `mean(fn)` is too large by for the length of the steps, an estimate, entry by entry;
-        NaN where it is not known, as of one step."""
+        NaN where it is not known, as of one step, or of couplings whose σ(x) varies."""
         return jax.tree.map(lambda error: error.value, self._step_errors(fn), is_leaf=_is_error)
 
     def step_uncertainty(self, fn: PathFunction = lambda path: path) -> PyTree:

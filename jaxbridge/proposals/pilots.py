@@ -15,7 +15,10 @@ there are enough of them to tell and they are not nearly equal.
 
 A candidate makes no pilot run where it could not win: of a coupling's simulated paths at most one
 in 1 + N is an effective sample, for each proposal needs N hitting counts. Nor where it would win
-next to nothing over all intervals, for each candidate is to be compiled. Seconds go by a rule, so
+next to nothing over all intervals, for each candidate is to be compiled. Where no candidate has
+five effective paths of light tails, couplings whose pairs hardly met are unknown and not worthless:
+their pilot runs are repeated, up to 16 times, before they are compared. (Not inside `jit`, where
+what was seen is not known in time.) Seconds go by a rule, so
 that one key gives one choice; or by the clock, where `choose_proposal` makes the choice.
 """
 
@@ -27,13 +30,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.averages import effective_size, normalised
 from ..engine.checks import is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.keys import key_for
-from ..engine.pareto import pareto_k
+from ..engine.pareto import most_reliable, pareto_k
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..schemes import error_of_log_mean, guessed
@@ -45,18 +49,23 @@ _PILOT_PATHS = 4_096
 _PILOT_RANGE = (32, 512)
 # Of fewer paths k̂ is a matter of chance: of many intervals some would seem to have heavy tails.
 _FEWEST_FOR_TAIL = 128
+# With fewer effective paths a rate is a matter of chance, and a coupling's pilot run is repeated
+# up to so often.
+_FEWEST_EFFECTIVE, _MOST_REPEATS = 5, 16
 # The rule for seconds may be wrong by this factor.
 _CONTENDS = 3.0
 
 
 class _Seen(NamedTuple):
-    """What a pilot run shows: the first three as the fields of a `Choice`, and the paths that were
-    simulated."""
+    """What a pilot run shows: the first three as the fields of a `Choice`, the paths that were
+    simulated, and the logs of the sums of weights and of their squares."""
 
     efficiency: Float[Array, " I"]
     step_error: Float[Array, " I"]
     pareto_k: Float[Array, " I"]
     num_simulated: Int[Array, " I"]
+    log_sum: Float[Array, " I"]
+    log_squares: Float[Array, " I"]
 
 
 def _rate(seen: _Seen, seconds: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -64,12 +73,13 @@ def _rate(seen: _Seen, seconds: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 class _Pilot(NamedTuple):
-    """A candidate, prepared; its pilot run, if there was one, and what that gave; and the seconds
-    per path that it should take."""
+    """A candidate, prepared; its pilot run with a key on active intervals, if there was one, and
+    what that gave; and the seconds per path that it should take."""
 
     candidate: AbstractSingleProposal
-    run: Callable[[], Any] | None
+    run: Callable[[Key[Array, ""], Bool[Array, " I"]], _Seen] | None
     seen: _Seen
+    active: Bool[Array, " I"]
     seconds: Float[Array, " I"]
 
 
@@ -94,7 +104,9 @@ def run_pilots(
             _run_pilot(key, purpose, model, candidate, intervals, num_steps, num_paths, best)
         )
         best = _better(best, pilots[-1].seen, pilots[-1].seconds)
-    seconds = _measured(pilots, best) if timed else [pilot.seconds for pilot in pilots]
+    seconds = _measured(key, pilots, best) if timed else [pilot.seconds for pilot in pilots]
+    if not is_traced(best):
+        pilots = _repeated(key, pilots)
     seen, seconds, chosen = _compared([pilot.seen for pilot in pilots], seconds)
     used = range(len(candidates)) if is_traced(chosen) else np.unique(chosen).tolist()
     return Choice(
@@ -145,11 +157,55 @@ def _run_pilot(
     if not called_for:
         nothing: Any = np.full(len(best), np.nan, best.dtype)
         none: Any = np.zeros(len(best), np.int32)
-        seen = _Seen(nothing, nothing, nothing, none)
-        return _Pilot(candidate, None, seen, seconds)
-    arguments = (model, candidate, intervals, active, num_steps, num_pilot)
-    run = functools.partial(_look, key, purpose, *arguments)
-    return _Pilot(candidate, run, run(), seconds)
+        seen = _Seen(nothing, nothing, nothing, none, nothing, nothing)
+        return _Pilot(candidate, None, seen, active, seconds)
+    arguments = (purpose, model, candidate, intervals, num_steps, num_pilot)
+    run = functools.partial(_look, *arguments)
+    return _Pilot(candidate, run, run(key, active), active, seconds)
+
+
+def _repeated(key: Key[Array, ""], pilots: list[_Pilot]) -> list[_Pilot]:
+    """Return the pilots, with what repeated runs show of couplings that hardly met in theirs, on
+    the intervals where no candidate has enough effective paths of light tails."""
+    sizes = [_size(pilot.seen.efficiency, pilot.seen.num_simulated) for pilot in pilots]
+    shapes = [np.asarray(pilot.seen.pareto_k) for pilot in pilots]
+    light = [~(shape >= most_reliable(10**9)) for shape in shapes]  # NaN is of too few to tell
+    best = np.max([np.where(ok, size, 0) for size, ok in zip(sizes, light, strict=True)], axis=0)
+    poor = best < _FEWEST_EFFECTIVE
+    return [
+        _repeat(key, pilot, np.asarray(pilot.active) & poor & (size < _FEWEST_EFFECTIVE))
+        for pilot, size in zip(pilots, sizes, strict=True)
+    ]
+
+
+def _repeat(key: Key[Array, ""], pilot: _Pilot, active: Bool[np.ndarray, " I"]) -> _Pilot:
+    """Return the pilot of a coupling, with the efficiency of all its runs where that is known."""
+    if pilot.run is None or pilot.candidate.by_coupling is None:
+        return pilot
+    efficiency, step_error, shape, count, log_sum, log_squares = map(np.array, pilot.seen)
+    for number in range(1, _MOST_REPEATS + 1):
+        if not active.any():
+            break
+        seen = pilot.run(jax.random.fold_in(key, number), jnp.asarray(active))
+        _, error, _, more, more_sum, more_squares = map(np.asarray, seen)
+        log_sum[active] = np.logaddexp(log_sum, more_sum)[active]
+        log_squares[active] = np.logaddexp(log_squares, more_squares)[active]
+        count[active] += more[active]
+        some = log_sum > -np.inf
+        size = np.exp(2 * np.where(some, log_sum, 0) - np.where(some, log_squares, np.inf))
+        found = active & (size >= _FEWEST_EFFECTIVE)
+        efficiency[found] = (size / np.maximum(count, 1))[found]
+        shape[found], step_error[found] = np.nan, error[found]
+        active = active & (size < 2 * _FEWEST_EFFECTIVE)
+    values = {"efficiency": efficiency, "step_error": step_error, "pareto_k": shape}
+    values = {name: jnp.asarray(value, efficiency.dtype) for name, value in values.items()}
+    # The paths of the first run go with its seconds.
+    return pilot._replace(seen=pilot.seen._replace(**values))
+
+
+def _size(efficiency: Float[Array, " I"], num_simulated: Int[Array, " I"]) -> Float[Any, " I"]:
+    """Return the effective paths of a pilot run, zero where there was none."""
+    return np.nan_to_num(np.asarray(efficiency, float)) * np.asarray(num_simulated, float)
 
 
 @compiled_sooner
@@ -166,14 +222,14 @@ def _worth(
 
 @compiled_sooner
 def _look(
-    key: Key[Array, ""],
     purpose: str,
     model: Diffusion,
     candidate: AbstractSingleProposal,
     intervals: Intervals,
-    active: Bool[Array, " I"],
     num_steps: int,
     num_pilot: int,
+    key: Key[Array, ""],
+    active: Bool[Array, " I"],
 ) -> _Seen:
     """What a pilot run shows of each active interval, NaN of the others."""
     candidate = candidate.for_pilot()
@@ -183,7 +239,8 @@ def _look(
     drawn = candidate.draw(keys, model, intervals, num_steps, nothing, True, active)
     num_simulated = jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32)
     # What takes too long to hit would have a weight beyond those that are seen.
-    size = _extrapolated_size(jnp.where(drawn.truncated, -jnp.inf, drawn.log_weights))
+    log_weights = jnp.where(drawn.truncated, -jnp.inf, drawn.log_weights)
+    size = _extrapolated_size(log_weights)
     efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
     share = guessed(candidate.step_share(model, intervals))
     error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
@@ -194,7 +251,8 @@ def _look(
         shape = pareto_k(drawn.log_weights)
     told = (efficiency, seen_error, shape)
     efficiency, seen_error, shape = (jnp.where(active, value, jnp.nan) for value in told)
-    return _Seen(efficiency, seen_error, shape, num_simulated)
+    sums = (logsumexp(power * log_weights, axis=1) for power in (1, 2))
+    return _Seen(efficiency, seen_error, shape, num_simulated, *sums)
 
 
 def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
@@ -213,7 +271,9 @@ def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
     return n * share * fall**2
 
 
-def _measured(pilots: list[_Pilot], best: Float[Array, " I"]) -> list[Float[Array, " I"]]:
+def _measured(
+    key: Key[Array, ""], pilots: list[_Pilot], best: Float[Array, " I"]
+) -> list[Float[Array, " I"]]:
     """Seconds per path by the clock, where that could change the choice; else by rule."""
 
     def contends(pilot: _Pilot) -> bool:
@@ -226,7 +286,8 @@ def _measured(pilots: list[_Pilot], best: Float[Array, " I"]) -> list[Float[Arra
     factors = {}
     for pilot in contenders:
         assert pilot.run is not None
-        took = min(_seconds_of(pilot.run) for _ in range(3))
+        run = functools.partial(pilot.run, key, pilot.active)
+        took = min(_seconds_of(run) for _ in range(3))
         expected = pilot.seconds * pilot.seen.num_simulated.astype(pilot.seconds.dtype)
         factors[id(pilot)] = took / float(jnp.sum(expected))
     others = float(np.median(list(factors.values())))

@@ -168,7 +168,7 @@ def share_of_order(order: int) -> float:
     return 1 / (2**order - 1)
 
 
-# Of an error of which D tells no more than the size, and that badly: its uncertainty is infinite.
+# Of an error of which D says nothing: figures were wrong by factors of 10,000.
 UNKNOWN_SHARE = math.inf
 _GUESS = 3.0
 
@@ -220,10 +220,14 @@ def _known(
 
 
 def _told(share, change, spread, some):
-    """The share of a change, with its uncertainty: exactly zero where the share is, infinitely
-    uncertain where that is not known; NaN where nothing is."""
+    """Return the share of a change, with its uncertainty: exactly zero where the share is, NaN with
+    an infinite uncertainty where the share is not known, NaN where nothing is."""
     share = jnp.asarray(share, change.dtype)
-    spread = jnp.where(share == UNKNOWN_SHARE, jnp.inf, spread)
-    known = guessed(share)
+    unknown = share == UNKNOWN_SHARE
+    known = jnp.where(unknown, 1, share)
     of = lambda value: jnp.where(share == 0, 0, jnp.where(some, known * value, jnp.nan))
-    return StepError(of(change), of(spread))
+    value, uncertainty = of(change), of(spread)
+    return StepError(
+        jnp.where(unknown, jnp.nan, value),
+        jnp.where(unknown & ~jnp.isnan(uncertainty), jnp.inf, uncertainty),
+    )

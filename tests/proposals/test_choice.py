@@ -418,3 +418,16 @@ def test_what_auto_leaves_out_is_said():
     assert "left out" not in str(as_proposal("auto", model, jnp.zeros(1)))
     blind = as_proposal("auto", BLIND, jnp.zeros(1))
     assert "time reversal" in blind.left_out
+
+
+@pytest.mark.slow
+def test_pairs_that_never_met_in_a_small_pilot_are_tried_again():
+    """From one side of a ring to the other, two ways round: what is pulled to the end point goes
+    through the middle, and of 32 pairs hardly one meets."""
+    model = jb.langevin(lambda x, p: -p * (x @ x - 1) ** 2, params=20.0)
+    choice = jb.choose_proposal(
+        jax.random.key(0), model, [1.0, 0.0], [-1.0, 0.0], 1.0, num_steps=50, num_pilot=32,
+        candidates=[jb.ModifiedDiffusionBridge(), jb.Guided("path"), jb.Coupling(0.0)],
+    )  # fmt: skip
+    assert int(choice.chosen[0]) == 2
+    assert choice.efficiency[2, 0] > 1e-3 > choice.efficiency[0, 0]
