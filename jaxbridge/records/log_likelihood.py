@@ -1,9 +1,15 @@
 """The likelihood of a record, however long it is, by guided particle filters.
 
-Several filters that know nothing of each other make a mean, and its error is told by their spread:
-what one filter knows of its own error it has from the particles that it did not lose. And what none
-of them knows, as where rare particles far from the guide would weigh more than all others, the
-shape k̂ of the largest weights tells at each observation. Coarser grids tell the step error.
+Several independent filters make a mean, and their spread gives its error: a single filter
+underestimates its error because it sees only the surviving particles. Errors that all filters
+share, as where rare particles far from the guide would weigh more than all others, show in the
+shape k̂ of the largest weights at each observation. Coarser grids give the step error.
+
+The log of a filter's estimate is nearly normal, with a variance s² (Bérard, Del Moral & Doucet
+2014). Of a few such estimates the largest is often missing, and with it most of their variance. The
+relative variance of their mean is therefore (e^{s²} - 1) / n, with s² from the logs, unless that of
+the estimates themselves is larger. It is a variance with about n - 1 degrees of freedom. The
+standard error is so much larger that two of them hold 95 %, as those of Student's law do.
 """
 
 import equinox as eqx
@@ -41,7 +47,14 @@ from .several import Records, as_record_problems, stacked
 
 # Fewer particles that count, or a larger standard error of a log, tell nothing; nor do tails that
 # are heavier than so many weights can show by more than the largest of many estimates of k is off.
-_FEWEST_TRUSTED, _MOST_SPREAD, _LARGEST_OF_MANY = 5, 0.5, 0.1
+_FEWEST_TRUSTED, _MOST_SPREAD, _LARGEST_OF_MANY = 5, 0.6, 0.1
+# Half the 97.7 % quantile of Student's law, by one over its degrees of freedom.
+_STUDENT = (
+    1 / np.array([np.inf, 40, 20, 10, 7, 5, 4, 3, 2, 1]),
+    np.array([1.0, 1.032, 1.067, 1.142, 1.214, 1.324, 1.435, 1.653, 2.263, 6.984]),
+)
+# Beyond, e^{s²} is no number of single precision.
+_LARGEST_VARIANCE = 80.0
 
 _UNEXPLAINED = (
     "No particle explains some observation (`unexplained` is its number). Check whether it is an "
@@ -72,8 +85,8 @@ class LogLikelihood(AbstractResult):
 
     - `value`: log p̂(y); `exp(value)` is unbiased up to the step error. -inf where no particle
         explains what was seen.
-    - `standard_error`: that of `value`, from the spread of the filters by the delta method;
-        infinite of a single one.
+    - `standard_error`: that of `value`, from the spread of the filters, widened as Student's law
+        is for few of them; infinite of a single one.
     - `log_estimates`: log p̂ of each filter, shape (num_filters,).
     - `effective_sample_size`: how many particles count before each observation is followed by
         resampling, the mean over the filters, shape (n,).
@@ -117,7 +130,7 @@ class LogLikelihood(AbstractResult):
     @property
     def verdict(self) -> Verdict:
         """Return the faults: an observation that no particle explains, few effective particles or
-        filters that disagree, so that the delta method fails, heavy tails of the weights, lost
+        filters that disagree, so that their spread is unknown, heavy tails of the weights, lost
         particles, and a step error that dominates and is beyond 0.05."""
         error = StepError(self.step_error, self.step_uncertainty)
         return Verdict(
@@ -220,8 +233,7 @@ def _told(
     records: Records, grids: Filtered, rate: Float[Array, ""], num_weights: int
 ) -> LogLikelihood:
     """What filters on the grid, and on coarser ones, say of all records together."""
-    log_mean, each_error, _ = jax.vmap(log_mean_and_error)(grids.log_estimate)
-    values, errors = jnp.sum(log_mean, axis=1), jnp.sqrt(jnp.sum(each_error**2, axis=1))
+    values, errors = jax.vmap(_mean_of_filters)(grids.log_estimate)
     fine = jax.tree.map(lambda leaf: leaf[0], grids)
     value, error = values[0], errors[0]
     # What rounding leaves of the sum over all steps is no change, either.
@@ -240,6 +252,30 @@ def _told(
         *step_error,
         rate,
     )
+
+
+def _mean_of_filters(
+    log_estimates: Float[Array, "records num_filters"],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the log-likelihood of all records, each by the mean of its filters, and its standard
+    error."""
+    n = log_estimates.shape[1]
+    log_mean, error, _ = log_mean_and_error(log_estimates)
+    if n == 1:
+        return jnp.sum(log_mean), jnp.sqrt(jnp.sum(error**2))
+    finite = jnp.isfinite(log_estimates)
+    number = jnp.maximum(jnp.sum(finite, axis=1, keepdims=True).astype(error.dtype), 2)
+    centre = jnp.sum(jnp.where(finite, log_estimates, 0), axis=1, keepdims=True) / number
+    squares = jnp.where(finite, log_estimates - centre, 0) ** 2
+    spread = jnp.sum(squares / (number - 1), axis=1)
+    variance = jnp.maximum(error**2, jnp.expm1(jnp.minimum(spread, _LARGEST_VARIANCE)) / n)
+    # Welch and Satterthwaite, relative to the largest, so that squares are finite.
+    largest = jnp.max(variance)
+    some = (largest > 0) & (largest < jnp.inf)
+    relative = jnp.where(some, variance / jnp.where(some, largest, 1), 1)
+    inverse_degrees = jnp.sum(relative**2) / jnp.sum(relative) ** 2 / (n - 1)
+    widening = jnp.interp(inverse_degrees, *(leaf.astype(error.dtype) for leaf in _STUDENT))
+    return jnp.sum(log_mean), widening * jnp.sqrt(jnp.sum(variance))
 
 
 def _guides(records: Records) -> Guidance:
