@@ -1,10 +1,11 @@
 """`python -m jaxbridge`: the paper's simulation study, in numbers and pictures."""
 
 import argparse
+import contextlib
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -16,7 +17,7 @@ from .studies.benchmark import BENCHMARK, Benchmark, save
 from .studies.exact import COST, EXACT, VARIATION
 from .studies.paper import APPROXIMATE
 from .studies.report import Study
-from .studies.rivals import RIVALS, Rivals, save_rivals
+from .studies.rivals import RIVALS, Rivals, rivals_files
 
 _PARTS = {
     "approximate": (APPROXIMATE,),
@@ -99,16 +100,34 @@ def _keep_programs(folder: Path) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
 
 
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[Path]:
+    """Give a name to write to; the file becomes `path` once it is complete. If it cannot be
+    written, end with one line and without a part of it; earlier files and tables stay."""
+    partial = path.with_name(f".{path.name}")
+    try:
+        yield partial
+        partial.replace(path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        _end_progress()
+        print(f"python -m jaxbridge: cannot write {path}: {error.strerror}", file=sys.stderr)
+        sys.exit(1)
+
+
 def _run(study: Study, options: argparse.Namespace) -> None:
     print(f"{study.title}{_QUICK if options.quick else ''}\n")
     results = study.run(jax.random.key(options.seed), options.quick, _say)
     _end_progress()
     print(f"{study.tables(results)}\n\n{study.what_to_see}\n")
     if isinstance(results, Benchmark):
-        save(results, options.out / "benchmark.json")
+        with _writing(options.out / "benchmark.json") as path:
+            save(results, path)
         print(f"all figures in {options.out / 'benchmark.json'}")
     if isinstance(results, Rivals):
-        save_rivals(results, options.out)
+        for name, text in rivals_files(results).items():
+            with _writing(options.out / name) as path:
+                path.write_text(text, encoding="utf-8")
         print(f"all figures in {options.out / 'rivals.json'}, and as a page beside it")
     try:
         from .studies import figures
@@ -117,7 +136,8 @@ def _run(study: Study, options: argparse.Namespace) -> None:
         return
     pictures = study.draw(figures, results)
     for name, figure in pictures.items():
-        figure.savefig(options.out / name, dpi=150)
+        with _writing(options.out / name) as path:
+            figure.savefig(path, dpi=150, format=Path(name).suffix[1:])
     some = "a picture" if len(pictures) == 1 else f"{len(pictures)} pictures"
     print(f"{some} in {options.out}\n")
 

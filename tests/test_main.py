@@ -1,5 +1,6 @@
 """The command line."""
 
+import errno
 import os
 import subprocess
 import sys
@@ -7,6 +8,7 @@ import sys
 import pytest
 from helpers import slow_beyond
 
+from jaxbridge.__main__ import _writing
 from jaxbridge.studies.benchmark import load
 from jaxbridge.studies.rivals import load_rivals
 
@@ -84,6 +86,17 @@ def test_bad_arguments_end_with_one_line(arguments, tmp_path):
     assert done.returncode == 2
     assert len(done.stderr.strip().splitlines()) == 1
     assert done.stderr.startswith("python -m jaxbridge: ")
+
+
+def test_a_full_disk_ends_with_one_line_and_no_part_of_a_file(tmp_path, capsys):
+    with _writing(tmp_path / "first.json") as path:
+        path.write_text("{}")
+    with pytest.raises(SystemExit), _writing(tmp_path / "second.json") as path:
+        path.write_text("{")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert [file.name for file in tmp_path.iterdir()] == ["first.json"]
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "second.json: No space left on device" in line
 
 
 def test_help(tmp_path):

@@ -26,6 +26,11 @@ from .memory_maps import mind_memory_maps
 # Steps of paths, at some 10 ns more for each: 20 ms a call for .5 s to the first.
 _MANY = 2_000_000
 
+_LESS_MEMORY = (
+    "Memory does not suffice for these paths. Keep only some times of each path (`save_at=[...]`), "
+    "or ask for fewer paths, particles or steps in one call."
+)
+
 
 def compiled(fn: Callable) -> Callable:
     """`fn`, compiled for each structure of its arguments; arrays in them are traced."""
@@ -50,6 +55,14 @@ def _compiled(fn: Callable, is_wanted_sooner: Callable[..., bool]) -> Callable:
     @functools.wraps(fn)
     def call(*args, **kwargs):
         mind_memory_maps(is_outermost)
+        try:
+            return run(*args, **kwargs)
+        except jax.errors.JaxRuntimeError as error:
+            if "RESOURCE_EXHAUSTED" in str(error):
+                error.add_note(_LESS_MEMORY)
+            raise
+
+    def run(*args, **kwargs):
         if jax.default_backend() != "cpu":
             return within(*args, **kwargs)
         warn_of_loop_fault()

@@ -76,19 +76,18 @@ def _load() -> float:
     return round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else 0.0
 
 
-def save_rivals(rivals: Rivals, folder: Path) -> None:
-    """Everything as JSON, and the page that is made of it."""
+def rivals_files(rivals: Rivals) -> dict[str, str]:
+    """Return everything as JSON, and the page that is made of it, by the names of their files."""
     content: dict[str, Any] = rivals._asdict()
     content["sizes"] = rivals.sizes._asdict()
     for name in ("bridges", "filters", "posteriors"):
         content[name] = [row._asdict() for row in content[name]]
     text = json.dumps(content, indent=1, ensure_ascii=False)
-    (folder / "rivals.json").write_text(text + "\n", encoding="utf-8")
-    (folder / "rivals.md").write_text(as_page(rivals), encoding="utf-8")
+    return {"rivals.json": text + "\n", "rivals.md": as_page(rivals)}
 
 
 def load_rivals(path: Path) -> Rivals:
-    """What `save_rivals` wrote as JSON."""
+    """What `rivals_files` has as JSON."""
     content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     content["load"] = tuple(content["load"])
     content["sizes"] = Sizes(**content["sizes"])

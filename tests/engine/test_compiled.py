@@ -62,3 +62,12 @@ def test_many_steps_are_compiled_for_speed():
     for _ in range(4):
         np.testing.assert_array_equal(double(X), 2 * X)
     assert len(traced) == 2
+
+
+def test_errors_of_memory_say_what_takes_less():
+    def fill(x):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.")
+
+    with pytest.raises(jax.errors.JaxRuntimeError) as caught:
+        compiled_sooner(fill)(X)
+    assert any("save_at" in note for note in caught.value.__notes__)

@@ -11,6 +11,8 @@ import jaxbridge as jb
 from jaxbridge.engine import memory_maps
 from jaxbridge.engine.compiled import compiled
 
+double = compiled(lambda x: 2 * x)
+
 
 def call():
     jb.sample_bridges(jax.random.key(0), paper_model(), [0.0, 0.0], [0.5, 0.0], 1.0, num_steps=4)
@@ -35,6 +37,22 @@ def test_others_are_not(num, most, monkeypatch):
         call()
 
 
+def test_a_process_that_fills_the_memory_is_warned_once(monkeypatch):
+    monkeypatch.setattr(memory_maps, "_memory", lambda moment: (13 * 2**30, 16 * 2**30))
+    monkeypatch.setattr(memory_maps, "_warned", [])
+    with pytest.warns(RuntimeWarning, match=r"13\.0 of the 16\.0 GiB.*lambda.*clear_caches"):
+        double(jnp.ones(3))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        double(jnp.ones(3))
+
+
+def test_memory_is_read_where_the_system_tells():
+    memory_maps._memory.cache_clear()
+    resident, total = memory_maps._memory(0)
+    assert 0 < resident < total or resident == total == 0
+
+
 def test_maps_are_counted_where_the_system_tells():
     memory_maps._num_maps.cache_clear()
     num, most = memory_maps._num_maps(0), memory_maps._most_maps()
@@ -48,7 +66,7 @@ def test_programs_are_dropped_before_the_process_ends(traced, monkeypatch):
     monkeypatch.setattr(jax, "clear_caches", lambda: dropped.append(True))
     pretend(monkeypatch, 60_000, 65_530)
     monkeypatch.setattr(memory_maps._num_maps, "cache_clear", lambda: None, raising=False)
-    double = compiled(lambda x: 2 * x)
+    double = compiled(lambda x: 2 * x)  # a new one, which is compiled here
     said = "will be dropped" if traced else "were dropped"
     with pytest.warns(RuntimeWarning, match=said):
         (jax.jit(double) if traced else double)(jnp.ones(3))

@@ -17,7 +17,7 @@ from jaxbridge.studies.rivals import (
     as_page,
     in_plain_characters,
     load_rivals,
-    save_rivals,
+    rivals_files,
 )
 
 NOTEBOOKS = pathlib.Path(__file__).parents[2] / "notebooks"
@@ -133,7 +133,8 @@ def made_up():
 
 
 def test_results_survive_their_file_and_the_page_has_their_tables(tmp_path):
-    save_rivals(made_up(), tmp_path)
+    for name, text in rivals_files(made_up()).items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
     assert load_rivals(tmp_path / "rivals.json") == made_up()
     page = (tmp_path / "rivals.md").read_text(encoding="utf-8")
     for row in (
