@@ -94,17 +94,16 @@ def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
 def spectral_radius(matrix: Float[Array, "d d"]) -> Float[Array, ""]:
     """Return the largest absolute value of eigenvalues, up to a few per cent: ‖Aⁿ‖^{1/n} at n = 32,
     which hardly depends on the units of coordinates."""
-    scale = jnp.max(jnp.abs(matrix))
-    log_size = jnp.zeros((), matrix.dtype)
-    power = matrix
-    for _ in range(5):
+
+    def squared(_, state):
+        power, log_size = state
         size = jnp.max(jnp.abs(power))
-        power = power / jnp.where(size > 0, size, 1)
-        power = matmul(power, power)
-        log_size = 2 * (log_size + jnp.log(jnp.where(size > 0, size, 1)))
-    norm = jnp.sqrt(jnp.sum(power**2))
-    radius = jnp.exp((log_size + jnp.log(norm)) / 32)
-    return jnp.where(scale > 0, radius, 0)
+        size = jnp.where(size > 0, size, 1)
+        power = power / size
+        return matmul(power, power), 2 * (log_size + jnp.log(size))
+
+    power, log_size = lax.fori_loop(0, 5, squared, (matrix, jnp.zeros((), matrix.dtype)))
+    return jnp.exp((log_size + jnp.log(jnp.sum(power**2)) / 2) / 32)
 
 
 def solve(matrix: Float[Array, "d d"], right: Float[Array, "d *m"]) -> Float[Array, "d *m"]:

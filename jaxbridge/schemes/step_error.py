@@ -192,8 +192,8 @@ def share_in_regime(
     def rate(x):
         return spectral_radius(jax.jacfwd(model.drift)(x))
 
-    rates = jnp.minimum(jax.vmap(rate)(intervals.start), jax.vmap(rate)(intervals.end))
-    too_long = rates * intervals.duration / num_steps > _LONGEST_STEP
+    rates = jax.vmap(rate)(jnp.concatenate([intervals.start, intervals.end])).reshape(2, -1)
+    too_long = jnp.min(rates, axis=0) * intervals.duration / num_steps > _LONGEST_STEP
     return jnp.where(too_long & (share > 0), UNKNOWN_SHARE, share)
 
 
