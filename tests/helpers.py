@@ -8,6 +8,7 @@ import textwrap
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -143,6 +144,14 @@ def of_unknown_constant():
         reversible=True,
         sample_stationary=lambda key, p: jax.random.normal(key, (1,)) / jnp.sqrt(2),
     )
+
+
+def zeros_of(call):
+    """Return what `call()` returns with zeros for its numbers: it is traced, not run."""
+    like = eqx.filter_eval_shape(call)
+    shaped = lambda leaf: hasattr(leaf, "dtype")
+    with jax.ensure_compile_time_eval():  # wherever it is called for first
+        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if shaped(x) else x, like)
 
 
 def loglog_slope(sizes, errors):

@@ -4,14 +4,14 @@ import functools
 import itertools
 
 import cir
-import equinox as eqx
+import diffrax
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import optax
 import pytest
-from helpers import chosen_of, of_unknown_constant, paper_model
+from helpers import chosen_of, of_unknown_constant, paper_model, zeros_of
 from inference_oracles import ou_1d
 
 import jaxbridge as jb
@@ -46,10 +46,7 @@ def each(what, call, values, *said):
 @functools.cache
 def made(call, **options):
     """What a function returns, with zeros for its numbers, which are not worked out."""
-    like = eqx.filter_eval_shape(lambda: call(KEY, PAPER, A, B, 1.0, **options))
-    shaped = lambda leaf: hasattr(leaf, "dtype")
-    with jax.ensure_compile_time_eval():  # wherever it is called for first
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype) if shaped(x) else x, like)
+    return zeros_of(lambda: call(KEY, PAPER, A, B, 1.0, **options))
 
 
 approximate = functools.partial(made, jb.sample_bridges, num_bridges=3, num_steps=4)
@@ -82,7 +79,48 @@ lamperti = of(jb.lamperti, model=cir.model(), at=0.5, reach=8.0)
 domain = lambda domain: lambda: jb.Diffusion(DECAY, domain=domain).drift(X)
 scaled = lambda s: jb.transform(jb.Diffusion(DECAY, s * jnp.eye(2)), jnp.sinh, jnp.arcsinh).model
 
+neuron, inert = of(jb.fitzhugh_nagumo), of(jb.underdamped_langevin, LOG_NORMAL)
+seasonal, heated = of(jb.seasonal_ornstein_uhlenbeck), of(jb.langevin, LOG_NORMAL)
+one_point, of_four = lambda x: x, lambda a, b, c, d: a
+
 MODELS = [
+    # Parameters that cannot be, and functions of other arguments.
+    *each("ε", lambda e: neuron(epsilon=e), [0.0, -1.0, NAN], "`epsilon` must be positive"),
+    ("σ", neuron(sigma=-1.0), "`sigma` must be zero or more"),
+    ("γ", neuron(gamma=np.inf), "`gamma` must be finite"),
+    *each("kT", lambda t: inert(temperature=t), [0.0, -1.0, NAN], "`temperature` must be positive"),
+    ("friction", inert(friction=-1.0), "`friction` must be zero or more"),
+    *each("kT", lambda t: heated(temperature=t), [0.0, -1.0, NAN], "`temperature` must be pos"),
+    ("kT", heated(temperature=[1.0]), "`temperature` must be a number"),
+    (
+        "kT",
+        traced(lambda t: heated(temperature=t)().drift(X), 1.0),
+        "`temperature` is a",
+        TypeError,
+    ),
+    ("period", seasonal(period=0.0), "`period` must be positive"),
+    ("rate", seasonal(rate=NAN), "`rate` must be finite"),
+    ("mean", of(jb.GaussianLaw)([NAN], [[1.0]]), "`mean` must be finite"),
+    *each("drift", of(jb.Diffusion), [one_point, of_four], "`drift` must be a fun.* or", TypeError),
+    *(
+        (
+            f"{name} of one",
+            diffusion(**{name: one_point}),
+            f"`{name}` must be a function",
+            TypeError,
+        )
+        for name in ("diffusion", "log_stationary", "reverse_drift", "domain")
+    ),
+    ("prepare of four", diffusion(prepare=of_four), "`prepare` must be a function", TypeError),
+    (
+        "NumPy's",
+        lambda: jb.Diffusion(lambda x, p: np.sin(x)).drift(X),
+        "`drift` cannot be",
+        TypeError,
+    ),
+    ("beyond", lambda: jb.Diffusion(lambda x, p: p["a"] * x, params={}).drift(X), "`drift` raised"),
+    ("solver", simulate(solver="heun"), "`solver` must be a solver of diffrax", TypeError),
+    ("solver", simulate(solver=diffrax.Heun), "`solver` must be .* got the class", TypeError),
     *each("drift", of(jb.Diffusion), [None, 3.0, X], f"`drift` {FUNCTION}", TypeError),
     ("log ν", diffusion(log_stationary=3.0), f"`log_stationary` {FUNCTION}", TypeError),
     ("reversal", diffusion(reverse_drift=3.0), f"`reverse_drift` {FUNCTION}", TypeError),
@@ -163,7 +201,7 @@ MODELS = [
         "times", on, [[0.0, 0.0], [0.0, 2.0, 1.0], [1.0, 0.0], [NAN] * 2], "`times` must increase"
     ),
     *each("x0", lambda x: simulate(x0=x), [1.0, np.zeros((3, 2))], "`x0` must have shape"),
-    ("x0 on a line", simulate(x0=[0.0]), r"at a point of shape \(1,\)"),
+    ("x0 on a line", simulate(x0=[0.0]), r"at a point `x` of shape \(1,\)"),
     ("x0 in space", simulate(model=ROTATING, x0=np.zeros(3)), r"at a point of shape \(3,\)"),
     ("x0 in more dimensions than OU's", simulate(model=OU, x0=A), r"for points of shape \(1,\)"),
     (
@@ -209,7 +247,7 @@ SCHEMES = [
     ("times", path([0.0, 1.0], (3, 2)), "`times` must have shape"),
     *each("times", lambda t: path(t, (3, 2)), [[0.0, 0.0, 1.0], [0.0, NAN, 1.0]], "increase"),
     ("times since 1970", path(days, (6, 2)), "`times` are too far from zero"),
-    ("form", path(TIMES, (3, 2), form="other"), "`form` must be one of"),
+    ("form", path(TIMES, (3, 2), form="other"), "`form` must be"),
     ("no gradient", likelihood(ROTATING, form="ito"), "gradient"),
     ("varying σ", likelihood(VARYING, form="ito_taylor"), "constant σ"),
 ]
@@ -365,6 +403,14 @@ REMEDIES = [
 WITH_REMEDIES = "(?s)" + "".join(f"(?=.*{remedy})" for remedy in REMEDIES)
 rough = lambda way: log_density(KEY, UNKNOWN, *POINT, proposal=way)
 middle_of = lambda path: path[3, 0]
+weighted_mean = lambda fn: weighted().mean(fn)
+BEYOND = [
+    lambda path: path[50],
+    lambda path: path[-50, 0],
+    lambda path: jnp.diff(path, axis=0)[50],
+    lambda path: path[np.array([0, 50])],
+    lambda path: path[jnp.arange(55)],
+]
 
 
 STOP = ("stop_gradient", TypeError)
@@ -415,6 +461,10 @@ EXACT = [
     ("not exact", expectation(approximate), "exact law", TypeError),
     ("thinned", expectation(lambda: weighted(save_at=(1.0,))), "whole path"),
     ("of σ", traced(jax.grad(of_sigma), jnp.eye(2)), "σ depends on parameters", TypeError),
+    # Functions of a path.
+    *each("beyond", lambda fn: of(weighted_mean)(fn), BEYOND, r"`fn` takes the entry -?\d+ of"),
+    ("of two", of(weighted_mean)(lambda x, y: x), "`fn` must be a function `.path.`", TypeError),
+    ("NumPy's", of(weighted_mean)(lambda path: np.exp(path)), "`fn` cannot be traced", TypeError),
     # Two grids.
     ("coarse first", extrapolate(density, fine), "half as many steps"),
     ("density and paths", extrapolate(density, weighted), "must both be what", TypeError),
@@ -531,6 +581,8 @@ RECORDS = [
         "2 records, and here there is a path of one",
     ),
     # Paths between what was seen.
+    ("no proposal", between(proposal=None, num_proposals=3), "`num_proposals` is for a `proposal`"),
+    ("blocks", between(block_length=3), "`block_length` is for paths without"),
     ("free", smooth(FREE, TIMES, LINE), "leave out `proposal`, so that paths are guided by the"),
     ("no ν", of_draws(proposal=PAIRS), "give `Diffusion` a `log_stationary`"),
     ("no noise", between(observation=EXACTLY), "every component that is seen must have noise"),
@@ -602,8 +654,22 @@ UNKNOWN_RATE = jb.Diffusion(lambda x, p: -p * x, params=1.0, reversible=True)
 with_pairs = of(jb.pmmh, KEY, times=TIMES, observations=LINE, prior=PRIOR, proposal=PAIRS)
 
 DAYS = ["2024-02-28", "2024-02-29", "2024-03-01"]
+INITIAL = dict(initial=[0.0])
+TINY, MANY = dict(step_size=1e-9), dict(num_steps=2**26)
 
 INFERENCE = [
+    # Arguments that do not apply.
+    ("initial", gibbs(**INITIAL), "`initial`: for records"),
+    ("initial", pmmh(**INITIAL), "`initial`: for records"),
+    ("initial", maximum(**INITIAL), "`initial`: for records"),
+    ("num_warmup", gibbs(num_warmup=3), "`num_warmup`: for records"),
+    # Too much.
+    *each("steps", lambda call: call(**TINY), [gibbs, pmmh, maximum], "`step_size` = .* pass 3"),
+    *each("steps", lambda call: call(**MANY), [gibbs, pmmh, maximum], "`num_steps` = 67,108,864"),
+    ("steps of a record", of_noise(**TINY), "`step_size` = 1e-09 asks for 2e.09 steps"),
+    ("meter", gibbs(progress_meter=True), "`progress_meter` must be `None` or", TypeError),
+    ("where", gibbs(where=lambda params: params[9]), "`where` raised IndexError"),
+    ("where", gibbs(where=lambda params: 2.0), "`where` must return parts of `model.params`"),
     ("times", gibbs(times=[0.0, 2.0, 1.0]), r"`times\[1\]`.*sort them"),
     ("missing time", gibbs(times=[0.0, NAN, 1.0]), r"`times\[1\]` = nan is missing"),
     ("two times", gibbs(times=[0.0, 1.0]), "`observations` must have shape"),

@@ -24,14 +24,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.checks import Numbers, check_count, check_key, is_traced
+from ..engine.arguments import check_instance
+from ..engine.checks import Numbers, check_key, check_num_steps, is_traced
 from ..engine.compiled import compiled
 from ..engine.doors import door
 from ..engine.keys import folded, key_for
 from ..engine.lanes import over_lanes
 from ..engine.linalg import is_finite
 from ..engine.noise import noisy_scan
-from ..models.bridge_problem import as_intervals
+from ..models.bridge_problem import as_intervals, as_points
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.dynamics import Dynamics
 from ..schemes import check_model
@@ -135,9 +136,13 @@ def measure_burn_in(
     """
     check_key(key)
     check_diffusion(model)
-    num_steps = check_count("num_steps", num_steps)
+    num_steps = check_num_steps(num_steps, 1)
+    end = as_points("end", end)
+    if not is_traced(end) and not np.all(np.isfinite(end)):
+        raise ValueError(f"`end` must be finite; got {end}.")
     intervals, _, _ = as_intervals(end, end, duration)
     coupling = Coupling() if coupling is None else coupling
+    check_instance("coupling", coupling, AbstractCoupling, "a `Coupling`")
     check_model(model, intervals, coupling.scheme)
     model.check_reversal()
     time = _measure(key, model, coupling, intervals.end, intervals.duration, num_steps)

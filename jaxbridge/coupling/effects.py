@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..engine.checks import Numbers, as_floating, check_count
+from ..engine.checks import Numbers, as_floating, check_num_steps
 from ..engine.doors import door
 from ..engine.noise import chunks
 from ..models import decisions
@@ -58,7 +58,7 @@ def effects(
     check_diffusion(model)
     coupling = Coupling() if coupling is None else coupling
     check_coupling(coupling)
-    num_steps = check_count("num_steps", num_steps)
+    num_steps = check_num_steps(num_steps, 1)
     like = _find_point(model) if at is None else as_floating("at", at)
     if like.ndim != 1:
         raise ValueError(f"`at` must be one point, shape (d,); got {like.shape}.")

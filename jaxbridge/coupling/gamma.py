@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from ..engine.arguments import check_function
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import dot
 from ..schemes import AbstractScheme, Euler, Frame, HeunOrEuler
@@ -76,6 +77,9 @@ class Coupling(AbstractCoupling):
         rotation: Rotation | None = None,
         start_law: Any = None,
     ):
+        if callable(gamma):
+            check_function("gamma", gamma, "(key)")
+        check_function("rotation", rotation, "(sigma, driven_sigma)", optional=True)
         law, gamma = (gamma, jnp.nan) if callable(gamma) else (None, gamma)
         self.gamma = as_floating("gamma", gamma)
         self.meeting = BrownianCrossing() if meeting is None else meeting

@@ -98,8 +98,10 @@ class SignTest(AbstractMeeting):
 
     def __init__(self, radius: float | Float[Array, ""] | None = None):
         self.radius = None if radius is None else as_floating("radius", radius)
-        if self.radius is not None and not is_traced(self.radius) and not self.radius > 0:
-            raise ValueError(f"`radius` must be positive; got {radius}.")
+        if self.radius is None:
+            return
+        if self.radius.shape != () or not (is_traced(self.radius) or self.radius > 0):
+            raise ValueError(f"`radius` must be a positive number; got {radius}.")
 
     def met(self, step, forward, uniform):
         crossed = step.frame.gap * step.gap_next() < 0

@@ -9,6 +9,7 @@ where x tends to x', and L solves by substitution (`driven_through_root`).
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from ..engine.checks import Numbers, as_floating, check_precision
 from ..engine.linalg import matmul, matvec, polar_factor
 from ..models import decisions
 from ..models.dynamics import Dynamics
@@ -28,6 +29,7 @@ def polar_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]
     coupling = jb.Coupling(0.5, rotation=jb.polar_rotation)
     ```
     """
+    sigma, driven_sigma = _as_matrices(sigma, driven_sigma)
     return polar_factor(matmul(driven_sigma.T, sigma))
 
 
@@ -57,7 +59,26 @@ def published_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d
     coupling = jb.Coupling(0.5, rotation=jb.published_rotation)
     ```
     """
+    sigma, driven_sigma = _as_matrices(sigma, driven_sigma)
     return polar_factor(matmul(sigma.T, driven_sigma))
+
+
+def _as_matrices(sigma: Numbers, driven_sigma: Numbers) -> tuple[Array, Array]:
+    """Return both as square matrices of one shape.
+
+    **Raises:** `ValueError` for other shapes.
+    """
+    first, second = as_floating("sigma", sigma), as_floating("driven_sigma", driven_sigma)
+    if first.ndim != 2 or first.shape[0] != first.shape[1] or second.shape != first.shape:
+        raise ValueError(
+            "`sigma` and `driven_sigma` must have one shape, (d, d); got shapes "
+            f"{first.shape} and {second.shape}."
+        )
+    check_precision(
+        "`sigma` and `driven_sigma`",
+        min(first.dtype, second.dtype, key=lambda dtype: dtype.itemsize),
+    )
+    return first, second
 
 
 def rotation_between(

@@ -6,6 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Inexact, PyTree, Shaped
 
+from .arguments import as_returned, check_function, named
+from .indices import check_indices
+
 # A function of one path; its values may be truth values and counts.
 PathFunction = Callable[[Array], PyTree]
 
@@ -37,15 +40,29 @@ def filled(paths: Float[Array, "*I n K d"], met: Bool[Array, "*I n"]) -> Float[A
 
 def values_of(fn: PathFunction, paths: Float[Array, "*I n K d"]) -> PyTree:
     """`fn` of every path, with leading axes (*I, n); truth values and counts as numbers."""
-    each = jax.vmap(fn)
-    for _ in paths.shape[:-3]:
+    like = jax.ShapeDtypeStruct(paths.shape[-2:], paths.dtype)
+    each = path_function("fn", fn, like)
+    for _ in paths.shape[:-2]:
         each = jax.vmap(each)
+    return each(paths)
+
+
+def path_function(name: str, fn: PathFunction, like: jax.ShapeDtypeStruct) -> PathFunction:
+    """Return `fn` of paths like this one; truth values and counts among its values are numbers.
+
+    **Raises:** `TypeError` where it is no function of one path, or cannot be traced; `ValueError`
+    where it takes a point beyond the end of the path.
+    """
+    check_function(name, fn, "(path)")
 
     def number(value):
+        value = as_returned(name, value, complex_too=True)
         inexact = jnp.issubdtype(value.dtype, jnp.inexact)
-        return value if inexact else value.astype(paths.dtype)
+        return value if inexact else value.astype(like.dtype)
 
-    return jax.tree.map(number, each(paths))
+    numbers = lambda path: jax.tree.map(number, named(name, fn)(path))
+    check_indices(name, numbers, like)
+    return numbers
 
 
 def weighted_mean(

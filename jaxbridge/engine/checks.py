@@ -21,6 +21,9 @@ Numbers = ArrayLike | Sequence[Any]
 # Trials are numbered in 32 bits.
 _MOST_TRIALS = 2**30
 
+# Grids of more points, each with coordinates, noise and weights, exhaust the memory.
+_MOST_STEPS = 2**26
+
 
 def as_array(value: Numbers) -> Array:
     """`value` as an array, whole on every device; a number of Python's keeps its weak type, which
@@ -70,6 +73,10 @@ def as_real(name: str, value: Numbers) -> Array:
         else:
             with jax.ensure_compile_time_eval():
                 array = as_array(value)
+    except OverflowError as error:
+        raise ValueError(
+            f"`{name}` has integers beyond the range of JAX's; pass floating point numbers."
+        ) from error
     except (TypeError, ValueError) as error:
         raise TypeError(f"`{name}` must be real numbers in an array; got {value!r}.") from error
     if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer)):
@@ -166,6 +173,21 @@ def as_numbers(values: dict[str, Numbers]) -> dict[str, Array]:
     return numbers
 
 
+def check_range(
+    name: str, value: Array, *, positive: bool = False, nonnegative: bool = False
+) -> None:
+    """Raise `ValueError` where a visible entry is not finite, or not as large as it must be."""
+    if is_traced(value):
+        return
+    entries = np.asarray(value)
+    ok = np.isfinite(entries)
+    ok = ok & (entries > 0) if positive else ok
+    ok = ok & (entries >= 0) if nonnegative else ok
+    if not np.all(ok):
+        wanted = "positive" if positive else "zero or more" if nonnegative else "finite"
+        raise ValueError(f"`{name}` must be {wanted}; got {entries}.")
+
+
 def check_precision(names: str, dtype: jnp.dtype) -> None:
     """Raise `TypeError` where arrays of these names are of less than single precision."""
     if dtype.itemsize < 4:
@@ -235,7 +257,29 @@ def steps_of_size(
         )
     if isinstance(step_size, bool) or not isinstance(step_size, int | float) or not step_size > 0:
         raise ValueError(f"`step_size` must be a positive number; got {step_size!r}.")
-    return np.ceil(np.asarray(durations, float) / step_size * (1 - 1e-4)).clip(1).astype(int)
+    wanted = np.ceil(np.asarray(durations, float) / step_size * (1 - 1e-4)).clip(1)
+    if not np.sum(wanted) <= _MOST_STEPS:
+        least = 1.01 * np.sum(np.asarray(durations, float)) / _MOST_STEPS
+        raise ValueError(
+            f"`step_size` = {step_size:g} asks for {np.sum(wanted):.3g} steps in all, and memory "
+            f"is reserved for at most 2²⁶ = {_MOST_STEPS:,}: pass {least:.2g} or more."
+        )
+    return wanted.astype(int)
+
+
+def check_num_steps(value, num_intervals: int) -> int:
+    """Return `num_steps`, of each of so many intervals.
+
+    **Raises:** `TypeError` for anything but an integer, `ValueError` for one below 1, and for more
+    steps in all than memory is reserved for.
+    """
+    num_steps = check_count("num_steps", value)
+    if num_steps * num_intervals > _MOST_STEPS:
+        raise ValueError(
+            f"`num_steps` = {num_steps:,} for {num_intervals:,} intervals are more than "
+            f"2²⁶ = {_MOST_STEPS:,} steps in all, for which memory is reserved: take fewer."
+        )
+    return num_steps
 
 
 def check_key(key) -> None:
@@ -246,12 +290,14 @@ def check_key(key) -> None:
         raise ValueError(f"`key` must be a single key; got an array of keys, {key.shape}.")
 
 
-def check_count(name: str, value, minimum: int = 1) -> int:
-    """A static whole number of at least `minimum`."""
+def check_count(name: str, value, minimum: int = 1, maximum: int = 2**31 - 1) -> int:
+    """A static whole number of at least `minimum` and at most `maximum`."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"`{name}` must be a Python integer, known when compiling; got {value!r}.")
     if value < minimum:
         raise ValueError(f"`{name}` must be at least {minimum}; got {value}.")
+    if value > maximum:
+        raise ValueError(f"`{name}` must be at most {maximum}; got {value}.")
     return int(value)
 
 

@@ -7,11 +7,13 @@ a program looks for the mistakes of its own, are off inside, and as they were ou
 """
 
 import functools
+import inspect
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 import jax
 
+from .arguments import SHARED
 from .devices import on_whole_batches
 
 _Arguments = ParamSpec("_Arguments")
@@ -19,10 +21,15 @@ _Result = TypeVar("_Result")
 
 
 def door(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`fn`, a public function, inside which the caller's guards are off."""
+    """`fn`, a public function, inside which the caller's guards are off, and whose arguments that
+    all functions share are checked."""
+    shared = [name for name in SHARED if name in inspect.signature(fn).parameters]
 
     @functools.wraps(fn)
     def entered(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
+        for name in shared:  # given by name only, in all of them
+            if name in kwargs:
+                SHARED[name](name, kwargs[name])
         with jax.transfer_guard("allow"), jax.debug_nans(False), jax.debug_infs(False):
             return on_whole_batches(fn, *args, **kwargs)
 

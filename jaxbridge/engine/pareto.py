@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from .checks import Numbers, as_floating
 from .doors import door
 
 # A fit to fewer weights means nothing.
@@ -51,7 +52,7 @@ def is_reliable(
 
 
 @door
-def pareto_k(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:
+def pareto_k(log_weights: Numbers) -> Float[Array, "*I"]:
     """The Pareto shape k̂ of the min(n/5, 3√n) largest of n weights, in the last axis.
 
     Below 0.7 the mean of the weights, and its standard error, can be trusted. The estimate is that
@@ -63,8 +64,9 @@ def pareto_k(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:
     jb.pareto_k(jax.random.normal(key, (1000,)))  # of log-normal weights
     ```
 
-    **Arguments:** `log_weights`, logarithms of weights up to a constant. -inf is a weight of zero,
-    which counts as a weight; so is what adds nothing to the largest weight in its precision.
+    **Arguments:** `log_weights`, shape (..., n), logarithms of weights up to a constant. -inf is a
+    weight of zero, which counts as a weight; so is what adds nothing to the largest weight in its
+    precision.
 
     **Returns:** k̂, never NaN, which is
 
@@ -73,7 +75,9 @@ def pareto_k(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:
     - inf where there is nothing to judge by: fewer than 5 of the largest weights are above zero,
       or n < 25 (unless all are equal), or a weight is infinite or NaN.
     """
-    log_weights = lax.stop_gradient(log_weights)
+    log_weights = lax.stop_gradient(as_floating("log_weights", log_weights))
+    if log_weights.ndim == 0:
+        raise ValueError("`log_weights` must have shape (..., n); got a single number.")
     n = log_weights.shape[-1]
     size = min(n // 5, math.ceil(3 * math.sqrt(n)))
     if n < _FEWEST:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import diffrax
 from jaxtyping import Array, Key
 
+from ..engine.arguments import check_choice
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.doors import door
 from ..engine.verdict import throw_where_untrustworthy
@@ -94,6 +95,7 @@ def sample_exact_bridges(
     ```
     """
     check_key(key)
+    check_choice("method", method, ("pseudo_marginal", "renewal", "crank_nicolson"))
     problem = bridge_problem(model, start, end, duration, num_steps)
     num_bridges = check_count("num_bridges", num_bridges)
     if proposal is None and method == "crank_nicolson":
@@ -113,12 +115,8 @@ def sample_exact_bridges(
                 "`num_counts` and `max_trials` are for the pseudo-marginal chain: the renewal "
                 "chain counts nothing."
             )
-    elif method == "pseudo_marginal":
-        run = run_pseudo_marginal
     else:
-        raise ValueError(
-            f'`method` must be "pseudo_marginal", "renewal" or "crank_nicolson"; got {method!r}.'
-        )
+        run = run_pseudo_marginal
     first = check_position(position, problem)
     problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from ..engine.arguments import check_choice
 from ..engine.checks import is_traced
 from ..engine.keys import split_each
 from ..models.diffusion import Diffusion
@@ -160,10 +161,9 @@ def augment(
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
     """
-    if bridges not in ("exact", "approximate"):
-        raise ValueError(f'`bridges` must be "exact" or "approximate"; got {bridges!r}.')
-    if method not in (None, "pseudo_marginal", "renewal"):
-        raise ValueError(f'`method` must be "pseudo_marginal" or "renewal"; got {method!r}.')
+    check_choice("bridges", bridges, ("exact", "approximate"))
+    if method is not None:
+        check_choice("method", method, ("pseudo_marginal", "renewal"))
     if bridges == "approximate" and method is not None:
         raise ValueError("`method` is for exact bridges: approximate ones need none.")
     use = "weights" if bridges == "exact" else "approximate"

@@ -10,8 +10,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import (
     Numbers,
-    check_count,
     check_key,
+    check_num_steps,
     check_precision,
     is_traced,
     steps_of_size,
@@ -150,7 +150,7 @@ def step_groups(
 
     durations = intervals.duration
     if step_size is None:
-        num_steps = check_count("num_steps", 50 if num_steps is None else num_steps)
+        num_steps = check_num_steps(50 if num_steps is None else num_steps, len(durations))
         return (group(np.arange(len(durations)), num_steps),)
     wanted = steps_of_size(durations, num_steps, step_size)
     levels = np.ceil(np.log2(wanted) * _LEVELS_PER_OCTAVE)

@@ -219,7 +219,7 @@ def gibbs(
     ```
     """
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
-    parameters = as_parameters(model, where, constraint)
+    parameters = as_parameters(model, where, constraint, prior)
     if observation is not None:
         check_key(key)
         check_no_bridges(

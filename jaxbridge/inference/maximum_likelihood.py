@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from ..engine.arguments import check_choice
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
@@ -197,8 +198,7 @@ def maximum_likelihood(
     """
     num_iterations = check_count("num_iterations", num_iterations, 2)
     num_bridges = check_count("num_bridges", num_bridges, 2)
-    if method not in ("gradient", "em"):
-        raise ValueError(f'`method` must be "gradient" or "em"; got {method!r}.')
+    check_choice("method", method, ("gradient", "em"))
     if not (optimizer is None or isinstance(optimizer, optax.GradientTransformation)):
         raise TypeError(
             f"`optimizer` must be one of optax's, such as `optax.adam(1e-2)`; got {optimizer!r}."

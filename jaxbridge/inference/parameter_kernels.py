@@ -25,6 +25,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
+from ..engine.arguments import check_function
 from ..engine.lanes import over_lanes
 from ..engine.linalg import any_cholesky, any_solve, dot, matvec
 from .augmentation import Augmentation, Paths
@@ -167,11 +168,7 @@ class GivenKernel(AbstractParameterKernel):
 
 def check_kernel(kernel: Any) -> None:
     """Raise `TypeError` for anything but a function, or `None`."""
-    if kernel is not None and not callable(kernel):
-        raise TypeError(
-            "`parameter_kernel` must be a function that makes a kernel from a log density, for "
-            f"instance `lambda f: blackjax.mala(f, 0.1)`; got {kernel!r}."
-        )
+    check_function("parameter_kernel", kernel, "(log_density)", optional=True)
 
 
 def choose_kernel(

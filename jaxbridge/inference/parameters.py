@@ -6,6 +6,7 @@ not depend on θ wherever paths are part of the state: two σ's give singular la
 path would never let go of the θ it was made with.
 """
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ..engine.arguments import as_returned, check_function, evaluated, named, shown
 from ..engine.checks import as_floating, cast_floats, is_traced
 from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion, check_diffusion
@@ -34,7 +36,7 @@ class Parameters(eqx.Module):
     @property
     def params(self) -> PyTree:
         """The unknown parameters, as they are in the model."""
-        return self.model.params if self.where is None else self.where(self.model.params)
+        return self.model.params if self.where is None else pick(self.where, self.model.params)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,7 +83,8 @@ class Parameters(eqx.Module):
         finite = jnp.all(jnp.isfinite(theta))
         if self.constraint is None:
             return finite
-        value = jnp.asarray(self.constraint(self.select(theta)))
+        value = named("constraint", self.constraint)(self.select(theta))
+        value = as_returned("constraint", value)
         if value.shape != () or value.dtype != bool:
             raise ValueError(
                 "`constraint` must map the unknown parameters to one truth value; it returned "
@@ -109,19 +112,81 @@ def as_parameters(
     model: Diffusion,
     where: Callable[[PyTree], PyTree] | None,
     constraint: Constraint | None = None,
+    prior: Any = None,
 ) -> Parameters:
-    """The parameters that the user wants to know, checked as far as can be without data."""
+    """The parameters that the user wants to know, checked as far as can be without data. Integers
+    among them are unknown where `where` or the prior names them."""
     check_diffusion(model)
-    if where is not None and not callable(where):
-        raise TypeError(
-            f"`where` must be a function that picks from `model.params`; got {where!r}."
+    check_function("where", where, "(params)", optional=True)
+    check_function("constraint", constraint, "(unknown)", optional=True)
+    params = _with_named_integers(model.params, where, prior)
+    return Parameters(model.with_params(params), where, constraint)
+
+
+def _with_named_integers(
+    params: PyTree, where: Callable[[PyTree], PyTree] | None, prior: Any
+) -> PyTree:
+    """Return the parameters with those integers as floating point numbers that `where` picks or
+    that have entries of their own in a prior of pytrees.
+
+    **Warns:** where all parameters are asked for, of integers that are held fixed.
+    """
+    picked = params if where is None else pick(where, params)
+    if not any(map(_is_integer, jax.tree.leaves(picked))):
+        return params
+    means = [getattr(prior, name, None) for name in ("mean", "variance")]
+    structure = jax.tree.structure(picked)
+    named_by_prior = structure.num_nodes > 1 and structure in map(jax.tree.structure, means)
+    if named_by_prior or (where is not None and _is_plain(picked)):
+        floats = jax.tree.map(lambda leaf: _as_float(leaf) if _is_integer(leaf) else leaf, picked)
+        return floats if where is None else eqx.tree_at(where, params, floats)
+    if where is None:
+        leaves = jax.tree_util.tree_leaves_with_path(params)
+        names = [
+            jax.tree_util.keystr(path, simple=True, separator=".") or "params"
+            for path, leaf in leaves
+            if _is_integer(leaf)
+        ]
+        warnings.warn(
+            f"the integers {', '.join(f'`{name}`' for name in names)} among `params` are held "
+            "fixed: write 1.0 for 1 to infer them, or pick the unknown parameters by `where=`.",
+            stacklevel=5,
         )
-    if constraint is not None and not callable(constraint):
-        raise TypeError(
-            "`constraint` must be a function that maps the unknown parameters to a truth value; "
-            f"got {constraint!r}."
-        )
-    return Parameters(model, where, constraint)
+    return params
+
+
+def pick(where: Callable[[PyTree], PyTree], params: PyTree) -> PyTree:
+    """Return what `where` picks from the parameters.
+
+    **Raises:** `ValueError` where it takes what is not there, or returns what is no part of them.
+    """
+    picked = evaluated("where", where, params)
+    try:
+        eqx.tree_at(where, params, picked)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            "`where` must return parts of `model.params`, each once, such as "
+            f"`lambda params: params.mean`; it returned {shown(picked)}."
+        ) from error
+    return picked
+
+
+def _is_integer(leaf: Any) -> bool:
+    if eqx.is_array(leaf) or isinstance(leaf, np.ndarray | np.generic):
+        return jnp.issubdtype(leaf.dtype, jnp.integer)
+    return isinstance(leaf, int) and not isinstance(leaf, bool)
+
+
+def _as_float(leaf: Any) -> Array:
+    return as_floating("params", leaf)
+
+
+def _is_plain(tree: PyTree) -> bool:
+    """Return whether a pytree has no containers but tuples, lists and dictionaries: integers in
+    others, as in neural networks, are sizes."""
+    plain = lambda node: isinstance(node, tuple | list | dict)
+    nodes = jax.tree.leaves(tree, is_leaf=lambda node: not plain(node))
+    return jax.tree_util.all_leaves(nodes)
 
 
 def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p"]:
@@ -130,7 +195,8 @@ def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p
     if theta.size == 0:
         raise ValueError(
             "this model has no parameters to be inferred: give `Diffusion` its unknown numbers as "
-            "`params=`, of floating point: whole numbers stay what they are."
+            "`params=`, as floating point numbers, for integers are held fixed, and let `where`, "
+            "if given, pick some of them."
         )
     if not is_traced(theta) and not np.all(np.isfinite(theta)):
         raise ValueError(

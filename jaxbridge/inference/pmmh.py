@@ -237,7 +237,7 @@ def pmmh(
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
     num_warmup = check_count("num_warmup", num_warmup, 0)
     num_proposals = check_count("num_proposals", num_proposals)
-    parameters = as_parameters(model, where, constraint)
+    parameters = as_parameters(model, where, constraint, prior)
     check_key(key)
     pilot_key, run_key = jax.random.split(key)
     if observation is None:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from ..engine.arguments import as_returned, check_function, named
 from ..engine.checks import as_floating, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.linalg import any_inverse, dot, matvec
@@ -56,7 +57,8 @@ class GivenDensity(eqx.Module):
     function: Callable[[PyTree], Any] = eqx.field(static=True)
 
     def __call__(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
-        value = jnp.asarray(self.function(self.parameters.select(theta)))
+        value = named("prior", self.function)(self.parameters.select(theta))
+        value = as_returned("prior", value)
         if value.shape != ():
             raise ValueError(f"`prior` must return a number; it returned shape {value.shape}.")
         return value.astype(theta.dtype)
@@ -140,4 +142,5 @@ def as_log_prior(
             "`prior` must be a `NormalPrior`, or a function that maps the unknown parameters to "
             f"the log of a density; got {prior!r}."
         )
+    check_function("prior", prior, "(unknown)")
     return GivenDensity(parameters, prior)

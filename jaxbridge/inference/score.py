@@ -55,7 +55,8 @@ class Score(AbstractResult):
         its part of the score nor the error of that can be trusted.
     - `step_error`: what `gradient` is too large by for the length of the steps, an estimate, shape
         (p,), with a standard error of it, `step_uncertainty`. NaN where it is not known.
-    - `num_missing`: intervals without any bridge. They are left out.
+    - `num_missing`: intervals without any bridge. They are left out. If there are no others, the
+        score is NaN and its error infinite.
     - `num_truncated`: weights that `max_trials` cut off.
     """
 
@@ -203,7 +204,16 @@ class _Sums(NamedTuple):
 def _over_all(parameters: Parameters, blocks: tuple[Block, ...], made: Sequence[_Sums]) -> Score:
     sums = over_intervals(blocks, made)
     step_error = StepError(sums.step_error, jnp.sqrt(sums.step_variance))
-    num_missing = jnp.sum(sums.effective_sample_size == 0, dtype=jnp.int32)
+    missing = sums.effective_sample_size == 0
+    num_missing = jnp.sum(missing, dtype=jnp.int32)
+    # Of intervals that all are without bridges nothing is known: 0 ± 0 would be a lie.
+    unknown = jnp.all(missing)
+    blank = lambda leaf, value: jnp.where(unknown, jnp.asarray(value, leaf.dtype), leaf)
+    sums = sums._replace(
+        gradient=blank(sums.gradient, jnp.nan),
+        covariance=blank(sums.covariance, jnp.inf),
+        information=blank(sums.information, jnp.nan),
+    )
     return as_score(parameters, sums, step_error, num_missing, sums.num_truncated)
 
 

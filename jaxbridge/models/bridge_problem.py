@@ -18,7 +18,7 @@ from ..engine.checks import (
     Numbers,
     as_floating,
     as_real,
-    check_count,
+    check_num_steps,
     check_precision,
     is_traced,
 )
@@ -99,21 +99,15 @@ def bridge_problem(
 ) -> BridgeProblem:
     """What every function that makes bridges is asked for, checked; whole paths are kept."""
     check_diffusion(model)
-    num_steps = check_count("num_steps", num_steps)
     intervals, batched, several_durations = as_intervals(start, end, duration)
+    num_steps = check_num_steps(num_steps, len(intervals.duration))
     return BridgeProblem(intervals, None, num_steps, batched, several_durations)
 
 
 def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Intervals, bool, bool]:
     """The intervals, and whether the end points and the duration came with an axis I."""
-    points = {"start": as_real("start", start), "end": as_real("end", end)}
+    points = {"start": as_points("start", start), "end": as_points("end", end)}
     duration = as_real("duration", duration)
-    for name, point in points.items():
-        if point.ndim not in (1, 2) or point.shape[-1] == 0:
-            raise ValueError(
-                f"`{name}` must be one point, shape (d,), or one for each interval, shape "
-                f"(I, d); got {point.shape}."
-            )
     if duration.ndim > 1:
         raise ValueError(f"`duration` must have shape () or (I,); got {duration.shape}.")
     if points["start"].shape[-1] != points["end"].shape[-1]:
@@ -154,6 +148,20 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
         jnp.broadcast_to(duration, (num_intervals,)).astype(dtype),
     )
     return intervals, bool(lengths), duration.ndim == 1
+
+
+def as_points(name: str, value: Numbers) -> Array:
+    """Return one point, shape (d,), or several, shape (I, d).
+
+    **Raises:** `ValueError` for another shape.
+    """
+    points = as_real(name, value)
+    if points.ndim not in (1, 2) or points.shape[-1] == 0:
+        raise ValueError(
+            f"`{name}` must be one point, shape (d,), or one for each interval, shape "
+            f"(I, d); got {points.shape}."
+        )
+    return points
 
 
 def uniform_fractions(num_steps: int) -> Float[np.ndarray, " points"]:

@@ -25,7 +25,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Key, PyTree
 
-from ..engine.checks import Numbers, as_array, as_floating, cast_floats, is_traced, settled
+from ..engine.arguments import as_returned, check_flag, check_function, named
+from ..engine.checks import (
+    Numbers,
+    as_array,
+    as_floating,
+    as_numbers,
+    cast_floats,
+    check_key,
+    check_precision,
+    is_traced,
+    settled,
+)
 from ..engine.linalg import lower_factor
 from . import decisions
 from .dynamics import Dynamics, DynamicsAt, stationary_flux
@@ -39,6 +50,9 @@ _NOT_HOMOGENEOUS = (
     "`gibbs`, `pmmh` and `maximum_likelihood`, whose times are absolute; a state that was seen "
     "exactly is `jb.LinearGaussian(covariance=0.0)`. `model.drift(x, time)` is the drift at a time."
 )
+
+
+_OF_POINT, _OF_TIME = "(x, params)", "(x, params, t)"
 
 
 class Diffusion(eqx.Module):
@@ -118,16 +132,19 @@ class Diffusion(eqx.Module):
         prepare: Callable | None = None,
         _coordinates: Callable | None = None,
     ):
-        for name, function in [
-            ("drift", drift),
-            ("log_stationary", log_stationary),
-            ("reverse_drift", reverse_drift),
-            ("sample_stationary", sample_stationary),
-            ("domain", domain),
-            ("prepare", prepare),
+        check_function("drift", drift, _OF_POINT, _OF_TIME)
+        if callable(diffusion):
+            check_function("diffusion", diffusion, _OF_POINT, _OF_TIME)
+        for name, function, signature in [
+            ("log_stationary", log_stationary, _OF_POINT),
+            ("reverse_drift", reverse_drift, _OF_POINT),
+            ("sample_stationary", sample_stationary, "(key, params)"),
+            ("domain", domain, _OF_POINT),
+            ("prepare", prepare, "(params)"),
         ]:
-            if not (callable(function) or (function is None and name != "drift")):
-                raise TypeError(f"`{name}` must be a function, got {function!r}.")
+            check_function(name, function, signature, optional=True)
+        check_flag("reversible", reversible)
+        check_flag("normalised", normalised)
         of_stationary = {
             "log_stationary": log_stationary is not None,
             "reverse_drift": reverse_drift is not None,
@@ -166,13 +183,13 @@ class Diffusion(eqx.Module):
 
     def drift(self, x: Numbers, time: Numbers | None = None) -> Float[Array, " d"]:
         """α(x), shape (d,), at this time where it depends on it."""
-        x = as_floating("x", x)
+        x = _as_point(x)
         return self._at(x, time).drift(x)
 
     def diffusion(self, x: Numbers, time: Numbers | None = None) -> Float[Array, "d m"]:
         """σ(x) as a dense matrix, shape (d, d), or (d, m) where m < d; at this time where it
         depends on it."""
-        x = as_floating("x", x)
+        x = _as_point(x)
         return self._at(x, time).sigma(x).as_matrix(x.shape[0], x.dtype)
 
     def reverse_drift(self, x: Numbers) -> Float[Array, " d"]:
@@ -181,12 +198,12 @@ class Diffusion(eqx.Module):
         **Raises:** `ValueError` for a model without `log_stationary` or `reverse_drift` that
         is not declared reversible.
         """
-        x = as_floating("x", x)
+        x = _as_point(x)
         return self.backward(x).drift(x)
 
     def log_stationary(self, x: Numbers) -> Float[Array, ""]:
         """log ν(x) up to a constant."""
-        return self._log_stationary_function()(as_floating("x", x))
+        return self._log_stationary_function()(_as_point(x))
 
     def sample_stationary(self, key: Key[Array, ""]) -> Float[Array, " d"]:
         """One draw from ν, shape (d,), by the model's own sampler."""
@@ -195,6 +212,7 @@ class Diffusion(eqx.Module):
                 "this model has no sampler of its stationary law: pass `sample_stationary=`, "
                 "a function `(key, params) -> x`, to `Diffusion`."
             )
+        check_key(key)
         return self._sample_stationary(key, self._prepared_params())
 
     @property
@@ -219,6 +237,9 @@ class Diffusion(eqx.Module):
         (timereversible) of the paper, divided by ν.
         """
         points = as_floating("points", points)
+        if points.ndim != 2 or 0 in points.shape:
+            raise ValueError(f"`points` must have shape (n, d); got {points.shape}.")
+        check_precision("`points`", points.dtype)
         forward, log_nu = self.forward(points[0]), self._log_stationary_function()
         divergence = forward.sigma_varies
         flux = functools.partial(stationary_flux, forward, log_nu, divergence=divergence)
@@ -334,7 +355,7 @@ class Diffusion(eqx.Module):
     def _at(self, x: Float[Array, " d"], time: Numbers | None) -> Dynamics:
         if time is None:
             return self.forward(x)
-        return self.forward_at(x)(as_floating("time", time).astype(x.dtype))
+        return self.forward_at(x)(as_numbers({"time": time})["time"].astype(x.dtype))
 
     def _drift_at(self, params: PyTree) -> Callable[[Any], Callable[[Array], Array]]:
         function = traced_once(self._drift)
@@ -350,7 +371,7 @@ class Diffusion(eqx.Module):
         if self._diffusion is None:
             constant_sigma = _as_sigma(self._constant_sigma, like)
             return lambda time: lambda x: constant_sigma, False
-        function = traced_once(self._diffusion)
+        function = named("diffusion", traced_once(self._diffusion))
         timed = takes_time(self._diffusion)
         values = function if timed else lambda x, params, time: function(x, params)
         now = jnp.zeros((), like.dtype)
@@ -409,6 +430,8 @@ class Diffusion(eqx.Module):
         with the next step, and no bridge ends there."""
         inside = self._state_space(params)
 
+        values = named(name, values)
+
         def drift(x):
             value = check_value(name, values(x), x.shape, x)
             return value if inside is None else jnp.where(inside(x), value, jnp.nan)
@@ -421,12 +444,12 @@ class Diffusion(eqx.Module):
         return self._state_space(self._prepared_params())
 
     def _state_space(self, params: PyTree) -> Callable[[Array], Array] | None:
-        domain = self._domain
-        if domain is None:
+        if self._domain is None:
             return None
+        domain = named("domain", self._domain)
 
         def inside(x):
-            value = jnp.asarray(domain(x, params))
+            value = as_returned("domain", domain(x, params))
             if value.shape != () or value.dtype != bool:
                 raise ValueError(
                     "`domain` must return one truth value, such as `jnp.all(x > 0)`; it returned "
@@ -444,7 +467,8 @@ class Diffusion(eqx.Module):
             raise ValueError(
                 "this model has no stationary density: pass `log_stationary=` to `Diffusion`."
             )
-        params, log_stationary = self._prepared_params(), traced_once(self._log_stationary)
+        params = self._prepared_params()
+        log_stationary = named("log_stationary", traced_once(self._log_stationary))
         return lambda x: check_value("log_stationary", log_stationary(x, params), (), x)
 
 
@@ -457,7 +481,7 @@ def _as_sigma(
     if isinstance(values, AbstractSigma):  # of a model that knows the form of its σ
         sigma: AbstractSigma = cast_floats(values, x.dtype)
         return Constant(sigma.as_matrix(d, x.dtype)) if constant else sigma
-    values = _as_real("diffusion", values)
+    values = as_returned("diffusion", values)
     if values.shape != (d,) and not (values.ndim == 2 and values.shape[0] == d and values.size):
         raise ValueError(
             f"`diffusion` must have shape ({d}, m) for noise of m dimensions, or ({d},) for a "
@@ -474,8 +498,20 @@ def _as_sigma(
     return Constant(values) if constant else Full(values)
 
 
+def _as_point(x: Numbers) -> Float[Array, " d"]:
+    """Return a point of the state space.
+
+    **Raises:** `ValueError` for anything but a vector, `TypeError` for less than single precision.
+    """
+    x = as_floating("x", x)
+    if x.ndim != 1 or not x.size:
+        raise ValueError(f"`x` must be a point, shape (d,); got shape {x.shape}.")
+    check_precision("`x`", x.dtype)
+    return x
+
+
 def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) -> Array:
-    value = _as_real(name, value)
+    value = as_returned(name, value)
     if value.shape != shape:
         raise ValueError(
             f"`{name}` must return shape {shape} at a point of shape {x.shape}; "
@@ -484,22 +520,12 @@ def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) 
     return value.astype(x.dtype)
 
 
-def _as_real(name: str, value: Numbers) -> Array:
-    value = jnp.asarray(value)
-    if jnp.iscomplexobj(value):
-        raise TypeError(
-            f"`{name}` must return real numbers; it returned dtype {value.dtype}: write a complex "
-            "equation in its real and imaginary parts."
-        )
-    return value
-
-
 def check_dimension(x: Float[Array, " d"], dim: int) -> None:
     """Raise `ValueError` where a model whose dimension is known is asked of another point."""
     if x.shape != (dim,):
         raise ValueError(
-            f"the `drift` of this model is for points of shape ({dim},); it was called at a point "
-            f"of shape {x.shape}."
+            f"the `drift` of this `model` is for points of shape ({dim},); it was called at a "
+            f"point `x` of shape {x.shape}."
         )
 
 
@@ -526,6 +552,7 @@ def _as_tuples(sigma: Array) -> tuple:
 
 def _check_constant_sigma(sigma: Numbers) -> Array:
     sigma = as_floating("diffusion", sigma)
+    check_precision("`diffusion`", sigma.dtype)
     if sigma.ndim not in (1, 2) or 0 in sigma.shape:
         raise ValueError(
             "a constant `diffusion` must have shape (d, m) for noise of m dimensions, or (d,) for "
@@ -579,4 +606,11 @@ def _as_leaf(leaf):
     if isinstance(leaf, float):
         return settled(as_array(float(leaf)))
     arrays = np.ndarray | np.generic | jax.Array
-    return settled(as_array(leaf)) if isinstance(leaf, arrays) else leaf
+    if not isinstance(leaf, arrays):
+        return leaf
+    try:
+        return settled(as_array(leaf))
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"`params` must have arrays of numbers; got one of dtype {leaf.dtype}."
+        ) from error

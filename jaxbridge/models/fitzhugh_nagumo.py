@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..engine.checks import Numbers, as_numbers
+from ..engine.checks import Numbers, as_numbers, check_range
 from .diffusion import Diffusion, check_dimension
 
 
@@ -40,9 +40,9 @@ def fitzhugh_nagumo(
     Time is in units of the relaxation time of Y; X and Y have no units. `params` is a
     `FitzHughNagumoParams`.
 
-    **Arguments:** `epsilon`, ε; `gamma`, γ; `beta`, β; `sigma`, σ: numbers, shape ().
+    **Arguments:** `epsilon`, ε > 0; `gamma`, γ; `beta`, β; `sigma`, σ ≥ 0: numbers, shape ().
 
-    **Raises:** `ValueError` for other shapes.
+    **Raises:** `ValueError` for other shapes or values.
 
     **Example:**
 
@@ -52,7 +52,12 @@ def fitzhugh_nagumo(
     ```
     """
     values = {"epsilon": epsilon, "gamma": gamma, "beta": beta, "sigma": sigma}
-    return Diffusion(_drift, _sigma, params=FitzHughNagumoParams(**as_numbers(values)))
+    params = FitzHughNagumoParams(**as_numbers(values))
+    check_range("epsilon", params.epsilon, positive=True)
+    check_range("gamma", params.gamma)
+    check_range("beta", params.beta)
+    check_range("sigma", params.sigma, nonnegative=True)
+    return Diffusion(_drift, _sigma, params=params)
 
 
 def _drift(x: Float[Array, " d"], p: FitzHughNagumoParams) -> Float[Array, " d"]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.checks import Numbers, as_floating, check_precision, check_range, is_traced
 from ..engine.linalg import any_cholesky, any_inverse, dot, matvec
 from .diffusion import Diffusion
 
@@ -36,13 +36,15 @@ class GaussianLaw(eqx.Module):
 
     def __init__(self, mean: Numbers, covariance: Numbers):
         mean, covariance = as_floating("mean", mean), as_floating("covariance", covariance)
-        dtype = jnp.promote_types(mean.dtype, covariance.dtype)
+        dtype = max(mean.dtype, covariance.dtype, key=lambda dtype: dtype.itemsize)
         self.mean, self.covariance = mean.astype(dtype), covariance.astype(dtype)
         if mean.ndim != 1 or covariance.shape != 2 * mean.shape:
             raise ValueError(
                 "`mean` must have shape (d,) and `covariance` (d, d); got "
                 f"{mean.shape} and {covariance.shape}."
             )
+        check_precision("`mean` and `covariance`", dtype)
+        check_range("mean", mean)
         if is_traced(covariance):
             return
         matrix = np.asarray(covariance, float)
@@ -61,8 +63,12 @@ class GaussianLaw(eqx.Module):
         """One draw, shape (d,). The model is not looked at: start laws are called with one."""
         return _draw(self.mean, self.covariance, key)
 
-    def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
-        """The normalised log density at a point."""
+    def log_density(self, x: Numbers) -> Float[Array, ""]:
+        """Return the normalised log density at a point, shape (d,)."""
+        x = as_floating("x", x)
+        if x.shape != self.mean.shape:
+            raise ValueError(f"`x` must have shape {self.mean.shape}; got {x.shape}.")
+        check_precision("`x`", x.dtype)
         return _log_density(self.mean, self.covariance, x)
 
 

@@ -3,11 +3,14 @@
 import dataclasses
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from ..engine.arguments import check_function
+from ..engine.checks import Numbers, as_numbers, check_range, is_traced
 from ..engine.linalg import matvec
-from .diffusion import Diffusion
+from .diffusion import Diffusion, check_value
 from .dynamics import weighted_divergence
 from .sigma import Triangular, root_of
 
@@ -41,9 +44,9 @@ def stationary_diffusion(
     model = jb.stationary_diffusion(lambda x, p: -x @ x / 2, Q=lambda x, p: swirl)
     ```
     """
-    for name, function in [("log_density", log_density), ("V", V), ("Q", Q)]:
-        if not (callable(function) or (function is None and name != "log_density")):
-            raise TypeError(f"`{name}` must be a function `(x, params)`; got {function!r}.")
+    check_function("log_density", log_density, "(x, params)")
+    check_function("V", V, "(x, params)", optional=True)
+    check_function("Q", Q, "(x, params)", optional=True)
     return Diffusion(
         drift=_RecipeDrift(log_density, V, Q, 1),
         diffusion=None if V is None else _Root(V),
@@ -56,20 +59,63 @@ def stationary_diffusion(
 
 
 def langevin(
-    log_density: Callable, params: PyTree = None, *, normalised: bool = False
+    log_density: Callable,
+    params: PyTree = None,
+    *,
+    temperature: Numbers | Callable[[PyTree], Numbers] | None = None,
+    normalised: bool = False,
 ) -> Diffusion:
-    """The Langevin diffusion `dX = ½ ∇log ν(X) dt + dW`: reversible, with stationary density ν.
+    """Return the Langevin diffusion `dX = ½ ∇log ν(X) dt + dW`, or, at a temperature,
 
-    **Arguments:** `log_density`, `(x, params) -> ()`, is log ν up to a constant; `params`, any
-    pytree, is what it receives; `normalised` as in `Diffusion`.
+        dX = kT ∇log ν(X) dt + √(2kT) dW,
+
+    which is dX = -∇V dt + √(2kT) dW for ν ∝ exp(-V / kT). Both are reversible with the stationary
+    density ν. They differ in the unit of time: without a `temperature` a process in a potential V
+    runs slower than with it by the factor 2kT.
+
+    **Arguments:** `log_density`, `(x, params) -> ()`, is log ν up to a constant, so -V / kT;
+    `params`, any pytree, is what it receives; `temperature`, kT > 0 in units of V, is a number or
+    a function of `params`; `normalised` as in `Diffusion`.
+
+    **Raises:** `TypeError` for a `log_density` that is no function, and for a number as
+    `temperature` that is traced; `ValueError` for a `temperature` that is not positive.
 
     **Example:**
 
     ```python
     double_well = jb.langevin(lambda x, p: -p * (x @ x - 1) ** 2, params=1.0)
+    V = lambda x: (x @ x - 1) ** 2
+    heated = jb.langevin(lambda x, kT: -V(x) / kT, params=0.15, temperature=lambda kT: kT)
+    heated.drift(jnp.array([0.5]))  # Array([1.5], dtype=float32), which is -∇V
     ```
     """
-    return stationary_diffusion(log_density, params=params, normalised=normalised)
+    if temperature is None:
+        return stationary_diffusion(log_density, params=params, normalised=normalised)
+    check_function("log_density", log_density, "(x, params)")
+    if callable(temperature):
+        check_function("temperature", temperature, "(params)")
+    else:
+        temperature = _number(temperature)
+    return Diffusion(
+        _HeatedDrift(log_density, temperature),
+        _HeatedNoise(temperature),
+        log_density,
+        params,
+        reversible=True,
+        normalised=normalised,
+    )
+
+
+def _number(temperature: Numbers) -> float:
+    """Return a temperature that is known."""
+    if is_traced(temperature):
+        raise TypeError(
+            "`temperature` is a traced number: let it be a function of `params`, such as "
+            "`lambda params: params`."
+        )
+    array = as_numbers({"temperature": temperature})["temperature"]
+    check_range("temperature", array, positive=True)
+    return float(array)
 
 
 # The callables below are frozen dataclasses, so that models made twice from the same functions
@@ -105,6 +151,35 @@ class _Root:
     def __call__(self, x: Float[Array, " d"], params: PyTree) -> Float[Array, " d"] | Triangular:
         V = jnp.asarray(self.V(x, params))
         return jnp.sqrt(V) if V.ndim == 1 else root_of(V)
+
+
+@dataclasses.dataclass(frozen=True)
+class _HeatedDrift:
+    """kT ∇log ν."""
+
+    log_density: Callable
+    temperature: float | Callable
+
+    def __call__(self, x: Float[Array, " d"], params: PyTree) -> Float[Array, " d"]:
+        log_nu = lambda y: check_value("log_density", self.log_density(y, params), (), y)
+        return _temperature(self.temperature, x, params) * jax.grad(log_nu)(x)
+
+
+@dataclasses.dataclass(frozen=True)
+class _HeatedNoise:
+    """√(2kT) in all coordinates."""
+
+    temperature: float | Callable
+
+    def __call__(self, x: Float[Array, " d"], params: PyTree) -> Float[Array, " d"]:
+        return jnp.broadcast_to(jnp.sqrt(2 * _temperature(self.temperature, x, params)), x.shape)
+
+
+def _temperature(
+    temperature: float | Callable, x: Float[Array, " d"], params: PyTree
+) -> Float[Array, ""]:
+    value = temperature(params) if callable(temperature) else temperature
+    return check_value("temperature", value, (), x)
 
 
 def _multiply(matrix: Array, vector: Float[Array, " d"]) -> Float[Array, " d"]:

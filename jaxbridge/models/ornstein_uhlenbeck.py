@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.checks import Numbers, as_floating, check_precision, is_traced
 from ..engine.doors import door
 from ..engine.linalg import any_cholesky, any_inverse, any_log_abs_det, dot, matvec, solve
 from .bridge_problem import as_intervals
@@ -81,6 +81,7 @@ def ornstein_uhlenbeck(
     ```
     """
     B = as_floating("B", B)
+    check_precision("`B`", B.dtype)
     if B.ndim != 2 or B.shape[0] != B.shape[1]:
         raise ValueError(f"`B` must be a square matrix, shape (d, d); got {B.shape}.")
     d = B.shape[0]
@@ -93,6 +94,7 @@ def ornstein_uhlenbeck(
         sigma = as_floating("sigma", sigma)
         if sigma.shape not in ((d,), (d, d)):
             raise ValueError(f"`sigma` must have shape ({d}, {d}) or ({d},); got {sigma.shape}.")
+        check_precision("`sigma`", sigma.dtype)
         check_invertible("sigma", sigma)
     if not is_traced(B):
         if not np.all(np.isfinite(B)):
@@ -282,7 +284,7 @@ def ou_params(model: Diffusion) -> OrnsteinUhlenbeckParams:
     params = getattr(model, "params", None)
     if not isinstance(params, OrnsteinUhlenbeckParams):
         raise TypeError(
-            "the closed form is for models made by `ornstein_uhlenbeck`; got a model with "
-            f"params {params!r}."
+            "`model` must be made by `ornstein_uhlenbeck`, for this is a closed form; got "
+            f"{type(model).__name__} with params {params!r}."
         )
     return params

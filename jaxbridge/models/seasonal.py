@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..engine.checks import Numbers, as_floating
+from ..engine.checks import Numbers, as_floating, check_range
 from .diffusion import Diffusion
 
 
@@ -47,9 +47,10 @@ def seasonal_ornstein_uhlenbeck(
     t is the time of the caller, as `times` has it. `params` is a `SeasonalParams`.
 
     **Arguments:** `rate`, a, per unit of time; `mean`; `amplitude`; `phase`, in radians; `period`,
-    in units of time; `sigma`, σ, in space per square root of a unit of time: shape () or (d,) each.
+    in units of time, positive; `sigma`, σ ≥ 0, in space per square root of a unit of time: shape ()
+    or (d,) each.
 
-    **Raises:** `ValueError` for other shapes.
+    **Raises:** `ValueError` for other shapes or values.
 
     **Example:**
 
@@ -63,6 +64,7 @@ def seasonal_ornstein_uhlenbeck(
     for name, value in arrays.items():
         if value.ndim > 1:
             raise ValueError(f"`{name}` must have shape () or (d,); got {value.shape}.")
+        check_range(name, value, positive=name == "period", nonnegative=name == "sigma")
     return Diffusion(_drift, _sigma, params=SeasonalParams(**arrays))
 
 

@@ -30,7 +30,7 @@ from ..engine.linalg import (
 )
 
 NO_INVERSE = (
-    "σ of this model has fewer columns than rows, so noise reaches only a part of the state at "
+    "σ of this `model` has fewer columns than rows, so noise reaches only a part of the state at "
     "once, and what was asked for rests on an inverse of σ, as do couplings, bridges between exact "
     "states and transition densities. What does not: `simulate`, and with an `observation` "
     "`log_likelihood`, `smooth`, `innovations`, `gibbs`, `pmmh` and `maximum_likelihood`; a state "

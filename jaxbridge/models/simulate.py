@@ -8,7 +8,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key
 
-from ..engine.checks import Numbers, as_floating, check_count, check_key
+from ..engine.arguments import check_instance
+from ..engine.checks import Numbers, as_floating, check_count, check_key, check_num_steps
 from ..engine.compiled import compiled
 from ..engine.doors import door
 from ..engine.times import as_times, check_increasing, check_resolved
@@ -60,11 +61,11 @@ def simulate(
     check_key(key)
     check_diffusion(model)
     num_paths = check_count("num_paths", num_paths)
-    num_steps = check_count("num_steps", num_steps)
     known = as_times("times", times)
     if len(known.shape) != 1 or known.shape[0] < 2:
         raise ValueError(f"`times` must have shape (K,) with K ≥ 2; got {known.shape}.")
     check_increasing(known)
+    num_steps = check_num_steps(num_steps, known.shape[0] - 1)
     start_key, path_key = jax.random.split(key)
     if x0 is None:
         x0 = jax.vmap(model.prepared().sample_stationary)(jax.random.split(start_key, num_paths))
@@ -75,6 +76,7 @@ def simulate(
         )
     x0 = jnp.broadcast_to(x0, (num_paths, x0.shape[-1]))
     solver = diffrax.Heun() if solver is None else solver
+    check_instance("solver", solver, diffrax.AbstractSolver, "a solver of diffrax, an instance")
     clock, since = known.clock(x0.dtype)
     gaps = known.gaps.astype(x0.dtype)
     if model.depends_on_time:

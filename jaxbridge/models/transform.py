@@ -20,6 +20,7 @@ import jax.numpy as jnp
 from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
+from ..engine.arguments import check_function
 from ..engine.checks import Numbers, as_floating
 from ..engine.linalg import log_abs_det
 from .diffusion import Diffusion, check_diffusion, check_value
@@ -121,8 +122,7 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
     """
     check_diffusion(model)
     for name, function in [("forward", forward), ("inverse", inverse)]:
-        if not callable(function):
-            raise TypeError(f"`{name}` must be a function of a point; got {function!r}.")
+        check_function(name, function, "(x)")
     if model.depends_on_time:
         raise ValueError(
             "the coefficients of this `model` depend on time, and `transform` is for those that do "

@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..engine.checks import Numbers, as_numbers
+from ..engine.arguments import check_function
+from ..engine.checks import Numbers, as_numbers, check_range
 from .diffusion import Diffusion, check_value, halves
 
 
@@ -39,11 +40,12 @@ def underdamped_langevin(
 
     Noise reaches Q by way of P only: couplings do not apply, records with an `observation` do.
 
-    **Arguments:** `potential`, U, `(q, params) -> ()` of positions, shape (n,); `friction`, γ, and
-    `temperature`, τ, shape (); `params`, any pytree, is what the potential receives. `params` of
-    the model is an `UnderdampedLangevinParams`.
+    **Arguments:** `potential`, U, `(q, params) -> ()` of positions, shape (n,); `friction`, γ ≥ 0,
+    and `temperature`, τ > 0, shape (); `params`, any pytree, is what the potential receives.
+    `params` of the model is an `UnderdampedLangevinParams`.
 
-    **Raises:** `TypeError` for a potential that is no function; `ValueError` for shapes.
+    **Raises:** `TypeError` for a potential that is no function; `ValueError` for other shapes or
+    values.
 
     **Example:**
 
@@ -52,9 +54,10 @@ def underdamped_langevin(
     well.drift(jnp.array([0.0, 1.0]))  # Array([ 1. , -0.5], dtype=float32)
     ```
     """
-    if not callable(potential):
-        raise TypeError(f"`potential` must be a function `(q, params)`; got {potential!r}.")
+    check_function("potential", potential, "(q, params)")
     numbers = as_numbers({"friction": friction, "temperature": temperature})
+    check_range("friction", numbers["friction"], nonnegative=True)
+    check_range("temperature", numbers["temperature"], positive=True)
     functions = _Functions(potential)
     made = UnderdampedLangevinParams(**numbers, potential=params)
     return Diffusion(functions.drift, _sigma, functions.log_stationary, made)

@@ -145,6 +145,7 @@ def as_proposal(
     like: Float[Array, " d"],
     budget: Budget = _NO_BUDGET,
     for_density: bool = False,
+    name: str = "proposal",
 ) -> AbstractProposal:
     """What the user gave as `proposal`, for points like this one; `for_density` if the size of its
     weights matters, and not only their proportion."""
@@ -152,12 +153,13 @@ def as_proposal(
         candidates = default_candidates(model, for_density)
         given = choice_between(candidates, budget, left_out=why_left_out(model, for_density))
         return given.for_model(model, like)
-    return _given(Coupling() if proposal is None else proposal, budget).for_model(model, like)
+    given = _given(Coupling() if proposal is None else proposal, budget, name)
+    return given.for_model(model, like)
 
 
-def _given(proposal: Any, budget: Budget) -> AbstractProposal:
+def _given(proposal: Any, budget: Budget, name: str = "proposal") -> AbstractProposal:
     if isinstance(proposal, AbstractProposal):
-        if budget != _NO_BUDGET:
+        if any(value is not None for value in budget):
             raise ValueError(
                 "`num_counts`, `max_proposals` and `max_trials` are for a `Coupling`; this "
                 "`proposal` has its own, or none."
@@ -165,7 +167,7 @@ def _given(proposal: Any, budget: Budget) -> AbstractProposal:
         return proposal
     if not isinstance(proposal, AbstractCoupling):
         raise TypeError(
-            "`proposal` must be a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, "
+            f"`{name}` must be a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, "
             f'`Guided()`, what `choose_proposal` returns, or "auto"; got {proposal!r}.'
         )
     num_counts = 1 if budget.num_counts is None else check_count("num_counts", budget.num_counts)
@@ -187,7 +189,7 @@ def choice_between(
     if len(candidates) == 0:
         raise ValueError("`candidates` must have at least one proposal.")
     proposals = tuple(
-        _given(each, budget if isinstance(each, AbstractCoupling) else _NO_BUDGET)
+        _given(each, budget if isinstance(each, AbstractCoupling) else _NO_BUDGET, "candidates")
         for each in candidates
     )
     if not all(isinstance(proposal, AbstractSingleProposal) for proposal in proposals):

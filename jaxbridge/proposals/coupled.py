@@ -294,5 +294,7 @@ def as_pairs(
 ) -> CoupledPairs:
     """The proposal, which must be a coupling's for this method."""
     if not isinstance(proposal, CoupledPairs):
-        raise TypeError(f"{method} is for couplings: pass a `Coupling`, or choose {instead}.")
+        raise TypeError(
+            f"{method} is for couplings: pass a `Coupling` as `proposal`, or choose {instead}."
+        )
     return proposal

@@ -532,7 +532,7 @@ def as_guided(proposal: AbstractProposal) -> AbstractGuidedProposal:
     """The proposal itself, if it makes paths from normal noise."""
     if not isinstance(proposal, AbstractGuidedProposal):
         raise TypeError(
-            "Crank–Nicolson moves are for proposals that make paths from normal noise: "
+            "Crank–Nicolson moves are for a `proposal` that makes paths from normal noise: "
             "`ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()`."
         )
     return proposal

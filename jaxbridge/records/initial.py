@@ -20,6 +20,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, PyTree
 
 from ..coupling import Stationary
+from ..engine.arguments import as_returned, check_function, evaluated
 from ..engine.averages import effective_size, normalised, proper
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import (
@@ -102,13 +103,19 @@ class _OfParams(eqx.Module):
     function: Callable[[PyTree], Any] = eqx.field(static=True)
 
     def __call__(self, params: PyTree) -> Any:
-        return self.function(params)
+        law = evaluated("initial", self.function, params)
+        if isinstance(law, GaussianLaw | Stationary):
+            return law
+        return as_returned("initial", law)
 
 
 def as_initial(initial: Initial) -> Initial:
     """What the user gave, as a pytree of arrays."""
     is_function = callable(initial) and jax.tree_util.all_leaves([initial])
-    return _OfParams(initial) if is_function else initial
+    if not is_function:
+        return initial
+    check_function("initial", initial, "(params)")
+    return _OfParams(initial)
 
 
 def bound(initial: Initial, model: Diffusion) -> Initial:

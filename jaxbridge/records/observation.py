@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
+from ..engine.arguments import as_returned, check_function, named
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import dot, safe_norm
 from ..models.diffusion import check_value
@@ -74,6 +75,8 @@ class LinearGaussian(eqx.Module):
                 raise ValueError(f"`matrix` must have shape (m, d); got {self.matrix.shape}.")
             if not is_traced(self.matrix) and not np.all(np.isfinite(self.matrix)):
                 raise ValueError(f"`matrix` must be finite; got {self.matrix}.")
+        if callable(covariance):
+            check_function("covariance", covariance, "(params)", "(params, t)")
         self._function = covariance if callable(covariance) else None
         self.covariance = None if callable(covariance) else as_floating("covariance", covariance)
         if self.covariance is not None:
@@ -94,7 +97,7 @@ class LinearGaussian(eqx.Module):
         value, dtype = self.covariance, time.dtype
         if self._function is not None:
             arguments = (params, time) if self.depends_on_time else (params,)
-            value = jnp.asarray(self._function(*arguments))
+            value = as_returned("covariance", named("covariance", self._function)(*arguments))
         assert value is not None
         if value.shape not in ((), (m,), (m, m)):
             raise ValueError(
@@ -190,8 +193,7 @@ class ObservationDensity(eqx.Module):
     _log_density: Callable = eqx.field(static=True)
 
     def __init__(self, log_density: Callable, guess: LinearGaussian):
-        if not callable(log_density):
-            raise TypeError(f"`log_density` must be a function; got {log_density!r}.")
+        check_function("log_density", log_density, "(y, x, params)", "(y, x, params, t)")
         if not isinstance(guess, LinearGaussian):
             raise TypeError(f"`guess` must be a `LinearGaussian`; got {guess!r}.")
         if guess.covariance is not None:
@@ -225,7 +227,8 @@ class ObservationDensity(eqx.Module):
         arguments = (shown, x, params)
         if takes_time(self._log_density, 3):
             arguments = (*arguments, time)
-        true = check_value("log_density", self._log_density(*arguments), (), x)
+        log_density = named("log_density", self._log_density)
+        true = check_value("log_density", log_density(*arguments), (), x)
         guess = log_density_of(self.scalars(row, params, x.shape[0]), x)
         return jnp.where(seen, true - guess, 0)
 

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 from ..engine.checks import (
     Numbers,
     as_floating,
-    check_count,
+    check_num_steps,
     check_precision,
     is_traced,
     missing_as_nan,
@@ -250,7 +250,7 @@ def _segments(
 ) -> tuple[int, Int[np.ndarray, " n"]]:
     """N, and of how many segments each gap is made."""
     if step_size is None:
-        num_steps = check_count("num_steps", 10 if num_steps is None else num_steps)
+        num_steps = check_num_steps(10 if num_steps is None else num_steps, gaps.shape[0])
         return num_steps, np.ones(gaps.shape[0], int)
     wanted = steps_of_size(gaps, num_steps, step_size)
 

@@ -11,7 +11,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.averages import PathFunction
+from ..engine.averages import PathFunction, path_function
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
@@ -170,9 +170,9 @@ class Smoothed(AbstractResult):
         return jax.tree.unflatten(treedef, values), jax.tree.unflatten(treedef, doubts)
 
     def _values(self, fn: PathFunction) -> PyTree:
-        return jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, self.paths.dtype), jax.vmap(jax.vmap(fn))(self.paths)
-        )
+        like = jax.ShapeDtypeStruct(self.paths.shape[-2:], self.paths.dtype)
+        values = jax.vmap(jax.vmap(path_function("fn", fn, like)))(self.paths)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf, self.paths.dtype), values)
 
 
 @door
@@ -187,9 +187,9 @@ def smooth(
     num_draws: int = 1000,
     num_warmup: int = 200,
     num_chains: int = 4,
-    block_length: int = 10,
+    block_length: int | None = None,
     proposal: Any = None,
-    num_proposals: int = 10,
+    num_proposals: int | None = None,
     num_steps: int | None = None,
     step_size: float | None = None,
     initial_time: Numbers | None = None,
@@ -206,14 +206,16 @@ def smooth(
         `initial_time`, `density`: as in `innovations`.
     - `num_draws`: of each chain, after `num_warmup` in which the size of moves is learnt.
     - `num_chains`: chains, which start from guided paths that know nothing of each other.
-    - `block_length`: how many intervals between observations move at once: more where they are so
-        close that neighbours tell much of each other, fewer where blocks are seldom accepted.
+    - `block_length`: how many intervals between observations move at once, by default 10: more
+        where they are so close that neighbours tell much of each other, fewer where blocks are
+        seldom accepted. Not with a `proposal`.
     - `proposal`: by default paths are guided by all that was seen, as by a linear process. Across
         gaps in which the diffusion could have gone several ways (wells, many relaxation times)
         give a proposal of bridges, as `sample_exact_bridges` takes them: a `Coupling`, or "auto",
         which tries several on each gap. Then the states at the times of observations move, with
         new bridges on both sides. That asks for a stationary law and for noise in all that is seen.
-    - `num_proposals`: how many bridges of a `proposal` are made for each move of each gap.
+    - `num_proposals`: how many bridges of a `proposal` are made for each move of each gap, by
+        default 10.
     - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time where the result is not `trustworthy`.
 
@@ -232,11 +234,15 @@ def smooth(
     check_key(key)
     counts = (check_count("num_draws", num_draws), check_count("num_warmup", num_warmup, 0))
     num_chains = check_count("num_chains", num_chains)
-    block_length = check_count("block_length", block_length, 2)
+    if proposal is None and num_proposals is not None:
+        raise ValueError("`num_proposals` is for a `proposal`: give one, or leave this out.")
+    if proposal is not None and block_length is not None:
+        raise ValueError("`block_length` is for paths without a `proposal`: leave it out.")
+    block_length = check_count("block_length", 10 if block_length is None else block_length, 2)
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     problem = as_record_problem(*arguments, num_steps=num_steps, any_constant=True, **options)
-    num_proposals = check_count("num_proposals", num_proposals)
+    num_proposals = check_count("num_proposals", 10 if num_proposals is None else num_proposals)
     made = linearised(problem, model)
     if proposal is None:
         sizes = counts, num_chains, block_length

@@ -41,6 +41,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from ..engine.arguments import check_choice
 from ..engine.checks import Numbers, as_floating, check_precision, is_traced
 from ..engine.compiled import compiled
 from ..engine.doors import door
@@ -87,6 +88,8 @@ def path_log_likelihood(
     ```
     """
     check_diffusion(model)
+    if form is not None:
+        check_choice("form", form, get_args(Form))
     (times, steps), path = as_times("times", times), as_floating("path", path)
     if path.ndim < 2 or path.shape[-2] < 2:
         raise ValueError(
@@ -260,8 +263,6 @@ def _form(model: Diffusion, like: Float[Array, " d"], form: Form | None) -> Form
     forms = forms_of(model, like)
     if form is None:
         return forms[0]
-    if form not in get_args(Form):
-        raise ValueError(f"`form` must be one of {', '.join(get_args(Form))}; got {form!r}.")
     if form in (*forms, "euler"):
         return form
     if form == "trapezoid" and "ito_taylor" in forms:

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from ..coupling import Coupling
+from ..engine.arguments import as_sequence
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.doors import door
 from ..models.bridge_problem import BridgeProblem, bridge_problem
@@ -84,7 +85,7 @@ def choose_proposal(
         given = default_candidates(model, for_density)
         left_out = why_left_out(model, for_density)
     else:
-        given = list(candidates)
+        given = list(as_sequence("candidates", candidates, "proposals"))
 
     def choose_between(candidates, left_out=""):
         auto = choice_between(candidates, num_pilot=num_pilot, left_out=left_out)

@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from ..coupling import AnyStartLaw, hitting_counts
+from ..engine.arguments import as_sequence
 from ..engine.averages import normalised
 from ..engine.checks import check_count, check_key
 from ..engine.doors import door
@@ -86,7 +87,7 @@ def hitting_variation(
     ```
     """
     check_key(key)
-    sizes = [check_count("num_counts", n) for n in num_counts]
+    sizes = [check_count("num_counts", n) for n in as_sequence("num_counts", num_counts, "counts")]
     if len(sizes) < 2 or sorted(set(sizes)) != sizes:
         raise ValueError(f"`num_counts` must be two or more increasing numbers; got {num_counts}.")
     if not isinstance(bridges, AbstractExactBridges):

@@ -11,7 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from ..coupling import sample_bridges
-from ..engine.checks import Numbers, cast_floats
+from ..engine.arguments import as_returned, as_sequence
+from ..engine.averages import path_function
+from ..engine.checks import Numbers, as_floating, as_numbers, cast_floats
 from ..engine.diagnostics import effective_sample_size
 from ..engine.keys import key_for
 from ..exact import (
@@ -71,7 +73,10 @@ class Scene(NamedTuple):
 
     def values(self, paths: Float[Array, "n K d"]) -> Float[np.ndarray, "n m"]:
         """`fn` of each path."""
-        return np.asarray(jax.vmap(lambda path: jnp.ravel(self.fn(path)))(paths), float)
+        fn = path_function("fn", self.fn, jax.ShapeDtypeStruct(paths.shape[1:], paths.dtype))
+        return np.asarray(
+            jax.vmap(lambda path: jnp.ravel(as_returned("fn", fn(path))))(paths), float
+        )
 
 
 def check_precisions(scene: Scene, dtypes: Sequence[str]) -> None:
@@ -180,7 +185,9 @@ def given(reference: tuple[Numbers, Numbers] | None) -> Estimate | None:
     """The mean and the standard deviation that the user knows."""
     if reference is None:
         return None
-    mean, sd = (np.ravel(np.asarray(part, float)) for part in reference)
+    if len(as_sequence("reference", reference, "a mean and a standard deviation")) != 2:
+        raise ValueError("`reference` must be a mean and a standard deviation, `(mean, sd)`.")
+    mean, sd = (np.ravel(np.asarray(as_floating("reference", part))) for part in reference)
     return Estimate(mean, np.zeros_like(mean), sd)
 
 
@@ -188,7 +195,7 @@ def given_density(log_density: Numbers | None) -> Estimate | None:
     """The density that the user knows."""
     if log_density is None:
         return None
-    value = np.exp(np.ravel(np.asarray(log_density, float)))
+    value = np.exp(np.asarray(as_numbers({"log_density": log_density})["log_density"]))[None]
     return Estimate(value, np.zeros_like(value), value)
 
 

@@ -27,6 +27,7 @@ from ..coupling import (
     needs_burn_in,
     sample_bridges,
 )
+from ..engine.arguments import as_sequence, check_instance
 from ..engine.batch_size import most_lanes
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.compiled import compiled
@@ -168,8 +169,11 @@ def tune_coupling(
     """
     if couplings is None:
         couplings = [Coupling(gamma) for gamma in (-1.0, 0.0, 0.5, 0.9)]
-    if len(couplings) == 0:
+    couplings = as_sequence("couplings", couplings, "couplings")
+    if not couplings:
         raise ValueError("`couplings` must have at least one candidate.")
+    for coupling in couplings:
+        check_instance("couplings", coupling, Coupling, "a sequence of `Coupling`s")
     problem = bridge_problem(model, start, end, duration, num_steps)
     runs = (
         coupling_pilots(key, model, problem, coupling, num_pilot, for_density)
@@ -195,7 +199,9 @@ def coupling_pilots(
             "point."
         )
     if not isinstance(coupling, Coupling):
-        raise TypeError(f"a start law is chosen for a `Coupling`; got {coupling!r}.")
+        raise TypeError(
+            f"`coupling` must be a `Coupling`, whose start law is chosen; got {coupling!r}."
+        )
     if is_traced(key, model, coupling, problem):
         raise TypeError(
             "a start law is chosen by looking at numbers, which `jit` and `vmap` hide: choose it "

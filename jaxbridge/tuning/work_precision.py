@@ -25,7 +25,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from ..coupling import Coupling
-from ..engine.checks import Numbers, check_count, check_key
+from ..engine.arguments import as_sequence, check_function
+from ..engine.checks import Numbers, as_floating, as_numbers, check_count, check_key
 from ..engine.doors import door
 from ..engine.keys import key_for
 from ..engine.progress import as_meter
@@ -49,6 +50,7 @@ from .measurement import (
 )
 from .settings import WorkPrecision
 
+_DTYPES = ("float32", "float64")
 METHODS = (
     "approximate",
     "weights",
@@ -138,6 +140,10 @@ def work_precision(
     problem = bridge_problem(model, start, end, duration, 1)
     if problem.batched:
         raise ValueError("`work_precision` looks at one interval: `start` and `end` of shape (d,).")
+    num_steps = as_sequence("num_steps", num_steps, "numbers of steps")
+    methods = as_sequence("methods", methods, "methods")
+    dtypes = as_sequence("dtypes", dtypes, "dtypes")
+    check_function("fn", fn, "(path)", optional=True)
     steps = [check_count("num_steps", n) for n in num_steps]
     for name, count in [("num_bridges", num_bridges), ("repeats", repeats)]:
         check_count(name, count)
@@ -172,7 +178,7 @@ def work_precision(
     whole = (lambda points: points) if fn is None else fn
     start_point, end_point = (np.asarray(point[0]) for point in problem.intervals[:2])
     length = float(problem.intervals.duration[0])
-    times = np.asarray(save_at, float)
+    times = np.asarray(as_floating("save_at", save_at), float)
     inside = (times > 0) & (times < length)
     if not inside.any() and not all(map(is_density, methods)):
         raise ValueError(_NOTHING_TO_ESTIMATE)
@@ -218,12 +224,11 @@ def _check_settings(
 ) -> None:
     if not steps:
         raise ValueError("`num_steps` must have at least one number of steps.")
-    unknown = [method for method in methods if method not in METHODS]
-    if unknown or not methods:
+    if not methods or not all(isinstance(m, str) and m in METHODS for m in methods):
         raise ValueError(f"`methods` must be some of {METHODS}; got {tuple(methods)}.")
-    if any(dtype not in ("float32", "float64") for dtype in dtypes) or not dtypes:
+    if not dtypes or not all(isinstance(d, str) and d in _DTYPES for d in dtypes):
         raise ValueError(f'`dtypes` must be "float32" or "float64"; got {tuple(dtypes)}.')
-    if target is not None and not target > 0:
+    if target is not None and not as_numbers({"target": target})["target"] > 0:
         raise ValueError(f"`target` must be positive; got {target}.")
 
 
@@ -234,7 +239,8 @@ def _candidates(
         proposals = [Coupling(scheme=Heun()), Coupling(scheme=Euler())]
         if is_linear(model.forward(like), like):
             proposals.append(Coupling(scheme=GaussianTransition()))
-    candidates = [as_proposal(proposal, model, like) for proposal in proposals]
+    proposals = as_sequence("proposals", proposals, "proposals")
+    candidates = [as_proposal(proposal, model, like, name="proposals") for proposal in proposals]
     if any(len(candidate.singles) > 1 for candidate in candidates):
         raise ValueError('`proposals` must be single ones; "auto" chooses between several.')
     return candidates

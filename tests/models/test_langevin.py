@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.integrate
+import scipy.sparse.linalg
 import scipy.special
 import scipy.stats
 from helpers import assert_moments, slow_beyond
@@ -224,3 +225,56 @@ def test_a_constant_V_is_recognised():
     )
     assert not model.forward(jnp.ones(2)).sigma_varies
     np.testing.assert_allclose(model.drift(jnp.array([1.0, 0.0])), [-1, -0.5])
+
+
+def test_a_temperature_sets_the_clock():
+    """In a quadratic potential the Langevin diffusion is an Ornstein–Uhlenbeck process, whose
+    transition is known; without a temperature it is slower by 2kT."""
+    rate, heat, points = 1.3, 0.15, np.linspace(-1, 1, 5)[:, None]
+    log_density = lambda x, kT: -rate * x @ x / (2 * kT) - jnp.log(2 * jnp.pi * kT / rate) / 2
+    exact = jb.ornstein_uhlenbeck([[rate]], sigma=[[float(np.sqrt(2 * heat))]])
+    of_params = jb.langevin(log_density, heat, temperature=lambda kT: kT, normalised=True)
+    of_number = jb.langevin(log_density, heat, temperature=heat, normalised=True)
+    slow = jb.langevin(log_density, heat)
+    for x in points:
+        for model in (of_params, of_number):
+            np.testing.assert_allclose(model.drift(x), exact.drift(x), rtol=1e-5)
+            np.testing.assert_allclose(model.reverse_drift(x), exact.drift(x), rtol=1e-5)
+            np.testing.assert_allclose(model.diffusion(x), exact.diffusion(x), rtol=1e-5)
+            np.testing.assert_allclose(model.log_stationary(x), exact.log_stationary(x), rtol=1e-4)
+        np.testing.assert_allclose(2 * heat * slow.drift(x), exact.drift(x), rtol=1e-5)
+    assert np.abs(of_params.reversibility_residual(points)).max() < 1e-5
+    assert not of_params.sigma_varies(jnp.zeros(1))
+    hotter = of_params.with_params(2 * heat)
+    np.testing.assert_allclose(hotter.diffusion(points[0]) ** 2, 4 * heat, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("proposal", [jb.Guided(), jb.Coupling(0.0)], ids=["guided", "coupling"])
+def test_transitions_of_a_double_well_at_a_temperature(proposal):
+    """Against the chain of a fine grid of points with the rates of -∇V and √(2kT)."""
+    heat, start, end, duration = 0.3, -0.6, 0.8, 1.5
+    potential = lambda x: (x @ x - 1) ** 2
+    nodes = np.linspace(-3, 3, 1201)
+    h, V = nodes[1] - nodes[0], (nodes**2 - 1) ** 2
+    up = heat / h**2 * np.exp(-np.diff(V) / (2 * heat))
+    down = heat / h**2 * np.exp(np.diff(V) / (2 * heat))
+    rates = np.diag(up, 1) + np.diag(down, -1)
+    rates -= np.diag(rates.sum(1))
+    law = scipy.sparse.linalg.expm_multiply(
+        duration * rates.T, np.isclose(nodes, start).astype(float)
+    )
+    expected = np.log(law[np.isclose(nodes, end)][0] / h)
+    mass = scipy.integrate.quad(lambda x: np.exp(-((x**2 - 1) ** 2) / heat), -4, 4)[0]
+    model = jb.langevin(
+        lambda x, kT: -potential(x) / kT - float(np.log(mass)),
+        heat,
+        temperature=lambda kT: kT,
+        normalised=True,
+    )
+    estimate = jb.transition_log_density(
+        jax.random.key(0), model, [start], [end], duration,
+        num_proposals=20_000, num_steps=60, proposal=proposal,
+    )  # fmt: skip
+    assert abs(estimate.value - expected) < 5 * estimate.standard_error + 0.01
+    assert estimate.standard_error < 0.03

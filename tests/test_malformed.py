@@ -1,0 +1,312 @@
+"""Calls of all public functions with one malformed argument each: the outcome is a result, or a
+refusal that names the argument."""
+
+import functools
+import inspect
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from helpers import zeros_of
+
+import jaxbridge as jb
+
+KEY = jax.random.key(0)
+MODEL, LINE = jb.ornstein_uhlenbeck([[1.0, 0.2], [0.0, 1.0]]), jb.ornstein_uhlenbeck([[1.0]])
+FREE = jb.Diffusion(lambda x, p: -p * x, params=1.0)
+INTERVAL = dict(model=MODEL, start=[0.0, 0.0], end=[1.0, 0.0], duration=1.0)
+SHORT = dict(num_steps=4)
+SEEN, GUIDED = jb.LinearGaussian(covariance=0.1), jb.Guided()
+RECORD = dict(model=LINE, times=[0.0, 1.0, 2.0], observations=[[0.0], [0.5], [0.2]])
+NOISY = dict(RECORD, observation=SEEN, num_steps=2)
+RATE = dict(where=lambda params: params.B, num_steps=2, prior=jb.NormalPrior(1.0, 1.0))
+FEW = dict(num_iterations=2, num_warmup=2)
+CAUCHY = jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + x**2)
+
+
+def interval(call, **options):
+    return lambda: (call, dict(INTERVAL, key=KEY, num_steps=4, **options))
+
+
+@functools.cache
+def zeros(call, **options):
+    return zeros_of(lambda: call(key=KEY, **INTERVAL, **options))
+
+
+def of_bridges(call, sampler=jb.sample_bridges, **options):
+    """A call with bridges of a sampler."""
+
+    def prepare():
+        bridges = zeros(sampler, num_steps=4, num_bridges=30, **options)
+        return call, dict(key=KEY, model=MODEL, bridges=bridges)
+
+    return prepare
+
+
+many = functools.partial(zeros, num_steps=4, num_bridges=30, proposal=GUIDED)
+weighted = functools.partial(many, jb.sample_weighted_bridges)
+chain = functools.partial(many, jb.sample_exact_bridges)
+density = functools.partial(zeros, jb.transition_log_density, num_proposals=30, proposal=GUIDED)
+method_of = lambda result, name: lambda: (getattr(result(), name), {})
+small = lambda call, **arguments: lambda: (call, arguments)
+
+# What is called, and with what: each of the arguments is replaced in turn.
+CALLS = {
+    "Diffusion": small(jb.Diffusion, drift=lambda x, p: -x),
+    "Diffusion.drift": small(MODEL.drift, x=[0.0, 0.0]),
+    "Diffusion.diffusion": small(MODEL.diffusion, x=[0.0, 0.0]),
+    "Diffusion.reverse_drift": small(MODEL.reverse_drift, x=[0.0, 0.0]),
+    "Diffusion.log_stationary": small(MODEL.log_stationary, x=[0.0, 0.0]),
+    "Diffusion.sample_stationary": small(MODEL.sample_stationary, key=KEY),
+    "Diffusion.reversibility_residual": small(MODEL.reversibility_residual, points=[[0.0, 0.0]]),
+    "ornstein_uhlenbeck": small(jb.ornstein_uhlenbeck, B=[[1.0, 0.2], [0.0, 1.0]]),
+    "hyperbolic": small(jb.hyperbolic, alpha=1.0, dim=2),
+    "langevin": small(jb.langevin, log_density=lambda x, p: -x @ x),
+    "stationary_diffusion": small(jb.stationary_diffusion, log_density=lambda x, p: -x @ x),
+    "transform": small(jb.transform, model=FREE, forward=jnp.sinh, inverse=jnp.arcsinh),
+    "lamperti": small(jb.lamperti, model=CAUCHY, at=0.0, reach=1.0, num_nodes=4),
+    "simulate": small(
+        jb.simulate, key=KEY, model=MODEL, x0=[0.0, 0.0], times=[0.0, 1.0], num_steps=2
+    ),
+    "fitzhugh_nagumo": small(jb.fitzhugh_nagumo),
+    "underdamped_langevin": small(jb.underdamped_langevin, potential=lambda q, p: q @ q),
+    "integrated": small(jb.integrated, model=LINE),
+    "seasonal_ornstein_uhlenbeck": small(jb.seasonal_ornstein_uhlenbeck),
+    "Coupling": small(jb.Coupling),
+    "SignTest": small(jb.SignTest),
+    "Stationary": small(jb.Stationary),
+    "GaussianLaw": small(jb.GaussianLaw, mean=[0.0, 0.0], covariance=np.eye(2)),
+    "GaussianLaw.log_density": small(
+        jb.GaussianLaw([0.0, 0.0], np.eye(2)).log_density, x=[0.0, 0.0]
+    ),
+    "ModifiedDiffusionBridge": small(jb.ModifiedDiffusionBridge),
+    "Guided": small(jb.Guided),
+    "ResidualBridge": small(jb.ResidualBridge),
+    "LinearGaussian": small(jb.LinearGaussian),
+    "ObservationDensity": small(jb.ObservationDensity, log_density=lambda y, x, p: 0.0, guess=SEEN),
+    "NormalPrior": small(jb.NormalPrior, mean=1.0, variance=1.0),
+    "polar_rotation": small(jb.polar_rotation, sigma=jnp.eye(2), driven_sigma=jnp.eye(2)),
+    "effective_sample_size": small(jb.effective_sample_size, draws=np.arange(8.0)),
+    "potential_scale_reduction": small(jb.potential_scale_reduction, draws=np.ones((2, 8))),
+    "pareto_k": small(jb.pareto_k, log_weights=list(range(30))),
+    "ou_stationary": small(jb.ou_stationary, model=MODEL),
+    "ou_transition": small(jb.ou_transition, model=MODEL, start=[0.0, 0.0], duration=1.0),
+    "gaussian_bridge": small(jb.gaussian_bridge, **INTERVAL, times=[0.5]),
+    "sample_bridges": interval(jb.sample_bridges),
+    "sample_weighted_bridges": interval(jb.sample_weighted_bridges, proposal=GUIDED),
+    "sample_exact_bridges": interval(jb.sample_exact_bridges),
+    "transition_log_density": interval(jb.transition_log_density, proposal=GUIDED),
+    "fit_start_law": interval(jb.fit_start_law),
+    "measure_burn_in": small(
+        jb.measure_burn_in, key=KEY, model=MODEL, end=[0.0, 0.0], duration=1.0
+    ),
+    "choose_proposal": interval(jb.choose_proposal),
+    "tune_coupling": interval(jb.tune_coupling),
+    "work_precision": lambda: (
+        jb.work_precision,
+        dict(INTERVAL, key=KEY, num_steps=(4,), num_bridges=10),
+    ),
+    "effects": small(jb.effects, model=MODEL),
+    "pseudo_marginal": small(jb.pseudo_marginal, **INTERVAL),
+    "renewal": small(jb.renewal, **INTERVAL),
+    "crank_nicolson": small(jb.crank_nicolson, **INTERVAL),
+    "weigh_bridges": of_bridges(jb.weigh_bridges),
+    "hitting_counts": of_bridges(jb.hitting_counts),
+    "hitting_variation": of_bridges(jb.hitting_variation, jb.sample_weighted_bridges),
+    "expectation": lambda: (
+        jb.expectation,
+        dict(fn=lambda path: path[2], bridges=weighted(), model=MODEL),
+    ),
+    "extrapolate": lambda: (
+        jb.extrapolate,
+        dict(fine=density(num_steps=4), coarse=density(num_steps=2)),
+    ),
+    "WeightedBridges.mean": method_of(weighted, "mean"),
+    "WeightedBridges.standard_error": method_of(weighted, "standard_error"),
+    "WeightedBridges.step_error": method_of(weighted, "step_error"),
+    "WeightedBridges.resample": lambda: (weighted().resample, dict(key=KEY, num_bridges=3)),
+    "Chain.mean": method_of(chain, "mean"),
+    "Chain.standard_error": method_of(chain, "standard_error"),
+    "path_log_likelihood": small(
+        jb.path_log_likelihood, model=MODEL, times=[0.0, 1.0], path=[[0.0, 0.0], [1.0, 0.0]]
+    ),
+    "log_likelihood": small(jb.log_likelihood, key=KEY, **NOISY, num_particles=4),
+    "smooth": small(jb.smooth, key=KEY, **NOISY, num_draws=4, num_warmup=2),
+    "innovations": small(jb.innovations, **NOISY),
+    "gibbs": small(jb.gibbs, key=KEY, **RECORD, **RATE, num_iterations=2, proposal=GUIDED),
+    "gibbs of a record": small(jb.gibbs, key=KEY, **RECORD, **RATE, **FEW, observation=SEEN),
+    "pmmh": small(jb.pmmh, key=KEY, **RECORD, **RATE, **FEW, num_proposals=4, proposal=GUIDED),
+    "pmmh of a record": small(jb.pmmh, key=KEY, **RECORD, **RATE, **FEW, observation=SEEN),
+    "maximum_likelihood": small(
+        jb.maximum_likelihood,
+        key=KEY,
+        **RECORD,
+        where=RATE["where"],
+        num_iterations=2,
+        num_bridges=4,
+        proposal=GUIDED,
+    ),
+    "maximum_likelihood of a record": small(
+        jb.maximum_likelihood, key=KEY, **NOISY, where=RATE["where"], num_iterations=2
+    ),
+    "score": small(
+        jb.score, key=KEY, **RECORD, where=RATE["where"], num_bridges=4, proposal=GUIDED
+    ),
+}
+RAGGED = [[1.0], [1.0, 2.0]]
+VALUES = {
+    "None": None,
+    "True": True,
+    "0": 0,
+    "-1": -1,
+    "2.5": 2.5,
+    "nan": np.nan,
+    "inf": np.inf,
+    "-inf": -np.inf,
+    "1e300": 1e300,
+    "2**70": 2**70,
+    "-2**70": -(2**70),
+    "10**400": 10**400,
+    "1j": 1j,
+    "a word": "word",
+    "no word": "",
+    "bytes": b"bytes",
+    "an empty list": [],
+    "an empty tuple": (),
+    "ragged": RAGGED,
+    "words": ["a", "b"],
+    "None in a list": [None, 1.0],
+    "an empty array": np.zeros(0),
+    "an array without rows": np.zeros((0, 2)),
+    "three axes": np.ones((2, 2, 2)),
+    "five numbers": np.arange(5.0),
+    "a matrix of 5": np.eye(5),
+    "NaNs": np.full(2, np.nan),
+    "rows of NaN": np.full((3, 2), np.nan),
+    "negative numbers": -np.ones(2),
+    "a negative matrix": -np.eye(2),
+    "truth values": np.array([True, False]),
+    "objects": np.array([object(), None]),
+    "numbers as objects": np.array([1, 2.0], object),
+    "strings": np.array(["1.0", "2.0"]),
+    "half precision": np.ones(2, np.float16),
+    "integers": np.array([1, 2]),
+    "a scalar array": np.array(1.0),
+    "a JAX array": jnp.ones(2),
+    "complex numbers": np.array([1j, 0.0]),
+    "a dict": {},
+    "a dict of numbers": {"a": 1.0},
+    "a set": {1.0},
+    "a range": range(3),
+    "a slice": slice(1),
+    "an object": object(),
+    "a class": jb.Coupling,
+    "the module": jb,
+    "an exception": ValueError("x"),
+    "a key": KEY,
+    "a function of none": lambda: 0.0,
+    "a function of one": lambda a: a,
+    "a function of two": lambda a, b: a,
+    "a function of five": lambda a, b, c, d, e: a,
+    "a function to None": lambda *args: None,
+    "a function to words": lambda *args: "word",
+    "a function to a number": lambda *args: 0.0,
+    "a function to NaN": lambda *args: np.nan,
+    "a function to five": lambda *args: jnp.ones(5),
+    "a function beyond": lambda x, *args: x[50],
+    "a number's function": np.linalg.norm,
+    "a model of five dimensions": jb.ornstein_uhlenbeck(np.eye(5)),
+    "a model without noise in x": jb.fitzhugh_nagumo(),
+    "a model of time": jb.seasonal_ornstein_uhlenbeck(),
+    "a coupling": jb.Coupling(0.0),
+    "a proposal": jb.Guided(),
+    "a prior": jb.NormalPrior(1.0, 1.0),
+    "an observation model": jb.LinearGaussian([[1.0, 0.0, 0.0]], 0.1),
+    "a law": jb.GaussianLaw(np.zeros(5), np.eye(5)),
+    "an optimiser": optax.adam(0.1),
+    "a scheme": jb.Heun(),
+}
+
+
+OF_FUNCTIONS = [name for name in VALUES if name.startswith(("a function", "a model", "a number's"))]
+# Choices that look at numbers.
+NOT_TRACED = {"fit_start_law", "choose_proposal", "tune_coupling"}
+# Names that a sentence may blame in the place of the argument.
+OF_A_MODEL = {"drift", "diffusion", "log_stationary", "x"}
+
+
+class Reached(BaseException):
+    """Raised in the place of the first compiled program: nothing was refused before it."""
+
+
+def reached(*_):
+    raise Reached
+
+
+def arguments_of(call):
+    """The names of a function's public arguments."""
+    return [name for name in inspect.signature(call).parameters if not name.startswith("_")]
+
+
+def fault_of(call, arguments, name, value):
+    """Return the fault of a call with one argument replaced, `None` where there is none."""
+    try:
+        call(**(arguments | {name: value}))
+    except Reached:
+        return None
+    except (ValueError, TypeError) as error:
+        internal = re.search("Tracer|jaxlib|jaxpr|positional argument|HloModule", str(error))
+        named = re.findall(r"\w+", " ".join(re.findall("`([^`]*)`", str(error))))
+        if internal or not OF_A_MODEL.union(arguments_of(call)).intersection(named):
+            return f"{type(error).__name__}: {error}"
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+def faults(call, values_of, monkeypatch, traced=False):
+    """Return all faults of a call, given the names of the values for the i-th argument."""
+    call, arguments = CALLS[call]()
+    if not traced:
+        monkeypatch.setattr("jaxbridge.engine.compiled.mind_memory_maps", reached)
+    found = []
+    for i, name in enumerate(arguments_of(call)):
+        for value in values_of(i):
+            look = lambda name=name, value=value: found.append(
+                (name, value, fault_of(call, arguments, name, VALUES[value]))
+            )
+            jax.eval_shape(look) if traced else look()
+    return [(name, value, fault) for name, value, fault in found if fault is not None]
+
+
+# NumPy and JAX warn of some values before they refuse them.
+pytestmark = [pytest.mark.usefixtures("unchecked"), pytest.mark.filterwarnings("ignore")]
+
+
+@pytest.mark.parametrize("call", CALLS)
+def test_some_malformed_arguments(call, monkeypatch):
+    """Of each argument every thirtieth value, each time others."""
+    shift = list(CALLS).index(call)
+    assert not faults(call, lambda i: list(VALUES)[(7 * shift + i) % 30 :: 30], monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", CALLS)
+def test_malformed_arguments(call, monkeypatch):
+    assert not faults(call, lambda i: VALUES, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", [call for call in CALLS if call not in NOT_TRACED])
+def test_malformed_functions_and_models(call, monkeypatch):
+    """Which are seen when programs are traced."""
+    with jax.numpy_dtype_promotion("standard"):  # as optax asks for
+        assert not faults(call, lambda i: OF_FUNCTIONS, monkeypatch, traced=True)
+
+
+def test_all_functions_are_called():
+    functions = {name for name in jb.__all__ if inspect.isfunction(getattr(jb, name))}
+    assert functions <= {*CALLS, "no_rotation", "published_rotation"}  # as `polar_rotation`
