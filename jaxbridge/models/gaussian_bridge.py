@@ -9,8 +9,6 @@ The bridge from a to b in T is Gaussian. With Γ_t of `ornstein_uhlenbeck` and t
 (The paper prints the gain without these transposes; that is right for reversible processes.)
 """
 
-import functools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float, Key
 
 from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.linalg import any_cholesky, any_solve
 from .diffusion import Diffusion
@@ -52,7 +51,7 @@ class GaussianBridge(eqx.Module):
         return _paths(self, key, num_paths)
 
 
-@functools.partial(jax.jit, static_argnums=2)
+@compiled_sooner
 def _paths(bridge: GaussianBridge, key, num_paths):
     params = ou_params(bridge._model)
     grid = jnp.concatenate([bridge.times, bridge._duration[None]])
@@ -118,7 +117,7 @@ def gaussian_bridge(
     return GaussianBridge(times, mean, covariance, model, a, b, total, gain)
 
 
-@jax.jit
+@compiled_sooner
 def _moments(params: OrnsteinUhlenbeckParams, a, b, total, times):
     decay_T, covariance_T = decay_and_covariance(params, total)
     miss = b - params.mean - decay_T @ (a - params.mean)

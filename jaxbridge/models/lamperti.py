@@ -15,7 +15,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +22,7 @@ from jax.tree_util import Partial
 from jaxtyping import Array, Float, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced
+from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from .diffusion import Diffusion, check_diffusion
 from .transform import Transformed, of_points
@@ -213,7 +213,7 @@ class _Lamperti:
         return jnp.asarray(solution.ys)
 
 
-@eqx.filter_jit
+@compiled_sooner
 def _tabulated(functions: _Lamperti, params: PyTree) -> _Table:
     params = params if functions.preparation is None else functions.preparation(params)
     below, above = (functions.solve(side, params) for side in (-1, 1))

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, check_precision, is_traced
+from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.linalg import any_cholesky, any_inverse, any_log_abs_det, dot, matvec, solve
 from .bridge_problem import as_intervals
@@ -156,7 +157,7 @@ def _stationary_covariance(params: OrnsteinUhlenbeckParams) -> Float[Array, "d d
     return _lyapunov(params.B, _noise_covariance(params))
 
 
-@jax.jit
+@compiled_sooner
 def _transition(params: OrnsteinUhlenbeckParams, start, duration):
     decay, covariance = decay_and_covariance(params, duration)
     return params.mean + decay @ (start - params.mean), covariance
