@@ -546,6 +546,30 @@ def jacobi_log_density(shape, start, end, duration, num_terms=40):
 
 
 @slow
+@pytest.mark.parametrize(
+    "freedom, end, duration, box", [(1.0, 10.0, 5.0, (-30, 35)), (3.0, 40.0, 100.0, (-80, 90))]
+)
+def test_models_of_heavy_tails(freedom, end, duration, box):
+    """From the centre far into the tail of Student's law, of one degree of freedom (Cauchy) and of
+    three, against Kolmogorov's equation: what has no warning is right."""
+    model = jb.Diffusion(
+        lambda x, p: -(p + 1) / 2 * x / (p + x**2), params=freedom, reversible=True
+    )
+    exact = fokker_planck.solve_model(model, [0.0], [end], duration, [box], 2_500)
+    assert exact.log_density_error < 1e-5
+    for proposal in (jb.ModifiedDiffusionBridge(), jb.Guided()):
+        for num_steps in (50, 100):
+            made = jb.transition_log_density(
+                jax.random.key(0), model, np.zeros((8, 1)), np.full((8, 1), end),
+                np.full(8, duration), num_proposals=4_000, num_steps=num_steps, proposal=proposal,
+            )  # fmt: skip
+            told = np.abs(made.step_error) + 2 * made.step_uncertainty
+            off = np.abs(np.asarray(made.value) - exact.log_density)
+            within = off < 4.5 * np.asarray(made.standard_error) + np.asarray(told)
+            assert np.all(within, where=np.asarray(made.trustworthy))
+
+
+@slow
 def test_heavy_tails_are_told_and_auto_takes_another():
     """A guide that takes the drift to lead away from the end pulls too late: few of the paths have
     the weight of all others together, and the sample has too few of them."""
