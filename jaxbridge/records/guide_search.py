@@ -1,4 +1,10 @@
-"""The path along which a record is linearised, searched for, and a check of what was found."""
+"""The search for the path along which a record is linearised, and a check of what was found.
+
+The first search starts from the path of the extended Kalman filter. Where that is thrown off, it
+finds no path whose weight is finite, or one that is far from what is seen. Then searches start from
+paths of particles that stay near what is seen (`tracking`), made likely by damped iterations
+(`likely_path`). The best path of all searches is the result.
+"""
 
 import functools
 from typing import NamedTuple
@@ -11,19 +17,26 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..engine.averages import proper
 from ..engine.checks import without_derivatives
-from ..engine.compiled import compiled_sooner
+from ..engine.compiled import compiled_sooner, is_outermost
+from ..engine.keys import key_for
 from ..models.diffusion import Diffusion
+from ..models.dynamics import is_linear
 from ..schemes import solve_root
 from .guided_record import Guidance, guided, path_and_log_weight
 from .initial import calls_for_cover, initial_law, likeliest
-from .linearisation import extended_kalman_path
+from .likely_path import likely_path
+from .linearisation import extended_kalman_path, stay_inside
 from .observation import Scalars
 from .problem import RecordProblem
 from .segments import split_first
+from .tracking import tracking_path
 
 # How often the path along which the process is linearised is found anew from the last; what log
 # weights gain by it that is worth no further turn; and the shortest of its steps.
 _MOST_TURNS, _NO_GAIN, _SHORTEST = 30, 0.5, 2.0**-10
+# From how many particles' paths it is searched for at most. How far from an observation a path may
+# be that calls for no other start: so much beyond the largest of n normal numbers.
+_MOST_PARTICLE_STARTS, _BEYOND_NOISE = 3, 1.0
 
 
 class Linearised(NamedTuple):
@@ -56,17 +69,11 @@ class GuideCheck(NamedTuple):
 def check_guide(problem: RecordProblem, model: Diffusion, guide: Guidance) -> GuideCheck:
     """Return the diagnostics of this guide of a record. No derivatives."""
     problem, model, guide = without_derivatives((problem, model, guide))
-    begin = likeliest(problem.initial, model, guide.initial, _first_scalars(problem, model))
-    _, log_weight = _path_without_noise(problem, model, guide, begin)
-    return GuideCheck(log_weight, largest_residual(guide))
+    _, log_weight = _path_without_noise(problem, model, guide, guide.start.origin)
+    return GuideCheck(log_weight, _largest_residual(guide))
 
 
-def _first_scalars(problem: RecordProblem, model: Diffusion) -> Scalars:
-    """Return what is seen of X(t_0)."""
-    return split_first(problem.scalars(model))[0]
-
-
-def largest_residual(guide: Guidance) -> Float[Array, ""]:
+def _largest_residual(guide: Guidance) -> Float[Array, ""]:
     """Return the largest distance of an observation from the path of linearisation, in standard
     deviations of its noise."""
 
@@ -92,6 +99,112 @@ def _path_without_noise(
     return path, proper(log_weight)
 
 
+class _Found(NamedTuple):
+    """The best path of a search, and its check."""
+
+    best: Linearised
+    check: GuideCheck
+
+    @property
+    def is_near(self) -> Bool[Array, ""]:
+        """Whether no other start is called for."""
+        guide = self.best.guide
+        num_seen = jnp.sum(guide.first.seen) + jnp.sum(guide.scalars.seen)
+        largest = jnp.sqrt(2 * jnp.log(jnp.maximum(num_seen, 1))) + _BEYOND_NOISE
+        return self.check.is_usable & (self.check.largest_residual < largest)
+
+
+def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
+    """Return the best path found, and the guide along it. The points have no derivatives, and the
+    guide none by the model.
+
+    The starts from particles are a program of their own, which is compiled where it is called for.
+    """
+    if not is_outermost():
+        return _in_program(problem, model)
+    found = _from_filter(problem, model)
+    if found.is_near or _is_linear(problem, model):
+        return found.best
+    for number in range(_MOST_PARTICLE_STARTS):
+        new = _from_particles(problem, model, jnp.int32(number))
+        found = new if new.check.log_weight > found.check.log_weight else found
+        if found.is_near:
+            break
+    return found.best
+
+
+def _in_program(own: RecordProblem, own_model: Diffusion) -> Linearised:
+    """Return the same within a compiled program."""
+    problem, model = without_derivatives((own, own_model))
+    found = _from_filter(problem, model)
+    if not _is_linear(problem, model):
+        found = _best_of_loop(problem, model, found)
+    points, guide = found.best
+    return Linearised(points, _guide_of((own, guide), model=model, points=points))
+
+
+def _is_linear(problem: RecordProblem, model: Diffusion) -> bool:
+    """Whether the guide is the same along any path."""
+    dynamics = model.forward_at(problem.like)(problem.record.times[0])
+    cover = calls_for_cover(problem.initial, model, problem.like)
+    return is_linear(dynamics, problem.like) and not cover
+
+
+def _best_of_loop(problem: RecordProblem, model: Diffusion, found: _Found) -> _Found:
+    """Search from paths of particles until one is near what is seen, in a compiled loop."""
+
+    def search(state: tuple[Int[Array, ""], _Found]) -> tuple[Int[Array, ""], _Found]:
+        number, found = state
+        new = _from_particles(problem, model, number)
+        better = new.check.log_weight > found.check.log_weight
+        return number + 1, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, found)
+
+    goes_on = lambda state: ~state[1].is_near & (state[0] < _MOST_PARTICLE_STARTS)
+    return lax.while_loop(goes_on, search, (jnp.int32(0), found))[1]
+
+
+class _Start(NamedTuple):
+    """Points along which the process is first linearised, and where paths without noise begin where
+    the law of X(t_0) is not normal."""
+
+    points: Float[Array, "points d"]
+    begin: Float[Array, " d"]
+
+
+@compiled_sooner  # a program of its own, which all who read the record share
+def _from_filter(problem: RecordProblem, model: Diffusion) -> _Found:
+    """Search from the path of the extended Kalman filter."""
+    return _search(problem, model, _filter_start(problem, model))
+
+
+@compiled_sooner
+def _from_particles(problem: RecordProblem, model: Diffusion, number: Int[Array, ""]) -> _Found:
+    """Search from the path of a particle."""
+    return _search(problem, model, _particle_start(problem, model, number))
+
+
+def _filter_start(problem: RecordProblem, model: Diffusion) -> _Start:
+    """Return the path of the extended Kalman filter, from a likely point where ν is not normal."""
+    initial, scalars = initial_law(problem.initial, model, problem.like), problem.scalars(model)
+    begin = likeliest(problem.initial, model, initial, split_first(scalars)[0])
+    points = extended_kalman_path(
+        problem.density,
+        model.forward_at(problem.like),
+        initial._replace(mean=begin),
+        problem.record.steps(),
+        scalars,
+        model.state_space(),
+    )
+    return _Start(points, begin)
+
+
+def _particle_start(problem: RecordProblem, model: Diffusion, number: Int[Array, ""]) -> _Start:
+    """Return a likely path near that of a particle which stays near what is seen."""
+    key = jax.random.fold_in(key_for("tracking", jax.random.key(0)), number)
+    points = likely_path(problem, model, tracking_path(key, problem, model))
+    return _Start(points, points[0])
+
+
 class _Search(NamedTuple):
     """Of Gauss and Newton's iteration: the points of the next turn; the best so far, the log weight
     of its path without noise, and that path; the length of the step to it, and whether it is
@@ -106,24 +219,15 @@ class _Search(NamedTuple):
     over: Bool[Array, ""]
 
 
-@compiled_sooner  # a program of its own, which all who read the record share
-def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
-    """Along the path of the extended Kalman filter, and then of the path that is guided without
-    noise; both begin at a likely point where ν is not normal. The points have no derivatives, and
-    the guide none by the model.
+def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> _Found:
+    """Search from these points: linearise along the path that is guided without noise, and repeat.
 
     What counts is the weight of the path without noise: where it is large, weights fall off as
     noise leads away from it, and where it is small paths that weigh more are missed. So a turn
     counts that raises it, and steps are shortened until one does: excitable and chaotic systems
     throw Gauss and Newton's iteration off for good, and between two wells its fixed point, the
     likeliest path, guides worse than the filter's means."""
-    own, (problem, model) = problem, without_derivatives((problem, model))
-    initial = initial_law(problem.initial, model, problem.like)
-    dynamics_at, scalars = model.forward_at(problem.like), problem.scalars(model)
-    begin = likeliest(problem.initial, model, initial, _first_scalars(problem, model))
-    first = initial._replace(mean=begin)
-    steps = problem.record.steps()
-    points = extended_kalman_path(problem.density, dynamics_at, first, steps, scalars)
+    (points, begin), inside = start, model.state_space()
 
     @jax.jit  # for its shapes and in the loop traced once
     def at(points):
@@ -142,6 +246,8 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
         length = jnp.where(better, jnp.minimum(2 * search.length, 1), search.length / 2)
         points = best.points + length * (path - best.points)
         points = jnp.where(length == 1, path, points)
+        if inside is not None:
+            points = jax.vmap(functools.partial(stay_inside, inside))(best.points, points)
         over = settled | (length < _SHORTEST)
         return _Search(search.turn + 1, points, best, log_weight, path, length, over)
 
@@ -150,8 +256,9 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     zero, one = jnp.zeros((), log_weight.dtype), jnp.ones((), points.dtype)
     init = _Search(jnp.int32(0), points, nothing, zero, points, one, jnp.zeros((), bool))
     goes_on = lambda search: ~search.over & (search.turn < _MOST_TURNS)
-    points, guide = lax.while_loop(goes_on, turn, init).best
-    return Linearised(points, _guide_of((own, guide), model=model, points=points))
+    made = lax.while_loop(goes_on, turn, init)
+    check = GuideCheck(made.log_weight, _largest_residual(made.best.guide))
+    return _Found(made.best, check)
 
 
 @eqx.filter_custom_jvp

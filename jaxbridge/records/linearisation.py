@@ -3,16 +3,17 @@
 From ξ_i a step goes to N(ξ_i + A_i u + a_i, Λ_i Λ_iᵀ), where u = x - ξ_i and A is the derivative of
 the mean: what the law of a step is for states near the path. The path is that of the extended
 Kalman filter, and then, a few times, the path without noise that is guided along the last one:
-Gauss and Newton's iteration for the most likely path (Bell 1994), with steps that are shortened
-where it would lead away (Särkkä & Svensson 2020).
+Gauss and Newton's iteration for the most likely path (Bell 1994; `guide_search`).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..engine.linalg import matmul, matvec
 from ..models.dynamics import Dynamics, DynamicsAt
@@ -21,6 +22,9 @@ from .observation import Scalars
 from .record import Steps
 from .segments import at_every_step, flat, split_first
 from .tilted_step import NormalStep
+
+# Shares of a step that would leave the state space, of which the first that does not counts.
+_SHARES = 2.0 ** -np.arange(12)
 
 
 class LinearisedStep(NamedTuple):
@@ -65,24 +69,44 @@ def extended_kalman_path(
     initial: NormalStep,
     steps: Steps,
     scalars: Scalars,
+    inside: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
 ) -> Float[Array, "points d"]:
     """The means of the extended Kalman filter, where these are finite, else the last ones that
-    are."""
+    are. A step that would leave the state space is shortened."""
+
+    def checked(new, old):
+        mean, covariance = _finite(new, old)
+        return (mean if inside is None else stay_inside(inside, old[0], mean)), covariance
 
     def step(state, inputs):
         (mean, covariance), ((dt, time), seen) = state, inputs
         law = linear_step(density, dynamics_at(time), mean, jnp.zeros_like(mean), dt)
         spread = matmul(law.root, law.root.T)
         moved = matmul(matmul(law.decay, covariance), law.decay.T) + spread
-        before = _finite((law.shift, moved), state)
-        return _finite(filtered(before[0], before[1], seen), before), mean
+        before = checked((law.shift, moved), state)
+        return checked(filtered(*before, seen), before), mean
 
     mean, root = initial
     first, rest = split_first(scalars)
-    state = filtered(mean, matmul(root, root.T), first)
+    before = mean, matmul(root, root.T)
+    state = checked(filtered(*before, first), before)
     inputs = flat(steps), at_every_step(rest, steps.dt.shape[1])
     (last, _), means = lax.scan(step, state, inputs)
     return jnp.concatenate([means, last[None]])
+
+
+def stay_inside(
+    inside: Callable[[Float[Array, " d"]], Bool[Array, ""]],
+    old: Float[Array, " d"],
+    new: Float[Array, " d"],
+) -> Float[Array, " d"]:
+    """Return `new` if it is inside of the state space, else a point on the way to it from `old`,
+    about half as far as the boundary: near a boundary noise may vanish, and with it the linear
+    process."""
+    shares = jnp.asarray(_SHARES, old.dtype)
+    are_inside = jax.vmap(lambda share: inside(old + share * (new - old)))(shares)
+    share = jnp.where(jnp.any(are_inside), shares[jnp.argmax(are_inside)] / 2, 0)
+    return jnp.where(inside(new), new, old + share * (new - old))
 
 
 def _finite(new, old):

@@ -1,0 +1,106 @@
+"""A path of the diffusion that stays near what is seen, to start the search for a guide from.
+
+Where the extended Kalman filter is thrown off (a first state that is hardly known, between two
+wells or on an unstable branch; spikes), the path of its means is far from every path that explains
+what is seen. Particles go several ways, and those that come near what is seen go on. They need not
+come as near as the noise of the observations asks: weights are tempered at each observation, so
+that several particles count at all of them.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int, Key
+
+from ..engine.averages import normalised, proper
+from ..engine.lanes import over_lanes
+from ..engine.linalg import dot, matvec
+from ..models.diffusion import Diffusion
+from .guided_steps import target_law
+from .initial import initial_law, log_ratio
+from .observation import Scalars
+from .problem import RecordProblem
+from .segments import split_first
+
+# How many particles there are, and how many of them are within a standard deviation of what is
+# seen, once its noise is taken to be as large as it must be for that.
+_NUM_PARTICLES, _NUM_NEAR = 64, 8
+
+
+def tracking_path(
+    key: Key[Array, ""], problem: RecordProblem, model: Diffusion
+) -> Float[Array, "points d"]:
+    """Return the path of a particle of a filter with tempered weights, which has followed all that
+    is seen. It may hold NaN if all particles are lost."""
+    P, N, (d,), dtype = _NUM_PARTICLES, problem.num_steps, problem.like.shape, problem.like.dtype
+    dynamics_at, inside = model.forward_at(problem.like), model.state_space()
+    first, rest = split_first(problem.scalars(model))
+    initial = initial_law(problem.initial, model, problem.like)
+
+    def log_weights(x, scalars: Scalars):
+        log_weight = _tempered(over_lanes(-1)(lambda x: _misfit(scalars, x))(x))
+        finite = jnp.all(jnp.isfinite(x), axis=0)
+        if inside is not None:
+            finite &= over_lanes(-1)(inside)(x)
+        return jnp.where(finite, log_weight, -jnp.inf)
+
+    def one(x, inputs):
+        zeta, step = inputs
+
+        def of_particle(x, zeta):
+            law = target_law(problem.density, dynamics_at, x, step)
+            return law.mean + matvec(law.root, zeta)
+
+        x = over_lanes(-1, -1)(of_particle)(x, zeta)
+        return x, x
+
+    def segment(x, inputs):
+        number, steps, scalars = inputs
+        noise_key, uniform_key = jax.random.split(jax.random.fold_in(key, number))
+        zeta = jax.random.normal(noise_key, (N, d, P), dtype)
+        x, path = lax.scan(one, x, (zeta, steps))
+        parents = _parents(uniform_key, log_weights(x, scalars))
+        return x[:, parents], (path, parents)
+
+    start_key, uniform_key = jax.random.split(jax.random.fold_in(key, 0))
+    zeta = jax.random.normal(start_key, (d, P), dtype)
+    starts = over_lanes(-1)(lambda zeta: initial.mean + matvec(initial.root, zeta))(zeta)
+    ratio = over_lanes(-1)(lambda x: log_ratio(problem.initial, model, initial, x))(starts)
+    parents = _parents(uniform_key, log_weights(starts, first) + proper(ratio))
+    inputs = 1 + jnp.arange(problem.num_segments), problem.record.steps(), rest
+    _, (paths, later) = lax.scan(segment, starts[:, parents], inputs)
+
+    def back(lane, inputs):
+        path, parents = inputs
+        lane = parents[lane]
+        return lane, path[..., lane]
+
+    lane, path = lax.scan(back, jnp.int32(0), (paths, later), reverse=True)
+    begin = starts[:, parents[lane]]
+    return jnp.concatenate([begin[None], path.reshape(-1, d)])
+
+
+def _misfit(scalars: Scalars, x: Float[Array, " d"]) -> Float[Array, ""]:
+    """Return the sum of the squared residuals, in variances of the noise. Exact numbers have that
+    of their rounding."""
+    total, eps = jnp.zeros((), x.dtype), jnp.finfo(x.dtype).eps
+    for row, value, variance, seen in zip(*scalars, strict=True):
+        size = jnp.abs(value) + 1
+        each = (value - dot(row, x)) ** 2 / jnp.maximum(variance, eps * size**2)
+        total += jnp.where(seen, each, 0)
+    return total
+
+
+def _tempered(misfits: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
+    """Return log weights of which several count, whatever the noise."""
+    near = jnp.sort(jnp.where(jnp.isnan(misfits), jnp.inf, misfits))[_NUM_NEAR]
+    return -misfits / (2 * jnp.maximum(near, 1))
+
+
+def _parents(key: Key[Array, ""], log_weights: Float[Array, " lanes"]) -> Int[Array, " lanes"]:
+    """Return the lanes that go on, by systematic resampling."""
+    P, dtype = len(log_weights), log_weights.dtype
+    bounds = jnp.cumsum(normalised(proper(log_weights)))
+    positions = (jax.random.uniform(key, (), dtype) + jnp.arange(P, dtype=dtype)) / P
+    lanes = jnp.searchsorted(bounds / jnp.maximum(bounds[-1], jnp.finfo(dtype).tiny), positions)
+    return jnp.minimum(lanes, P - 1).astype(jnp.int32)
