@@ -241,7 +241,8 @@ def gibbs(
         start = (theta, first_root(covariance, log_prior, unknown)) if state is None else state
         num_warmup = check_count("num_warmup", 500 if num_warmup is None else num_warmup, 0)
         size = (num_warmup, num_iterations, thin)
-        return sample_records(key, parameters, records, log_prior, start, size, progress_meter)
+        how = size, covariance is None, progress_meter
+        return sample_records(key, parameters, records, log_prior, start, *how)
     for_records = {"initial": initial, "initial_time": initial_time}
     check_no_record(num_warmup=num_warmup, covariance=covariance, **for_records)
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)

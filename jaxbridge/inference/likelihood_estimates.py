@@ -21,7 +21,8 @@ from ..proposals import AbstractWeightedProposal
 from ..records import Filtered, guided, half_will_do, rate_for_several, run_filters
 from ..schemes import share_of_grid
 from .blocks import Block, with_keys
-from .record_paths import GuidedRecords, guided_near, on_both_grids
+from .parameters import Parameters
+from .record_paths import GuidedRecords, guided_near, likely_root, on_both_grids
 
 # At least so many filters at each of several parameters, and so many particles, are a pilot.
 _FEWEST_FILTERS, _FEWEST_PARTICLES = 16, 128
@@ -78,6 +79,17 @@ class AbstractLikelihood(eqx.Module):
         to, `around` it, for the models `at` these: leaves may change, and no shapes, for both are
         states of one loop."""
 
+    @abstractmethod
+    def likely_root(
+        self,
+        parameters: Parameters,
+        log_prior: Callable[[Array], Array],
+        theta: Float[Array, " p"],
+        root: Float[Array, "p p"],
+    ) -> Float[Array, "p p"]:
+        """S of first moves from θ that are as wide as the likelihood, where that is known without
+        random numbers; else the given one. Asked for where there is a `guide`."""
+
     @property
     @abstractmethod
     def guide(self) -> Guide | None:
@@ -129,6 +141,9 @@ class TransitionLikelihood(AbstractLikelihood):
 
     def near(self, key, at, theta, around):
         return self
+
+    def likely_root(self, parameters, log_prior, theta, root):
+        return root
 
     @property
     def guide(self):
@@ -184,6 +199,9 @@ class RecordLikelihood(AbstractLikelihood):
             return jax.vmap(one)(keys, around)
 
         return RecordLikelihood(fine, coarse, rate_for_several(pilots, records, P), P)
+
+    def likely_root(self, parameters, log_prior, theta, root):
+        return likely_root(parameters, self.fine, log_prior, theta, root)
 
     @property
     def guide(self):

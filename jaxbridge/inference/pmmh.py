@@ -7,7 +7,7 @@ the step error. Proposals are normal random walks, whose covariance S Sᵀ is le
 
     S Sᵀ ← S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,    η_i = min(1, p i^(-2/3)),
 
-from the acceptance rates α_i (Vihola 2012), and fixed thereafter.
+from the acceptance rates α_i (Vihola 2012; `parameter_walk`), and fixed thereafter.
 """
 
 from collections.abc import Callable
@@ -51,9 +51,11 @@ from .parameter_walk import first_root, learnt
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
+    check_likelihood_was_found,
     drawn,
     first_chain,
     over_chains,
+    refused_moves,
     starting_points,
     step_errors_of_some,
 )
@@ -70,6 +72,11 @@ _NOISY = (
 _TRUNCATED = (
     "Weights were cut off by `max_trials` in more than 1 % of the iterations, so that the law is "
     "not exact. Allow more trials, or choose another `proposal`."
+)
+_NOISY_IN_PART = (
+    "In a tenth of the draws the variance of the log-likelihood estimates is above 5: where it is "
+    "large a chain seldom goes and then stays, so that a tail may not have been visited and errors "
+    "are too small. Take more `num_proposals`."
 )
 # For so many parameters it is decided how likelihoods are estimated.
 _NUM_LIKELY = 8
@@ -124,6 +131,8 @@ class PMMHPosterior(AbstractPosterior):
         than three, the chain holds on to lucky estimates and hardly moves: take as many times more
         `num_proposals`, or a better `proposal`; far below, fewer make iterations cheaper. Infinite
         where weights were cut off (`num_truncated`), and with one proposal.
+    - `variance_in_part`: what the variance of these estimates exceeds in a tenth of the draws,
+        shape (*chains,).
     - `log_step_error`: an estimate of the step error of each of these, NaN where none was worked
         out, shape (*chains, n): what `step_error`, that of the posterior mean, is made of.
     - `sigma_varies`: whether σ depends on the state.
@@ -141,6 +150,7 @@ class PMMHPosterior(AbstractPosterior):
     names: tuple[str, ...] = eqx.field(static=True)
     log_likelihood: Float[Array, "*chains n"]
     log_likelihood_variance: Float[Array, "*chains"]
+    variance_in_part: Float[Array, "*chains"]
     log_step_error: Float[Array, "*chains n"]
     sigma_varies: bool = eqx.field(static=True)
     accepted: Bool[Array, "*chains n"]
@@ -149,14 +159,27 @@ class PMMHPosterior(AbstractPosterior):
     state: PMMHState
 
     @property
+    def stuck(self) -> Bool[Array, "*chains"]:
+        """Whether a chain never moved, shape (*chains,): then its draws are not those of the
+        posterior, `effective_sample_size` is zero and `standard_error` infinite."""
+        return ~jnp.any(self.accepted, axis=-1)
+
+    @property
     def _stuck(self):
-        return False
+        return self.stuck
 
     @property
     def _faults(self):
         noisy = ~jnp.all(self.log_likelihood_variance < _MOST_VARIANCE)
-        often = jnp.any(self.num_truncated > _MOST_TRUNCATED * self.accepted.shape[-1])
-        return Fault(noisy, _NOISY), Fault(often, _TRUNCATED)
+        share = self.num_truncated.astype(self.theta.dtype) / self.accepted.shape[-1]
+        often = jnp.any(share > _MOST_TRUNCATED)
+        in_part = ~noisy & ~jnp.all(self.variance_in_part < _MOST_VARIANCE)
+        return (
+            refused_moves(self.accepted),
+            Fault(noisy, _NOISY),
+            Fault(in_part, _NOISY_IN_PART),
+            Fault(often, _TRUNCATED),
+        )
 
 
 @door
@@ -204,7 +227,8 @@ def pmmh(
         depends on the parameters.
     - `covariance`: of the first proposals, shape (p,) for a diagonal or (p, p), in the order of the
         result's `names`, which is that of `jax.tree.leaves(params)`; by default a tenth of the
-        prior's standard deviations, or a tenth of θ where the prior is not normal.
+        prior's standard deviations, or a tenth of θ where the prior is not normal, and of records
+        with an `observation` as wide as the likelihood is.
     - `init`: unknown parameters to start from, or the `state` of earlier draws, which go on with
         the proposals of paths, and their bounds, that they had, or with what guided their filters.
         Another `proposal` than "auto" takes the place of theirs; the estimate that the chain holds
@@ -220,7 +244,8 @@ def pmmh(
 
     **Returns:** `PMMHPosterior`. Not differentiable.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for arguments that do not fit; `ValueError` where a
+    chain never came to parameters whose likelihood is finite.
 
     **Example:**
 
@@ -274,7 +299,8 @@ def pmmh(
     sampler = _Sampler(parameters, likelihood, log_prior)
     start = (theta, root) if state is None else state
     size = (num_warmup, num_iterations, thin)
-    made = _run(run_key, sampler, start, size, progress_meter)
+    made = _run(run_key, sampler, start, size, covariance is None, progress_meter)
+    check_likelihood_was_found(jnp.all(made.log_likelihood == -jnp.inf, axis=-1))
     return replace(made, state=made.state._replace(proposals=likelihood.proposals))
 
 
@@ -359,6 +385,13 @@ class _Sampler(eqx.Module):
         allowed = jax.vmap(self.parameters.allowed)(moved)
         return jnp.where(allowed[:, None], moved, theta[which])
 
+    def likely_root(self, chain: _Chain) -> Float[Array, "*chains p p"]:
+        """S of all chains, as wide as the likelihood where the first is."""
+        theta, root = first_chain(chain.theta), chain.root
+        one = root.reshape(-1, *root.shape[-2:])[0]
+        made = self.likelihood.likely_root(self.parameters, self.log_prior, theta, one)
+        return jnp.broadcast_to(made, root.shape)
+
     def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Estimate:
         return self.likelihood.estimate(key, self.parameters.bind(theta))
 
@@ -404,9 +437,11 @@ def _run(
     sampler: _Sampler,
     start: tuple[Float[Array, "*chains p"], Float[Array, "p p"]] | PMMHState,
     size: tuple[int, int, int],
+    finds_root: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> PMMHPosterior:
-    """After so many iterations of the warm-up, so many draws, with so many iterations each."""
+    """After so many iterations of the warm-up, so many draws, with so many iterations each. The
+    first moves of θ are by the root of `start`, or as wide as the likelihood if it `finds_root`."""
     sampler, start = nondifferentiable((sampler, start))
     fresh = not isinstance(start, PMMHState)
     num_warmup, num_iterations, thin = size
@@ -422,6 +457,10 @@ def _run(
         if guide is not None:
             pilot_key = jax.random.fold_in(key_for("pilots", key), run.num_done)
             near = sampler.near(pilot_key, run.chain)
+            if finds_root:
+                found = lambda chain: near.likely_root(chain)  # `cond` hashes it
+                root = lax.cond(i == 0, found, lambda chain: chain.root, run.chain)
+                run = run._replace(chain=run.chain._replace(root=root))
         # An estimate by the guide before may be a lucky one, which a chain would hold on to.
         first_key = jax.random.fold_in(key, -run.num_done)  # iterations have positive numbers
         chain = over_chains(near.start, first_key, (run.chain.theta, run.chain.root))
@@ -458,6 +497,7 @@ def _run(
         **fields,
         log_likelihood=log_likelihood,
         log_likelihood_variance=jnp.median(held.variance, axis=0),
+        variance_in_part=jnp.quantile(held.variance, 0.9, axis=0, method="lower"),
         log_step_error=of_likelihood,
         sigma_varies=sampler.parameters.model.sigma_varies(sampler.likelihood.like),
         accepted=accepted,

@@ -33,6 +33,13 @@ _FEW = (
     "Fewer than 25 effective draws of some parameter: its mean and its error are not determined. "
     "Take more `num_iterations`."
 )
+# A walk that is refused more often is not adapted, or estimates are too noisy.
+_LEAST_ACCEPTED = 0.05
+_REFUSED = (
+    "Fewer than one in twenty of the proposed parameters were accepted in some chain: it stays "
+    "where it is for long, and its errors are too small where it has not been. Take more "
+    "`num_warmup`, start nearer by `init=`, or give the first `covariance` of the moves."
+)
 _STUCK = (
     "A parameter, or a block of the path, never moved. Take more `num_iterations`, or start from "
     "likelier parameters by `init=`."
@@ -81,8 +88,15 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def effective_sample_size(self) -> Float[Array, " p"]:
-        """Of each unknown parameter, from all chains: few where they disagree."""
-        return effective_size_of_chains(self._chains)
+        """Of each unknown parameter, from all chains: few where they disagree, and zero where it,
+        or a path that is drawn with it, never moved in one of the chains."""
+        return jnp.where(self._moved, effective_size_of_chains(self._chains), 0)
+
+    @property
+    def _moved(self) -> Bool[Array, " p"]:
+        """Whether each parameter moved in all chains, and all that is drawn with it."""
+        moved = jnp.all(jnp.any(self._chains != self._chains[:, :1], axis=1), axis=0)
+        return moved & ~jnp.any(jnp.asarray(self._stuck))
 
     @property
     def r_hat(self) -> Float[Array, " p"]:
@@ -108,10 +122,8 @@ class AbstractPosterior(AbstractResult):
         """The Monte Carlo error of the posterior mean of each unknown parameter; infinite where it,
         or a path that is drawn with it, never moved in one of the chains."""
         draws = self.theta.reshape(-1, self.theta.shape[-1])
-        moved = jnp.all(jnp.any(self._chains != self._chains[:, :1], axis=1), axis=0)
-        moved &= ~jnp.any(jnp.asarray(self._stuck))
         made = jnp.std(draws, axis=0) / jnp.sqrt(self.effective_sample_size)
-        return jnp.where(moved, made, jnp.inf)
+        return jnp.where(self._moved, made, jnp.inf)
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:
@@ -155,6 +167,23 @@ class AbstractPosterior(AbstractResult):
         if int(arviz.__version__.split(".")[0]) >= 1:
             return arviz.from_dict({"posterior": posterior})
         return arviz.from_dict(posterior=posterior)
+
+
+def refused_moves(accepted: Bool[Array, "*chains n"]) -> Fault:
+    """Return the fault of a random walk of which hardly any move is accepted."""
+    return Fault(jnp.any(jnp.mean(accepted, axis=-1) < _LEAST_ACCEPTED), _REFUSED)
+
+
+def check_likelihood_was_found(never: Bool[Array, "*chains"]) -> None:
+    """Raise `ValueError` where a chain `never` came to parameters and paths whose likelihood is
+    finite; under `jit` the draws are flagged instead."""
+    if not is_traced(never) and (stuck := np.flatnonzero(np.asarray(never))).size:
+        raise ValueError(
+            f"the likelihood at the parameters to start from is zero, guided by all observations "
+            f"too, and none of the moves found a positive one (chain {stuck[0]} of {never.size}). "
+            "Start from likelier parameters by `init=` or the model's `params`, take more "
+            "`num_steps`, or allow for outliers in the noise of the observations."
+        )
 
 
 def starting_points(

@@ -35,9 +35,11 @@ from .parameter_walk import learnt
 from .parameters import Parameters
 from .posterior import (
     AbstractPosterior,
+    check_likelihood_was_found,
     drawn,
     first_chain,
     over_chains,
+    refused_moves,
     step_errors_of_some,
 )
 from .priors import GivenDensity, NormalDensity
@@ -45,6 +47,7 @@ from .record_paths import (
     At,
     RecordPaths,
     as_record_paths,
+    likely_root,
     movable,
     no_paths,
     share_of_step_error,
@@ -111,7 +114,7 @@ class RecordPosterior(AbstractPosterior):
 
     @property
     def _faults(self):
-        return ()
+        return (refused_moves(self.parameters_moved),)
 
 
 class RecordSampler(eqx.Module):
@@ -133,9 +136,9 @@ class RecordSampler(eqx.Module):
 
     def step(
         self, key: Key[Array, ""], guided: GuidedState, learning: Bool[Array, ""]
-    ) -> tuple[GuidedState, tuple[Bool[Array, ""], Bool[Array, "R 2 B 1"]]]:
+    ) -> tuple[GuidedState, tuple[Bool[Array, ""], Bool[Array, ""], Bool[Array, "R 2 B 1"]]]:
         """The paths given θ, then θ given ξ; both learn the size of their moves. Whether θ moved,
-        and which blocks."""
+        whether paths have a weight, and which blocks moved."""
         path_key, noise_key, walk_key, accept_key = jax.random.split(key, 4)
         state, guides = guided
         theta, log_scales = state.theta, state.log_scales
@@ -163,7 +166,8 @@ class RecordSampler(eqx.Module):
             jnp.where(learning, scales, log_scales),
             number,
         )
-        return GuidedState(moved, guides), (accepted, taken)
+        has_weight = proper(jnp.where(accepted, new_weight, log_weight)) > -jnp.inf
+        return GuidedState(moved, guides), (accepted, has_weight, taken)
 
     def log_ratio(self, key: Key[Array, ""], guided: GuidedState) -> Float[Array, ""]:
         """log w̃ / w, of steps of twice the length."""
@@ -173,7 +177,6 @@ class RecordSampler(eqx.Module):
         return jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
 
 
-@compiled_sooner
 def sample_records(
     key: Key[Array, ""],
     parameters: Parameters,
@@ -181,9 +184,32 @@ def sample_records(
     log_prior: NormalDensity | GivenDensity,
     start: tuple[Float[Array, "*chains p"], Float[Array, "p p"]] | RecordState,
     size: tuple[int, int, int],
+    finds_root: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> RecordPosterior:
-    """After so many iterations of the warm-up, so many draws, with so many iterations each."""
+    """After so many iterations of the warm-up, so many draws, with so many iterations each. The
+    first moves of θ are by the root of `start`, or as wide as the likelihood if it `finds_root`.
+
+    **Raises:** `ValueError` where no paths with a weight were found.
+    """
+    arguments = (key, parameters, records, log_prior, start, size, finds_root, progress_meter)
+    posterior, never = _sample_records(*arguments)
+    check_likelihood_was_found(never)
+    return posterior
+
+
+@compiled_sooner
+def _sample_records(
+    key: Key[Array, ""],
+    parameters: Parameters,
+    records: Records,
+    log_prior: NormalDensity | GivenDensity,
+    start: tuple[Float[Array, "*chains p"], Float[Array, "p p"]] | RecordState,
+    size: tuple[int, int, int],
+    finds_root: bool,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> tuple[RecordPosterior, Bool[Array, "*chains"]]:
+    """The posterior, and which chains never found paths with a weight."""
     parameters, records, log_prior, start = nondifferentiable(
         (parameters, records, log_prior, start)
     )
@@ -196,10 +222,16 @@ def sample_records(
         state = guided.state
         completion = as_record_paths(parameters, records, first_chain(state.theta))
         sampler = RecordSampler(completion, log_prior)
+
+        def first(state):
+            root = state.root
+            if finds_root:
+                of_chain = first_chain(state.theta), root.reshape(-1, *root.shape[-2:])[0]
+                made = likely_root(parameters, completion.fine, log_prior, *of_chain)
+                root = jnp.broadcast_to(made, root.shape)
+            return over_chains(sampler.start, jax.random.fold_in(key, 0), (state.theta, root))
+
         if fresh:
-            first = lambda state: over_chains(
-                sampler.start, jax.random.fold_in(key, 0), (state.theta, state.root)
-            )
             state = lax.cond(i == 0, first, lambda state: state, state)
         return GuidedState(state, _guides_of(completion, state.theta)), sampler
 
@@ -219,21 +251,22 @@ def sample_records(
             step = lambda key, guided: sampler.step(key, guided, i < num_warmup)
             return over_chains(step, jax.random.fold_in(key, number(guided) + 1), guided)
 
-        guided, (moved, taken) = lax.scan(iterate, guided, i * thin + jnp.arange(thin))
+        made = lax.scan(iterate, guided, i * thin + jnp.arange(thin))
+        guided, (moved, has_weight, taken) = made
         theta = guided.state.theta
         share = jnp.mean(taken.astype(theta.dtype), axis=0)
-        made = theta, jnp.any(moved, axis=0), share[..., 0], log_ratios(sampler, i, guided)
-        return guided, made
+        weights = jnp.any(has_weight, axis=0), log_ratios(sampler, i, guided)
+        return guided, (theta, jnp.any(moved, axis=0), share[..., 0], *weights)
 
     bounds = stages(skipped if fresh else 0, skipped + num_iterations)
     state = _not_begun(records, *start) if fresh else start
     init = GuidedState(state, _no_guides(parameters, records, state.theta))
     (state, _), draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
-    fields, (moved, taken, log_ratio) = drawn(parameters, *draws)
+    fields, (moved, taken, has_weight, log_ratio) = drawn(parameters, *draws)
     real = movable(records)
     ever = jnp.any(taken > 0, axis=-4)  # of all draws
     change = relative_change(log_ratio, jnp.nanmedian(log_ratio))
-    return RecordPosterior(
+    posterior = RecordPosterior(
         **fields,
         parameters_moved=moved,
         blocks_moved=jnp.mean(taken, axis=(-3, -2, -1), where=real),
@@ -242,6 +275,7 @@ def sample_records(
         sigma_varies=parameters.model.sigma_varies(records.stacked.like),
         state=state,
     )
+    return posterior, ~jnp.any(has_weight, axis=-1)
 
 
 def _not_begun(

@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
+from ..engine.averages import proper
 from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
 from ..records import (
@@ -41,6 +42,9 @@ from .parameters import Parameters
 # Intervals between observations that move at once.
 _BLOCK_LENGTH = 10
 
+
+# How often the width of the likelihood is found anew from the last, and by which factors.
+_NUM_SECANTS, _SECANT = 6, (1 / 16, 8.0)
 
 # What says nothing about bridges.
 _USUAL = {"proposal": "auto", "bridges": "exact", "method": "gradient"}
@@ -223,6 +227,42 @@ def as_record_paths(
     """Linearised at θ."""
     grids = guided_near(records, records.coarsened(), parameters.bind(theta))
     return RecordPaths(parameters, *grids)
+
+
+def likely_root(
+    parameters: Parameters,
+    grid: GuidedRecords,
+    log_prior: Callable[[Array], Array],
+    theta: Float[Array, " p"],
+    root: Float[Array, "p p"],
+) -> Float[Array, "p p"]:
+    """Return S of first moves that are as wide as the posterior of each parameter given the others.
+
+    The likelihood is that of the guided path without noise, which is exact but for a constant
+    where the model is linear. The width h is where the mean of the log densities at θ ± h is ½
+    below that at θ, at most what the prior spans, ten times `root`; it is found by a few secants,
+    which needs no derivatives and takes any start. `root` is kept where the path has no weight.
+    """
+    points, p = grid.points, theta.shape[0]
+
+    def log_density(theta):
+        model = parameters.bind(theta)
+        _, log_weight = _of_noise(grid.records, model, _guides(grid, model), jnp.zeros_like(points))
+        allowed = parameters.allowed(theta)
+        return jnp.where(allowed, proper(log_weight) + log_prior(theta), -jnp.inf)
+
+    def turn(width, _):
+        steps = jnp.diag(width)
+        values = lax.map(log_density, jnp.concatenate([theta[None], theta + steps, theta - steps]))
+        drop = values[0] - (values[1 : p + 1] + values[p + 1 :]) / 2
+        factor = jnp.clip(lax.rsqrt(2 * jnp.maximum(drop, 1e-3)), *_SECANT)
+        factor = jnp.where(values[0] > -jnp.inf, factor, 1)
+        return jnp.minimum(width * factor, 10 * jnp.diagonal(root)), values[0]
+
+    first = jnp.diagonal(root)
+    width, values = lax.scan(turn, first, length=_NUM_SECANTS)
+    width = width * np.asarray(2.4 / np.sqrt(p), theta.dtype)
+    return jnp.where(values[0] > -jnp.inf, jnp.diag(width), root)
 
 
 def _guides(grid: GuidedRecords, model: Diffusion) -> Guidance:
