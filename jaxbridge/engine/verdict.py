@@ -6,6 +6,7 @@ error, chains that disagree. Each result collects its faults in one `Verdict`, a
 time.
 """
 
+import math
 from abc import abstractmethod
 from functools import reduce
 from typing import TypeVar
@@ -54,6 +55,8 @@ _LOST = (
 # A larger share of lost paths is a fault. They are proposals, of which the diffusion has more than
 # the proposal where the boundary is attained: with 3 % lost half of the mass may be missing.
 _MOST_LOST = 0.02
+
+_FEWEST_IN_SUM = 5
 
 
 class Fault(eqx.Module):
@@ -148,6 +151,18 @@ def heavy_tails(k: Float[Array, "*I"], effective: Float[Array, "*I"] | float) ->
     """Return the fault of weights whose mean a few large ones decide, by their Pareto shape and
     their effective number."""
     return Fault(~is_reliable(k, effective), _HEAVY)
+
+
+def heavy_tails_in_sum(k: Float[Array, " I"], effective: Float[Array, " I"]) -> Fault:
+    """Return the fault of a sum over intervals, each with weights of its own.
+
+    Of many intervals some look unreliable by chance, and each adds an error of its own size, while
+    the statistical error of the sum grows as √I: up to √I / 4 of them do not matter, if none has
+    fewer than five effective weights.
+    """
+    unreliable = jnp.sum(~is_reliable(k, effective))
+    hopeless = jnp.any(~(effective >= _FEWEST_IN_SUM))
+    return Fault((unreliable > math.isqrt(k.size) // 4) | hopeless, _HEAVY)
 
 
 def _located(fault: Fault) -> str:

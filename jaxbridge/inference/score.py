@@ -26,7 +26,7 @@ from ..engine.verdict import (
     AbstractResult,
     Fault,
     Verdict,
-    heavy_tails,
+    heavy_tails_in_sum,
     missing_bridges,
     truncated_weights,
 )
@@ -83,11 +83,10 @@ class Score(AbstractResult):
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:
-        heavy = heavy_tails(self.pareto_k, self.effective_sample_size)
         return (
             missing_bridges(self.num_missing > 0),
             truncated_weights(self.num_truncated > 0),
-            Fault(jnp.any(heavy.present), heavy.sentence),
+            heavy_tails_in_sum(self.pareto_k, self.effective_sample_size),
         )
 
 

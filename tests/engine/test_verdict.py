@@ -13,6 +13,7 @@ from jaxbridge.engine.verdict import (
     Fault,
     Verdict,
     heavy_tails,
+    heavy_tails_in_sum,
     lost_paths,
     throw_where_untrustworthy,
 )
@@ -59,6 +60,15 @@ def test_throwing_says_the_first_fault():
 def test_heavy_tails():
     k = jnp.array([0.2, 0.9, 0.2, jnp.nan])
     assert heavy_tails(k, jnp.array([99.0, 99.0, 4.0, 99.0])).present.tolist() == [0, 1, 1, 1]
+
+
+def test_heavy_tails_in_a_sum_are_counted():
+    """Of 100 intervals two may look so by chance, unless few paths have all the weight of one."""
+    k, size = jnp.full(100, 0.2), jnp.full(100, 99.0)
+    assert not heavy_tails_in_sum(k.at[:2].set(0.9), size).present
+    assert heavy_tails_in_sum(k.at[:3].set(0.9), size).present
+    assert heavy_tails_in_sum(k, size.at[0].set(3.0)).present
+    assert heavy_tails_in_sum(k[:1].at[0].set(0.9), size[:1]).present
 
 
 def test_every_result_has_a_verdict():
