@@ -186,8 +186,8 @@ def _held(operands: list, form: AbstractForm, lanes: int) -> list:
     """The operands as values of their own, those of them that are of one floating dtype. XLA's CPU
     compiler drops barriers before it fuses, and then computes a function of a function's value
     anew for each number that the outer one reads; through a product of matrices it does not fuse,
-    and I x is x. There 0 · ∞ is NaN: numbers go through as halves, ∞ as the least power of two of
-    which the double is infinite, and come out doubled."""
+    and I x is x. It is linear, for what is held may be tangents; but 0 · ∞ is NaN, so that one
+    infinite number of a lane makes NaN of the others that are held with it."""
     arrays = [form.join(operand, lanes) if form.is_own(operand) else None for operand in operands]
     floats = [a for a in arrays if a is not None and jnp.issubdtype(a.dtype, jnp.floating)]
     alike = [a for a in floats if a.dtype == floats[0].dtype]
@@ -196,9 +196,7 @@ def _held(operands: list, form: AbstractForm, lanes: int) -> list:
 
     def times_identity(*arrays):
         rows = jnp.concatenate([array.reshape(-1, lanes) for array in arrays])
-        most = 2.0 ** (jnp.finfo(rows.dtype).maxexp - 1)
-        doubled = 2 * jnp.eye(len(rows), dtype=rows.dtype)
-        rows = jnp.dot(doubled, jnp.clip(rows / 2, -most, most))
+        rows = jnp.dot(jnp.eye(len(rows), dtype=rows.dtype), rows)
         each = jnp.split(rows, np.cumsum([array.size // lanes for array in arrays])[:-1])
         return tuple(row.reshape(array.shape) for row, array in zip(each, arrays, strict=True))
 

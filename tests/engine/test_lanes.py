@@ -223,14 +223,13 @@ def test_a_function_of_a_held_value_computes_that_once():
         _assert_close(slope, jax.grad(lambda x: jnp.sum(plain(x)))(points))
 
 
-def test_what_is_held_stays_as_it_is():
-    """Infinite numbers do not reach their neighbours, and large and small ones keep their value."""
-    largest = jnp.finfo(jnp.float32).max
-    points = jnp.array([[jnp.inf, 1.0], [-jnp.inf, largest], [-largest, 3e-38]]).T
-    held = jax.jit(over_lanes(-1)(jax.lax.optimization_barrier))(points)
-    np.testing.assert_array_equal(held, points)
-    slope = jax.grad(lambda x: jnp.sum(over_lanes(-1)(jax.lax.optimization_barrier)(x)[1]))(points)
-    np.testing.assert_array_equal(slope, [[0, 0, 0], [1, 1, 1]])
+def test_what_is_held_can_be_tangents():
+    """Reverse mode transposes them."""
+    points = jnp.array([[1.0, 2.0], [3.0, 4.0]])
+    (transposed,) = jax.linear_transpose(over_lanes(-1)(jax.lax.optimization_barrier), points)(
+        points
+    )
+    np.testing.assert_array_equal(transposed, points)
 
 
 @pytest.mark.parametrize("width", [8, 16, 32])
