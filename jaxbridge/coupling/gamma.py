@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..engine.arguments import check_function
+from ..engine.captured import Captured
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import dot
 from ..schemes import AbstractScheme, Euler, Frame, HeunOrEuler
@@ -68,6 +69,7 @@ class Coupling(AbstractCoupling):
     rotation: Rotation | None = eqx.field(static=True)
     independent_noise: bool = eqx.field(static=True)
     _gamma_law: Callable | None = eqx.field(static=True)
+    _captured: Captured
 
     def __init__(
         self,
@@ -93,6 +95,7 @@ class Coupling(AbstractCoupling):
                 raise TypeError(f"`{name}` must be a `{kind.__name__}`; got {given!r}.")
         self.rotation = rotation
         self._gamma_law = law
+        self._captured = Captured(law)
         reflection = False
         if self.gamma.ndim != 0:
             raise ValueError(
@@ -130,7 +133,8 @@ class Coupling(AbstractCoupling):
     def realise(self, keys):
         if self._gamma_law is None:
             return self
-        gamma = jax.vmap(self._gamma_law)(keys)
+        law = self._gamma_law
+        gamma = jax.vmap(lambda key: self._captured.call(law, key))(keys)
         return eqx.tree_at(lambda c: c.gamma, self, _in_range(gamma.astype(self.gamma.dtype)))
 
     def _turn(self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None):

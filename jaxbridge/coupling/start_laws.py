@@ -15,7 +15,7 @@ path in the proposal, which has the density p*_T(b, ·) = ν(·) p_T(·, b) / ν
 It needs μ = 0 wherever ν = 0, π_μ > 0 and, for a finite variance, about ∫ μ²/ν < ∞.
 """
 
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -24,6 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from ..engine.captured import Captured
 from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
 from ..engine.keys import folded
 from ..engine.noise import noisy_scan
@@ -117,13 +118,30 @@ class Opaque(eqx.Module):
     """A start law that is not made of arrays, kept out of the sight of JAX: what it does is
     read once, when a program is compiled for it."""
 
-    law: _Identity = eqx.field(static=True)
+    _sample: "_Method" = eqx.field(static=True)
+    _log_density: "_Method" = eqx.field(static=True)
+    _captured: Captured
+
+    def __init__(self, law: Any):
+        self._sample = _Method(_Identity(law), "sample")
+        self._log_density = _Method(_Identity(law), "log_density")
+        self._captured = Captured(self._sample, self._log_density)
 
     def sample(self, key, model):
-        return self.law.value.sample(key, model)
+        return self._captured.call(self._sample, key, model)
 
     def log_density(self, x):
-        return self.law.value.log_density(x)
+        return self._captured.call(self._log_density, x)
+
+
+class _Method(NamedTuple):
+    """A method of an object, equal for the same object."""
+
+    law: _Identity
+    name: str
+
+    def __call__(self, *args):
+        return getattr(self.law.value, self.name)(*args)
 
 
 AnyStartLaw = Stationary | Reversed | StartLaw
@@ -146,7 +164,7 @@ def as_start_law(law: Any) -> AnyStartLaw:
                 f"{law.mean} and {law.covariance}."
             )
     if not all(eqx.is_array_like(leaf) for leaf in jax.tree.leaves(law)):
-        return Opaque(_Identity(law))
+        return Opaque(law)
     return jax.tree.map(jnp.asarray, law)  # numbers are traced, so that they may change
 
 

@@ -19,6 +19,7 @@ import jax
 from jax.core import eval_context
 from jax.extend.core import get_opaque_trace_state
 
+from .captured import call_with_captured
 from .compiler import cpu_options, warn_of_loop_fault
 from .generator import with_keys_written_out
 from .memory_maps import mind_memory_maps
@@ -63,10 +64,12 @@ def _compiled(fn: Callable, is_wanted_sooner: Callable[..., bool]) -> Callable:
             raise
 
     def run(*args, **kwargs):
-        if jax.default_backend() != "cpu":
-            return within(*args, **kwargs)
-        warn_of_loop_fault()
+        on_other = jax.default_backend() != "cpu"
+        if not on_other:
+            warn_of_loop_fault()
         if not is_outermost():
+            return call_with_captured(within, args, kwargs)
+        if on_other:
             return within(*args, **kwargs)
         return on_cpu(is_wanted_sooner(*args, **kwargs))(*args, **kwargs)
 

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from ..engine.arguments import as_returned, check_function, named
+from ..engine.captured import Captured
 from ..engine.checks import as_floating, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.linalg import any_inverse, dot, matvec
@@ -55,9 +56,14 @@ class GivenDensity(eqx.Module):
 
     parameters: Parameters
     function: Callable[[PyTree], Any] = eqx.field(static=True)
+    captured: Captured
+
+    def __init__(self, parameters: Parameters, function: Callable[[PyTree], Any]):
+        self.parameters, self.function = parameters, function
+        self.captured = Captured(function)
 
     def __call__(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
-        value = named("prior", self.function)(self.parameters.select(theta))
+        value = named("prior", self.captured.call)(self.function, self.parameters.select(theta))
         value = as_returned("prior", value)
         if value.shape != ():
             raise ValueError(f"`prior` must return a number; it returned shape {value.shape}.")

@@ -26,6 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Key, PyTree
 
 from ..engine.arguments import as_returned, check_flag, check_function, named
+from ..engine.captured import Captured
 from ..engine.checks import (
     Numbers,
     as_array,
@@ -60,8 +61,8 @@ class Diffusion(eqx.Module):
 
     A pytree: its leaves are the arrays of `params` (and a constant σ), so it passes through
     `jit`, `vmap` and `grad`; its functions are static and compared by identity, so define
-    them once to compile once. Differentiate and batch with respect to `params`, not with
-    respect to values that the functions close over.
+    them once to compile once. Traced values that the functions close over are differentiated
+    and batched like `params`. Such functions are traced again in every call, so prefer `params`.
 
     **Arguments:**
 
@@ -114,6 +115,7 @@ class Diffusion(eqx.Module):
     _constant_sigma: Inexact[Array, "..."] | None
     _numbers: PyTree
     _others: "_Others" = eqx.field(static=True)
+    _captured: Captured
     reversible: bool = eqx.field(static=True)
     normalised: bool = eqx.field(static=True)
 
@@ -169,6 +171,16 @@ class Diffusion(eqx.Module):
         else:
             self._diffusion, self._constant_sigma = None, _check_constant_sigma(diffusion)
         self._numbers, self._others = _parts(params)
+        self._captured = Captured(
+            drift,
+            self._diffusion,
+            log_stationary,
+            reverse_drift,
+            sample_stationary,
+            prepare,
+            domain,
+            _coordinates,
+        )
         self.reversible = reversible
         self.normalised = normalised
 
@@ -213,7 +225,7 @@ class Diffusion(eqx.Module):
                 "a function `(key, params) -> x`, to `Diffusion`."
             )
         check_key(key)
-        return self._sample_stationary(key, self._prepared_params())
+        return self._captured.call(self._sample_stationary, key, self._prepared_params())
 
     @property
     def has_sampler(self) -> bool:
@@ -273,13 +285,15 @@ class Diffusion(eqx.Module):
                 "`(x, params)` that finds it in `params`."
             )
         function = self._diffusion if sigma is None else _constant_function(_as_tuples(sigma))
-        return self._functions_with(function, None)
+        free = self._functions_with(function, None)
+        object.__setattr__(free, "_captured", Captured())
+        return free
 
     def _functions_with(
         self, diffusion: Callable | Numbers | None, prepared_params: PyTree
     ) -> "Diffusion":
         """The same functions, of parameters that need no preparation."""
-        return Diffusion(
+        made = Diffusion(
             self._drift,
             diffusion,
             self._log_stationary,
@@ -291,6 +305,8 @@ class Diffusion(eqx.Module):
             domain=self._domain,
             _coordinates=self._coordinates,
         )
+        object.__setattr__(made, "_captured", self._captured)  # also within a program
+        return made
 
     @property
     def preparation(self) -> Callable | None:
@@ -305,7 +321,11 @@ class Diffusion(eqx.Module):
 
     def coordinate_values(self) -> PyTree:
         """The values of that function, none where the coordinates are fixed."""
-        return () if self._coordinates is None else self._coordinates(self._prepared_params())
+        return (
+            ()
+            if self._coordinates is None
+            else self._captured.call(self._coordinates, self._prepared_params())
+        )
 
     @property
     def has_reversal(self) -> bool:
@@ -358,7 +378,7 @@ class Diffusion(eqx.Module):
         return self.forward_at(x)(as_numbers({"time": time})["time"].astype(x.dtype))
 
     def _drift_at(self, params: PyTree) -> Callable[[Any], Callable[[Array], Array]]:
-        function = traced_once(self._drift)
+        function = self._traced_once(self._drift)
         if takes_time(self._drift):
             return lambda time: self._inside("drift", lambda x: function(x, params, time), params)
         drift = self._inside("drift", lambda x: function(x, params), params)
@@ -371,7 +391,7 @@ class Diffusion(eqx.Module):
         if self._diffusion is None:
             constant_sigma = _as_sigma(self._constant_sigma, like)
             return lambda time: lambda x: constant_sigma, False
-        function = named("diffusion", traced_once(self._diffusion))
+        function = named("diffusion", self._traced_once(self._diffusion))
         timed = takes_time(self._diffusion)
         values = function if timed else lambda x, params, time: function(x, params)
         now = jnp.zeros((), like.dtype)
@@ -410,7 +430,7 @@ class Diffusion(eqx.Module):
         derived = self.reverse_drift_effect
         params, reverse_drift = self._prepared_params(), self._reverse_drift
         if reverse_drift is not None and not derived.simulated:
-            function = traced_once(reverse_drift)
+            function = self._traced_once(reverse_drift)
             drift = self._inside("reverse_drift", lambda x: function(x, params), params)
         else:
             log_nu = self._log_stationary_function()
@@ -446,7 +466,7 @@ class Diffusion(eqx.Module):
     def _state_space(self, params: PyTree) -> Callable[[Array], Array] | None:
         if self._domain is None:
             return None
-        domain = named("domain", self._domain)
+        domain = named("domain", functools.partial(self._captured.call, self._domain))
 
         def inside(x):
             value = as_returned("domain", domain(x, params))
@@ -459,8 +479,14 @@ class Diffusion(eqx.Module):
 
         return inside
 
+    def _traced_once(self, function: Callable) -> Callable:
+        once = traced_once(function)
+        return lambda *args: self._captured.call(function, *args, plain=once)
+
     def _prepared_params(self) -> PyTree:
-        return self.params if self._prepare is None else self._prepare(self.params)
+        if self._prepare is None:
+            return self.params
+        return self._captured.call(self._prepare, self.params)
 
     def _log_stationary_function(self) -> Callable[[Array], Array]:
         if self._log_stationary is None:
@@ -468,7 +494,7 @@ class Diffusion(eqx.Module):
                 "this model has no stationary density: pass `log_stationary=` to `Diffusion`."
             )
         params = self._prepared_params()
-        log_stationary = named("log_stationary", traced_once(self._log_stationary))
+        log_stationary = named("log_stationary", self._traced_once(self._log_stationary))
         return lambda x: check_value("log_stationary", log_stationary(x, params), (), x)
 
 

@@ -6,11 +6,11 @@ import functools
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..engine.doors import door
+from ..engine.doors import guards_off
 from .diffusion import Diffusion, check_diffusion, halves
 
 
-@door
+@guards_off
 def integrated(model: Diffusion) -> Diffusion:
     """The diffusion X of a model together with its integral: the state is (Z, X), shape (2d,),
 

@@ -23,14 +23,14 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced
 from ..engine.compiled import compiled_sooner
-from ..engine.doors import door
+from ..engine.doors import guards_off
 from .diffusion import Diffusion, check_diffusion
 from .transform import Transformed, of_points
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
-@door
+@guards_off
 def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 400) -> Transformed:
     """The one-dimensional model of Y = ∫_a^X du/σ(u), whose σ is one.
 

@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..engine.averages import proper
+from ..engine.captured import without_captured_derivatives
 from ..engine.checks import without_derivatives
 from ..engine.compiled import compiled_sooner, is_outermost
 from ..engine.keys import key_for
@@ -140,6 +141,7 @@ def _in_program(own: RecordProblem, own_model: Diffusion) -> Linearised:
     if not _is_linear(problem, model):
         found = _best_of_loop(problem, model, found)
     points, guide = found.best
+    own = without_captured_derivatives(own)  # as if it were in the model's parameters
     return Linearised(points, _guide_of((own, guide), model=model, points=points))
 
 

@@ -22,6 +22,7 @@ from jaxtyping import Array, Float, PyTree
 from ..coupling import Stationary
 from ..engine.arguments import as_returned, check_function, evaluated
 from ..engine.averages import effective_size, normalised, proper
+from ..engine.captured import Captured
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import (
     cholesky,
@@ -98,12 +99,16 @@ def log_normal(law: NormalStep, x: Float[Array, " d"]) -> Float[Array, ""]:
 
 
 class _OfParams(eqx.Module):
-    """A function of params that gives the law, as a pytree without arrays."""
+    """A function of params that gives the law, as a pytree."""
 
     function: Callable[[PyTree], Any] = eqx.field(static=True)
+    captured: Captured
+
+    def __init__(self, function: Callable[[PyTree], Any]):
+        self.function, self.captured = function, Captured(function)
 
     def __call__(self, params: PyTree) -> Any:
-        law = evaluated("initial", self.function, params)
+        law = evaluated("initial", self.captured.call, self.function, params)
         if isinstance(law, GaussianLaw | Stationary):
             return law
         return as_returned("initial", law)

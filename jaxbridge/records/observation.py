@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.arguments import as_returned, check_function, named
+from ..engine.captured import Captured
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import dot, safe_norm
 from ..models.diffusion import check_value
@@ -65,6 +66,7 @@ class LinearGaussian(eqx.Module):
     matrix: Float[Array, "m d"] | None
     covariance: Float[Array, "..."] | None
     _function: Callable | None = eqx.field(static=True)
+    _captured: Captured
 
     def __init__(
         self, matrix: Numbers | None = None, covariance: Numbers | Callable[[PyTree], Array] = 0.0
@@ -78,6 +80,7 @@ class LinearGaussian(eqx.Module):
         if callable(covariance):
             check_function("covariance", covariance, "(params)", "(params, t)")
         self._function = covariance if callable(covariance) else None
+        self._captured = Captured(self._function)
         self.covariance = None if callable(covariance) else as_floating("covariance", covariance)
         if self.covariance is not None:
             _check_covariance(self.covariance)
@@ -97,7 +100,8 @@ class LinearGaussian(eqx.Module):
         value, dtype = self.covariance, time.dtype
         if self._function is not None:
             arguments = (params, time) if self.depends_on_time else (params,)
-            value = as_returned("covariance", named("covariance", self._function)(*arguments))
+            value = named("covariance", self._captured.call)(self._function, *arguments)
+            value = as_returned("covariance", value)
         assert value is not None
         if value.shape not in ((), (m,), (m, m)):
             raise ValueError(
@@ -191,6 +195,7 @@ class ObservationDensity(eqx.Module):
 
     guess: LinearGaussian
     _log_density: Callable = eqx.field(static=True)
+    _captured: Captured
 
     def __init__(self, log_density: Callable, guess: LinearGaussian):
         check_function("log_density", log_density, "(y, x, params)", "(y, x, params, t)")
@@ -199,6 +204,7 @@ class ObservationDensity(eqx.Module):
         if guess.covariance is not None:
             _check_positive(guess.covariance)
         self._log_density, self.guess = log_density, guess
+        self._captured = Captured(log_density)
 
     @property
     def linear(self) -> LinearGaussian:
@@ -227,8 +233,8 @@ class ObservationDensity(eqx.Module):
         arguments = (shown, x, params)
         if takes_time(self._log_density, 3):
             arguments = (*arguments, time)
-        log_density = named("log_density", self._log_density)
-        true = check_value("log_density", log_density(*arguments), (), x)
+        true = named("log_density", self._captured.call)(self._log_density, *arguments)
+        true = check_value("log_density", true, (), x)
         guess = log_density_of(self.scalars(row, params, x.shape[0]), x)
         return jnp.where(seen, true - guess, 0)
 
