@@ -266,7 +266,8 @@ def test_doubt_where_noise_is_led_on_by_the_state():
             observation=jb.LinearGaussian([[1.0, 0.0]], 0.1), initial=[0.0, 0.0],
             num_draws=20, num_warmup=4, num_chains=2,
         )  # fmt: skip
-        assert np.isfinite(made.step_uncertainty()[1:]).all() == known
+        told, doubt = np.abs(made.step_error()[1:]), np.asarray(made.step_uncertainty()[1:])
+        assert np.isfinite(doubt).all() and np.all(doubt >= told) != known
 
 
 def test_a_factor_of_many_rows_is_that_of_few(x64):

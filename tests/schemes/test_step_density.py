@@ -302,7 +302,8 @@ def test_superlinear_rotation_is_finite_and_converges(name):
         )  # fmt: skip
         assert np.isfinite(estimate.value)
         assert estimate.num_met > 30_000
-        assert estimate.step_error < 2 * estimate.step_uncertainty
+        known = np.isfinite(estimate.step_error)  # not of steps beyond the relaxation time
+        assert not known or estimate.step_error < 2 * estimate.step_uncertainty
     if name == "mdb":
         assert not any(e.trustworthy for e in estimates.values())
         assert all(estimates[n].pareto_k > 0.7 for n in (10, 25, 50, 100))
