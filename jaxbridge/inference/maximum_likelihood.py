@@ -1,9 +1,8 @@
 """Maximum likelihood: by stochastic approximation over bridges, or of a simulated likelihood.
 
 Where σ is known, the search is by `stochastic_approximation` over bridges: with an optimiser it
-ends in the average of the second half of the iterates, by EM in the last. There `score` with
-independent bridges gives the observed information I, one step of Newton's method,
-θ + I⁻¹ ∇ log L(θ), and the Monte Carlo error that is left.
+ends in the average of the second half of the iterates, by EM in the last. From there Newton's
+method (`newton`) goes on by scores and information of independent bridges, new ones in each pass.
 
 Where σ depends on the unknown parameters paths are of no use, and the maximum is that of the
 likelihood by simulation (`simulated_likelihood`).
@@ -21,7 +20,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.arguments import check_choice
-from ..engine.checks import Numbers, check_count, check_key
+from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.verdict import AbstractResult, Fault, Verdict
@@ -31,6 +30,7 @@ from ..records import Initial, Observation, as_record_problems
 from ..schemes import StepError, dominates, step_fault
 from .augmentation import augment
 from .data import Problem, as_problem
+from .newton import Passes, Slope, falls, is_maximum, maximum_faults, newton_passes
 from .parameters import (
     Constraint,
     Parameters,
@@ -39,7 +39,7 @@ from .parameters import (
 )
 from .record_maximum import RecordMaximumLikelihood, maximum_of_records
 from .record_paths import check_no_bridges, check_no_record
-from .score import Score, as_score, score_at
+from .score import Score, Scorer, as_score, scorer_at
 from .simulated_likelihood import (
     as_pulled,
     newton_ascent,
@@ -51,11 +51,6 @@ from .stochastic_approximation import EM, Gradient, Search, SearchInfo, approxim
 
 # Made once, for optimisers are compared by identity.
 _ADAM = optax.adam(1e-2)
-
-_NO_MAXIMUM = (
-    "No maximum was found (`newton` is false). Take more `num_iterations`, a larger learning rate, "
-    "more `num_bridges`, or check that the likelihood has a maximum inside the constraint."
-)
 
 
 class MaximumLikelihood(AbstractResult):
@@ -70,21 +65,23 @@ class MaximumLikelihood(AbstractResult):
     - `step_error`: what `theta` is too large by for the length of the steps, an estimate, shape
         (p,), with a standard error of it, `step_uncertainty`. NaN where it is not known.
     - `iterates`: of the stochastic approximation, shape (n, p).
-    - `score`: at the average of the iterates, before the last step; where σ is unknown, at the
-        estimate, so that its gradient is about zero, and the covariance of that by the noise of
+    - `score`: where the last pass of Newton's method was, before its step; where σ is unknown, at
+        the estimate, so that its gradient is about zero, and the covariance of that by the noise of
         the bridges is what matters. Errors can be trusted where its `effective_sample_size` is
         large in all intervals.
     - `num_missing`: iterations' bridges that were not found, in all.
     - `num_truncated`: weights that `max_trials` cut off.
     - `num_refused`: iterations whose step led out of the constraint, or to what is not finite, and
         was not made.
-    - `newton`: whether the last step was made. Not so if the information was not positive definite,
-        or the step longer than about a standard error, or out of the constraint: then the average
-        of the iterates is returned, which is not the maximum, and more iterations are needed, or
-        longer steps. Where σ is unknown: whether a maximum was found, and no Monte Carlo error,
-        in any direction, is more than half a standard error. If not, `params` are those of the
-        largest simulated likelihood that was seen, which may be a maximum of the noise alone: more
-        bridges are needed, or a better proposal, unless the maximum lies out of the constraint.
+    - `newton`: whether Newton's method converged to a maximum: the next step is short beside the
+        standard errors or the Monte Carlo errors, the information is positive definite, and no
+        Monte Carlo error, in any direction, is more than half a standard error. If not, `params`
+        are no estimate: more iterations are needed, longer steps or more bridges, unless the
+        maximum lies out of the constraint.
+    - `fall`: by how much the log-likelihood falls where a parameter is one standard error below and
+        above the estimate, and the others follow, shape (2, p). It is 0.5 if the log-likelihood is
+        quadratic, and near zero or below where it levels off, so that no maximum is inside;
+        infinite out of the constraint.
     """
 
     params: PyTree
@@ -100,16 +97,17 @@ class MaximumLikelihood(AbstractResult):
     num_truncated: Int[Array, ""]
     num_refused: Int[Array, ""]
     newton: Bool[Array, ""]
+    fall: Float[Array, "2 p"]
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: no maximum, the faults of the weights of `score`, a step error that
-        dominates and is beyond 0.05 standard errors."""
+        """Return the faults: no maximum, or none inside, the faults of the weights of `score`, a
+        step error that dominates and is beyond 0.05 standard errors."""
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
         steps = step_fault(StepError(self.step_error, self.step_uncertainty), sd, sd)
         return Verdict(
             (
-                Fault(~self.newton, _NO_MAXIMUM),
+                *maximum_faults(self.newton, self.fall),
                 *self.score._weight_faults,
                 Fault(jnp.any(steps.present), steps.sentence),
             )
@@ -162,8 +160,9 @@ def maximum_likelihood(
     - `method`: "gradient", or "em", which takes no optimiser and needs fewer iterations, and a
         known σ.
     - `num_iterations`: of the stochastic approximation.
-    - `num_bridges`: weighted bridges of each interval for the last step and the errors; where σ
-        is unknown, for the likelihood whose maximum is the estimate.
+    - `num_bridges`: weighted bridges of each interval in each pass of Newton's method, which follow
+        the iterations, and for the errors; where σ is unknown, for the likelihood whose maximum is
+        the estimate.
     - `observation`, `initial`, `initial_time`: for records that were seen with noise or in part, as
         in `innovations`. Any parameters may be unknown there, and `num_bridges` are draws of each
         of eight chains of paths.
@@ -247,31 +246,31 @@ def _by_bridges(
     search: Search,
     num_bridges: int,
 ) -> MaximumLikelihood:
-    """Stochastic approximation, and one step of Newton's method."""
+    """Stochastic approximation, and Newton's method."""
     parameters, theta = problem.parameters, problem.theta
     augment_key, run_key, score_key = jax.random.split(key, 3)
     augmentation = augment(augment_key, problem, theta, proposal, "exact", None, budget)
     iterates, info = approximate(run_key, parameters, augmentation, search, theta)
     rough = iterates[-1] if isinstance(search.rule, EM) else _mean_of_later(iterates)
-    at_rough = score_at(score_key, problem, rough, proposal, budget, num_bridges, None)
-    return _newton_step(parameters, rough, iterates, at_rough, info)
+    scorer = scorer_at(score_key, problem, rough, proposal, budget, num_bridges)
+    passes = _refined(score_key, parameters, scorer, rough)
+    found = passes.converged & is_maximum(passes.slope)
+    fall = falls(passes.slope, passes.offsets)
+    return _summary(parameters, passes.theta, iterates, passes.details, info, found, fall)
 
 
 @compiled_sooner
-def _newton_step(
-    parameters: Parameters,
-    rough: Float[Array, " p"],
-    iterates: Float[Array, "n p"],
-    at_rough: Score,
-    info: SearchInfo,
-) -> MaximumLikelihood:
-    step = jnp.linalg.inv(at_rough.information) @ at_rough.gradient
-    definite = jnp.all(jnp.linalg.eigvalsh(at_rough.information) > 0)
-    # Further off the likelihood need not be near its quadratic approximation.
-    near = at_rough.gradient @ step < rough.shape[0]
-    ok = definite & near & parameters.allowed(rough + step)
-    estimate = jnp.where(ok, rough + step, rough)
-    return _summary(parameters, estimate, iterates, at_rough, info, ok)
+def _refined(
+    key: Key[Array, ""], parameters: Parameters, scorer: Scorer, theta: Float[Array, " p"]
+) -> Passes:
+    """Newton's method from θ, with new bridges in each pass."""
+    scorer, theta = nondifferentiable((scorer, theta))
+
+    def evaluate(i, theta, offsets, memory):
+        score, rises = scorer.at(jax.random.fold_in(key, i), theta, offsets)
+        return Slope(score.gradient, score.covariance, score.information, rises), score, memory
+
+    return newton_passes(evaluate, parameters, theta, None)
 
 
 def _by_simulation(
@@ -296,7 +295,8 @@ def _by_simulation(
     made = maximum.simulated
     step_error = step_error_of_score(last_key, parameters, blocks, maximum, num_bridges)
     at_maximum = as_score(parameters, made, step_error, made.num_missing, jnp.int32(0))
-    return _summary(parameters, maximum.theta, iterates, at_maximum, info, maximum.found)
+    found, fall = maximum.found, maximum.fall
+    return _summary(parameters, maximum.theta, iterates, at_maximum, info, found, fall)
 
 
 @compiled_sooner
@@ -311,7 +311,8 @@ def _summary(
     iterates: Float[Array, "n p"],
     score: Score,
     info: SearchInfo,
-    ok: Bool[Array, ""],
+    found: Bool[Array, ""],
+    fall: Float[Array, "2 p"],
 ) -> MaximumLikelihood:
     """The estimate with its errors, which are those of the score times the inverse information."""
     covariance = jnp.linalg.inv(score.information)
@@ -334,5 +335,6 @@ def _summary(
         info.missing,
         info.truncated + score.num_truncated,
         info.refused,
-        ok,
+        found,
+        fall,
     )

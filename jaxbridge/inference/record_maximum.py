@@ -10,7 +10,9 @@ initial law are as good as those of the drift, however small the steps.
 
 Chains of paths move given the current θ, are read as ξ, and θ makes a step of an optimiser along
 the mean of ∇ log w, which takes the paths along (Gu & Kong 1998). From the average of the second
-half of the iterates, where the chains run on with θ fixed, one step of Newton's method is made.
+half of the iterates Newton's method goes on (`newton`), in passes in which the chains run with θ
+fixed. Log L(θ + d) - log L(θ) is the log of the mean of w(θ + d) / w(θ) given the data, taken to
+second order in the cumulants of its logarithm.
 
 ∇² log w is the difference of ∇ log w at θ ± h e_j, which takes a third of the time to compile that
 its derivative takes. h is a share of 1 / √D_j, with D_j the mean of -∂²_j log w: of what a standard
@@ -32,6 +34,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import all_finite_leaves, nondifferentiable
@@ -41,6 +44,14 @@ from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..records import Records, tuned
 from ..schemes import StepError, dominates, step_fault
+from .newton import (
+    Passes,
+    Slope,
+    falls,
+    is_maximum,
+    maximum_faults,
+    newton_passes,
+)
 from .parameters import Parameters
 from .record_paths import At, RecordPaths, as_record_paths, movable, share_of_step_error
 from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
@@ -48,14 +59,14 @@ from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 _CHAINS = 8
 # Of the chains before θ moves.
 _SWEEPS = 50
-# h of differences, as a share; and by how many draws before those that count it is learnt.
-_DIFFERENCE, _LEARNING = 0.05, 10
+# h of differences, as a share; and by how many draws before those that count it is learnt, while
+# the chains settle at a new θ.
+_DIFFERENCE, _LEARNING = 0.05, 20
 
 _MOST_R_HAT = 1.1
-_NO_MAXIMUM = (
-    "No maximum was found (`newton` is false). Take more `num_iterations`, a larger learning rate, "
-    "more `num_bridges`, or check that the likelihood has a maximum inside the constraint."
-)
+# Chains that disagree by no more than rounding agree: beside this Monte Carlo error, in standard
+# errors, R̂ matters.
+_MATTERS = 0.01
 _STUCK = "A block of a path never moved. Take more `num_bridges` or more steps."
 _APART = "Chains of paths disagree (R̂ above 1.1 of the gradient). Take more `num_bridges`."
 
@@ -73,16 +84,17 @@ class RecordMaximumLikelihood(AbstractResult):
     - `step_error`: what `theta` is too large by for the length of the steps, an estimate, shape
         (p,), with a standard error of it, `step_uncertainty`. NaN of one step.
     - `iterates`: of the stochastic approximation, shape (n, p).
-    - `gradient`: of the log likelihood at the average of the later iterates, before the last step,
+    - `gradient`: of the log likelihood where the last pass of Newton's method was, before its step,
         shape (p,), with the `effective_sample_size` of its draws and `r_hat` over the chains.
     - `stuck`: chains in which a block of a path never moved, of those at the end, shape (chains,).
     - `num_refused`: iterations whose step led out of the constraint, or to what is not finite, and
         was not made.
-    - `newton`: whether the last step was made. Not so if the information was not positive definite,
-        or nothing was found that suits as the step of the differences it is made of, or the last
-        step longer than about a standard error, or out of the constraint: then the average of the
-        iterates is returned, which is not the maximum, and more iterations are needed, or longer
-        steps.
+    - `newton`: whether Newton's method converged to a maximum: the next step is short beside the
+        standard errors or the Monte Carlo errors, and the information is positive definite, by far.
+    - `fall`: by how much the log-likelihood falls where a parameter is one standard error below and
+        above the estimate, and the others follow, shape (2, p). It is 0.5 if the log-likelihood is
+        quadratic, and near zero or below where it levels off, so that no maximum is inside;
+        infinite out of the constraint.
     """
 
     params: PyTree
@@ -99,21 +111,28 @@ class RecordMaximumLikelihood(AbstractResult):
     stuck: Bool[Array, " chains"]
     num_refused: Int[Array, ""]
     newton: Bool[Array, ""]
+    fall: Float[Array, "2 p"]
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: no maximum, a block of a path that never moved, chains that disagree,
-        a step error that dominates and is beyond 0.05 standard errors."""
+        """Return the faults: no maximum, or none inside, a block of a path that never moved, chains
+        that disagree, a step error that dominates and is beyond 0.05 standard errors."""
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
         steps = step_fault(StepError(self.step_error, self.step_uncertainty), sd, sd)
         return Verdict(
             (
-                Fault(~self.newton, _NO_MAXIMUM),
+                *maximum_faults(self.newton, self.fall),
                 Fault(jnp.any(self.stuck), _STUCK),
-                Fault(~jnp.all(self.r_hat < _MOST_R_HAT), _APART),
+                Fault(self._chains_disagree, _APART),
                 Fault(jnp.any(steps.present), steps.sentence),
             )
         )
+
+    @property
+    def _chains_disagree(self) -> Bool[Array, ""]:
+        errors = ravel_pytree(self.monte_carlo_errors)[0]
+        rounded = errors <= _MATTERS * jnp.sqrt(jnp.diagonal(self.covariance))
+        return ~(jnp.all(self.r_hat < _MOST_R_HAT) | jnp.all(rounded))
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:
@@ -131,12 +150,14 @@ class _Chains(NamedTuple):
 
 
 class _Draw(NamedTuple):
-    """Of one ξ: ∇ log w and ∇² log w, log w̃ / w and ∇ log w̃; and which blocks moved."""
+    """Of one ξ: ∇ log w and ∇² log w, log w̃ / w and ∇ log w̃; by how much log w rises from θ to
+    points around it; and which blocks moved."""
 
     gradient: Float[Array, "*n p"]
     hessian: Float[Array, "*n p p"]
     log_ratio: Float[Array, "*n"]
     coarse: Float[Array, "*n p"]
+    rises: Float[Array, "*n 2 p"]
     taken: Bool[Array, "*n R 2 B"]
 
 
@@ -156,8 +177,8 @@ def maximum_of_records(
     rough = jnp.mean(iterates[len(iterates) // 2 :], axis=0)
     # What guides well at the first θ need not do so at the last.
     completion = as_record_paths(parameters, records, rough)
-    draws, h = _draws_at(last_key, completion, rough, chains, num_draws, search.progress_meter)
-    return _summary(completion, rough, iterates, info, draws, h)
+    passes = _refined(last_key, completion, rough, chains, num_draws, search.progress_meter)
+    return _summary(completion, iterates, info, passes)
 
 
 def _of_chains(function: Callable, key: Key[Array, ""], *mapped: PyTree) -> PyTree:
@@ -228,28 +249,51 @@ def _mean_log_weight(
 
 
 @compiled_sooner
-def _draws_at(
+def _refined(
     key: Key[Array, ""],
     completion: RecordPaths,
     theta: Float[Array, " p"],
     chains: _Chains,
     num_draws: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
-) -> tuple[_Draw, Float[Array, " p"]]:
-    """Of all chains, axes (chains, n), at θ; and h."""
-    completion, theta = nondifferentiable((completion, theta))
+) -> Passes:
+    """Newton's method from θ, with so many draws of each chain in a pass."""
+    completion, theta, chains = nondifferentiable((completion, theta, chains))
+
+    def evaluate(i, theta, offsets, memory):
+        where, key_of_pass = (theta, offsets, memory), jax.random.fold_in(key, i)
+        made = _draws_at(key_of_pass, completion, *where, num_draws, progress_meter)
+        draws, chains, h = made
+        return _slope(draws, h), draws, (chains, h)
+
+    h = jnp.where(theta == 0, 0.01, 0.01 * jnp.abs(theta))
+    return newton_passes(evaluate, completion.parameters, theta, (chains, h))
+
+
+def _draws_at(
+    key: Key[Array, ""],
+    completion: RecordPaths,
+    theta: Float[Array, " p"],
+    offsets: Float[Array, "2 p p"],
+    start: tuple[_Chains, Float[Array, " p"]],
+    num_draws: int,
+    progress_meter: diffrax.AbstractProgressMeter | None,
+) -> tuple[_Draw, _Chains, Float[Array, " p"]]:
+    """Of all chains, axes (chains, n), at θ; where the chains are then; and h."""
     p, here = len(theta), completion.at(theta)
 
     def derivatives(key, paths, taken, h):
         noise, log_weight = completion.noise(key, here, paths)
         log_w = lambda theta, coarse: completion.either_log_weight(theta, noise, coarse)
         apart = jnp.diag(h)
-        around = theta + jnp.concatenate([jnp.zeros((2, p), h.dtype), apart, -apart])
-        is_coarse = jnp.arange(2 * p + 2) == 1
+        zeros = jnp.zeros((2, p), h.dtype)
+        around = theta + jnp.concatenate([zeros, apart, -apart, offsets.reshape(2 * p, p)])
+        is_coarse = jnp.arange(4 * p + 2) == 1
         values, slopes = lax.map(lambda at: jax.value_and_grad(log_w)(*at), (around, is_coarse))
-        hessian = (slopes[2 : 2 + p] - slopes[2 + p :]) / (2 * h[:, None])
+        hessian = (slopes[2 : 2 + p] - slopes[2 + p : 2 + 2 * p]) / (2 * h[:, None])
         hessian = (hessian + hessian.T) / 2
-        return _Draw(slopes[0], hessian, values[1] - log_weight, slopes[1], taken)
+        rises = (values[2 + 2 * p :] - values[0]).reshape(2, p)
+        return _Draw(slopes[0], hessian, values[1] - log_weight, slopes[1], rises, taken)
 
     def draw(state, i):
         chains, h = state
@@ -261,10 +305,10 @@ def _draws_at(
         curvature = -jnp.diagonal(jnp.nanmean(made.hessian, axis=0))
         return (chains, jnp.where(i < _LEARNING, _nearer(h, curvature), h)), made
 
-    first = jnp.where(theta == 0, 0.01, 0.01 * jnp.abs(theta))
     numbers = jnp.arange(_LEARNING + num_draws)
-    (_, h), draws = metered_scan(draw, (chains, first), numbers, progress_meter)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf[_LEARNING:], 0, 1), draws), h
+    (chains, h), draws = metered_scan(draw, start, numbers, progress_meter)
+    draws = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[_LEARNING:], 0, 1), draws)
+    return draws, chains, h
 
 
 def _nearer(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -273,29 +317,39 @@ def _nearer(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> Float[Array
     return jnp.where(jnp.isfinite(wanted), jnp.clip(wanted, h / 8, h * 8), h / 8)
 
 
-def _summary(
-    completion: RecordPaths,
-    rough: Float[Array, " p"],
-    iterates: Float[Array, "n p"],
-    info: SearchInfo,
-    draws: _Draw,
-    h: Float[Array, " p"],
-) -> RecordMaximumLikelihood:
-    """One step of Newton's method, and the errors of where it leads."""
-    parameters, p = completion.parameters, len(rough)
+def _slope(draws: _Draw, h: Float[Array, " p"]) -> Slope:
+    """Log L near θ by Fisher's and Louis's identities, NaN if h does not suit the curvature."""
+    p = len(h)
     gradients = draws.gradient.reshape(-1, p)
     gradient, spread = jnp.mean(gradients, axis=0), jnp.cov(gradients.T).reshape(p, p)
     curvature = -jnp.mean(draws.hessian, axis=(0, 1))
-    information = curvature - spread
-    covariance = jnp.linalg.inv(information)
-    step = covariance @ gradient
-    definite = jnp.all(jnp.linalg.eigvalsh(information) > 0)
     learnt = jnp.all(jnp.abs(jnp.log(_nearer(h, jnp.diagonal(curvature)) / h)) < jnp.log(2.0))
-    # Further off the likelihood need not be near its quadratic approximation.
-    ok = definite & learnt & (gradient @ step < p) & parameters.allowed(rough + step)
-    theta = jnp.where(ok, rough + step, rough)
     size = effective_size_of_chains(draws.gradient)
-    left = covariance @ (spread / jnp.sqrt(size[:, None] * size)) @ covariance
+    covariance = spread / jnp.sqrt(size[:, None] * size)
+    information = jnp.where(learnt, curvature - spread, jnp.nan)
+    return Slope(gradient, covariance, information, _rises(draws.rises))
+
+
+def _rises(each: Float[Array, "chains n 2 p"]) -> Float[Array, "2 p"]:
+    """The log of the mean of exponentials, by two cumulants and no more than the largest; -inf
+    where none is finite."""
+    finite = jnp.isfinite(each)
+    number = jnp.sum(finite, axis=(0, 1)).astype(each.dtype)
+    mean = jnp.sum(jnp.where(finite, each, 0), axis=(0, 1)) / jnp.maximum(number, 1)
+    squares = jnp.where(finite, each - mean, 0) ** 2
+    variance = jnp.sum(squares, axis=(0, 1)) / jnp.maximum(number, 1)
+    largest = jnp.max(jnp.where(finite, each, -jnp.inf), axis=(0, 1))
+    return jnp.minimum(mean + variance / 2, largest)
+
+
+@compiled_sooner
+def _summary(
+    completion: RecordPaths, iterates: Float[Array, "n p"], info: SearchInfo, passes: Passes
+) -> RecordMaximumLikelihood:
+    """The estimate where Newton's method ended, with its errors."""
+    parameters, slope, draws = completion.parameters, passes.slope, passes.details
+    covariance = jnp.linalg.inv(slope.information)
+    left = covariance @ slope.covariance @ covariance
     stuck = jnp.any(
         movable(completion.fine.records) & ~jnp.any(draws.taken, axis=1), axis=(1, 2, 3)
     )
@@ -303,19 +357,20 @@ def _summary(
     monte_carlo = jnp.where(jnp.any(stuck), jnp.inf, monte_carlo)
     step_error = _step_error(completion, draws, covariance)
     return RecordMaximumLikelihood(
-        parameters.full(theta),
+        parameters.full(passes.theta),
         parameters.each(jnp.sqrt(jnp.diagonal(covariance))),
         parameters.each(monte_carlo),
-        theta,
+        passes.theta,
         covariance,
         *step_error,
         iterates,
-        gradient,
-        size,
+        slope.gradient,
+        effective_size_of_chains(draws.gradient),
         potential_scale_reduction(draws.gradient),
         stuck,
         info.refused,
-        ok,
+        passes.converged & is_maximum(slope),
+        falls(slope, passes.offsets),
     )
 
 

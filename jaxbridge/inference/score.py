@@ -12,11 +12,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.averages import effective_size, normalised
+from ..engine.averages import effective_size, expanded, normalised
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
@@ -138,27 +140,47 @@ def score(
         "or pick the others with `where=`."
     )
     budget = Budget(num_counts, max_proposals, max_trials)
-    return score_at(key, problem, problem.theta, proposal, budget, num_bridges, progress_meter)
+    theta = problem.theta
+    scorer = scorer_at(key, problem, theta, proposal, budget, num_bridges, progress_meter)
+    return scorer.at(key, theta, jnp.zeros((0, len(theta)), theta.dtype))[0]
 
 
-def score_at(
+class Scorer(eqx.Module):
+    """Estimator of the score at any θ, by so many bridges of each interval: the proposals are
+    decided, for all θ alike."""
+
+    parameters: Parameters
+    blocks: tuple[Block, ...]
+    form: Form = eqx.field(static=True)
+    num_bridges: int = eqx.field(static=True)
+    progress_meter: diffrax.AbstractProgressMeter | None = eqx.field(static=True)
+
+    def at(
+        self, key: Key[Array, ""], theta: Float[Array, " p"], offsets: Float[Array, "*shape p"]
+    ) -> tuple[Score, Float[Array, "*shape"]]:
+        """Return the score at θ, and by how much the log-likelihood rises from there to
+        θ + offsets."""
+        made = [
+            _of_block(block_key, self, theta, offsets, block)
+            for block_key, block in with_keys(key, self.blocks)
+        ]
+        return _over_all(self.parameters, self.blocks, made)
+
+
+def scorer_at(
     key: Key[Array, ""],
     problem: Problem,
     theta: Float[Array, " p"],
     proposal: Any,
     budget: Budget,
     num_bridges: int,
-    progress_meter: diffrax.AbstractProgressMeter | None,
-) -> Score:
-    """The score at any θ."""
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+) -> Scorer:
+    """Return the estimator whose proposals are decided at θ."""
     model = problem.parameters.bind(theta)
     blocks = make_blocks(key, model, problem, proposal, budget, "means")
     form = target_forms(blocks, model)[0]
-    made = [
-        _of_block(block_key, problem.parameters, theta, block, form, num_bridges, progress_meter)
-        for block_key, block in with_keys(key, blocks)
-    ]
-    return _over_all(problem.parameters, blocks, made)
+    return Scorer(problem.parameters, blocks, form, num_bridges, progress_meter)
 
 
 def as_score(
@@ -187,7 +209,8 @@ def as_score(
 class _Sums(NamedTuple):
     """Σ over intervals of the score, of the covariance of its error, and of the information; the
     effective number of bridges of each, and k̂; the step error of the score, with the square of
-    its uncertainty; and how many weights were cut off."""
+    its uncertainty; how many weights were cut off; and by how much the log-likelihood rises from θ
+    to points around it."""
 
     gradient: Float[Array, " p"]
     covariance: Float[Array, "p p"]
@@ -197,10 +220,14 @@ class _Sums(NamedTuple):
     step_error: Float[Array, " p"]
     step_variance: Float[Array, " p"]
     num_truncated: Int[Array, ""]
+    rises: Float[Array, "*shape"]
 
 
 @compiled_sooner
-def _over_all(parameters: Parameters, blocks: tuple[Block, ...], made: Sequence[_Sums]) -> Score:
+def _over_all(
+    parameters: Parameters, blocks: tuple[Block, ...], made: Sequence[_Sums]
+) -> tuple[Score, Float[Array, "*shape"]]:
+    """The score, and the rises."""
     sums = over_intervals(blocks, made)
     step_error = StepError(sums.step_error, jnp.sqrt(sums.step_variance))
     missing = sums.effective_sample_size == 0
@@ -213,12 +240,14 @@ def _over_all(parameters: Parameters, blocks: tuple[Block, ...], made: Sequence[
         covariance=blank(sums.covariance, jnp.inf),
         information=blank(sums.information, jnp.nan),
     )
-    return as_score(parameters, sums, step_error, num_missing, sums.num_truncated)
+    score = as_score(parameters, sums, step_error, num_missing, sums.num_truncated)
+    return score, sums.rises
 
 
 class _Bridges(NamedTuple):
     """n weighted bridges of each interval, with the derivatives of the log density of their paths;
-    and, of the first m, D of `halving` with its gradient."""
+    of the first m, D of `halving` with its gradient; and by how much their log density rises from θ
+    to points around it."""
 
     log_weights: Float[Array, "I n"]
     truncated: Bool[Array, "I n"]
@@ -226,18 +255,20 @@ class _Bridges(NamedTuple):
     hessian: Float[Array, "I n p p"]
     log_halving: Float[Array, "I m"]
     slope: Float[Array, "I m p"]
+    rises: Float[Array, "I n *shape"]
 
 
 def _draw(
     key: Key[Array, ""],
-    parameters: Parameters,
+    scorer: "Scorer",
     theta: Float[Array, " p"],
+    offsets: Float[Array, "*shape p"],
     model: Diffusion,
     block: Block,
-    form: Form,
     n: int,
 ) -> _Bridges:
     """Bridges of this model, prepared at θ."""
+    parameters, form = scorer.parameters, scorer.form
     intervals, num_steps = block.intervals, block.num_steps
     m = num_looked(n, model.sigma_varies(intervals.start[0]))
     keys = jax.random.split(key, (len(block.index), n))
@@ -257,42 +288,47 @@ def _draw(
     gradient = jax.jacfwd(log_f)
     derivatives = (gradient(theta), jax.jacfwd(gradient)(theta))
     halvings = (log_halving(theta), jax.jacfwd(log_halving)(theta))
-    return _Bridges(drawn.log_weights, drawn.truncated, *derivatives, *halvings)
+    points = (theta + offsets).reshape(-1, len(theta))
+    none = jnp.zeros((0, len(keys), n), theta.dtype)
+    around = lax.map(log_f, points) - log_f(theta) if len(points) else none
+    rises = jnp.moveaxis(around, 0, -1).reshape(len(keys), n, *offsets.shape[:-1])
+    return _Bridges(drawn.log_weights, drawn.truncated, *derivatives, *halvings, rises)
 
 
 @compiled_sooner
 def _of_block(
     key: Key[Array, ""],
-    parameters: Parameters,
+    scorer: Scorer,
     theta: Float[Array, " p"],
+    offsets: Float[Array, "*shape p"],
     block: Block,
-    form: Form,
-    num_bridges: int,
-    progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> _Sums:
-    parameters, block = nondifferentiable((parameters, block))
-    model = parameters.bind(theta).prepared()
+    scorer, block = nondifferentiable((scorer, block))
+    model, num_bridges = scorer.parameters.bind(theta).prepared(), scorer.num_bridges
+    form = scorer.form
     num_intervals = len(block.index)
     at_once = min(num_bridges, max(1, _PATHS // num_intervals))
     num_batches = -(-num_bridges // at_once)
 
     def batch(_, i):
         mine = jax.random.fold_in(key, i)
-        return None, _draw(mine, parameters, theta, model, block, form, at_once)
+        return None, _draw(mine, scorer, theta, offsets, model, block, at_once)
 
-    _, made = metered_scan(batch, None, jnp.arange(num_batches), progress_meter)
+    _, made = metered_scan(batch, None, jnp.arange(num_batches), scorer.progress_meter)
 
     def join(leaf, number: int):
         """The first so many of each batch, of all batches."""
         leaf = jnp.moveaxis(leaf[:, :, :number], 0, 1)
-        return leaf.reshape(num_intervals, -1, *leaf.shape[3:])
+        return leaf.reshape(num_intervals, num_batches * leaf.shape[2], *leaf.shape[3:])
 
     m = made.log_halving.shape[2]
     some = _Bridges(*(join(leaf, m) for leaf in made))
     share = block.step_shares(model, form)
     halves = (some.gradient, some.gradient + some.slope)
     error = error_of_mean(some.log_weights, some.log_halving, share, *halves)
-    log_weights, truncated, g, H = (join(leaf, at_once)[:, :num_bridges] for leaf in made[:4])
+    all_bridges = (*made[:4], made.rises)
+    all_bridges = (join(leaf, at_once)[:, :num_bridges] for leaf in all_bridges)
+    log_weights, truncated, g, H, rises = all_bridges
     weights = normalised(log_weights)
     mean = jnp.sum(weights[..., None] * g, axis=1)
     deviation = g - mean[:, None]
@@ -312,4 +348,19 @@ def _of_block(
         jnp.sum(error.value, axis=0),
         jnp.sum(error.uncertainty**2, axis=0),
         jnp.sum(truncated, dtype=jnp.int32),
+        _rises(weights, rises),
     )
+
+
+def _rises(
+    weights: Float[Array, "I n"], each: Float[Array, "I n *shape"]
+) -> Float[Array, "*shape"]:
+    """Σ over intervals of the log of the weighted mean of exponentials, of those with bridges."""
+    weights = expanded(weights, each)
+    used = (weights > 0) & (each < jnp.inf)
+    largest = jnp.max(jnp.where(used, each, -jnp.inf), axis=1, keepdims=True)
+    largest = jnp.where(jnp.isfinite(largest), largest, 0)
+    ratios = jnp.where(used, weights * jnp.exp(jnp.where(used, each - largest, 0)), 0)
+    logs = jnp.log(jnp.sum(ratios, axis=1)) + largest[:, 0]
+    some = jnp.any(weights > 0, axis=1)
+    return jnp.sum(jnp.where(some, logs, 0), axis=0)

@@ -35,6 +35,14 @@ from ..proposals import AbstractProposal, Budget, as_proposal, choice_between, g
 from ..schemes import StepError
 from .blocks import Block, make_blocks, over_intervals, with_keys
 from .data import Problem
+from .newton import (
+    Slope,
+    allowed_offsets,
+    ascent_direction,
+    falls,
+    is_maximum,
+    longest_fraction,
+)
 from .parameters import Parameters
 from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 
@@ -44,10 +52,6 @@ _FEW = 8
 _NO_WEIGHT = -60.0
 # Newton's method has arrived where the square of the next step, in standard errors, is less.
 _GAIN = 1e-5
-# A Monte Carlo error of more, in standard errors, is too much for a maximum.
-_NOISE = 0.5
-# The longest step, in standard errors.
-_LONGEST = 2.0
 # Points that are tried, and the shortest fraction of a step so bounded.
 _MOST_POINTS = 60
 _SHORTEST = 1e-4
@@ -70,11 +74,13 @@ class Simulated(NamedTuple):
 
 
 class Maximum(NamedTuple):
-    """Where Newton's method ended, what ℓ̂ is there, and whether that is a maximum."""
+    """Where Newton's method ended, what ℓ̂ is there, whether that is a maximum, and by how much ℓ̂
+    falls around it."""
 
     theta: Float[Array, " p"]
     simulated: Simulated
     found: Bool[Array, ""]
+    fall: Float[Array, "2 p"]
 
 
 def as_pulled(
@@ -162,6 +168,22 @@ def _log_densities(
     sums = jnp.where(some, sums, 1)
     variance = (squares / sums**2 - 1 / n) * (n / (n - 1))
     return jnp.where(some, jnp.log(sums) + largest - np.log(n) + variance / 2, 0)
+
+
+def simulated_value(
+    key: Key[Array, ""],
+    parameters: Parameters,
+    blocks: tuple[Block, ...],
+    theta: Float[Array, " p"],
+    num_paths: int,
+) -> Float[Array, ""]:
+    """ℓ̂ at θ with the noise of this key."""
+    value = jnp.zeros((), theta.dtype)
+    for block_key, block in with_keys(key, blocks):
+        value += jnp.sum(
+            _log_densities(*_log_weights(block_key, parameters, block, num_paths, theta))
+        )
+    return value
 
 
 def simulated(
@@ -253,23 +275,6 @@ def _of_block(
     )
 
 
-def ascent_direction(
-    gradient: Float[Array, " p"], information: Float[Array, "p p"]
-) -> Float[Array, " p"]:
-    """Newton's step where ℓ̂ is concave; elsewhere that with curvatures of the other sign turned
-    round, in units in which those along the axes are ±1: uphill in any case."""
-    scale = jnp.sqrt(jnp.abs(jnp.diagonal(information)))
-    scale = jnp.where((scale > 0) & jnp.isfinite(scale), scale, 1)
-    scaled = information / scale[:, None] / scale
-    scaled = jnp.where(
-        jnp.all(jnp.isfinite(scaled)), scaled, jnp.eye(len(scale), dtype=scale.dtype)
-    )
-    curvature, axes = jnp.linalg.eigh(scaled)
-    # Below this a curvature is not known from zero.
-    curvature = jnp.maximum(jnp.abs(curvature), 10 * jnp.finfo(scale.dtype).eps)
-    return axes @ ((axes.T @ (gradient / scale)) / curvature) / scale
-
-
 class _Ascent(NamedTuple):
     """The best point so far, the step from there, and the fraction of it to be tried next."""
 
@@ -320,7 +325,7 @@ def newton_ascent(
         step = ascent_direction(made.gradient, made.information)
         gain = made.gradient @ step
         # A leap could end where weights are so uneven that ℓ̂ has maxima of its own.
-        longest = _LONGEST / jnp.sqrt(jnp.maximum(gain, _LONGEST**2))
+        longest = longest_fraction(gain)
         fraction = jnp.where(better | starting, longest, state.fraction / 3).astype(theta.dtype)
         # The last point that was tried is better, or no shorter step would do.
         done = (state.i + 1 >= at_start) & ((gain < _GAIN) | (fraction < _SHORTEST * longest))
@@ -337,11 +342,17 @@ def newton_ascent(
     first = _Ascent(jnp.int32(0), starts[0], nowhere, jnp.zeros_like(starts[0]), one, no)
     last = lax.while_loop(lambda state: ~state.done & (state.i < _MOST_POINTS), next_point, first)
     made = last.simulated
-    # Positive definite, and by far: where weights are very uneven ℓ̂ has maxima of its own.
-    clear = jnp.all(jnp.linalg.eigvalsh(_NOISE**2 * made.information - made.covariance) > 0)
-    # By rounding a step may seem to lead down that does not.
-    found = clear & (made.gradient @ last.step < 100 * _GAIN)
-    return Maximum(last.theta, made, found)
+    offsets = allowed_offsets(parameters, last.theta, made.information)
+    values = lax.map(
+        lambda point: simulated_value(key, parameters, blocks, point, num_paths),
+        (last.theta + offsets).reshape(-1, len(last.theta)),
+    )
+    rises = values.reshape(offsets.shape[:-1]) - made.value
+    slope = Slope(made.gradient, made.covariance, made.information, rises)
+    # Where weights are very uneven ℓ̂ has maxima of its own. By rounding a step may seem to lead
+    # down that does not.
+    found = is_maximum(slope) & (made.gradient @ last.step < 100 * _GAIN)
+    return Maximum(last.theta, made, found, falls(slope, offsets))
 
 
 @compiled_sooner

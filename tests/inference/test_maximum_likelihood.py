@@ -41,7 +41,7 @@ def exact_maximum():
 
 @pytest.mark.slow
 def test_one_unknown_rate():
-    """The maximum, or, where the search has only begun, no claim to have found it."""
+    """From near and from far."""
     times = np.arange(0.0, 30.0)
     data = ou_data(1, times)
     grid = np.linspace(0.05, 4, 4_000)
@@ -60,10 +60,13 @@ def test_one_unknown_rate():
     assert made.newton and made.num_missing == 0 and made.num_truncated == 0
     assert abs(float(made.theta[0]) - exact) < 5 * error + 0.03 * sd and error < 0.1 * sd
     with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
-        begun = jb.maximum_likelihood(
+        far = jb.maximum_likelihood(
             jax.random.key(0), ou_1d(5.0), times, data, num_iterations=20, **options
         )
-    assert not begun.newton and 4 < begun.theta[0] < 5
+    assert 4 < far.iterates[-1, 0] < 5  # the search by the optimiser has only begun
+    error = float(far.monte_carlo_errors)
+    assert far.newton and abs(float(far.theta[0]) - exact) < 5 * error + 0.03 * sd
+    assert np.all(np.abs(far.fall - 0.5) < 0.3)
 
 
 @pytest.mark.parametrize("method", ["em", "gradient"])

@@ -1,0 +1,206 @@
+"""Newton's method for a log-likelihood whose derivatives have Monte Carlo errors, and checks of
+where it ends.
+
+A pass estimates the gradient g of log L at θ, the covariance S of its Monte Carlo error, and the
+observed information I. The method has converged where the next step, I⁻¹g, is short:
+
+    gᵀI⁻¹g ≤ max(10⁻³, 4 tr I⁻¹S),
+
+in squares of standard errors. This is a maximum if I is positive definite, and larger than S by
+far. But far out on a slope that levels off, as of a likelihood whose maximum is at infinity, steps
+are short as well, and I is small and positive. There log L does not fall as its curvature says. So
+each pass measures log L at θ ± d_j as well, where entry j is one standard error away and the others
+follow, d_j = I⁻¹e_j / √(I⁻¹)_jj, and compares
+
+    log L(θ) + gᵀd - log L(θ + d)   with   ½ dᵀId.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from ..engine.verdict import Fault
+from .parameters import Parameters
+
+# The square of the next step of a search that has converged: at least, and in Monte Carlo errors.
+_SHORT, _SHORT_IN_ERRORS = 1e-3, 4.0
+# The longest step, in standard errors, and by how many halvings it returns to the constraint.
+_LONGEST, _HALVINGS = 2.0, 8
+_MOST_PASSES = 15
+# A Monte Carlo error of more, in standard errors, is too much for a maximum.
+_NOISE = 0.5
+# log L falls by ½ at one standard error from a maximum where it is quadratic; less than this share
+# of that is no maximum.
+_LEAST_FALL = 0.1
+
+_NO_MAXIMUM = (
+    "No maximum was found (`newton` is false). Take more `num_iterations`, a larger learning rate, "
+    "more `num_bridges`, or check that the likelihood has a maximum inside the constraint."
+)
+_NOT_INSIDE = (
+    "There is no maximum inside: one standard error from the estimate the log-likelihood hardly "
+    "falls (`fall` is below 0.1, and not 0.5), as where its maximum is at infinity. The data do "
+    "not determine these parameters: hold some fixed by `where=`, or use `gibbs` or `pmmh` with a "
+    "prior."
+)
+
+
+class Slope(NamedTuple):
+    """Log L near θ: its gradient, with the covariance of the Monte Carlo error, the observed
+    information, and by how much it rises from θ to each of 2p points around it."""
+
+    gradient: Float[Array, " p"]
+    covariance: Float[Array, "p p"]
+    information: Float[Array, "p p"]
+    rises: Float[Array, "2 p"]
+
+
+class Passes(NamedTuple):
+    """Newton's method after some passes: θ of the next one, the step that leads there, the longest
+    that was allowed, and its gain in squares of standard errors; what the last pass found, with the
+    `offsets` of its points, and details; what it hands on to the next."""
+
+    number: Int[Array, ""]
+    theta: Float[Array, " p"]
+    step: Float[Array, " p"]
+    longest: Float[Array, ""]
+    gain: Float[Array, ""]
+    offsets: Float[Array, "2 p p"]
+    slope: Slope
+    details: Any
+    memory: Any
+    converged: Bool[Array, ""]
+
+
+def newton_passes(
+    evaluate: Callable[[Int[Array, ""], Array, Array, Any], tuple[Slope, Any, Any]],
+    parameters: Parameters,
+    theta: Float[Array, " p"],
+    memory: PyTree,
+) -> Passes:
+    """Iterate Newton's method from θ until it has converged, for a bounded number of passes.
+
+    `evaluate(i, θ, offsets, memory)` returns the `Slope` at θ with the rises at θ + offsets, any
+    details, and the memory that the next pass is given.
+    """
+    evaluate = jax.jit(evaluate)  # for its shapes and in the loop traced once
+    p = len(theta)
+    offsets = jnp.zeros((2, p, p), theta.dtype)
+    shapes = jax.eval_shape(evaluate, jnp.int32(0), theta, offsets, memory)[:2]
+    slope, details = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+    def one(state: Passes) -> Passes:
+        here = state.theta
+        offsets = allowed_offsets(parameters, here, state.slope.information)
+        slope, details, memory = evaluate(state.number, here, offsets, state.memory)
+        step, longest, short = _next_step(parameters, state, slope)
+        gain = slope.gradient @ ascent_direction(slope.gradient, slope.information)
+        # The first pass has no points around, and none is skipped.
+        converged = short & (state.number > 0)
+        moved = here + step, step, longest, gain
+        return Passes(state.number + 1, *moved, offsets, slope, details, memory, converged)
+
+    def goes_on(state: Passes) -> Bool[Array, ""]:
+        return ~state.converged & (state.number < _MOST_PASSES)
+
+    none, longest = jnp.zeros_like(theta[0]), jnp.full_like(theta[0], _LONGEST)
+    at_start = theta, jnp.zeros_like(theta), longest, none
+    no = jnp.array(False)
+    start = Passes(jnp.int32(0), *at_start, offsets, slope, details, memory, no)
+    return lax.while_loop(goes_on, one, start)
+
+
+def is_maximum(slope: Slope) -> Bool[Array, ""]:
+    """Return whether the information is positive definite, and clearly so beside its noise."""
+    clear = _NOISE**2 * slope.information - slope.covariance
+    return jnp.all(jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(clear), clear, -1)) > 0)
+
+
+def falls(slope: Slope, offsets: Float[Array, "2 p p"]) -> Float[Array, "2 p"]:
+    """Return by how much log L falls at each offset beside its linear part, in units in which a
+    quadratic function falls by ½; infinite at a point that has no likelihood, or is not allowed."""
+    linear = offsets @ slope.gradient
+    quadratic = jnp.einsum("spi,ij,spj->sp", offsets, slope.information, offsets)
+    fall = (linear - slope.rises) / jnp.where(quadratic > 0, quadratic, 1)
+    measured = jnp.isfinite(slope.rises) & jnp.any(offsets != 0, axis=-1)
+    return jnp.where(measured, fall, jnp.inf)
+
+
+def maximum_faults(newton: Bool[Array, ""], fall: Float[Array, "2 p"]) -> tuple[Fault, Fault]:
+    """Return the faults of a search that found no maximum, or one at infinity."""
+    outside = newton & ~jnp.all(fall > _LEAST_FALL)
+    return Fault(~newton, _NO_MAXIMUM), Fault(outside, _NOT_INSIDE)
+
+
+def allowed_offsets(
+    parameters: Parameters, theta: Float[Array, " p"], information: Float[Array, "p p"]
+) -> Float[Array, "2 p p"]:
+    """Return the moves of each entry by one standard error, below and above, with the others at
+    their maximum given it; zero where they leave the constraint, or the information is not positive
+    definite."""
+    covariance = jnp.linalg.inv(information)
+    variances = jnp.diagonal(covariance)
+    ok = jnp.all(jnp.isfinite(covariance)) & jnp.all(variances > 0)
+    moves = jnp.where(ok, covariance / jnp.sqrt(jnp.where(ok, variances, 1))[:, None], 0)
+    offsets = jnp.stack([-moves, moves])
+    allowed = jax.vmap(jax.vmap(lambda offset: parameters.allowed(theta + offset)))(offsets)
+    return jnp.where(allowed[..., None], offsets, 0)
+
+
+def ascent_direction(
+    gradient: Float[Array, " p"], information: Float[Array, "p p"]
+) -> Float[Array, " p"]:
+    """Newton's step where log L is concave; elsewhere that with curvatures of the other sign turned
+    round, in units in which those along the axes are ±1: uphill in any case."""
+    scale = jnp.sqrt(jnp.abs(jnp.diagonal(information)))
+    scale = jnp.where((scale > 0) & jnp.isfinite(scale), scale, 1)
+    scaled = information / scale[:, None] / scale
+    scaled = jnp.where(
+        jnp.all(jnp.isfinite(scaled)), scaled, jnp.eye(len(scale), dtype=scale.dtype)
+    )
+    curvature, axes = jnp.linalg.eigh(scaled)
+    # Below this a curvature is not known from zero.
+    curvature = jnp.maximum(jnp.abs(curvature), 10 * jnp.finfo(scale.dtype).eps)
+    return axes @ ((axes.T @ (gradient / scale)) / curvature) / scale
+
+
+def longest_fraction(
+    gain: Float[Array, ""], longest: Float[Array, ""] | float = _LONGEST
+) -> Float[Array, ""]:
+    """Return the share of a step of this gain, its squared length in standard errors, that is not
+    too long."""
+    return longest / jnp.sqrt(jnp.maximum(gain, longest**2))
+
+
+def _next_step(
+    parameters: Parameters, state: Passes, slope: Slope
+) -> tuple[Float[Array, " p"], Float[Array, ""], Bool[Array, ""]]:
+    """The step from θ and the longest that is allowed after it, and whether it is so short that the
+    search has converged.
+
+    The longest step doubles while steps do not lead beyond a maximum. One that led far beyond, or
+    to where nothing is known, is taken back but for a quarter.
+    """
+    theta, (gradient, covariance, information, _) = state.theta, slope
+    step = ascent_direction(gradient, information)
+    gain = gradient @ step
+    usable = jnp.all(jnp.isfinite(information)) & jnp.isfinite(gain)
+    came = jnp.any(state.step != 0)
+    beyond = came & (gradient @ state.step < 0)
+    too_far = (beyond & (gain > state.gain)) | (came & ~usable)
+    longest = jnp.where(came & ~beyond, 2 * state.longest, _LONGEST)
+    forward = longest_fraction(gain, longest).astype(step.dtype) * step
+    # Where the information is unknown at first the pass is repeated.
+    forward = jnp.where(usable, forward, 0)
+    fractions = 0.5 ** jnp.arange(_HALVINGS, dtype=step.dtype)
+    tried = fractions[:, None] * forward
+    allowed = jax.vmap(lambda move: parameters.allowed(theta + move))(tried)
+    forward = jnp.where(jnp.any(allowed), tried[jnp.argmax(allowed)], 0)
+    noise = jnp.trace(jnp.linalg.inv(information) @ covariance)
+    short = gain <= jnp.maximum(_SHORT, _SHORT_IN_ERRORS * noise)
+    back = jnp.where(too_far & ~short, -0.75 * state.step, forward)
+    return back, longest, short & allowed[0] & usable
