@@ -56,7 +56,8 @@ def counts(seed, rate, sigma):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed, rate, sigma", [(1, 0.5, 1.0), (2, 1.0, 1.0), (3, 0.5, 0.7)])
 def test_errors_of_counts(seed, rate, sigma):
-    """Of 24 keys, against a filter on a grid."""
+    """Of 96 keys, against a filter on a grid. The root of the mean square of n standard normal
+    errors has a standard deviation of about 1 / √(2n)."""
     times, values = counts(seed, rate, sigma)
     sd = sigma / np.sqrt(2 * rate)
     nodes = np.linspace(-6 * sd, 6 * sd, 501)
@@ -70,7 +71,8 @@ def test_errors_of_counts(seed, rate, sigma):
         jb.log_likelihood(
             jax.random.key(i), model, times, values, observation=COUNTS, initial=law, num_steps=10
         )
-        for i in range(24)
+        for i in range(96)
     ]
     z = np.array([float((each.value - exact) / each.standard_error) for each in made])
-    assert 0.5 < np.sqrt(np.mean(z**2)) < 1.3 and np.mean(np.abs(z) > 3) <= 1 / 24
+    lowest = 1 - 5 / np.sqrt(2 * len(z))
+    assert lowest < np.sqrt(np.mean(z**2)) < 1.3 and np.mean(np.abs(z) > 3) <= 1 / 24
