@@ -102,7 +102,7 @@ def innovations_path(model, observation, _, initial):
 
 def smooth(model, observation, _, initial):
     options = dict(observation=observation, initial=initial, num_draws=4, num_steps=2)
-    return jb.smooth(KEY, model, TIMES, POINTS, **options).paths[0, 2, 0]
+    return jb.smooth(KEY, model, TIMES, POINTS, **options).paths[0, 0, 2, 0]
 
 
 def path_log_likelihood(model, *_):
