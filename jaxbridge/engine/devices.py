@@ -79,7 +79,7 @@ def on_whole_batches(function: Callable[..., _Result], *args: Any, **kwargs: Any
     return eqx.combine(hand_back(*leaves), static)
 
 
-def _is_split_by_vmap(array: Array | np.ndarray) -> bool:
+def _is_split_by_vmap(array: Array | np.ndarray | np.generic) -> bool:
     """Return whether the array is one of a batch that is split along an explicit axis of a mesh.
 
     Its type has the mesh, but not the axis: only rules of `vmap` get the batch.

@@ -267,7 +267,7 @@ def test_doubt_where_noise_is_led_on_by_the_state():
             num_draws=20, num_warmup=4, num_chains=2,
         )  # fmt: skip
         told, doubt = np.abs(made.step_error()[1:]), np.asarray(made.step_uncertainty()[1:])
-        assert np.isfinite(doubt).all() and np.all(doubt >= told) != known
+        assert np.any(doubt < told) == known  # else all of it is in doubt, or nothing is known
 
 
 def test_a_factor_of_many_rows_is_that_of_few(x64):
