@@ -52,6 +52,17 @@ class Captured:
         self.ids, self.values = tuple(tracers), tuple(tracers.values())
         self.entry = entry if tracers else None
 
+    # Models are compared, so that the functions of transformed ones compile once.
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Captured) and self._identity == other._identity
+
+    def __hash__(self) -> int:
+        return hash(self._identity)
+
+    @property
+    def _identity(self) -> tuple:
+        return self.functions, self.ids, tuple(map(id, self.values)), self.entry
+
     def known_to(self, entry: "_Entry") -> "Captured":
         """The same functions with all values that are known to be in their closures. Values that
         were passed along before are kept."""

@@ -169,7 +169,6 @@ def test_maps_take_one_point_and_many():
     np.testing.assert_allclose(logarithm.forward([[0.5], [2]]), np.log([[0.5], [2]]), rtol=1e-6)
 
 
-@pytest.mark.xfail(reason="functions are wrapped anew, to find what they close over")
 def test_maps_are_pytrees_that_compile_once():
     run = jax.jit(lambda moved, x: moved.forward(x))
     points = jnp.ones((5, 1))
@@ -235,7 +234,6 @@ def test_a_domain_is_told_from_no_domain():
     assert (np.asarray(free.paths) < 0).any() and free.num_nonfinite == 0
 
 
-@pytest.mark.xfail(reason="functions are wrapped anew, to find what they close over")
 def test_the_same_functions_compile_once():
     def run(mean):
         model = cir().with_params((RATE, mean, NOISE))
