@@ -77,6 +77,19 @@ def over_points(function: Callable) -> Callable[..., Any]:
     return over
 
 
+def hold(tree: PyTree[Array]) -> PyTree[Array]:
+    """The numbers of a point as values of their own, which a compiler computes once however many
+    functions read them. Where lanes are written out, the numbers of a lane pass through one product
+    with the identity, in which 0 · ∞ is NaN: they pass as halves, ∞ as the least power of two of
+    which the double is infinite."""
+
+    def finite(array):
+        most = 2.0 ** (jnp.finfo(array.dtype).maxexp - 1)
+        return jnp.clip(array / 2, -most, most)
+
+    return jax.tree.map(lambda array: 2 * array, lax.optimization_barrier(jax.tree.map(finite, tree)))
+
+
 class Rows(tuple[Array, ...]):
     """The rows of an array as arrays of their own, for the state of a compiled loop: each step
     would otherwise write them into one array, element by element."""
@@ -186,8 +199,8 @@ def _held(operands: list, form: AbstractForm, lanes: int) -> list:
     """The operands as values of their own, those of them that are of one floating dtype. XLA's CPU
     compiler drops barriers before it fuses, and then computes a function of a function's value
     anew for each number that the outer one reads; through a product of matrices it does not fuse,
-    and I x is x. It is linear, for what is held may be tangents; but 0 · ∞ is NaN, so that one
-    infinite number of a lane makes NaN of the others that are held with it."""
+    and I x is x. It is linear, for what is held may be tangents; infinite numbers are the affair of
+    `hold`."""
     arrays = [form.join(operand, lanes) if form.is_own(operand) else None for operand in operands]
     floats = [a for a in arrays if a is not None and jnp.issubdtype(a.dtype, jnp.floating)]
     alike = [a for a in floats if a.dtype == floats[0].dtype]

@@ -2,9 +2,9 @@
 
 from typing import ClassVar
 
-from jax import lax
 from jaxtyping import Array, Float
 
+from ..engine.lanes import hold
 from ..models import decisions
 from ..models.dynamics import Dynamics, ito_correction
 from .base import AbstractScheme
@@ -37,7 +37,7 @@ class Heun(AbstractScheme):
     def step(self, dynamics, x, dt, dw):
         drift, sigma = self._stratonovich_drift(dynamics, x), dynamics.sigma(x)
         # Computed before the drift there is, which would else compute it anew for each part.
-        predicted = lax.optimization_barrier(x + drift * dt + sigma.mv(dw))
+        predicted = hold(x + drift * dt + sigma.mv(dw))
         drift = (drift + self._stratonovich_drift(dynamics, predicted)) / 2
         return x + drift * dt + sigma.average(dynamics.sigma(predicted)).mv(dw)
 

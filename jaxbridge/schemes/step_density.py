@@ -42,9 +42,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
+from ..engine.lanes import hold
 from ..engine.linalg import matmul, semidefinite_factor, total
 from ..models.dynamics import Dynamics
 from ..models.sigma import columns_of
@@ -153,7 +153,7 @@ class ItoTaylorDensity(AbstractStepDensity):
         along = [_along(dynamics.drift, x, column) for column in columns_of(sigma, x)]
         slopes, bends = zip(*along, strict=True)
         # What is made of them would else compute them anew for each of its numbers.
-        drift, slopes, bends = lax.optimization_barrier((dynamics.drift(x), slopes, bends))
+        drift, slopes, bends = hold((dynamics.drift(x), slopes, bends))
         beta = sigma.solve(drift)
         # σ (Aβ + ½ Δβ), and A with columns σ⁻¹ (∇α σ_k).
         bent = total(jnp.stack([slopes[k] * beta[k] + bends[k] / 2 for k in range(d)]))

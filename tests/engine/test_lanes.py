@@ -11,7 +11,7 @@ from jax import lax
 
 import jaxbridge as jb
 from jaxbridge.coupling.join import Inputs, propose
-from jaxbridge.engine.lanes import join_rows, over_lanes, over_points, split_rows
+from jaxbridge.engine.lanes import hold, join_rows, over_lanes, over_points, split_rows
 from jaxbridge.engine.linalg import cholesky, inverse, polar_factor, safe_norm
 from jaxbridge.models.bridge_problem import Intervals
 from jaxbridge.proposals.coupled import pair_log_weights
@@ -209,7 +209,7 @@ def test_a_function_of_a_held_value_computes_that_once():
 
         return jax.jit(over_lanes(-1)(function))
 
-    held, plain = nested(jax.lax.optimization_barrier), nested(lambda y: y)
+    held, plain = nested(hold), nested(lambda y: y)
     points = _points()
     _assert_close(held(points), plain(points))
     where_made = [
@@ -221,6 +221,16 @@ def test_a_function_of_a_held_value_computes_that_once():
     for function in (held, plain):
         slope = jax.grad(lambda x, function=function: jnp.sum(function(x)))(points)
         _assert_close(slope, jax.grad(lambda x: jnp.sum(plain(x)))(points))
+
+
+def test_infinite_numbers_do_not_reach_what_is_held_with_them():
+    """And large and small numbers keep their value, and tangents theirs."""
+    largest = jnp.finfo(jnp.float32).max
+    points = jnp.array([[jnp.inf, 1.0], [-jnp.inf, largest], [-largest, 3e-38]]).T
+    held = jax.jit(over_lanes(-1)(hold))(points)
+    np.testing.assert_array_equal(held, points)
+    slope = jax.grad(lambda x: jnp.sum(over_lanes(-1)(hold)(x)[1]))(points)
+    np.testing.assert_array_equal(slope, [[0, 0, 0], [1, 1, 1]])
 
 
 def test_what_is_held_can_be_tangents():
