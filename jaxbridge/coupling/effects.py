@@ -60,7 +60,7 @@ def effects(
     check_coupling(coupling)
     num_steps = check_num_steps(num_steps, 1)
     like = _find_point(model) if at is None else as_floating("at", at)
-    if like.ndim != 1:
+    if like.ndim != 1 or not like.size:
         raise ValueError(f"`at` must be one point, shape (d,); got {like.shape}.")
     invertible, depends_on_time = model.sigma_is_invertible(like), model.depends_on_time
     noise_by_drift = decisions.noise_by_drift(invertible)

@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..engine.arguments import check_function
+from ..engine.arguments import check_function, named
 from ..engine.captured import Captured
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import dot
+from ..models.diffusion import check_value
 from ..schemes import AbstractScheme, Euler, Frame, HeunOrEuler
 from .base import AbstractCoupling, Rotation
 from .meeting import AbstractMeeting, BrownianCrossing, ReflectionPlane, SignTest
@@ -134,7 +135,8 @@ class Coupling(AbstractCoupling):
         if self._gamma_law is None:
             return self
         law = self._gamma_law
-        gamma = jax.vmap(lambda key: self._captured.call(law, key))(keys)
+        draw = named("gamma", self._captured.call)
+        gamma = jax.vmap(lambda key: check_value("gamma", draw(law, key), (), self.gamma))(keys)
         return eqx.tree_at(lambda c: c.gamma, self, _in_range(gamma.astype(self.gamma.dtype)))
 
     def _turn(self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None):

@@ -9,6 +9,7 @@ where x tends to x', and L solves by substitution (`driven_through_root`).
 import equinox as eqx
 from jaxtyping import Array, Float
 
+from ..engine.arguments import as_returned, evaluated
 from ..engine.checks import Numbers, as_floating, check_precision
 from ..engine.linalg import matmul, matvec, polar_factor
 from ..models import decisions
@@ -89,7 +90,14 @@ def rotation_between(
         return None
     assert isinstance(sigma, Full | Triangular) and isinstance(driven_sigma, Full | Triangular)
     rotation = polar_rotation if coupling.rotation is None else coupling.rotation
-    return rotation(sigma.matrix, driven_sigma.matrix)
+    matrix = evaluated("rotation", rotation, sigma.matrix, driven_sigma.matrix)
+    matrix = as_returned("rotation", matrix)
+    if matrix.shape != sigma.matrix.shape:
+        raise ValueError(
+            f"`rotation` must return a matrix of shape {sigma.matrix.shape}; it returned shape "
+            f"{matrix.shape}."
+        )
+    return matrix.astype(sigma.matrix.dtype)
 
 
 def rotation_effect(coupling: AbstractCoupling, sigma: type[AbstractSigma]) -> decisions.Effect:

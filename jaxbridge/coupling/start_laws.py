@@ -24,6 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from ..engine.arguments import evaluated
 from ..engine.captured import Captured
 from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
 from ..engine.keys import folded
@@ -214,7 +215,7 @@ def draw_starts(
     if isinstance(law, Stationary):
         draws = jax.vmap(model.sample_stationary)(keys)
     else:
-        draws = jax.vmap(lambda key: law.sample(key, model))(keys)
+        draws = jax.vmap(lambda key: evaluated("start_law", law.sample, key, model))(keys)
     if draws.shape[1:] != end.shape[:1]:
         raise ValueError(
             f"`start_law` must give points of shape {end.shape[:1]}, as the end points are; it "

@@ -1,5 +1,6 @@
 """Arguments that are no numbers: functions of the user, words, flags and progress meters."""
 
+import functools
 import inspect
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -20,7 +21,8 @@ _NEED_VALUES = (
     jax.errors.NonConcreteBooleanIndexError,
 )
 
-_NOT_THERE = (AttributeError, IndexError, KeyError, ZeroDivisionError)
+# What has a cause outside of the function: the device, the memory, guards against NaNs.
+_NOT_THE_FUNCTIONS = (RuntimeError, FloatingPointError)
 
 
 def check_function(name: str, function: Any, *signatures: str, optional: bool = False) -> None:
@@ -52,30 +54,31 @@ def _takes(function: Callable, number: int) -> bool:
 
 
 def named(name: str, function: Callable) -> Callable:
-    """Return `function`, whose errors that name nothing are raised with its name: `TypeError` where
-    it cannot be traced, `ValueError` where it takes from its arguments what these do not have."""
-
-    def call(*args):
-        try:
-            return function(*args)
-        except _NOT_THERE as error:
-            raise ValueError(f"`{name}` raised {type(error).__name__}: {error}") from error
-        except _NEED_VALUES as error:
-            raise TypeError(
-                f"`{name}` cannot be traced by JAX, for it needs the values of its arguments: "
-                "write it with `jax.numpy` in the place of `numpy`, and `jnp.where` in the place "
-                "of `if`."
-            ) from error
-
-    return call
+    """Return `function`, whose errors are raised with its name."""
+    return functools.partial(evaluated, name, function)
 
 
 def evaluated(name: str, function: Callable, *args: Any) -> Any:
-    """Return `function(*args)`, whose errors are raised with its name."""
+    """Return `function(*args)`.
+
+    **Raises:** `TypeError` where the function cannot be traced. The function's own errors are
+    raised again with its name, a `TypeError` as such, all others as `ValueError`.
+    """
     try:
         return function(*args)
-    except Exception as error:  # the user's own
-        raise ValueError(f"`{name}` raised {type(error).__name__}: {error}") from error
+    except _NEED_VALUES as error:
+        raise TypeError(
+            f"`{name}` cannot be traced by JAX, for it needs the values of its arguments: "
+            "write it with `jax.numpy` in the place of `numpy`, and `jnp.where` in the place "
+            "of `if`."
+        ) from error
+    except _NOT_THE_FUNCTIONS:
+        raise
+    except Exception as error:
+        if f"`{name}`" in str(error):
+            raise
+        kind = TypeError if isinstance(error, TypeError) else ValueError
+        raise kind(f"`{name}` raised {type(error).__name__}: {error}") from error
 
 
 def as_returned(name: str, value: Any, complex_too: bool = False) -> Array:

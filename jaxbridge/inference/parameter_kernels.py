@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key
 
-from ..engine.arguments import check_function
+from ..engine.arguments import check_function, evaluated, shown
 from ..engine.lanes import over_lanes
 from ..engine.linalg import any_cholesky, any_solve, dot, matvec
 from .augmentation import Augmentation, Paths
@@ -158,9 +158,22 @@ class GivenKernel(AbstractParameterKernel):
         def log_density(params):
             return data.log_posterior(data.parameters.vector(params))
 
-        kernel = self.build(log_density)
-        state, _ = kernel.step(key, kernel.init(data.parameters.select(theta)))
-        moved = data.parameters.vector(state.position)
+        def step(key, params):
+            kernel = self.build(log_density)
+            if not all(callable(getattr(kernel, part, None)) for part in ("init", "step")):
+                raise TypeError(
+                    "`parameter_kernel` must return a kernel with functions `init(position)` and "
+                    f"`step(key, state)`, as those of BlackJAX; it returned {shown(kernel)}."
+                )
+            state, _ = kernel.step(key, kernel.init(params))
+            return data.parameters.vector(state.position)
+
+        moved = evaluated("parameter_kernel", step, key, data.parameters.select(theta))
+        if moved.shape != theta.shape:
+            raise ValueError(
+                "`parameter_kernel` must keep the structure of the unknown parameters; it "
+                f"returned {moved.size} numbers in the place of {theta.size}."
+            )
         ok = data.parameters.allowed(moved)
         moved = jnp.where(ok, moved, theta)
         return ParameterStep(moved, jnp.any(moved != theta))

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Inexact, Key, PyTree
 
-from ..engine.arguments import as_returned, check_flag, check_function, named
+from ..engine.arguments import as_returned, check_flag, check_function, evaluated, named
 from ..engine.captured import Captured
 from ..engine.checks import (
     Numbers,
@@ -225,7 +225,15 @@ class Diffusion(eqx.Module):
                 "a function `(key, params) -> x`, to `Diffusion`."
             )
         check_key(key)
-        return self._captured.call(self._sample_stationary, key, self._prepared_params())
+        sample = named("sample_stationary", self._captured.call)
+        drawn = sample(self._sample_stationary, key, self._prepared_params())
+        point = as_returned("sample_stationary", drawn)
+        if point.ndim != 1:
+            raise ValueError(
+                "`sample_stationary` must return one point, shape (d,); it returned shape "
+                f"{point.shape}."
+            )
+        return point
 
     @property
     def has_sampler(self) -> bool:
@@ -393,7 +401,12 @@ class Diffusion(eqx.Module):
             return lambda time: lambda x: constant_sigma, False
         function = named("diffusion", self._traced_once(self._diffusion))
         timed = takes_time(self._diffusion)
-        values = function if timed else lambda x, params, time: function(x, params)
+
+        def values(x, params, time):
+            value = function(x, params, time) if timed else function(x, params)
+            # Models that know the form of their σ return it.
+            return value if isinstance(value, AbstractSigma) else as_returned("diffusion", value)
+
         now = jnp.zeros((), like.dtype)
         varies = uses_argument(lambda x: values(x, params, now), like)
         if not (varies or timed):
@@ -486,7 +499,7 @@ class Diffusion(eqx.Module):
     def _prepared_params(self) -> PyTree:
         if self._prepare is None:
             return self.params
-        return self._captured.call(self._prepare, self.params)
+        return named("prepare", self._captured.call)(self._prepare, self.params)
 
     def _log_stationary_function(self) -> Callable[[Array], Array]:
         if self._log_stationary is None:
@@ -504,9 +517,10 @@ def _as_sigma(
     if values is None:
         return Identity()
     d = x.shape[0]
-    if isinstance(values, AbstractSigma):  # of a model that knows the form of its σ
+    if isinstance(values, AbstractSigma):
         sigma: AbstractSigma = cast_floats(values, x.dtype)
-        return Constant(sigma.as_matrix(d, x.dtype)) if constant else sigma
+        as_it_is = isinstance(sigma, Identity) or not constant
+        return sigma if as_it_is else Constant(sigma.as_matrix(d, x.dtype))
     values = as_returned("diffusion", values)
     if values.shape != (d,) and not (values.ndim == 2 and values.shape[0] == d and values.size):
         raise ValueError(
@@ -544,6 +558,16 @@ def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) 
             f"it returned {value.shape}."
         )
     return value.astype(x.dtype)
+
+
+def value_at(
+    name: str, function: Callable, shape: tuple, x: Float[Array, " d"], *others: Any
+) -> Array:
+    """Return `function(x, *others)`, in the dtype of `x`.
+
+    **Raises:** `ValueError` and `TypeError` with its name, for its errors and for another shape.
+    """
+    return check_value(name, evaluated(name, function, x, *others), shape, x)
 
 
 def check_dimension(x: Float[Array, " d"], dim: int) -> None:

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from ..engine.arguments import check_function
+from ..engine.arguments import as_returned, check_function, evaluated
 from ..engine.checks import Numbers, as_numbers, check_range, is_traced
 from ..engine.linalg import matvec
-from .diffusion import Diffusion, check_value
+from .diffusion import Diffusion, check_value, value_at
 from .dynamics import weighted_divergence
 from .sigma import Triangular, root_of
 
@@ -133,13 +133,14 @@ class _RecipeDrift:
 
     def __call__(self, x: Float[Array, " d"], params: PyTree) -> Float[Array, " d"]:
         def product(y, v):
-            image = v if self.V is None else _multiply(self.V(y, params), v)
+            image = v if self.V is None else _multiply(_matrix("V", self.V, y, params), v)
             if self.Q is not None:
-                image += self.sign * _multiply(self.Q(y, params), v)
+                image += self.sign * _multiply(_matrix("Q", self.Q, y, params), v)
             return image
 
         varies = not (self.V is None and self.Q is None)
-        return weighted_divergence(product, lambda y: self.log_density(y, params), x, varies) / 2
+        log_nu = lambda y: _log_nu(self.log_density, y, params)
+        return weighted_divergence(product, log_nu, x, varies) / 2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,7 +150,7 @@ class _Root:
     V: Callable
 
     def __call__(self, x: Float[Array, " d"], params: PyTree) -> Float[Array, " d"] | Triangular:
-        V = jnp.asarray(self.V(x, params))
+        V = _matrix("V", self.V, x, params)
         return jnp.sqrt(V) if V.ndim == 1 else root_of(V)
 
 
@@ -161,7 +162,7 @@ class _HeatedDrift:
     temperature: float | Callable
 
     def __call__(self, x: Float[Array, " d"], params: PyTree) -> Float[Array, " d"]:
-        log_nu = lambda y: check_value("log_density", self.log_density(y, params), (), y)
+        log_nu = lambda y: _log_nu(self.log_density, y, params)
         return _temperature(self.temperature, x, params) * jax.grad(log_nu)(x)
 
 
@@ -178,10 +179,27 @@ class _HeatedNoise:
 def _temperature(
     temperature: float | Callable, x: Float[Array, " d"], params: PyTree
 ) -> Float[Array, ""]:
-    value = temperature(params) if callable(temperature) else temperature
-    return check_value("temperature", value, (), x)
+    if callable(temperature):
+        temperature = evaluated("temperature", temperature, params)
+    return check_value("temperature", temperature, (), x)  # pyright: ignore[reportArgumentType]
+
+
+def _log_nu(log_density: Callable, x: Float[Array, " d"], params: PyTree) -> Float[Array, ""]:
+    """log ν at one point."""
+    return value_at("log_density", log_density, (), x, params)
+
+
+def _matrix(name: str, function: Callable, x: Float[Array, " d"], params: PyTree) -> Array:
+    """A matrix field at one point: shape (d, d), or (d,) for a diagonal."""
+    value = as_returned(name, evaluated(name, function, x, params))
+    (d,) = x.shape
+    if value.shape not in ((d,), (d, d)):
+        raise ValueError(
+            f"`{name}` must return shape ({d}, {d}), or ({d},) for a diagonal, at a point of shape "
+            f"({d},); it returned {value.shape}."
+        )
+    return value.astype(x.dtype)
 
 
 def _multiply(matrix: Array, vector: Float[Array, " d"]) -> Float[Array, " d"]:
-    matrix = jnp.asarray(matrix)
     return matrix * vector if matrix.ndim == 1 else matvec(matrix, vector)

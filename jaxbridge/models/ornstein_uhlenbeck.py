@@ -28,6 +28,7 @@ from .bridge_problem import as_intervals
 from .diffusion import Diffusion, check_dimension, check_invertible
 from .gaussian_law import GaussianLaw
 from .linear import linear_transition
+from .sigma import Identity
 
 
 class OrnsteinUhlenbeckParams(NamedTuple):
@@ -177,7 +178,7 @@ def _reverse_drift(x, p: _Prepared):
 
 
 def _sigma(x, p: _Prepared):
-    return p.sigma
+    return Identity() if p.sigma is None else p.sigma
 
 
 def _log_stationary(x, p: _Prepared):

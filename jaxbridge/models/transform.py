@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from ..engine.arguments import check_function
 from ..engine.checks import Numbers, as_floating
 from ..engine.linalg import log_abs_det
-from .diffusion import Diffusion, check_diffusion, check_value
+from .diffusion import Diffusion, check_diffusion, value_at
 from .sigma import columns_of
 
 Map = Callable[[Array], Any]
@@ -62,7 +62,7 @@ class Transformed(eqx.Module):
                 "`bridges` must be what `sample_bridges`, `sample_weighted_bridges` or "
                 f"`sample_exact_bridges` returned; got {type(bridges).__name__}."
             )
-        inverse = lambda y: check_value("inverse", self.inverse(y), y.shape, y)
+        inverse = lambda y: value_at("inverse", self.inverse, y.shape, y)
         mapped = jax.vmap(inverse)(_rows(paths))
         return eqx.tree_at(lambda result: result.paths, bridges, mapped.reshape(paths.shape))
 
@@ -175,11 +175,11 @@ class _Moved:
         return self._f(self.unbound.with_params(params).sample_stationary(key))
 
     def _at(self, y, params) -> tuple[Array, Diffusion]:
-        x = check_value("inverse", self.inverse(y), y.shape, y)
+        x = value_at("inverse", self.inverse, y.shape, y)
         return x, self.unbound.with_params(params)
 
     def _f(self, x):
-        return check_value("forward", self.forward(x), x.shape, x)
+        return value_at("forward", self.forward, x.shape, x)
 
     def _along(self, x, direction):
         """∇f v."""

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..engine.arguments import check_function
 from ..engine.checks import Numbers, as_numbers, check_range
-from .diffusion import Diffusion, check_value, halves
+from .diffusion import Diffusion, halves, value_at
 
 
 class UnderdampedLangevinParams(NamedTuple):
@@ -78,7 +78,7 @@ class _Functions:
         return -(self._energy(q, p) + v @ v / 2) / p.temperature
 
     def _energy(self, q, p):
-        return check_value("potential", self.potential(q, p.potential), (), q)
+        return value_at("potential", self.potential, (), q, p.potential)
 
 
 def _sigma(x, p):
