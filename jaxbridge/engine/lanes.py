@@ -87,7 +87,8 @@ def hold(tree: PyTree[Array]) -> PyTree[Array]:
         most = 2.0 ** (jnp.finfo(array.dtype).maxexp - 1)
         return jnp.clip(array / 2, -most, most)
 
-    return jax.tree.map(lambda array: 2 * array, lax.optimization_barrier(jax.tree.map(finite, tree)))
+    held = lax.optimization_barrier(jax.tree.map(finite, tree))
+    return jax.tree.map(lambda array: 2 * array, held)
 
 
 class Rows(tuple[Array, ...]):
