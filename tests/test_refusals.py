@@ -422,6 +422,12 @@ def middle(end):
     return jb.weigh_bridges(KEY, PAPER, some).mean()[5]
 
 
+def with_gamma(gamma):
+    """A coupling's own numbers: reverse mode would end in the midst of its loops."""
+    density = jb.transition_log_density(KEY, PAPER, A, B, 1.0, proposal=jb.Coupling(gamma))
+    return density.value
+
+
 def of_sigma(sigma):
     made_at = PAPER.with_params(PAPER.params._replace(sigma=sigma))
     return jb.expectation(middle_of, weighted(), made_at)
@@ -436,6 +442,7 @@ EXACT = [
     ("no counts", weigh(approximate, num_counts=0), "at least 1"),
     ("another law", weigh(approximate, BLIND, start_law=LAW), "paid for"),
     *each("derivative", lambda d: traced(d(middle), X), [jax.jacfwd, jax.jacrev], *STOP),
+    *each("coupling", lambda d: traced(d(with_gamma), 0.5), [jax.grad, jax.jacfwd], *STOP),
     # Chains.
     ("method", exact(method="gibbs"), '`method` must be "pseudo_marginal", "renewal"'),
     ("proposal", exact(proposal=0.5), "`proposal` must be", TypeError),

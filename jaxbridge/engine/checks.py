@@ -220,9 +220,9 @@ def nondifferentiable(tree: PyTree) -> PyTree:
 def _refuse(primals, tangents):
     raise TypeError(
         "what corrects bridges to their exact law has no derivative path by path: whether a pair "
-        "meets, and how often a bridge is hit, depends on the parameters too. Apply "
-        "`jax.lax.stop_gradient` to the parameters where bridges are made, and differentiate a "
-        "likelihood of their paths."
+        "meets, and how often a bridge is hit, depends on the numbers of the model and of the "
+        "coupling too. Apply `jax.lax.stop_gradient` to them where bridges are made, and "
+        "differentiate a likelihood of their paths."
     )
 
 

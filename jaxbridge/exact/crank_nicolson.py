@@ -116,7 +116,7 @@ def _init(
     intervals: Intervals,
     num_steps: int,
 ) -> CrankNicolsonState:
-    model, intervals = nondifferentiable((model.prepared(), intervals))
+    model, proposal, intervals = nondifferentiable((model.prepared(), proposal, intervals))
     dynamics = model.forward(intervals.start[0])
     if paths is None:
         noise = _normal(keys, num_steps, intervals)
@@ -129,7 +129,7 @@ def _init(
 
 @compiled_sooner
 def _step(rng_key, state, model, proposal, intervals, beta):
-    model, intervals = nondifferentiable((model.prepared(), intervals))
+    model, proposal, intervals = nondifferentiable((model.prepared(), proposal, intervals))
     dynamics = model.forward(intervals.start[0])
     state = jax.tree.map(lambda leaf: leaf[None], state)
     moved = _move(rng_key[None], state, proposal, dynamics, intervals, beta)
@@ -175,7 +175,8 @@ def run_crank_nicolson(
     beta: Float[Array, ""],
 ) -> Chain:
     """The chain of each interval, side by side, from its `position` if there is one."""
-    model, problem, position = nondifferentiable((model.prepared(), problem, position))
+    fixed = (model.prepared(), proposal, problem, position)
+    model, proposal, problem, position = nondifferentiable(fixed)
     intervals, num_steps = problem.intervals, problem.num_steps
     dynamics = model.forward(problem.like)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)

@@ -127,7 +127,7 @@ class Chain(AbstractExactBridges):
                 truncated_weights(cut),
                 lost_paths(self.num_nonfinite, self.num_simulated),
                 *heavy,
-                Fault(moves < min(_FEWEST_MOVES, self.accepted.shape[-1] / 2), _STILL),
+                Fault(moves < min(_FEWEST_MOVES, (self.accepted.shape[-1] + 1) // 2), _STILL),
                 step_fault(self.step_error_in_sds(), error),
             )
         )

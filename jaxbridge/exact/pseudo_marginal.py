@@ -99,14 +99,15 @@ def pseudo_marginal(
 
 @compiled_sooner
 def _draw_state(rng_key, model, proposal, intervals, num_steps):
-    model, intervals = nondifferentiable((model.prepared(), intervals))
+    model, proposal, intervals = nondifferentiable((model.prepared(), proposal, intervals))
     drawn = proposal.draw(rng_key[None, None], model, intervals, num_steps, None, False)
     return _first(drawn), drawn.num_simulated[0, 0]
 
 
 @compiled_sooner
 def _reweigh_state(rng_key, paths, model, proposal, intervals, num_steps):
-    model, intervals, paths = nondifferentiable((model.prepared(), intervals, paths))
+    fixed = (model.prepared(), proposal, intervals, paths)
+    model, proposal, intervals, paths = nondifferentiable(fixed)
     return _first(proposal.reweigh(rng_key[None], model, intervals, paths))
 
 
@@ -136,7 +137,8 @@ def run_pseudo_marginal(
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Chain:
     """The chain of each interval, from its `first` path if there is one."""
-    model, problem, first = nondifferentiable((model.prepared(), problem, first))
+    fixed = (model.prepared(), proposal, problem, first)
+    model, proposal, problem, first = nondifferentiable(fixed)
     intervals, num_steps = problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)

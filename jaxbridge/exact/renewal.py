@@ -110,7 +110,8 @@ def renewal(
 @compiled_sooner
 def _renewal_step(rng_key, state, model, pairs, intervals):
     everything = jnp.ones(1, bool)
-    model, intervals, path = nondifferentiable((model.prepared(), intervals, state.position))
+    fixed = (model.prepared(), pairs, intervals, state.position)
+    model, pairs, intervals, path = nondifferentiable(fixed)
     paths, info = renew(rng_key[None], model, pairs, intervals, path[None], everything)
     return RenewalState(paths[0]), jax.tree.map(lambda leaf: leaf[0], info)
 
@@ -242,7 +243,8 @@ def run_renewal(
     one, since a proposal depends on the key of its step only: from there on they are one, and
     the rest of the record holds. So a repair is short, and the result that of one long run.
     """
-    model, problem, first = nondifferentiable((model.prepared(), problem, first))
+    fixed = (model.prepared(), pairs, problem, first)
+    model, pairs, problem, first = nondifferentiable(fixed)
     intervals, num_steps, num_intervals = (
         problem.intervals,
         problem.num_steps,

@@ -144,8 +144,8 @@ class CoupledPairs(AbstractSingleProposal):
             )
 
     def prepared(self, key, model, intervals, num_steps):
-        _, end, duration = nondifferentiable(intervals)
-        coupling = with_start_law(key, model, self.coupling, end, duration, num_steps)
+        coupling, (_, end, duration) = nondifferentiable((self.coupling, intervals))
+        coupling = with_start_law(key, model, coupling, end, duration, num_steps)
         return eqx.tree_at(lambda p: p.coupling, self, coupling)
 
     def fractions(self, num_steps):
@@ -166,7 +166,7 @@ class CoupledPairs(AbstractSingleProposal):
         active=None,
         progress_meter=None,
     ):
-        model, intervals = nondifferentiable((model, intervals))
+        self, model, intervals = nondifferentiable((self, model, intervals))
         max_proposals = jnp.int32(1) if misses_count else self.max_proposals
 
         def block(keys, intervals, active):
@@ -211,7 +211,7 @@ class CoupledPairs(AbstractSingleProposal):
     def reweigh(self, keys, model, intervals, paths, active=None):
         # Under the target the counts of a path are size-biased, and x_0 is where a trial that
         # hit had started: N + 1 counts, less one trial.
-        model, intervals, paths = nondifferentiable((model, intervals, paths))
+        self, model, intervals, paths = nondifferentiable((self, model, intervals, paths))
         found = jnp.all(jnp.isfinite(paths), axis=(1, 2))
         if active is not None:
             found &= active
