@@ -147,6 +147,15 @@ class Diffusion(eqx.Module):
             check_function(name, function, signature, optional=True)
         check_flag("reversible", reversible)
         check_flag("normalised", normalised)
+        if normalised and log_stationary is None:
+            raise ValueError(
+                "`normalised=True` is about `log_stationary`: give this function, or leave it out."
+            )
+        if reversible and reverse_drift is not None:
+            raise ValueError(
+                "`reversible=True` declares that the reverse drift is the drift: leave out "
+                "`reverse_drift`, or this."
+            )
         of_stationary = {
             "log_stationary": log_stationary is not None,
             "reverse_drift": reverse_drift is not None,
