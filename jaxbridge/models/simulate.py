@@ -1,5 +1,7 @@
 """Unconditional paths of the diffusion, by diffrax."""
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key
 
-from ..engine.arguments import check_instance
+from ..engine.arguments import check_instance, shown
 from ..engine.checks import Numbers, as_floating, check_count, check_key, check_num_steps
 from ..engine.compiled import compiled
 from ..engine.doors import door
@@ -76,12 +78,26 @@ def simulate(
         )
     x0 = jnp.broadcast_to(x0, (num_paths, x0.shape[-1]))
     solver = diffrax.Heun() if solver is None else solver
-    check_instance("solver", solver, diffrax.AbstractSolver, "a solver of diffrax, an instance")
+    _check_solver(solver)
     clock, since = known.clock(x0.dtype)
     gaps = known.gaps.astype(x0.dtype)
     if model.depends_on_time:
         check_resolved(clock, since, gaps / num_steps)
     return _simulate(path_key, model, x0, clock, since[:-1], gaps, num_steps, solver)
+
+
+def _check_solver(solver: Any) -> None:
+    """Raise `TypeError` for anything but a solver of stochastic differential equations."""
+    check_instance("solver", solver, diffrax.AbstractSolver, "a solver of diffrax, an instance")
+    of_any = diffrax.AbstractItoSolver | diffrax.AbstractStratonovichSolver
+    of_langevin = diffrax.ALIGN | diffrax.QUICSORT | diffrax.ShOULD
+    if not isinstance(solver, of_any) or isinstance(solver, of_langevin):
+        raise TypeError(
+            "`solver` must be a solver of diffrax for any stochastic differential equation, such "
+            "as `diffrax.Heun()`, `diffrax.Euler()` or `diffrax.SRA1()`: an "
+            "`AbstractItoSolver` or an `AbstractStratonovichSolver`, not of Langevin's equation "
+            f"only; got {shown(solver)}."
+        )
 
 
 @compiled
