@@ -222,7 +222,7 @@ MODELS = [
     ),
     ("bridges", lambda: transform()().back(3.0), "`bridges` must be", TypeError),
     ("σ is traced", traced(lambda s: scaled(s).drift(X), 0.5), "constant σ that is traced"),
-    ("domain", domain(lambda x, p: x > 0), "`domain` must return one truth value"),
+    ("domain", domain(lambda x, p: x > 0), "`domain` must return one boolean"),
     ("model", lamperti(model=3.0), "`model` must be", TypeError),
     ("two points", lamperti(at=[0.5, 0.5]), "`at` must be a number"),
     ("outside", lamperti(at=-1.0), "`at` must be a point inside"),

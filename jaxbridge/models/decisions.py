@@ -71,7 +71,7 @@ def noise_by_drift(invertible: bool) -> Effect:
     """Decide whether to simulate ∫ (δ - s) ∇α σ dW, the noise that the drift transports."""
     if invertible:
         return Effect(False, "σ reaches all coordinates")
-    return Effect(True, "σ has fewer columns than rows: the drift carries noise to all coordinates")
+    return Effect(True, "σ has fewer columns than rows: the drift transports the noise")
 
 
 def time(depends_on_time: bool) -> Effect:
