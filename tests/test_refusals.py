@@ -169,9 +169,9 @@ MODELS = [
         of(jb.underdamped_langevin, LOG_NORMAL)(np.ones(2)),
         "`friction` must be a number",
     ),
-    ("half", lambda: jb.underdamped_langevin(LOG_NORMAL).drift(np.ones(3)), "as many of the one"),
+    ("half", lambda: jb.underdamped_langevin(LOG_NORMAL).drift(np.ones(3)), "even number of coord"),
     ("no model", of(jb.integrated)(3.0), "`model` must be", TypeError),
-    ("integral", lambda: jb.integrated(HYPERBOLIC).drift(np.ones(3)), "as many coordinates"),
+    ("integral", lambda: jb.integrated(HYPERBOLIC).drift(np.ones(3)), "even number of coord"),
     ("seasons", of(jb.seasonal_ornstein_uhlenbeck)(np.eye(2)), "`rate` must have shape"),
     # Closed forms.
     ("another model", of(jb.ou_stationary)(HYPERBOLIC), "made by `ornstein_uhlenbeck`", TypeError),
@@ -282,7 +282,7 @@ COUPLING = [
     ("burn-in", of(jb.Stationary)(-1.0), "positive time"),
     ("mean", of(jb.GaussianLaw)([0.0], jnp.eye(2)), "must have shape"),
     ("covariance", of(jb.GaussianLaw)(A, jnp.eye(3)), "must have shape"),
-    *each("law", of(jb.GaussianLaw, A), [-np.eye(2), np.eye(2)[::-1]], "positive definite"),
+    *each("law", of(jb.GaussianLaw, A), [-np.eye(2), np.eye(2)[::-1]], "positive semidef"),
     ("singular law", coupling(start_law=SINGULAR_LAW), "positive definite"),
     # Bridges.
     ("cube", bridges(start=[[A]]), "`start` must be one point"),
