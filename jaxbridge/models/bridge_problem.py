@@ -80,7 +80,7 @@ class BridgeProblem(eqx.Module):
         return dataclasses.replace(self, stored=stored)
 
     def kept(self, paths: Float[Array, "*I points d"]) -> Float[Array, "*I K d"]:
-        """Return the stored points of paths that have all N + 1 points."""
+        """Return the stored points of paths with all grid points."""
         return paths if self.stored is None else paths[..., self.stored, :]
 
     def times(self, fractions: Float[np.ndarray, " points"]) -> Float[Array, "*durations K"]:
@@ -99,8 +99,10 @@ class BridgeProblem(eqx.Module):
         return tree if self.batched else jax.tree.map(lambda leaf: leaf[0], tree)
 
     def total(self, counts: Shaped[Array, "..."]) -> Int[Array, "*I"]:
-        """Return the sum of `counts` for each interval. The counts are grouped by interval, in
-        order, with equally many for each."""
+        """Return the sum of `counts` for each interval.
+
+        The counts are grouped by interval, in order, with equally many for each.
+        """
         sums = jnp.sum(counts.reshape(self.num_intervals, -1), axis=1, dtype=jnp.int32)
         return self.result(sums)
 
@@ -194,8 +196,9 @@ def uniform_fractions(num_steps: int) -> Float[np.ndarray, " points"]:
 def _stored_steps(
     save_at: Numbers | None, duration: Numbers, fractions: Float[np.ndarray, " points"]
 ) -> Int[Array, " K"] | None:
-    """Return the indices of the grid points t_i = `duration` × `fractions[i]` that are nearest to
-    `save_at`; `None` for all points. Traced times are not checked.
+    """Return the indices of the grid points nearest to `save_at`; `None` for all points.
+
+    Grid point i is `duration` × `fractions[i]`. Traced times are not checked.
 
     **Raises:** `ValueError` for times that are not increasing points of the grid.
     """
@@ -204,7 +207,7 @@ def _stored_steps(
     save_at = as_floating("save_at", save_at)
     if save_at.ndim != 1 or save_at.shape[0] == 0:
         raise ValueError(f"`save_at` must be an array of times, shape (K,); got {save_at.shape}.")
-    # The nearest grid point is the number of midpoints below the time.
+    # The index of the nearest grid point is the number of midpoints below the time.
     midpoints = (fractions[1:] + fractions[:-1]) / 2
     if is_traced(save_at, duration):
         targets = save_at / jnp.asarray(duration)
@@ -223,13 +226,13 @@ def _stored_steps(
             f"are {fractions[nearest] * length}."
         )
     if np.any(np.diff(nearest) <= 0):
-        raise ValueError(f"`save_at` must be different grid times in order; got {save_at}.")
+        raise ValueError(f"`save_at` must increase by at least one grid step; got {save_at}.")
     return jnp.asarray(nearest, jnp.int32)
 
 
 def _working_dtype(*arrays: Array) -> jnp.dtype:
-    """Return the widest floating point dtype of the arrays. Integers and weakly typed numbers do
-    not count; without any other array return JAX's default."""
+    """Return the widest floating point dtype of the arrays, or else JAX's default."""
+    # Integers and Python numbers, which are weakly typed, do not widen the result.
     floating = [
         a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating) and not a.weak_type
     ]

@@ -101,6 +101,7 @@ def divergence(reverse_drift: Effect, sigma_varies: bool) -> Effect:
 
 def solves(sigma: type[AbstractSigma]) -> Effect:
     """Describe whether σ⁻¹ v needs elimination with a matrix."""
+    # No entry for `Tall`: couplings do not apply to it.
     reasons = {
         Identity: "σ is the identity",
         Constant: "σ is constant: one inversion before all steps",

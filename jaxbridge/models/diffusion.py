@@ -1,8 +1,8 @@
 """Diffusions and their time reversal (sections 2 and 2.1 of the paper).
 
 A diffusion solves `dX = α(X) dt + σ(X) dW` in R^d and is ergodic with stationary density ν. The
-stationary process in reversed time is a diffusion with the same σ and the drift of equation
-(reversedrift),
+stationary process in reversed time is a diffusion with the same σ. Equation (reversedrift) is its
+drift:
 
     α*(x) = -α(x) + ν(x)⁻¹ Σ_j ∂_j(ν V_ij)(x) = -α + V ∇log ν + div V,    V = σσᵀ.
 
@@ -151,6 +151,7 @@ class Diffusion(eqx.Module):
             check_function(name, function, signature, optional=True)
         check_flag("reversible", reversible)
         check_flag("normalised", normalised)
+        # Arguments that describe a stationary law, which a time-dependent model lacks.
         of_stationary_law = {
             "log_stationary": log_stationary is not None,
             "reverse_drift": reverse_drift is not None,
@@ -194,6 +195,7 @@ class Diffusion(eqx.Module):
     @property
     def params(self) -> PyTree:
         """Return the parameters, with floating point numbers as arrays."""
+        # Arrays are dynamic and other leaves static fields: put them together.
         static_leaves, structure = self._static_leaves
         leaves = structure.flatten_up_to(self._arrays)
         for index, leaf in static_leaves:
@@ -284,7 +286,7 @@ class Diffusion(eqx.Module):
         check_precision("`points`", points.dtype)
         forward, log_nu = self.forward(points[0]), self._log_stationary_function()
         # V ∇log ν + div V = α + α*, which is 2α for a reversible diffusion.
-        divergence = forward.sigma_varies
+        divergence = forward.sigma_varies  # div V = 0 for a constant σ
         flux = functools.partial(stationary_flux, forward, log_nu, divergence=divergence)
         return jax.vmap(lambda x: forward.drift(x) - flux(x) / 2)(points)
 

@@ -52,10 +52,9 @@ def weighted_divergence(
     x: Float[Array, " d"],
     varies: bool,
 ) -> Float[Array, " d"]:
-    """Return ν⁻¹ Σ_j ∂_j(ν M_ij) = M ∇log ν + div M for a matrix field M, with `product(x, v)` =
-    M(x) v.
+    """Return ν⁻¹ Σ_j ∂_j(ν M_ij) = M ∇log ν + div M for a matrix field M.
 
-    Unless M `varies`, div M is left out.
+    `product(x, v)` is M(x) v. Unless M `varies`, div M is left out.
     """
     flux = product(x, jax.grad(log_nu)(x))
     if varies:

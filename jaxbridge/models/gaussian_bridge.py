@@ -1,9 +1,9 @@
 """Bridges of the Ornstein–Uhlenbeck process in closed form (section 3.1 of the paper).
 
-The bridge from a to b in time T is Gaussian. With Γ_t of `ornstein_uhlenbeck` and the gain
-`K_t = Γ_t e^{-Bᵀ(T-t)} Γ_T⁻¹` its moments are
+The bridge from a to b in time T is Gaussian. Γ_t is that of `ornstein_uhlenbeck`, and the gain is
+`K_t = Γ_t e^{-Bᵀ(T-t)} Γ_T⁻¹`. The moments are:
 
-    E Z_t = m + e^{-tB}(a - m) + K_t (b - m - e^{-TB}(a - m)),
+    E Z_t = m + e^{-tB}(a - m) + K_t (b - m - e^{-TB}(a - m));
     Var Z_t = Γ_t - K_t e^{-B(T-t)} Γ_t.
 
 The paper prints the gain without these transposes, which is right for reversible processes only.
@@ -78,6 +78,7 @@ def _paths(bridge: GaussianBridge, key, num_paths):
 
     start = jnp.broadcast_to(bridge._start - params.mean, (num_paths, len(bridge._start)))
     _, path = lax.scan(step, start, (decay, root, noise))
+    # The correction moves each end X_T to b.
     gap = bridge._end - params.mean - path[-1]
     correction = jnp.einsum("kij,nj->nki", bridge._gain, gap)
     return params.mean + jnp.moveaxis(path[:-1], 0, 1) + correction

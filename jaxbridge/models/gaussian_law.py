@@ -19,11 +19,11 @@ class GaussianLaw(eqx.Module):
     """Normal distribution N(mean, covariance).
 
     **Arguments:** `mean`, shape (d,); `covariance`, shape (d, d), symmetric and positive
-    semidefinite.
+    semidefinite. For a singular covariance `sample` and `log_density` return NaN.
 
-    **Raises:** `ValueError` for shapes that do not fit, a mean that is not finite, and a covariance
-    that is not symmetric or has a negative eigenvalue, beyond rounding errors. Traced values are
-    not checked.
+    **Raises:** `ValueError` for shapes that do not fit and a mean that is not finite. Also for a
+    covariance that is not symmetric or has a negative eigenvalue, beyond rounding errors. Traced
+    values are not checked.
 
     **Example:**
 
@@ -50,6 +50,7 @@ class GaussianLaw(eqx.Module):
         if is_traced(covariance):
             return
         matrix = np.asarray(covariance, float)
+        # A hundred times the rounding error of the largest entry.
         tolerance = 100 * np.finfo(dtype).eps * np.abs(matrix).max()
         symmetric = np.abs(matrix - matrix.T).max() <= tolerance  # false for NaN
         if not (symmetric and np.linalg.eigvalsh(matrix).min() >= -tolerance):
@@ -66,8 +67,7 @@ class GaussianLaw(eqx.Module):
         return _draw(self.mean, self.covariance, key)
 
     def log_density(self, x: Numbers) -> Float[Array, ""]:
-        """Return the normalised log density at a point, shape (d,). The covariance must be positive
-        definite.
+        """Return the normalised log density at a point, shape (d,).
 
         **Raises:** `ValueError` for a point of another shape.
         """

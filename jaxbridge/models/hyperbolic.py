@@ -90,14 +90,15 @@ def _hyperbolic_log_stationary(x: Float[Array, " d"], p: _Hyperbolic) -> Float[A
 class _HyperbolicSampler:
     """Exact sampler of the hyperbolic distribution in R^dim.
 
-    With t = √(1+|x|²) - 1 and β = 2α, the density of t is proportional to
+    Let t = √(1+|x|²) - 1 and β = 2α. The direction of x is uniform, and the density of t is
+    proportional to
 
-        t^a (t+2)^a (1+t) e^{-βt},    a = dim/2 - 1,
+        t^a (t+2)^a (1+t) e^{-βt},    a = dim/2 - 1.
 
-    and the direction is uniform. For even dim this is a mixture of gamma laws. For odd dim, replace
-    (1+t) by (t+2)^½ (√t+√2), using `√t + √2 ≥ √(t+2) ≥ (1+t)/√(t+2)`. The result is such a mixture.
-    Rejection sampling accepts a draw from it with probability `(1+t) / (√(t+2) (√t+√2))`, which is
-    never less than 0.43.
+    - For even dim this is a mixture of gamma laws.
+    - For odd dim it becomes one if its upper bound √(t+2) (√t+√2) replaces the factor 1+t.
+        Rejection sampling then accepts with probability `(1+t) / (√(t+2) (√t+√2))`, which is at
+        least 0.43.
     """
 
     dim: int
@@ -108,6 +109,7 @@ class _HyperbolicSampler:
         dtype = jnp.result_type(beta)
         weights, exponents = self._mixture()  # Σ_j w_j t^{e_j} e^{-βt}
         shapes = jnp.asarray(exponents + 1, dtype)
+        # ∫ t^e e^{-βt} dt = Γ(e+1) / β^{e+1}
         log_masses = jnp.asarray(np.log(weights), dtype) + special.gammaln(shapes)
         log_masses -= shapes * jnp.log(beta)
 
@@ -115,12 +117,13 @@ class _HyperbolicSampler:
             component_key, gamma_key, accept_key = jax.random.split(key, 3)
             component = jax.random.categorical(component_key, log_masses)
             t = jax.random.gamma(gamma_key, shapes[component], dtype=dtype) / beta
+            # An upper bound of 1 + t, as √t + √2 ≥ √(t+2) ≥ (1+t)/√(t+2).
             envelope = jnp.sqrt(t + 2) * (jnp.sqrt(t) + np.sqrt(2).astype(dtype))
             accepted = jax.random.uniform(accept_key, dtype=dtype) * envelope < 1 + t
             return t, accepted
 
         if self.dim % 2 == 0:
-            t, _ = propose(key)
+            t, _ = propose(key)  # the mixture is exact: no rejection
         else:
             # A bounded loop: it accepts the attempt after 100 rejections, whose probability is
             # below 0.57^100.
@@ -138,8 +141,10 @@ class _HyperbolicSampler:
         return jnp.sqrt(t * (t + 2)) * direction / jnp.linalg.norm(direction)
 
     def _mixture(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the weights w_j and exponents e_j of Σ_j w_j t^{e_j} = t^a (t+2)^a (1+t), the
-        density without its exponential; for odd dim, of its upper bound."""
+        """Return the weights w_j and exponents e_j of Σ_j w_j t^{e_j}.
+
+        The sum is the density of t without its exponential; for odd dim, the upper bound of it.
+        """
         a = self.dim / 2 - 1
         power = int(np.ceil(a))  # expand (t+2)^power by the binomial theorem
         j = np.arange(power + 1)
@@ -158,7 +163,8 @@ def _log_bessel_k(order: float, z: Float[Array, ""]) -> Float[Array, ""]:
     # Beyond the cutoff the integrand is negligible. The integral does not depend on it.
     cutoff = lax.stop_gradient(jnp.arcsinh((order + 40) / z) + 2)
     t = cutoff * jnp.linspace(0, 1, 257, dtype=jnp.result_type(z))
-    # The sum is taken in logarithms: exp(-z cosh t) underflows for large z.
+    # Trapezoid rule: half a weight at zero. The other end contributes nothing.
     weights = jnp.full(t.shape, t[1]).at[0].mul(0.5)
+    # In logarithms, because exp(-z cosh t) underflows for large z.
     log_cosh = jnp.logaddexp(order * t, -order * t) - math.log(2)
     return special.logsumexp(log_cosh - z * jnp.cosh(t), b=weights)

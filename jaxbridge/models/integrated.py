@@ -76,7 +76,7 @@ class _Integrated:
     def domain(self, x, params):
         inside = self.unbound.with_params(params).state_space()
         assert inside is not None  # `integrated` uses this function only for a model with a domain
-        return inside(_halves(x)[1])
+        return inside(_halves(x)[1])  # Z is unrestricted
 
 
 # Equal models share one object, so that its functions compile once.

@@ -168,6 +168,7 @@ class _Lamperti:
         # Nodes outside the state space are NaN; as infinities they keep the table sorted.
         ordered = jnp.where(jnp.isnan(nodes), jnp.where(is_below, -jnp.inf, jnp.inf), nodes)
         cell = jnp.clip(jnp.searchsorted(ordered, x, side="right") - 1, 0, last - 1)
+        # Quadrature points between the node below and x.
         half = (x - nodes[cell]) / 2
         points = nodes[cell] + half * (1 + jnp.asarray(_NODES, x.dtype)[:, None])
         sigma_values = jax.vmap(lambda u: self.sigma_at(u, table.params))(points.ravel())
@@ -183,19 +184,21 @@ class _Lamperti:
             )
         x = self.inverse(table, y)
         sigma = lambda x: self.sigma_at(x[0], table.params)
+        # One forward derivative gives σ(x) and σ'(x).
         sigma_x, sigma_derivative = jax.jvp(sigma, (x,), (jnp.ones_like(x),))
         return self._model(table).drift(x) / sigma_x - sigma_derivative / 2
 
     def log_stationary(self, y: Float[Array, " one"], table: _Table) -> Float[Array, ""]:
         x = self.inverse(table, y)
+        # The Jacobian dx/dy is σ(x).
         return self._model(table).log_stationary(x) + jnp.log(self.sigma_at(x[0], table.params))
 
     def sample_stationary(self, key: Key[Array, ""], table: _Table) -> Float[Array, " one"]:
         return self.forward(table, self._model(table).sample_stationary(key))
 
     def coordinates(self, table: _Table) -> PyTree:
-        """Return values that depend on the same parameters as Y does."""
-        # Y depends on the parameters of σ, at any point, and on those of X, if X has coordinates.
+        """Return values that depend on the same parameters as Y: those of σ and of X itself."""
+        # The value of σ at one point stands for all its parameters.
         inner_coordinates = self.unbound.coordinates
         sigma_origin = self.sigma_at(jnp.asarray(self.origin, float), table.params)
         return sigma_origin, () if inner_coordinates is None else inner_coordinates(table.params)
@@ -212,8 +215,10 @@ class _Lamperti:
         return jnp.where(inside, model.diffusion(point_inside[None])[0, 0], jnp.nan)
 
     def solve(self, direction: int, params: PyTree) -> Float[Array, " nodes"]:
-        """Solve g' = σ(g), g(0) = a, in the `direction` 1 or -1; return g at the nodes after the
-        first."""
+        """Solve g' = σ(g), g(0) = a, in the `direction` 1 or -1.
+
+        Return g at the nodes, without the origin.
+        """
         ys = np.linspace(0, direction * self.reach, self.num_nodes + 1)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda y, x, params: self.sigma_at(x, params)),

@@ -57,6 +57,7 @@ def stationary_diffusion(
         diffusion=None if V is None else _Root(V),
         log_stationary=log_density,
         params=params,
+        # The time reversal changes the sign of Q.
         reverse_drift=None if Q is None else _RecipeDrift(log_density, V, Q, -1),
         reversible=Q is None,
         normalised=normalised,
@@ -180,7 +181,7 @@ class _HeatedDrift:
 
 @dataclasses.dataclass(frozen=True)
 class _HeatedNoise:
-    """Coefficient σ = √(2kT), a diagonal."""
+    """Diagonal coefficient σ = √(2kT)."""
 
     temperature: float | Callable
 

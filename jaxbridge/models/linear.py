@@ -1,13 +1,13 @@
 """The transition of a linear diffusion `dX = α(X) dt + σ dW`, α(x) = α(0) + A x, V = σσᵀ.
 
-Given X_0 = x, X_t is normal with mean `x + M_t α(x)` and covariance Γ_t,
+Given X_0 = x, X_t is normal with mean `x + M_t α(x)` and covariance Γ_t. For any A, invertible or
+not:
 
-    M_t = ∫_0^t e^{sA} ds,   e^{tA} = I + A M_t,   Γ_t = ∫_0^t e^{sA} V e^{sAᵀ} ds,
+    M_t = ∫_0^t e^{sA} ds;   e^{tA} = I + A M_t;   Γ_t = ∫_0^t e^{sA} V e^{sAᵀ} ds.
 
-whether or not A is invertible. Taylor series give both integrals over a short time t / 2^k. Then
-the time is doubled k times:
+Taylor series give both integrals over a short time t / 2^k. Then the time is doubled k times:
 
-    M_2s = M_s + e^{sA} M_s,   Γ_2s = Γ_s + e^{sA} Γ_s e^{sAᵀ}.
+    M_2s = M_s + e^{sA} M_s;   Γ_2s = Γ_s + e^{sA} Γ_s e^{sAᵀ}.
 
 The second recursion only adds positive semidefinite terms. So short times lose no digits, and for
 stable A long times do not overflow.
@@ -53,8 +53,8 @@ def linear_transition(
 
 @linear_transition.defjvp
 def _tangents(primals, tangents):
-    # A `while_loop` has no reverse mode. So derivatives use the largest number of doublings, of
-    # which those beyond `doublings` change nothing.
+    # A `while_loop` has no reverse mode. So derivatives use a loop of fixed length, whose last
+    # iterations change nothing.
     def transition(A, V, t):
         doublings, moments = _over_short_time(A, V, t)
 
@@ -79,8 +79,8 @@ def _over_short_time(A, V, t) -> tuple[Float[Array, ""], LinearTransition]:
     s = t / 2**doublings
     term, covariance_term = s * identity, s * V
     integral, covariance = term, covariance_term
-    # Term j of M_s is s^j A^{j-1} / j!. Term j of Γ_s follows from term
-    # j - 1, as Γ' = V + A Γ + Γ Aᵀ.
+    # Term j of M_s is s^j A^{j-1} / j!. As Γ' = V + A Γ + Γ Aᵀ, term j of Γ_s follows from
+    # term j - 1.
     for j in range(2, _NUM_TERMS + 1):
         term = s / j * _product(A, term)
         product = _product(A, covariance_term)

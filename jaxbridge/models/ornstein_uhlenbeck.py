@@ -1,10 +1,10 @@
 """The Ornstein–Uhlenbeck process in closed form (section 3.1 of the paper).
 
-For `dX = -B (X - m) dt + σ dW`, V = σσᵀ and B with eigenvalues in the right half plane,
+The process solves `dX = -B (X - m) dt + σ dW`, V = σσᵀ. The eigenvalues of B lie in the right half
+plane. The stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x - m), Γ_t), where:
 
-    Γ solves B Γ + Γ Bᵀ = V,   Γ_t = ∫_0^t e^{-sB} V e^{-sBᵀ} ds = Γ - e^{-tB} Γ e^{-tBᵀ}.
-
-The stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x - m), Γ_t).
+    Γ solves B Γ + Γ Bᵀ = V;
+    Γ_t = ∫_0^t e^{-sB} V e^{-sBᵀ} ds = Γ - e^{-tB} Γ e^{-tBᵀ}.
 
 Γ is computed, factored and inverted in the coordinates x or σ⁻¹x, whichever give the smaller B.
 With nearly singular noise, B can have huge entries that cancel, and Γ can exceed floating point
@@ -110,6 +110,7 @@ def ornstein_uhlenbeck(
     if not is_traced(B):
         if not np.all(np.isfinite(B)):
             raise ValueError(f"`B` must be finite; got {B}.")
+        # Ergodic only if all solutions of dX = -B (X - m) dt decay.
         eigenvalues = np.linalg.eigvals(B)
         if not np.all(eigenvalues.real > 0):
             raise ValueError(
@@ -229,6 +230,7 @@ def _prepare(params: OrnsteinUhlenbeckParams) -> _Prepared:
         # Back to the coordinates x.
         root=from_scaled @ root,
         precision=to_scaled.T @ precision @ to_scaled,
+        # The change of coordinates has the Jacobian |σ|.
         log_normaliser=log_normaliser + jnp.where(is_scaled, log_det, 0),
         reverse_B=from_scaled @ reverse_B @ to_scaled,
     )
@@ -238,7 +240,7 @@ def _stationary(B: Float[Array, "d d"], sigma: Float[Array, "d d"]) -> tuple[Arr
     """Return a factor of Γ, Γ⁻¹, ½ log |2πΓ|, and the matrix ΓBᵀΓ⁻¹ of the time reversal."""
     covariance = _lyapunov(B, sigma @ sigma.T)
     root, precision = any_cholesky(covariance), any_inverse(covariance)
-    precision = (precision + precision.T) / 2
+    precision = (precision + precision.T) / 2  # symmetric in spite of rounding
     log_normaliser = jnp.sum(jnp.log(jnp.diagonal(root))) + len(B) / 2 * math.log(2 * math.pi)
     return root, precision, log_normaliser, covariance @ B.T @ precision
 

@@ -1,14 +1,20 @@
 """The diffusion coefficient σ(x) at one point, as a linear operator.
 
-There are six forms: the identity; a constant matrix, inverted outside the loop over time; a
-diagonal; a full matrix that depends on the state; a lower triangular matrix; and a tall matrix, for
-noise in fewer dimensions than the state. Callers use the methods of `AbstractSigma` for all of
-them, and each form does only the work that it needs. A tall matrix has no inverse: `solve` raises
-an error.
+There are six forms:
 
-The law of the diffusion depends on V = σσᵀ only. So a full σ(x) = L Q may be replaced by its
-triangular root L. Solving with L needs no elimination and no pivots. L does not rotate: as V(x) →
-V(x'), L(x) → L(x'), for any Q.
+- The identity.
+- A constant matrix, inverted once, outside the loop over time.
+- A diagonal.
+- A full matrix that depends on the state.
+- A lower triangular matrix that depends on the state.
+- A tall matrix, for noise in fewer dimensions than the state. It has no inverse.
+
+Callers use the methods of `AbstractSigma` for all of them, and each form does only the work that it
+needs.
+
+The law of the diffusion depends on V = σσᵀ only. So the triangular root L may replace a full σ(x) =
+L Q. Solving with L needs neither elimination nor pivots. L does not rotate: it is a smooth function
+of V, whatever Q is.
 """
 
 from abc import abstractmethod
@@ -73,7 +79,7 @@ class AbstractSigma(eqx.Module):
 
     @abstractmethod
     def root(self) -> "AbstractSigma":
-        """Return a root of V = σσᵀ. If σ varies, V alone determines the root."""
+        """Return a root of V = σσᵀ. If σ varies and is invertible, the root depends on V alone."""
 
 
 class Identity(AbstractSigma):

@@ -47,9 +47,9 @@ def simulate(
     **Returns:** paths, shape (num_paths, K, d), differentiable in forward mode. A path that
     explodes is NaN or infinite from there on.
 
-    **Raises:** `ValueError` for shapes that do not fit, and for times that do not increase. Also if
-    single precision cannot resolve a step at these times, for coefficients that depend on time;
-    this is not checked for traced times.
+    **Raises:** `ValueError` for shapes that do not fit, and for times that do not increase. For
+    coefficients that depend on time, also if single precision cannot resolve a step at these times.
+    Traced times are not checked for it.
 
     **Example:**
 
@@ -140,6 +140,7 @@ def _simulate(key, model, x0, clock, starts, gaps, num_steps, solver):
 def _levy_area(solver: diffrax.AbstractSolver):
     """Return the smallest class of increments with the Lévy area that the solver needs."""
     required_area = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
+    # From the least information about the noise to the most.
     candidates = (
         diffrax.BrownianIncrement,
         diffrax.SpaceTimeLevyArea,

@@ -29,13 +29,14 @@ def traced_once(function: Callable) -> Callable:
     return call
 
 
+# Leaves that `jit` traces. All others are static.
 _ARRAYS = (jax.Array, np.ndarray)
 
 
 # The cache of `jit` holds the jaxpr, and `inline` removes the call from the program.
 @functools.partial(jax.jit, static_argnums=(0, 1, 2), inline=True)
 def _call_flat(function, structure, static_leaves, arrays):
-    """Call `function` with arguments that are given as leaves: arrays, and static ones with their
+    """Call `function` with the arguments that these leaves form: arrays, and static leaves with
     types."""
     remaining = iter(static_leaves)
     leaves = [next(remaining)[1] if array is None else array for array in arrays]
@@ -43,10 +44,10 @@ def _call_flat(function, structure, static_leaves, arrays):
 
 
 def takes_time(function: Any, num_before_time: int = 2) -> bool:
-    """Return whether `function` requires a positional argument after the first `num_before_time`:
-    the time.
+    """Return whether `function` requires more than `num_before_time` positional arguments.
 
-    An argument with a default value does not count, nor does a function without a signature.
+    The next argument is the time. An argument with a default value does not count, nor does a
+    function without a signature.
     """
     try:
         parameters = inspect.signature(function).parameters.values()
@@ -72,7 +73,7 @@ def _dependent_results(jaxpr: jax.extend.core.Jaxpr, marked: list[bool]) -> list
 
     for equation in jaxpr.eqns:
         inputs = [is_reached(atom) for atom in equation.invars]
-        # Follow calls of `jit` inside. Any other result may depend on each input.
+        # Follow inner calls of `jit`. Assume that other results depend on every input.
         if equation.primitive.name in ("jit", "pjit"):
             outputs = _dependent_results(equation.params["jaxpr"].jaxpr, inputs)
         else:

@@ -1,10 +1,10 @@
 """A diffusion in other coordinates, by Itô's formula.
 
-For a smooth bijection f with inverse g, Y = f(X) solves an equation with
+Let f be a smooth bijection with inverse g. Then Y = f(X) has, at x = g(y), the coefficients
 
-    α_Y(y) = ∇f α + ½ Σ_k ∂²f[σ_k, σ_k],    σ_Y(y) = ∇f σ,    at x = g(y),
+    α_Y(y) = ∇f α + ½ Σ_k ∂²f[σ_k, σ_k],    σ_Y(y) = ∇f σ.
 
-where σ_k are the columns of σ. Its stationary density is ν(g(y)) |det ∇g(y)|.
+Here σ_k are the columns of σ. The stationary density of Y is ν(g(y)) |det ∇g(y)|.
 
 The map takes a state space with a boundary to all of R^d, which no step leaves. Bridges are sampled
 and weighted there, and their paths are mapped back.
@@ -145,6 +145,7 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
         functions.diffusion,
         functions.log_stationary if model.has_density else None,
         model.params,
+        # Without one, α* is derived from the transformed density.
         reverse_drift=functions.reverse_drift if model.has_reverse_drift else None,
         sample_stationary=functions.sample_stationary if model.has_sampler else None,
         reversible=model.reversible,

@@ -74,7 +74,7 @@ def underdamped_langevin(
 
 @dataclasses.dataclass(frozen=True)
 class _Functions:
-    """Functions of one state and the parameters. Equal potentials give equal objects and compile
+    """Functions of one state and the parameters. Equal potentials give equal objects, which compile
     once."""
 
     potential: Callable
@@ -85,6 +85,7 @@ class _Functions:
 
     def log_stationary(self, x, p):
         q, v = _halves(x)
+        # Boltzmann's law: potential and kinetic energy, with mass 1.
         return -(self._energy(q, p) + v @ v / 2) / p.temperature
 
     def _energy(self, q, p):
@@ -95,6 +96,7 @@ class _Functions:
 def _sigma(x, p):
     """Return σ, shape (2n, n): zero for the positions, √(2γτ) I for the velocities."""
     n = len(_halves(x)[0])
+    # Fluctuation and dissipation balance at this strength, so the law is stationary.
     noise = jnp.sqrt(2 * p.friction * p.temperature) * jnp.eye(n, dtype=x.dtype)
     return jnp.concatenate([jnp.zeros((n, n), x.dtype), noise])
 
