@@ -126,7 +126,7 @@ def _model(sigma, skew, params):
         _turned_root,
         log_density,
         params,
-        reverse_drift=lambda x, p: model.with_params(p).reverse_drift(x),
+        reverse_drift=None if Q is None else lambda x, p: model.with_params(p).reverse_drift(x),
         reversible=Q is None,
     )
 

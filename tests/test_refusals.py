@@ -665,11 +665,6 @@ INITIAL = dict(initial=[0.0])
 TINY, MANY = dict(step_size=1e-9), dict(num_steps=2**26)
 
 INFERENCE = [
-    # Arguments that do not apply.
-    ("initial", gibbs(**INITIAL), "`initial`: for records"),
-    ("initial", pmmh(**INITIAL), "`initial`: for records"),
-    ("initial", maximum(**INITIAL), "`initial`: for records"),
-    ("num_warmup", gibbs(num_warmup=3), "`num_warmup`: for records"),
     # Too much.
     *each("steps", lambda call: call(**TINY), [gibbs, pmmh, maximum], "`step_size` = .* pass 3"),
     *each("steps", lambda call: call(**MANY), [gibbs, pmmh, maximum], "`num_steps` = 67,108,864"),
@@ -761,6 +756,71 @@ INFERENCE = [
         r"`observations\[2\]` = .* is not finite: leave out observations that are missing",
     ),
     ("of two records", two_records([[0.0], [0.0], [NAN]]), r"in record 1: `observations\[2\]`"),
+]
+
+# Options that another option, or the model, leaves without use.
+BUDGET = ("num_counts", "max_proposals", "max_trials")
+FREE_RATE = jb.Diffusion(lambda x, p: -p * x, params=1.0)
+on_line = {"times": TIMES, "observations": LINE}
+of_free = dict(model=FREE_RATE, where=None, constraint=None)
+exactly_seen = of(jb.log_likelihood, KEY, OU, **on_line)
+CHAIN = jb.PMMHState(jnp.ones(2), 0.0, 0.0, 0.0, jnp.eye(2), 0, (), None)
+PATHS = jb.RecordState(jnp.ones(1), None, None, None, 0)
+going_on = functools.partial(pmmh, init=CHAIN)
+
+UNUSED = [
+    *each("initial", lambda call: call(**INITIAL), [gibbs, pmmh, maximum], "`initial`: for rec"),
+    ("num_warmup", gibbs(num_warmup=3), "`num_warmup`: for records"),
+    *(
+        (name, exactly_seen(**{name: value}), f"without an `observation` .*leave out .*`{name}`")
+        for name, value in [
+            ("initial", [0.0]),
+            ("initial_time", 0.0),
+            ("density", jb.EulerDensity()),
+            ("num_filters", 4),
+        ]
+    ),
+    # The work of couplings, where there are none.
+    *(
+        (f"{name}, no reversal", call(proposal="auto", **{name: 5}), f"`{name}`: for couplings")
+        for name in BUDGET
+        for call in (
+            of(jb.sample_weighted_bridges, KEY, FREE, A, B, 1.0),
+            of(jb.sample_exact_bridges, KEY, FREE, A, B, 1.0),
+            of(jb.score, KEY, FREE_RATE, **on_line),
+            functools.partial(gibbs, **of_free),
+        )
+    ),
+    *(
+        (f"{name}, no reversal", call(proposal="auto", **{name: 5}), f"`{name}`: for couplings")
+        for name in ("num_counts", "max_trials")
+        for call in (
+            of(jb.transition_log_density, KEY, FREE, A, B, 1.0),
+            of(jb.pmmh, KEY, FREE_RATE, **on_line, prior=PRIOR),
+        )
+    ),
+    *each("σ", lambda b: maximum(proposal="auto", **{b: 5}), BUDGET, ": for couplings.*σ depends"),
+    # Counts, where nothing is counted.
+    *(
+        (f"{name} of {how}", gibbs(proposal=PAIRS, **how, **{name: 5}), f"`{name}`: for `method=")
+        for name in ("num_counts", "max_trials")
+        for how in ({}, {"method": "renewal"}, {"bridges": "approximate"})
+    ),
+    # A new start, where there is none.
+    ("covariance", gibbs(observation=SEEN, init=PATHS, covariance=[0.1]), "`cov.*for a new start"),
+    ("covariance", going_on(covariance=[0.1, 0.1]), "`covariance` is for a new start"),
+    *each("state", lambda b: going_on(**{b: 5}), BUDGET[::2], ": for a new start"),
+    # Declarations.
+    ("normalised", diffusion(normalised=True), "`normalised=True` is about `log_stationary`"),
+    ("two reversals", diffusion(reverse_drift=DECAY, reversible=True), "leave out `reverse_drift`"),
+    # References.
+    ("log_density", precision(num_steps=(4,), log_density=-1.0), "`log_density`: for a method"),
+    ("fn", precision(methods=("density",), fn=lambda p: p), "`fn`: for a method of paths"),
+    (
+        "reference",
+        precision(methods=("density",), reference=(0.0, 1.0)),
+        "`reference`: for a method of paths",
+    ),
 ]
 
 draw = of(plot.bridge_fan, TIMES[:2])
@@ -880,6 +940,7 @@ TABLE = {
     "records": RECORDS,
     "tuning": TUNING,
     "inference": INFERENCE,
+    "unused": UNUSED,
     "plot": PLOT,
     "everywhere": EVERYWHERE,
 }

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from ..coupling import AbstractCoupling
 from ..engine.arguments import check_choice
 from ..engine.checks import is_traced
 from ..engine.keys import split_each
@@ -171,6 +172,13 @@ def augment(
         use = "renewal"
     if proposal is None and use == "weights" and method is None:
         proposal = "auto"
+    by_pairs = method is None and isinstance(proposal, AbstractCoupling)
+    if use != "weights" or by_pairs:
+        reason = (
+            'for `method="pseudo_marginal"`: the renewal chain and approximate bridges count no '
+            "hittings"
+        )
+        budget._replace(max_proposals=None).refuse(reason)
     model = problem.parameters.bind(theta)
     blocks = make_blocks(key, model, problem, proposal, budget, use)
     kernels = tuple(_kernel(block.proposal, use, method) for block in blocks)

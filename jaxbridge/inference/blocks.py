@@ -101,8 +101,7 @@ def make_blocks(
     is_auto = isinstance(proposal, str) and proposal == "auto"
     if moving and is_auto and needs_burn_in(Stationary(), model) and not model.has_density:
         left_out = why_left_out(model, for_density) or _NO_SAMPLER
-        proposal = choice_between(guided_candidates(), left_out=left_out)
-        budget = Budget()
+        proposal = choice_between(guided_candidates(), budget, left_out=left_out)
     given = as_proposal(proposal, model, like, budget, for_density)
     given.check(model, problem.intervals)
     if for_density:

@@ -37,6 +37,7 @@ from .parameter_walk import first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
+    check_covariance_is_used,
     drawn,
     first_chain,
     first_states,
@@ -238,6 +239,7 @@ def gibbs(
         theta, state = starting_points(
             parameters, unknown, init, num_chains, log_prior, RecordState
         )
+        check_covariance_is_used(covariance, state)
         start = (theta, first_root(covariance, log_prior, unknown)) if state is None else state
         num_warmup = check_count("num_warmup", 500 if num_warmup is None else num_warmup, 0)
         size = (num_warmup, num_iterations, thin)

@@ -51,6 +51,7 @@ from .parameter_walk import first_root, learnt
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
+    check_covariance_is_used,
     check_likelihood_was_found,
     drawn,
     first_chain,
@@ -271,10 +272,11 @@ def pmmh(
         unknown = problem.theta
 
         def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
+            budget = Budget(num_counts, None, max_trials)
             if state is not None and isinstance(proposal, str) and proposal == "auto":
+                budget.refuse("for a new start: the proposals of a state as `init` have their own")
                 blocks = _blocks_of_state(state, problem, model)
             else:
-                budget = Budget(num_counts, None, max_trials)
                 blocks = make_blocks(pilot_key, model, problem, proposal, budget, "density")
             return TransitionLikelihood(blocks, num_proposals)
 
@@ -293,8 +295,7 @@ def pmmh(
     log_prior = as_log_prior(prior, parameters, unknown)
     root = first_root(covariance, log_prior, unknown)
     theta, state = starting_points(parameters, unknown, init, num_chains, log_prior, PMMHState)
-    if state is not None and covariance is not None:
-        raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
+    check_covariance_is_used(covariance, state)
     likelihood = first_likelihood(parameters.bind(first_chain(theta)), state)
     sampler = _Sampler(parameters, likelihood, log_prior)
     start = (theta, root) if state is None else state

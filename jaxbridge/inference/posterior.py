@@ -223,6 +223,12 @@ def starting_points(
     return theta, state
 
 
+def check_covariance_is_used(covariance: Any, state: Any) -> None:
+    """Raise `ValueError` for a `covariance` beside a state to go on from."""
+    if state is not None and covariance is not None:
+        raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
+
+
 def first_chain(theta: Float[Array, "*chains p"]) -> Float[Array, " p"]:
     """θ of the first chain, at which proposals are chosen."""
     return theta.reshape(-1, theta.shape[-1])[0]

@@ -83,6 +83,12 @@ class Maximum(NamedTuple):
     fall: Float[Array, "2 p"]
 
 
+_NO_DERIVATIVE = (
+    "σ depends on the unknown parameters, and given a whole path σ is known: the likelihood itself "
+    "is differentiated, and with couplings its estimates have no derivative"
+)
+
+
 def as_pulled(
     proposal: Any, model: Diffusion, like: Float[Array, " d"], budget: Budget
 ) -> AbstractProposal:
@@ -91,14 +97,12 @@ def as_pulled(
     **Raises:** `ValueError` and `TypeError` for one whose weights have no derivatives.
     """
     if isinstance(proposal, str) and proposal == "auto":
-        proposal = choice_between(guided_candidates())
+        proposal = choice_between(guided_candidates(), budget, left_out=_NO_DERIVATIVE)
     given = as_proposal(proposal, model, like, budget)
     if given.coupled:
         raise ValueError(
-            "σ depends on the unknown parameters, and given a whole path σ is known: the "
-            "likelihood itself is differentiated, and with couplings its estimates have no "
-            "derivative. Choose proposals that are pulled to the end point, such as `Guided()`, "
-            '`ModifiedDiffusionBridge()` or "auto", or use `pmmh`.'
+            f"{_NO_DERIVATIVE}. Choose proposals that are pulled to the end point, such as "
+            '`Guided()`, `ModifiedDiffusionBridge()` or "auto", or use `pmmh`.'
         )
     return given
 

@@ -97,8 +97,8 @@ class Diffusion(eqx.Module):
         every loop.
 
     **Raises:** `TypeError` for functions that cannot be called with these arguments. `ValueError`
-    for a constant σ of a wrong shape, singular or not finite, and for stationary functions of a
-    model that depends on time.
+    for a constant σ that is singular, not finite or of a wrong shape; for stationary functions of a
+    model that depends on time; for declarations that contradict the functions.
 
     **Example:**
 
@@ -151,6 +151,16 @@ class Diffusion(eqx.Module):
             check_function(name, function, signature, optional=True)
         check_flag("reversible", reversible)
         check_flag("normalised", normalised)
+        if normalised and log_stationary is None:
+            raise ValueError(
+                "`normalised=True` describes `log_stationary`: pass this function or leave out "
+                "`normalised`."
+            )
+        if reversible and reverse_drift is not None:
+            raise ValueError(
+                "`reversible=True` declares that the reverse drift is the drift: leave out "
+                "`reverse_drift` or `reversible`."
+            )
         # Arguments that describe a stationary law, which a time-dependent model lacks.
         of_stationary_law = {
             "log_stationary": log_stationary is not None,

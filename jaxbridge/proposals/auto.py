@@ -135,6 +135,12 @@ class Budget(NamedTuple):
     max_proposals: int | None = None
     max_trials: int | None = None
 
+    def refuse(self, reason: str) -> None:
+        """Raise `ValueError`, which says what they are for, where any of these is given."""
+        given = [f"`{name}`" for name, value in self._asdict().items() if value is not None]
+        if given:
+            raise ValueError(f"{' and '.join(given)}: {reason}. Leave this out.")
+
 
 _NO_BUDGET = Budget()
 
@@ -185,9 +191,14 @@ def choice_between(
     num_pilot: int | None = None,
     left_out: str = "",
 ) -> Auto:
-    """A choice between these, yet to be made; the budget is for couplings among them."""
+    """A choice between these, yet to be made; the budget is for couplings among them.
+
+    **Raises:** `ValueError` for a budget where there are none, which `left_out` explains.
+    """
     if len(candidates) == 0:
         raise ValueError("`candidates` must have at least one proposal.")
+    if not any(isinstance(each, AbstractCoupling) for each in candidates):
+        budget.refuse(f'for couplings, which `proposal="auto"` leaves out here: {left_out}')
     proposals = tuple(
         _given(each, budget if isinstance(each, AbstractCoupling) else _NO_BUDGET, "candidates")
         for each in candidates

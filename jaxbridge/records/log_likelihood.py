@@ -169,7 +169,7 @@ def log_likelihood(
     observation: Observation | None = None,
     initial: Initial = None,
     num_particles: int = 100,
-    num_filters: int = 8,
+    num_filters: int | None = None,
     num_steps: int | None = None,
     step_size: float | None = None,
     initial_time: Numbers | None = None,
@@ -186,8 +186,9 @@ def log_likelihood(
         a leading axis, are several records, independent given the parameters.
         Without an `observation` the state was seen whole and exactly: the sum of the log transition
         densities by `transition_log_density(proposal="auto")`, given the first.
-    - `num_particles`: of each filter.
-    - `num_filters`: filters that know nothing of each other, whose spread tells the error.
+    - `num_particles`: of each filter; without an `observation` weighted paths of each interval.
+    - `num_filters`: independent filters, by default 8, whose spread gives the error. Only with an
+        `observation`.
     - `throw`: raise an error at run time where the result is not `trustworthy`.
 
     **Returns:** `LogLikelihood`. For a linear model all weights are equal, and `value` is that of
@@ -208,15 +209,17 @@ def log_likelihood(
     """
     check_key(key)
     num_particles = check_count("num_particles", num_particles)
-    num_filters = check_count("num_filters", num_filters)
     if observation is None:
-        if initial is not None or initial_time is not None or density is not None:
+        for_records = (initial, initial_time, density, num_filters)
+        if any(value is not None for value in for_records):
             raise ValueError(
-                "without an `observation` the first state is given, and steps are those of "
-                "`transition_log_density`: leave out `initial`, `initial_time` and `density`."
+                "without an `observation` the first state is given, and steps and errors are those "
+                "of `transition_log_density`: leave out `initial`, `initial_time`, `density` and "
+                "`num_filters`."
             )
         made = _exact(key, model, times, observations, num_particles, num_steps, step_size)
         return throw_where_untrustworthy(made, "value", model) if throw else made
+    num_filters = check_count("num_filters", 8 if num_filters is None else num_filters)
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     records = as_record_problems(*arguments, num_steps=num_steps, **options)

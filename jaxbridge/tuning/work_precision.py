@@ -162,6 +162,7 @@ def work_precision(
     for candidate, n in itertools.product(candidates, grids):
         problem.keep(save_at, duration, candidate.fractions(n))
     runs = _runs(methods, candidates, dtypes, steps, num_bridges)
+    _check_references(runs, fn, reference, log_density)
     if any(is_density(method) for method in methods):
         for candidate in candidates:
             candidate.check_for_density(model)
@@ -217,6 +218,22 @@ def _runs(
     if not runs:
         raise ValueError(f"none of `proposals` fits any of `methods`; got {tuple(methods)}.")
     return runs
+
+
+def _check_references(
+    runs: Sequence[Run], fn: Any, reference: Any, log_density: Numbers | None
+) -> None:
+    """Raise `ValueError` for arguments that none of the methods uses."""
+    of_density = {is_density(run.method) for run in runs}
+    of_paths = {"fn": fn, "reference": reference} if of_density == {True} else {}
+    of_densities = {"log_density": log_density} if of_density == {False} else {}
+    for wanted, values in (("of paths", of_paths), ('"density"', of_densities)):
+        names = [f"`{name}`" for name, value in values.items() if value is not None]
+        if names:
+            raise ValueError(
+                f"{' and '.join(names)}: for a method {wanted}, which is not among `methods`. "
+                "Leave this out."
+            )
 
 
 def _check_settings(
