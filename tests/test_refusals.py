@@ -286,7 +286,7 @@ COUPLING = [
     ("singular law", coupling(start_law=SINGULAR_LAW), "positive definite"),
     # Bridges.
     ("cube", bridges(start=[[A]]), "`start` must be one point"),
-    ("line", bridges(start=[0.0]), "points of one dimension"),
+    ("line", bridges(start=[0.0]), "the same dimension"),
     ("3 and 2", bridges(start=[A] * 3, end=[A] * 2), "number of intervals"),
     ("none at all", bridges(start=np.ones((0, 2))), "at least one interval"),
     ("half precision", bridges(**IN_HALVES), "float32 or float64; got float16", TypeError),
@@ -300,7 +300,7 @@ COUPLING = [
     ("beyond", bridges(save_at=[0.0, 1.2]), "`save_at` must lie in"),
     ("beyond in jit", traced(bridges(save_at=[0.5, 7.0])), "`save_at` must lie in"),
     ("back", bridges(save_at=[0.5, 0.2]), "`save_at` must increase"),
-    ("a time", bridges(save_at=0.5), "`save_at` must be times"),
+    ("a time", bridges(save_at=0.5), "`save_at` must be an array of times"),
     ("no reversal", bridges(model=FREE), "time reversal of this model is unknown"),
     *each("σ", lambda m: bridges(model=m), [OF_ROOTS, SINGULAR], "must be invertible"),
     ("α is missing", bridges(model=HYPERBOLIC.with_params(NAN)), "`params` .* not finite"),
@@ -362,7 +362,7 @@ PROPOSALS = [
         ]
     ),
     ("varying σ", bent(proposal=TAYLOR), "is for constant σ"),
-    ("no ν", bent(proposal=PAIRS), "does not need it, such as `ModifiedDiffusionBridge"),
+    ("no ν", bent(proposal=PAIRS), "without time reversal, such as `ModifiedDiff"),
     # Choices.
     ("words", exact(proposal="best"), 'what `choose_proposal` returns, or "auto"', TypeError),
     ("kernel", kernel(PAPER, A, B, 1.0, proposal="auto"), "a kernel makes no pilot run"),
@@ -811,7 +811,7 @@ UNUSED = [
     ("covariance", going_on(covariance=[0.1, 0.1]), "`covariance` is for a new start"),
     *each("state", lambda b: going_on(**{b: 5}), BUDGET[::2], ": for a new start"),
     # Declarations.
-    ("normalised", diffusion(normalised=True), "`normalised=True` is about `log_stationary`"),
+    ("normalised", diffusion(normalised=True), "`normalised=True` describes `log_stationary`"),
     ("two reversals", diffusion(reverse_drift=DECAY, reversible=True), "leave out `reverse_drift`"),
     # References.
     ("log_density", precision(num_steps=(4,), log_density=-1.0), "`log_density`: for a method"),

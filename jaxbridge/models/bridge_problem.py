@@ -144,7 +144,7 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
     lengths |= {duration.shape[0]} if duration.ndim == 1 else set()
     if len(lengths - {1}) > 1:
         raise ValueError(
-            "`start`, `end` and `duration` must have the same number I of intervals; got shapes "
+            "`start`, `end` and `duration` must have the same number of intervals; got shapes "
             f"{points['start'].shape}, {points['end'].shape} and {duration.shape}."
         )
     if 0 in lengths:

@@ -23,8 +23,7 @@ def integrated(model: Diffusion) -> Diffusion:
         interval.
 
     The model is hypoelliptic: noise enters X only. Couplings do not apply; use records with an
-    `observation`. `params` are those of `model`. Z has no stationary law, so records need
-    `initial=`.
+    `observation`. `params` belong to `model`. Z has no stationary law, so records need `initial=`.
 
     **Arguments:** `model`, the model of X. If its σ is a constant array, that must not be traced.
 

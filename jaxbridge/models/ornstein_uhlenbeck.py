@@ -132,6 +132,8 @@ def ornstein_uhlenbeck(
 def ou_stationary(model: Diffusion) -> GaussianLaw:
     """Return the stationary law N(m, Γ) of an Ornstein–Uhlenbeck model. Γ solves B Γ + Γ Bᵀ = σ σᵀ.
 
+    **Arguments:** `model`, from `ornstein_uhlenbeck`.
+
     **Raises:** `TypeError` for any other model.
 
     **Example:**

@@ -49,7 +49,7 @@ def seasonal_ornstein_uhlenbeck(
 
         dX = -a (X - m(t)) dt + σ dW,    m(t) = mean + amplitude · sin(2πt / period + phase).
 
-    t is the absolute time, as in `times`. `params` is a `SeasonalParams`.
+    t is the absolute time, on the same clock as `times`. `params` is a `SeasonalParams`.
 
     **Arguments:** shape () or (d,) each:
 
