@@ -61,7 +61,7 @@ class BridgeProblem(eqx.Module):
 
     @property
     def like(self) -> Float[Array, " d"]:
-        """Return a point with the shape and dtype of the states; ignore its values."""
+        """Return a point with the shape and dtype of the states. Its values have no meaning."""
         return self.intervals.start[0]
 
     def keep(
@@ -95,7 +95,8 @@ class BridgeProblem(eqx.Module):
         return numbered(key, self.num_intervals * num).reshape(self.num_intervals, num)
 
     def result(self, tree: PyTree) -> PyTree:
-        """Return arrays with the axis I; drop this axis unless the problem is `batched`."""
+        """Return `tree`, whose arrays have an axis I; drop this axis unless the problem is
+        `batched`."""
         return tree if self.batched else jax.tree.map(lambda leaf: leaf[0], tree)
 
     def total(self, counts: Shaped[Array, "..."]) -> Int[Array, "*I"]:

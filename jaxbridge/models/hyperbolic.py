@@ -52,8 +52,8 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     )
 
 
-class _Hyperbolic(NamedTuple):
-    """Parameters with the logarithm of the normaliser of the stationary density."""
+class _PreparedHyperbolic(NamedTuple):
+    """The parameter, with the logarithm of the normaliser of the stationary density."""
 
     alpha: Float[Array, ""]
     log_normaliser: Float[Array, ""]
@@ -65,10 +65,10 @@ class _PrepareHyperbolic:
 
     dim: int
 
-    def __call__(self, alpha: Float[Array, ""]) -> _Hyperbolic:
+    def __call__(self, alpha: Float[Array, ""]) -> _PreparedHyperbolic:
         log_bessel = _log_bessel_k((self.dim + 1) / 2, 2 * alpha)
         power = (self.dim - 1) / 2 * jnp.log(np.pi / alpha)
-        return _Hyperbolic(alpha, math.log(2) + log_bessel + power)
+        return _PreparedHyperbolic(alpha, math.log(2) + log_bessel + power)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,12 +77,12 @@ class _HyperbolicDrift:
 
     dim: int
 
-    def __call__(self, x: Float[Array, " d"], p: _Hyperbolic) -> Float[Array, " d"]:
+    def __call__(self, x: Float[Array, " d"], p: _PreparedHyperbolic) -> Float[Array, " d"]:
         check_dimension(x, self.dim)  # the normaliser holds for this dimension only
         return -p.alpha * x / jnp.sqrt(1 + dot(x, x))
 
 
-def _hyperbolic_log_stationary(x: Float[Array, " d"], p: _Hyperbolic) -> Float[Array, ""]:
+def _hyperbolic_log_stationary(x: Float[Array, " d"], p: _PreparedHyperbolic) -> Float[Array, ""]:
     return -2 * p.alpha * jnp.sqrt(1 + dot(x, x)) - p.log_normaliser
 
 
@@ -103,7 +103,7 @@ class _HyperbolicSampler:
 
     dim: int
 
-    def __call__(self, key: Key[Array, ""], p: _Hyperbolic) -> Float[Array, " d"]:
+    def __call__(self, key: Key[Array, ""], p: _PreparedHyperbolic) -> Float[Array, " d"]:
         key, direction_key = jax.random.split(key)
         beta = 2 * p.alpha
         dtype = jnp.result_type(beta)

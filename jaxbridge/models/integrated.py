@@ -51,7 +51,7 @@ def integrated(model: Diffusion) -> Diffusion:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Integrated:
+class _IntegratedFunctions:
     """Functions of the state (Z, X) and the parameters, built from the model of X."""
 
     unbound: Diffusion
@@ -79,7 +79,7 @@ class _Integrated:
 
 
 # Equal models share one object, so that its functions compile once.
-_cached_functions = functools.lru_cache(maxsize=256)(_Integrated)
+_cached_functions = functools.lru_cache(maxsize=256)(_IntegratedFunctions)
 
 
 def _halves(x: Float[Array, " d"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:

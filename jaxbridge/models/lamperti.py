@@ -125,7 +125,7 @@ class _Table(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Lamperti:
+class _LampertiFunctions:
     """Functions of Y, with the table in place of the parameters, and the maps between X and Y."""
 
     unbound: Diffusion
@@ -238,7 +238,7 @@ class _Lamperti:
 
 
 @compiled_sooner
-def _tabulated(functions: _Lamperti, params: PyTree) -> _Table:
+def _tabulated(functions: _LampertiFunctions, params: PyTree) -> _Table:
     """Return the table of both directions. Compiled once per object and shape of the parameters."""
     params = params if functions.preparation is None else functions.preparation(params)
     below, above = (functions.solve(side, params) for side in (-1, 1))
@@ -247,4 +247,4 @@ def _tabulated(functions: _Lamperti, params: PyTree) -> _Table:
 
 
 # Equal arguments share one object, so that its functions compile once.
-_cached_functions = functools.lru_cache(maxsize=256)(_Lamperti)
+_cached_functions = functools.lru_cache(maxsize=256)(_LampertiFunctions)

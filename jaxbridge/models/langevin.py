@@ -53,12 +53,12 @@ def stationary_diffusion(
     check_function("V", V, "(x, params)", optional=True)
     check_function("Q", Q, "(x, params)", optional=True)
     return Diffusion(
-        drift=_RecipeDrift(log_density, V, Q, 1),
-        diffusion=None if V is None else _Root(V),
+        drift=_StationaryDrift(log_density, V, Q, 1),
+        diffusion=None if V is None else _RootOfV(V),
         log_stationary=log_density,
         params=params,
         # The time reversal changes the sign of Q.
-        reverse_drift=None if Q is None else _RecipeDrift(log_density, V, Q, -1),
+        reverse_drift=None if Q is None else _StationaryDrift(log_density, V, Q, -1),
         reversible=Q is None,
         normalised=normalised,
     )
@@ -106,8 +106,8 @@ def langevin(
     else:
         temperature = _positive_number(temperature)
     return Diffusion(
-        _HeatedDrift(log_density, temperature),
-        _HeatedNoise(temperature),
+        _ThermalDrift(log_density, temperature),
+        _ThermalNoise(temperature),
         log_density,
         params,
         reversible=True,
@@ -135,7 +135,7 @@ def _positive_number(temperature: Numbers) -> float:
 
 
 @dataclasses.dataclass(frozen=True)
-class _RecipeDrift:
+class _StationaryDrift:
     """Drift ½ ν⁻¹ div(ν (V + `sign` Q)): `sign` is 1, or -1 for the time reversal."""
 
     log_density: Callable
@@ -157,7 +157,7 @@ class _RecipeDrift:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Root:
+class _RootOfV:
     """Coefficient σ with σσᵀ = V: triangular, or diagonal if V is."""
 
     V: Callable
@@ -168,7 +168,7 @@ class _Root:
 
 
 @dataclasses.dataclass(frozen=True)
-class _HeatedDrift:
+class _ThermalDrift:
     """Drift kT ∇log ν."""
 
     log_density: Callable
@@ -180,7 +180,7 @@ class _HeatedDrift:
 
 
 @dataclasses.dataclass(frozen=True)
-class _HeatedNoise:
+class _ThermalNoise:
     """Diagonal coefficient σ = √(2kT)."""
 
     temperature: float | Callable

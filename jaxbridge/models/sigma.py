@@ -67,7 +67,7 @@ class AbstractSigma(eqx.Module):
 
     @abstractmethod
     def average(self, other: "AbstractSigma") -> "AbstractSigma":
-        """Return `½ (σ + other)` for two coefficients of one model."""
+        """Return `½ (σ + other)`, for two values of one model's σ."""
 
     @abstractmethod
     def log_abs_det(self) -> Float[Array, ""]:

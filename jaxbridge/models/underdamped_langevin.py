@@ -67,13 +67,13 @@ def underdamped_langevin(
     numbers = as_numbers({"friction": friction, "temperature": temperature})
     check_range("friction", numbers["friction"], nonnegative=True)
     check_range("temperature", numbers["temperature"], positive=True)
-    functions = _Functions(potential)
+    functions = _UnderdampedFunctions(potential)
     model_params = UnderdampedLangevinParams(**numbers, potential=params)
     return Diffusion(functions.drift, _sigma, functions.log_stationary, model_params)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Functions:
+class _UnderdampedFunctions:
     """Functions of one state and the parameters. Equal potentials give equal objects, which compile
     once."""
 
