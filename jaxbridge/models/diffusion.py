@@ -362,10 +362,10 @@ class Diffusion(eqx.Module):
 
     @property
     def coordinates(self) -> Callable[[PyTree], PyTree] | None:
-        """Return a function that shows on which parameters the coordinates depend; else `None`.
+        """Return a function that shows the parameters on which the coordinates depend; else `None`.
 
-        It maps prepared parameters to values that depend on the same parameters as the coordinates
-        do. Coordinates from `lamperti` depend on the parameters of σ.
+        It maps prepared parameters to values, which depend on the same parameters as the
+        coordinates do. Coordinates from `lamperti` depend on the parameters of σ, others on none.
         """
         return self._coordinates
 
@@ -655,7 +655,7 @@ def check_dimension(x: Float[Array, " d"], dim: int) -> None:
 
 
 def halves(x: Float[Array, " d"], parts: str) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Return the two halves of a state, which consists of these `parts`.
+    """Return the two halves of a state. `parts` describes them in the error message.
 
     **Raises:** `ValueError` for an odd number of coordinates.
     """

@@ -63,7 +63,7 @@ class GaussianLaw(eqx.Module):
         yield from (self.mean, self.covariance)
 
     def sample(self, key: Key[Array, ""], model: Diffusion | None = None) -> Float[Array, " d"]:
-        """Sample one point, shape (d,). The `model` that start laws receive is not used."""
+        """Sample one point, shape (d,). All start laws receive a `model`; this one ignores it."""
         return _draw(self.mean, self.covariance, key)
 
     def log_density(self, x: Numbers) -> Float[Array, ""]:

@@ -102,5 +102,5 @@ def _double(moments: LinearTransition) -> LinearTransition:
 
 
 def _product(left: Float[Array, "d d"], right: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """Return the product of two matrices, written out for small ones."""
+    """Return the product of two matrices, in elementwise operations for small ones."""
     return matmul(left, right) if left.shape[0] <= 16 else left @ right
