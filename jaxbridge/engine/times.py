@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .checks import Numbers, as_floating, is_traced
+from .checks import Numbers, as_floating, is_traced, missing_as_nan
 
 # By how much of their smallest difference single precision may have moved times that were given in
 # it, and by how much of a step it may move the times at which coefficients are evaluated.
@@ -98,6 +98,7 @@ def as_times(name: str, times: Numbers) -> Times:
     **Raises:** `TypeError` for anything but real numbers; `ValueError` where single precision, in
     which they were given, has spoilt the differences, or for a single number.
     """
+    times = missing_as_nan(times)
     array = as_floating(name, times)
     if array.ndim == 0:
         raise ValueError(f"`{name}` must have shape (n,); got a single number, {times!r}.")

@@ -18,7 +18,7 @@ from ..engine.averages import proper
 from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
-from ..records import Filtered, guided, half_will_do, rate_for_several, run_filters
+from ..records import Filtered, GuideCheck, guided, half_will_do, rate_for_several, run_filters
 from ..schemes import share_of_grid
 from .blocks import Block, with_keys
 from .parameters import Parameters
@@ -30,11 +30,13 @@ _FEWEST_FILTERS, _FEWEST_PARTICLES = 16, 128
 
 class Guide(NamedTuple):
     """What guides the filters of R records: the points along which each is linearised, on the grid
-    and on one of half as many steps, and the rate at which it forgets."""
+    and on one of half as many steps, the rate at which it forgets,
+    and how good it is on the grid."""
 
     fine: Float[Array, "R points d"]
     coarse: Float[Array, "R coarse_points d"]
     rate: Float[Array, ""]
+    check: GuideCheck
 
 
 class Estimate(NamedTuple):
@@ -205,12 +207,13 @@ class RecordLikelihood(AbstractLikelihood):
 
     @property
     def guide(self):
-        return Guide(self.fine.points, self.coarse.points, self.rate)
+        return Guide(self.fine.points, self.coarse.points, self.rate, self.fine.check)
 
     def guided_by(self, guide: Guide) -> "RecordLikelihood":
         """The same with what another has as `guide`."""
-        grids = self.fine._replace(points=guide.fine), self.coarse._replace(points=guide.coarse)
-        return RecordLikelihood(*grids, guide.rate, self.num_particles)
+        fine = self.fine._replace(points=guide.fine, check=guide.check)
+        coarse = self.coarse._replace(points=guide.coarse)
+        return RecordLikelihood(fine, coarse, guide.rate, self.num_particles)
 
     @property
     def tells_step_error(self):
@@ -235,7 +238,7 @@ class RecordLikelihood(AbstractLikelihood):
     ) -> Filtered:
         """So many filters of each record, whose guides forget at this rate. To skip steps of no
         length takes a decision at each, which pays where there are many: on the coarse grid."""
-        (records, points), size = grid, (num_filters, self.num_particles)
+        (records, points, _), size = grid, (num_filters, self.num_particles)
         moving = records.moving if skips else None
 
         def one(problem, key, points):

@@ -37,7 +37,7 @@ from ..engine.verdict import Fault
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal, Budget
-from ..records import Initial, Observation, as_record_problems
+from ..records import GuideCheck, Initial, Observation, as_record_problems
 from .blocks import Block, block_of, make_blocks
 from .data import Problem, as_problem
 from .likelihood_estimates import (
@@ -144,6 +144,8 @@ class PMMHPosterior(AbstractPosterior):
     - `num_truncated`: weights that `max_trials` cut off, in all these iterations, shape
         (*chains,): where there are many the law is not exact.
     - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
+    - `guide`: diagnostics of the guide of each record, found last in the warm-up; `None` without an
+        `observation`. A poor one is a fault where the chain suffers.
     """
 
     params: PyTree
@@ -158,6 +160,7 @@ class PMMHPosterior(AbstractPosterior):
     num_without_estimate: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
     state: PMMHState
+    guide: GuideCheck | None = None
 
     @property
     def stuck(self) -> Bool[Array, "*chains"]:
@@ -175,8 +178,11 @@ class PMMHPosterior(AbstractPosterior):
         share = self.num_truncated.astype(self.theta.dtype) / self.accepted.shape[-1]
         often = jnp.any(share > _MOST_TRUNCATED)
         in_part = ~noisy & ~jnp.all(self.variance_in_part < _MOST_VARIANCE)
+        refused = refused_moves(self.accepted)
+        hampered = noisy | in_part | refused.present | jnp.any(self.stuck)
         return (
-            refused_moves(self.accepted),
+            refused,
+            *(() if self.guide is None else (self.guide.fault(hampered),)),
             Fault(noisy, _NOISY),
             Fault(in_part, _NOISY_IN_PART),
             Fault(often, _TRUNCATED),
@@ -507,6 +513,7 @@ def _run(
         state=PMMHState(
             **run.chain._asdict(), num_done=run.num_done, proposals=(), guide=run.guide
         ),
+        guide=None if run.guide is None else run.guide.check,
     )
 
 

@@ -29,7 +29,7 @@ from ..engine.compiled import compiled_sooner
 from ..engine.keys import key_for
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
-from ..records import Guidance, Records, tuned
+from ..records import Guidance, GuideCheck, Records, tuned
 from ..schemes import relative_change
 from .parameter_walk import learnt
 from .parameters import Parameters
@@ -96,6 +96,8 @@ class RecordPosterior(AbstractPosterior):
         `step_error`, that of the posterior mean, is made of.
     - `sigma_varies`: whether σ depends on the state.
     - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
+    - `guide`: diagnostics of the guide of each record, found last in the warm-up. A poor one is a
+        fault where chains suffer.
     """
 
     params: PyTree
@@ -107,6 +109,7 @@ class RecordPosterior(AbstractPosterior):
     log_step_error: Float[Array, "*chains n"]
     sigma_varies: bool = eqx.field(static=True)
     state: RecordState
+    guide: GuideCheck | None = None
 
     @property
     def _stuck(self):
@@ -114,7 +117,9 @@ class RecordPosterior(AbstractPosterior):
 
     @property
     def _faults(self):
-        return (refused_moves(self.parameters_moved),)
+        refused = refused_moves(self.parameters_moved)
+        hampered = refused.present | jnp.any(self.stuck)
+        return refused, *(() if self.guide is None else (self.guide.fault(hampered),))
 
 
 class RecordSampler(eqx.Module):
@@ -256,12 +261,14 @@ def _sample_records(
         theta = guided.state.theta
         share = jnp.mean(taken.astype(theta.dtype), axis=0)
         weights = jnp.any(has_weight, axis=0), log_ratios(sampler, i, guided)
-        return guided, (theta, jnp.any(moved, axis=0), share[..., 0], *weights)
+        made = theta, jnp.any(moved, axis=0), share[..., 0], *weights
+        return guided, (made, sampler.completion.fine.check)
 
     bounds = stages(skipped if fresh else 0, skipped + num_iterations)
     state = _not_begun(records, *start) if fresh else start
     init = GuidedState(state, _no_guides(parameters, records, state.theta))
     (state, _), draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
+    draws, checks = draws
     fields, (moved, taken, has_weight, log_ratio) = drawn(parameters, *draws)
     real = movable(records)
     ever = jnp.any(taken > 0, axis=-4)  # of all draws
@@ -274,6 +281,7 @@ def _sample_records(
         log_step_error=share_of_step_error(records) * change,
         sigma_varies=parameters.model.sigma_varies(records.stacked.like),
         state=state,
+        guide=jax.tree.map(lambda leaf: leaf[-1], checks),
     )
     return posterior, ~jnp.any(has_weight, axis=-1)
 

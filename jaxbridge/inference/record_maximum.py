@@ -42,7 +42,7 @@ from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict
-from ..records import Records, tuned
+from ..records import GuideCheck, Records, tuned
 from ..schemes import StepError, dominates, step_fault
 from .newton import (
     Passes,
@@ -95,6 +95,7 @@ class RecordMaximumLikelihood(AbstractResult):
         above the estimate, and the others follow, shape (2, p). It is 0.5 if the log-likelihood is
         quadratic, and near zero or below where it levels off, so that no maximum is inside;
         infinite out of the constraint.
+    - `guide`: diagnostics of the guide of each record. A poor one is a fault where chains suffer.
     """
 
     params: PyTree
@@ -112,6 +113,7 @@ class RecordMaximumLikelihood(AbstractResult):
     num_refused: Int[Array, ""]
     newton: Bool[Array, ""]
     fall: Float[Array, "2 p"]
+    guide: GuideCheck
 
     @property
     def verdict(self) -> Verdict:
@@ -119,11 +121,13 @@ class RecordMaximumLikelihood(AbstractResult):
         that disagree, a step error that dominates and is beyond 0.05 standard errors."""
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
         steps = step_fault(StepError(self.step_error, self.step_uncertainty), sd, sd)
+        stuck, apart = jnp.any(self.stuck), self._chains_disagree
         return Verdict(
             (
                 *maximum_faults(self.newton, self.fall),
-                Fault(jnp.any(self.stuck), _STUCK),
-                Fault(self._chains_disagree, _APART),
+                Fault(stuck, _STUCK),
+                Fault(apart, _APART),
+                self.guide.fault(stuck | apart | ~self.newton),
                 Fault(jnp.any(steps.present), steps.sentence),
             )
         )
@@ -371,6 +375,7 @@ def _summary(
         info.refused,
         passes.converged & is_maximum(slope),
         falls(slope, passes.offsets),
+        completion.fine.check,
     )
 
 

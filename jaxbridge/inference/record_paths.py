@@ -24,6 +24,7 @@ from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
 from ..records import (
     Guidance,
+    GuideCheck,
     Paths,
     Records,
     blocks_of_both_cuts,
@@ -31,6 +32,7 @@ from ..records import (
     guided,
     has_segments,
     linearisations,
+    no_check,
     noise_and_log_weight,
     path_and_log_weight,
     stacked,
@@ -51,10 +53,12 @@ _USUAL = {"proposal": "auto", "bridges": "exact", "method": "gradient"}
 
 
 class GuidedRecords(NamedTuple):
-    """Records, and the points along which each is linearised, whatever the parameters."""
+    """Records, the points along which each is linearised, whatever the parameters, and how good a
+    guide that makes."""
 
     records: Records
     points: Float[Array, "R points d"]
+    check: GuideCheck
 
 
 class At(NamedTuple):
@@ -85,7 +89,7 @@ class RecordPaths(eqx.Module):
         self, key: Key[Array, ""], at: At
     ) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:
         """Paths to begin with, and log β of the moves of their blocks."""
-        model, (records, points) = self.parameters.bind(at.theta), self.fine
+        model, (records, points, _) = self.parameters.bind(at.theta), self.fine
 
         def one(problem, key, points, guide):
             noise = jax.random.normal(key, points.shape, points.dtype)
@@ -103,7 +107,7 @@ class RecordPaths(eqx.Module):
         log_scales: Float[Array, "R 2 B"],
     ) -> tuple[Float[Array, "R points d"], Bool[Array, "R 2 B 1"]]:
         """The paths after a sweep given θ, and which blocks moved."""
-        model, (records, points) = self.parameters.bind(at.theta), self.fine
+        model, (records, points, _) = self.parameters.bind(at.theta), self.fine
 
         def one(problem, key, points, guide, log_scales, path):
             (K, N), d = problem.record.dt.shape, problem.dim
@@ -195,7 +199,8 @@ def unguided(records: Records) -> GuidedRecords:
     """With points that stand in until there are some."""
     problem = records.stacked
     shape = records.number, problem.num_segments * problem.num_steps + 1, problem.dim
-    return GuidedRecords(records, jnp.zeros(shape, problem.like.dtype))
+    dtype = problem.like.dtype
+    return GuidedRecords(records, jnp.zeros(shape, dtype), no_check(records.number, dtype))
 
 
 def on_both_grids(function: Callable, fine: PyTree, coarse: PyTree) -> Any:
@@ -209,8 +214,9 @@ def guided_near(
     fine: Records, coarse: Records, model: Diffusion
 ) -> tuple[GuidedRecords, GuidedRecords]:
     """Linearised at the parameters of this model."""
-    points = on_both_grids(lambda records: linearisations(records, model), fine, coarse)
-    return GuidedRecords(fine, points[0]), GuidedRecords(coarse, points[1])
+    made = on_both_grids(lambda records: linearisations(records, model), fine, coarse)
+    of_fine, of_coarse = (jax.tree.map(lambda leaf, i=i: leaf[i], made) for i in range(2))
+    return GuidedRecords(fine, *of_fine), GuidedRecords(coarse, *of_coarse)
 
 
 def no_paths(records: Records) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:

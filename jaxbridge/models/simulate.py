@@ -1,5 +1,7 @@
 """Unconditional paths of a diffusion, from the solvers of diffrax."""
 
+from typing import Any
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Key
 
-from ..engine.arguments import check_instance
+from ..engine.arguments import check_instance, shown
 from ..engine.checks import Numbers, as_floating, check_count, check_key, check_num_steps
 from ..engine.compiled import compiled
 from ..engine.doors import door
@@ -49,7 +51,7 @@ def simulate(
 
     **Raises:** `ValueError` for shapes that do not fit, and for times that do not increase. For
     coefficients that depend on time, also if single precision cannot resolve a step at these times.
-    Traced times are not checked for it.
+    Traced times are not checked for it. `TypeError` for a solver of other equations.
 
     **Example:**
 
@@ -76,12 +78,27 @@ def simulate(
         )
     x0 = jnp.broadcast_to(x0, (num_paths, x0.shape[-1]))
     solver = diffrax.Heun() if solver is None else solver
-    check_instance("solver", solver, diffrax.AbstractSolver, "a solver of diffrax, an instance")
+    _check_solver(solver)
     clock, elapsed = time_axis.clock(x0.dtype)
     gaps = time_axis.gaps.astype(x0.dtype)
     if model.depends_on_time:
         check_resolved(clock, elapsed, gaps / num_steps)
     return _simulate(path_key, model, x0, clock, elapsed[:-1], gaps, num_steps, solver)
+
+
+def _check_solver(solver: Any) -> None:
+    """Raise `TypeError` unless the solver is for all stochastic differential equations."""
+    check_instance("solver", solver, diffrax.AbstractSolver, "a solver of diffrax, an instance")
+    general = diffrax.AbstractItoSolver | diffrax.AbstractStratonovichSolver
+    # These have the interface, but assume the structure of a Langevin equation.
+    langevin_only = diffrax.ALIGN | diffrax.QUICSORT | diffrax.ShOULD
+    if not isinstance(solver, general) or isinstance(solver, langevin_only):
+        raise TypeError(
+            "`solver` must be a solver of diffrax for any stochastic differential equation, an "
+            "`AbstractItoSolver` or `AbstractStratonovichSolver` that is not for Langevin equations "
+            "only, such as `diffrax.Heun()`, `diffrax.Euler()` or `diffrax.SRA1()`; got "
+            f"{shown(solver)}."
+        )
 
 
 @compiled

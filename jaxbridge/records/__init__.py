@@ -28,6 +28,7 @@ from .guide_search import (
     GuideCheck as GuideCheck,
     check_guide as check_guide,
     linearised as linearised,
+    no_check as no_check,
 )
 from .guided_record import (
     Guidance as Guidance,

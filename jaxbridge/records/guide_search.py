@@ -12,14 +12,16 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..engine.averages import proper
 from ..engine.captured import without_captured_derivatives
-from ..engine.checks import without_derivatives
+from ..engine.checks import all_finite_leaves, without_derivatives
 from ..engine.compiled import compiled_sooner, is_outermost
 from ..engine.keys import key_for
+from ..engine.verdict import Fault
 from ..models.diffusion import Diffusion
 from ..models.dynamics import is_linear
 from ..schemes import solve_root
@@ -38,32 +40,73 @@ _MOST_TURNS, _NO_GAIN, _SHORTEST = 30, 0.5, 2.0**-10
 # From how many particles' paths it is searched for at most. How far from an observation a path may
 # be that calls for no other start: so much beyond the largest of n normal numbers.
 _MOST_PARTICLE_STARTS, _BEYOND_NOISE = 3, 1.0
+# Beyond all log weights of paths that have one.
+_NO_WEIGHT = 1e20
 
 
-class Linearised(NamedTuple):
-    """The points along which the process is linearised, and what guides paths there."""
-
-    points: Float[Array, "points d"]
-    guide: Guidance
+_POOR = (
+    "The guide of a record is poor: the path along which it is linearised has no weight, or is "
+    "further from an observation than √(2 log n) + 1 standard deviations of its noise, n the "
+    "number of observations. Start from likelier parameters (the model's `params`, or `init=`), "
+    "take more `num_steps`, or check for outliers, which the noise must allow for."
+)
 
 
 class GuideCheck(NamedTuple):
-    """Diagnostics of a guide at the parameters of a model.
+    """Diagnostics of the guide of a record, or of each of several in a leading axis, at the
+    parameters that it was made for.
 
     - `log_weight`: of the guided path without noise; -inf where that path leaves the finite numbers
         or the state space, or explains no observation.
     - `largest_residual`: the largest distance of an observation from the path of linearisation, in
-        standard deviations of its noise. Exact observations do not count.
+        standard deviations of its noise. Exact observations do not count. inf where the guide is
+        not finite.
+    - `num_observed`: the number of observed components.
     """
 
-    log_weight: Float[Array, ""]
-    largest_residual: Float[Array, ""]
+    log_weight: Float[Array, "*R"]
+    largest_residual: Float[Array, "*R"]
+    num_observed: Int[Array, "*R"]
 
     @property
-    def is_usable(self) -> Bool[Array, ""]:
+    def is_usable(self) -> Bool[Array, "*R"]:
         """Whether the guided path without noise has a weight at all: where it has none, paths with
         noise seldom do."""
         return self.log_weight > -jnp.inf
+
+    @property
+    def is_near(self) -> Bool[Array, "*R"]:
+        """Whether the guide is usable and as near to the observations as their noise explains."""
+        number = jnp.maximum(self.num_observed, 1).astype(self.largest_residual.dtype)
+        largest = jnp.sqrt(2 * jnp.log(number)) + _BEYOND_NOISE
+        return self.is_usable & (self.largest_residual < largest)
+
+    @property
+    def rank(self) -> Float[Array, "*R"]:
+        """How good the guide is beside others: its log weight, or far below all of these where it
+        has none, the further the larger its residuals are."""
+        unusable = -_NO_WEIGHT * (1 + self.largest_residual)
+        return jnp.where(self.is_usable, self.log_weight, unusable)
+
+    def fault(self, hampered: Bool[Array, ""] | bool = True) -> Fault:
+        """Return the fault of a poor guide. Weights and chains are exact with any guide: where a
+        result has diagnostics of its own, it is a fault if these show that it `hampered` them."""
+        return Fault(jnp.any(~self.is_near) & hampered, _POOR)
+
+
+class Linearised(NamedTuple):
+    """The points along which the process is linearised, what guides paths there, and how good that
+    is."""
+
+    points: Float[Array, "points d"]
+    guide: Guidance
+    check: GuideCheck
+
+
+def no_check(number: int, dtype: np.dtype) -> GuideCheck:
+    """Return what stands in for the check of each of so many records until there is one."""
+    nothing = jnp.zeros(number, dtype)
+    return GuideCheck(nothing, nothing, jnp.zeros(number, jnp.int32))
 
 
 @compiled_sooner
@@ -71,7 +114,16 @@ def check_guide(problem: RecordProblem, model: Diffusion, guide: Guidance) -> Gu
     """Return the diagnostics of this guide of a record. No derivatives."""
     problem, model, guide = without_derivatives((problem, model, guide))
     _, log_weight = _path_without_noise(problem, model, guide, guide.start.origin)
-    return GuideCheck(log_weight, _largest_residual(guide))
+    return _check_of(guide, log_weight)
+
+
+def _check_of(guide: Guidance, log_weight: Float[Array, ""]) -> GuideCheck:
+    """Return the diagnostics of a guide whose path without noise has this weight."""
+    num_observed = jnp.sum(guide.first.seen) + jnp.sum(guide.scalars.seen)
+    # Along a path that explodes h is not finite, and no path has a weight.
+    finite = all_finite_leaves((guide.start, guide.steps))
+    residual = jnp.where(finite, _largest_residual(guide), jnp.inf)
+    return GuideCheck(log_weight, residual, num_observed.astype(jnp.int32))
 
 
 def _largest_residual(guide: Guidance) -> Float[Array, ""]:
@@ -100,21 +152,6 @@ def _path_without_noise(
     return path, proper(log_weight)
 
 
-class _Found(NamedTuple):
-    """The best path of a search, and its check."""
-
-    best: Linearised
-    check: GuideCheck
-
-    @property
-    def is_near(self) -> Bool[Array, ""]:
-        """Whether no other start is called for."""
-        guide = self.best.guide
-        num_seen = jnp.sum(guide.first.seen) + jnp.sum(guide.scalars.seen)
-        largest = jnp.sqrt(2 * jnp.log(jnp.maximum(num_seen, 1))) + _BEYOND_NOISE
-        return self.check.is_usable & (self.check.largest_residual < largest)
-
-
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     """Return the best path found, and the guide along it. The points have no derivatives, and the
     guide none by the model.
@@ -124,14 +161,14 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     if not is_outermost():
         return _in_program(problem, model)
     found = _from_filter(problem, model)
-    if found.is_near or _is_linear(problem, model):
-        return found.best
+    if found.check.is_near or _is_linear(problem, model):
+        return found
     for number in range(_MOST_PARTICLE_STARTS):
         new = _from_particles(problem, model, jnp.int32(number))
-        found = new if new.check.log_weight > found.check.log_weight else found
-        if found.is_near:
+        found = new if new.check.rank > found.check.rank else found
+        if found.check.is_near:
             break
-    return found.best
+    return found
 
 
 def _in_program(own: RecordProblem, own_model: Diffusion) -> Linearised:
@@ -140,9 +177,9 @@ def _in_program(own: RecordProblem, own_model: Diffusion) -> Linearised:
     found = _from_filter(problem, model)
     if not _is_linear(problem, model):
         found = _best_of_loop(problem, model, found)
-    points, guide = found.best
     own = without_captured_derivatives(own)  # as if it were in the model's parameters
-    return Linearised(points, _guide_of((own, guide), model=model, points=points))
+    guide = _guide_of((own, found.guide), model=model, points=found.points)
+    return found._replace(guide=guide)
 
 
 def _is_linear(problem: RecordProblem, model: Diffusion) -> bool:
@@ -152,16 +189,16 @@ def _is_linear(problem: RecordProblem, model: Diffusion) -> bool:
     return is_linear(dynamics, problem.like) and not cover
 
 
-def _best_of_loop(problem: RecordProblem, model: Diffusion, found: _Found) -> _Found:
+def _best_of_loop(problem: RecordProblem, model: Diffusion, found: Linearised) -> Linearised:
     """Search from paths of particles until one is near what is seen, in a compiled loop."""
 
-    def search(state: tuple[Int[Array, ""], _Found]) -> tuple[Int[Array, ""], _Found]:
+    def search(state: tuple[Int[Array, ""], Linearised]) -> tuple[Int[Array, ""], Linearised]:
         number, found = state
         new = _from_particles(problem, model, number)
-        better = new.check.log_weight > found.check.log_weight
+        better = new.check.rank > found.check.rank
         return number + 1, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, found)
 
-    goes_on = lambda state: ~state[1].is_near & (state[0] < _MOST_PARTICLE_STARTS)
+    goes_on = lambda state: ~state[1].check.is_near & (state[0] < _MOST_PARTICLE_STARTS)
     return lax.while_loop(goes_on, search, (jnp.int32(0), found))[1]
 
 
@@ -174,13 +211,13 @@ class _Start(NamedTuple):
 
 
 @compiled_sooner  # a program of its own, which all who read the record share
-def _from_filter(problem: RecordProblem, model: Diffusion) -> _Found:
+def _from_filter(problem: RecordProblem, model: Diffusion) -> Linearised:
     """Search from the path of the extended Kalman filter."""
     return _search(problem, model, _filter_start(problem, model))
 
 
 @compiled_sooner
-def _from_particles(problem: RecordProblem, model: Diffusion, number: Int[Array, ""]) -> _Found:
+def _from_particles(problem: RecordProblem, model: Diffusion, number: Int[Array, ""]) -> Linearised:
     """Search from the path of a particle."""
     return _search(problem, model, _particle_start(problem, model, number))
 
@@ -208,20 +245,20 @@ def _particle_start(problem: RecordProblem, model: Diffusion, number: Int[Array,
 
 
 class _Search(NamedTuple):
-    """Of Gauss and Newton's iteration: the points of the next turn; the best so far, the log weight
-    of its path without noise, and that path; the length of the step to it, and whether it is
+    """Of Gauss and Newton's iteration: the points of the next turn; the best so far, the check of
+    it, and its path without noise; the length of the step to it, and whether it is
     over."""
 
     turn: Int[Array, ""]
     points: Float[Array, "points d"]
-    best: Linearised
-    log_weight: Float[Array, ""]
+    best: tuple[Float[Array, "points d"], Guidance]
+    check: GuideCheck
     path: Float[Array, "points d"]
     length: Float[Array, ""]
     over: Bool[Array, ""]
 
 
-def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> _Found:
+def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> Linearised:
     """Search from these points: linearise along the path that is guided without noise, and repeat.
 
     What counts is the weight of the path without noise: where it is large, weights fall off as
@@ -236,31 +273,30 @@ def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> _Found:
         guide = guided(problem, model, points)
         path, log_weight = _path_without_noise(problem, model, guide, begin)
         path = jnp.where(jnp.all(jnp.isfinite(path)), path, points)
-        return Linearised(points, guide), log_weight, path
+        return (points, guide), _check_of(guide, log_weight), path
 
     def turn(search: _Search) -> _Search:
         new = at(search.points)
-        gain = jnp.where(search.turn == 0, jnp.inf, new[1] - search.log_weight)
-        better = (gain > _NO_GAIN) | (search.log_weight == -jnp.inf)
-        old = search.best, search.log_weight, search.path
-        best, log_weight, path = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
+        gain = jnp.where(search.turn == 0, jnp.inf, new[1].rank - search.check.rank)
+        better = (gain > _NO_GAIN) | (search.check.rank == -jnp.inf)
+        old = search.best, search.check, search.path
+        best, check, path = jax.tree.map(lambda a, b: jnp.where(better, a, b), new, old)
         settled = jnp.abs(gain) < _NO_GAIN
         length = jnp.where(better, jnp.minimum(2 * search.length, 1), search.length / 2)
-        points = best.points + length * (path - best.points)
+        points = best[0] + length * (path - best[0])
         points = jnp.where(length == 1, path, points)
         if inside is not None:
-            points = jax.vmap(functools.partial(stay_inside, inside))(best.points, points)
+            points = jax.vmap(functools.partial(stay_inside, inside))(best[0], points)
         over = settled | (length < _SHORTEST)
-        return _Search(search.turn + 1, points, best, log_weight, path, length, over)
+        return _Search(search.turn + 1, points, best, check, path, length, over)
 
-    shapes, log_weight, _ = jax.eval_shape(at, points)
+    shapes = jax.eval_shape(at, points)[:2]
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    zero, one = jnp.zeros((), log_weight.dtype), jnp.ones((), points.dtype)
-    init = _Search(jnp.int32(0), points, nothing, zero, points, one, jnp.zeros((), bool))
+    one = jnp.ones((), points.dtype)
+    init = _Search(jnp.int32(0), points, *nothing, points, one, jnp.zeros((), bool))
     goes_on = lambda search: ~search.over & (search.turn < _MOST_TURNS)
     made = lax.while_loop(goes_on, turn, init)
-    check = GuideCheck(made.log_weight, _largest_residual(made.best.guide))
-    return _Found(made.best, check)
+    return Linearised(*made.best, made.check)
 
 
 @eqx.filter_custom_jvp

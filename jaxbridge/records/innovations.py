@@ -7,35 +7,48 @@ with θ, and θ may be a parameter of σ, of the noise or of the initial law, ho
 """
 
 import math
+import warnings
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from ..engine.checks import Numbers
+from ..engine.checks import Numbers, is_traced
 from ..engine.compiled import compiled
 from ..engine.doors import door
+from ..engine.verdict import Fault, Verdict
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
-from .guide_search import linearised
+from .guide_search import GuideCheck, linearised
 from .guided_record import guided, path_and_log_weight
 from .initial import Initial
 from .observation import Observation
 from .problem import RecordProblem, as_record_problem
 from .start_share import start_share
 
+_NOT_FINITE = (
+    "Paths of some noise ξ ~ N(0, I) have no weight: they left the finite numbers or the state "
+    "space. A sampler of ξ stops there, and means of weights miss their mass. Take more "
+    "`num_steps`: explicit steps explode where they are long for the drift."
+)
+# So many draws of ξ are tried.
+_NUM_TRIED = 10
+
 
 class Innovations(NamedTuple):
-    """What `innovations` returns: the record's paths as functions of noise ξ, shape (`size`,). Its
-    methods may be given to `jax.jit` and `jax.grad` as they are.
+    """Paths of a record as functions of noise ξ, shape (`size`,), from `innovations`. Its methods
+    may be given to `jax.jit` and `jax.grad` as they are.
 
     - `problem`: the model, what was seen of it, and how.
     - `points`: along which it is linearised, shape (M + 1, d).
+    - `guide`: diagnostics of the guide along these points.
     """
 
     problem: RecordProblem
     points: Float[Array, "points d"]
+    guide: GuideCheck
 
     @property
     def size(self) -> int:
@@ -69,6 +82,30 @@ class Innovations(NamedTuple):
         out a mode or falls off too fast: then means of w over ξ are not to be trusted, and a
         sampler may not find its way; `log_likelihood` covers that law with several."""
         return start_share(self.problem, self.problem.model, self.points)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the faults at the parameters of the model: a poor guide, and paths without a
+        weight for ξ = 0 or one of ten random ξ."""
+        params, dtype = self.problem.model.params, self.points.dtype
+        keys = jax.random.split(jax.random.key(0), _NUM_TRIED)
+        tried = jax.vmap(lambda key: jax.random.normal(key, (self.size,), dtype))(keys)
+        tried = jnp.concatenate([jnp.zeros_like(tried[:1]), tried])
+        log_weights = jax.vmap(lambda xi: self.log_weight(params, xi))(tried)
+        lost = jnp.any(log_weights == -jnp.inf)
+        return Verdict((self.guide.fault(), Fault(lost, _NOT_FINITE)))
+
+    @property
+    def trustworthy(self) -> Bool[Array, ""]:
+        """Return whether no fault of `verdict` is present."""
+        return self.verdict.trustworthy
+
+    def why(self) -> str:
+        """Return each fault with its remedy, one a line.
+
+        **Raises:** `TypeError` inside `jit`, where the numbers are not known yet.
+        """
+        return self.verdict.why()
 
     def _run(self, params: PyTree, xi) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
         return _path_and_log_weight(self.problem, self.points, params, xi)
@@ -118,7 +155,8 @@ def innovations(
     - `density`: of the steps, by default `ItoTaylorDensity()` for constant σ, else
         `EulerDensity()`, or `HypoellipticDensity()` where σ has fewer columns than rows.
 
-    **Returns:** `Innovations`, differentiable in parameters and noise.
+    **Returns:** `Innovations`, differentiable in parameters and noise. Its `why()` names what is
+    wrong with the guide; there is a warning where the likelihood at ξ = 0 is zero.
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
 
@@ -141,4 +179,11 @@ def innovations(
         initial_time=initial_time,
         density=density,
     )
-    return Innovations(problem, linearised(problem, model).points)
+    points, _, check = linearised(problem, model)
+    if not is_traced(check) and not check.is_usable:
+        warnings.warn(
+            "the likelihood at ξ = 0 and the model's parameters is zero, so that no sampler can "
+            "start there: see `why()` of the result.",
+            stacklevel=3,
+        )
+    return Innovations(problem, points, check)

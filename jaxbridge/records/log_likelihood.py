@@ -12,6 +12,8 @@ the estimates themselves is larger. It is a variance with about n - 1 degrees of
 standard error is so much larger that two of them hold 95 %, as those of Student's law do.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -37,7 +39,7 @@ from ..schemes import (
     step_fault,
 )
 from .forgetting import chosen_of, confirmed, half_will_do, rates_for, undecided
-from .guide_search import linearised
+from .guide_search import GuideCheck, linearised
 from .guided_record import Guidance, forgetful
 from .initial import Initial
 from .observation import Observation
@@ -102,6 +104,8 @@ class LogLikelihood(AbstractResult):
         step.
     - `forgetting`: γ, the rate at which what guides the particles forgets what is seen later, in
         units of one over time: zero where all of it is a help, as it is where the model is linear.
+    - `guide`: diagnostics of the guide of each record; `None` without an `observation`. A poor one
+        is a fault where weights suffer.
     """
 
     value: Float[Array, ""]
@@ -114,6 +118,7 @@ class LogLikelihood(AbstractResult):
     step_error: Float[Array, ""]
     step_uncertainty: Float[Array, ""]
     forgetting: Float[Array, ""]
+    guide: GuideCheck | None = None
 
     @property
     def unexplained(self) -> Int[Array, ""]:
@@ -130,14 +135,18 @@ class LogLikelihood(AbstractResult):
     @property
     def verdict(self) -> Verdict:
         """Return the faults: an observation that no particle explains, few effective particles or
-        filters that disagree, so that their spread is unknown, heavy tails of the weights, lost
-        particles, and a step error that dominates and is beyond 0.05."""
+        filters that disagree, so that their spread is unknown, heavy tails of the weights, a poor
+        guide beside one of these, lost particles, and a step error that dominates and is beyond
+        0.05."""
         error = StepError(self.step_error, self.step_uncertainty)
+        lost, apart, heavy = self.unexplained >= 0, ~self._filters_agree, self._is_heavy
+        guide = () if self.guide is None else (self.guide.fault(lost | apart | heavy),)
         return Verdict(
             (
-                Fault(self.unexplained >= 0, _UNEXPLAINED),
-                Fault(~self._filters_agree, _DISAGREE),
-                Fault(self._is_heavy, _HEAVY),
+                Fault(lost, _UNEXPLAINED),
+                Fault(apart, _DISAGREE),
+                Fault(heavy, _HEAVY),
+                *guide,
                 Fault(self._missing > jnp.maximum(self.standard_error, _MOST_LOST), _LOST),
                 step_fault(error, self.standard_error),
             )
@@ -226,8 +235,10 @@ def log_likelihood(
     size = num_filters, num_particles
     levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
     grids = [records, *map(records.coarsened, levels)]
-    filtered, rate = _filtered(key, grids, [_guides(grid) for grid in grids], *size)
+    guides, checks = zip(*map(_guides, grids), strict=True)
+    filtered, rate = _filtered(key, grids, list(guides), *size)
     made = _told(records, filtered, rate, num_filters * num_particles)
+    made = dataclasses.replace(made, guide=checks[0])
     return throw_where_untrustworthy(made, "value", model) if throw else made
 
 
@@ -281,9 +292,9 @@ def _mean_of_filters(
     return jnp.sum(log_mean), widening * jnp.sqrt(jnp.sum(variance))
 
 
-def _guides(records: Records) -> Guidance:
+def _guides(records: Records) -> tuple[Guidance, GuideCheck]:
     """Of each record, at the parameters of the model."""
-    return records.each(lambda problem: linearised(problem, problem.model).guide)
+    return records.each(lambda problem: linearised(problem, problem.model)[1:])
 
 
 def _exact(

@@ -131,7 +131,7 @@ def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, 
 
     **Raises:** `ValueError` where there are not as many of the one as of the other.
     """
-    if _num_axes(observations) != 3:
+    if _num_axes(observations) != 3 and not _has_rows(times):
         return [(times, observations)]
     rows: list[Any] = list(observations)  # pyright: ignore[reportArgumentType]
     when: list[Any] = len(rows) * [times]
@@ -143,6 +143,12 @@ def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, 
             f"empty; got {len(when)} and {len(rows)}."
         )
     return list(zip(when, rows, strict=True))
+
+
+def _has_rows(times: Numbers) -> bool:
+    """Whether there are the times of several records, each of two or more."""
+    several = isinstance(times, list | tuple | np.ndarray | jax.Array) and _num_axes(times) == 2
+    return several and len(times[0]) > 1  # pyright: ignore
 
 
 def of_each(function: Callable[..., Any], seen: list[tuple[Numbers, Numbers]]) -> list[Any]:

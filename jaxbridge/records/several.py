@@ -18,7 +18,7 @@ from ..engine.checks import Numbers
 from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
-from .guide_search import linearised
+from .guide_search import GuideCheck, linearised
 from .initial import Initial
 from .observation import Observation
 from .problem import RecordProblem, check_clock, check_domain, problem_of
@@ -136,6 +136,13 @@ def stacked(*alike: PyTree) -> tuple[PyTree, PyTree]:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays), rest[0]
 
 
-def linearisations(records: Records, model: Diffusion) -> Float[Array, "R points d"]:
-    """The points along which each record is linearised."""
-    return records.each(lambda problem: linearised(problem, model).points)
+def linearisations(
+    records: Records, model: Diffusion
+) -> tuple[Float[Array, "R points d"], GuideCheck]:
+    """The points along which each record is linearised, and how good a guide that makes."""
+
+    def one(problem: RecordProblem):
+        points, _, check = linearised(problem, model)
+        return points, check
+
+    return records.each(one)

@@ -29,7 +29,7 @@ from ..schemes import (
     share_of_order,
     step_fault,
 )
-from .guide_search import Linearised, linearised
+from .guide_search import GuideCheck, Linearised, linearised
 from .guided_record import path_and_log_weight
 from .initial import Initial
 from .observation import Observation
@@ -69,6 +69,7 @@ class Smoothed(AbstractResult):
         infinite if there is one, for draws of a path that stays tell nothing of their error.
     - `num_truncated`: how many weights of a `proposal` were cut off at a bound on the work, by
         which draws are not exact.
+    - `guide`: diagnostics of the guide of the paths. A poor one is a fault where chains suffer.
     """
 
     times: Float[Array | np.ndarray, " K"]
@@ -77,6 +78,7 @@ class Smoothed(AbstractResult):
     stuck: Bool[Array, " chains"]
     num_truncated: Int[Array, ""]
     _problem: RecordProblem
+    guide: GuideCheck | None = None
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
         """The mean of `fn(path)`, a function of one path of shape (K, d), by default itself."""
@@ -126,14 +128,17 @@ class Smoothed(AbstractResult):
     @property
     def verdict(self) -> Verdict:
         """Return the faults: a block that never moved, weights cut off, chains that disagree at
-        some points, a step error of the mean path that dominates and is beyond 0.05 standard
-        deviations (root mean square)."""
+        some points, a poor guide beside one of these, a step error of the mean path that dominates
+        and is beyond 0.05 standard deviations (root mean square)."""
         error, standard_error = self._errors_in_sds
+        stuck, apart = jnp.any(self.stuck), ~self._chains_agree
+        guide = () if self.guide is None else (self.guide.fault(stuck | apart),)
         return Verdict(
             (
-                Fault(jnp.any(self.stuck), _STUCK),
+                Fault(stuck, _STUCK),
                 Fault(self.num_truncated > 0, _CUT_OFF),
-                Fault(~self._chains_agree, _APART),
+                Fault(apart, _APART),
+                *guide,
                 step_fault(error, standard_error),
             )
         )
@@ -256,7 +261,7 @@ def smooth(
     found = (drawn.accepted, drawn.stuck, drawn.num_truncated)
     times = problem.record.clock.exactly(drawn.since)
     problem = dataclasses.replace(problem, record=drawn.record)
-    smoothed = Smoothed(times, paths, *found, problem)
+    smoothed = Smoothed(times, paths, *found, problem, made.check)
     return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
 
 
@@ -266,7 +271,7 @@ def _guided_paths(
 ) -> Float[Array, "chains points d"]:
     """Guided paths that know nothing of each other, or where they left the finite numbers the one
     along which they are guided."""
-    points, guide = made
+    points, guide, _ = made
 
     def first(key):
         noise = jax.random.normal(key, points.shape, points.dtype)
@@ -287,7 +292,7 @@ def _smooth(
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Draws:
     model, (num_draws, num_warmup) = problem.model, counts
-    points, guide = made
+    points, guide, _ = made
     start_key, key = jax.random.split(key)
 
     firsts = jnp.moveaxis(_guided_paths(start_key, problem, made, num_chains), 0, -1)

@@ -47,7 +47,7 @@ from ..engine.compiled import compiled
 from ..engine.doors import door
 from ..engine.lanes import over_lanes
 from ..engine.linalg import dot, total
-from ..engine.times import as_times
+from ..engine.times import as_times, check_increasing
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.dynamics import Dynamics
 from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
@@ -90,7 +90,8 @@ def path_log_likelihood(
     check_diffusion(model)
     if form is not None:
         check_choice("form", form, get_args(Form))
-    (times, steps), path = as_times("times", times), as_floating("path", path)
+    known, path = as_times("times", times), as_floating("path", path)
+    times, steps = known
     if path.ndim < 2 or path.shape[-2] < 2:
         raise ValueError(
             "`path` must hold two or more points in the axis before the last, shape (..., K, d); "
@@ -107,7 +108,9 @@ def path_log_likelihood(
             f"{num_times}) for paths of shape (I, ..., {num_times}, d); got {times.shape} for "
             f"paths of shape {path.shape}."
         )
-    if not is_traced(steps) and not np.all(np.asarray(steps) > 0):
+    if times.ndim == 1:
+        check_increasing(known)
+    elif not is_traced(steps) and not np.all(np.asarray(steps) > 0):
         raise ValueError("`times` must be finite and increase.")
     return log_likelihood_of_steps(model, steps.astype(path.dtype), path, form)
 

@@ -68,8 +68,26 @@ def test_a_reading_outside_of_the_state_space():
         "num_steps": 20,
     }
     problem = as_record_problem(model, times, values, **options)
-    points, guide = linearised(problem, model)
-    assert np.all(points > 0) and check_guide(problem, model, guide).is_usable
+    points, _, check = linearised(problem, model)
+    assert np.all(points > 0) and check.is_usable
     made = jb.log_likelihood(jax.random.key(0), model, times, values, num_particles=500, **options)
     error = 5 * made.standard_error + abs(made.step_error) + 2 * made.step_uncertainty
     assert abs(made.value - exact.log_likelihood) < error < 0.3
+
+
+@pytest.mark.slow
+def test_a_guide_is_finite_where_explicit_steps_explode():
+    """A double well whose first state is so far out that paths without noise explode: along one of
+    them h is not finite, and no path would have a weight. Others begin further in."""
+    a = jnp.float32(1.08)
+    model = jb.Diffusion(lambda x, a: jnp.exp(a) * (x - x**3), [[0.7]], params=a)
+    values = np.array([2.37, 0.72, 0.78, 1.11, 1.17, 1.02])[:, None]
+    options = {"observation": jb.LinearGaussian(covariance=0.04), "num_steps": 10}
+    options["initial"] = jb.GaussianLaw([0.0], [[1.0]])
+    with pytest.warns(UserWarning, match="zero"):
+        paths = jb.innovations(model, np.arange(6) * 0.5, values, **options)
+    assert not paths.guide.is_usable and paths.guide.largest_residual < 3
+    noise = jax.random.normal(jax.random.key(0), (200, paths.size))
+    log_weights = jax.vmap(paths.log_weight, (None, 0))(a, noise)
+    assert np.sum(np.isfinite(log_weights)) > 20
+    assert not paths.trustworthy and "guide" in paths.why() and "num_steps" in paths.why()

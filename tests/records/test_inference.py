@@ -311,7 +311,7 @@ def test_noise_is_that_which_makes_the_path():
     """The inverse of `path_and_log_weight`, to rounding, where noise moves the path everywhere."""
     values, law = record()[:6], jb.GaussianLaw([0.0], [[0.5]])
     problem = as_record_problem(model(), TIMES[:6], values, SEEN, law, num_steps=3)
-    points, guide = jax.jit(lambda: linearised(problem, model()))()
+    points, guide, _ = jax.jit(lambda: linearised(problem, model()))()
     noise = jax.random.normal(jax.random.key(2), points.shape)
     path, log_weight = path_and_log_weight(problem, model(), guide, noise)
     again, same = noise_and_log_weight(jax.random.key(3), problem, model(), guide, path)

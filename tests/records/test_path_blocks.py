@@ -36,7 +36,7 @@ def problem_of_length(num, observation=POSITIVE):
 @pytest.mark.slow
 def test_a_path_of_no_weight_is_left():
     problem = problem_of_length(6)
-    both = blocks_of_both_cuts(problem, *linearised(problem, MODEL), 2)
+    both = blocks_of_both_cuts(problem, *linearised(problem, MODEL)[:2], 2)
     scales = jnp.zeros((2, both.segment.shape[-1]))
     paths = Paths(jnp.full((1, 3), -1.0), jnp.full((6, 4, 1, 3), -1.0))
     step = jax.jit(lambda key, paths: sweep(key, problem, MODEL, both, scales, paths))

@@ -8,7 +8,7 @@ import pytest
 from helpers import count_compilations
 
 import jaxbridge as jb
-from jaxbridge.records.record import as_records
+from jaxbridge.records.record import as_records, as_rows, split_records
 
 MODEL = jb.ornstein_uhlenbeck([[1.0, 0.5], [0.0, 1.0]])
 TIMES, VALUES = np.arange(4.0), np.zeros((4, 2))
@@ -94,6 +94,16 @@ def test_one_series_of_numbers_is_one_column():
     for values in given:
         assert log_weight(TIMES, values) == expected
     assert log_weight(pd.Series(range(4), dtype="Int64")) == expected
+
+
+def test_several_series_of_numbers_are_several_records():
+    given = [TIMES, 2 * TIMES[:3]], [READINGS[:, 0], READINGS[:3, 0]]
+    columns = given[0], [values[:, None] for values in given[1]]
+    for times, values in (given, columns):
+        seen = split_records(times, values)
+        assert [np.shape(as_rows(each)) for _, each in seen] == [(4, 1), (3, 1)]
+    both = [record.values for record in as_records(split_records(*given), 2, None)]
+    np.testing.assert_array_equal(both[1][:, 0], READINGS[:3, 0].astype(np.float32))
 
 
 def test_a_record_may_begin_before_its_first_time():
