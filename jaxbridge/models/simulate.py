@@ -95,8 +95,8 @@ def _check_solver(solver: Any) -> None:
     if not isinstance(solver, general) or isinstance(solver, langevin_only):
         raise TypeError(
             "`solver` must be a solver of diffrax for any stochastic differential equation, an "
-            "`AbstractItoSolver` or `AbstractStratonovichSolver` that is not for Langevin equations "
-            "only, such as `diffrax.Heun()`, `diffrax.Euler()` or `diffrax.SRA1()`; got "
+            "`AbstractItoSolver` or `AbstractStratonovichSolver` that is not only for Langevin "
+            "equations, such as `diffrax.Heun()`, `diffrax.Euler()` or `diffrax.SRA1()`; got "
             f"{shown(solver)}."
         )
 
