@@ -176,9 +176,9 @@ MODELS = [
         of(jb.underdamped_langevin, LOG_NORMAL)(np.ones(2)),
         "`friction` must be a number",
     ),
-    ("half", lambda: jb.underdamped_langevin(LOG_NORMAL).drift(np.ones(3)), "as many of the one"),
+    ("half", lambda: jb.underdamped_langevin(LOG_NORMAL).drift(np.ones(3)), "even number of coord"),
     ("no model", of(jb.integrated)(3.0), "`model` must be", TypeError),
-    ("integral", lambda: jb.integrated(HYPERBOLIC).drift(np.ones(3)), "as many coordinates"),
+    ("integral", lambda: jb.integrated(HYPERBOLIC).drift(np.ones(3)), "even number of coord"),
     ("seasons", of(jb.seasonal_ornstein_uhlenbeck)(np.eye(2)), "`rate` must have shape"),
     # Closed forms.
     ("another model", of(jb.ou_stationary)(HYPERBOLIC), "made by `ornstein_uhlenbeck`", TypeError),
@@ -229,7 +229,7 @@ MODELS = [
     ),
     ("bridges", lambda: transform()().back(3.0), "`bridges` must be", TypeError),
     ("σ is traced", traced(lambda s: scaled(s).drift(X), 0.5), "constant σ that is traced"),
-    ("domain", domain(lambda x, p: x > 0), "`domain` must return one truth value"),
+    ("domain", domain(lambda x, p: x > 0), "`domain` must return one boolean"),
     ("model", lamperti(model=3.0), "`model` must be", TypeError),
     ("two points", lamperti(at=[0.5, 0.5]), "`at` must be a number"),
     ("outside", lamperti(at=-1.0), "`at` must be a point inside"),
@@ -292,11 +292,11 @@ COUPLING = [
     ("burn-in", of(jb.Stationary)(-1.0), "positive time"),
     ("mean", of(jb.GaussianLaw)([0.0], jnp.eye(2)), "must have shape"),
     ("covariance", of(jb.GaussianLaw)(A, jnp.eye(3)), "must have shape"),
-    *each("law", of(jb.GaussianLaw, A), [-np.eye(2), np.eye(2)[::-1]], "positive definite"),
+    *each("law", of(jb.GaussianLaw, A), [-np.eye(2), np.eye(2)[::-1]], "positive semidef"),
     ("singular law", coupling(start_law=SINGULAR_LAW), "positive definite"),
     # Bridges.
     ("cube", bridges(start=[[A]]), "`start` must be one point"),
-    ("line", bridges(start=[0.0]), "points of one dimension"),
+    ("line", bridges(start=[0.0]), "the same dimension"),
     ("3 and 2", bridges(start=[A] * 3, end=[A] * 2), "number of intervals"),
     ("none at all", bridges(start=np.ones((0, 2))), "at least one interval"),
     ("half precision", bridges(**IN_HALVES), "float32 or float64; got float16", TypeError),
@@ -310,7 +310,7 @@ COUPLING = [
     ("beyond", bridges(save_at=[0.0, 1.2]), "`save_at` must lie in"),
     ("beyond in jit", traced(bridges(save_at=[0.5, 7.0])), "`save_at` must lie in"),
     ("back", bridges(save_at=[0.5, 0.2]), "`save_at` must increase"),
-    ("a time", bridges(save_at=0.5), "`save_at` must be times"),
+    ("a time", bridges(save_at=0.5), "`save_at` must be an array of times"),
     ("no reversal", bridges(model=FREE), "time reversal of this model is unknown"),
     *each("σ", lambda m: bridges(model=m), [OF_ROOTS, SINGULAR], "must be invertible"),
     ("α is missing", bridges(model=HYPERBOLIC.with_params(NAN)), "`params` .* not finite"),
@@ -372,7 +372,7 @@ PROPOSALS = [
         ]
     ),
     ("varying σ", bent(proposal=TAYLOR), "is for constant σ"),
-    ("no ν", bent(proposal=PAIRS), "does not need it, such as `ModifiedDiffusionBridge"),
+    ("no ν", bent(proposal=PAIRS), "without time reversal, such as `ModifiedDiff"),
     # Choices.
     ("words", exact(proposal="best"), 'what `choose_proposal` returns, or "auto"', TypeError),
     ("kernel", kernel(PAPER, A, B, 1.0, proposal="auto"), "a kernel makes no pilot run"),
@@ -821,7 +821,7 @@ UNUSED = [
     ("covariance", going_on(covariance=[0.1, 0.1]), "`covariance` is for a new start"),
     *each("state", lambda b: going_on(**{b: 5}), BUDGET[::2], ": for a new start"),
     # Declarations.
-    ("normalised", diffusion(normalised=True), "`normalised=True` is about `log_stationary`"),
+    ("normalised", diffusion(normalised=True), "`normalised=True` describes `log_stationary`"),
     ("two reversals", diffusion(reverse_drift=DECAY, reversible=True), "leave out `reverse_drift`"),
     # References.
     ("log_density", precision(num_steps=(4,), log_density=-1.0), "`log_density`: for a method"),

@@ -1,16 +1,32 @@
-"""What diffuses: dX = α(X) dt + σ(X) dW, stationary with density ν, and its time reversal
+"""Models of diffusions: `dX = α(X) dt + σ(X) dW` with stationary density ν, and its time reversal
 
     dX* = α*(X*) dt + σ(X*) dW,    α* = -α + V ∇log ν + div V,    V = σσᵀ.
 
-σ at a point is one of six operators (`sigma`); with a drift it makes the coefficients of an
-equation (`dynamics`). A model (`diffusion`) is made of functions and parameters: it is seen what
-these depend on (`tracing`), and decided what need be simulated (`decisions`). Some are at hand:
-those of a given ν (`langevin`), `hyperbolic`, and `ornstein_uhlenbeck` with its stationary law
-(`gaussian_law`), its transitions (`linear`, for any linear drift) and its bridges
-(`gaussian_bridge`). The same model in other coordinates, Y = f(X), has Itô's drift
-∇f α + ½ Σ_k ∂²f(σ_k, σ_k) (`transform`); where Y = ∫ du/σ(u) its σ is one (`lamperti`). Noise
-reaches only a part of the state of `fitzhugh_nagumo`, of `underdamped_langevin`, and of a model
-`integrated` over time; and that of a `seasonal` one depends on time. Paths that are free at their
-end are simulated (`simulate`); of bridges the end points and durations are given, on a grid of
-times (`bridge_problem`).
+Parts of a model:
+
+- `sigma`: σ at one point, as one of six linear operators.
+- `dynamics`: the drift and σ of one equation, ready for compiled loops.
+- `tracing`: traces of a model's functions, and the arguments that these functions use.
+- `decisions`: the rules that select the effects to simulate.
+- `diffusion`: the model, which combines functions and parameters.
+
+Ready models:
+
+- `langevin`: diffusions with a given stationary density.
+- `hyperbolic`: the hyperbolic diffusion.
+- `ornstein_uhlenbeck`: linear models, with their stationary law (`gaussian_law`), transitions
+    (`linear`, for every linear drift) and bridges (`gaussian_bridge`).
+- `seasonal`: a model whose coefficients depend on time.
+- `fitzhugh_nagumo`, `underdamped_langevin`, `integrated`: hypoelliptic models, in which noise
+    enters only some coordinates.
+
+Changes of coordinates Y = f(X):
+
+- `transform`: any smooth bijection f. By Itô's formula Y has the drift ∇f α + ½ Σ_k ∂²f(σ_k, σ_k).
+- `lamperti`: in one dimension, Y = ∫ du/σ(u), which has σ = 1.
+
+Paths:
+
+- `simulate`: unconditional paths.
+- `bridge_problem`: the end points, durations and time grid of bridges.
 """

@@ -1,8 +1,7 @@
-"""The bridges asked for: end points and durations, checked and brought to one shape; the grid of
-their times, as fractions of T, and which of its points are kept; and the shapes of results.
+"""The input that all bridge samplers share: end points, durations, time grid and stored times.
 
-What is wrong and visible before tracing is refused here, with a sentence that says what to
-change. Values that are being traced cannot be looked at and pass.
+The checks raise an error before anything is traced or compiled. They skip traced values, because
+those have no numbers yet. `BridgeProblem` also shapes the results.
 """
 
 import dataclasses
@@ -27,7 +26,8 @@ from .diffusion import Diffusion, check_diffusion
 
 
 class Intervals(NamedTuple):
-    """I bridges of one model: from `start` to `end`, both (I, d), in `duration`, (I,)."""
+    """End points and durations of I bridges: `start` and `end`, shape (I, d), and `duration`, (I,),
+    in units of time."""
 
     start: Float[Array, "I d"]
     end: Float[Array, "I d"]
@@ -35,11 +35,13 @@ class Intervals(NamedTuple):
 
 
 class BridgeProblem(eqx.Module):
-    """I bridges of one model on a grid of N steps, and how what is found of them is returned: with
-    an axis I where the end points or the duration came with one.
+    """I bridges of one model on a grid of N steps, and the shape of their results.
 
-    - `stored`: the K grid points at which paths are kept, all where it is `None`.
-    - `several_durations`: whether each interval has times of its own.
+    - `stored`: indices of the K grid points at which paths are stored; `None` stores all.
+    - `num_steps`: N.
+    - `batched`: whether results have an axis I. They have one if an end point or the duration has.
+    - `several_durations`: whether the duration has an axis I, so that each interval has its own
+        times.
     """
 
     intervals: Intervals
@@ -50,46 +52,58 @@ class BridgeProblem(eqx.Module):
 
     @property
     def num_intervals(self) -> int:
+        """Return I."""
         return self.intervals.start.shape[0]
 
     def num_path_steps(self, num_bridges: int) -> int:
-        """The steps of so many paths of each interval."""
+        """Return the total number of steps of `num_bridges` paths per interval."""
         return num_bridges * self.num_intervals * self.num_steps
 
     @property
     def like(self) -> Float[Array, " d"]:
-        """A point, of which only shape and dtype count."""
+        """Return a point with the shape and dtype of the states. Its values have no meaning."""
         return self.intervals.start[0]
 
     def keep(
         self, save_at: Numbers | None, duration: Numbers, fractions: Float[np.ndarray, " points"]
     ) -> "BridgeProblem":
-        """The same, with paths kept at the times that the user asked for."""
-        whole = 1.0 if self.several_durations else duration
-        stored = _stored_steps(save_at, whole, fractions)
+        """Return the same problem with paths stored at the times `save_at` only.
+
+        `fractions` is the grid, divided by the duration. For several durations `save_at` has to be
+        divided by them, too.
+
+        **Raises:** `ValueError` for times that do not increase, or are not on the grid.
+        """
+        # Intervals of different durations share `save_at` as fractions of their durations.
+        length = 1.0 if self.several_durations else duration
+        stored = _stored_steps(save_at, length, fractions)
         return dataclasses.replace(self, stored=stored)
 
     def kept(self, paths: Float[Array, "*I points d"]) -> Float[Array, "*I K d"]:
-        """The points of whole paths that are kept."""
+        """Return the stored points of paths with all grid points."""
         return paths if self.stored is None else paths[..., self.stored, :]
 
     def times(self, fractions: Float[np.ndarray, " points"]) -> Float[Array, "*durations K"]:
-        """The times of the points that are kept, for each interval where durations differ."""
+        """Return the stored times: shape (K,), or (I, K) for several durations."""
         duration = self.intervals.duration
         duration = duration[:, None] if self.several_durations else duration[0]
-        kept = jnp.asarray(fractions, duration.dtype)
-        return (kept if self.stored is None else kept[self.stored]) * duration
+        grid = jnp.asarray(fractions, duration.dtype)
+        return (grid if self.stored is None else grid[self.stored]) * duration
 
     def keys(self, key: Key[Array, ""], num: int) -> Key[Array, "I num"]:
-        """A key for each of so many paths of each interval, numbered through."""
+        """Return `num` random keys per interval, shape (I, num)."""
         return numbered(key, self.num_intervals * num).reshape(self.num_intervals, num)
 
     def result(self, tree: PyTree) -> PyTree:
-        """What was found of each interval; of the only one without an axis."""
+        """Return `tree`, whose arrays have an axis I; drop this axis unless the problem is
+        `batched`."""
         return tree if self.batched else jax.tree.map(lambda leaf: leaf[0], tree)
 
     def total(self, counts: Shaped[Array, "..."]) -> Int[Array, "*I"]:
-        """The sums of counts of which each interval has as many, in order."""
+        """Return the sum of `counts` for each interval.
+
+        The counts are grouped by interval, in order, with equally many for each.
+        """
         sums = jnp.sum(counts.reshape(self.num_intervals, -1), axis=1, dtype=jnp.int32)
         return self.result(sums)
 
@@ -97,7 +111,10 @@ class BridgeProblem(eqx.Module):
 def bridge_problem(
     model: Diffusion, start: Numbers, end: Numbers, duration: Numbers, num_steps: int
 ) -> BridgeProblem:
-    """What every function that makes bridges is asked for, checked; whole paths are kept."""
+    """Check the arguments common to all bridge samplers; return a problem that stores all points.
+
+    **Raises:** `TypeError` and `ValueError` for invalid arguments.
+    """
     check_diffusion(model)
     intervals, batched, several_durations = as_intervals(start, end, duration)
     num_steps = check_num_steps(num_steps, len(intervals.duration))
@@ -105,28 +122,35 @@ def bridge_problem(
 
 
 def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Intervals, bool, bool]:
-    """The intervals, and whether the end points and the duration came with an axis I."""
+    """Check end points and durations; broadcast them to I intervals of one dtype.
+
+    **Returns:** the intervals; whether any argument has an axis I; whether the duration has one.
+
+    **Raises:** `ValueError` for shapes that do not fit, values that are not finite, and durations
+    that are not positive or too short for the dtype.
+    """
     points = {"start": as_points("start", start), "end": as_points("end", end)}
     duration = as_real("duration", duration)
     if duration.ndim > 1:
         raise ValueError(f"`duration` must have shape () or (I,); got {duration.shape}.")
     if points["start"].shape[-1] != points["end"].shape[-1]:
         raise ValueError(
-            "`start` and `end` must be points of one dimension; got shapes "
+            "`start` and `end` must have the same dimension d; got shapes "
             f"{points['start'].shape} and {points['end'].shape}."
         )
     dtype = _working_dtype(*points.values(), duration)
     check_precision("`start`, `end` and `duration`", dtype)
+    # Arguments without an axis I, or with I = 1, apply to all intervals.
     lengths = {point.shape[0] for point in points.values() if point.ndim == 2}
     lengths |= {duration.shape[0]} if duration.ndim == 1 else set()
     if len(lengths - {1}) > 1:
         raise ValueError(
-            "`start`, `end` and `duration` must agree in the number of intervals; got shapes "
+            "`start`, `end` and `duration` must have the same number of intervals; got shapes "
             f"{points['start'].shape}, {points['end'].shape} and {duration.shape}."
         )
     if 0 in lengths:
         raise ValueError(
-            "there must be at least one interval; `start`, `end` and `duration` have shapes "
+            "`start`, `end` and `duration` must have at least one interval; got shapes "
             f"{points['start'].shape}, {points['end'].shape} and {duration.shape}."
         )
     for name, value in {**points, "duration": duration}.items():
@@ -134,11 +158,12 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
             raise ValueError(f"`{name}` must be finite; got {value}.")
     if not is_traced(duration) and not np.all(np.asarray(duration) > 0):
         raise ValueError(f"`duration` must be positive; got {duration}.")
-    shortest = 2**30 * float(jnp.finfo(dtype).tiny)  # divided into steps it is still a number
+    # The factor leaves room for up to 2³⁰ steps, whose size is then still a normal number.
+    shortest = 2**30 * float(jnp.finfo(dtype).tiny)
     if not is_traced(duration) and np.any(np.asarray(duration) < shortest):
         raise ValueError(
-            f"`duration` = {duration} is too short for steps of type {dtype}: choose another unit "
-            "of time."
+            f"`duration` = {duration} is too short for steps of type {dtype}: choose a smaller "
+            "unit of time."
         )
     num_intervals = max(lengths, default=1)
     d = points["start"].shape[-1]
@@ -151,57 +176,64 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
 
 
 def as_points(name: str, value: Numbers) -> Array:
-    """Return one point, shape (d,), or several, shape (I, d).
+    """Return `value` as one point, shape (d,), or as I points, shape (I, d).
 
-    **Raises:** `ValueError` for another shape.
+    **Raises:** `ValueError` for any other shape.
     """
     points = as_real(name, value)
     if points.ndim not in (1, 2) or points.shape[-1] == 0:
         raise ValueError(
-            f"`{name}` must be one point, shape (d,), or one for each interval, shape "
-            f"(I, d); got {points.shape}."
+            f"`{name}` must be one point, shape (d,), or one point per interval, shape "
+            f"(I, d); got shape {points.shape}."
         )
     return points
 
 
 def uniform_fractions(num_steps: int) -> Float[np.ndarray, " points"]:
-    """t_i / T on the grid of equal steps."""
+    """Return t_i / T for the grid of N equal steps."""
     return np.arange(num_steps + 1) / num_steps
 
 
 def _stored_steps(
     save_at: Numbers | None, duration: Numbers, fractions: Float[np.ndarray, " points"]
 ) -> Int[Array, " K"] | None:
-    """The grid points, t_i = T × fraction, at which paths are kept."""
+    """Return the indices of the grid points nearest to `save_at`; `None` for all points.
+
+    Grid point i is `duration` × `fractions[i]`. Traced times are not checked.
+
+    **Raises:** `ValueError` for times that are not increasing points of the grid.
+    """
     if save_at is None:
         return None
     save_at = as_floating("save_at", save_at)
     if save_at.ndim != 1 or save_at.shape[0] == 0:
-        raise ValueError(f"`save_at` must be times in an array of shape (K,); got {save_at.shape}.")
-    between = (fractions[1:] + fractions[:-1]) / 2
+        raise ValueError(f"`save_at` must be an array of times, shape (K,); got {save_at.shape}.")
+    # The index of the nearest grid point is the number of midpoints below the time.
+    midpoints = (fractions[1:] + fractions[:-1]) / 2
     if is_traced(save_at, duration):
-        wanted = save_at / jnp.asarray(duration)
-        middle = jnp.asarray(between, wanted.dtype)
-        return jnp.searchsorted(middle, wanted).astype(jnp.int32)
+        targets = save_at / jnp.asarray(duration)
+        traced_midpoints = jnp.asarray(midpoints, targets.dtype)
+        return jnp.searchsorted(traced_midpoints, targets).astype(jnp.int32)
     length = float(np.asarray(duration, float))
-    wanted = np.asarray(save_at, float) / length
-    nearest = np.searchsorted(between, wanted)
-    # A thousandth of a step, and what rounding makes of times.
+    targets = np.asarray(save_at, float) / length
+    nearest = np.searchsorted(midpoints, targets)
+    # A thousandth of a step, plus the rounding error of the times.
     tolerance = 1e-3 * np.diff(fractions).min() + float(jnp.finfo(save_at.dtype).eps)
-    if np.any(wanted < -tolerance) or np.any(wanted > 1 + tolerance):
+    if np.any(targets < -tolerance) or np.any(targets > 1 + tolerance):
         raise ValueError(f"`save_at` must lie in [0, {duration}]; got {save_at}.")
-    if np.any(np.abs(fractions[nearest] - wanted) > tolerance):
+    if np.any(np.abs(fractions[nearest] - targets) > tolerance):
         raise ValueError(
-            "`save_at` must lie on the grid of `num_steps` steps: the times nearest to "
-            f"those given are {fractions[nearest] * length}."
+            "`save_at` must lie on the grid of `num_steps` steps: the nearest grid times "
+            f"are {fractions[nearest] * length}."
         )
     if np.any(np.diff(nearest) <= 0):
-        raise ValueError(f"`save_at` must increase from one grid point on; got {save_at}.")
+        raise ValueError(f"`save_at` must increase by at least one grid step; got {save_at}.")
     return jnp.asarray(nearest, jnp.int32)
 
 
 def _working_dtype(*arrays: Array) -> jnp.dtype:
-    """The widest floating point type that was given; JAX's default if none was."""
+    """Return the widest floating point dtype of the arrays, or else JAX's default."""
+    # Integers and Python numbers, which are weakly typed, do not widen the result.
     floating = [
         a.dtype for a in arrays if jnp.issubdtype(a.dtype, jnp.floating) and not a.weak_type
     ]

@@ -1,10 +1,9 @@
-"""Which effects a scene calls for: the one table of decisions.
+"""Rules that select the effects which a compiled program simulates.
 
-A model and a coupling are a scene. What its compiled program contains is decided here and
-nowhere else, when it is traced: the model asks for the rules of the reversal, the scheme for
-that of its drift, the pair for those of its noise and its rotation. (Whether there is a matrix
-to solve with follows from the class of σ, which `solves` puts in words.) `coupling.effects` asks
-the same rules and prints their answers, so what it says is what is simulated.
+The effects depend on the model and the coupling. While a program is traced, the model, the scheme
+and the coupled pair apply these rules and no others. `coupling.effects` prints the same decisions,
+so the table describes the program exactly. Exception: the class of σ determines whether a step
+solves a linear system; `solves` only describes it.
 """
 
 from typing import NamedTuple
@@ -13,29 +12,29 @@ from .sigma import AbstractSigma, Constant, Diagonal, Full, Identity, Triangular
 
 
 class Effect(NamedTuple):
-    """Whether something is simulated, and why, or why not."""
+    """Decision about one effect: whether it is simulated, and the reason."""
 
     simulated: bool
     why: str
 
 
 class Effects(NamedTuple):
-    """The decisions for one scene.
+    """Decisions about all effects for one model and coupling.
 
     - `reverse_drift`: α* by automatic differentiation of log ν, in each step of the reversed path.
     - `divergence`: div V in α*.
-    - `solves`: elimination with a matrix σ in each step.
-    - `triangular_root`: the root of V = σσᵀ in the place of σ, in each step of the pair.
-    - `rotation`: O(x, x') in each step of the pair.
-    - `independent_noise`: dU, one normal number a step.
-    - `crossing_uniforms`: one uniform number a step, for the meeting rule.
-    - `corrector`: Heun's second look at the drift, at the point that it predicts.
-    - `stratonovich`: the correction of the drift by which Itô's form exceeds Stratonovich's.
-    - `stored_times`: whole paths kept, rather than the times asked for.
-    - `early_stop`: associated paths looked at on the way, and stopped where all have hit.
-    - `noise_by_drift`: noise that the drift leads to the part of the state that σ does not reach,
-        within each step of the paths of a record.
-    - `time`: coefficients worked out anew for each step of the paths of a record, at its middle.
+    - `solves`: Gaussian elimination with the matrix σ, in each step.
+    - `triangular_root`: the triangular root of V = σσᵀ instead of σ, in each step of the pair.
+    - `rotation`: the orthogonal matrix O(x, x'), in each step of the pair.
+    - `independent_noise`: dU, one normal number per step.
+    - `crossing_uniforms`: one uniform number per step, for the meeting rule.
+    - `corrector`: Heun's second evaluation of the drift, at the predicted point.
+    - `stratonovich`: the difference between the Itô drift and the Stratonovich drift.
+    - `stored_times`: storage of all grid points, not only of the requested times.
+    - `early_stop`: a loop over associated paths that stops once all of them have hit.
+    - `noise_by_drift`: noise that the drift transports, within a step, to coordinates that σ does
+        not reach. For paths of records.
+    - `time`: coefficients evaluated at the middle of each step. For paths of records.
     """
 
     reverse_drift: Effect
@@ -53,6 +52,7 @@ class Effects(NamedTuple):
     time: Effect
 
     def __str__(self) -> str:
+        """Return a table with one row per effect."""
         lines = [f"{'effect':<18}  {'':<9}  why"]
         for name, effect in self._asdict().items():
             word = "simulated" if effect.simulated else "left out"
@@ -61,51 +61,52 @@ class Effects(NamedTuple):
 
 
 def without_pairs(noise_by_drift: Effect, time: Effect, why: str) -> Effects:
-    """The effects of a model to which couplings do not apply, for this reason."""
-    nothing = Effect(False, f"no coupling applies: {why}")
-    of_records = {"noise_by_drift": noise_by_drift, "time": time}
-    return Effects(**{name: of_records.get(name, nothing) for name in Effects._fields})
+    """Return the effects for a model without couplings; `why` is the reason for their absence."""
+    no_pair = Effect(False, f"no coupling applies: {why}")
+    record_effects = {"noise_by_drift": noise_by_drift, "time": time}
+    return Effects(**{name: record_effects.get(name, no_pair) for name in Effects._fields})
 
 
 def noise_by_drift(invertible: bool) -> Effect:
-    """∫ (δ - s) ∇α σ dW in the part of the state that σ does not reach."""
+    """Decide whether to simulate ∫ (δ - s) ∇α σ dW, the noise that the drift transports."""
     if invertible:
-        return Effect(False, "σ reaches the whole state")
-    return Effect(True, "σ has fewer columns than rows: noise comes to the rest by the drift")
+        return Effect(False, "σ reaches all coordinates")
+    return Effect(True, "σ has fewer columns than rows: the drift transports the noise")
 
 
 def time(depends_on_time: bool) -> Effect:
-    """α(x, t) and σ(x, t)."""
+    """Decide whether to evaluate α(x, t) and σ(x, t) anew for each step."""
     if not depends_on_time:
         return Effect(False, "no coefficient depends on time")
-    return Effect(True, "the drift or σ takes a third argument, the time")
+    return Effect(True, "the drift or σ takes the time as a third argument")
 
 
-def reverse_drift(reversible: bool, given: bool) -> Effect:
-    """α* by automatic differentiation."""
+def reverse_drift(reversible: bool, has_reverse_drift: bool) -> Effect:
+    """Decide whether to derive α* by automatic differentiation."""
     if reversible:
         return Effect(False, "the model is declared reversible: α* = α")
-    if given:
-        return Effect(False, "the model brings its `reverse_drift`")
+    if has_reverse_drift:
+        return Effect(False, "the model has a `reverse_drift`")
     return Effect(True, "α* = -α + V ∇log ν + div V, from `log_stationary`")
 
 
 def divergence(reverse_drift: Effect, sigma_varies: bool) -> Effect:
-    """div V."""
+    """Decide whether to compute div V."""
     if not reverse_drift.simulated:
-        return Effect(False, "α* needs no derivative")
+        return Effect(False, "α* needs no derivatives")
     if not sigma_varies:
         return Effect(False, "σ does not depend on the state: div V = 0")
     return Effect(True, "σ depends on the state")
 
 
 def solves(sigma: type[AbstractSigma]) -> Effect:
-    """σ⁻¹ v by elimination."""
+    """Describe whether σ⁻¹ v needs elimination with a matrix."""
+    # No entry for `Tall`: couplings do not apply to it.
     reasons = {
         Identity: "σ is the identity",
-        Constant: "σ is constant: inverted once, before the steps",
-        Diagonal: "σ is diagonal: a division",
-        Triangular: "its root is triangular: one substitution",
+        Constant: "σ is constant: one inversion before all steps",
+        Diagonal: "σ is diagonal: a division per coordinate",
+        Triangular: "the root of V = σσᵀ is triangular: one substitution",
     }
     if sigma is Full:
         return Effect(True, "σ is a full matrix that depends on the state")
@@ -113,66 +114,66 @@ def solves(sigma: type[AbstractSigma]) -> Effect:
 
 
 def triangular_root(sigma: type[AbstractSigma], rotation_given: bool, stratonovich: bool) -> Effect:
-    """L of σ = L Q, L Lᵀ = V."""
+    """Decide whether to replace σ = L Q by its triangular factor L, L Lᵀ = V."""
     if sigma is not Full:
-        return Effect(False, "σ is no full matrix that depends on the state, or triangular already")
+        return Effect(False, "σ is constant, diagonal or triangular")
     if rotation_given:
-        return Effect(False, "the coupling turns σ(x) itself, by its `rotation`")
+        return Effect(False, "the `rotation` of the coupling acts on σ(x) itself")
     if stratonovich:
         return Effect(False, "the scheme differentiates σ(x) itself")
-    return Effect(True, "V = σσᵀ is all that counts, and its root solves without elimination")
+    return Effect(True, "the law depends on V = σσᵀ only, and its root needs no elimination")
 
 
-def rotation(sigma: type[AbstractSigma], rotation_given: bool, left_out: bool) -> Effect:
-    """O(x, x')."""
+def rotation(sigma: type[AbstractSigma], rotation_given: bool, is_disabled: bool) -> Effect:
+    """Decide whether to compute the orthogonal matrix O(x, x')."""
     if sigma not in (Full, Triangular):
-        return Effect(False, "σ is no matrix that depends on the state: O = I")
-    if left_out:
-        return Effect(False, "the coupling's choice, `no_rotation`")
+        return Effect(False, "σ is constant or diagonal: O = I")
+    if is_disabled:
+        return Effect(False, "the coupling has `rotation=no_rotation`")
     if sigma is Triangular and not rotation_given:
-        return Effect(False, "triangular roots of V = σσᵀ do not turn: O = I")
-    return Effect(True, "so that σ(x')O points where σ(x) does")
+        return Effect(False, "triangular roots of V = σσᵀ do not rotate: O = I")
+    return Effect(True, "aligns σ(x')O with σ(x)")
 
 
-def independent_noise(has_own: bool) -> Effect:
-    """dU."""
-    if has_own:
-        return Effect(True, "the pair shares only a part of its noise along u")
-    return Effect(False, "the noise of one path is a function of the other's")
+def independent_noise(has_independent_noise: bool) -> Effect:
+    """Decide whether to draw dU, the part of the noise along u that the paths do not share."""
+    if has_independent_noise:
+        return Effect(True, "the paths share only a part of their noise along u")
+    return Effect(False, "the noise of one path determines the noise of the other")
 
 
-def crossing_uniforms(draws: bool) -> Effect:
-    """The meeting rule's own randomness."""
-    if draws:
-        return Effect(True, "whether the gap closed inside a step is drawn")
-    return Effect(False, "the meeting rule looks at the grid points only")
+def crossing_uniforms(draws_uniform: bool) -> Effect:
+    """Decide whether the meeting rule draws uniform numbers."""
+    if draws_uniform:
+        return Effect(True, "the meeting rule draws whether the paths meet inside a step")
+    return Effect(False, "the meeting rule uses the grid points only")
 
 
 def corrector(sigma_varies: bool) -> Effect:
-    """α at the predicted point, where the scheme is left to the scene."""
+    """Decide whether `HeunOrEuler` evaluates α at the predicted point too."""
     if sigma_varies:
-        return Effect(False, "σ depends on the state: it would not raise the order")
-    return Effect(True, "σ is constant: it raises the weak order from 1 to 2")
+        return Effect(False, "σ depends on the state: the corrector would not raise the weak order")
+    return Effect(True, "σ is constant: the corrector raises the weak order from 1 to 2")
 
 
-def stratonovich(asked_for: bool, sigma_varies: bool) -> Effect:
-    """½ Σ_jk ∂_kσ_ij σ_kj."""
-    if not asked_for:
-        return Effect(False, "the scheme works with Itô's form")
+def stratonovich(uses_stratonovich: bool, sigma_varies: bool) -> Effect:
+    """Decide whether to compute the Itô correction ½ Σ_jk ∂_kσ_ij σ_kj."""
+    if not uses_stratonovich:
+        return Effect(False, "the scheme uses the Itô drift")
     if not sigma_varies:
-        return Effect(False, "σ does not depend on the state: both forms are one")
-    return Effect(True, "the scheme works with Stratonovich's form")
+        return Effect(False, "σ does not depend on the state: both drifts are equal")
+    return Effect(True, "the scheme uses the Stratonovich drift")
 
 
 def stored_times(num_stored: int | None) -> Effect:
-    """The joined path at every step."""
+    """Decide whether to store the joined path at every step."""
     if num_stored is None:
-        return Effect(True, "the whole path was asked for")
-    return Effect(False, f"only {num_stored} times were asked for")
+        return Effect(True, "the result contains all grid points")
+    return Effect(False, f"only {num_stored} times are requested")
 
 
 def early_stop(num_chunks: int) -> Effect:
-    """Looking on the way whether all associated paths have hit."""
+    """Decide whether to stop as soon as all associated paths have hit."""
     if num_chunks == 1:
-        return Effect(False, "the noise of the path is one chunk, drawn at once")
-    return Effect(True, f"after each of {num_chunks} chunks of noise")
+        return Effect(False, "one chunk holds the noise of the path")
+    return Effect(True, f"a check after each of {num_chunks} chunks of noise")

@@ -1,17 +1,19 @@
-"""A diffusion and its time reversal (sections 2 and 2.1 of the paper).
+"""Diffusions and their time reversal (sections 2 and 2.1 of the paper).
 
-The diffusion solves `dX = α(X) dt + σ(X) dW` in R^d and is ergodic with stationary density ν.
-Run backwards in time, the stationary process is a diffusion with the same σ and the drift of
-equation (reversedrift),
+A diffusion solves `dX = α(X) dt + σ(X) dW` in R^d and is ergodic with stationary density ν. The
+stationary process in reversed time is a diffusion with the same σ. Equation (reversedrift) is its
+drift:
 
-    α*(x) = -α(x) + ν(x)⁻¹ Σ_j ∂_j(ν V_ij)(x) = -α + V ∇log ν + div V,    V = σσᵀ,
+    α*(x) = -α(x) + ν(x)⁻¹ Σ_j ∂_j(ν V_ij)(x) = -α + V ∇log ν + div V,    V = σσᵀ.
 
-in which the normaliser of ν cancels. It is reversible if and only if α* = α, equation
+The normaliser of ν cancels. The diffusion is reversible if and only if α* = α, equation
 (timereversible).
 
-Two kinds of diffusions have no such reversal that couplings could use, but can be seen with noise
-or in part all the same (`records`): those whose noise reaches only a part of the state at once, σ
-of fewer columns than rows; and those whose coefficients α(x, t) and σ(x, t) change with time.
+Couplings need this reversal and an inverse of σ. Two kinds of models lack them, and can be used
+with noisy or partial observations (`records`) only:
+
+- Hypoelliptic models: σ has fewer columns than rows, so noise enters only some coordinates.
+- Time-dependent models: coefficients α(x, t) and σ(x, t).
 """
 
 import copy
@@ -45,56 +47,58 @@ from .sigma import NO_INVERSE, AbstractSigma, Constant, Diagonal, Full, Identity
 from .tracing import takes_time, traced_once, uses_argument
 
 _NOT_HOMOGENEOUS = (
-    "the coefficients of this model depend on time, and what was asked for is for diffusions whose "
-    "do not, as are couplings, reversals, and bridges and transition densities of a duration. What "
-    "is not: `simulate`, and with an `observation` `log_likelihood`, `smooth`, `innovations`, "
-    "`gibbs`, `pmmh` and `maximum_likelihood`, whose times are absolute; a state that was seen "
-    "exactly is `jb.LinearGaussian(covariance=0.0)`. `model.drift(x, time)` is the drift at a time."
+    "the coefficients of this `model` depend on time. Couplings, reversals, bridges and transition "
+    "densities of a `duration` need coefficients that do not. Use `simulate`; or, with an "
+    "`observation` and absolute times, `log_likelihood`, `smooth`, `innovations`, `gibbs`, `pmmh` "
+    "and `maximum_likelihood`. For an exactly observed state the `observation` is "
+    "`jb.LinearGaussian(covariance=0.0)`. `model.drift(x, time)` is the drift at one time."
 )
 
-
+# Signatures of the user's functions, for error messages.
 _OF_POINT, _OF_TIME = "(x, params)", "(x, params, t)"
 
 
 class Diffusion(eqx.Module):
-    """The diffusion `dX = α(X) dt + σ(X) dW`, from pure functions of one point.
+    """Diffusion `dX = α(X) dt + σ(X) dW`, defined by pure functions of one point.
 
-    A pytree: its leaves are the arrays of `params` (and a constant σ), so it passes through
-    `jit`, `vmap` and `grad`; its functions are static and compared by identity, so define
-    them once to compile once. Traced values that the functions close over are differentiated
-    and batched like `params`. Such functions are traced again in every call, so prefer `params`.
+    A `Diffusion` is a pytree. Its leaves are the arrays in `params` (and a constant σ), so it
+    passes through `jit`, `vmap` and `grad`. Its functions are static and compared by identity:
+    define them once, and programs compile once. Functions may close over traced values, which are
+    differentiated and batched like `params`. But then every call traces the functions again, so
+    prefer `params`.
 
     **Arguments:**
 
-    - `drift`: α, a function `(x, params) -> (d,)` of a point `x` of shape (d,), in space per
-        unit of time; or `(x, params, t)`, with a third argument that has no default, of time.
-    - `diffusion`: σ. `None` is the identity; an array of shape (d, d), or (d,) for a
-        diagonal, is constant; a function `(x, params)` or `(x, params, t)` returns one of these.
-        Whether it uses `x` is seen when it is traced: one that does not is constant as well. In
-        space per square root of a unit of time. Of full rank. Where its shape is (d, m) with
-        m > d the root of V = σσᵀ stands in for it. With m < d noise reaches only a part of the
-        state at once; then V has no inverse, on which couplings rest.
+    - `drift`: α, in space per unit of time. A function `(x, params) -> (d,)` of a point `x` of
+        shape (d,). If α depends on time, a function `(x, params, t)`; `t` must have no default.
+    - `diffusion`: σ, in space per square root of a unit of time, of full rank. `None` is the
+        identity. An array of shape (d, m), or (d,) for a diagonal, is a constant σ. A function
+        `(x, params)` or `(x, params, t)` returns such an array. If tracing shows that it does not
+        use `x`, σ is constant too. For m > d the model uses the triangular root of V = σσᵀ instead
+        of σ. For m < d noise enters only some coordinates; V has no inverse, and couplings do not
+        apply.
     - `log_stationary`: log ν up to a constant, `(x, params) -> ()`.
-    - `params`: any pytree. Floating point numbers in it become JAX arrays, and whatever is no array
-        stays what it is: whole numbers, truth values, names, the activation of a neural network.
-        These are static: another value compiles again, and they are neither inferred nor
-        differentiated. So write 1.0 for a rate.
-    - `reverse_drift`: α*, `(x, params) -> (d,)`, where it is known in closed form. Otherwise
-        it comes from `log_stationary` by automatic differentiation.
+    - `params`: any pytree. Floating point numbers in it become JAX arrays. Leaves that are not
+        arrays are static: integers, booleans, strings, the activation function of a neural network.
+        A new static value compiles a new program; it is neither inferred nor differentiated. So
+        write 1.0, not 1, for a rate.
+    - `reverse_drift`: α* in closed form, `(x, params) -> (d,)`. By default α* is derived from
+        `log_stationary` by automatic differentiation.
     - `sample_stationary`: an exact sampler of ν, `(key, params) -> (d,)`.
-    - `reversible`: declare α* = α; then no reverse drift is computed. See
-        `reversibility_residual` for a check.
-    - `normalised`: declare that `log_stationary` is the logarithm of a density, not only up to a
-        constant. Transition densities by couplings from the stationary law rest on it.
-    - `domain`: the state space, where it is not all of R^d: a function `(x, params)` to whether x
-        is inside. A path that leaves it is a miss, and counted among `num_nonfinite`. Where paths
-        come near the boundary, `transform` loses none of them.
-    - `prepare`: maps `params` to what the functions above receive in their place, for
-        quantities that depend on the parameters but not on the point. It runs once per call,
-        outside every loop.
+    - `reversible`: declare that α* = α, so that no reverse drift is computed.
+        `reversibility_residual` checks it.
+    - `normalised`: declare that `log_stationary` is the logarithm of a normalised density.
+        Transition densities from couplings that start in the stationary law need it.
+    - `domain`: the state space, if it is not all of R^d. A function `(x, params) -> ()` that is
+        true inside. A path that leaves it is a miss, counted in `num_nonfinite`. If paths come near
+        the boundary, use `transform`, which loses no paths there.
+    - `prepare`: a function `(params)`. The functions above receive its result instead of `params`.
+        Use it for quantities that depend on the parameters only. It runs once per call, outside
+        every loop.
 
-    **Raises:** `TypeError` where a function is not callable; `ValueError` for a constant σ of
-    a wrong shape, or singular.
+    **Raises:** `TypeError` for functions that cannot be called with these arguments. `ValueError`
+    for a constant σ that is singular, not finite or of a wrong shape; for stationary functions of a
+    model that depends on time; for declarations that contradict the functions.
 
     **Example:**
 
@@ -113,8 +117,8 @@ class Diffusion(eqx.Module):
     _domain: Callable | None = eqx.field(static=True)
     _coordinates: Callable | None = eqx.field(static=True)
     _constant_sigma: Inexact[Array, "..."] | None
-    _numbers: PyTree
-    _others: "_Others" = eqx.field(static=True)
+    _arrays: PyTree
+    _static_leaves: "_StaticLeaves" = eqx.field(static=True)
     _captured: Captured
     reversible: bool = eqx.field(static=True)
     normalised: bool = eqx.field(static=True)
@@ -149,23 +153,27 @@ class Diffusion(eqx.Module):
         check_flag("normalised", normalised)
         if normalised and log_stationary is None:
             raise ValueError(
-                "`normalised=True` is about `log_stationary`: give this function, or leave it out."
+                "`normalised=True` describes `log_stationary`: pass this function or leave out "
+                "`normalised`."
             )
         if reversible and reverse_drift is not None:
             raise ValueError(
                 "`reversible=True` declares that the reverse drift is the drift: leave out "
-                "`reverse_drift`, or this."
+                "`reverse_drift` or `reversible`."
             )
-        of_stationary = {
+        # Arguments that describe a stationary law, which a time-dependent model lacks.
+        of_stationary_law = {
             "log_stationary": log_stationary is not None,
             "reverse_drift": reverse_drift is not None,
             "sample_stationary": sample_stationary is not None,
             "reversible": reversible,
         }
-        if any(of_stationary.values()) and (takes_time(drift) or takes_time(diffusion)):
-            names = ", ".join(f"`{name}`" for name, given in of_stationary.items() if given)
+        if any(of_stationary_law.values()) and (takes_time(drift) or takes_time(diffusion)):
+            names = ", ".join(
+                f"`{name}`" for name, is_given in of_stationary_law.items() if is_given
+            )
             raise ValueError(
-                "`drift` or `diffusion` takes a third argument, the time, and a diffusion whose "
+                "`drift` or `diffusion` takes the time as a third argument, and a diffusion whose "
                 f"coefficients depend on time is not stationary: leave out {names}."
             )
         self._drift = drift
@@ -179,7 +187,8 @@ class Diffusion(eqx.Module):
             self._diffusion, self._constant_sigma = diffusion, None
         else:
             self._diffusion, self._constant_sigma = None, _check_constant_sigma(diffusion)
-        self._numbers, self._others = _parts(params)
+        self._arrays, self._static_leaves = _split_params(params)
+        # Traced values in the closures of these functions become leaves of the model.
         self._captured = Captured(
             drift,
             self._diffusion,
@@ -195,39 +204,52 @@ class Diffusion(eqx.Module):
 
     @property
     def params(self) -> PyTree:
-        """The parameters, as they were given, but for numbers that have become arrays."""
-        others, structure = self._others
-        leaves = structure.flatten_up_to(self._numbers)
-        for place, leaf in others:
-            leaves[place] = leaf
+        """Return the parameters, with floating point numbers as arrays."""
+        # Arrays are dynamic and other leaves static fields: put them together.
+        static_leaves, structure = self._static_leaves
+        leaves = structure.flatten_up_to(self._arrays)
+        for index, leaf in static_leaves:
+            leaves[index] = leaf
         return structure.unflatten(leaves)
 
     def drift(self, x: Numbers, time: Numbers | None = None) -> Float[Array, " d"]:
-        """α(x), shape (d,), at this time where it depends on it."""
+        """Return α(x), shape (d,), or α(x, `time`) if the drift depends on time.
+
+        **Raises:** `ValueError` without a `time` if the coefficients depend on time.
+        """
         x = _as_point(x)
-        return self._at(x, time).drift(x)
+        return self._dynamics_at(x, time).drift(x)
 
     def diffusion(self, x: Numbers, time: Numbers | None = None) -> Float[Array, "d m"]:
-        """σ(x) as a dense matrix, shape (d, d), or (d, m) where m < d; at this time where it
-        depends on it."""
+        """Return σ(x), or σ(x, `time`) if σ depends on time, as a dense matrix: shape (d, d), or
+        (d, m) for m < d.
+
+        **Raises:** `ValueError` without a `time` if the coefficients depend on time.
+        """
         x = _as_point(x)
-        return self._at(x, time).sigma(x).as_matrix(x.shape[0], x.dtype)
+        return self._dynamics_at(x, time).sigma(x).as_matrix(x.shape[0], x.dtype)
 
     def reverse_drift(self, x: Numbers) -> Float[Array, " d"]:
-        """α*(x), shape (d,): equation (reversedrift) of the paper.
+        """Return α*(x), shape (d,): equation (reversedrift) of the paper.
 
-        **Raises:** `ValueError` for a model without `log_stationary` or `reverse_drift` that
-        is not declared reversible.
+        **Raises:** `ValueError` for a model that is not declared reversible and has neither
+        `log_stationary` nor `reverse_drift`.
         """
         x = _as_point(x)
         return self.backward(x).drift(x)
 
     def log_stationary(self, x: Numbers) -> Float[Array, ""]:
-        """log ν(x) up to a constant."""
+        """Return log ν(x) up to a constant, shape ().
+
+        **Raises:** `ValueError` for a model without a stationary density.
+        """
         return self._log_stationary_function()(_as_point(x))
 
     def sample_stationary(self, key: Key[Array, ""]) -> Float[Array, " d"]:
-        """One draw from ν, shape (d,), by the model's own sampler."""
+        """Sample one point from ν, shape (d,), with the model's own sampler.
+
+        **Raises:** `ValueError` for a model without a sampler.
+        """
         if self._sample_stationary is None:
             raise ValueError(
                 "this model has no sampler of its stationary law: pass `sample_stationary=`, "
@@ -235,8 +257,8 @@ class Diffusion(eqx.Module):
             )
         check_key(key)
         sample = named("sample_stationary", self._captured.call)
-        drawn = sample(self._sample_stationary, key, self._prepared_params())
-        point = as_returned("sample_stationary", drawn)
+        value = sample(self._sample_stationary, key, self._prepared_params())
+        point = as_returned("sample_stationary", value)
         if point.ndim != 1:
             raise ValueError(
                 "`sample_stationary` must return one point, shape (d,); it returned shape "
@@ -246,71 +268,79 @@ class Diffusion(eqx.Module):
 
     @property
     def has_sampler(self) -> bool:
-        """Whether the model comes with a sampler of its stationary law."""
+        """Return whether the model has a sampler of its stationary law."""
         return self._sample_stationary is not None
 
     @property
     def has_density(self) -> bool:
-        """Whether the model knows its stationary density."""
+        """Return whether the model has a stationary density."""
         return self._log_stationary is not None
 
     @property
     def has_reverse_drift(self) -> bool:
-        """Whether the drift of the reversed diffusion was given, and need not be derived."""
+        """Return whether the model has a reverse drift in closed form."""
         return self._reverse_drift is not None
 
     def reversibility_residual(self, points: Numbers) -> Float[Array, "n d"]:
-        """α - ½ (V ∇log ν + div V) at each of the points, shape (n, d).
+        """Return α - ½ (V ∇log ν + div V) at each of the `points`, shape (n, d).
 
-        Zero everywhere if and only if the diffusion is time-reversible: equation
-        (timereversible) of the paper, divided by ν.
+        It is zero everywhere if and only if the diffusion is reversible: equation (timereversible)
+        of the paper, divided by ν.
+
+        **Raises:** `ValueError` for points of another shape and for a model without a stationary
+        density.
         """
         points = as_floating("points", points)
         if points.ndim != 2 or 0 in points.shape:
             raise ValueError(f"`points` must have shape (n, d); got {points.shape}.")
         check_precision("`points`", points.dtype)
         forward, log_nu = self.forward(points[0]), self._log_stationary_function()
-        divergence = forward.sigma_varies
+        # V ∇log ν + div V = α + α*, which is 2α for a reversible diffusion.
+        divergence = forward.sigma_varies  # div V = 0 for a constant σ
         flux = functools.partial(stationary_flux, forward, log_nu, divergence=divergence)
         return jax.vmap(lambda x: forward.drift(x) - flux(x) / 2)(points)
 
     def with_params(self, params: PyTree) -> "Diffusion":
-        """The same functions with other parameters."""
-        made = copy.copy(self)
-        # `eqx.tree_at` would not reach what is static.
-        for name, part in zip(("_numbers", "_others"), _parts(params), strict=True):
-            object.__setattr__(made, name, part)
-        return made
+        """Return the same model with other parameters."""
+        model = copy.copy(self)
+        # `eqx.tree_at` cannot replace static fields.
+        for name, value in zip(("_arrays", "_static_leaves"), _split_params(params), strict=True):
+            object.__setattr__(model, name, value)
+        return model
 
     def prepared(self) -> "Diffusion":
-        """The same model with `prepare` done, so that no loop repeats it."""
+        """Return the model with prepared parameters, so that no loop repeats `prepare`."""
         if self._prepare is None:
             return self
+        # `diffusion` as the constructor received it: a constant or a function.
         sigma = self._constant_sigma if self._diffusion is None else self._diffusion
-        return self._functions_with(sigma, self._prepared_params())
+        return self._with_prepared_params(sigma, self._prepared_params())
 
     def unbound(self) -> "Diffusion":
-        """The functions alone, for `with_params` of what `preparation` makes of the parameters. It
-        has no arrays, and can be compared and hashed.
+        """Return the functions alone: a model without parameters, `prepare` and arrays.
+
+        It can be compared and hashed. Its `with_params` needs prepared parameters, from
+        `preparation`.
 
         **Raises:** `ValueError` for a constant σ that is traced.
         """
         sigma = self._constant_sigma
         if is_traced(sigma):
             raise ValueError(
-                "this model has a constant σ that is traced: let `diffusion` be a function "
-                "`(x, params)` that finds it in `params`."
+                "this model has a constant σ that is traced: put it into `params`, and pass a "
+                "function `(x, params)` as `diffusion` that returns it."
             )
         function = self._diffusion if sigma is None else _constant_function(_as_tuples(sigma))
-        free = self._functions_with(function, None)
-        object.__setattr__(free, "_captured", Captured())
-        return free
+        model = self._with_prepared_params(function, None)
+        # Traced values in closures would prevent comparison and hashing.
+        object.__setattr__(model, "_captured", Captured())
+        return model
 
-    def _functions_with(
+    def _with_prepared_params(
         self, diffusion: Callable | Numbers | None, prepared_params: PyTree
     ) -> "Diffusion":
-        """The same functions, of parameters that need no preparation."""
-        made = Diffusion(
+        """Return a model with the same functions, for parameters that need no preparation."""
+        model = Diffusion(
             self._drift,
             diffusion,
             self._log_stationary,
@@ -322,22 +352,25 @@ class Diffusion(eqx.Module):
             domain=self._domain,
             _coordinates=self._coordinates,
         )
-        object.__setattr__(made, "_captured", self._captured)  # also within a program
-        return made
+        object.__setattr__(model, "_captured", self._captured)  # keep traced closures
+        return model
 
     @property
     def preparation(self) -> Callable | None:
-        """`prepare`, as it was given."""
+        """Return the function `prepare`, or `None`."""
         return self._prepare
 
     @property
     def coordinates(self) -> Callable[[PyTree], PyTree] | None:
-        """Where the coordinates of the model depend on its parameters, as those of `lamperti` do:
-        a function of the prepared parameters, to values that depend on the same of them."""
+        """Return a function that shows the parameters on which the coordinates depend; else `None`.
+
+        It maps prepared parameters to values, which depend on the same parameters as the
+        coordinates do. Coordinates from `lamperti` depend on the parameters of σ, others on none.
+        """
         return self._coordinates
 
     def coordinate_values(self) -> PyTree:
-        """The values of that function, none where the coordinates are fixed."""
+        """Return the values of `coordinates` for these parameters; `()` for fixed coordinates."""
         return (
             ()
             if self._coordinates is None
@@ -346,105 +379,122 @@ class Diffusion(eqx.Module):
 
     @property
     def has_reversal(self) -> bool:
-        """Whether the time reversal of this model is known."""
-        given = (self._reverse_drift, self._log_stationary)
-        return self.reversible or any(function is not None for function in given)
+        """Return whether the time reversal of this model is known."""
+        functions = (self._reverse_drift, self._log_stationary)
+        return self.reversible or any(function is not None for function in functions)
 
     def check_reversal(self) -> None:
-        """Raise `ValueError` where the time reversal of this model is unknown."""
+        """Raise `ValueError` if the coefficients depend on time or the time reversal is unknown."""
         if self.depends_on_time:
             raise ValueError(_NOT_HOMOGENEOUS)
         if not self.has_reversal:
             raise ValueError(
                 "the time reversal of this model is unknown, and couplings need it: give "
                 "`Diffusion` a `log_stationary` (up to a constant), a `reverse_drift`, or "
-                "`reversible=True`; or choose a proposal that does not need it, such as "
+                "`reversible=True`; or use a proposal without time reversal, such as "
                 "`ModifiedDiffusionBridge()` or `Guided()`."
             )
 
     @property
     def reverse_drift_effect(self) -> decisions.Effect:
-        """Whether α* comes by automatic differentiation."""
+        """Return the decision whether α* is derived by automatic differentiation."""
         return decisions.reverse_drift(self.reversible, self._reverse_drift is not None)
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether the drift or σ takes the time as a third argument."""
+        """Return whether the drift or σ takes the time as a third argument."""
         return takes_time(self._drift) or takes_time(self._diffusion)
 
     def forward(self, like: Float[Array, " d"]) -> Dynamics:
-        """The coefficients α and σ at points like this one (only its shape and dtype count),
-        with everything done that does not depend on the point.
+        """Return the coefficients α and σ as functions of a point.
 
-        **Raises:** `ValueError` where they depend on time.
+        Quantities that do not depend on the point are computed here, once. Only the shape and dtype
+        of `like`, any point, are used.
+
+        **Raises:** `ValueError` if the coefficients depend on time.
         """
         if self.depends_on_time:
             raise ValueError(_NOT_HOMOGENEOUS)
         return self.forward_at(like)(None)
 
     def forward_at(self, like: Float[Array, " d"]) -> DynamicsAt:
-        """The same as a function of time, which does not count where nothing depends on it."""
+        """Return a function of time whose values are the coefficients, as from `forward`.
+
+        The time is ignored, and may be `None`, if no coefficient depends on it.
+        """
         params = self._prepared_params()
         drift_at = self._drift_at(params)
         sigma_at, varies = self._sigma_at(params, like)
         return lambda time: Dynamics(drift_at(time), sigma_at(time), varies)
 
-    def _at(self, x: Float[Array, " d"], time: Numbers | None) -> Dynamics:
-        if time is None:
+    def _dynamics_at(self, x: Float[Array, " d"], time: Numbers | None) -> Dynamics:
+        """Return the coefficients at a `time`, or those of all times for `None`."""
+        if time is None:  # raises if a coefficient depends on time
             return self.forward(x)
         return self.forward_at(x)(as_numbers({"time": time})["time"].astype(x.dtype))
 
     def _drift_at(self, params: PyTree) -> Callable[[Any], Callable[[Array], Array]]:
+        """Return the drift as a function of time, with values that are functions of a point."""
         function = self._traced_once(self._drift)
         if takes_time(self._drift):
-            return lambda time: self._inside("drift", lambda x: function(x, params, time), params)
-        drift = self._inside("drift", lambda x: function(x, params), params)
+            return lambda time: self._nan_outside(
+                "drift", lambda x: function(x, params, time), params
+            )
+        # Built once: it is the same function at all times.
+        drift = self._nan_outside("drift", lambda x: function(x, params), params)
         return lambda time: drift
 
     def _sigma_at(
         self, params: PyTree, like: Float[Array, " d"]
     ) -> tuple[Callable[[Any], Callable[[Array], AbstractSigma]], bool]:
-        """σ as a function of time, and whether it varies with the point."""
+        """Return σ as a function of time and whether σ depends on the point."""
         if self._diffusion is None:
             constant_sigma = _as_sigma(self._constant_sigma, like)
             return lambda time: lambda x: constant_sigma, False
         function = named("diffusion", self._traced_once(self._diffusion))
-        timed = takes_time(self._diffusion)
+        depends_on_time = takes_time(self._diffusion)
 
         def values(x, params, time):
-            value = function(x, params, time) if timed else function(x, params)
-            # Models that know the form of their σ return it.
+            value = function(x, params, time) if depends_on_time else function(x, params)
+            # A ready model may return an operator, which holds the structure of its σ.
             return value if isinstance(value, AbstractSigma) else as_returned("diffusion", value)
 
-        now = jnp.zeros((), like.dtype)
-        varies = uses_argument(lambda x: values(x, params, now), like)
-        if not (varies or timed):
-            constant = _as_sigma(values(jnp.zeros_like(like), params, now), like)
+        # Tracing shows whether σ uses `x`; it needs a time, but not a particular one.
+        any_time = jnp.zeros((), like.dtype)
+        varies = uses_argument(lambda x: values(x, params, any_time), like)
+        if not (varies or depends_on_time):  # evaluate σ once, at any point
+            constant = _as_sigma(values(jnp.zeros_like(like), params, any_time), like)
             return lambda time: lambda x: constant, False
         return lambda time: lambda x: _as_sigma(values(x, params, time), x, constant=False), varies
 
     def sigma_varies(self, like: Float[Array, " d"]) -> bool:
-        """Whether σ depends on the point. Nothing is computed for the answer."""
-        return self._sees(like)[0]
+        """Return whether σ depends on the point. Nothing is computed."""
+        return self._sigma_traits(like)[0]
 
     def sigma_is_invertible(self, like: Float[Array, " d"]) -> bool:
-        """Whether noise reaches the whole state at once. Nothing is computed for the answer."""
-        return self._sees(like)[1]
+        """Return whether σ is invertible: noise enters all coordinates. Nothing is computed."""
+        return self._sigma_traits(like)[1]
 
     def check_invertible_sigma(self, like: Float[Array, " d"]) -> None:
-        """Raise `ValueError` where noise reaches only a part of the state at once."""
+        """Raise `ValueError` if σ has fewer columns than rows."""
         if not self.sigma_is_invertible(like):
             raise ValueError(NO_INVERSE)
 
-    def _sees(self, like: Float[Array, " d"]) -> tuple[bool, bool]:
-        def seen(model, x):
+    def _sigma_traits(self, like: Float[Array, " d"]) -> tuple[bool, bool]:
+        """Return whether σ varies and whether it is invertible, by abstract evaluation."""
+
+        def traits(model, x):
             dynamics = model.forward_at(x)(jnp.zeros((), x.dtype))
             return dynamics.sigma_varies, dynamics.sigma(x).invertible
 
-        return eqx.filter_eval_shape(seen, self, like)
+        # Results that are not arrays, such as booleans, are returned as they are.
+        return eqx.filter_eval_shape(traits, self, like)
 
     def backward(self, like: Float[Array, " d"]) -> Dynamics:
-        """The coefficients α* and σ of the time-reversed diffusion, as for `forward`."""
+        """Return the coefficients α* and σ of the time-reversed diffusion as functions of a point.
+
+        **Raises:** `ValueError` if the coefficients depend on time or the time reversal is unknown.
+        """
         self.check_reversal()
         forward = self.forward(like)
         if self.reversible:
@@ -453,11 +503,12 @@ class Diffusion(eqx.Module):
         params, reverse_drift = self._prepared_params(), self._reverse_drift
         if reverse_drift is not None and not derived.simulated:
             function = self._traced_once(reverse_drift)
-            drift = self._inside("reverse_drift", lambda x: function(x, params), params)
+            drift = self._nan_outside("reverse_drift", lambda x: function(x, params), params)
         else:
             log_nu = self._log_stationary_function()
             divergence = decisions.divergence(derived, forward.sigma_varies).simulated
 
+            # NaN outside the state space, as `forward.drift` is.
             def derived_drift(x):
                 return -forward.drift(x) + stationary_flux(forward, log_nu, x, divergence)
 
@@ -465,13 +516,14 @@ class Diffusion(eqx.Module):
 
         return forward._replace(drift=drift)
 
-    def _inside(
+    def _nan_outside(
         self, name: str, values: Callable[[Float[Array, " d"]], Array], params: PyTree
     ) -> Callable[[Float[Array, " d"]], Float[Array, " d"]]:
-        """A drift with these values, NaN outside the state space: a path that steps out is lost
-        with the next step, and no bridge ends there."""
-        inside = self._state_space(params)
+        """Return a drift with these values that is NaN outside the state space.
 
+        A path that leaves the state space is NaN from the next step on, so no bridge ends there.
+        """
+        inside = self._state_space(params)
         values = named(name, values)
 
         def drift(x):
@@ -481,8 +533,10 @@ class Diffusion(eqx.Module):
         return drift
 
     def state_space(self) -> Callable[[Float[Array, " d"]], Bool[Array, ""]] | None:
-        """Whether a point is inside, a function with everything done that does not depend on it;
-        `None` where the state space is all of R^d."""
+        """Return a test whether a point is inside the state space; `None` for all of R^d.
+
+        `prepare` runs here, once, and not for each point.
+        """
         return self._state_space(self._prepared_params())
 
     def _state_space(self, params: PyTree) -> Callable[[Array], Array] | None:
@@ -494,7 +548,7 @@ class Diffusion(eqx.Module):
             value = as_returned("domain", domain(x, params))
             if value.shape != () or value.dtype != bool:
                 raise ValueError(
-                    "`domain` must return one truth value, such as `jnp.all(x > 0)`; it returned "
+                    "`domain` must return one boolean, such as `jnp.all(x > 0)`; it returned "
                     f"shape {value.shape} and dtype {value.dtype}."
                 )
             return value
@@ -502,8 +556,9 @@ class Diffusion(eqx.Module):
         return inside
 
     def _traced_once(self, function: Callable) -> Callable:
-        once = traced_once(function)
-        return lambda *args: self._captured.call(function, *args, plain=once)
+        """Return `function` with its trace cached and its closures passed as arguments."""
+        traced = traced_once(function)
+        return lambda *args: self._captured.call(function, *args, plain=traced)
 
     def _prepared_params(self) -> PyTree:
         if self._prepare is None:
@@ -523,34 +578,39 @@ class Diffusion(eqx.Module):
 def _as_sigma(
     values: Numbers | AbstractSigma | None, x: Float[Array, " d"], constant: bool = True
 ) -> AbstractSigma:
+    """Return the operator for a value of `diffusion` at `x`; `constant` if σ does not vary.
+
+    **Raises:** `ValueError` for a value of another shape.
+    """
     if values is None:
         return Identity()
     d = x.shape[0]
     if isinstance(values, AbstractSigma):
         sigma: AbstractSigma = cast_floats(values, x.dtype)
-        as_it_is = isinstance(sigma, Identity) or not constant
-        return sigma if as_it_is else Constant(sigma.as_matrix(d, x.dtype))
+        # A constant operator becomes a matrix with its inverse, computed once, outside loops.
+        keeps_form = isinstance(sigma, Identity) or not constant
+        return sigma if keeps_form else Constant(sigma.as_matrix(d, x.dtype))
     values = as_returned("diffusion", values)
     if values.shape != (d,) and not (values.ndim == 2 and values.shape[0] == d and values.size):
         raise ValueError(
             f"`diffusion` must have shape ({d}, m) for noise of m dimensions, or ({d},) for a "
-            f"diagonal, at a point of shape ({d},); it has {values.shape}."
+            f"diagonal, at a point of shape ({d},); got {values.shape}."
         )
     values = values.astype(x.dtype)
     if values.ndim == 1:
         return Diagonal(values)
     if values.shape[1] < d:
         return Tall(values)
-    if values.shape[1] > d:
+    if values.shape[1] > d:  # the law depends on V = σσᵀ only: its root has d columns
         values = lower_factor(values)
         return Constant(values) if constant else Triangular(values)
     return Constant(values) if constant else Full(values)
 
 
 def _as_point(x: Numbers) -> Float[Array, " d"]:
-    """Return a point of the state space.
+    """Return `x` as a point of the state space, shape (d,).
 
-    **Raises:** `ValueError` for anything but a vector, `TypeError` for less than single precision.
+    **Raises:** `ValueError` for any other shape, `TypeError` for less than single precision.
     """
     x = as_floating("x", x)
     if x.ndim != 1 or not x.size:
@@ -560,27 +620,33 @@ def _as_point(x: Numbers) -> Float[Array, " d"]:
 
 
 def check_value(name: str, value: Numbers, shape: tuple, x: Float[Array, " d"]) -> Array:
+    """Return the `value` of a user's function at `x`, in the dtype of `x`.
+
+    **Raises:** `TypeError` for a value that is not an array of real numbers, `ValueError` for
+    another shape; both name the function.
+    """
     value = as_returned(name, value)
     if value.shape != shape:
         raise ValueError(
             f"`{name}` must return shape {shape} at a point of shape {x.shape}; "
             f"it returned {value.shape}."
         )
-    return value.astype(x.dtype)
+    return value.astype(x.dtype)  # `x` sets the working precision
 
 
 def value_at(
-    name: str, function: Callable, shape: tuple, x: Float[Array, " d"], *others: Any
+    name: str, function: Callable, shape: tuple, x: Float[Array, " d"], *arguments: Any
 ) -> Array:
-    """Return `function(x, *others)`, in the dtype of `x`.
+    """Return `function(x, *arguments)` in the dtype of `x`.
 
-    **Raises:** `ValueError` and `TypeError` with its name, for its errors and for another shape.
+    **Raises:** `TypeError` and `ValueError` with the name of the function, for errors that it
+    raises and for a value of another shape.
     """
-    return check_value(name, evaluated(name, function, x, *others), shape, x)
+    return check_value(name, evaluated(name, function, x, *arguments), shape, x)
 
 
 def check_dimension(x: Float[Array, " d"], dim: int) -> None:
-    """Raise `ValueError` where a model whose dimension is known is asked of another point."""
+    """Raise `ValueError` if a point does not have the dimension of the model, `dim`."""
     if x.shape != (dim,):
         raise ValueError(
             f"the `drift` of this `model` is for points of shape ({dim},); it was called at a "
@@ -588,28 +654,34 @@ def check_dimension(x: Float[Array, " d"], dim: int) -> None:
         )
 
 
-def halves(x: Float[Array, " d"], what: str) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """The two halves of a state, which are `what`.
+def halves(x: Float[Array, " d"], parts: str) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """Return the two halves of a state. `parts` describes them in the error message.
 
-    **Raises:** `ValueError` for one of an odd number of coordinates.
+    **Raises:** `ValueError` for an odd number of coordinates.
     """
     if x.shape[0] % 2:
-        raise ValueError(f"the state `x` is {what}; got shape {x.shape}.")
+        raise ValueError(f"the state `x` must consist of {parts}; got shape {x.shape}.")
     first, second = jnp.split(x, 2)
     return first, second
 
 
+# Functions are compared by identity: cached ones compile once for equal numbers.
 @functools.lru_cache(maxsize=256)
 def _constant_function(values: tuple) -> Callable:
-    """σ as a function of a point, the same one for the same numbers."""
+    """Return a constant σ as a function of a point, the same object for the same numbers."""
     return lambda x, params: jnp.asarray(np.array(values), x.dtype)
 
 
 def _as_tuples(sigma: Array) -> tuple:
+    """Return the numbers of σ as nested tuples, which can be hashed."""
     return tuple(tuple(row) if isinstance(row, list) else row for row in sigma.tolist())
 
 
 def _check_constant_sigma(sigma: Numbers) -> Array:
+    """Return a constant σ as an array.
+
+    **Raises:** `ValueError` for a wrong shape and for a matrix that is singular or not finite.
+    """
     sigma = as_floating("diffusion", sigma)
     check_precision("`diffusion`", sigma.dtype)
     if sigma.ndim not in (1, 2) or 0 in sigma.shape:
@@ -617,51 +689,61 @@ def _check_constant_sigma(sigma: Numbers) -> Array:
             "a constant `diffusion` must have shape (d, m) for noise of m dimensions, or (d,) for "
             f"a diagonal; got {sigma.shape}."
         )
-    tall = " (or have fewer columns, where noise reaches only a part of the state)"
+    tall = " (or have fewer columns than rows, if noise enters only some coordinates)"
     check_invertible("diffusion", sigma, tall)
     return sigma
 
 
 def check_diffusion(model) -> None:
-    """Raise `TypeError` for anything but a model."""
+    """Raise `TypeError` unless `model` is a `Diffusion`."""
     if not isinstance(model, Diffusion):
         raise TypeError(f"`model` must be a `jaxbridge.Diffusion`; got {type(model).__name__}.")
 
 
-def check_invertible(name: str, sigma: Array | np.ndarray, otherwise: str = "") -> None:
-    """Raise `ValueError` for a visibly singular or non-finite σ, which says what it may be
-    `otherwise`; silent while tracing."""
+def check_invertible(name: str, sigma: Array | np.ndarray, alternative: str = "") -> None:
+    """Raise `ValueError` for a σ that is numerically singular or not finite; accept traced ones.
+
+    `alternative` is added to the message: the other matrices that are allowed.
+    """
     if is_traced(sigma):
         return
     matrix = np.diag(sigma) if sigma.ndim == 1 else np.asarray(sigma)
     if not np.all(np.isfinite(matrix)):
         raise ValueError(f"`{name}` must be finite; got {matrix}.")
+    # Above this condition number the inverse has no correct digits.
     if np.linalg.cond(matrix) > 1 / np.finfo(matrix.dtype).eps:
         raise ValueError(
-            f"`{name}` must be invertible{otherwise}; got the singular matrix {matrix}."
+            f"`{name}` must be invertible{alternative}; got the singular matrix {matrix}."
         )
 
 
-class _Others(NamedTuple):
-    """Of a pytree, the leaves that are no arrays, each with its place, and its structure."""
+class _StaticLeaves(NamedTuple):
+    """The leaves of a pytree that are not arrays, each with its index, and the structure of the
+    pytree."""
 
     leaves: tuple[tuple[int, Any], ...]
     structure: Any
 
 
-def _parts(params: PyTree) -> tuple[PyTree, _Others]:
-    """The arrays of the parameters, and the rest of them."""
+def _split_params(params: PyTree) -> tuple[PyTree, _StaticLeaves]:
+    """Return the arrays of `params`, with `None` for other leaves, and the static leaves."""
     leaves, structure = jax.tree.flatten(jax.tree.map(_as_leaf, params))
-    numbers = structure.unflatten([leaf if _is_number(leaf) else None for leaf in leaves])
-    others = [(i, leaf) for i, leaf in enumerate(leaves) if not _is_number(leaf)]
-    return numbers, _Others(tuple(others), structure)
+    arrays = structure.unflatten([leaf if _is_array(leaf) else None for leaf in leaves])
+    static_leaves = [(i, leaf) for i, leaf in enumerate(leaves) if not _is_array(leaf)]
+    return arrays, _StaticLeaves(tuple(static_leaves), structure)
 
 
-def _is_number(leaf) -> bool:
+def _is_array(leaf) -> bool:
+    """Return whether a leaf is an array, or the shape and dtype of one."""
     return eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct)
 
 
 def _as_leaf(leaf):
+    """Return a leaf of `params` as an array if it is a float or an array, else unchanged.
+
+    **Raises:** `TypeError` for arrays without numbers.
+    """
+    # Without weak types a Python float and an array share one compiled program.
     if isinstance(leaf, float):
         return settled(as_array(float(leaf)))
     arrays = np.ndarray | np.generic | jax.Array
@@ -671,5 +753,5 @@ def _as_leaf(leaf):
         return settled(as_array(leaf))
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f"`params` must have arrays of numbers; got one of dtype {leaf.dtype}."
+            f"arrays in `params` must hold numbers; got an array of dtype {leaf.dtype}."
         ) from error

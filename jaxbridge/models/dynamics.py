@@ -1,4 +1,7 @@
-"""The coefficients of one stochastic differential equation, for compiled loops."""
+"""Coefficients of one stochastic differential equation, and quantities derived from them.
+
+They are separate from the model because its parameters are already bound and prepared here.
+"""
 
 import functools
 from collections.abc import Callable
@@ -14,10 +17,11 @@ from .tracing import uses_argument
 
 
 class Dynamics(NamedTuple):
-    """The coefficients of one stochastic differential equation, ready for a compiled loop.
+    """Coefficients of one stochastic differential equation, ready for a compiled loop.
 
-    `drift` maps a point, shape (d,), to a vector (d,); `sigma` maps it to σ(x);
-    `sigma_varies` tells whether σ depends on the point at all.
+    - `drift`: maps a point, shape (d,), to the drift, shape (d,).
+    - `sigma`: maps a point to the operator σ(x).
+    - `sigma_varies`: whether σ depends on the point.
     """
 
     drift: Callable[[Array], Array]
@@ -25,16 +29,17 @@ class Dynamics(NamedTuple):
     sigma_varies: bool
 
 
-# The coefficients at a time.
+# Maps a time to the coefficients at that time.
 DynamicsAt = Callable[[Float[Array, ""] | None], Dynamics]
 
 
 def ito_correction(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
-    """½ Σ_jk ∂_k σ_ij σ_kj, by which Itô's drift exceeds Stratonovich's."""
+    """Return ½ Σ_jk ∂_k σ_ij σ_kj: the Itô drift minus the Stratonovich drift."""
 
     def column(y, j):
         return dynamics.sigma(y).as_matrix(y.shape[0], y.dtype)[:, j]
 
+    # Column σ_j contributes its derivative in the direction of itself.
     correction = jnp.zeros_like(x)
     for j in range(dynamics.sigma(x).as_matrix(x.shape[0], x.dtype).shape[1]):
         correction += jax.jvp(functools.partial(column, j=j), (x,), (column(x, j),))[1]
@@ -47,11 +52,13 @@ def weighted_divergence(
     x: Float[Array, " d"],
     varies: bool,
 ) -> Float[Array, " d"]:
-    """ν⁻¹ Σ_j ∂_j(ν M_ij) = M ∇log ν + div M, for a matrix field given by `product(x, v)` =
-    M(x) v; div M is left out where M does not vary."""
+    """Return ν⁻¹ Σ_j ∂_j(ν M_ij) = M ∇log ν + div M for a matrix field M.
+
+    `product(x, v)` is M(x) v. Unless M `varies`, div M is left out.
+    """
     flux = product(x, jax.grad(log_nu)(x))
     if varies:
-
+        # div M is the sum of the derivatives of M e_j in the directions e_j.
         def column(direction):
             return jax.jvp(lambda y: product(y, direction), (x,), (direction,))[1]
 
@@ -62,7 +69,7 @@ def weighted_divergence(
 def stationary_flux(
     dynamics: Dynamics, log_nu: Callable, x: Float[Array, " d"], divergence: bool
 ) -> Float[Array, " d"]:
-    """V ∇log ν + div V = α + α*, div V only where it is called for."""
+    """Return V ∇log ν + div V, which equals α + α*. Compute div V only if `divergence`."""
 
     def product(y, v):
         sigma = dynamics.sigma(y)
@@ -72,6 +79,7 @@ def stationary_flux(
 
 
 def is_linear(dynamics: Dynamics, like: Float[Array, " d"]) -> bool:
-    """Whether the drift is linear, α(0) + A x, and σ constant."""
+    """Return whether the drift is linear, α(0) + A x, and σ is constant."""
+    # The jaxpr of a linear drift's Jacobian does not use the point.
     jacobian = jax.jacfwd(dynamics.drift)
     return not (dynamics.sigma_varies or uses_argument(jacobian, like))

@@ -1,4 +1,4 @@
-"""FitzHugh and Nagumo's neuron, with noise in the recovery variable."""
+"""The FitzHugh–Nagumo model of a neuron, with noise in the recovery variable only."""
 
 from typing import NamedTuple
 
@@ -10,15 +10,17 @@ from .diffusion import Diffusion, check_dimension
 
 
 class FitzHughNagumoParams(NamedTuple):
-    """The parameters of `fitzhugh_nagumo`, `params` of the model: `epsilon`, how much faster the
-    voltage is than the recovery variable; `gamma` and `beta`, per unit of time; `sigma`, the noise,
-    per square root of a unit of time. Shape () each.
+    """Parameters of `fitzhugh_nagumo`, the `params` of the model, shape () each.
+
+    - `epsilon`: ratio of the time scale of the voltage to that of the recovery variable.
+    - `gamma`, `beta`: per unit of time.
+    - `sigma`: noise, per square root of a unit of time.
 
     **Example:**
 
     ```python
     model = jb.fitzhugh_nagumo()
-    moved = model.with_params(model.params._replace(sigma=jnp.asarray(0.2)))
+    noisier = model.with_params(model.params._replace(sigma=jnp.asarray(0.4)))
     ```
     """
 
@@ -31,14 +33,16 @@ class FitzHughNagumoParams(NamedTuple):
 def fitzhugh_nagumo(
     epsilon: Numbers = 0.1, gamma: Numbers = 1.5, beta: Numbers = 0.8, sigma: Numbers = 0.3
 ) -> Diffusion:
-    """A neuron that spikes (FitzHugh 1961; Nagumo, Arimoto & Yoshizawa 1962), in the form of
-    Ditlevsen & Samson (2019): the state is (X, Y), voltage and recovery variable,
+    """Return the model of a spiking neuron (FitzHugh 1961; Nagumo, Arimoto & Yoshizawa 1962), in
+    the form of Ditlevsen & Samson (2019).
+
+    The state is (X, Y), voltage and recovery variable:
 
         dX = (X - X³ - Y) / ε dt,    dY = (γX - Y + β) dt + σ dW.
 
-    Noise reaches X by way of Y only: couplings do not apply, records with an `observation` do.
-    Time is in units of the relaxation time of Y; X and Y have no units. `params` is a
-    `FitzHughNagumoParams`.
+    The model is hypoelliptic: noise enters Y only. Couplings do not apply; use records with an
+    `observation`. Time is in units of the relaxation time of Y; X and Y have no units. `params` is
+    a `FitzHughNagumoParams`.
 
     **Arguments:** `epsilon`, ε > 0; `gamma`, γ; `beta`, β; `sigma`, σ ≥ 0: numbers, shape ().
 
@@ -63,9 +67,10 @@ def fitzhugh_nagumo(
 def _drift(x: Float[Array, " d"], p: FitzHughNagumoParams) -> Float[Array, " d"]:
     check_dimension(x, 2)
     voltage, recovery = x
-    fast = (voltage - voltage**3 - recovery) / p.epsilon
-    return jnp.stack([fast, p.gamma * voltage - recovery + p.beta])
+    voltage_drift = (voltage - voltage**3 - recovery) / p.epsilon
+    return jnp.stack([voltage_drift, p.gamma * voltage - recovery + p.beta])
 
 
 def _sigma(x: Float[Array, " d"], p: FitzHughNagumoParams) -> Float[Array, "d m"]:
+    # One column: one noise for two coordinates.
     return jnp.stack([jnp.zeros_like(p.sigma), p.sigma])[:, None]

@@ -1,12 +1,12 @@
-"""The bridges of the Ornstein–Uhlenbeck process in closed form (section 3.1 of the paper).
+"""Bridges of the Ornstein–Uhlenbeck process in closed form (section 3.1 of the paper).
 
-The bridge from a to b in T is Gaussian. With Γ_t of `ornstein_uhlenbeck` and the gain
-`K_t = Γ_t e^{-Bᵀ(T-t)} Γ_T⁻¹` its moments are
+The bridge from a to b in time T is Gaussian. Γ_t is that of `ornstein_uhlenbeck`, and the gain is
+`K_t = Γ_t e^{-Bᵀ(T-t)} Γ_T⁻¹`. The moments are:
 
-    E Z_t = m + e^{-tB}(a - m) + K_t (b - m - e^{-TB}(a - m)),
+    E Z_t = m + e^{-tB}(a - m) + K_t (b - m - e^{-TB}(a - m));
     Var Z_t = Γ_t - K_t e^{-B(T-t)} Γ_t.
 
-(The paper prints the gain without these transposes; that is right for reversible processes.)
+The paper prints the gain without these transposes, which is right for reversible processes only.
 """
 
 import equinox as eqx
@@ -30,10 +30,13 @@ from .ornstein_uhlenbeck import (
 
 
 class GaussianBridge(eqx.Module):
-    """The exact law of an Ornstein–Uhlenbeck bridge at K times, from `gaussian_bridge`.
+    """Exact law of an Ornstein–Uhlenbeck bridge at K times, from `gaussian_bridge`.
 
-    `times` (K,), `mean` (K, d) and `covariance` (K, d, d), the covariance at each time;
-    `sample` draws whole paths.
+    - `times`: shape (K,).
+    - `mean`: the mean at each time, (K, d).
+    - `covariance`: the covariance at each time, (K, d, d).
+
+    `sample` samples whole paths.
     """
 
     times: Float[Array, " K"]
@@ -46,8 +49,11 @@ class GaussianBridge(eqx.Module):
     _gain: Float[Array, "K d d"]
 
     def sample(self, key: Key[Array, ""], num_paths: int) -> Float[Array, "n K d"]:
-        """Independent paths at `times`, exact in law: an unconditional path X, corrected by
-        `Z_t = X_t + K_t (b - X_T)`, as in the paper's lemma on the bridge."""
+        """Sample `num_paths` independent paths at `times`, exact in law.
+
+        Each is an unconditional path X with the correction `Z_t = X_t + K_t (b - X_T)`, as in the
+        paper's lemma on the bridge.
+        """
         return _paths(self, key, num_paths)
 
 
@@ -57,21 +63,24 @@ def _paths(bridge: GaussianBridge, key, num_paths):
     grid = jnp.concatenate([bridge.times, bridge._duration[None]])
     steps = jnp.diff(grid, prepend=jnp.zeros((), grid.dtype))
     decay, covariance = jax.vmap(lambda t: decay_and_covariance(params, t))(steps)
-    still = (steps <= 0)[:, None, None]  # two equal times: no noise between them
+    is_empty = (steps <= 0)[:, None, None]  # no noise between equal times
     identity = jnp.eye(len(bridge._start), dtype=grid.dtype)
-    root = jax.vmap(any_cholesky)(jnp.where(still, identity, covariance))
-    root = jnp.where(still, 0, root)
+    # A zero covariance has no Cholesky factor: factor the identity there, then set zero.
+    root = jax.vmap(any_cholesky)(jnp.where(is_empty, identity, covariance))
+    root = jnp.where(is_empty, 0, root)
     noise = jax.random.normal(key, (len(steps), num_paths, len(bridge._start)), grid.dtype)
 
-    def step(x, inputs):  # x: deviations from the mean, (num_paths, d)
+    # `x` holds the deviations from the mean, shape (num_paths, d).
+    def step(x, inputs):
         decay, root, noise = inputs
         x = x @ decay.T + noise @ root.T
         return x, x
 
     start = jnp.broadcast_to(bridge._start - params.mean, (num_paths, len(bridge._start)))
     _, path = lax.scan(step, start, (decay, root, noise))
-    miss = bridge._end - params.mean - path[-1]
-    correction = jnp.einsum("kij,nj->nki", bridge._gain, miss)
+    # The correction moves each end X_T to b.
+    gap = bridge._end - params.mean - path[-1]
+    correction = jnp.einsum("kij,nj->nki", bridge._gain, gap)
     return params.mean + jnp.moveaxis(path[:-1], 0, 1) + correction
 
 
@@ -83,15 +92,15 @@ def gaussian_bridge(
     duration: Numbers,
     times: Numbers,
 ) -> GaussianBridge:
-    """The exact law of the (start, end, duration)-bridge of an Ornstein–Uhlenbeck model: the
+    """Return the exact law of the bridge from `start` to `end` of an Ornstein–Uhlenbeck model: the
     paper's lemma on the bridge, for any B.
 
     **Arguments:**
 
-    - `model`: from `ornstein_uhlenbeck`. It need not be reversible.
+    - `model`: from `ornstein_uhlenbeck`, reversible or not.
     - `start`, `end`: points, shape (d,).
     - `duration`: in units of time, shape ().
-    - `times`: increasing, shape (K,), in [0, duration].
+    - `times`: in increasing order within [0, duration], shape (K,). Equal times are allowed.
 
     **Returns:** `GaussianBridge`.
 
@@ -105,28 +114,32 @@ def gaussian_bridge(
     ```
     """
     params = ou_params(model)
-    a, b, total = single_interval(params, start, end, duration)
+    a, b, horizon = single_interval(params, start, end, duration)
     times = as_floating("times", times).astype(params.B.dtype)
     if times.ndim != 1:
         raise ValueError(f"`times` must have shape (K,); got {times.shape}.")
-    if not is_traced(times, total) and not (
-        np.all(np.diff(times, prepend=0, append=total) >= 0) and times.size
+    if not is_traced(times, horizon) and not (
+        np.all(np.diff(times, prepend=0, append=horizon) >= 0) and times.size
     ):
-        raise ValueError(f"`times` must increase within [0, {total}]; got {times}.")
-    mean, covariance, gain = _moments(params, a, b, total, times)
-    return GaussianBridge(times, mean, covariance, model, a, b, total, gain)
+        raise ValueError(
+            f"`times` must increase within [0, {horizon}], with at least one entry; got {times}."
+        )
+    mean, covariance, gain = _moments(params, a, b, horizon, times)
+    return GaussianBridge(times, mean, covariance, model, a, b, horizon, gain)
 
 
 @compiled_sooner
-def _moments(params: OrnsteinUhlenbeckParams, a, b, total, times):
-    decay_T, covariance_T = decay_and_covariance(params, total)
-    miss = b - params.mean - decay_T @ (a - params.mean)
+def _moments(params: OrnsteinUhlenbeckParams, a, b, horizon, times):
+    """Return the means, covariances and gains K_t at `times`."""
+    decay_T, covariance_T = decay_and_covariance(params, horizon)
+    gap = b - params.mean - decay_T @ (a - params.mean)
 
     def moments(t):
         decay, covariance = decay_and_covariance(params, t)
-        remaining, _ = decay_and_covariance(params, total - t)
+        remaining, _ = decay_and_covariance(params, horizon - t)
+        # K_t is the transpose of Γ_T⁻¹ e^{-B(T-t)} Γ_t, as Γ is symmetric.
         gain = any_solve(covariance_T, remaining @ covariance).T
-        mean = params.mean + decay @ (a - params.mean) + gain @ miss
+        mean = params.mean + decay @ (a - params.mean) + gain @ gap
         return mean, covariance - gain @ remaining @ covariance, gain
 
     return jax.vmap(moments)(times)

@@ -1,4 +1,4 @@
-"""The normal law."""
+"""The normal distribution, which serves as start law, stationary law and transition law."""
 
 import functools
 import math
@@ -16,12 +16,14 @@ from .diffusion import Diffusion
 
 
 class GaussianLaw(eqx.Module):
-    """The normal distribution N(mean, covariance).
+    """Normal distribution N(mean, covariance).
 
-    **Arguments:** `mean`, shape (d,); `covariance`, shape (d, d).
+    **Arguments:** `mean`, shape (d,); `covariance`, shape (d, d), symmetric and positive
+    semidefinite. For a singular covariance `sample` and `log_density` return NaN.
 
-    **Raises:** `ValueError` for shapes that do not fit, or a covariance that is visibly not
-    symmetric and positive definite.
+    **Raises:** `ValueError` for shapes that do not fit and a mean that is not finite. Also for a
+    covariance that is not symmetric or has a negative eigenvalue, beyond rounding errors. Traced
+    values are not checked.
 
     **Example:**
 
@@ -48,23 +50,27 @@ class GaussianLaw(eqx.Module):
         if is_traced(covariance):
             return
         matrix = np.asarray(covariance, float)
+        # A hundred times the rounding error of the largest entry.
         tolerance = 100 * np.finfo(dtype).eps * np.abs(matrix).max()
         symmetric = np.abs(matrix - matrix.T).max() <= tolerance  # false for NaN
         if not (symmetric and np.linalg.eigvalsh(matrix).min() >= -tolerance):
             raise ValueError(
-                f"`covariance` must be symmetric and positive definite; got {covariance}."
+                f"`covariance` must be symmetric and positive semidefinite; got {covariance}."
             )
 
     def __iter__(self) -> Iterator[Array]:
-        """`mean, covariance = law`."""
+        """Yield the mean and the covariance, for `mean, covariance = law`."""
         yield from (self.mean, self.covariance)
 
     def sample(self, key: Key[Array, ""], model: Diffusion | None = None) -> Float[Array, " d"]:
-        """One draw, shape (d,). The model is not looked at: start laws are called with one."""
+        """Sample one point, shape (d,). All start laws receive a `model`; this one ignores it."""
         return _draw(self.mean, self.covariance, key)
 
     def log_density(self, x: Numbers) -> Float[Array, ""]:
-        """Return the normalised log density at a point, shape (d,)."""
+        """Return the normalised log density at a point, shape (d,).
+
+        **Raises:** `ValueError` for a point of another shape.
+        """
         x = as_floating("x", x)
         if x.shape != self.mean.shape:
             raise ValueError(f"`x` must have shape {self.mean.shape}; got {x.shape}.")
@@ -80,6 +86,9 @@ def _draw(mean, covariance, key):
 
 @functools.partial(jax.jit, inline=True)
 def _log_density(mean, covariance, x):
+    # Through the Cholesky factor, so that no determinant overflows.
     root = any_cholesky(covariance)
-    white = matvec(any_inverse(root), (x - mean).astype(root.dtype))
-    return -dot(white, white) / 2 - jnp.sum(jnp.log(math.sqrt(2 * math.pi) * jnp.diag(root)))
+    standardised = matvec(any_inverse(root), (x - mean).astype(root.dtype))
+    return -dot(standardised, standardised) / 2 - jnp.sum(
+        jnp.log(math.sqrt(2 * math.pi) * jnp.diag(root))
+    )

@@ -1,4 +1,5 @@
-"""The hyperbolic diffusion (section 3.2 of the paper)."""
+"""The hyperbolic diffusion (section 3.2 of the paper), with its exact stationary density and
+sampler."""
 
 import dataclasses
 import math
@@ -19,13 +20,15 @@ from .diffusion import Diffusion, check_dimension
 
 @door
 def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
-    """The hyperbolic diffusion `dX = -α X / √(1+|X|²) dt + dW` in R^dim: equation
-    (hyperbolicsde). Reversible; its log stationary density is the normalised one of equation
-    (hypdensity), and its stationary sampler is exact. `params` is α.
+    """Return the hyperbolic diffusion `dX = -α X / √(1+|X|²) dt + dW` in R^dim: equation
+    (hyperbolicsde).
 
-    **Arguments:** `alpha`, α > 0, per unit of time; `dim`, the dimension d.
+    It is reversible. Its log stationary density is normalised, equation (hypdensity), and its
+    stationary sampler is exact. `params` is α.
 
-    **Raises:** `ValueError` for α ≤ 0 or dim < 1.
+    **Arguments:** `alpha`, α > 0, per unit of time, shape (); `dim`, the dimension d ≥ 1.
+
+    **Raises:** `ValueError` for α ≤ 0, α that is not finite, and dim < 1.
 
     **Example:**
 
@@ -37,7 +40,7 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     dim = check_count("dim", dim)
     alpha = as_floating("alpha", alpha)
     if alpha.shape != () or not (is_traced(alpha) or 0 < np.asarray(alpha) < np.inf):
-        raise ValueError(f"`alpha` must be one positive number; got {alpha}.")
+        raise ValueError(f"`alpha` must be one positive number, shape (); got {alpha}.")
     return Diffusion(
         drift=_HyperbolicDrift(dim),
         log_stationary=_hyperbolic_log_stationary,
@@ -49,57 +52,64 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     )
 
 
-class _Hyperbolic(NamedTuple):
+class _PreparedHyperbolic(NamedTuple):
+    """The parameter, with the logarithm of the normaliser of the stationary density."""
+
     alpha: Float[Array, ""]
     log_normaliser: Float[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True)
 class _PrepareHyperbolic:
-    """The normaliser of equation (hypdensity): `2 K_{(d+1)/2}(2α) (π/α)^{(d-1)/2}`."""
+    """Computation of the normaliser of (hypdensity): `2 K_{(d+1)/2}(2α) (π/α)^{(d-1)/2}`."""
 
     dim: int
 
-    def __call__(self, alpha: Float[Array, ""]) -> _Hyperbolic:
+    def __call__(self, alpha: Float[Array, ""]) -> _PreparedHyperbolic:
         log_bessel = _log_bessel_k((self.dim + 1) / 2, 2 * alpha)
         power = (self.dim - 1) / 2 * jnp.log(np.pi / alpha)
-        return _Hyperbolic(alpha, math.log(2) + log_bessel + power)
+        return _PreparedHyperbolic(alpha, math.log(2) + log_bessel + power)
 
 
 @dataclasses.dataclass(frozen=True)
 class _HyperbolicDrift:
+    """The drift of equation (hyperbolicsde), for points of dimension `dim`."""
+
     dim: int
 
-    def __call__(self, x: Float[Array, " d"], p: _Hyperbolic) -> Float[Array, " d"]:
-        check_dimension(x, self.dim)  # for the normaliser is of this one
+    def __call__(self, x: Float[Array, " d"], p: _PreparedHyperbolic) -> Float[Array, " d"]:
+        check_dimension(x, self.dim)  # the normaliser holds for this dimension only
         return -p.alpha * x / jnp.sqrt(1 + dot(x, x))
 
 
-def _hyperbolic_log_stationary(x: Float[Array, " d"], p: _Hyperbolic) -> Float[Array, ""]:
+def _hyperbolic_log_stationary(x: Float[Array, " d"], p: _PreparedHyperbolic) -> Float[Array, ""]:
     return -2 * p.alpha * jnp.sqrt(1 + dot(x, x)) - p.log_normaliser
 
 
 @dataclasses.dataclass(frozen=True)
 class _HyperbolicSampler:
-    """Exact draws from the hyperbolic distribution in R^dim.
+    """Exact sampler of the hyperbolic distribution in R^dim.
 
-    With t = √(1+|x|²) - 1 and β = 2α, the density of t is proportional to
+    Let t = √(1+|x|²) - 1 and β = 2α. The direction of x is uniform, and the density of t is
+    proportional to
 
-        t^a (t+2)^a (1+t) e^{-βt},    a = dim/2 - 1,
+        t^a (t+2)^a (1+t) e^{-βt},    a = dim/2 - 1.
 
-    and the direction is uniform. For even dim this is a mixture of gamma laws. For odd dim,
-    (t+2)^{a+½} times `√t + √2 ≥ √(t+2) ≥ (1+t)/√(t+2)` gives such a mixture, from which a draw
-    is accepted with probability `(1+t) / (√(t+2) (√t+√2))`, never less than 0.43.
+    - For even dim this is a mixture of gamma laws.
+    - For odd dim it becomes one if its upper bound √(t+2) (√t+√2) replaces the factor 1+t.
+        Rejection sampling then accepts with probability `(1+t) / (√(t+2) (√t+√2))`, which is at
+        least 0.43.
     """
 
     dim: int
 
-    def __call__(self, key: Key[Array, ""], p: _Hyperbolic) -> Float[Array, " d"]:
+    def __call__(self, key: Key[Array, ""], p: _PreparedHyperbolic) -> Float[Array, " d"]:
         key, direction_key = jax.random.split(key)
         beta = 2 * p.alpha
         dtype = jnp.result_type(beta)
         weights, exponents = self._mixture()  # Σ_j w_j t^{e_j} e^{-βt}
         shapes = jnp.asarray(exponents + 1, dtype)
+        # ∫ t^e e^{-βt} dt = Γ(e+1) / β^{e+1}
         log_masses = jnp.asarray(np.log(weights), dtype) + special.gammaln(shapes)
         log_masses -= shapes * jnp.log(beta)
 
@@ -107,15 +117,17 @@ class _HyperbolicSampler:
             component_key, gamma_key, accept_key = jax.random.split(key, 3)
             component = jax.random.categorical(component_key, log_masses)
             t = jax.random.gamma(gamma_key, shapes[component], dtype=dtype) / beta
-            bound = jnp.sqrt(t + 2) * (jnp.sqrt(t) + np.sqrt(2).astype(dtype))
-            accepted = jax.random.uniform(accept_key, dtype=dtype) * bound < 1 + t
+            # An upper bound of 1 + t, as √t + √2 ≥ √(t+2) ≥ (1+t)/√(t+2).
+            envelope = jnp.sqrt(t + 2) * (jnp.sqrt(t) + np.sqrt(2).astype(dtype))
+            accepted = jax.random.uniform(accept_key, dtype=dtype) * envelope < 1 + t
             return t, accepted
 
         if self.dim % 2 == 0:
-            t, _ = propose(key)
+            t, _ = propose(key)  # the mixture is exact: no rejection
         else:
-            # After 100 refusals, of probability below 0.57^100, the next is taken as it is.
-            def again(state):
+            # A bounded loop: it accepts the attempt after 100 rejections, whose probability is
+            # below 0.57^100.
+            def is_rejected(state):
                 attempt, (_, accepted) = state
                 return ~accepted & (attempt < 100)
 
@@ -123,29 +135,36 @@ class _HyperbolicSampler:
                 attempt, _ = state
                 return attempt + 1, propose(jax.random.fold_in(key, attempt + 1))
 
-            _, (t, _) = lax.while_loop(again, attempt_next, (0, propose(key)))
+            _, (t, _) = lax.while_loop(is_rejected, attempt_next, (0, propose(key)))
+        # |x|² = t (t + 2)
         direction = jax.random.normal(direction_key, (self.dim,), dtype)
         return jnp.sqrt(t * (t + 2)) * direction / jnp.linalg.norm(direction)
 
     def _mixture(self) -> tuple[np.ndarray, np.ndarray]:
-        """Weights and powers of t in `t^a (t+2)^a (1+t)`, or in its bound for odd dim."""
+        """Return the weights w_j and exponents e_j of Σ_j w_j t^{e_j}.
+
+        The sum is the density of t without its exponential; for odd dim, the upper bound of it.
+        """
         a = self.dim / 2 - 1
-        power = int(np.ceil(a))  # (t+2)^power by the binomial theorem
+        power = int(np.ceil(a))  # expand (t+2)^power by the binomial theorem
         j = np.arange(power + 1)
         expansion = np.array([math.comb(power, k) for k in j]) * 2.0 ** (power - j)
-        lift, factor = (1.0, 1.0) if self.dim % 2 == 0 else (0.5, math.sqrt(2))
+        extra_power, factor = (1.0, 1.0) if self.dim % 2 == 0 else (0.5, math.sqrt(2))
         weights = np.concatenate([factor * expansion, expansion])
-        return weights, np.concatenate([a + j, a + lift + j])
+        return weights, np.concatenate([a + j, a + extra_power + j])
 
 
 def _log_bessel_k(order: float, z: Float[Array, ""]) -> Float[Array, ""]:
-    """log K_ν(z), from K_ν(z) = ∫_0^∞ exp(-z cosh t) cosh(νt) dt.
+    """Return log K_ν(z) for ν = `order`, from K_ν(z) = ∫_0^∞ exp(-z cosh t) cosh(νt) dt.
 
-    The integrand is even and analytic and decays doubly exponentially, so the trapezoid rule
-    is exact to rounding.
+    The integrand is even and analytic and decays doubly exponentially. So the trapezoid rule is
+    exact up to rounding.
     """
-    reach = lax.stop_gradient(jnp.arcsinh((order + 40) / z) + 2)
-    t = reach * jnp.linspace(0, 1, 257, dtype=jnp.result_type(z))
+    # Beyond the cutoff the integrand is negligible. The integral does not depend on it.
+    cutoff = lax.stop_gradient(jnp.arcsinh((order + 40) / z) + 2)
+    t = cutoff * jnp.linspace(0, 1, 257, dtype=jnp.result_type(z))
+    # Trapezoid rule: half a weight at zero. The other end contributes nothing.
     weights = jnp.full(t.shape, t[1]).at[0].mul(0.5)
+    # In logarithms, because exp(-z cosh t) underflows for large z.
     log_cosh = jnp.logaddexp(order * t, -order * t) - math.log(2)
     return special.logsumexp(log_cosh - z * jnp.cosh(t), b=weights)

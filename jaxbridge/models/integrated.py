@@ -1,4 +1,4 @@
-"""A diffusion together with its integral over time."""
+"""A diffusion together with its integral over time: a model for observed positions or averages."""
 
 import dataclasses
 import functools
@@ -12,18 +12,22 @@ from .diffusion import Diffusion, check_diffusion, halves
 
 @guards_off
 def integrated(model: Diffusion) -> Diffusion:
-    """The diffusion X of a model together with its integral: the state is (Z, X), shape (2d,),
+    """Return the model of a diffusion X and its integral Z: the state is (Z, X), shape (2d,), with
 
         dZ = X dt,    dX = α(X) dt + σ(X) dW.
 
-    So a record of positions is one of Z, of which X is the velocity (for animals Johnson, London,
-    Lea & Durban 2008); and one of means over intervals is of differences of Z. Noise reaches Z by
-    way of X only: couplings do not apply, records with an `observation` do. `params` are those of
-    the model. There is no stationary law, for Z has none: give `initial=`.
+    Use it for two kinds of records:
 
-    **Arguments:** `model`, that of X. A constant σ that it was given as an array must be known.
+    - Positions Z, where X is the velocity (for animals Johnson, London, Lea & Durban 2008).
+    - Averages of X over intervals, which are differences of Z divided by the length of the
+        interval.
 
-    **Raises:** `TypeError` for what is no model.
+    The model is hypoelliptic: noise enters X only. Couplings do not apply; use records with an
+    `observation`. `params` belong to `model`. Z has no stationary law, so records need `initial=`.
+
+    **Arguments:** `model`, the model of X. If its σ is a constant array, that must not be traced.
+
+    **Raises:** `TypeError` unless `model` is a `Diffusion`.
 
     **Example:**
 
@@ -35,11 +39,11 @@ def integrated(model: Diffusion) -> Diffusion:
     ```
     """
     check_diffusion(model)
-    functions = _functions(model.unbound())
-    timed = model.depends_on_time
+    functions = _cached_functions(model.unbound())
+    takes_time = model.depends_on_time
     return Diffusion(
-        functions.drift_at if timed else functions.drift,
-        functions.diffusion_at if timed else functions.diffusion,
+        functions.drift_at if takes_time else functions.drift,
+        functions.diffusion_at if takes_time else functions.diffusion,
         params=model.params,
         domain=functions.domain if model.state_space() is not None else None,
         prepare=model.preparation,
@@ -47,8 +51,8 @@ def integrated(model: Diffusion) -> Diffusion:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Integrated:
-    """The functions of (Z, X) and the parameters."""
+class _IntegratedFunctions:
+    """Functions of the state (Z, X) and the parameters, built from the model of X."""
 
     unbound: Diffusion
 
@@ -70,13 +74,14 @@ class _Integrated:
 
     def domain(self, x, params):
         inside = self.unbound.with_params(params).state_space()
-        assert inside is not None  # only then is it asked
-        return inside(_halves(x)[1])
+        assert inside is not None  # `integrated` uses this function only for a model with a domain
+        return inside(_halves(x)[1])  # Z is unrestricted
 
 
-# The same object for the same model, so that its functions compile once.
-_functions = functools.lru_cache(maxsize=256)(_Integrated)
+# Equal models share one object, so that its functions compile once.
+_cached_functions = functools.lru_cache(maxsize=256)(_IntegratedFunctions)
 
 
 def _halves(x: Float[Array, " d"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    return halves(x, "an integral and what is integrated, as many coordinates of each")
+    """Return Z and X."""
+    return halves(x, "n integrals and n values, an even number of coordinates")

@@ -1,11 +1,13 @@
-"""Lamperti's transform: in one dimension, coordinates in which σ is one.
+"""The Lamperti transform: coordinates in which a one-dimensional diffusion has σ = 1.
 
-    Y = F(X),    F(x) = ∫_a^x du/σ(u),    dY = (α/σ - σ'/2)(F⁻¹(Y)) dt + dW,
+    Y = F(X),    F(x) = ∫_a^x du/σ(u),    dY = (α/σ - σ'/2)(F⁻¹(Y)) dt + dW.
 
-with stationary density ν(g(y)) σ(g(y)), g = F⁻¹. Then nothing is left of what a σ(x) asks for:
-meetings, transitions and weights are those of a constant σ, of second order in the step. The
-inverse solves g' = σ(g), g(0) = a; it is tabulated, with cubic interpolation between the nodes,
-once a call for the parameters of that call. F itself is found by quadrature from the node before.
+With g = F⁻¹ the stationary density is ν(g(y)) σ(g(y)). Meetings, transitions and weights are those
+of a constant σ, of second order in the step size.
+
+The inverse g solves g' = σ(g), g(0) = a. Each call tabulates g once, for its parameters, and
+interpolates between the nodes by cubic polynomials. F is computed by quadrature from the nearest
+node below.
 """
 
 import dataclasses
@@ -27,28 +29,33 @@ from ..engine.doors import guards_off
 from .diffusion import Diffusion, check_diffusion
 from .transform import Transformed, of_points
 
+# Gauss–Legendre quadrature on [-1, 1], exact for polynomials of degree 9.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
 @guards_off
 def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 400) -> Transformed:
-    """The one-dimensional model of Y = ∫_a^X du/σ(u), whose σ is one.
+    """Return the one-dimensional model of Y = ∫_a^X du/σ(u), which has σ = 1.
 
     **Arguments:**
 
-    - `model`: a one-dimensional model with a σ(x) > 0.
-    - `at`: a, a number in the state space, which becomes Y = 0.
-    - `reach`: how far Y may go in either direction, in square roots of a unit of time. A path that
-        goes further, or leaves the state space, is a miss, and counted among `num_nonfinite`.
-    - `num_nodes`: of the table of X, in either direction; errors are O((`reach`/`num_nodes`)⁴).
+    - `model`: a one-dimensional model with σ(x) > 0.
+    - `at`: a, a number in the state space, which corresponds to Y = 0.
+    - `reach`: the largest |Y|, in square roots of a unit of time. A path that goes beyond it, or
+        leaves the state space, is a miss, counted in `num_nonfinite`.
+    - `num_nodes`: the number of nodes of the table of X, in either direction. Interpolation errors
+        are O((`reach`/`num_nodes`)⁴).
 
-    **Returns:** `Transformed`. Its `model` takes other parameters, also those of σ, by
-    `with_params`, and compiles once; `forward`, `inverse` and `back` are for the parameters that
-    `model` has. So parameters of σ cannot be inferred from observations in these coordinates,
-    which would move with them: `gibbs`, `pmmh`, `score` and `maximum_likelihood` refuse it.
+    **Returns:** `Transformed`. Its `model` accepts other parameters, including those of σ, by
+    `with_params`, and compiles once. Its `forward`, `inverse` and `back` use the parameters of
+    `model`.
 
-    **Raises:** `ValueError` for numbers that are out of range and for a σ(a) that is not a
-    positive number; `TypeError` for what is no model, or no number.
+    The coordinates depend on the parameters of σ. So these parameters cannot be inferred from
+    observations in these coordinates: `gibbs`, `pmmh`, `score` and `maximum_likelihood` raise an
+    error.
+
+    **Raises:** `ValueError` for numbers out of range, and unless σ(a) is positive and finite.
+    `TypeError` for traced numbers, and unless `model` is a `Diffusion`.
 
     **Example:**
 
@@ -63,19 +70,19 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
     ```
     """
     check_diffusion(model)
-    origin, reach = _number("at", at), _number("reach", reach)
+    origin, reach = _static_number("at", at), _static_number("reach", reach)
     if not reach > 0:
         raise ValueError(f"`reach` must be positive; got {reach}.")
     check_count("num_nodes", num_nodes)
-    functions = _coordinates_of(model.unbound(), model.preparation, origin, reach, num_nodes)
+    functions = _cached_functions(model.unbound(), model.preparation, origin, reach, num_nodes)
     table = functions.prepare(model.params)
-    slope = table.sigma[num_nodes]
-    if not is_traced(slope) and not 0 < slope < math.inf:
+    sigma_origin = table.sigma[num_nodes]
+    if not is_traced(sigma_origin) and not 0 < sigma_origin < math.inf:
         raise ValueError(
-            f"`at` must be a point inside the state space, where σ is positive; σ({origin:g}) is "
-            f"{float(slope):g}."
+            f"`at` must be a point inside the state space, where σ is positive; got σ({origin:g}) "
+            f"= {float(sigma_origin):g}."
         )
-    moved = Diffusion(
+    transformed = Diffusion(
         functions.drift,
         None,
         functions.log_stationary if model.has_density else None,
@@ -90,24 +97,27 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
     forward, inverse = (
         of_points(Partial(function, table)) for function in (functions.forward, functions.inverse)
     )
-    return Transformed(moved, forward, inverse)
+    return Transformed(transformed, forward, inverse)
 
 
-def _number(name: str, value: Numbers) -> float:
-    """A number that is known: coordinates are chosen before anything is compiled."""
+def _static_number(name: str, value: Numbers) -> float:
+    """Return a number that is not traced: coordinates are chosen before compilation.
+
+    **Raises:** `ValueError` unless it is one finite number, `TypeError` if it is traced.
+    """
     array = as_floating(name, value)
     if array.shape != ():
         raise ValueError(f"`{name}` must be a number; got shape {array.shape}.")
     if is_traced(array):
-        raise TypeError(f"`{name}` must be a known number, not a value that is traced.")
+        raise TypeError(f"`{name}` must be a known number, not a traced one: pass a Python number.")
     if not math.isfinite(float(array)):
         raise ValueError(f"`{name}` must be finite; got {float(array)}.")
     return float(array)
 
 
 class _Table(NamedTuple):
-    """X and σ(X) at Y = -reach, ..., 0, ..., reach, and the parameters as the functions of the
-    given model want them."""
+    """Values of X and σ(X) at the nodes Y = -reach, ..., 0, ..., reach, and the prepared parameters
+    of the original model."""
 
     x: Float[Array, " n"]
     sigma: Float[Array, " n"]
@@ -115,9 +125,8 @@ class _Table(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Lamperti:
-    """The functions of the model of Y, given the table in the place of parameters, and the two
-    maps."""
+class _LampertiFunctions:
+    """Functions of Y, with the table in place of the parameters, and the maps between X and Y."""
 
     unbound: Diffusion
     preparation: Callable | None
@@ -130,71 +139,86 @@ class _Lamperti:
         return self.reach / self.num_nodes
 
     def prepare(self, params: PyTree) -> _Table:
+        """Return the table for these parameters."""
         return _tabulated(self, params)
 
     def inverse(self, table: _Table, y: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """g(y) = x, by cubic Hermite interpolation: NaN beyond the table."""
-        place = (y + self.reach) / self.spacing
-        cell = jnp.clip(jnp.floor(place), 0, 2 * self.num_nodes - 1).astype(int)
-        s = place - cell.astype(y.dtype)
+        """Return x = g(y), by cubic Hermite interpolation; NaN outside the table."""
+        position = (y + self.reach) / self.spacing
+        # Cell i lies between the nodes i and i + 1, and 0 ≤ s ≤ 1 inside.
+        cell = jnp.clip(jnp.floor(position), 0, 2 * self.num_nodes - 1).astype(int)
+        s = position - cell.astype(y.dtype)
         left, right = (table.x[i].astype(y.dtype) for i in (cell, cell + 1))
-        before, after = (self.spacing * table.sigma[i].astype(y.dtype) for i in (cell, cell + 1))
+        left_slope, right_slope = (
+            self.spacing * table.sigma[i].astype(y.dtype) for i in (cell, cell + 1)
+        )
+        # The slopes at the nodes are exact, as g' = σ(g).
         rise = right - left
         x = left + s * (
-            before + s * (3 * rise - 2 * before - after + s * (before + after - 2 * rise))
+            left_slope
+            + s
+            * (3 * rise - 2 * left_slope - right_slope + s * (left_slope + right_slope - 2 * rise))
         )
         return jnp.where((s >= 0) & (s <= 1), x, jnp.nan)
 
     def forward(self, table: _Table, x: Float[Array, " one"]) -> Float[Array, " one"]:
-        """F(x) = F(x_i) + ∫ du/σ(u) from the node x_i before x: NaN beyond the table."""
+        """Return F(x) = F(x_i) + ∫ du/σ(u), from the node x_i below x; NaN outside the table."""
         nodes, last = table.x.astype(x.dtype), 2 * self.num_nodes
-        lower = jnp.arange(last + 1) < self.num_nodes
-        ordered = jnp.where(jnp.isnan(nodes), jnp.where(lower, -jnp.inf, jnp.inf), nodes)
+        is_below = jnp.arange(last + 1) < self.num_nodes
+        # Nodes outside the state space are NaN; as infinities they keep the table sorted.
+        ordered = jnp.where(jnp.isnan(nodes), jnp.where(is_below, -jnp.inf, jnp.inf), nodes)
         cell = jnp.clip(jnp.searchsorted(ordered, x, side="right") - 1, 0, last - 1)
+        # Quadrature points between the node below and x.
         half = (x - nodes[cell]) / 2
         points = nodes[cell] + half * (1 + jnp.asarray(_NODES, x.dtype)[:, None])
-        slopes = jax.vmap(lambda u: self.sigma_at(u, table.params))(points.ravel())
-        weighted = jnp.asarray(_WEIGHTS, x.dtype)[:, None] / slopes.reshape(points.shape)
+        sigma_values = jax.vmap(lambda u: self.sigma_at(u, table.params))(points.ravel())
+        integrand = jnp.asarray(_WEIGHTS, x.dtype)[:, None] / sigma_values.reshape(points.shape)
         y = (cell.astype(x.dtype) - self.num_nodes) * self.spacing
-        y += half * jnp.sum(weighted, axis=0)
+        y += half * jnp.sum(integrand, axis=0)
         return jnp.where((x >= nodes[cell]) & (x <= nodes[cell + 1]), y, jnp.nan)
 
     def drift(self, y: Float[Array, " one"], table: _Table) -> Float[Array, " one"]:
         if y.shape != (1,):
             raise ValueError(
-                f"`lamperti` is for a one-dimensional `model`; points have shape {y.shape}."
+                f"`lamperti` needs a one-dimensional `model`; got points of shape {y.shape}."
             )
         x = self.inverse(table, y)
         sigma = lambda x: self.sigma_at(x[0], table.params)
-        slope, bend = jax.jvp(sigma, (x,), (jnp.ones_like(x),))
-        return self._model(table).drift(x) / slope - bend / 2
+        # One forward derivative gives σ(x) and σ'(x).
+        sigma_x, sigma_derivative = jax.jvp(sigma, (x,), (jnp.ones_like(x),))
+        return self._model(table).drift(x) / sigma_x - sigma_derivative / 2
 
     def log_stationary(self, y: Float[Array, " one"], table: _Table) -> Float[Array, ""]:
         x = self.inverse(table, y)
+        # The Jacobian dx/dy is σ(x).
         return self._model(table).log_stationary(x) + jnp.log(self.sigma_at(x[0], table.params))
 
     def sample_stationary(self, key: Key[Array, ""], table: _Table) -> Float[Array, " one"]:
         return self.forward(table, self._model(table).sample_stationary(key))
 
     def coordinates(self, table: _Table) -> PyTree:
-        """Y depends on the parameters that σ depends on, at any point, and on those of the
-        coordinates that it is made from."""
-        within = self.unbound.coordinates
-        slope = self.sigma_at(jnp.asarray(self.origin, float), table.params)
-        return slope, () if within is None else within(table.params)
+        """Return values that depend on the same parameters as Y: those of σ and of X itself."""
+        # The value of σ at one point stands for all its parameters.
+        inner_coordinates = self.unbound.coordinates
+        sigma_origin = self.sigma_at(jnp.asarray(self.origin, float), table.params)
+        return sigma_origin, () if inner_coordinates is None else inner_coordinates(table.params)
 
     def _model(self, table: _Table) -> Diffusion:
         return self.unbound.with_params(table.params)
 
     def sigma_at(self, x: Float[Array, ""], params: PyTree) -> Float[Array, ""]:
-        """σ at one number: NaN, with derivative zero, outside the state space."""
+        """Return σ at one number; NaN, with derivative zero, outside the state space."""
         model = self.unbound.with_params(params)
+        # Outside, σ is evaluated at the origin: `where` alone would pass on NaN derivatives.
         inside = jax.lax.stop_gradient(model.diffusion(x[None])[0, 0]) > 0
-        safe = jnp.where(inside, x, jnp.asarray(self.origin, x.dtype))
-        return jnp.where(inside, model.diffusion(safe[None])[0, 0], jnp.nan)
+        point_inside = jnp.where(inside, x, jnp.asarray(self.origin, x.dtype))
+        return jnp.where(inside, model.diffusion(point_inside[None])[0, 0], jnp.nan)
 
     def solve(self, direction: int, params: PyTree) -> Float[Array, " nodes"]:
-        """g' = σ(g) away from a."""
+        """Solve g' = σ(g), g(0) = a, in the `direction` 1 or -1.
+
+        Return g at the nodes, without the origin.
+        """
         ys = np.linspace(0, direction * self.reach, self.num_nodes + 1)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda y, x, params: self.sigma_at(x, params)),
@@ -214,12 +238,13 @@ class _Lamperti:
 
 
 @compiled_sooner
-def _tabulated(functions: _Lamperti, params: PyTree) -> _Table:
+def _tabulated(functions: _LampertiFunctions, params: PyTree) -> _Table:
+    """Return the table of both directions. Compiled once per object and shape of the parameters."""
     params = params if functions.preparation is None else functions.preparation(params)
     below, above = (functions.solve(side, params) for side in (-1, 1))
     x = jnp.concatenate([below[::-1], jnp.asarray([functions.origin], float), above])
     return _Table(x, jax.vmap(lambda x: functions.sigma_at(x, params))(x), params)
 
 
-# The same object for the same arguments, so that its functions compile once.
-_coordinates_of = functools.lru_cache(maxsize=256)(_Lamperti)
+# Equal arguments share one object, so that its functions compile once.
+_cached_functions = functools.lru_cache(maxsize=256)(_LampertiFunctions)

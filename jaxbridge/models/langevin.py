@@ -1,4 +1,4 @@
-"""Diffusions with a given stationary density: Langevin's, and the general recipe."""
+"""Diffusions with a given stationary density: Langevin diffusions, and the general form."""
 
 import dataclasses
 from collections.abc import Callable
@@ -23,17 +23,22 @@ def stationary_diffusion(
     *,
     normalised: bool = False,
 ) -> Diffusion:
-    """Every diffusion with a given stationary density ν and diffusion matrix V:
+    """Return the diffusion with stationary density ν, diffusion matrix V and skew-symmetric field
+    Q:
 
-        α = ½ ν⁻¹ div(ν (V + Q)),    σ = the Cholesky factor of V,
+        α = ½ ν⁻¹ div(ν (V + Q)),    σ = the Cholesky factor of V.
 
-    for a skew-symmetric matrix field Q (Ma, Chen & Fox 2015). Its time reversal has -Q in the
-    place of Q, so it is reversible if Q = 0.
+    Every diffusion with stationary density ν and matrix V has this form (Ma, Chen & Fox 2015). Its
+    time reversal has -Q instead of Q, so it is reversible if Q = 0.
 
-    **Arguments:** functions `(x, params)` of one point `x` of shape (d,): `log_density`, log ν
-    up to a constant; `V`, positive definite, shape (d, d), or (d,) for a diagonal, by default
-    the identity; `Q`, shape (d, d), by default zero. `params`, any pytree, is what they receive;
-    `normalised` as in `Diffusion`.
+    **Arguments:**
+
+    - `log_density`: log ν up to a constant, `(x, params) -> ()` of one point `x` of shape (d,).
+    - `V`: a function `(x, params)` to a positive definite matrix, shape (d, d), or to a diagonal,
+        (d,). By default the identity.
+    - `Q`: a function `(x, params)` to a skew-symmetric matrix, shape (d, d). By default zero.
+    - `params`: any pytree; the functions receive it.
+    - `normalised`: as in `Diffusion`.
 
     **Raises:** `TypeError` for arguments that are not functions.
 
@@ -48,11 +53,12 @@ def stationary_diffusion(
     check_function("V", V, "(x, params)", optional=True)
     check_function("Q", Q, "(x, params)", optional=True)
     return Diffusion(
-        drift=_RecipeDrift(log_density, V, Q, 1),
-        diffusion=None if V is None else _Root(V),
+        drift=_StationaryDrift(log_density, V, Q, 1),
+        diffusion=None if V is None else _RootOfV(V),
         log_stationary=log_density,
         params=params,
-        reverse_drift=None if Q is None else _RecipeDrift(log_density, V, Q, -1),
+        # The time reversal changes the sign of Q.
+        reverse_drift=None if Q is None else _StationaryDrift(log_density, V, Q, -1),
         reversible=Q is None,
         normalised=normalised,
     )
@@ -67,18 +73,21 @@ def langevin(
 ) -> Diffusion:
     """Return the Langevin diffusion `dX = ½ ∇log ν(X) dt + dW`, or, at a temperature,
 
-        dX = kT ∇log ν(X) dt + √(2kT) dW,
+        dX = kT ∇log ν(X) dt + √(2kT) dW.
 
-    which is dX = -∇V dt + √(2kT) dW for ν ∝ exp(-V / kT). Both are reversible with the stationary
-    density ν. They differ in the unit of time: without a `temperature` a process in a potential V
-    runs slower than with it by the factor 2kT.
+    The second form is dX = -∇V dt + √(2kT) dW for ν ∝ exp(-V / kT). Both are reversible with
+    stationary density ν and differ in the unit of time only. A process in a potential V runs 2kT
+    times as fast with a `temperature` as without.
 
-    **Arguments:** `log_density`, `(x, params) -> ()`, is log ν up to a constant, so -V / kT;
-    `params`, any pytree, is what it receives; `temperature`, kT > 0 in units of V, is a number or
-    a function of `params`; `normalised` as in `Diffusion`.
+    **Arguments:**
 
-    **Raises:** `TypeError` for a `log_density` that is no function, and for a number as
-    `temperature` that is traced; `ValueError` for a `temperature` that is not positive.
+    - `log_density`: log ν up to a constant, so -V / kT. A function `(x, params) -> ()`.
+    - `params`: any pytree; `log_density` receives it.
+    - `temperature`: kT > 0 in units of V, a number or a function `(params) -> ()`.
+    - `normalised`: as in `Diffusion`.
+
+    **Raises:** `TypeError` for a `log_density` that is not a function, and for a traced number as
+    `temperature`. `ValueError` for a `temperature` that is not positive.
 
     **Example:**
 
@@ -95,10 +104,10 @@ def langevin(
     if callable(temperature):
         check_function("temperature", temperature, "(params)")
     else:
-        temperature = _number(temperature)
+        temperature = _positive_number(temperature)
     return Diffusion(
-        _HeatedDrift(log_density, temperature),
-        _HeatedNoise(temperature),
+        _ThermalDrift(log_density, temperature),
+        _ThermalNoise(temperature),
         log_density,
         params,
         reversible=True,
@@ -106,25 +115,28 @@ def langevin(
     )
 
 
-def _number(temperature: Numbers) -> float:
-    """Return a temperature that is known."""
+def _positive_number(temperature: Numbers) -> float:
+    """Return a `temperature` as a float, so that models with equal temperatures are equal.
+
+    **Raises:** `TypeError` for a traced number, `ValueError` unless it is positive.
+    """
     if is_traced(temperature):
         raise TypeError(
-            "`temperature` is a traced number: let it be a function of `params`, such as "
+            "`temperature` is a traced number: pass a function of `params` instead, such as "
             "`lambda params: params`."
         )
-    array = as_numbers({"temperature": temperature})["temperature"]
-    check_range("temperature", array, positive=True)
-    return float(array)
+    value = as_numbers({"temperature": temperature})["temperature"]
+    check_range("temperature", value, positive=True)
+    return float(value)
 
 
-# The callables below are frozen dataclasses, so that models made twice from the same functions
-# are equal and compile once.
+# The callables below are frozen dataclasses. So two models of the same functions are equal, and
+# compile once.
 
 
 @dataclasses.dataclass(frozen=True)
-class _RecipeDrift:
-    """½ ν⁻¹ div(ν (V ± Q))."""
+class _StationaryDrift:
+    """Drift ½ ν⁻¹ div(ν (V + `sign` Q)): `sign` is 1, or -1 for the time reversal."""
 
     log_density: Callable
     V: Callable | None
@@ -133,19 +145,20 @@ class _RecipeDrift:
 
     def __call__(self, x: Float[Array, " d"], params: PyTree) -> Float[Array, " d"]:
         def product(y, v):
-            image = v if self.V is None else _multiply(_matrix("V", self.V, y, params), v)
+            result = v if self.V is None else _multiply(_matrix("V", self.V, y, params), v)
+            # One product with V ± Q gives both terms of the divergence.
             if self.Q is not None:
-                image += self.sign * _multiply(_matrix("Q", self.Q, y, params), v)
-            return image
+                result += self.sign * _multiply(_matrix("Q", self.Q, y, params), v)
+            return result
 
-        varies = not (self.V is None and self.Q is None)
+        has_matrix = not (self.V is None and self.Q is None)
         log_nu = lambda y: _log_nu(self.log_density, y, params)
-        return weighted_divergence(product, log_nu, x, varies) / 2
+        return weighted_divergence(product, log_nu, x, has_matrix) / 2
 
 
 @dataclasses.dataclass(frozen=True)
-class _Root:
-    """σ with σσᵀ = V."""
+class _RootOfV:
+    """Coefficient σ with σσᵀ = V: triangular, or diagonal if V is."""
 
     V: Callable
 
@@ -155,8 +168,8 @@ class _Root:
 
 
 @dataclasses.dataclass(frozen=True)
-class _HeatedDrift:
-    """kT ∇log ν."""
+class _ThermalDrift:
+    """Drift kT ∇log ν."""
 
     log_density: Callable
     temperature: float | Callable
@@ -167,8 +180,8 @@ class _HeatedDrift:
 
 
 @dataclasses.dataclass(frozen=True)
-class _HeatedNoise:
-    """√(2kT) in all coordinates."""
+class _ThermalNoise:
+    """Diagonal coefficient σ = √(2kT)."""
 
     temperature: float | Callable
 
@@ -179,18 +192,22 @@ class _HeatedNoise:
 def _temperature(
     temperature: float | Callable, x: Float[Array, " d"], params: PyTree
 ) -> Float[Array, ""]:
+    """Return kT for these parameters, in the dtype of `x`."""
     if callable(temperature):
         temperature = evaluated("temperature", temperature, params)
     return check_value("temperature", temperature, (), x)  # pyright: ignore[reportArgumentType]
 
 
 def _log_nu(log_density: Callable, x: Float[Array, " d"], params: PyTree) -> Float[Array, ""]:
-    """log ν at one point."""
+    """Return log ν at one point."""
     return value_at("log_density", log_density, (), x, params)
 
 
 def _matrix(name: str, function: Callable, x: Float[Array, " d"], params: PyTree) -> Array:
-    """A matrix field at one point: shape (d, d), or (d,) for a diagonal."""
+    """Return a matrix field at one point: shape (d, d), or (d,) for a diagonal.
+
+    **Raises:** `ValueError` for any other shape.
+    """
     value = as_returned(name, evaluated(name, function, x, params))
     (d,) = x.shape
     if value.shape not in ((d,), (d, d)):
@@ -202,4 +219,5 @@ def _matrix(name: str, function: Callable, x: Float[Array, " d"], params: PyTree
 
 
 def _multiply(matrix: Array, vector: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Return the product of a matrix, or of a diagonal, and a vector."""
     return matrix * vector if matrix.ndim == 1 else matvec(matrix, vector)

@@ -1,16 +1,16 @@
 """The transition of a linear diffusion `dX = α(X) dt + σ dW`, α(x) = α(0) + A x, V = σσᵀ.
 
-Given X_0 = x, X_t is normal with mean `x + M_t α(x)` and covariance Γ_t,
+Given X_0 = x, X_t is normal with mean `x + M_t α(x)` and covariance Γ_t. For any A, invertible or
+not:
 
-    M_t = ∫_0^t e^{sA} ds,   e^{tA} = I + A M_t,   Γ_t = ∫_0^t e^{sA} V e^{sAᵀ} ds,
+    M_t = ∫_0^t e^{sA} ds;   e^{tA} = I + A M_t;   Γ_t = ∫_0^t e^{sA} V e^{sAᵀ} ds.
 
-whether or not A is invertible. Both integrals by their Taylor series over a time t / 2^k short
-enough for it, and then k times
+Taylor series give both integrals over a short time t / 2^k. Then the time is doubled k times:
 
-    M_2s = M_s + e^{sA} M_s,   Γ_2s = Γ_s + e^{sA} Γ_s e^{sAᵀ},
+    M_2s = M_s + e^{sA} M_s;   Γ_2s = Γ_s + e^{sA} Γ_s e^{sAᵀ}.
 
-of which the second adds positive terms only: no digits are lost for short times, and for stable
-A nothing overflows for long ones.
+The second recursion only adds positive semidefinite terms. So short times lose no digits, and for
+stable A long times do not overflow.
 """
 
 from typing import NamedTuple
@@ -22,14 +22,15 @@ from jaxtyping import Array, Float
 
 from ..engine.linalg import matmul
 
-# ‖A‖ s ≤ 1/16 and ten terms leave an error below 1e-16, also of Γ, whose series goes by 2 ‖A‖ s.
-_SHORT, _NUM_TERMS = 1 / 16, 10
-# Enough for times of 2^60 times the shortest relaxation time.
+# For ‖A‖ s ≤ 1/16 ten terms leave an error below 1e-16, also in Γ, a series in 2 ‖A‖ s.
+_MAX_SERIES_NORM, _NUM_TERMS = 1 / 16, 10
+# Sufficient for 2^60 times the shortest relaxation time.
 _MAX_DOUBLINGS = 64
 
 
 class LinearTransition(NamedTuple):
-    """e^{tA}, M_t and Γ_t, shape (d, d) each."""
+    """Transition in a time t: `decay` e^{tA}, `integral` M_t and `covariance` Γ_t, shape (d, d)
+    each."""
 
     decay: Float[Array, "d d"]
     integral: Float[Array, "d d"]
@@ -40,7 +41,7 @@ class LinearTransition(NamedTuple):
 def linear_transition(
     A: Float[Array, "d d"], V: Float[Array, "d d"], t: Float[Array, ""]
 ) -> LinearTransition:
-    """The transition in a time t ≥ 0, from no more doublings than it takes."""
+    """Return the transition in a time t ≥ 0, with as few doublings as the time needs."""
     doublings, moments = _over_short_time(A, V, t)
     _, moments = lax.while_loop(
         lambda state: state[0] < doublings,
@@ -52,7 +53,8 @@ def linear_transition(
 
 @linear_transition.defjvp
 def _tangents(primals, tangents):
-    # A `while_loop` has no reverse mode: a derivative goes through all the doublings there can be.
+    # A `while_loop` has no reverse mode. So derivatives use a loop of fixed length, whose last
+    # iterations change nothing.
     def transition(A, V, t):
         doublings, moments = _over_short_time(A, V, t)
 
@@ -68,32 +70,37 @@ def _tangents(primals, tangents):
 
 
 def _over_short_time(A, V, t) -> tuple[Float[Array, ""], LinearTransition]:
-    """How often to double a time short enough for the Taylor series, and the transition in it."""
+    """Return the number of doublings, and the transition in the time t / 2^doublings."""
     identity = jnp.eye(A.shape[0], dtype=A.dtype)
+    # The ∞-norm of A. The number of doublings is a choice, so nothing here is differentiated.
     rate = lax.stop_gradient(jnp.max(jnp.sum(jnp.abs(A), axis=1)))
-    doublings = jnp.ceil(jnp.log2(jnp.maximum(lax.stop_gradient(t) * rate / _SHORT, 1)))
-    doublings = jnp.minimum(doublings, _MAX_DOUBLINGS)  # there is an end, whatever the numbers
+    doublings = jnp.ceil(jnp.log2(jnp.maximum(lax.stop_gradient(t) * rate / _MAX_SERIES_NORM, 1)))
+    doublings = jnp.minimum(doublings, _MAX_DOUBLINGS)  # the loop ends for infinite rates too
     s = t / 2**doublings
     term, covariance_term = s * identity, s * V
     integral, covariance = term, covariance_term
+    # Term j of M_s is s^j A^{j-1} / j!. As Γ' = V + A Γ + Γ Aᵀ, term j of Γ_s follows from
+    # term j - 1.
     for j in range(2, _NUM_TERMS + 1):
         term = s / j * _product(A, term)
-        flow = _product(A, covariance_term)
-        covariance_term = s / j * (flow + flow.T)
+        product = _product(A, covariance_term)
+        covariance_term = s / j * (product + product.T)
         integral, covariance = integral + term, covariance + covariance_term
     decay = identity + _product(A, integral)
     return doublings, LinearTransition(decay, integral, covariance)
 
 
 def _double(moments: LinearTransition) -> LinearTransition:
+    """Return the transition in twice the time."""
     decay, integral, covariance = moments
-    grown = _product(_product(decay, covariance), decay.T)
+    propagated = _product(_product(decay, covariance), decay.T)
     return LinearTransition(
         _product(decay, decay),
         integral + _product(decay, integral),
-        covariance + (grown + grown.T) / 2,
+        covariance + (propagated + propagated.T) / 2,  # symmetric in spite of rounding
     )
 
 
 def _product(left: Float[Array, "d d"], right: Float[Array, "d d"]) -> Float[Array, "d d"]:
+    """Return the product of two matrices, in elementwise operations for small ones."""
     return matmul(left, right) if left.shape[0] <= 16 else left @ right

@@ -1,14 +1,14 @@
 """The Ornstein–Uhlenbeck process in closed form (section 3.1 of the paper).
 
-For `dX = -B (X - m) dt + σ dW`, V = σσᵀ and B with eigenvalues in the right half plane,
+The process solves `dX = -B (X - m) dt + σ dW`, V = σσᵀ. The eigenvalues of B lie in the right half
+plane. The stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x - m), Γ_t), where:
 
-    Γ solves B Γ + Γ Bᵀ = V,   Γ_t = ∫_0^t e^{-sB} V e^{-sBᵀ} ds = Γ - e^{-tB} Γ e^{-tBᵀ},
+    Γ solves B Γ + Γ Bᵀ = V;
+    Γ_t = ∫_0^t e^{-sB} V e^{-sBᵀ} ds = Γ - e^{-tB} Γ e^{-tBᵀ}.
 
-the stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x - m), Γ_t).
-
-Γ is found, factored and inverted in the coordinates x or σ⁻¹x, whichever make B the smaller. A
-process whose noise is nearly singular may be harmless in the second and have a B of huge entries
-that cancel, and a Γ beyond the precision of numbers, in the first; another the other way round.
+Γ is computed, factored and inverted in the coordinates x or σ⁻¹x, whichever give the smaller B.
+With nearly singular noise, B can have huge entries that cancel, and Γ can exceed floating point
+precision, in one of the two but not in the other.
 """
 
 import functools
@@ -32,13 +32,16 @@ from .sigma import Identity
 
 
 class OrnsteinUhlenbeckParams(NamedTuple):
-    """The parameters of an Ornstein–Uhlenbeck model, `params` of `ornstein_uhlenbeck`: `B`, shape
-    (d, d), per unit of time; `mean`, (d,); `sigma`, (d, d), (d,) for a diagonal, or `None` for I.
+    """Parameters of `ornstein_uhlenbeck`, the `params` of the model.
+
+    - `B`: shape (d, d), per unit of time.
+    - `mean`: shape (d,).
+    - `sigma`: shape (d, d), (d,) for a diagonal, or `None` for the identity.
 
     **Example:**
 
     ```python
-    moved = model.with_params(model.params._replace(mean=jnp.ones(2)))
+    shifted = model.with_params(model.params._replace(mean=jnp.ones(2)))
     ```
     """
 
@@ -48,7 +51,13 @@ class OrnsteinUhlenbeckParams(NamedTuple):
 
 
 class _Prepared(NamedTuple):
-    """What depends on the parameters alone."""
+    """The parameters, and quantities that depend on them alone.
+
+    - `root`: a factor of Γ.
+    - `precision`: Γ⁻¹.
+    - `log_normaliser`: ½ log |2πΓ|.
+    - `reverse_B`: Γ Bᵀ Γ⁻¹, the matrix of the time reversal.
+    """
 
     B: Float[Array, "d d"]
     mean: Float[Array, " d"]
@@ -63,17 +72,17 @@ class _Prepared(NamedTuple):
 def ornstein_uhlenbeck(
     B: Numbers, mean: Numbers | None = None, sigma: Numbers | None = None
 ) -> Diffusion:
-    """The Ornstein–Uhlenbeck process `dX = -B (X - mean) dt + σ dW`: equation (OU).
+    """Return the Ornstein–Uhlenbeck process `dX = -B (X - mean) dt + σ dW`: equation (OU).
 
-    Its time reversal is the Ornstein–Uhlenbeck process with matrix Γ Bᵀ Γ⁻¹; it is reversible
-    if and only if BΓ is symmetric, which is not asked for. The log stationary density is
-    normalised. `params` is an `OrnsteinUhlenbeckParams`, and Γ follows it.
+    Its time reversal is the Ornstein–Uhlenbeck process with matrix Γ Bᵀ Γ⁻¹. It is reversible if
+    and only if BΓ is symmetric, which is not required. The log stationary density is normalised.
+    `params` is an `OrnsteinUhlenbeckParams`; Γ is recomputed for new parameters.
 
     **Arguments:** `B`, shape (d, d), per unit of time; `mean`, shape (d,), by default zero;
     `sigma`, shape (d, d) or (d,), by default the identity.
 
-    **Raises:** `ValueError` where B has an eigenvalue whose real part is not positive, so
-    that the process is not ergodic; for a singular σ; for shapes that do not fit.
+    **Raises:** `ValueError` if an eigenvalue of B has a real part that is not positive, because the
+    process is not ergodic then; for a singular σ; for shapes that do not fit.
 
     **Example:**
 
@@ -101,6 +110,7 @@ def ornstein_uhlenbeck(
     if not is_traced(B):
         if not np.all(np.isfinite(B)):
             raise ValueError(f"`B` must be finite; got {B}.")
+        # Ergodic only if all solutions of dX = -B (X - m) dt decay.
         eigenvalues = np.linalg.eigvals(B)
         if not np.all(eigenvalues.real > 0):
             raise ValueError(
@@ -120,8 +130,9 @@ def ornstein_uhlenbeck(
 
 
 def ou_stationary(model: Diffusion) -> GaussianLaw:
-    """The stationary law N(m, Γ) of `model`, an Ornstein–Uhlenbeck model, with Γ the solution of
-    B Γ + Γ Bᵀ = σ σᵀ.
+    """Return the stationary law N(m, Γ) of an Ornstein–Uhlenbeck model. Γ solves B Γ + Γ Bᵀ = σ σᵀ.
+
+    **Arguments:** `model`, from `ornstein_uhlenbeck`.
 
     **Raises:** `TypeError` for any other model.
 
@@ -136,10 +147,12 @@ def ou_stationary(model: Diffusion) -> GaussianLaw:
 
 
 def ou_transition(model: Diffusion, start: Numbers, duration: Numbers) -> GaussianLaw:
-    """The law of X_t given X_0 = `start`, shape (d,), for t = `duration`, of `model`, an
-    Ornstein–Uhlenbeck model.
+    """Return the law of X_t given X_0 of an Ornstein–Uhlenbeck model.
 
-    **Raises:** `TypeError` for any other model.
+    **Arguments:** `model`, from `ornstein_uhlenbeck`; `start`, X_0, shape (d,); `duration`, t > 0,
+    shape ().
+
+    **Raises:** `TypeError` for any other model, `ValueError` for arguments that do not fit.
 
     **Example:**
 
@@ -191,40 +204,51 @@ def _sample_stationary(key, p: _Prepared):
 
 
 def _prepare(params: OrnsteinUhlenbeckParams) -> _Prepared:
+    """Return the prepared parameters; compute Γ in x or σ⁻¹x, whichever give the smaller B."""
     B, mean, sigma = params
     if sigma is None:
         return _Prepared(B, mean, sigma, *_stationary(B, jnp.eye(len(B), dtype=B.dtype)))
     if sigma.ndim == 1:
-        forth, back, log_det = jnp.diag(sigma), jnp.diag(1 / sigma), jnp.sum(jnp.log(abs(sigma)))
+        from_scaled, to_scaled, log_det = (
+            jnp.diag(sigma),
+            jnp.diag(1 / sigma),
+            jnp.sum(jnp.log(abs(sigma))),
+        )
     else:
-        forth, back, log_det = sigma, any_inverse(sigma), any_log_abs_det(sigma)
-    smaller = jnp.sum((back @ B @ forth) ** 2) < jnp.sum(B**2)
+        from_scaled, to_scaled, log_det = sigma, any_inverse(sigma), any_log_abs_det(sigma)
+    # B in the coordinates σ⁻¹x is σ⁻¹ B σ; the noise there is the identity.
+    is_scaled = jnp.sum((to_scaled @ B @ from_scaled) ** 2) < jnp.sum(B**2)
     identity = jnp.eye(len(B), dtype=B.dtype)
-    forth, noise = jnp.where(smaller, forth, identity), jnp.where(smaller, identity, forth)
-    back = jnp.where(smaller, back, identity)
-    root, precision, log_normaliser, reverse_B = _stationary(back @ B @ forth, noise)
+    from_scaled, noise = (
+        jnp.where(is_scaled, from_scaled, identity),
+        jnp.where(is_scaled, identity, from_scaled),
+    )
+    to_scaled = jnp.where(is_scaled, to_scaled, identity)
+    root, precision, log_normaliser, reverse_B = _stationary(to_scaled @ B @ from_scaled, noise)
     return _Prepared(
         B,
         mean,
         sigma,
-        root=forth @ root,
-        precision=back.T @ precision @ back,
-        log_normaliser=log_normaliser + jnp.where(smaller, log_det, 0),
-        reverse_B=forth @ reverse_B @ back,
+        # Back to the coordinates x.
+        root=from_scaled @ root,
+        precision=to_scaled.T @ precision @ to_scaled,
+        # The change of coordinates has the Jacobian |σ|.
+        log_normaliser=log_normaliser + jnp.where(is_scaled, log_det, 0),
+        reverse_B=from_scaled @ reverse_B @ to_scaled,
     )
 
 
 def _stationary(B: Float[Array, "d d"], sigma: Float[Array, "d d"]) -> tuple[Array, ...]:
-    """A root of Γ, Γ⁻¹, ½ log |2πΓ| and the matrix ΓBᵀΓ⁻¹ of the reversal."""
+    """Return a factor of Γ, Γ⁻¹, ½ log |2πΓ|, and the matrix ΓBᵀΓ⁻¹ of the time reversal."""
     covariance = _lyapunov(B, sigma @ sigma.T)
     root, precision = any_cholesky(covariance), any_inverse(covariance)
-    precision = (precision + precision.T) / 2
+    precision = (precision + precision.T) / 2  # symmetric in spite of rounding
     log_normaliser = jnp.sum(jnp.log(jnp.diagonal(root))) + len(B) / 2 * math.log(2 * math.pi)
     return root, precision, log_normaliser, covariance @ B.T @ precision
 
 
 def _noise_covariance(params: OrnsteinUhlenbeckParams) -> Float[Array, "d d"]:
-    """V = σσᵀ."""
+    """Return V = σσᵀ."""
     if params.sigma is None:
         return jnp.eye(params.B.shape[0], dtype=params.B.dtype)
     matrix = jnp.diag(params.sigma) if params.sigma.ndim == 1 else params.sigma
@@ -232,29 +256,32 @@ def _noise_covariance(params: OrnsteinUhlenbeckParams) -> Float[Array, "d d"]:
 
 
 def _lyapunov(B: Float[Array, "d d"], V: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """Γ with BΓ + ΓBᵀ = V, equation (Gamma), as one linear system of size d²; up to two dimensions
-    by Γ = [|B| V + (B - tr B I) V (B - tr B I)ᵀ] / (2 |B| tr B)."""
+    """Return Γ with BΓ + ΓBᵀ = V, equation (Gamma), from a linear system of size d².
+
+    Up to two dimensions Γ = [|B| V + (B - tr B I) V (B - tr B I)ᵀ] / (2 |B| tr B).
+    """
     identity = jnp.eye(B.shape[0], dtype=B.dtype)
     if B.shape[0] <= 2:
         determinant, trace = _determinant(B), jnp.trace(B)
-        rest = B - trace * identity
-        return (determinant * V + rest @ V @ rest.T) / (2 * determinant * trace)
+        shifted = B - trace * identity
+        return (determinant * V + shifted @ V @ shifted.T) / (2 * determinant * trace)
     operator = jnp.kron(B, identity) + jnp.kron(identity, B)
-    # Inference does this in a loop, where LAPACK is a hazard; but d² soon is much to write out.
-    solved = solve if B.shape[0] <= 3 else jnp.linalg.solve
-    solution = solved(operator, V.reshape(-1)).reshape(V.shape)
+    # Inference runs this in a loop, where LAPACK calls are slow and can deadlock. But elimination
+    # that is written out for d² unknowns takes long to compile for d > 3.
+    solver = solve if B.shape[0] <= 3 else jnp.linalg.solve
+    solution = solver(operator, V.reshape(-1)).reshape(V.shape)
     return (solution + solution.T) / 2
 
 
 def _determinant(B: Float[Array, "d d"]) -> Float[Array, ""]:
-    """Of one or two dimensions."""
+    """Return the determinant of a matrix of one or two dimensions."""
     return B[0, 0] if B.shape[0] == 1 else B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
 
 
 def decay_and_covariance(
     params: OrnsteinUhlenbeckParams, t: Float[Array, ""]
 ) -> tuple[Float[Array, "d d"], Float[Array, "d d"]]:
-    """e^{-tB} and Γ_t."""
+    """Return e^{-tB} and Γ_t."""
     moments = linear_transition(-params.B, _noise_covariance(params), t)
     return moments.decay, moments.covariance
 
@@ -262,11 +289,14 @@ def decay_and_covariance(
 def single_interval(
     params: OrnsteinUhlenbeckParams, start: Numbers, end: Numbers, duration: Numbers
 ) -> tuple[Float[Array, " d"], Float[Array, " d"], Float[Array, ""]]:
-    """The end points and the duration, checked and in the precision of the parameters."""
+    """Return `start`, `end` and `duration` of one interval, in the dtype of the parameters.
+
+    **Raises:** `ValueError` for several intervals and for shapes that do not fit.
+    """
     intervals, batched, several_durations = as_intervals(start, end, duration)
     if batched or several_durations:
         raise ValueError(
-            "`start`, `end` and `duration` must be those of one interval, shapes (d,), (d,) and "
+            "`start`, `end` and `duration` must describe one interval, shapes (d,), (d,) and "
             "(); use `jax.vmap` for several."
         )
     d, dtype = params.B.shape[0], params.B.dtype
@@ -283,10 +313,11 @@ def single_interval(
 
 
 def ou_params(model: Diffusion) -> OrnsteinUhlenbeckParams:
+    """Return the parameters of an Ornstein–Uhlenbeck model; for others raise `TypeError`."""
     params = getattr(model, "params", None)
     if not isinstance(params, OrnsteinUhlenbeckParams):
         raise TypeError(
-            "`model` must be made by `ornstein_uhlenbeck`, for this is a closed form; got "
-            f"{type(model).__name__} with params {params!r}."
+            "`model` must be made by `ornstein_uhlenbeck`, as the closed form needs its `params`; "
+            f"got {type(model).__name__} with params {params!r}."
         )
     return params

@@ -1,4 +1,4 @@
-"""An Ornstein–Uhlenbeck process around a mean that changes with the season."""
+"""The Ornstein–Uhlenbeck process with a mean that changes with the season."""
 
 from typing import NamedTuple
 
@@ -11,15 +11,20 @@ from .diffusion import Diffusion
 
 
 class SeasonalParams(NamedTuple):
-    """The parameters of `seasonal_ornstein_uhlenbeck`, `params` of the model, shape () or (d,)
-    each: `rate`, per unit of time; `mean`; `amplitude`; `phase`, in radians; `period`, in units of
-    time; `sigma`, in space per square root of a unit of time.
+    """Parameters of `seasonal_ornstein_uhlenbeck`, the `params` of the model, shape () or (d,)
+    each.
+
+    - `rate`: per unit of time.
+    - `mean`, `amplitude`: in units of space.
+    - `phase`: in radians.
+    - `period`: in units of time.
+    - `sigma`: in space per square root of a unit of time.
 
     **Example:**
 
     ```python
     model = jb.seasonal_ornstein_uhlenbeck()
-    moved = model.with_params(model.params._replace(amplitude=jnp.asarray(3.0)))
+    stronger = model.with_params(model.params._replace(amplitude=jnp.asarray(3.0)))
     ```
     """
 
@@ -39,16 +44,20 @@ def seasonal_ornstein_uhlenbeck(
     period: Numbers = 1.0,
     sigma: Numbers = 1.0,
 ) -> Diffusion:
-    """Independent coordinates that are drawn to a mean that changes with the season, as
-    temperatures are (Alaton, Djehiche & Stillberger 2002),
+    """Return the model of independent coordinates that revert to a seasonal mean, as temperatures
+    do (Alaton, Djehiche & Stillberger 2002):
 
         dX = -a (X - m(t)) dt + σ dW,    m(t) = mean + amplitude · sin(2πt / period + phase).
 
-    t is the time of the caller, as `times` has it. `params` is a `SeasonalParams`.
+    t is the absolute time, on the same clock as `times`. `params` is a `SeasonalParams`.
 
-    **Arguments:** `rate`, a, per unit of time; `mean`; `amplitude`; `phase`, in radians; `period`,
-    in units of time, positive; `sigma`, σ ≥ 0, in space per square root of a unit of time: shape ()
-    or (d,) each.
+    **Arguments:** shape () or (d,) each:
+
+    - `rate`: a, per unit of time.
+    - `mean`, `amplitude`: in units of space.
+    - `phase`: in radians.
+    - `period`: in units of time, positive.
+    - `sigma`: σ ≥ 0, in space per square root of a unit of time.
 
     **Raises:** `ValueError` for other shapes or values.
 
@@ -69,9 +78,9 @@ def seasonal_ornstein_uhlenbeck(
 
 
 def _drift(x: Float[Array, " d"], p: SeasonalParams, t: Float[Array, ""]) -> Float[Array, " d"]:
-    # The remainder is exact, where t / period is rounded: by much, after many periods.
-    since = jnp.fmod(t, p.period)
-    season = jnp.sin(2 * np.pi * since / p.period + p.phase)
+    # The remainder is exact. After many periods, t / period has a large rounding error.
+    time_in_period = jnp.fmod(t, p.period)
+    season = jnp.sin(2 * np.pi * time_in_period / p.period + p.phase)
     return -p.rate * (x - p.mean - p.amplitude * season)
 
 

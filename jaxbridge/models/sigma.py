@@ -1,13 +1,20 @@
-"""The diffusion coefficient σ(x) at one point, as the operator its form calls for.
+"""The diffusion coefficient σ(x) at one point, as a linear operator.
 
-Six forms: the identity, a constant matrix (inverted outside the loop over time), a diagonal, a
-full matrix that changes with the state, its lower triangular root, and a tall matrix, of noise in
-fewer dimensions than the state has. Whoever holds an `AbstractSigma` multiplies and solves without
-knowing which; what a form does not need is never computed. A tall one solves nothing, and says so.
+There are six forms:
 
-The law of the diffusion is that of V = σσᵀ. So where only the law counts, and there is anything
-to solve, a full σ(x) = L Q gives way to its root L, which solves without elimination or pivots and
-does not turn: L(x) → L(x') as V(x) → V(x'), whatever Q does.
+- The identity.
+- A constant matrix, inverted once, outside the loop over time.
+- A diagonal.
+- A full matrix that depends on the state.
+- A lower triangular matrix that depends on the state.
+- A tall matrix, for noise in fewer dimensions than the state. It has no inverse.
+
+Callers use the methods of `AbstractSigma` for all of them, and each form does only the work that it
+needs.
+
+The law of the diffusion depends on V = σσᵀ only. So the triangular root L may replace a full σ(x) =
+L Q. Solving with L needs neither elimination nor pivots. L does not rotate: it is a smooth function
+of V, whatever Q is.
 """
 
 from abc import abstractmethod
@@ -30,51 +37,53 @@ from ..engine.linalg import (
 )
 
 NO_INVERSE = (
-    "σ of this `model` has fewer columns than rows, so noise reaches only a part of the state at "
-    "once, and what was asked for rests on an inverse of σ, as do couplings, bridges between exact "
-    "states and transition densities. What does not: `simulate`, and with an `observation` "
-    "`log_likelihood`, `smooth`, `innovations`, `gibbs`, `pmmh` and `maximum_likelihood`; a state "
-    "that was seen exactly is `jb.LinearGaussian(covariance=0.0)`."
+    "σ of this `model` has fewer columns than rows, so noise enters only some coordinates. "
+    "Couplings, bridges between exact states and transition densities need an inverse of σ. Use "
+    "`simulate`; or, with an `observation`, `log_likelihood`, `smooth`, `innovations`, `gibbs`, "
+    "`pmmh` and `maximum_likelihood`. For an exactly observed state the `observation` is "
+    "`jb.LinearGaussian(covariance=0.0)`."
 )
 
 
 class AbstractSigma(eqx.Module):
-    """σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,). `invertible`
-    says whether it has an inverse: a tall one has noise of shape (m,), m < d, and none."""
+    """Operator σ(x) at one point: a linear map from noise, shape (d,), to space, shape (d,).
+
+    `invertible` is false for a tall matrix only, whose noise has shape (m,), m < d.
+    """
 
     invertible: ClassVar[bool] = True
 
     @abstractmethod
     def mv(self, noise: Float[Array, " d"]) -> Float[Array, " d"]:
-        """`σ w`."""
+        """Return `σ w`."""
 
     @abstractmethod
     def mv_transpose(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
-        """`σᵀ v`."""
+        """Return `σᵀ v`."""
 
     @abstractmethod
     def solve(self, vector: Float[Array, " d"]) -> Float[Array, " d"]:
-        """`σ⁻¹ v`."""
+        """Return `σ⁻¹ v`."""
 
     @abstractmethod
     def average(self, other: "AbstractSigma") -> "AbstractSigma":
-        """`½ (σ + other)`, for two coefficients of one model."""
+        """Return `½ (σ + other)`, for two values of one model's σ."""
 
     @abstractmethod
     def log_abs_det(self) -> Float[Array, ""]:
-        """`log |det σ|`."""
+        """Return `log |det σ|`."""
 
     @abstractmethod
     def as_matrix(self, dim: int, dtype) -> Float[Array, "d m"]:
-        """`σ` as a dense matrix."""
+        """Return `σ` as a dense matrix of `dim` rows."""
 
     @abstractmethod
     def root(self) -> "AbstractSigma":
-        """A root of V = σσᵀ: where σ varies one that V alone determines, however σ turns."""
+        """Return a root of V = σσᵀ. If σ varies and is invertible, the root depends on V alone."""
 
 
 class Identity(AbstractSigma):
-    """σ = I."""
+    """Operator σ = I."""
 
     def mv(self, noise):
         return noise
@@ -99,7 +108,7 @@ class Identity(AbstractSigma):
 
 
 class Constant(AbstractSigma):
-    """The same matrix everywhere, kept with its inverse."""
+    """Matrix that is the same at all points, stored with its inverse."""
 
     matrix: Float[Array, "d d"]
     inverse: Float[Array, "d d"]
@@ -117,7 +126,7 @@ class Constant(AbstractSigma):
     def solve(self, vector):
         return matvec(self.inverse, vector)
 
-    def average(self, other):
+    def average(self, other):  # both are the same constant
         return self
 
     def log_abs_det(self):
@@ -131,7 +140,7 @@ class Constant(AbstractSigma):
 
 
 class Diagonal(AbstractSigma):
-    """A diagonal matrix, given by its diagonal."""
+    """Diagonal matrix, stored as its diagonal."""
 
     diagonal: Float[Array, " d"]
 
@@ -155,11 +164,12 @@ class Diagonal(AbstractSigma):
         return jnp.diag(self.diagonal)
 
     def root(self):
+        # Signs of the diagonal do not affect V.
         return Diagonal(jnp.abs(self.diagonal))
 
 
 class AbstractMatrix(AbstractSigma):
-    """A matrix that changes with the state, multiplied the same whatever its form."""
+    """Matrix that depends on the state. Its subclasses share products and averages."""
 
     matrix: eqx.AbstractVar[Float[Array, "d m"]]
 
@@ -171,6 +181,7 @@ class AbstractMatrix(AbstractSigma):
 
     def average(self, other):
         assert isinstance(other, type(self))
+        # The average of two triangular matrices with positive diagonals is one, too.
         return type(self)((self.matrix + other.matrix) / 2)  # pyright: ignore
 
     def as_matrix(self, dim, dtype):
@@ -178,7 +189,7 @@ class AbstractMatrix(AbstractSigma):
 
 
 class Full(AbstractMatrix):
-    """A full matrix."""
+    """Square matrix without structure."""
 
     matrix: Float[Array, "d d"]
 
@@ -193,7 +204,7 @@ class Full(AbstractMatrix):
 
 
 class Triangular(AbstractMatrix):
-    """A lower triangular matrix with a positive diagonal."""
+    """Lower triangular matrix with a positive diagonal."""
 
     matrix: Float[Array, "d d"]
 
@@ -208,7 +219,7 @@ class Triangular(AbstractMatrix):
 
 
 class Tall(AbstractMatrix):
-    """A matrix of fewer columns than rows: V = σσᵀ has no inverse, and no density."""
+    """Matrix of fewer columns than rows. V = σσᵀ is singular, so it defines no density."""
 
     matrix: Float[Array, "d m"]
     invertible: ClassVar[bool] = False
@@ -224,11 +235,12 @@ class Tall(AbstractMatrix):
 
 
 def columns_of(sigma: AbstractSigma, x: Float[Array, " d"]) -> list[Float[Array, " d"]]:
-    """The columns of σ at x."""
+    """Return the columns of σ at x."""
     num_columns = sigma.as_matrix(x.shape[0], x.dtype).shape[1]
+    # By products with unit vectors, so that diagonals stay cheap.
     return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(num_columns)]
 
 
 def root_of(V: Float[Array, "d d"]) -> Triangular:
-    """The lower triangular root of V."""
+    """Return the lower triangular root of V."""
     return Triangular(cholesky(V))

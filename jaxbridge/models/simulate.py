@@ -1,4 +1,4 @@
-"""Unconditional paths of the diffusion, by diffrax."""
+"""Unconditional paths of a diffusion, from the solvers of diffrax."""
 
 from typing import Any
 
@@ -31,27 +31,27 @@ def simulate(
     num_steps: int = 50,
     solver: diffrax.AbstractSolver | None = None,
 ) -> Float[Array, "num_paths K d"]:
-    """Unconditional paths, started at `times[0]`.
+    """Simulate unconditional paths from `times[0]` on.
 
     **Arguments:**
 
     - `key`: a typed key.
-    - `model`: the diffusion. Neither its reversal nor its stationary law is called for.
-    - `x0`: the start, shape (d,), or one for each path, (num_paths, d), or `None` to draw from
-        the stationary law by the model's sampler.
-    - `times`: increasing, shape (K,), in units of time. Their zero does not matter: differences
-        are taken in double precision. Coefficients that depend on time get these times; where
-        single precision cannot resolve them beside a step, that is refused, but not of traced ones.
-    - `num_paths`: how many paths.
-    - `num_steps`: solver steps between one time and the next.
-    - `solver`: a diffrax solver that takes fixed steps; by default `diffrax.Heun()`. A solver
-        for Stratonovich equations is given the drift in that form, and one that asks for a
-        Lévy area gets it.
+    - `model`: the diffusion. It needs neither a time reversal nor a stationary law.
+    - `x0`: the start, shape (d,), or one start per path, (num_paths, d). `None` samples the starts
+        from the stationary law, with the model's sampler.
+    - `times`: increasing, shape (K,), in units of time, with any origin: differences are computed
+        in double precision. Coefficients that depend on time receive these times.
+    - `num_paths`: the number of paths.
+    - `num_steps`: the number of solver steps between two successive times.
+    - `solver`: a diffrax solver that takes fixed steps; by default `diffrax.Heun()`. A Stratonovich
+        solver receives the Stratonovich drift. A solver that needs a Lévy area receives it.
 
-    **Returns:** paths, shape (num_paths, K, d). A path that left the finite numbers is NaN or
-    infinite from there on. Differentiable in forward mode.
+    **Returns:** paths, shape (num_paths, K, d), differentiable in forward mode. A path that
+    explodes is NaN or infinite from there on.
 
-    **Raises:** `ValueError` for shapes that do not fit or times that do not increase.
+    **Raises:** `ValueError` for shapes that do not fit, and for times that do not increase. For
+    coefficients that depend on time, also if single precision cannot resolve a step at these times.
+    Traced times are not checked for it. `TypeError` for a solver of other equations.
 
     **Example:**
 
@@ -63,51 +63,56 @@ def simulate(
     check_key(key)
     check_diffusion(model)
     num_paths = check_count("num_paths", num_paths)
-    known = as_times("times", times)
-    if len(known.shape) != 1 or known.shape[0] < 2:
-        raise ValueError(f"`times` must have shape (K,) with K ≥ 2; got {known.shape}.")
-    check_increasing(known)
-    num_steps = check_num_steps(num_steps, known.shape[0] - 1)
+    time_axis = as_times("times", times)
+    if len(time_axis.shape) != 1 or time_axis.shape[0] < 2:
+        raise ValueError(f"`times` must have shape (K,) with K ≥ 2; got {time_axis.shape}.")
+    check_increasing(time_axis)
+    num_steps = check_num_steps(num_steps, time_axis.shape[0] - 1)
     start_key, path_key = jax.random.split(key)
     if x0 is None:
         x0 = jax.vmap(model.prepared().sample_stationary)(jax.random.split(start_key, num_paths))
     x0 = as_floating("x0", x0)
     if x0.shape[:-1] not in ((), (num_paths,)) or x0.ndim == 0:
         raise ValueError(
-            f"`x0` must have shape (d,) or ({num_paths}, d), one for each path; got {x0.shape}."
+            f"`x0` must have shape (d,) or ({num_paths}, d), one per path; got {x0.shape}."
         )
     x0 = jnp.broadcast_to(x0, (num_paths, x0.shape[-1]))
     solver = diffrax.Heun() if solver is None else solver
     _check_solver(solver)
-    clock, since = known.clock(x0.dtype)
-    gaps = known.gaps.astype(x0.dtype)
+    clock, elapsed = time_axis.clock(x0.dtype)
+    gaps = time_axis.gaps.astype(x0.dtype)
     if model.depends_on_time:
-        check_resolved(clock, since, gaps / num_steps)
-    return _simulate(path_key, model, x0, clock, since[:-1], gaps, num_steps, solver)
+        check_resolved(clock, elapsed, gaps / num_steps)
+    return _simulate(path_key, model, x0, clock, elapsed[:-1], gaps, num_steps, solver)
 
 
 def _check_solver(solver: Any) -> None:
-    """Raise `TypeError` for anything but a solver of stochastic differential equations."""
+    """Raise `TypeError` unless the solver is for all stochastic differential equations."""
     check_instance("solver", solver, diffrax.AbstractSolver, "a solver of diffrax, an instance")
-    of_any = diffrax.AbstractItoSolver | diffrax.AbstractStratonovichSolver
-    of_langevin = diffrax.ALIGN | diffrax.QUICSORT | diffrax.ShOULD
-    if not isinstance(solver, of_any) or isinstance(solver, of_langevin):
+    general = diffrax.AbstractItoSolver | diffrax.AbstractStratonovichSolver
+    # These have the interface, but assume the structure of a Langevin equation.
+    langevin_only = diffrax.ALIGN | diffrax.QUICSORT | diffrax.ShOULD
+    if not isinstance(solver, general) or isinstance(solver, langevin_only):
         raise TypeError(
-            "`solver` must be a solver of diffrax for any stochastic differential equation, such "
-            "as `diffrax.Heun()`, `diffrax.Euler()` or `diffrax.SRA1()`: an "
-            "`AbstractItoSolver` or an `AbstractStratonovichSolver`, not of Langevin's equation "
-            f"only; got {shown(solver)}."
+            "`solver` must be a solver of diffrax for any stochastic differential equation, an "
+            "`AbstractItoSolver` or `AbstractStratonovichSolver` that is not only for Langevin "
+            "equations, such as `diffrax.Heun()`, `diffrax.Euler()` or `diffrax.SRA1()`; got "
+            f"{shown(solver)}."
         )
 
 
 @compiled
 def _simulate(key, model, x0, clock, starts, gaps, num_steps, solver):
-    """Paths by one solution for each interval, on a clock of its own that begins with zero: noise
-    is drawn by the times of steps, which must be distinct, and is scaled by their differences."""
+    """Return the paths, from one solution per interval.
+
+    Each interval has its own clock, which starts at zero. The noise is a function of the times of
+    the steps, which must be distinct in floating point, and scales with their differences.
+    """
     dynamics_at = model.forward_at(x0[0])
     fractions = np.arange(1 + num_steps) / num_steps
     stratonovich = isinstance(solver, diffrax.AbstractStratonovichSolver)
 
+    # `t` is the time since `start`, the beginning of the interval.
     def drift(t, x, start):
         dynamics = dynamics_at(clock(start + t))
         if stratonovich and dynamics.sigma_varies:
@@ -117,11 +122,12 @@ def _simulate(key, model, x0, clock, starts, gaps, num_steps, solver):
     def sigma(t, x, start):
         return _as_operator(dynamics_at(clock(start + t)), x)
 
-    num_noises = jax.eval_shape(sigma, starts[0], x0[0], starts[0]).in_size()
-    shape = jax.ShapeDtypeStruct((num_noises,), x0.dtype)
+    noise_dim = jax.eval_shape(sigma, starts[0], x0[0], starts[0]).in_size()
+    shape = jax.ShapeDtypeStruct((noise_dim,), x0.dtype)
 
-    def over_interval(x, interval):
+    def solve_interval(x, interval):
         key, start, gap = interval
+        # Unsafe only for steps that are rejected and repeated; here steps are fixed.
         noise = diffrax.UnsafeBrownianPath(shape, key, _levy_area(solver))
         solution = diffrax.diffeqsolve(
             diffrax.MultiTerm(diffrax.ODETerm(drift), diffrax.ControlTerm(sigma, noise)),
@@ -135,31 +141,33 @@ def _simulate(key, model, x0, clock, starts, gaps, num_steps, solver):
             stepsize_controller=diffrax.StepTo(ts=jnp.asarray(fractions, gap.dtype) * gap),
             adjoint=diffrax.ForwardMode(),
             max_steps=num_steps,
-            throw=False,
+            throw=False,  # paths that explode are returned
         )
         x = jnp.asarray(solution.ys)[0]
         return x, x
 
     def one_path(key, x0):
         keys = jax.random.split(key, len(gaps))
-        _, path = lax.scan(over_interval, x0, (keys, starts, gaps))
+        _, path = lax.scan(solve_interval, x0, (keys, starts, gaps))
         return jnp.concatenate([x0[None], path])
 
     return jax.vmap(one_path)(jax.random.split(key, len(x0)), x0)
 
 
 def _levy_area(solver: diffrax.AbstractSolver):
-    """The least that the solver must know of the Brownian path."""
-    least = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
+    """Return the smallest class of increments with the Lévy area that the solver needs."""
+    required_area = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
+    # From the least information about the noise to the most.
     candidates = (
         diffrax.BrownianIncrement,
         diffrax.SpaceTimeLevyArea,
         diffrax.SpaceTimeTimeLevyArea,
     )
-    return next(candidate for candidate in candidates if issubclass(candidate, least))
+    return next(candidate for candidate in candidates if issubclass(candidate, required_area))
 
 
 def _as_operator(dynamics: Dynamics, x: Float[Array, " d"]) -> lx.AbstractLinearOperator:
+    """Return σ(x) as an operator of lineax, as diffrax needs it."""
     sigma: AbstractSigma = dynamics.sigma(x)
     if isinstance(sigma, Diagonal):
         return lx.DiagonalLinearOperator(sigma.diagonal)

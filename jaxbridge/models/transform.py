@@ -1,12 +1,13 @@
 """A diffusion in other coordinates, by Itô's formula.
 
-For a smooth bijection f with inverse g, Y = f(X) solves an equation with
+Let f be a smooth bijection with inverse g. Then Y = f(X) has, at x = g(y), the coefficients
 
-    α_Y(y) = ∇f α + ½ Σ_k ∂²f[σ_k, σ_k],    σ_Y(y) = ∇f σ,    at x = g(y),
+    α_Y(y) = ∇f α + ½ Σ_k ∂²f[σ_k, σ_k],    σ_Y(y) = ∇f σ.
 
-σ_k the columns of σ, and has the stationary density ν(g(y)) |det ∇g(y)|. A state space with a
-boundary becomes all of R^d, in which no step leads out of it; bridges are simulated and weighted
-there, and their paths mapped back.
+Here σ_k are the columns of σ. The stationary density of Y is ν(g(y)) |det ∇g(y)|.
+
+The map takes a state space with a boundary to all of R^d, which no step leaves. Bridges are sampled
+and weighted there, and their paths are mapped back.
 """
 
 import dataclasses
@@ -31,11 +32,11 @@ _Result = TypeVar("_Result")
 
 
 class Transformed(eqx.Module):
-    """A model in other coordinates, and the way there and back.
+    """A model in other coordinates, with the maps in both directions.
 
-    - `model`: of Y = f(X), with the parameters of the given model.
-    - `forward`, `inverse`: f and its inverse, of points of shape (d,) or (..., d), such as
-        observations.
+    - `model`: the model of Y = f(X), with the same parameters as the model of X.
+    - `forward`, `inverse`: f and its inverse, functions of points of shape (d,) or (..., d), such
+        as observations.
 
     **Example:**
 
@@ -53,33 +54,41 @@ class Transformed(eqx.Module):
     inverse: Partial
 
     def back(self, bridges: _Result) -> _Result:
-        """What `sample_bridges`, `sample_weighted_bridges`, `weigh_bridges` or
-        `sample_exact_bridges` returned, with paths in the coordinates of X. Weigh before: the
-        result is no longer of this model."""
+        """Return `bridges` with paths in the coordinates of X.
+
+        `bridges` is a result of `sample_bridges`, `sample_weighted_bridges`, `weigh_bridges` or
+        `sample_exact_bridges`. Compute weights first: the returned bridges no longer belong to this
+        model.
+
+        **Raises:** `TypeError` for an object without `paths`.
+        """
         paths = getattr(bridges, "paths", None)
         if paths is None:
             raise TypeError(
-                "`bridges` must be what `sample_bridges`, `sample_weighted_bridges` or "
-                f"`sample_exact_bridges` returned; got {type(bridges).__name__}."
+                "`bridges` must be a result of `sample_bridges`, `sample_weighted_bridges` or "
+                f"`sample_exact_bridges`; got {type(bridges).__name__}."
             )
         inverse = lambda y: value_at("inverse", self.inverse, y.shape, y)
         mapped = jax.vmap(inverse)(_rows(paths))
         return eqx.tree_at(lambda result: result.paths, bridges, mapped.reshape(paths.shape))
 
     def log_jacobian(self, x: Numbers) -> Float[Array, "*batch"]:
-        """log |det ∇f(x)| at points of shape (d,) or (..., d): add it to a transition density of Y
-        at f(x), and it is that of X."""
+        """Return log |det ∇f(x)| at points of shape (d,) or (..., d).
+
+        Add it to the log transition density of Y at f(x) to obtain that of X at x.
+        """
         x = as_floating("x", x)
         values = jax.vmap(lambda x: log_abs_det(jax.jacfwd(self.forward)(x)))(_rows(x))
         return values.reshape(x.shape[:-1])
 
 
 def _rows(points: Float[Array, "... d"]) -> Float[Array, "n d"]:
+    """Return points of shape (..., d) as rows, shape (n, d)."""
     return points.reshape(-1, points.shape[-1])
 
 
 def of_points(function: Map) -> Partial:
-    """A function of one point as one of points of shape (d,) or (..., d)."""
+    """Return a function of one point as a function of points of shape (d,) or (..., d)."""
     return Partial(_of_points, Partial(function))
 
 
@@ -92,19 +101,21 @@ def _of_points(function: Map, points: Numbers) -> Array:
 
 
 def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
-    """The model of Y = f(X): drift, σ, stationary density and sampler, by automatic
+    """Return the model of Y = f(X): drift, σ, stationary density and sampler, by automatic
     differentiation.
 
     **Arguments:**
 
-    - `model`: the model of X. A constant σ that it was given as an array must be known.
-    - `forward`: f, a smooth bijection of the state space onto R^d, a function of one point (d,);
-        for instance `jnp.log`, or `jax.scipy.special.logit`.
-    - `inverse`: its inverse, for instance `jnp.exp` or `jax.nn.sigmoid`.
+    - `model`: the model of X, with coefficients that do not depend on time. If its σ is a constant
+        array, that must not be traced.
+    - `forward`: f, a smooth bijection of the state space onto R^d, a function of one point (d,),
+        such as `jnp.log` or `jax.scipy.special.logit`.
+    - `inverse`: the inverse of f, such as `jnp.exp` or `jax.nn.sigmoid`.
 
     **Returns:** `Transformed`. Calls with the same functions compile once.
 
-    **Raises:** `TypeError` for what is no model or no function.
+    **Raises:** `TypeError` unless `model` is a `Diffusion`, and for arguments that are not
+    functions. `ValueError` for a model that depends on time.
 
     **Example:**
 
@@ -125,15 +136,16 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
         check_function(name, function, "(x)")
     if model.depends_on_time:
         raise ValueError(
-            "the coefficients of this `model` depend on time, and `transform` is for those that do "
-            "not: write the model in its new coordinates."
+            "the coefficients of this `model` depend on time, which `transform` does not support: "
+            "write the model in its new coordinates."
         )
-    functions = _moved(model.unbound(), forward, inverse)
-    moved = Diffusion(
+    functions = _cached_functions(model.unbound(), forward, inverse)
+    transformed = Diffusion(
         functions.drift,
         functions.diffusion,
         functions.log_stationary if model.has_density else None,
         model.params,
+        # Without one, α* is derived from the transformed density.
         reverse_drift=functions.reverse_drift if model.has_reverse_drift else None,
         sample_stationary=functions.sample_stationary if model.has_sampler else None,
         reversible=model.reversible,
@@ -141,57 +153,61 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
         prepare=model.preparation,
         _coordinates=model.coordinates,
     )
-    return Transformed(moved, of_points(forward), of_points(inverse))
+    return Transformed(transformed, of_points(forward), of_points(inverse))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Moved:
-    """The functions of the model of Y, of one point and the parameters."""
+class _TransformedFunctions:
+    """Functions of the model of Y, of one point y and the parameters."""
 
     unbound: Diffusion
     forward: Map
     inverse: Map
 
     def drift(self, y, params):
-        x, model = self._at(y, params)
+        x, model = self._original(y, params)
         return self._ito(x, model.forward(x))
 
     def reverse_drift(self, y, params):
-        x, model = self._at(y, params)
+        x, model = self._original(y, params)
         return self._ito(x, model.backward(x))
 
     def diffusion(self, y, params):
-        x, model = self._at(y, params)
+        x, model = self._original(y, params)
         columns = columns_of(model.forward(x).sigma(x), x)
-        moved = [self._along(x, column) for column in columns]
-        # In one dimension a matrix is its diagonal.
-        return moved[0] if x.shape[0] == 1 else jnp.stack(moved, axis=1)
+        mapped_columns = [self._derivative(x, column) for column in columns]
+        # In one dimension return a diagonal, for which all operations are cheaper.
+        return mapped_columns[0] if x.shape[0] == 1 else jnp.stack(mapped_columns, axis=1)
 
     def log_stationary(self, y, params):
-        x, model = self._at(y, params)
+        x, model = self._original(y, params)
         return model.log_stationary(x) + log_abs_det(jax.jacfwd(self.inverse)(y))
 
     def sample_stationary(self, key, params):
-        return self._f(self.unbound.with_params(params).sample_stationary(key))
+        return self._forward(self.unbound.with_params(params).sample_stationary(key))
 
-    def _at(self, y, params) -> tuple[Array, Diffusion]:
+    def _original(self, y, params) -> tuple[Array, Diffusion]:
+        """Return x = g(y) and the model of X with these parameters."""
         x = value_at("inverse", self.inverse, y.shape, y)
         return x, self.unbound.with_params(params)
 
-    def _f(self, x):
+    def _forward(self, x):
         return value_at("forward", self.forward, x.shape, x)
 
-    def _along(self, x, direction):
-        """∇f v."""
-        return jax.jvp(self._f, (x,), (direction,))[1]
+    def _derivative(self, x, direction):
+        """Return ∇f v, the derivative of f at x in this direction."""
+        return jax.jvp(self._forward, (x,), (direction,))[1]
 
     def _ito(self, x, dynamics):
-        """∇f α + ½ Σ_k ∂²f(σ_k, σ_k), with the columns σ_k of σ."""
-        moved = self._along(x, dynamics.drift(x))
+        """Return ∇f α + ½ Σ_k ∂²f(σ_k, σ_k), where σ_k are the columns of σ."""
+        mapped_drift = self._derivative(x, dynamics.drift(x))
+        # The second derivative of f in the direction σ_k, from two nested `jvp`.
         for column in columns_of(dynamics.sigma(x), x):
-            moved += jax.jvp(lambda x, v=column: self._along(x, v), (x,), (column,))[1] / 2
-        return moved
+            mapped_drift += (
+                jax.jvp(lambda x, v=column: self._derivative(x, v), (x,), (column,))[1] / 2
+            )
+        return mapped_drift
 
 
-# The same object for the same arguments, so that its functions compile once.
-_moved = functools.lru_cache(maxsize=256)(_Moved)
+# Equal arguments share one object, so that its functions compile once.
+_cached_functions = functools.lru_cache(maxsize=256)(_TransformedFunctions)

@@ -1,4 +1,4 @@
-"""Langevin's equation with inertia: noise reaches the velocities only."""
+"""The Langevin equation with inertia, in which noise enters the velocities only."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,8 +14,11 @@ from .diffusion import Diffusion, halves, value_at
 
 
 class UnderdampedLangevinParams(NamedTuple):
-    """The parameters of `underdamped_langevin`, `params` of the model: `friction`, per unit of
-    time; `temperature`, in units of the potential; `potential`, what that receives.
+    """Parameters of `underdamped_langevin`, the `params` of the model.
+
+    - `friction`: per unit of time, shape ().
+    - `temperature`: in units of the potential, shape ().
+    - `potential`: the parameters that the potential receives, any pytree.
 
     **Example:**
 
@@ -33,18 +36,24 @@ class UnderdampedLangevinParams(NamedTuple):
 def underdamped_langevin(
     potential: Callable, friction: Numbers = 1.0, temperature: Numbers = 1.0, params: PyTree = None
 ) -> Diffusion:
-    """A particle of mass 1 in a potential U, in a bath that slows and shakes it (Langevin 1908;
-    Pavliotis 2014, chapter 6): the state is (Q, P), positions and velocities, shape (2n,),
+    """Return the model of a particle of mass 1 in a potential U and a heat bath (Langevin 1908;
+    Pavliotis 2014, chapter 6).
+
+    The state is (Q, P), positions and velocities, shape (2n,):
 
         dQ = P dt,    dP = (-∇U(Q) - γP) dt + √(2γτ) dW,    log ν = -(U(q) + ½|p|²) / τ + constant.
 
-    Noise reaches Q by way of P only: couplings do not apply, records with an `observation` do.
+    The model is hypoelliptic: noise enters P only. Couplings do not apply; use records with an
+    `observation`. `params` of the model is an `UnderdampedLangevinParams`.
 
-    **Arguments:** `potential`, U, `(q, params) -> ()` of positions, shape (n,); `friction`, γ ≥ 0,
-    and `temperature`, τ > 0, shape (); `params`, any pytree, is what the potential receives.
-    `params` of the model is an `UnderdampedLangevinParams`.
+    **Arguments:**
 
-    **Raises:** `TypeError` for a potential that is no function; `ValueError` for other shapes or
+    - `potential`: U, a function `(q, params) -> ()` of positions, shape (n,).
+    - `friction`: γ ≥ 0, shape ().
+    - `temperature`: τ > 0, shape ().
+    - `params`: any pytree; the potential receives it.
+
+    **Raises:** `TypeError` for a potential that is not a function. `ValueError` for other shapes or
     values.
 
     **Example:**
@@ -58,14 +67,15 @@ def underdamped_langevin(
     numbers = as_numbers({"friction": friction, "temperature": temperature})
     check_range("friction", numbers["friction"], nonnegative=True)
     check_range("temperature", numbers["temperature"], positive=True)
-    functions = _Functions(potential)
-    made = UnderdampedLangevinParams(**numbers, potential=params)
-    return Diffusion(functions.drift, _sigma, functions.log_stationary, made)
+    functions = _UnderdampedFunctions(potential)
+    model_params = UnderdampedLangevinParams(**numbers, potential=params)
+    return Diffusion(functions.drift, _sigma, functions.log_stationary, model_params)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Functions:
-    """Of one state and the parameters; equal for the same potential, so that they compile once."""
+class _UnderdampedFunctions:
+    """Functions of one state and the parameters. Equal potentials give equal objects, which compile
+    once."""
 
     potential: Callable
 
@@ -75,17 +85,22 @@ class _Functions:
 
     def log_stationary(self, x, p):
         q, v = _halves(x)
+        # Boltzmann's law: potential and kinetic energy, with mass 1.
         return -(self._energy(q, p) + v @ v / 2) / p.temperature
 
     def _energy(self, q, p):
+        """Return the potential U(q)."""
         return value_at("potential", self.potential, (), q, p.potential)
 
 
 def _sigma(x, p):
+    """Return σ, shape (2n, n): zero for the positions, √(2γτ) I for the velocities."""
     n = len(_halves(x)[0])
+    # Fluctuation and dissipation balance at this strength, so the law is stationary.
     noise = jnp.sqrt(2 * p.friction * p.temperature) * jnp.eye(n, dtype=x.dtype)
     return jnp.concatenate([jnp.zeros((n, n), x.dtype), noise])
 
 
 def _halves(x: Float[Array, " d"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    return halves(x, "positions and velocities, as many of the one as of the other")
+    """Return positions and velocities."""
+    return halves(x, "n positions and n velocities, an even number of coordinates")
