@@ -55,12 +55,15 @@ def run_associated(
     start_keys, path_keys, coupling_keys = split_each(keys, 3)
     lanes, axes = in_lanes(coupling, forward, like, coupling_keys, dt)
     law, scheme = lanes.coupling.start_law, lanes.coupling.scheme
+    # Without a sampler of ν the start is the end of a run, which begins at the end point b.
     start = draw_starts(law, model, scheme, start_keys, path[-1], dt, num_steps)
 
     @over_lanes(-1, -1, -1, -1, -1, axes)
     def step_associated(y, hit, z, z_next, noise, lane):
+        # The noise of Z, recovered from its step: only paths are stored, not their noise.
         dw = lane.scheme.noise(forward, z, z_next, lane.dt)
         pair = drive_back(forward, lane, y, z, z_next, dw, noise)
+        # A hit stays a hit. The path continues, because other lanes may need more steps.
         return pair.x_next, hit | have_met(forward, lane.coupling, pair, noise)
 
     def step(carry, inputs):

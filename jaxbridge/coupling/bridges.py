@@ -134,6 +134,7 @@ def sample_bridges(
     num_bridges = check_count("num_bridges", num_bridges)
     check_model(model, problem.intervals, coupling.scheme)
     model.check_reversal()
+    # Proposals use a uniform grid, so `save_at` refers to its fractions.
     problem = problem.keep(save_at, duration, uniform_fractions(num_steps))
     max_proposals = check_bound("max_proposals", max_proposals, max(1_000 * num_bridges, 100_000))
     if batch_size is None:
@@ -155,6 +156,7 @@ def _sample_bridges(
 ) -> Bridges:
     num_intervals, num_steps, stored = problem.num_intervals, problem.num_steps, problem.stored
     num_bridges = search.wanted
+    # One key for each interval. The number of an attempt gives the key of that attempt.
     keys = problem.keys(key, 1)[:, 0]
     inputs = Inputs(model.prepared(), coupling, problem.intervals)
     all_active = jnp.ones(num_intervals, bool)
@@ -163,7 +165,9 @@ def _sample_bridges(
         keys, without_derivatives(inputs), all_active, num_steps, stored, search
     )
     paths, reverse_start, rho = search_result.outputs
+    # ρ = N + 1 marks a row without a bridge.
     met = rho <= num_steps
+    # Rows are ordered by interval, with n rows for each.
     interval = jnp.repeat(jnp.arange(num_intervals), num_bridges)
     # An empty row has the number -1. It uses the number 0, and its path is masked below.
     accepted = (keys, interval, jnp.maximum(search_result.number, 0), stored, rho)
@@ -215,6 +219,7 @@ def _find_bridges(num_steps: int, problems: tuple, shared: tuple, search: Search
     inputs = Inputs(model, coupling, intervals)
     attempt = eqx.Partial(_attempt, inputs, keys, num_steps, stored)
     (num_problems, d), dtype = inputs.intervals.start.shape, inputs.intervals.start.dtype
+    # Initial rows mark missing bridges: NaN starts and ρ = N + 1.
     num_rows = num_problems * search.wanted
     num_stored = num_steps + 1 if stored is None else stored.shape[0]
     rows = Joined(
@@ -233,6 +238,7 @@ def _attempt(
     problem: Int[Array, " lanes"],
     number: Int[Array, " lanes"],
 ) -> Attempts:
+    # `propose` has lanes in the last axis, rejection sampling in the first.
     proposals = _propose_numbered(inputs, keys, problem, number, num_steps, stored)
     joined = Joined(
         jnp.moveaxis(proposals.paths, -1, 0), proposals.reverse_start.T, proposals.meeting_step

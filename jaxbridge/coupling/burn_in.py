@@ -89,6 +89,7 @@ def with_start_law(
     measured = with_burn_in(key, model, coupling, end, duration, num_steps)
     if not (needs_burn_in(coupling.start_law, model) and model.has_density):
         return measured
+    # Runs of the measured length supply the draws, once for all trials.
     law = _smoothed_law(key, model, measured, _replace_missing(end), duration, num_steps)
     return eqx.tree_at(lambda c: c.start_law, measured, law)
 
@@ -103,6 +104,7 @@ def _replace_missing(end: Float[Array, "P d"]) -> Float[Array, "P d"]:
 def _smoothed_law(key, model, coupling, end, duration, num_steps) -> SmoothedDraws:
     interval = jnp.arange(NUM_DRAWS) * len(end) // NUM_DRAWS
     # An infinite burn-in (none found) makes `draw_starts` take the longest run.
+    # Named keys keep these draws independent of the random numbers of the proposals.
     draw_key, fit_key = (key_for(f"smoothed draws{suffix}", key) for suffix in ("", ", fit"))
     keys = jax.random.split(draw_key, NUM_DRAWS)
     dt, law = duration[interval] / num_steps, coupling.start_law
@@ -199,6 +201,7 @@ def _measure_time(
     backward = model.prepared().backward(end[:, 0])
     dynamics = driven_through_root(reflection, backward, end[:, 0])
     pairs = in_lanes(reflection, dynamics, end[:, 0], jax.random.split(key, _NUM_PAIRS), dt)
+    # 2s must not exceed the bound on the steps of a run.
     max_doublings = max(0, (MOST_STEPS // 2 // num_steps).bit_length() - 1)
 
     def attempt(doublings):
@@ -206,9 +209,11 @@ def _measure_time(
         ahead_key, pair_key = jax.random.split(jax.random.fold_in(key, doublings))
         keys, repeats = jax.random.split(ahead_key, _NUM_PAIRS), 2**doublings
         repeats_of_lanes = jnp.full(_NUM_PAIRS, repeats)
+        # X' starts at the end of an independent run of length s.
         driven = run_for(dynamics, coupling.scheme, keys, end, dt, num_steps, repeats_of_lanes)
         x, driven, met = _run_pairs(pair_key, dynamics, pairs, end, driven, num_steps, repeats)
         exploded = ~met & ~jnp.all(is_finite(x) & is_finite(driven), axis=0)
+        # A few lost pairs are tolerable; many mean that the step size is too large.
         too_many = jnp.mean(exploded) > _MOST_EXPLODED
         return jnp.all(met | exploded) & ~too_many, too_many
 
@@ -248,12 +253,14 @@ def _run_pairs(
         dw = lane.root_dt * normal
         x_next = lane.scheme.step(dynamics, x, lane.dt, dw)
         pair = drive(dynamics, lane, x, x_next, dw, driven, noise)
+        # A pair that has met is one path from then on.
         met |= have_met(dynamics, lane.coupling, pair, noise)
         return x_next, jnp.where(met, x_next, pair.driven_next), met
 
     def draw(key, k):
         normal_key, uniform_key = jax.random.split(key)
         uniform = jax.random.uniform(uniform_key, (k,), x.dtype)
+        # Reflection has no independent noise dU.
         return jax.random.normal(normal_key, (k, len(x)), x.dtype), PairNoise(None, uniform)
 
     def run_once(repeat, pairs):

@@ -71,6 +71,7 @@ def effects(
             f"`at` must be one point, shape (d,); got shape {like.shape}. Pass any point of the "
             "state space."
         )
+    # Couplings need an invertible σ and a stationary law, so time-independent coefficients.
     invertible, depends_on_time = model.sigma_is_invertible(like), model.depends_on_time
     noise_by_drift = decisions.noise_by_drift(invertible)
     time = decisions.time(depends_on_time)
@@ -85,6 +86,7 @@ def effects(
         type(eqx.filter_eval_shape(dynamics.sigma, like))
         for dynamics in (forward, driven_through_root(coupling, forward, like))
     )
+    # `HeunOrEuler` becomes one of the two for this equation.
     scheme = scheme_for(coupling.scheme, forward)
     reverse_drift = model.reverse_drift_effect
     return Effects(
@@ -109,6 +111,7 @@ def _find_point(model: Diffusion) -> Float[Array, " d"]:
     for d in _DIMENSIONS:
         like = jnp.zeros(d)
         try:
+            # Tracing raises an error for a wrong dimension, at no numerical cost.
             jax.eval_shape(functools.partial(_coefficients, model), like)
         except (IndexError, TypeError, ValueError):  # a point of a wrong shape
             continue

@@ -86,6 +86,7 @@ class Coupling(AbstractCoupling):
         if callable(gamma):
             check_function("gamma", gamma, "(key)")
         check_function("rotation", rotation, "(sigma, driven_sigma)", optional=True)
+        # With a law γ is NaN until `realise` samples one for each lane.
         law, gamma = (gamma, jnp.nan) if callable(gamma) else (None, gamma)
         self.gamma = as_floating("gamma", gamma)
         self.meeting = BrownianCrossing() if meeting is None else meeting
@@ -102,7 +103,9 @@ class Coupling(AbstractCoupling):
                 )
         self.rotation = rotation
         self._gamma_law = law
+        # Arrays in the closure of the law become fields, so that JAX can trace them.
         self._captured = Captured(law)
+        # Static: the program omits dU only if γ = -1 is known at compile time.
         reflection = False
         if self.gamma.ndim != 0:
             raise ValueError(
@@ -152,6 +155,7 @@ class Coupling(AbstractCoupling):
     def _couple(self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None):
         """Return {I - (1-γ)Π} w + √(1-γ²) u ΔU. The map is symmetric, so it serves both
         directions."""
+        # Only the component along u changes.
         along_u = -(1 - self.gamma) * dot(frame.u, dw)
         if du is not None:
             # 1 - γ² as a product keeps its digits near γ = ±1.
@@ -193,5 +197,6 @@ def most_accurate(coupling: AbstractCoupling) -> AbstractCoupling:
         lambda c: (c.meeting, c.scheme),
         coupling,
         (BrownianCrossing(), HeunOrEuler()),
+        # Rules and schemes as leaves: they are replaced as a whole, not array by array.
         is_leaf=lambda leaf: isinstance(leaf, AbstractMeeting | AbstractScheme),
     )

@@ -85,6 +85,7 @@ class HittingCounts(AbstractResult):
         if there was no hit. It is then finite, and too small on average. It is NaN for a missing
         bridge.
         """
+        # Complete counts add up to `num_trials`, so both cases are one formula.
         hits = jnp.maximum(self._num_hits, 1).astype(self.start.dtype)
         mean = self.num_trials.astype(self.start.dtype) / hits
         return jnp.where(self.num_trials > 0, mean, jnp.nan)
@@ -120,11 +121,13 @@ class HittingCounts(AbstractResult):
         # One miss in all trials is the smallest share of misses that is visible.
         resolution = 1 / jnp.maximum(trials, 1).astype(probability.dtype)
         variance = probability**2 * jnp.maximum(1 - probability, resolution)
+        # N - 2 in place of N corrects for few hits.
         error = jnp.sqrt(variance / jnp.maximum(hits - 2, 1).astype(variance.dtype))
         return jnp.where(hits > 2, error, jnp.inf)
 
     @property
     def _num_hits(self) -> Int[Array, "*I n"]:
+        # Incomplete counts are -1.
         return jnp.sum(self.counts > 0, axis=-1, dtype=jnp.int32)
 
 
@@ -208,10 +211,12 @@ def count_hits_of_bridges(
     search: Search,
 ) -> tuple[HittingCounts, AbstractCoupling]:
     """Return counts for all bridges, and the coupling with its measured burn-in."""
+    # Counts are discrete: a derivative raises an error, because it would be zero.
     model, coupling, bridges = nondifferentiable((model.prepared(), coupling, bridges))
     shape, num_steps = bridges.met.shape, bridges.num_steps
     paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
     duration = bridge_durations(bridges)
+    # If the start law is ν and the model has no sampler, trials need runs of a measured length.
     coupling = with_burn_in(key, model, coupling, paths[:, -1], duration, num_steps)
     counts = count_hits(
         jax.random.split(key, len(paths)),
@@ -253,6 +258,7 @@ def _count_hits(problems: tuple, shared: tuple, search: Search) -> HittingCounts
         [jnp.full_like(trial_number[:, :1], -1), trial_number[:, :-1]], axis=1
     )
     last = jnp.maximum(hits.num_found - 1, 0)
+    # Each output row is the initial state of a trial that hit.
     starts = hits.outputs.reshape(*trial_number.shape, -1)
     is_cut = run_is_cut(coupling.start_law, model, duration / num_steps, num_steps)
     return HittingCounts(
@@ -290,6 +296,7 @@ def bridge_durations(bridges: BridgePaths) -> Float[Array, " P"]:
     """Return the durations of the P = I × n bridges, one for each bridge."""
     duration = bridges.times[..., -1]
     if bridges.times.ndim == 2:
+        # I durations, each shared by the n bridges of an interval.
         duration = duration[:, None]
     return jnp.broadcast_to(duration, bridges.met.shape).reshape(-1)
 

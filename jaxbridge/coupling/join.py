@@ -74,8 +74,10 @@ def propose(
     """
     model, coupling, (start, end, duration) = inputs
     like, dt = start[:, 0], duration / num_steps
+    # X, X' and a random γ have independent keys.
     reverse_keys, driven_keys, coupling_keys = split_each(keys, 3)
     backward = model.backward(like)
+    # Only the pair uses the triangular root. Any root of V gives the reversed path its law.
     forward = driven_through_root(coupling, model.forward(like), like)
     x_start, x_path = reverse_path(backward, coupling.scheme, reverse_keys, end, dt, num_steps)
     pairs = in_lanes(coupling, forward, like, coupling_keys, dt)
@@ -134,12 +136,14 @@ def _driven_path(
 
     @over_lanes(-1, -1, -1, -1, -1, None, axes)
     def step_joined(x, z, rho, x_next, noise, i, lane):
+        # The forward noise of X, recovered from its path: equation (Wrev).
         dw = lane.scheme.noise(forward, x, x_next, lane.dt)
         pair = drive(forward, lane, x, x_next, dw, z, noise)
         if not replayed:
             # The minimum over all steps with a meeting is the first one.
             met = have_met(forward, lane.coupling, pair, noise)
             rho = jnp.where(met, jnp.minimum(rho, i + 1), rho)
+        # After the meeting Z follows X.
         return jnp.where(i + 1 >= rho, x_next, pair.driven_next), rho
 
     def step(carry, inputs):
@@ -148,6 +152,7 @@ def _driven_path(
         z, rho = step_joined(x, z, rho, x_next, noise, i, lanes)
         return (x_next, z, rho), z
 
+    # N + 1 stands for no meeting.
     never = jnp.full(lanes.dt.shape, num_steps + 1, jnp.int32)
     (_, z_end, rho), z_path = noisy_scan(
         step,

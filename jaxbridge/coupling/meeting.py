@@ -112,7 +112,9 @@ class SignTest(AbstractMeeting):
             )
 
     def met(self, step, forward, uniform):
+        # The first gap is a norm, so the product is negative if and only if the next gap is.
         crossed = step.frame.gap * step.gap_next() < 0
+        # A gap of zero has no sign to change, but the pair has met.
         touching = step.frame.gap == 0
         if self.radius is not None:
             crossed &= safe_norm(step.x - step.driven) <= self.radius
@@ -138,6 +140,7 @@ class ReflectionPlane(AbstractMeeting):
     looks_ahead: ClassVar[bool] = False
 
     def met(self, step, forward, uniform):
+        # The move of X without its drift: the plane reflects the noise only.
         noise = step.along_u(step.x_next - step.x - forward.drift(step.x) * step.dt)
         return noise <= -step.frame.gap / 2
 
@@ -168,6 +171,7 @@ class BrownianCrossing(AbstractMeeting):
         gap_next = step.gap_next()
         moving = step.gap_variance > 0  # a gap without noise cannot close
         scale = jnp.where(moving, step.gap_variance * step.dt, 1)
+        # Gaps of opposite signs give a positive exponent: the crossing is certain.
         exponent = jnp.where(moving, -2 * step.frame.gap * gap_next / scale, -jnp.inf)
         # A gap that is already closed counts as a meeting, also at index 0.
         exponent = jnp.where(step.frame.gap > 0, exponent, 0)

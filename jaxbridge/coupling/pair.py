@@ -90,6 +90,7 @@ def relative_frame(
 
     `scheme` is the coupling's scheme, fitted to the step size.
     """
+    # The rule decides: the gap after the drift of the step, or the gap before it as in the paper.
     if coupling.meeting.looks_ahead:
         return scheme.frame(dynamics, x, driven, dt)
     return frame(dynamics.sigma(driven), x, driven)
@@ -106,6 +107,7 @@ def drive(
 ) -> PairStep:
     """Return the step in which X drives X'. X moves to `x_next` by the noise `dw`."""
     pair_frame, rotation, du = _geometry(dynamics, lane, x, driven, noise)
+    # O rotates the noise of X before the coupling, and Oᵀ after it in the other direction.
     driven_dw = lane.coupling.driven_noise(pair_frame, rotate(rotation, dw), du)
     driven_next = lane.scheme.step(dynamics, driven, lane.dt, driven_dw)
     return _pair_step(lane, pair_frame, x, x_next, driven, driven_next)
@@ -131,6 +133,7 @@ def have_met(
     dynamics: Dynamics, coupling: AbstractCoupling, step: PairStep, noise: PairNoise
 ) -> Bool[Array, ""]:
     """Return whether the pair met in this step by the coupling's rule, with finite states."""
+    # NaN compares as false, but an infinite state could pass as a meeting.
     met = coupling.meeting.met(step, dynamics, noise.uniform)
     return met & all_finite(step.x_next) & all_finite(step.driven_next)
 
@@ -138,6 +141,7 @@ def have_met(
 def _geometry(dynamics, lane, x, driven, noise):
     """Return the frame of the pair, its rotation (or `None`), and the increment dU (or `None`)."""
     pair_frame = relative_frame(lane.coupling, lane.scheme, dynamics, x, driven, lane.dt)
+    # Both directions call this function, so they share O and u.
     rotation = rotation_between(lane.coupling, dynamics.sigma(x), dynamics.sigma(driven))
     return pair_frame, rotation, None if noise.normal is None else lane.root_dt * noise.normal
 

@@ -76,6 +76,7 @@ def _as_matrices(sigma: Numbers, driven_sigma: Numbers) -> tuple[Array, Array]:
             "`sigma` and `driven_sigma` must both have shape (d, d); got shapes "
             f"{first.shape} and {second.shape}. Pass two square matrices of the same size."
         )
+    # The polar factor needs at least single precision.
     check_precision(
         "`sigma` and `driven_sigma`",
         min(first.dtype, second.dtype, key=lambda dtype: dtype.itemsize),
@@ -89,6 +90,7 @@ def rotation_between(
     """Return O(x, x'), or `None` if the type of σ needs no rotation."""
     if not rotation_effect(coupling, type(sigma)).simulated:
         return None
+    # Scalar and diagonal σ have no directions to align.
     assert isinstance(sigma, Full | Triangular) and isinstance(driven_sigma, Full | Triangular)
     rotation = polar_rotation if coupling.rotation is None else coupling.rotation
     matrix = evaluated("rotation", rotation, sigma.matrix, driven_sigma.matrix)
@@ -123,6 +125,7 @@ def driven_through_root(
     # Abstract evaluation gives the type of σ without any computation.
     if not root_effect(coupling, type(eqx.filter_eval_shape(dynamics.sigma, like))).simulated:
         return dynamics
+    # Only V = σσᵀ determines the law, so any root of V gives the same diffusion.
     return dynamics._replace(sigma=lambda x: dynamics.sigma(x).root())
 
 

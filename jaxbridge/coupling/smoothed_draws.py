@@ -65,6 +65,7 @@ class SmoothedDraws(eqx.Module):
         # E is the law of d coordinates of a uniform point on a sphere in d + 2α + 2 dimensions.
         normal = jax.random.normal(keys[2], (d + 2 * _POWER + 2,), dtype)
         inside = _radius(d) * normal[:d] / jnp.linalg.norm(normal)
+        # Both draws are computed; a uniform number selects one of them.
         elliptical = jax.random.uniform(keys[3], dtype=dtype) < self.share
         # The difference of two uniform numbers has the triangular density K.
         kernel = point + self.widths * (first - second)
@@ -80,6 +81,7 @@ class SmoothedDraws(eqx.Module):
         log_constant = gammaln(d / 2 + _POWER + 1) - gammaln(_POWER + 1) - d * math.log(_radius(d))
         log_constant -= d / 2 * math.log(math.pi) + jnp.sum(jnp.log(jnp.diagonal(self.root)))
         elliptical = _POWER * _log(base) + log_constant
+        # The density of the mixture, on the log scale.
         shares = _log(1 - self.share), _log(self.share)
         return jnp.logaddexp(shares[0] + kernels, shares[1] + elliptical)
 
@@ -103,6 +105,7 @@ def smoothed_draws(
 
     shares, scales = np.array(_CANDIDATES).T.astype(fit.mean.dtype)
     efficiency = lambda share, scale: _log_efficiency(key, law_of(share, scale), model)
+    # The same key for all candidates reduces the noise of their comparison.
     best = jnp.argmax(jax.vmap(efficiency)(jnp.asarray(shares), jnp.asarray(scales)))
     return law_of(jnp.asarray(shares)[best], jnp.asarray(scales)[best])
 
@@ -111,6 +114,7 @@ def _log_efficiency(key: Key[Array, ""], law: SmoothedDraws, model: Diffusion) -
     """Estimate the log of (∫ μ)² / ∫ μ²/ν, where both integrals are over the set ν > 0."""
     x = jax.vmap(lambda key: law.sample(key, model))(jax.random.split(key, NUM_DRAWS))
     log_ratio = jax.vmap(law.log_density)(x) - jax.vmap(lambda x: model.log_stationary(x))(x)
+    # Both integrals are over the set ν > 0, where the weight μ/ν is finite.
     inside = jnp.isfinite(log_ratio)
 
     def log_sum(values):
@@ -129,6 +133,7 @@ def _fit(points: Float[Array, "M d"]) -> SmoothedDraws:
     # A lower bound on the spread: without it equal points would have no density.
     spread = jnp.maximum(spread, 1e-3 * jnp.max(spread) + 1e-6 * (1 + jnp.max(jnp.abs(points))))
     white = (points - mean) / spread
+    # The small multiple of I keeps the factorisation stable.
     correlation = white.T @ white / num + 1e-4 * jnp.eye(d, dtype=points.dtype)
     root = spread[:, None] * any_cholesky(correlation)
     widths = spread * num ** (-1 / (d + 4)) / math.sqrt(_VARIANCE)

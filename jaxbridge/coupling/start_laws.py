@@ -175,6 +175,7 @@ def as_start_law(law: Any) -> AnyStartLaw:
             "`start_law` must be `Stationary()`, `GaussianLaw(mean, covariance)`, `Reversed()`, or "
             f"an object with `sample(key, model)` and `log_density(x)`; got {law!r}."
         )
+    # `GaussianLaw` accepts degenerate laws, which have no density.
     if isinstance(law, GaussianLaw) and not is_traced(law):
         matrix = np.asarray(law.covariance, float)
         if not (np.all(np.isfinite(law.mean)) and np.linalg.eigvalsh(matrix).min() > 0):
@@ -215,6 +216,7 @@ def run_is_cut(
     """
     if not isinstance(law, Stationary) or law.burn_in is None or model.has_sampler:
         return jnp.zeros(dt.shape, bool)
+    # Runs consist of whole repeats of `num_steps` steps.
     longest = (MOST_STEPS // num_steps) * num_steps * dt
     return ~(law.burn_in.astype(dt.dtype) <= longest * (1 + 1e-4))  # allow for rounding
 
@@ -230,6 +232,7 @@ def draw_starts(
 ) -> Float[Array, "d lanes"]:
     """Sample one start from the law in each lane."""
     if isinstance(law, Stationary) and not model.has_sampler:
+        # `with_burn_in` has set it before any program starts.
         assert law.burn_in is not None
         repeats = jnp.ceil(law.burn_in.astype(dt.dtype) / (num_steps * dt))
         repeats = jnp.minimum(repeats, MOST_STEPS // num_steps).astype(jnp.int32)

@@ -114,6 +114,7 @@ def sample_exact_bridges(
         run = functools.partial(run_crank_nicolson, beta=check_step_size(step_size))
     elif method == "renewal":
         proposal, run = as_pairs(proposal), run_renewal
+        # Silently ignored arguments would mislead, so they are refused.
         if not (num_counts is None and max_trials is None):
             raise ValueError(
                 "`num_counts` and `max_trials` are for the pseudo-marginal chain; got "
@@ -122,8 +123,10 @@ def sample_exact_bridges(
             )
     else:
         run = run_pseudo_marginal
+    # Checks of arguments come first, so that errors come before any pilot run.
     first = check_position(position, problem)
     problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
+    # The pilot run of "auto" selects a concrete proposal here.
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     chain = run(key, model, proposal, problem, num_bridges, first, progress_meter)
     return throw_where_untrustworthy(chain, "paths", model) if throw else chain

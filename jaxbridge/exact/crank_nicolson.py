@@ -160,16 +160,19 @@ def _move(
     noise_keys, accept_keys = split_each(keys, 2)
     dtype = state.noise.dtype
     beta = beta.astype(dtype)
+    # N - 1 steps have noise: the last one ends in b.
     fresh = _sample_noise(noise_keys, state.noise.shape[1] + 1, intervals)
     # 1 - β² as a product keeps its digits near β = 1.
     noise = jnp.sqrt((1 - beta) * (1 + beta)) * state.noise + beta * fresh
     paths, log_weights, log_halving = path_of(proposal, dynamics, intervals, noise)
     candidate = CrankNicolsonState(paths, noise, _non_finite_to_neg_inf(log_weights), log_halving)
+    # The move leaves N(0, I) invariant, so the rate contains the weights only.
     rate = acceptance_rate(state.log_weight, candidate.log_weight)
     uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=dtype))(accept_keys)
     accepted = uniform < rate
 
     def select(new, old):
+        # Add axes so that one decision for each chain broadcasts over its arrays.
         return jnp.where(accepted.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     info = CrankNicolsonInfo(rate, accepted, candidate.log_weight)
@@ -202,9 +205,12 @@ def run_crank_nicolson(
         return state, (stored, info)
 
     _, outputs = metered_scan(step, first, step_keys.T, progress_meter)
+    # The scan puts steps first; results have intervals first.
     states, info = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), outputs)
     met = states.log_weight > -jnp.inf
+    # The first path counts as a simulated path too.
     log_weights_of_proposals = jnp.concatenate([first.log_weight[:, None], info.log_weight], axis=1)
+    # A state of weight zero, for instance a first path outside the state space, is missing.
     paths = jnp.where(met[..., None, None], states.position, jnp.nan)
     return Chain(
         times=problem.times(proposal.fractions(num_steps)),

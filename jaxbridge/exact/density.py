@@ -176,6 +176,7 @@ def transition_log_density(
     budget = Budget(num_counts, None, max_trials)
     proposal = as_proposal(proposal, model, problem.like, budget, for_density=True)
     proposal.check(model, problem.intervals)
+    # A density needs the constant of ν, bridges do not.
     proposal.check_for_density(model)
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     estimate = estimate_log_density(key, model, proposal, problem, num_proposals, progress_meter)
@@ -210,12 +211,15 @@ def estimate_log_density(
         progress_meter=progress_meter,
     )
     log_mean, error, size = log_mean_and_error(weighted_paths.log_weights)
+    # One truncated weight biases the whole mean, so the standard error becomes infinite.
     is_truncated = jnp.any(weighted_paths.truncated, axis=1)
     share = proposal.share_in_regime(model, intervals, num_steps)
     step_error = error_of_log_mean(
         weighted_paths.log_weights, weighted_paths.log_halving, share, held
     )
-    if proposal.by_coupling is None:  # weights of coupled pairs are no sums over steps
+    # Log weights of guided proposals are sums over steps, whose rounding errors add up. Weights of
+    # couplings are counts.
+    if proposal.by_coupling is None:
         step_error = with_rounding(step_error, num_steps, problem.like.shape[0])
     value, error, size, k_hat, step_error, share = problem.result(
         (
@@ -223,6 +227,7 @@ def estimate_log_density(
             jnp.where(is_truncated, jnp.inf, error),
             size,
             pareto_k(weighted_paths.log_weights),
+            # An error estimate is a diagnostic: it has no derivative.
             lax.stop_gradient(step_error),
             share,
         )
@@ -255,6 +260,7 @@ def log_mean_and_error(
     n = log_weights.shape[1]
     # Weights relative to the largest one, so that sums of squares keep their digits.
     largest = lax.stop_gradient(jnp.max(log_weights, axis=1, keepdims=True))
+    # If all weights are zero, -inf - (-inf) would be NaN.
     largest = jnp.where(largest > -jnp.inf, largest, 0)
     log_sum = logsumexp(log_weights - largest, axis=1)
     log_squares = logsumexp(2 * (log_weights - largest), axis=1)
@@ -265,6 +271,7 @@ def log_mean_and_error(
     log_mean = jnp.where(is_positive, log_sum - math.log(n), 0)
     deviation = jnp.expm1(log_weights - largest - log_mean[:, None])
     variance = jnp.sum(deviation**2, axis=1) / n / max(n - 1, 1)
+    # One weight does not determine a variance.
     error = jnp.sqrt(variance) if n > 1 else jnp.full_like(variance, jnp.inf)
     size = jnp.where(is_positive, 1 / jnp.where(is_positive, inverse_size, 1), 0)
     return log_sum + largest[:, 0] - math.log(n), jnp.where(is_positive, error, jnp.inf), size

@@ -87,6 +87,7 @@ class AbstractExactBridges(AbstractResult):
         """
 
         def of_entry(error, standard_error):
+            # A value that is the same for all bridges, such as an end point, has no error at all.
             return dominates(error, standard_error) & (standard_error > 0)
 
         errors = self._step_errors(fn)
@@ -101,6 +102,7 @@ class AbstractExactBridges(AbstractResult):
         """
         weights, axis = normalised(self.log_mean_weights), self.met.ndim - 1
         paths, error = filled(self.paths, self.met), self._step_errors(lambda path: path)
+        # The weighted variance of each coordinate at each time gives the unit.
         deviation = paths - jnp.expand_dims(weighted_mean(weights, paths), axis)
         variance = weighted_mean(weights, deviation**2)
         return StepError(*(root_mean_square_in_sds(value, variance) for value in error))

@@ -77,9 +77,11 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
     duration = lax.stop_gradient(bridges.times)[..., -1:]
     steps = jnp.asarray(fractions, duration.dtype) * duration
     like = paths.reshape(-1, paths.shape[-1])[0]
+    # Bridges of the Euler scheme need its own path density; others take the most accurate one.
     targets = [single.target for single in bridges.proposal.singles]
     form = forms_of_targets(targets, model, like)[0]
     log_f = log_likelihood_of_steps(model, steps, paths, form)
+    # Relative to the largest weight, the exponentials cannot overflow.
     largest = jnp.max(log_weights, axis=-1, keepdims=True)
     # The ratio f_θ'/f_θ is one in value; only its derivatives matter.
     ratios = jnp.exp(log_weights - largest + log_f - lax.stop_gradient(log_f))

@@ -107,6 +107,7 @@ class ExtrapolatedBridges(AbstractResult):
         return Verdict((*self.fine._weight_faults, *self.coarse._weight_faults))
 
     def _combined(self, fn, fine, coarse, combine):
+        # Extrapolation needs the order p only, so it also works where `step_share` is infinite.
         share = share_of_known_order(self.fine.step_share)
 
         def of_entry(fine_entry, coarse_entry):
@@ -178,6 +179,7 @@ def _check_pair(fine: Any, coarse: Any) -> None:
             f"`coarse` must have half as many steps as `fine`; got {fine.num_steps} "
             f"(`fine`) and {coarse.num_steps} (`coarse`)."
         )
+    # The structure includes the types and static settings of a proposal, not its numbers.
     structures = [jax.tree.structure(estimate.proposal) for estimate in (fine, coarse)]
     if structures[0] != structures[1] or len(fine.proposal.singles) > 1:
         raise ValueError(
@@ -196,6 +198,7 @@ def _log_density(fine: TransitionLogDensity, coarse: TransitionLogDensity):
         is_finite, jnp.exp(coarse.value - jnp.where(is_finite, fine.value, 0)), jnp.inf
     )
     combined = _richardson(share, 1.0, ratio)
+    # The safe value 1 keeps derivatives and logs finite where the combination is not positive.
     positive = is_finite & (combined > 0)
     safe = jnp.where(positive, combined, 1)
     # The log of an estimate that is zero has an infinite error, but the estimate itself has none.
@@ -217,4 +220,5 @@ def _richardson(share, fine, coarse):
 
 def _richardson_error(share, fine, coarse):
     """Return the standard error of the combination of two independent estimates."""
+    # The combination is (1 + share) · fine - share · coarse.
     return jnp.hypot((1 + share) * fine, share * coarse)

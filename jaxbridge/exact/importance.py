@@ -130,6 +130,7 @@ class WeightedBridges(AbstractExactBridges):
 
         def error(value):
             mean, entry_weights = weighted_mean(weights, value), expanded(weights, value)
+            # The delta method for a ratio of means: Σ w² (h - mean)², with Σ w = 1.
             deviation = value - jnp.expand_dims(mean, axis)
             # A value without weight may be infinite: 0 · ∞ would be NaN.
             squares = jnp.where(entry_weights > 0, (entry_weights * deviation) ** 2, 0)
@@ -184,6 +185,7 @@ class WeightedBridges(AbstractExactBridges):
         check_key(key)
 
         def one_interval(key, weights, paths):
+            # Systematic resampling uses one random shift for all points.
             shift = jax.random.uniform(key, dtype=weights.dtype)
             points = (jnp.arange(num_bridges, dtype=weights.dtype) + shift) / num_bridges
             cumulative = jnp.cumsum(weights)
@@ -249,6 +251,7 @@ def weigh_bridges(
     coupling = coupling_of_bridges(bridges, start_law)
     search = search_for_hits(bridges, num_counts, max_trials, batch_size, progress_meter)
     check_density(coupling.start_law, model)
+    # Any row serves: only its dimension and dtype matter.
     like = bridges.reverse_start.reshape(-1, bridges.paths.shape[-1])[0]
     pairs = as_proposal(coupling, model, like, Budget(search.wanted, None, max_trials))
     weighted = _weigh_bridges(key_for("weights", key), model, pairs, bridges, search)
@@ -272,10 +275,12 @@ def _weigh_bridges(key, model, pairs, bridges, search):
         bridges.reverse_start.reshape(-1, d),
         counts.mean.reshape(-1),
     ).reshape(shape)
+    # A weight that is NaN becomes zero, and the bridge is marked as truncated.
     log_weights, unusable = usable(log_weights, bridges.met)
     intervals = Intervals(paths[:, 0], ends, durations)
     log_halving = pairs.log_halving(model, intervals, paths, shape[-1]).reshape(shape)
     share = pairs.share_in_regime(model, intervals, bridges.num_steps)
+    # The share is the same for all bridges of an interval.
     share = share.reshape(shape)[..., 0]
     num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)
     num_nonfinite = jnp.sum(counts.num_nonfinite, axis=-1, dtype=jnp.int32)
@@ -287,6 +292,7 @@ def _weigh_bridges(key, model, pairs, bridges, search):
         truncated=counts.truncated | unusable,
         num_simulated=bridges.num_proposals + num_trials,
         num_nonfinite=bridges.num_nonfinite + num_nonfinite,
+        # The result contains the start law of its weights, with the measured burn-in.
         proposal=eqx.tree_at(lambda p: p.coupling, pairs, coupling),
         log_halving=log_halving,
         step_share=share,

@@ -129,6 +129,7 @@ class Chain(AbstractExactBridges):
         is_truncated = self.num_truncated > 0
         if self.truncated is not None:
             is_truncated = jnp.any(self.truncated, axis=-1)
+        # A chain has no effective sample size of weights, so only k̂ decides.
         heavy = () if self.pareto_k is None else (heavy_tails(self.pareto_k, math.inf),)
         # The number of moves bounds the effective sample size from above.
         error = 1 / jnp.sqrt(jnp.maximum(moves, 1).astype(self.paths.dtype))
@@ -152,12 +153,14 @@ class Chain(AbstractExactBridges):
         """
         weights, axis = normalised(self.log_mean_weights), self.met.ndim - 1
         size = effective_sample_size
+        # With several intervals the chains are independent: one sample size for each.
         for _ in range(axis):
             size = jax.vmap(size)
 
         def error(value):
             deviation = value - jnp.expand_dims(weighted_mean(weights, value), axis)
             has_path = expanded(self.met, value)
+            # States without a path carry no information, so they reduce the sample size.
             share = jnp.mean(has_path, axis=axis, dtype=value.dtype)
             sample_size = size(jnp.where(has_path, deviation, 0)) * share
             return jnp.sqrt(weighted_mean(weights, deviation**2) / sample_size)
@@ -173,6 +176,7 @@ def acceptance_rate(
     It is zero for a missing candidate, and one for a missing state with a candidate that is not
     missing.
     """
+    # Both weights may be zero: -inf - (-inf) would be NaN.
     ratio = jnp.where(candidate > -jnp.inf, candidate - log_weight, -jnp.inf)
     return jnp.exp(jnp.minimum(ratio, 0))
 
@@ -181,6 +185,7 @@ def chain_keys(
     key: Key[Array, ""], problem: BridgeProblem, num_bridges: int
 ) -> tuple[Key[Array, "I n"], Key[Array, " I"]]:
     """Return the keys of the steps, and of the first state, of the chain of each interval."""
+    # A single interval uses the key itself, so that a kernel with the same keys gives this chain.
     keys = problem.keys(key, 1)[:, 0] if problem.batched else key[None]
     run_keys, init_keys = split_each(keys, 2)
     return jax.vmap(lambda key: jax.random.split(key, num_bridges))(run_keys), init_keys
@@ -226,6 +231,7 @@ def check_position(
     paths = path.reshape(shape)
     if not is_traced(paths, intervals):
         ends = np.stack([intervals.start, intervals.end], axis=1)
+        # The tolerance allows for paths in single precision.
         values = np.asarray(paths)
         if not (np.all(np.isfinite(values)) and np.allclose(values[:, [0, -1]], ends, atol=1e-3)):
             raise ValueError(

@@ -129,6 +129,7 @@ def _first_state(weighted_paths: WeightedPaths) -> PseudoMarginalState:
 
 @compiled_sooner
 def _pseudo_marginal_step(rng_key, state, *setting):
+    # The same split as in `run_pseudo_marginal`, so both give the same chain.
     draw_key, accept_key = jax.random.split(rng_key)
     candidate, num_simulated = _propose_state(draw_key, *setting)
     uniform = jax.random.uniform(accept_key, dtype=candidate.position.dtype)
@@ -164,11 +165,13 @@ def run_pseudo_marginal(
     )
     if first is not None:
         first_state = proposal.reweigh(init_keys, model, intervals, first)
+        # `reweigh` returns whole paths, candidates only have the stored times.
         first_state = first_state._replace(paths=problem.kept(first_state.paths))
         candidates = jax.tree.map(
             lambda *rows: jnp.concatenate(rows, axis=1), first_state, candidates
         )
     uniform = jax.vmap(lambda k: jax.random.uniform(k, dtype=intervals.start.dtype))(accept_keys)
+    # The chain selects rows; paths are gathered once, after the scan.
     row, accepted = accept_reject(candidates.log_weights, uniform.reshape(step_keys.shape))
     interval = jnp.arange(problem.num_intervals)[:, None]
     states = problem.result(jax.tree.map(lambda leaf: leaf[interval, row], candidates))
@@ -203,6 +206,8 @@ def accept_reject(
     def step(state, inputs):
         row, log_weight = state
         i, candidate, uniform = inputs
+        # A candidate keeps its random weight for as long as it is the state: this makes the chain
+        # exact.
         accepted = uniform < acceptance_rate(log_weight, candidate)
         state = jnp.where(accepted, i, row), jnp.where(accepted, candidate, log_weight)
         return state, (state[0], accepted)

@@ -126,8 +126,8 @@ def _renewal_step(rng_key, state, model, pairs, intervals):
     return RenewalState(paths[0]), jax.tree.map(lambda leaf: leaf[0], info)
 
 
-# The renewal chain runs in segments side by side. Each has at least this length, and all of them fit
-# into the lanes.
+# The renewal chain runs in segments side by side. Each has at least this length, and they all
+# fit into the lanes.
 _SHORTEST_SEGMENT = 64
 # Few segments must run again: this many at a time.
 _REPAIR_WIDTH = 128
@@ -173,6 +173,7 @@ class _Runner(NamedTuple):
     @property
     def head(self) -> Bool[Array, " S"]:
         """Return which segments are the first of their interval."""
+        # Segments of an interval lie side by side, in the order of time.
         num_segments = len(self.keys) // self.problem.num_intervals
         return jnp.arange(len(self.keys)) % num_segments == 0
 
@@ -236,16 +237,19 @@ class _Runner(NamedTuple):
         state = (jnp.int32(0), self._starts(segments)[index], chosen < num, segments)
         state = metered_while_loop(is_unfinished, one_step, state, progress, progress_meter)
         _, positions, changed, segments = state
+        # A run that rejoined leaves the recorded end as it is: the end is the same.
         ends = segments.ends.at[jnp.where(changed, chosen, num)].set(positions, mode="drop")
         stale = segments.stale.at[chosen].set(False, mode="drop")
         # A run that did not rejoin has another end, and the next segment must run again.
         after = jnp.where(changed, chosen + 1, num)
+        # The first segment of an interval starts from the given path, so it is never stale again.
         stale = stale.at[after].set(True, mode="drop") & ~self.head
         return segments._replace(ends=ends, stale=stale)
 
     def repair(self, segments: _Segments) -> _Segments:
         """Run the first stale segments again, at most `_REPAIR_WIDTH` of them."""
         num = len(self.keys)
+        # `jnp.nonzero` needs a static size; the fill value is an index out of range.
         chosen = jnp.nonzero(segments.stale, size=min(_REPAIR_WIDTH, num), fill_value=num)[0]
         return self.run(segments, chosen)
 
@@ -294,6 +298,7 @@ def run_renewal(
     max_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
     num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, max_segments))
     length = -(-num_bridges // num_segments)
+    # Surplus steps repeat the last key.
     steps = jnp.minimum(jnp.arange(num_segments * length), num_bridges - 1)
     keys = step_keys[:, steps].reshape(num_intervals * num_segments, length)
     segment_intervals = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_segments, axis=0), intervals)
@@ -310,8 +315,8 @@ def run_renewal(
         return problem.result(leaf[:, :num_bridges])
 
     paths = of_steps(segments.paths)
-    # Whole paths exist only at the ends of segments, so `log_halving` (D) is NaN elsewhere. The last
-    # segment may be too long; its end is then no state of the chain.
+    # Whole paths exist only at the ends of segments, so `log_halving` (D) is NaN elsewhere. The
+    # last segment may be too long; its end is then no state of the chain.
     is_segment_end = (steps == jnp.arange(len(steps))) & (
         jnp.arange(len(steps)) % length == length - 1
     )
@@ -356,7 +361,9 @@ def renew(
     trial_keys, propose_keys, accept_keys = split_each(keys, 3)
     dt = intervals.duration / num_steps
     lanes = jnp.moveaxis(paths, 0, -1)
+    # Only a hit requires a proposal, which costs much more than a trial.
     associated = run_associated(model, pairs.coupling, trial_keys, lanes, dt)
+    # A chain without a path takes any proposal.
     missing = ~jnp.all(jnp.isfinite(paths), axis=(1, 2))
     needs_path = active & (associated.hit | missing)
     proposed = propose_paths(propose_keys, model, pairs, intervals, needs_path, num_steps)
@@ -391,6 +398,7 @@ def propose_paths(
 
     Otherwise few intervals are expected to be active, so the default number of lanes is smaller.
     """
+    # Few chains need a path in the same step: a quarter of them sets the number of lanes.
     num_wanted = len(keys) if active is None else len(keys) // 4
     active = jnp.ones(len(keys), bool) if active is None else active
     num_lanes = default_num_lanes(num_wanted, num_steps, intervals.start)
