@@ -174,15 +174,15 @@ def _sample_bridges(
     paths = _with_replayed_tangents(inputs, accepted, paths, num_steps)
     paths = jnp.where(met[:, None, None], paths, jnp.nan)
 
-    def of_rows(rows):
+    def by_interval(rows):
         return problem.result(rows.reshape(num_intervals, num_bridges, *rows.shape[1:]))
 
     return Bridges(
         problem.times(uniform_fractions(num_steps)),
-        of_rows(paths),
-        of_rows(met),
-        of_rows(jnp.where(met, rho, -1)),
-        of_rows(reverse_start),
+        by_interval(paths),
+        by_interval(met),
+        by_interval(jnp.where(met, rho, -1)),
+        by_interval(reverse_start),
         problem.result(search_result.num_trials),
         problem.result(search_result.num_nonfinite),
         coupling,
@@ -206,9 +206,9 @@ def find_bridges(
     stored: Int[Array, " K"] | None,
     search: Search,
 ) -> Accepted:
-    """Propose until each active problem, one of P intervals with a key, has its bridges.
+    """Propose bridges for P problems until each active one has as many as `search` wants.
 
-    The outputs of the result are `Joined`.
+    A problem is an interval with a key. The outputs of the result are `Joined`.
     """
     problems, shared = (keys, inputs.intervals, active), (inputs.model, inputs.coupling, stored)
     return over_problems(functools.partial(_find_bridges, num_steps), problems, shared, search)

@@ -135,9 +135,8 @@ def measure_burn_in(
         out.
     - It may be 2e-3 if the drift fades far out, as for heavy-tailed stationary laws. Then use a
         multiple of this time.
-    - It is unknown if the diffusion stays in one well for very many of its relaxation times,
-        because only wells that are left within the run are found. Then choose a longer time
-        yourself.
+    - It is unknown if the diffusion stays in one well for very many of its relaxation times: no
+        finite run shows this. Then choose a longer time yourself.
 
     **Arguments:** as in `sample_bridges`. Of `coupling` only the scheme and the rotation matter.
 

@@ -103,7 +103,7 @@ class Coupling(AbstractCoupling):
                 )
         self.rotation = rotation
         self._gamma_law = law
-        # Arrays in the closure of the law become fields, so that JAX can trace them.
+        # Traced values in the closure of the law become leaves of the coupling.
         self._captured = Captured(law)
         # Static: the program omits dU only if γ = -1 is known at compile time.
         reflection = False

@@ -90,7 +90,7 @@ def rotation_between(
     """Return O(x, x'), or `None` if the type of σ needs no rotation."""
     if not rotation_effect(coupling, type(sigma)).simulated:
         return None
-    # Scalar and diagonal σ have no directions to align.
+    # `rotation_effect` excludes all other types of σ: their directions do not vary.
     assert isinstance(sigma, Full | Triangular) and isinstance(driven_sigma, Full | Triangular)
     rotation = polar_rotation if coupling.rotation is None else coupling.rotation
     matrix = evaluated("rotation", rotation, sigma.matrix, driven_sigma.matrix)

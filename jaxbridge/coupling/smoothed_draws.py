@@ -99,15 +99,15 @@ def smoothed_draws(
     finite = jnp.all(is_finite(draws), axis=1, keepdims=True)
     fit = _fit(jnp.where(finite, draws, otherwise))
 
-    def law_of(share, scale):
+    def candidate_law(share, scale):
         smoother = eqx.tree_at(lambda law: law.widths, fit, scale * fit.widths)
         return eqx.tree_at(lambda law: law.share, smoother, share)
 
     shares, scales = np.array(_CANDIDATES).T.astype(fit.mean.dtype)
-    efficiency = lambda share, scale: _log_efficiency(key, law_of(share, scale), model)
+    efficiency = lambda share, scale: _log_efficiency(key, candidate_law(share, scale), model)
     # The same key for all candidates reduces the noise of their comparison.
     best = jnp.argmax(jax.vmap(efficiency)(jnp.asarray(shares), jnp.asarray(scales)))
-    return law_of(jnp.asarray(shares)[best], jnp.asarray(scales)[best])
+    return candidate_law(jnp.asarray(shares)[best], jnp.asarray(scales)[best])
 
 
 def _log_efficiency(key: Key[Array, ""], law: SmoothedDraws, model: Diffusion) -> Float[Array, ""]:

@@ -82,8 +82,7 @@ class TransitionLogDensity(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, "*I"]:
-        """Return whether the discretisation error exceeds the standard error, or is too uncertain
-        to tell.
+        """Return whether the discretisation error, or its uncertainty, exceeds the standard error.
 
         Then more steps help, and more proposals do not.
         """

@@ -52,7 +52,7 @@ class AbstractExactBridges(AbstractResult):
     @property
     @abstractmethod
     def log_mean_weights(self) -> Float[Array, "*I n"]:
-        """Return the log weights for means, -inf for a missing bridge."""
+        """Return the log weights that `mean` uses, shape (n,); -inf for a missing bridge."""
 
     @abstractmethod
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
@@ -82,16 +82,16 @@ class AbstractExactBridges(AbstractResult):
     def step_error_dominates(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return whether the discretisation error of `mean(fn)` exceeds its standard error.
 
-        It is also true if the error is too uncertain to tell. Then more steps help, and more
+        It is also true if the uncertainty of the error is large. Then more steps help, and more
         bridges do not. It is false for a value that is the same for all bridges.
         """
 
-        def of_entry(error, standard_error):
+        def dominates_entry(error, standard_error):
             # A value that is the same for all bridges, such as an end point, has no error at all.
             return dominates(error, standard_error) & (standard_error > 0)
 
         errors = self._step_errors(fn)
-        return jax.tree.map(of_entry, errors, self.standard_error(fn), is_leaf=_is_error)
+        return jax.tree.map(dominates_entry, errors, self.standard_error(fn), is_leaf=_is_error)
 
     def step_error_in_sds(self) -> StepError:
         """Return the discretisation error of the mean path, relative to the spread of the paths,

@@ -110,7 +110,7 @@ class ExtrapolatedBridges(AbstractResult):
         # Extrapolation needs the order p only, so it also works where `step_share` is infinite.
         share = share_of_known_order(self.fine.step_share)
 
-        def of_entry(fine_entry, coarse_entry):
+        def combine_entries(fine_entry, coarse_entry):
             if fine_entry.shape != coarse_entry.shape:
                 raise ValueError(
                     "`fn` must return the same shapes for paths of both grids; got "
@@ -121,7 +121,7 @@ class ExtrapolatedBridges(AbstractResult):
             factor = share.reshape(*share.shape, *[1] * (fine_entry.ndim - share.ndim))
             return combine(factor, fine_entry, coarse_entry)
 
-        return jax.tree.map(of_entry, fine, coarse)
+        return jax.tree.map(combine_entries, fine, coarse)
 
 
 @overload

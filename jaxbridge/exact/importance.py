@@ -379,17 +379,17 @@ def _sample_weighted(
         False,
         progress_meter=progress_meter,
     )
-    of_interval = problem.result(weighted_paths)
+    results = problem.result(weighted_paths)
     return WeightedBridges(
         times=problem.times(proposal.fractions(num_steps)),
-        paths=of_interval.paths,
-        log_weights=of_interval.log_weights,
-        met=of_interval.found,
-        truncated=of_interval.truncated,
+        paths=results.paths,
+        log_weights=results.log_weights,
+        met=results.found,
+        truncated=results.truncated,
         num_simulated=problem.total(weighted_paths.num_simulated),
         num_nonfinite=problem.total(weighted_paths.num_nonfinite),
         proposal=proposal,
-        log_halving=of_interval.log_halving,
+        log_halving=results.log_halving,
         step_share=problem.result(proposal.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )

@@ -152,7 +152,7 @@ class _Segments(NamedTuple):
     num_nonfinite: Int[Array, " S"]
 
 
-class _Runner(NamedTuple):
+class _SegmentRunner(NamedTuple):
     """Data of the segments of all chains, and methods that run them.
 
     All segments have the same length, and all intervals the same number of segments. The last steps
@@ -302,7 +302,7 @@ def run_renewal(
     steps = jnp.minimum(jnp.arange(num_segments * length), num_bridges - 1)
     keys = step_keys[:, steps].reshape(num_intervals * num_segments, length)
     segment_intervals = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_segments, axis=0), intervals)
-    runner = _Runner(model, pairs, problem, initial_paths, keys, segment_intervals)
+    runner = _SegmentRunner(model, pairs, problem, initial_paths, keys, segment_intervals)
     segments = runner.begin()
     if len(keys) > _REPAIR_WIDTH or progress_meter is not None:
         segments = runner.run(segments, jnp.arange(len(keys)), progress_meter)
@@ -310,11 +310,11 @@ def run_renewal(
     # stale segment starts from a final state, so each pass makes at least that segment final.
     segments = lax.while_loop(lambda s: jnp.any(s.stale), runner.repair, segments)
 
-    def of_steps(leaf):
+    def join_segments(leaf):
         leaf = jnp.moveaxis(leaf, 0, 1).reshape(num_intervals, -1, *leaf.shape[2:])
         return problem.result(leaf[:, :num_bridges])
 
-    paths = of_steps(segments.paths)
+    paths = join_segments(segments.paths)
     # Whole paths exist only at the ends of segments, so `log_halving` (D) is NaN elsewhere. The
     # last segment may be too long; its end is then no state of the chain.
     is_segment_end = (steps == jnp.arange(len(steps))) & (
@@ -330,7 +330,7 @@ def run_renewal(
     return Chain(
         times=problem.times(pairs.fractions(num_steps)),
         paths=paths,
-        accepted=of_steps(segments.is_new),
+        accepted=join_segments(segments.is_new),
         log_weights=None,
         met=jnp.all(jnp.isfinite(paths), axis=(-2, -1)),
         truncated=None,
