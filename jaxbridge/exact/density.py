@@ -82,7 +82,7 @@ class TransitionLogDensity(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, "*I"]:
-        """Return whether the discretisation error, or its uncertainty, exceeds the standard error.
+        """Return whether the discretisation error is, or may be, larger than the standard error.
 
         Then more steps help, and more proposals do not.
         """

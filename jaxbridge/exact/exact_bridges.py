@@ -80,10 +80,10 @@ class AbstractExactBridges(AbstractResult):
         return jax.tree.map(lambda error: error.uncertainty, errors, is_leaf=_is_error)
 
     def step_error_dominates(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """Return whether the discretisation error of `mean(fn)` exceeds its standard error.
+        """Return whether the discretisation error of `mean(fn)` is, or may be, larger than its
+        standard error.
 
-        It is also true if the uncertainty of the error is large. Then more steps help, and more
-        bridges do not. It is false for a value that is the same for all bridges.
+        Then more steps help, and more bridges do not. It is false for a value that is the same for all bridges.
         """
 
         def dominates_entry(error, standard_error):

@@ -50,9 +50,9 @@ class ExtrapolatedLogDensity(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, "*I"]:
-        """Return whether the remaining discretisation error exceeds the standard error.
+        """Return whether a bound on the remaining discretisation error exceeds three standard errors.
 
-        Half of `removed` serves as its bound. Two grids do not determine the error of the next
+        The bound is half of `removed`. Two grids do not determine the error of the next
         order; a third grid does.
         """
         return dominates(self._remaining_error, self.standard_error)
