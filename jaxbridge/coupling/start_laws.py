@@ -168,7 +168,7 @@ def as_start_law(law: Any) -> AnyStartLaw:
     """
     if isinstance(law, type):
         raise TypeError(
-            f"`start_law` must be an object; got the class itself. Pass `{law.__name__}(...)`."
+            f"`start_law` must be an object, not a class; got {law!r}. Pass `{law.__name__}(...)`."
         )
     if not isinstance(law, Stationary | Reversed | StartLaw):
         raise TypeError(

@@ -50,10 +50,10 @@ class ExtrapolatedLogDensity(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, "*I"]:
-        """Return whether a bound on the remaining discretisation error exceeds three standard errors.
+        """Return whether half of `removed`, a bound on the remaining error, exceeds three standard
+        errors.
 
-        The bound is half of `removed`. Two grids do not determine the error of the next
-        order; a third grid does.
+        Two grids do not determine the error of the next order; a third grid does.
         """
         return dominates(self._remaining_error, self.standard_error)
 
