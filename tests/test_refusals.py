@@ -328,7 +328,7 @@ COUPLING = [
     ("counts of a number", of(jb.hitting_counts)(KEY, HYPERBOLIC, 3.0), "`bridges`", TypeError),
     ("counts", counts(jb.GaussianLaw([0.0], [[1.0]])), r"must give points of shape \(2,\)"),
     ("effects of a number", of(jb.effects)(3.0), "`model`", TypeError),
-    ("dimension", of(jb.effects)(FLAT), "pass a point"),
+    ("dimension", of(jb.effects)(FLAT), "Pass a point"),
     ("points", of(jb.effects)(HYPERBOLIC, at=np.zeros((2, 2))), r"shape \(d,\)"),
     ("coupling", of(jb.effects)(HYPERBOLIC, 0.5), "`coupling` must be", TypeError),
     ("no reversal", of(jb.effects)(FREE), "time reversal"),
@@ -448,7 +448,7 @@ EXACT = [
     ("paths", weigh(lambda: approximate().paths), "`bridges` must come from", TypeError),
     ("thinned", weigh(lambda: approximate(save_at=(0.5, 1.0))), "without `save_at`"),
     ("start law", weigh(approximate, start_law=lambda k: k), "`start_law` must be", TypeError),
-    ("class", weigh(approximate, start_law=jb.Stationary), "write `Stationary", TypeError),
+    ("class", weigh(approximate, start_law=jb.Stationary), "Pass `Stationary", TypeError),
     ("no counts", weigh(approximate, num_counts=0), "at least 1"),
     ("another law", weigh(approximate, BLIND, start_law=LAW), "paid for"),
     *each("derivative", lambda d: traced(d(middle), X), [jax.jacfwd, jax.jacrev], *STOP),
@@ -484,7 +484,7 @@ EXACT = [
     ("NumPy's", of(weighted_mean)(lambda path: np.exp(path)), "`fn` cannot be traced", TypeError),
     # Two grids.
     ("coarse first", extrapolate(density, fine), "half as many steps"),
-    ("density and paths", extrapolate(density, weighted), "must both be what", TypeError),
+    ("density and paths", extrapolate(density, weighted), "must both be results", TypeError),
     ("two proposals", extrapolate(fine, by_another), "the same single proposal"),
     ("whole paths", lambda: extrapolate(fine_paths, weighted)().mean(), "save_at"),
     # Diagnostics.

@@ -1,20 +1,33 @@
-"""Bridges from a to b by coupling: two diffusions that meet are one from then on.
+"""Couplings of two copies of a diffusion, and the approximate bridges built from them.
 
-A coupling drives X' by the noise of X, and X by that of X' (`base`; `gamma`),
+A coupling drives a second copy X' of the diffusion by the noise of the first copy X, or X by the
+noise of X' (`base`, `gamma`):
 
-    dW' = {I - (1-γ)Π} O dW + √(1-γ²) u dU,    Π = uuᵀ,
+    dW' = {I - (1-γ)Π} O dW + √(1-γ²) u dU,    Π = uuᵀ.
 
-with u along σ(x')⁻¹(x - x') and O a `rotation` that aligns σ(x) and σ(x'), which by default the
-triangular root of V = σσᵀ makes unnecessary, until a rule says that they have met (`meeting`): one
-step of a `pair`. With X run back from b and X' from a, joined where they meet, Z = X' before and X
-after is a proposed bridge (`join`), and those that met are kept (`bridges`). They have the density
-f_br(z) π(z) / π, π(z) the probability that the diffusion associated with z (`associated`)
-hits z; it starts from ν or another law (`start_laws`), for a ν without sampler from draws of it
-(`smoothed_draws`), taken when the past is forgotten (`burn_in`). How many it takes to hit is
-counted (`hitting`). `effects` is a table of what such a program simulates, and why.
+Here u points along σ(x')⁻¹(x - x'), and the rotation O aligns σ(x) with σ(x') (`rotation`). By
+default the triangular root of V = σσᵀ drives the pair, and no rotation is needed.
+
+A bridge from a to b is proposed in four steps:
+
+- Simulate X backwards in time from b, and X' forwards from a; `pair` makes one step of both.
+- Decide in each step whether the two meet (`meeting`).
+- Join the paths: Z is X' before the meeting and X after it (`join`).
+- Reject the proposals whose pair does not meet (`bridges`).
+
+The accepted paths have the density f_br(z) π(z) / π. In it f_br is the density of the exact bridge,
+π(z) the probability that the diffusion associated with z hits z (`associated`), and π the
+normaliser. Four modules serve the estimation of π(z):
+
+- `hitting` counts the associated diffusions up to a hit.
+- `start_laws` holds the laws of their initial state: the stationary density ν, or another law.
+- `burn_in` measures the time after which a run has the law ν, for a ν without sampler.
+- `smoothed_draws` builds a start law with a density from draws of ν.
+
+`effects` returns a table of the effects that such a program simulates, with reasons.
 """
 
-# What the folders above use of this one.
+# Names for the packages that build on this one.
 from .associated import run_associated as run_associated
 from .base import AbstractCoupling as AbstractCoupling
 from .bridges import (
@@ -29,18 +42,18 @@ from .burn_in import (
 )
 from .gamma import (
     Coupling as Coupling,
-    described as described,
+    describe_coupling as describe_coupling,
     ingredients as ingredients,
     most_accurate as most_accurate,
 )
 from .hitting import (
     HittingCounts as HittingCounts,
+    bridge_durations as bridge_durations,
     check_max_trials as check_max_trials,
     count_hits as count_hits,
-    counts_of as counts_of,
-    coupling_of as coupling_of,
+    count_hits_of_bridges as count_hits_of_bridges,
+    coupling_of_bridges as coupling_of_bridges,
     default_lanes as default_lanes,
-    durations_of as durations_of,
     hitting_counts as hitting_counts,
     search_for_hits as search_for_hits,
 )

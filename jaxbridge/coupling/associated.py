@@ -1,12 +1,12 @@
-"""The diffusion associated with a bridge: does it hit? (sections 2.2 and 2.3)
+"""The diffusion associated with a bridge, and whether it hits the bridge (sections 2.2 and 2.3).
 
-Given a bridge Z, its associated diffusion Y is driven by the noise of Z through the same
-coupling read in the other direction, equation (stjerne-dif),
+The noise of a given bridge Z drives its associated diffusion Y. The coupling is the same, read in
+the other direction: Z takes the place of X' in equation (stjerne-dif),
 
-    dY = α(Y) dt + σ(Y) Oᵀ [{I - (1-γ)Π} dW̃ + √(1-γ²) u dU'],    Z in the place of X',
+    dY = α(Y) dt + σ(Y) Oᵀ [{I - (1-γ)Π} dW̃ + √(1-γ²) u dU'].
 
-where W̃ drives Z, and u, Π and O are those of the pair (Y, Z). It hits Z where the two would
-have met as a proposed pair: index 0 counts, and the rule is the coupling's own.
+Here W̃ is the noise of Z, and u, Π and O are those of the pair (Y, Z). Y hits Z where the two would
+have met as a proposed pair: the same meeting rule decides, and index 0 counts.
 """
 
 from typing import NamedTuple
@@ -26,10 +26,11 @@ from .start_laws import draw_starts
 
 
 class Associated(NamedTuple):
-    """One path of the associated diffusion in each lane.
+    """Result of one associated diffusion in each lane.
 
-    `hit` says whether it hit the bridge, `start` is where it started, and `finite` is false
-    where it left the finite numbers before it hit.
+    - `hit`: whether it hit the bridge.
+    - `start`: its initial state.
+    - `finite`: false where it became non-finite before a hit.
     """
 
     hit: Bool[Array, " lanes"]
@@ -44,19 +45,25 @@ def run_associated(
     path: Float[Array, "points d lanes"],
     dt: Float[Array, " lanes"],
 ) -> Associated:
-    """One path associated with the bridge in each lane, whose random numbers depend on the
-    lane's key alone. Simulation ends when all lanes have hit."""
+    """Simulate one associated diffusion for the bridge in each lane.
+
+    The random numbers of a lane depend on the key of that lane only. The simulation ends early once
+    all lanes have hit.
+    """
     num_steps, like = len(path) - 1, path[0, :, 0]
     forward = driven_through_root(coupling, model.forward(like), like)
     start_keys, path_keys, coupling_keys = split_each(keys, 3)
     lanes, axes = in_lanes(coupling, forward, like, coupling_keys, dt)
     law, scheme = lanes.coupling.start_law, lanes.coupling.scheme
+    # Without a sampler of ν the start is the end of a run, which begins at the end point b.
     start = draw_starts(law, model, scheme, start_keys, path[-1], dt, num_steps)
 
     @over_lanes(-1, -1, -1, -1, -1, axes)
     def step_associated(y, hit, z, z_next, noise, lane):
+        # The noise of Z, recovered from its step: only paths are stored, not their noise.
         dw = lane.scheme.noise(forward, z, z_next, lane.dt)
         pair = drive_back(forward, lane, y, z, z_next, dw, noise)
+        # A hit stays a hit. The path continues, because other lanes may need more steps.
         return pair.x_next, hit | have_met(forward, lane.coupling, pair, noise)
 
     def step(carry, inputs):
@@ -72,5 +79,6 @@ def run_associated(
         (path[:-1], path[1:]),
         num_steps,
     )
+    # A non-finite path stays so, hence the last state shows it. After a hit the path is irrelevant.
     finite = jnp.all(is_finite(y_end), axis=0) | hit
     return Associated(hit, start, finite)

@@ -1,9 +1,11 @@
-"""Couplings: how the noise of one copy of the diffusion is made from that of the other.
+"""The interface of couplings: maps between the noises of two copies of a diffusion.
 
-The direction u of the gap, u ∝ σ(x')⁻¹(x - x'), is built with σ(x') whichever copy drives the
-other, x' being the state of X', and in discrete time from the gap when the noise of the step sets
-in (`meeting`, `pair`). The rotation O(x, x') belongs to the pair, not to the coupling's geometry
-(`rotation`): a coupling sees the noise of X after O has turned it, so one O serves both directions.
+The direction u of the gap is proportional to σ(x')⁻¹(x - x'), where x' is the state of X'. It uses
+σ(x') in both directions, whichever copy drives the other. In discrete time the gap is taken at the
+moment when the noise of the step begins to act (`meeting`, `pair`).
+
+The rotation O(x, x') belongs to the pair (`rotation`), not to the coupling. A coupling receives the
+noise of X after its rotation by O, so one O serves both directions.
 """
 
 from abc import abstractmethod
@@ -20,16 +22,22 @@ Rotation = Callable[[Float[Array, "d d"], Float[Array, "d d"]], Float[Array, "d 
 
 
 class AbstractCoupling(eqx.Module):
-    """A coupling is two maps of noise increments, and how the pair is stepped and joined.
+    """Base class of couplings: two maps of noise increments, and rules for steps and meetings.
 
-    Both maps act on one point: `dw`, shape (d,), is the noise of X, already turned by O;
-    `driven_dw` that of X'; `du` an independent N(0, δ) increment, or `None` where
-    `independent_noise` is false, in which case none is drawn. Each map must turn N(0, δ I)
-    noise into N(0, δ I) noise, and the two must be the two conditional laws of one joint law.
+    Both maps act on one point:
 
-    Fields are arrays, or static: bridges carry their coupling with them out of `jit`.
+    - `dw`, shape (d,), is the noise of X after its rotation by O.
+    - `driven_dw`, shape (d,), is the noise of X'.
+    - `du`, shape (), is an independent N(0, δ) increment. It is `None` if `independent_noise` is
+        false, and then none is sampled.
 
-    Write another coupling by subclassing. Synchronous up to a distance, then reflection:
+    Each map must turn N(0, δ I) noise into N(0, δ I) noise. The two maps must be the two
+    conditional laws of one joint law.
+
+    Fields must be arrays or static, because results that leave `jit` contain their coupling.
+
+    Subclass this class for another coupling. The example is synchronous while the gap is large, and
+    reflects the noise when the gap is small:
 
     ```python
     import equinox as eqx
@@ -69,25 +77,30 @@ class AbstractCoupling(eqx.Module):
     def driven_noise(
         self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None
     ) -> Float[Array, " d"]:
-        """ΔW' of the driven X', from ΔW."""
+        """Return ΔW', the noise of the driven X', for the noise ΔW of X."""
 
     @abstractmethod
     def driving_noise(
         self, frame: Frame, driven_dw: Float[Array, " d"], du: Float[Array, ""] | None
     ) -> Float[Array, " d"]:
-        """ΔW of X, from ΔW': the same joint law read in the other direction."""
+        """Return ΔW, the noise of X, for ΔW', in the same joint law as `driven_noise`."""
 
     @abstractmethod
     def gap_variance(self, frame: Frame) -> Float[Array, ""]:
-        """The variance per unit of time of `uᵀ(dW - dW')`."""
+        """Return the variance of `uᵀ(dW - dW')` per unit of time."""
 
     @abstractmethod
     def realise(self, keys: Key[Array, " lanes"]) -> "AbstractCoupling":
-        """The coupling of each of many proposals: arrays drawn at random get a trailing axis
-        of lanes. A coupling without randomness of its own returns itself."""
+        """Return the coupling of each lane: random arrays get a trailing axis of lanes.
+
+        A coupling without random parameters returns itself.
+        """
 
 
 def check_coupling(coupling) -> None:
-    """Raise `TypeError` for anything but a coupling."""
+    """Raise `TypeError` if `coupling` is not an `AbstractCoupling`."""
     if not isinstance(coupling, AbstractCoupling):
-        raise TypeError(f"`coupling` must be a `Coupling`; got {coupling!r}.")
+        raise TypeError(
+            f"`coupling` must be a `Coupling`; got {coupling!r}. Pass `Coupling(gamma)`, or an "
+            "instance of a subclass of `AbstractCoupling`."
+        )

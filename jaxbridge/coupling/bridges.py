@@ -1,7 +1,7 @@
-"""Approximate bridges by rejection (section 2.2): propose until the pair meets.
+"""Approximate bridges by rejection sampling (section 2.2): propose until the pair meets.
 
-The proposals of an interval are numbered attempts (`rejection`), and its j-th success is the
-interval's j-th bridge.
+The proposals of an interval are numbered attempts (`rejection`). Its j-th success is its j-th
+bridge.
 """
 
 import functools
@@ -34,20 +34,21 @@ from .join import Inputs, Proposals, propose
 
 
 class Bridges(AbstractResult):
-    """What `sample_bridges` returns. With I intervals arrays have a leading axis I; `times` has
-    it only where there are I durations.
+    """Result of `sample_bridges`: approximate bridges.
+
+    With I intervals arrays have a leading axis I. `times` has it only if there are I durations.
 
     - `times`: the K stored times, shape (K,), from 0 to the duration.
-    - `paths`: the bridges, shape (n, K, d). A bridge that was not found is NaN throughout.
+    - `paths`: the bridges, shape (n, K, d). A missing bridge is NaN at all times.
     - `met`: whether the bridge was found, shape (n,).
-    - `meeting_step`: ρ, the first step at which the path follows the reversed path, between 1
-        and N; -1 where no bridge was found. Shape (n,).
-    - `reverse_start`: the reversed path at time 0, shape (n, d); NaN where no bridge was found.
-    - `num_proposals`: proposals made until the last bridge was found, or until the bound.
-        The number of those `met` over it estimates the acceptance probability.
-    - `num_nonfinite`: how many of them left the finite numbers, or came further out than 1e18, and
-        were rejected for it.
-    - `coupling`, `num_steps`: those they were made with.
+    - `meeting_step`: ρ, the first step at which the path follows the reversed path, between 1 and
+        N; -1 for a missing bridge. Shape (n,).
+    - `reverse_start`: the reversed path at time 0, shape (n, d); NaN for a missing bridge.
+    - `num_proposals`: number of proposals up to the last bridge, or up to the bound. The number of
+        `met` divided by it estimates the acceptance probability.
+    - `num_nonfinite`: number of these proposals that became non-finite (NaN, infinite or beyond
+        1e18). They are rejected.
+    - `coupling`, `num_steps`: the coupling and the number N of steps of the proposals.
     """
 
     times: Float[Array, "*durations K"]
@@ -62,7 +63,7 @@ class Bridges(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the only fault of approximate bridges: some were not found."""
+        """Return the only possible fault of approximate bridges: missing bridges."""
         return Verdict((missing_bridges(jnp.any(~self.met, axis=-1)),))
 
 
@@ -83,43 +84,41 @@ def sample_bridges(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
 ) -> Bridges:
-    """Independent approximate (start, end, duration)-bridges: section 2.2 of the paper.
+    """Sample independent approximate (start, end, duration)-bridges: section 2.2 of the paper.
 
-    Their law is that of the diffusion bridge conditioned on being hit by its associated
-    diffusion (Theorem 1), close to the bridge's own law for end points that are likely, and
-    closer the longer the duration. The step size adds its own error.
+    The law is that of the diffusion bridge, conditioned on a hit by its associated diffusion
+    (Theorem 1). It is close to the exact law for likely end points, and closer for longer
+    durations. The step size adds a discretisation error.
 
     **Arguments:**
 
     - `key`: a typed key, `jax.random.key(...)`.
-    - `model`: the diffusion; its time reversal must be known.
-    - `start`, `end`: points, shape (d,), or (I, d) for I intervals at once. The widest
-        floating point type of these and the duration is that of the paths.
+    - `model`: the diffusion. Its time reversal must be known.
+    - `start`, `end`: points, shape (d,), or shape (I, d) for I intervals. The paths have the widest
+        floating point type of `start`, `end` and `duration`.
     - `duration`: the length of the interval, in units of time, shape () or (I,).
-    - `num_bridges`: n, how many bridges of each interval.
-    - `num_steps`: N, so δ = duration / N. Compile time does not grow with it.
+    - `num_bridges`: n, the number of bridges of each interval.
+    - `num_steps`: N, the number of steps, so δ = duration / N. Compile time does not grow with it.
     - `coupling`: by default `Coupling(gamma=0.0)`.
-    - `max_proposals`: bounds the proposals of each interval; by default 1,000 for each bridge
-        and at least 100,000.
-    - `save_at`: times in [0, duration] on the grid, increasing, shape (K,), at which paths are
-        kept; with several durations, fractions of them. By default the whole grid.
-    - `batch_size`: proposals simulated side by side; bounds memory, and changes results by
-        rounding only. By default no more than are useful, and as many as fit in 16 MiB, or 256
-        if these fit in 512 MiB; on an accelerator in 1 GiB.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where a bridge was not found, or parameters are not
-        finite.
+    - `max_proposals`: bound on the proposals of each interval. The default is 1,000 for each
+        bridge, and at least 100,000.
+    - `save_at`: the stored times, shape (K,): increasing grid points in [0, duration]. With several
+        durations these are fractions of the duration. By default the whole grid is stored.
+    - `batch_size`: number of proposals that run side by side. It bounds memory, and changes results
+        by rounding only. The default is the number of useful proposals, as far as they fit in 16
+        MiB (at least 256 if these fit in 512 MiB); on an accelerator in 1 GiB.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time if a bridge is missing or a parameter is not finite.
 
     **Returns:** `Bridges`.
 
-    **Gradients** of the paths with respect to `params`, `start`, `end` and `duration`, forward
-    and reverse, are those at fixed noise and fixed meeting step: accepted paths are replayed
-    from their keys, all side by side, only when a derivative is asked for. They are *not*
-    derivatives of expectations over bridges, for whether a pair meets depends on the parameters
-    too.
+    **Gradients** of the paths with respect to `params`, `start`, `end` and `duration` exist in
+    forward and reverse mode, at fixed noise and fixed meeting step. Accepted paths are then
+    replayed from their keys, all side by side, only if a derivative is requested. They are *not*
+    derivatives of expectations over bridges, because the parameters also decide whether a pair
+    meets.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit, as far as their
-    values are visible before tracing.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments. Traced values are not checked.
 
     **Example:**
 
@@ -135,6 +134,7 @@ def sample_bridges(
     num_bridges = check_count("num_bridges", num_bridges)
     check_model(model, problem.intervals, coupling.scheme)
     model.check_reversal()
+    # Proposals use a uniform grid, so `save_at` refers to its fractions.
     problem = problem.keep(save_at, duration, uniform_fractions(num_steps))
     max_proposals = check_bound("max_proposals", max_proposals, max(1_000 * num_bridges, 100_000))
     if batch_size is None:
@@ -156,35 +156,42 @@ def _sample_bridges(
 ) -> Bridges:
     num_intervals, num_steps, stored = problem.num_intervals, problem.num_steps, problem.stored
     num_bridges = search.wanted
+    # One key for each interval. The number of an attempt gives the key of that attempt.
     keys = problem.keys(key, 1)[:, 0]
     inputs = Inputs(model.prepared(), coupling, problem.intervals)
-    everything = jnp.ones(num_intervals, bool)
-    found = find_bridges(keys, without_derivatives(inputs), everything, num_steps, stored, search)
-    paths, reverse_start, rho = found.outputs
+    all_active = jnp.ones(num_intervals, bool)
+    # The replay below supplies the derivatives, so none pass through the search.
+    search_result = find_bridges(
+        keys, without_derivatives(inputs), all_active, num_steps, stored, search
+    )
+    paths, reverse_start, rho = search_result.outputs
+    # ρ = N + 1 marks a row without a bridge.
     met = rho <= num_steps
+    # Rows are ordered by interval, with n rows for each.
     interval = jnp.repeat(jnp.arange(num_intervals), num_bridges)
-    accepted = (keys, interval, jnp.maximum(found.number, 0), stored, rho)
+    # An empty row has the number -1. It uses the number 0, and its path is masked below.
+    accepted = (keys, interval, jnp.maximum(search_result.number, 0), stored, rho)
     paths = _with_replayed_tangents(inputs, accepted, paths, num_steps)
     paths = jnp.where(met[:, None, None], paths, jnp.nan)
 
-    def of_rows(rows):
+    def by_interval(rows):
         return problem.result(rows.reshape(num_intervals, num_bridges, *rows.shape[1:]))
 
     return Bridges(
         problem.times(uniform_fractions(num_steps)),
-        of_rows(paths),
-        of_rows(met),
-        of_rows(jnp.where(met, rho, -1)),
-        of_rows(reverse_start),
-        problem.result(found.num_trials),
-        problem.result(found.num_nonfinite),
+        by_interval(paths),
+        by_interval(met),
+        by_interval(jnp.where(met, rho, -1)),
+        by_interval(reverse_start),
+        problem.result(search_result.num_trials),
+        problem.result(search_result.num_nonfinite),
         coupling,
         num_steps,
     )
 
 
 class Joined(NamedTuple):
-    """Accepted proposals: the path, X_0 and ρ of each row, N + 1 for a row not filled."""
+    """Accepted proposals, one in each row: path, X_0 and ρ; ρ = N + 1 marks an empty row."""
 
     paths: Float[Array, "rows K d"]
     reverse_start: Float[Array, "rows d"]
@@ -199,17 +206,20 @@ def find_bridges(
     stored: Int[Array, " K"] | None,
     search: Search,
 ) -> Accepted:
-    """Propose for each of P active problems, one interval and one key each, until it has its
-    bridges. The outputs are `Joined`."""
-    each, shared = (keys, inputs.intervals, active), (inputs.model, inputs.coupling, stored)
-    return over_problems(functools.partial(_find_bridges, num_steps), each, shared, search)
+    """Propose bridges for P problems until each active one has as many as `search` wants.
+
+    A problem is an interval with a key. The outputs of the result are `Joined`.
+    """
+    problems, shared = (keys, inputs.intervals, active), (inputs.model, inputs.coupling, stored)
+    return over_problems(functools.partial(_find_bridges, num_steps), problems, shared, search)
 
 
-def _find_bridges(num_steps: int, each: tuple, shared: tuple, search: Search) -> Accepted:
-    (keys, intervals, active), (model, coupling, stored) = each, shared
+def _find_bridges(num_steps: int, problems: tuple, shared: tuple, search: Search) -> Accepted:
+    (keys, intervals, active), (model, coupling, stored) = problems, shared
     inputs = Inputs(model, coupling, intervals)
     attempt = eqx.Partial(_attempt, inputs, keys, num_steps, stored)
     (num_problems, d), dtype = inputs.intervals.start.shape, inputs.intervals.start.dtype
+    # Initial rows mark missing bridges: NaN starts and ρ = N + 1.
     num_rows = num_problems * search.wanted
     num_stored = num_steps + 1 if stored is None else stored.shape[0]
     rows = Joined(
@@ -228,9 +238,12 @@ def _attempt(
     problem: Int[Array, " lanes"],
     number: Int[Array, " lanes"],
 ) -> Attempts:
-    made = _propose_numbered(inputs, keys, problem, number, num_steps, stored)
-    joined = Joined(jnp.moveaxis(made.paths, -1, 0), made.reverse_start.T, made.meeting_step)
-    return Attempts(made.meeting_step <= num_steps, made.finite, joined)
+    # `propose` has lanes in the last axis, rejection sampling in the first.
+    proposals = _propose_numbered(inputs, keys, problem, number, num_steps, stored)
+    joined = Joined(
+        jnp.moveaxis(proposals.paths, -1, 0), proposals.reverse_start.T, proposals.meeting_step
+    )
+    return Attempts(proposals.meeting_step <= num_steps, proposals.finite, joined)
 
 
 def _propose_numbered(
@@ -243,8 +256,11 @@ def _propose_numbered(
     meeting_step: Int[Array, " lanes"] | None = None,
     time_scale: Float[Array, " lanes"] | float = 1.0,
 ) -> Proposals:
-    """The proposals with these numbers, of these intervals: a function of nothing else, where none
-    is replayed with its `meeting_step`."""
+    """Return the proposals with these numbers, of these intervals.
+
+    The result depends on nothing else, unless `meeting_step` asks for a replay. `time_scale`
+    multiplies the durations.
+    """
     start, end, duration = inputs.intervals
     lanes = Intervals(start[interval].T, end[interval].T, duration[interval] * time_scale)
     lane_keys = numbered_keys(keys, interval, number)
@@ -253,9 +269,10 @@ def _propose_numbered(
 
 @eqx.filter_custom_jvp
 def _with_replayed_tangents(inputs, accepted, paths, num_steps):
-    """`paths`, whose tangents come from a replay of the accepted proposals.
+    """Return `paths`, with tangents from a replay of the accepted proposals.
 
-    Rejection is a `while_loop`, which has no reverse mode, and most of its work was rejected.
+    Rejection sampling is a `while_loop`, which has no reverse mode. A replay also skips the
+    rejected proposals, which are most of the work.
     """
     return paths
 
@@ -265,11 +282,11 @@ def _replay_tangents(primals, tangents):
     inputs, (keys, interval, number, stored, rho), paths, num_steps = primals
 
     def replay(inputs):
-        # A row without a bridge replays a proposal of no duration, which cannot overflow: its
-        # tangent is masked by the caller, and in reverse mode 0 · ∞ would be NaN.
-        brief = jnp.where(rho <= num_steps, 1, 1e-12).astype(paths.dtype)
-        again = eqx.Partial(_replayed_paths, inputs, keys, num_steps, stored)
-        return over_devices(again, (0, 0, 0, 0))(interval, number, rho, brief)
+        # An empty row replays a proposal of nearly zero duration, which stays finite. The caller
+        # masks its tangent, but in reverse mode a masked infinity is 0 · ∞ = NaN.
+        time_scale = jnp.where(rho <= num_steps, 1, 1e-12).astype(paths.dtype)
+        replay_in_lanes = eqx.Partial(_replayed_paths, inputs, keys, num_steps, stored)
+        return over_devices(replay_in_lanes, (0, 0, 0, 0))(interval, number, rho, time_scale)
 
     return paths, eqx.filter_jvp(replay, (inputs,), (tangents[0],))[1]
 
@@ -284,5 +301,7 @@ def _replayed_paths(
     rho: Int[Array, " rows"],
     time_scale: Float[Array, " rows"],
 ) -> Float[Array, "rows K d"]:
-    made = _propose_numbered(inputs, keys, interval, number, num_steps, stored, rho, time_scale)
-    return jnp.moveaxis(made.paths, -1, 0)
+    proposals = _propose_numbered(
+        inputs, keys, interval, number, num_steps, stored, rho, time_scale
+    )
+    return jnp.moveaxis(proposals.paths, -1, 0)

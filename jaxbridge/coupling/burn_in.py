@@ -1,20 +1,26 @@
-"""How long until the reversed diffusion has forgotten where it started?
+"""Measurement of the burn-in: the time after which the reversed diffusion is nearly stationary.
 
-For models without a sampler of their stationary law. Two copies of the reversed diffusion,
-coupled by reflection, start from b and from where another run from b has come in a time s. By
-the coupling inequality the total variation distance between their laws after t is at most
-P(τ > t), τ the time when they meet. s is doubled until all of 512 pairs meet within s, that
-is, until what s can spread s can join again; pairs at distance √s do not all meet within s
-before that, however small s is. Twice that s is the burn-in.
+Models without a sampler of their stationary law need it. The method couples two copies of the
+reversed diffusion by reflection. One copy starts from b, the other from the end of another run of
+length s from b. Let τ be the time when they meet. By the coupling inequality, the total variation
+distance between the laws of the copies at time t is at most P(τ > t).
 
-That all of 512 pairs have met says that P(τ > s) is about 1/512 or less, and no more. Where
-meeting times have exponential tails, as for a drift that pulls back in proportion to the distance
-or with a force that does not vanish far out, P(τ > 2s) is of the order of its square, and so
-the distance left is about 512⁻² ≈ 4·10⁻⁶. Where the drift fades far out, as for heavy-tailed
-stationary laws, they have polynomial tails, and to double s gains a factor only: 2·10⁻³ has been
-measured. And a diffusion with wells that it leaves only after very many relaxation times can
-deceive this, as any look at a finite run. In both cases give `Stationary(burn_in=...)` a longer
-time, or choose a start law with a density.
+The method doubles s until all of 512 pairs meet within s. Then a distance that a run of length s
+can open is also closed within s. A very small s does not pass, because pairs at distance √s do not
+all meet within s. The burn-in is 2s.
+
+The result has these limits:
+
+- 512 meetings show only that P(τ > s) is about 1/512 or less.
+- Meeting times have exponential tails if the drift pulls back in proportion to the distance, or
+    with a force that does not vanish far out. Then P(τ > 2s) is of the order of P(τ > s)². The
+    remaining distance is about 512⁻² ≈ 4·10⁻⁶.
+- Meeting times have polynomial tails if the drift fades far out, as for heavy-tailed stationary
+    laws. Then a doubling of s gains a constant factor only; 2·10⁻³ has been measured.
+- A diffusion may stay in one well for very many relaxation times. No finite run shows this.
+
+In the last two cases pass a longer time to `Stationary(burn_in=...)`, or choose a start law with a
+density.
 """
 
 import equinox as eqx
@@ -44,7 +50,7 @@ from .smoothed_draws import NUM_DRAWS, SmoothedDraws, smoothed_draws
 from .start_laws import MOST_STEPS, Stationary, draw_starts, needs_burn_in, run_for
 
 _NUM_PAIRS = 512
-# Pairs that explode are left out, as they are from bridges; but not if so many do.
+# Non-finite pairs are ignored, as in bridges, unless their share is larger than this.
 _MOST_EXPLODED = 0.5
 
 
@@ -56,12 +62,14 @@ def with_burn_in(
     duration: Float[Array, " P"],
     num_steps: int,
 ) -> AbstractCoupling:
-    """The coupling, whose start law knows its burn-in where it needs one: infinite where none was
-    found, by which `run_is_cut` knows it."""
+    """Return the coupling, with the measured burn-in in its start law where one is needed.
+
+    The burn-in is infinite if no time was found. `run_is_cut` recognises that value.
+    """
     if not needs_burn_in(coupling.start_law, model):
         return coupling
-    time = _measure(key, model, coupling, _known(end), duration, num_steps)
-    # Not by the constructor, which takes no infinite time from a user.
+    time = _measure_time(key, model, coupling, _replace_missing(end), duration, num_steps)
+    # The constructor refuses infinite times, so the field is set afterwards.
     law = eqx.tree_at(lambda law: law.burn_in, Stationary(1.0), time)
     return eqx.tree_at(lambda c: c.start_law, coupling, law)
 
@@ -74,29 +82,35 @@ def with_start_law(
     duration: Float[Array, " P"],
     num_steps: int,
 ) -> AbstractCoupling:
-    """The coupling for weights, of which a start law with a density is paid for: that of smoothed
-    draws where ν would call for a run for each trial."""
-    known = with_burn_in(key, model, coupling, end, duration, num_steps)
+    """Return the coupling for weights, where the start law may be any law with a density.
+
+    Where ν would need a run for each trial, the start law becomes that of smoothed draws.
+    """
+    measured = with_burn_in(key, model, coupling, end, duration, num_steps)
     if not (needs_burn_in(coupling.start_law, model) and model.has_density):
-        return known
-    law = _draw_law(key, model, known, _known(end), duration, num_steps)
-    return eqx.tree_at(lambda c: c.start_law, known, law)
+        return measured
+    # Runs of the measured length supply the draws, once for all trials.
+    law = _smoothed_law(key, model, measured, _replace_missing(end), duration, num_steps)
+    return eqx.tree_at(lambda c: c.start_law, measured, law)
 
 
-def _known(end: Float[Array, "P d"]) -> Float[Array, "P d"]:
-    """A known end in place of those of bridges that were not found, which are NaN."""
-    usable = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
-    return jnp.where(usable, end, end[jnp.argmax(usable)])
+def _replace_missing(end: Float[Array, "P d"]) -> Float[Array, "P d"]:
+    """Return the ends, with a finite one in place of each NaN (the end of a missing bridge)."""
+    is_found = jnp.all(jnp.isfinite(end), axis=1, keepdims=True)
+    return jnp.where(is_found, end, end[jnp.argmax(is_found)])
 
 
 @compiled
-def _draw_law(key, model, coupling, end, duration, num_steps) -> SmoothedDraws:
-    mine = jnp.arange(NUM_DRAWS) * len(end) // NUM_DRAWS
-    # If no burn-in was found it is infinite, and the longest run has to do.
-    draw_key, fit_key = (key_for(f"smoothed draws{which}", key) for which in ("", ", fit"))
+def _smoothed_law(key, model, coupling, end, duration, num_steps) -> SmoothedDraws:
+    interval = jnp.arange(NUM_DRAWS) * len(end) // NUM_DRAWS
+    # An infinite burn-in (none found) makes `draw_starts` take the longest run.
+    # Named keys keep these draws independent of the random numbers of the proposals.
+    draw_key, fit_key = (key_for(f"smoothed draws{suffix}", key) for suffix in ("", ", fit"))
     keys = jax.random.split(draw_key, NUM_DRAWS)
-    dt, law = duration[mine] / num_steps, coupling.start_law
-    draws = draw_starts(law, model.prepared(), coupling.scheme, keys, end[mine].T, dt, num_steps)
+    dt, law = duration[interval] / num_steps, coupling.start_law
+    draws = draw_starts(
+        law, model.prepared(), coupling.scheme, keys, end[interval].T, dt, num_steps
+    )
     return smoothed_draws(fit_key, draws.T, end[0], model.prepared())
 
 
@@ -110,22 +124,28 @@ def measure_burn_in(
     num_steps: int = 50,
     coupling: AbstractCoupling | None = None,
 ) -> Float[Array, ""]:
-    """A time after which the reversed diffusion from `end` is stationary, for
-    `Stationary(burn_in=...)`: twice one within which all of 512 coupled pairs meet, a multiple of
-    `duration`.
+    """Estimate a time after which the reversed diffusion from `end` is nearly stationary.
 
-    In total variation what is left of the start is about 1e-5 where the diffusion forgets it
-    exponentially fast, as where the drift pulls back however far out. Where the drift fades far
-    out, as for heavy-tailed stationary laws, it is forgotten by a power of the time, and 2e-3 may
-    be left: give a multiple of this time. It sees wells only if they are left within the run:
-    where a diffusion stays in one well for very many relaxation times of it, give a longer time
-    yourself.
+    Pass it to `Stationary(burn_in=...)`. It is a multiple of `duration`: twice a time within which
+    all of 512 coupled pairs meet.
 
-    **Arguments:** as in `sample_bridges`; only the scheme and the step matter.
+    The remaining distance to ν, in total variation, depends on the drift:
 
-    **Raises:** `ValueError` where the diffusion has not forgotten its start after 2¹⁷ steps, or
-    most paths explode, or for arguments that do not fit. Inside `jit`, and where a result measures
-    its burn-in itself, the time is then infinite, and what rests on it marked as `truncated`.
+    - It is about 1e-5 under exponential mixing, for instance if the drift pulls back however far
+        out.
+    - It may be 2e-3 if the drift fades far out, as for heavy-tailed stationary laws. Then use a
+        multiple of this time.
+    - It is unknown if the diffusion stays in one well for very many of its relaxation times: no
+        finite run shows this. Then choose a longer time yourself.
+
+    **Arguments:** as in `sample_bridges`. Of `coupling` only the scheme and the rotation matter.
+
+    **Returns:** the time, shape (). Inside `jit` it is infinite where this function would raise an
+    error. Functions that measure the burn-in themselves do the same, and mark their results as
+    `truncated`.
+
+    **Raises:** `ValueError` for invalid arguments, if some pairs have not met after 2¹⁷ steps, or
+    if most paths become non-finite.
 
     **Example:**
 
@@ -139,26 +159,28 @@ def measure_burn_in(
     num_steps = check_num_steps(num_steps, 1)
     end = as_points("end", end)
     if not is_traced(end) and not np.all(np.isfinite(end)):
-        raise ValueError(f"`end` must be finite; got {end}.")
+        raise ValueError(
+            f"`end` must be finite; got {end}. Remove points that are NaN or infinite."
+        )
     intervals, _, _ = as_intervals(end, end, duration)
     coupling = Coupling() if coupling is None else coupling
     check_instance("coupling", coupling, AbstractCoupling, "a `Coupling`")
     check_model(model, intervals, coupling.scheme)
     model.check_reversal()
-    time = _measure(key, model, coupling, intervals.end, intervals.duration, num_steps)
+    time = _measure_time(key, model, coupling, intervals.end, intervals.duration, num_steps)
     if not is_traced(time) and not np.isfinite(time):
         raise ValueError(
-            "two copies of the reversed diffusion have not all met after 2¹⁷ steps, so it has "
-            "not forgotten its start, or most paths left the finite numbers: give `Diffusion` a "
-            "sampler of its stationary law, the coupling a start law with a density, or, if you "
-            "know it, a `Stationary(burn_in=...)`. For a stiff drift, which calls for short steps "
-            "of an explicit scheme, take `SemiImplicit()`: its steps may be longer."
+            "no burn-in was found: the pairs of copies of the reversed diffusion have not all met "
+            "after 2¹⁷ steps, or most paths became non-finite. Pass a sampler of the stationary "
+            "law to `Diffusion`, a start law with a density to the coupling, or, if you know the "
+            "time, `Stationary(burn_in=...)`. A stiff drift needs short steps in an explicit "
+            "scheme: pass the scheme `SemiImplicit()`, which allows longer steps."
         )
     return time
 
 
 @compiled
-def _measure(
+def _measure_time(
     key: Key[Array, ""],
     model: Diffusion,
     coupling: AbstractCoupling,
@@ -166,37 +188,45 @@ def _measure(
     duration: Float[Array, " P"],
     num_steps: int,
 ) -> Float[Array, ""]:
-    """2s for the first s = 1, 2, 4, ... times `num_steps` steps within which all pairs meet."""
+    """Return 2s for the first s = 1, 2, 4, ... times `num_steps` steps within which all pairs meet.
+
+    Return infinity if there is no such s.
+    """
     key = key_for("burn-in", key)
-    mine = jnp.arange(_NUM_PAIRS) * len(end) // _NUM_PAIRS
-    end, dt = end[mine].T, duration[mine] / num_steps
+    interval = jnp.arange(_NUM_PAIRS) * len(end) // _NUM_PAIRS
+    end, dt = end[interval].T, duration[interval] / num_steps
+    # Reflection needs no dU, and pairs meet fast. Scheme and rotation are those of the user.
     reflection = Coupling(-1.0, scheme=coupling.scheme, rotation=coupling.rotation)
     backward = model.prepared().backward(end[:, 0])
     dynamics = driven_through_root(reflection, backward, end[:, 0])
     pairs = in_lanes(reflection, dynamics, end[:, 0], jax.random.split(key, _NUM_PAIRS), dt)
-    most = max(0, (MOST_STEPS // 2 // num_steps).bit_length() - 1)
+    # 2s must not exceed the bound on the steps of a run.
+    max_doublings = max(0, (MOST_STEPS // 2 // num_steps).bit_length() - 1)
 
     def attempt(doublings):
-        """Whether all pairs met, and whether too many exploded."""
+        """Return whether all pairs met, and whether too many became non-finite."""
         ahead_key, pair_key = jax.random.split(jax.random.fold_in(key, doublings))
         keys, repeats = jax.random.split(ahead_key, _NUM_PAIRS), 2**doublings
-        ahead = jnp.full(_NUM_PAIRS, repeats)
-        driven = run_for(dynamics, coupling.scheme, keys, end, dt, num_steps, ahead)
+        repeats_of_lanes = jnp.full(_NUM_PAIRS, repeats)
+        # X' starts at the end of an independent run of length s.
+        driven = run_for(dynamics, coupling.scheme, keys, end, dt, num_steps, repeats_of_lanes)
         x, driven, met = _run_pairs(pair_key, dynamics, pairs, end, driven, num_steps, repeats)
         exploded = ~met & ~jnp.all(is_finite(x) & is_finite(driven), axis=0)
+        # A few lost pairs are tolerable; many mean that the step size is too large.
         too_many = jnp.mean(exploded) > _MOST_EXPLODED
         return jnp.all(met | exploded) & ~too_many, too_many
 
-    def going_on(state):
+    def is_unfinished(state):
         doublings, (all_met, too_many) = state
-        return ~all_met & ~too_many & (doublings < most)
+        return ~all_met & ~too_many & (doublings < max_doublings)
 
     def double(state):
         doublings, _ = state
         return doublings + 1, attempt(doublings + 1)
 
     init = (jnp.int32(0), attempt(jnp.int32(0)))
-    doublings, (all_met, _) = lax.while_loop(going_on, double, init)
+    doublings, (all_met, _) = lax.while_loop(is_unfinished, double, init)
+    # With several intervals the step sizes differ; the longest is on the safe side.
     time = 2 * num_steps * jnp.max(dt) * (2**doublings).astype(dt.dtype)
     return jnp.where(all_met, time, jnp.inf)
 
@@ -210,7 +240,10 @@ def _run_pairs(
     num_steps: int,
     repeats: Int[Array, ""],
 ) -> tuple[Float[Array, "d pairs"], Float[Array, "d pairs"], Bool[Array, " pairs"]]:
-    """The pairs after `repeats` times `num_steps` steps, and which have met and stay together."""
+    """Run the pairs for `repeats` times `num_steps` steps. Return both states, and which pairs met.
+
+    Pairs that have met stay together.
+    """
     lanes, axes = pairs
     keys = jax.random.split(key, _NUM_PAIRS)
 
@@ -219,15 +252,17 @@ def _run_pairs(
         dw = lane.root_dt * normal
         x_next = lane.scheme.step(dynamics, x, lane.dt, dw)
         pair = drive(dynamics, lane, x, x_next, dw, driven, noise)
+        # A pair that has met is one path from then on.
         met |= have_met(dynamics, lane.coupling, pair, noise)
         return x_next, jnp.where(met, x_next, pair.driven_next), met
 
     def draw(key, k):
         normal_key, uniform_key = jax.random.split(key)
         uniform = jax.random.uniform(uniform_key, (k,), x.dtype)
+        # Reflection has no independent noise dU.
         return jax.random.normal(normal_key, (k, len(x)), x.dtype), PairNoise(None, uniform)
 
-    def once(repeat, pairs):
+    def run_once(repeat, pairs):
         return noisy_scan(
             lambda pairs, inputs: (step_pair(*pairs, *inputs[0], lanes), None),
             pairs,
@@ -237,4 +272,4 @@ def _run_pairs(
             num_steps,
         )[0]
 
-    return lax.fori_loop(0, repeats, once, (x, driven, jnp.zeros(_NUM_PAIRS, bool)))
+    return lax.fori_loop(0, repeats, run_once, (x, driven, jnp.zeros(_NUM_PAIRS, bool)))

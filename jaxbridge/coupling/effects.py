@@ -1,4 +1,8 @@
-"""`effects`: what the compiled program of a scene contains, and why."""
+"""The function `effects`: the effects that the compiled program of a model contains, with reasons.
+
+It is a module of its own because it calls all the decisions that couplings, schemes and models
+make.
+"""
 
 import functools
 
@@ -18,7 +22,8 @@ from .base import AbstractCoupling, check_coupling
 from .gamma import Coupling
 from .rotation import driven_through_root, root_effect, rotation_effect
 
-# Dimensions tried for a model that does not say its own; most that fit two fit them all.
+# Dimensions to try for a model that does not state its own, most likely ones first. Most models
+# that accept two accept them all.
 _DIMENSIONS = (2, 1, *range(3, 65))
 
 
@@ -31,22 +36,23 @@ def effects(
     num_steps: int = 50,
     save_at: Numbers | None = None,
 ) -> Effects:
-    """Which effects proposals of this scene simulate, which they leave out, and why: the very
-    decisions by which the program is made.
+    """Return which effects the proposals of a model simulate, which they omit, and why.
+
+    The table comes from the same decisions as the program itself.
 
     **Arguments:**
 
     - `model`, `coupling`: as in `sample_bridges`.
-    - `at`: any point of the state space, shape (d,). By default zero, in the first of the
-        dimensions 2, 1, 3, 4, ... that the model's functions accept.
+    - `at`: any point of the state space, shape (d,). The default is zero, in the first of the
+        dimensions 2, 1, 3, 4, ... that the functions of the model accept.
     - `num_steps`, `save_at`: as in `sample_bridges`.
 
-    **Returns:** `Effects`, a table when printed. Of a model to which couplings do not apply, with
-    noise in a part of the state or coefficients that depend on time, the last two rows say what
-    the paths of its records simulate.
+    **Returns:** `Effects`, which prints as a table. Couplings do not apply if σ has fewer columns
+    than rows, or if coefficients depend on time. Then the last two rows state what the paths of
+    records simulate.
 
-    **Raises:** `ValueError` where no dimension fits, or the time reversal is unknown; `TypeError`
-    for anything but a model and a coupling.
+    **Raises:** `ValueError` if no dimension fits, or if the time reversal is unknown; `TypeError`
+    if `model` is not a `Diffusion` or `coupling` is not a `Coupling`.
 
     **Example:**
 
@@ -61,7 +67,11 @@ def effects(
     num_steps = check_num_steps(num_steps, 1)
     like = _find_point(model) if at is None else as_floating("at", at)
     if like.ndim != 1 or not like.size:
-        raise ValueError(f"`at` must be one point, shape (d,); got {like.shape}.")
+        raise ValueError(
+            f"`at` must be one point, shape (d,); got shape {like.shape}. Pass any point of the "
+            "state space."
+        )
+    # Couplings need an invertible σ and a stationary law, so time-independent coefficients.
     invertible, depends_on_time = model.sigma_is_invertible(like), model.depends_on_time
     noise_by_drift = decisions.noise_by_drift(invertible)
     time = decisions.time(depends_on_time)
@@ -71,10 +81,12 @@ def effects(
         return decisions.without_pairs(noise_by_drift, time, "coefficients depend on time")
     model.check_reversal()
     forward = model.forward(like)
+    # The types of σ before and after the change to the triangular root; nothing is computed.
     own_sigma, sigma = (
         type(eqx.filter_eval_shape(dynamics.sigma, like))
         for dynamics in (forward, driven_through_root(coupling, forward, like))
     )
+    # `HeunOrEuler` becomes one of the two for this equation.
     scheme = scheme_for(coupling.scheme, forward)
     reverse_drift = model.reverse_drift_effect
     return Effects(
@@ -95,14 +107,19 @@ def effects(
 
 
 def _find_point(model: Diffusion) -> Float[Array, " d"]:
+    """Return zero, in the first dimension that the functions of the model accept."""
     for d in _DIMENSIONS:
         like = jnp.zeros(d)
         try:
+            # Tracing raises an error for a wrong dimension, at no numerical cost.
             jax.eval_shape(functools.partial(_coefficients, model), like)
         except (IndexError, TypeError, ValueError):  # a point of a wrong shape
             continue
         return like
-    raise ValueError("the dimension of this model is not visible: pass a point, `at=`, shape (d,).")
+    raise ValueError(
+        "the dimension of the model is unknown: its functions accept no point of 1 to 64 "
+        "dimensions. Pass a point of the state space as `at`, shape (d,)."
+    )
 
 
 def _coefficients(model: Diffusion, x: Float[Array, " d"]) -> tuple[Array, Array]:
@@ -111,7 +128,8 @@ def _coefficients(model: Diffusion, x: Float[Array, " d"]) -> tuple[Array, Array
 
 
 def _corrector(asked_for, scheme, forward) -> decisions.Effect:
-    """Of the coupling's scheme, which is `scheme` for this equation."""
+    """Return the effect of the corrector step; `scheme` is the coupling's scheme for this
+    equation."""
     if isinstance(asked_for, HeunOrEuler):
         return decisions.corrector(forward.sigma_varies)
     return decisions.Effect(

@@ -1,8 +1,10 @@
-"""The paper's γ-coupling (section 2.1) drives X' by
+"""The γ-coupling of the paper (section 2.1), and descriptions of couplings for tables.
 
-    dW' = {I - (1-γ)Π} O dW + √(1-γ²) u dU,    Π = uuᵀ,  u ∝ σ(x')⁻¹(x - x'),
+X drives X' by
 
-and read in the other direction, for the associated diffusion, equation (stjerne-dif),
+    dW' = {I - (1-γ)Π} O dW + √(1-γ²) u dU,    Π = uuᵀ,  u ∝ σ(x')⁻¹(x - x').
+
+In the other direction, for the associated diffusion, X' drives X (equation (stjerne-dif)):
 
     dW = Oᵀ [{I - (1-γ)Π} dW' + √(1-γ²) u dU'].
 """
@@ -31,29 +33,30 @@ from .start_laws import AnyStartLaw, Reversed, Stationary, as_start_law
 class Coupling(AbstractCoupling):
     """The γ-coupling of section 2.1 of the paper.
 
-    γ = -1 is reflection (Lindvall & Rogers 1986), γ = 0 projection (Chen & Li 1989), which in
-    one dimension makes X' independent of X: the method of Bladt & Sørensen (2014). As γ → 1
-    the two share more of their noise and meet more rarely, but a joined path is closer to a
+    γ = -1 is reflection (Lindvall & Rogers 1986). γ = 0 is projection (Chen & Li 1989): in one
+    dimension X' is then independent of X, which is the method of Bladt & Sørensen (2014). As γ → 1
+    the two share more of their noise and meet more rarely, but the joined path is closer to a
     bridge.
 
     **Arguments:**
 
-    - `gamma`: γ in [-1, 1); or a law, a function `key -> γ`, from which each proposal draws
-        its own. Pairs whose γ is out of that range, which only a law or a traced value can be,
-        never meet, and are counted in `num_nonfinite`.
+    - `gamma`: γ in [-1, 1); or a law, a function `key -> γ` that samples a γ for each proposal.
+        Only a law or a traced value can be outside [-1, 1). Such pairs never meet, and count in
+        `num_nonfinite`.
     - `meeting`: `BrownianCrossing()`, `SignTest(radius)` or, for γ = -1, `ReflectionPlane()`.
-    - `scheme`: by default `HeunOrEuler()`, Heun's scheme for constant σ and Euler's where it
-        depends on the state; or `Heun()`, `Euler()`, `Milstein()`, for stiff or superlinear drift
-        `SemiImplicit()`, for linear drift `GaussianTransition()`.
-    - `rotation`: O(x, x') from the matrices σ(x), σ(x'), where these are full and depend on the
-        state. `None` drives the pair through the triangular root of V = σσᵀ, which calls for none;
-        with `Heun()` it is `polar_rotation`.
-    - `start_law`: μ, where the associated diffusion starts, which only what corrects bridges to
-        their exact law makes use of: `Stationary()`, `GaussianLaw(mean, covariance)`, or any
-        object with `sample(key, model)` and a normalised `log_density(x)`; see `fit_start_law`.
+    - `scheme`: by default `HeunOrEuler()`, which is Heun's scheme for constant σ and Euler's for a
+        state-dependent σ. Others are `Heun()`, `Euler()` and `Milstein()`; `SemiImplicit()` for
+        stiff or superlinear drift; `GaussianTransition()` for linear drift.
+    - `rotation`: O(x, x'), a function of the matrices σ(x) and σ(x'), for a full state-dependent σ.
+        The default `None` drives the pair through the triangular root of V = σσᵀ, which needs no
+        rotation; with `Heun()` it selects `polar_rotation`.
+    - `start_law`: μ, the law of the initial state of the associated diffusion: `Stationary()`,
+        `GaussianLaw(mean, covariance)`, or any object with `sample(key, model)` and a normalised
+        `log_density(x)`; see `fit_start_law`. Only functions that correct bridges to their exact
+        law use it.
 
-    **Raises:** `ValueError` for γ outside [-1, 1) or `ReflectionPlane` with γ ≠ -1; `TypeError`
-    for a meeting rule, a scheme or a start law that is none.
+    **Raises:** `ValueError` for γ outside [-1, 1), or for `ReflectionPlane` with γ ≠ -1;
+    `TypeError` for an invalid meeting rule, scheme or start law.
 
     **Example:**
 
@@ -83,50 +86,60 @@ class Coupling(AbstractCoupling):
         if callable(gamma):
             check_function("gamma", gamma, "(key)")
         check_function("rotation", rotation, "(sigma, driven_sigma)", optional=True)
+        # With a law γ is NaN until `realise` samples one for each lane.
         law, gamma = (gamma, jnp.nan) if callable(gamma) else (None, gamma)
         self.gamma = as_floating("gamma", gamma)
         self.meeting = BrownianCrossing() if meeting is None else meeting
         self.scheme = HeunOrEuler() if scheme is None else scheme
         self.start_law = as_start_law(Stationary() if start_law is None else start_law)
-        for name, given, kind in [
+        for name, value, base_class in [
             ("meeting", self.meeting, AbstractMeeting),
             ("scheme", self.scheme, AbstractScheme),
         ]:
-            if not isinstance(given, kind):
-                raise TypeError(f"`{name}` must be a `{kind.__name__}`; got {given!r}.")
+            if not isinstance(value, base_class):
+                raise TypeError(
+                    f"`{name}` must be of type `{base_class.__name__}`; got {value!r}. Omit it for "
+                    "the default."
+                )
         self.rotation = rotation
         self._gamma_law = law
+        # Traced values in the closure of the law become leaves of the coupling.
         self._captured = Captured(law)
+        # Static: the program omits dU only if γ = -1 is known at compile time.
         reflection = False
         if self.gamma.ndim != 0:
             raise ValueError(
-                f"`gamma` must be a scalar, got shape {self.gamma.shape}; use `jax.vmap` "
-                "for several values, or pass a function `key -> gamma`."
+                f"`gamma` must be a scalar; got shape {self.gamma.shape}. Use `jax.vmap` for "
+                "several values, or pass a function `key -> gamma`."
             )
         if is_traced(self.gamma):
             self.gamma = _in_range(self.gamma)
         elif law is None:
+            # The constructor can check concrete values only; `_in_range` handles traced ones.
             if not -1 <= np.asarray(self.gamma) < 1:
-                raise ValueError(f"`gamma` must be in [-1, 1), got {gamma}.")
+                raise ValueError(f"`gamma` must be in [-1, 1); got {gamma}.")
             reflection = bool(np.asarray(self.gamma) == -1)
         self.independent_noise = not reflection
         if isinstance(self.meeting, ReflectionPlane) and not reflection:
             raise ValueError(
-                "`ReflectionPlane` decides meetings of the reflection coupling only: use "
-                f"`gamma=-1.0` (got {gamma}) or another meeting rule."
+                "`ReflectionPlane` is a meeting rule for the reflection coupling only; got "
+                f"`gamma={gamma}`. Pass `gamma=-1.0`, or another meeting rule."
             )
 
     @staticmethod
     def as_published(gamma: ArrayLike) -> "Coupling":
-        """The paper's own settings: Euler, the sign test with radius 0.05, the printed O and the
-        printed start law, with which bridges are **not** corrected to their exact law."""
+        """Return the paper's settings: Euler, sign test with radius 0.05, printed O and printed
+        start law.
+
+        With them bridges are **not** corrected to their exact law.
+        """
         return Coupling(gamma, SignTest(0.05), Euler(), published_rotation, Reversed())
 
     def driven_noise(self, frame, dw, du):
-        return self._turn(frame, dw, du)
+        return self._couple(frame, dw, du)
 
     def driving_noise(self, frame, driven_dw, du):
-        return self._turn(frame, driven_dw, du)
+        return self._couple(frame, driven_dw, du)
 
     def gap_variance(self, frame):
         return 2 * (1 - self.gamma)
@@ -139,45 +152,51 @@ class Coupling(AbstractCoupling):
         gamma = jax.vmap(lambda key: check_value("gamma", draw(law, key), (), self.gamma))(keys)
         return eqx.tree_at(lambda c: c.gamma, self, _in_range(gamma.astype(self.gamma.dtype)))
 
-    def _turn(self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None):
-        """{I - (1-γ)Π} w + √(1-γ²) u ΔU: symmetric, so it serves both directions."""
-        along = -(1 - self.gamma) * dot(frame.u, dw)
+    def _couple(self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None):
+        """Return {I - (1-γ)Π} w + √(1-γ²) u ΔU. The map is symmetric, so it serves both
+        directions."""
+        # Only the component along u changes.
+        along_u = -(1 - self.gamma) * dot(frame.u, dw)
         if du is not None:
-            own = (1 - self.gamma) * (1 + self.gamma)
-            positive = own > 0  # at a traced γ = -1 the root has no derivative
-            along += jnp.where(positive, jnp.sqrt(jnp.where(positive, own, 1)), 0) * du
-        return dw + frame.u * along
+            # 1 - γ² as a product keeps its digits near γ = ±1.
+            variance = (1 - self.gamma) * (1 + self.gamma)
+            positive = variance > 0  # the square root has no derivative at a traced γ = -1
+            along_u += jnp.where(positive, jnp.sqrt(jnp.where(positive, variance, 1)), 0) * du
+        return dw + frame.u * along_u
 
 
 def _in_range(gamma: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """NaN where γ is not in [-1, 1): such pairs never meet, and are counted as not finite."""
+    """Return γ, with NaN where it is outside [-1, 1): such pairs never meet, and count as
+    non-finite."""
     return jnp.where((gamma >= -1) & (gamma < 1), gamma, jnp.nan)
 
 
-def described(coupling: AbstractCoupling) -> str:
-    """A coupling in a few words."""
-    words = type(coupling).__name__
+def describe_coupling(coupling: AbstractCoupling) -> str:
+    """Return a short description of the coupling, such as `Coupling(0.5) from GaussianLaw`."""
+    text = type(coupling).__name__
     if isinstance(coupling, Coupling) and not is_traced(coupling.gamma):
-        words += f"({float(coupling.gamma):.3g})"
+        text += f"({float(coupling.gamma):.3g})"
     if not isinstance(coupling.start_law, Stationary):
-        words += f" from {type(coupling.start_law).__name__}"
-    return words
+        text += f" from {type(coupling.start_law).__name__}"
+    return text
 
 
 def ingredients(coupling: AbstractCoupling) -> tuple[str, str, float]:
-    """Its scheme and its meeting rule, and γ."""
+    """Return the name of the scheme, the name of the meeting rule, and γ (NaN for other
+    couplings)."""
     meeting = coupling.meeting
     radius = meeting.radius if isinstance(meeting, SignTest) else None
-    words = type(meeting).__name__ + ("" if radius is None else f"({float(radius):g})")
+    meeting_name = type(meeting).__name__ + ("" if radius is None else f"({float(radius):g})")
     gamma = float(coupling.gamma) if isinstance(coupling, Coupling) else np.nan
-    return type(coupling.scheme).__name__, words, gamma
+    return type(coupling.scheme).__name__, meeting_name, gamma
 
 
 def most_accurate(coupling: AbstractCoupling) -> AbstractCoupling:
-    """The same with the scheme and the meeting rule that have the smallest step error."""
+    """Return the coupling with the scheme and the meeting rule of smallest discretisation error."""
     return eqx.tree_at(
         lambda c: (c.meeting, c.scheme),
         coupling,
         (BrownianCrossing(), HeunOrEuler()),
+        # Rules and schemes as leaves: they are replaced as a whole, not array by array.
         is_leaf=lambda leaf: isinstance(leaf, AbstractMeeting | AbstractScheme),
     )

@@ -1,10 +1,14 @@
-"""Hitting counts: how many associated diffusions does it take to hit a bridge? (section 2.3)
+"""Hitting counts: the number of associated diffusions up to the first hit of a bridge (section
+2.3).
+
+The count
 
     T(x) = min {i : the i-th associated diffusion hits x}
 
-is geometric with mean 1/π(x), so the mean of N counts is an unbiased estimate of 1/π(x). The
-counts of one bridge are the gaps between the hits in one sequence of independent trials: the
-mean of N counts is the number of trials up to the N-th hit, divided by N.
+is geometric with mean 1/π(x). So the mean of N counts is an unbiased estimate of 1/π(x).
+
+All counts of a bridge come from one sequence of independent trials: a count is the gap between two
+hits. The mean of N counts is therefore the number of trials up to the N-th hit, divided by N.
 """
 
 import math
@@ -29,13 +33,13 @@ from .base import AbstractCoupling
 from .burn_in import with_burn_in
 from .start_laws import AnyStartLaw, as_start_law, run_is_cut
 
-# A count that takes longer than this is cut off, unless the user says otherwise.
+# Default bound on the trials of one count. Counts that would take longer are truncated.
 _MAX_TRIALS_PER_COUNT = 10_000
 
 
 @runtime_checkable
 class BridgePaths(Protocol):
-    """What has bridges in it: `Bridges`, `WeightedBridges` and `Chain`."""
+    """Interface of results that contain bridges: `Bridges`, `WeightedBridges` and `Chain`."""
 
     times: Array
     paths: Array
@@ -44,20 +48,22 @@ class BridgePaths(Protocol):
 
     @property
     def coupling(self) -> AbstractCoupling | None:
-        """That which proposed them, if one did."""
+        """Return the coupling that proposed the bridges, or `None` for another proposal."""
         ...
 
 
 class HittingCounts(AbstractResult):
-    """What `hitting_counts` returns: counts of n bridges, or of I × n with a leading axis I.
+    """Result of `hitting_counts`: counts for n bridges.
 
-    - `counts`: N independent counts for each bridge, shape (n, N); -1 where the trials ran out
-        before the count was complete, and for a bridge that is missing.
-    - `truncated`: whether the trials ran out, shape (n,). Also where they did not start from ν,
-        because the run that replaces a sampler of it was cut off: see `Stationary`.
-    - `num_trials`: how many there were in all, shape (n,).
-    - `num_nonfinite`: how many of them left the finite numbers, which is no hit.
-    - `start`: where the last trial that hit had started, shape (n, d).
+    With I intervals arrays have a leading axis I.
+
+    - `counts`: N independent counts for each bridge, shape (n, N). An entry is -1 if the trials
+        ended before that count was complete, or if the bridge is missing.
+    - `truncated`: whether the trials ended early, shape (n,). It is also true if the run that
+        replaces a sampler of ν was cut off, so that trials do not start from ν: see `Stationary`.
+    - `num_trials`: number of trials, shape (n,).
+    - `num_nonfinite`: number of these trials that became non-finite, which is no hit. Shape (n,).
+    - `start`: initial state of the last trial that hit, shape (n, d).
     """
 
     counts: Int[Array, "*I n N"]
@@ -68,29 +74,34 @@ class HittingCounts(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults of each bridge: it is missing, or its trials ran out."""
+        """Return the faults of each bridge: the bridge is missing, or its trials ended early."""
         return Verdict((missing_bridges(self.num_trials == 0), truncated_weights(self.truncated)))
 
     @property
     def mean(self) -> Float[Array, "*I n"]:
-        """ρ̂, the mean of the counts: an unbiased estimate of 1/π(x).
+        """Return ρ̂, the mean of the counts: an unbiased estimate of 1/π(x), shape (n,).
 
-        Where the trials ran out, all of them divided by the hits, or their number if nothing
-        hit: finite, and too small on average. NaN for a bridge that is missing.
+        If the trials ended early, it is their number divided by the number of hits, or their number
+        if there was no hit. It is then finite, and too small on average. It is NaN for a missing
+        bridge.
         """
+        # Complete counts add up to `num_trials`, so both cases are one formula.
         hits = jnp.maximum(self._num_hits, 1).astype(self.start.dtype)
         mean = self.num_trials.astype(self.start.dtype) / hits
         return jnp.where(self.num_trials > 0, mean, jnp.nan)
 
     @property
     def probability(self) -> Float[Array, "*I n"]:
-        """An unbiased estimate of the hitting probability π(x), (N - 1)/(Σ_j T_j - 1) for N
-        counts (Haldane 1945); with N = 1, whether the first trial hit. NaN for a bridge that is
-        missing."""
+        """Return an unbiased estimate of the hitting probability π(x), shape (n,).
+
+        It is (N - 1)/(Σ_j T_j - 1) for N counts (Haldane 1945). For N = 1 it is 1 if the first
+        trial hit, else 0. It is NaN for a missing bridge.
+        """
         hits, trials = self._num_hits, self.num_trials
-        # Trials that ran out are a binomial sample, estimated by hits / trials.
-        less = jnp.where(hits < self.counts.shape[-1], 0, 1)
-        numerator, denominator = hits - less, trials - less
+        # If the trials ended early, their number was fixed: a binomial sample, with estimate
+        # hits / trials. Otherwise the last trial is a hit by construction and does not count.
+        excluded = jnp.where(hits < self.counts.shape[-1], 0, 1)
+        numerator, denominator = hits - excluded, trials - excluded
         certain = denominator <= 0  # one trial, one hit
         numerator, denominator = (
             value.astype(self.start.dtype)
@@ -101,18 +112,22 @@ class HittingCounts(AbstractResult):
 
     @property
     def standard_error(self) -> Float[Array, "*I n"]:
-        """That of `probability`, about π √((1-π)/N), and about 1/N where no trial missed: N hits
-        in N trials tell π from 1 no better than that. Infinite for fewer than three counts, of
-        which nothing is known, as where the trials ran out without a hit."""
+        """Return the standard error of `probability`, shape (n,): about π √((1-π)/N).
+
+        If no trial missed, it is about 1/N, because N hits in N trials cannot distinguish π from 1
+        any better. It is infinite for fewer than three hits, which are too few for an estimate.
+        """
         hits, trials, probability = self._num_hits, self.num_trials, self.probability
-        # The smallest share of misses that the trials tell from none is one of them.
+        # One miss in all trials is the smallest share of misses that is visible.
         resolution = 1 / jnp.maximum(trials, 1).astype(probability.dtype)
         variance = probability**2 * jnp.maximum(1 - probability, resolution)
+        # N - 2 in place of N corrects for few hits.
         error = jnp.sqrt(variance / jnp.maximum(hits - 2, 1).astype(variance.dtype))
         return jnp.where(hits > 2, error, jnp.inf)
 
     @property
     def _num_hits(self) -> Int[Array, "*I n"]:
+        # Incomplete counts are -1.
         return jnp.sum(self.counts > 0, axis=-1, dtype=jnp.int32)
 
 
@@ -128,23 +143,25 @@ def hitting_counts(
     batch_size: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> HittingCounts:
-    """Independent counts T(x) for each of the bridges, and so their hitting probabilities.
+    """Count the associated diffusions up to a hit, N times for each bridge.
+
+    The counts T(x) are independent, and estimate the hitting probabilities π(x).
 
     **Arguments:**
 
     - `key`: a typed key.
-    - `model`: the model the bridges were made with.
-    - `bridges`: from `sample_bridges`, `weigh_bridges` or `sample_exact_bridges`, with their
+    - `model`: the model of the bridges.
+    - `bridges`: the result of `sample_bridges`, `weigh_bridges` or `sample_exact_bridges`, with
         whole paths (no `save_at`).
-    - `num_counts`: N, for each bridge.
-    - `start_law`: μ, by default that of the bridges' coupling.
-    - `max_trials`: bounds the trials of each bridge; by default 10,000 for each count.
-    - `batch_size`: trials simulated side by side; changes results by rounding only.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `num_counts`: N, the number of counts for each bridge.
+    - `start_law`: μ; by default the start law of the bridges' coupling.
+    - `max_trials`: bound on the trials of each bridge. The default is 10,000 for each count.
+    - `batch_size`: number of trials that run side by side. It changes results by rounding only.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
     **Returns:** `HittingCounts`.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -155,14 +172,14 @@ def hitting_counts(
     """
     check_key(key)
     check_diffusion(model)
-    coupling = coupling_of(bridges, start_law)
+    coupling = coupling_of_bridges(bridges, start_law)
     search = search_for_hits(bridges, num_counts, max_trials, batch_size, progress_meter)
     return _hitting_counts(key_for("hitting counts", key), model, coupling, bridges, search)
 
 
 @compiled_for(lambda key, model, coupling, bridges, search: bridges.met.size * bridges.num_steps)
 def _hitting_counts(key, model, coupling, bridges, search):
-    return counts_of(key, model, coupling, bridges, search)[0]
+    return count_hits_of_bridges(key, model, coupling, bridges, search)[0]
 
 
 def search_for_hits(
@@ -172,7 +189,7 @@ def search_for_hits(
     batch_size: int | None,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Search:
-    """What was asked for, checked, with what was not told."""
+    """Return the `Search` for these arguments, with checks and default values."""
     num_counts = check_count("num_counts", num_counts)
     bound = check_max_trials(max_trials, num_counts)
     if batch_size is None:
@@ -181,23 +198,25 @@ def search_for_hits(
 
 
 def default_lanes(paths: Float[Array, "*P points d"], num_counts: int) -> int:
-    """Trials side by side, for so many counts of each of the paths."""
+    """Return the default number of trials side by side, for `num_counts` counts of each path."""
     *leading, points, _ = paths.shape
     return default_num_lanes(math.prod(leading) * num_counts, points - 1, paths)
 
 
-def counts_of(
+def count_hits_of_bridges(
     key: Key[Array, ""],
     model: Diffusion,
     coupling: AbstractCoupling,
     bridges: BridgePaths,
     search: Search,
 ) -> tuple[HittingCounts, AbstractCoupling]:
-    """Counts for all the bridges, and the coupling with its burn-in measured."""
+    """Return counts for all bridges, and the coupling with its measured burn-in."""
+    # Counts are discrete: a derivative raises an error, because it would be zero.
     model, coupling, bridges = nondifferentiable((model.prepared(), coupling, bridges))
     shape, num_steps = bridges.met.shape, bridges.num_steps
     paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
-    duration = durations_of(bridges)
+    duration = bridge_durations(bridges)
+    # If the start law is ν and the model has no sampler, trials need runs of a measured length.
     coupling = with_burn_in(key, model, coupling, paths[:, -1], duration, num_steps)
     counts = count_hits(
         jax.random.split(key, len(paths)),
@@ -221,28 +240,33 @@ def count_hits(
     active: Bool[Array, " P"],
     search: Search,
 ) -> HittingCounts:
-    """Counts for each of P bridges that is active, from trials that share the lanes."""
+    """Count hits for each active bridge of P, with trials of all bridges in the same lanes."""
     return over_problems(_count_hits, (keys, paths, duration, active), (model, coupling), search)
 
 
-def _count_hits(each: tuple, shared: tuple, search: Search) -> HittingCounts:
-    (keys, paths, duration, active), (model, coupling) = each, shared
+def _count_hits(problems: tuple, shared: tuple, search: Search) -> HittingCounts:
+    (keys, paths, duration, active), (model, coupling) = problems, shared
     num_steps, num_counts = paths.shape[1] - 1, search.wanted
     trial = eqx.Partial(_trial, keys, model, coupling, paths, duration)
     num_rows = paths.shape[0] * num_counts
+    # One row for each hit: the initial state of its trial.
     rows = jnp.full((num_rows, paths.shape[2]), jnp.nan, paths.dtype)
-    found = rejection_sample(trial, rows, active, search)
-    number = found.number.reshape(-1, num_counts)
-    before = jnp.concatenate([jnp.full_like(number[:, :1], -1), number[:, :-1]], axis=1)
-    last = jnp.maximum(found.num_found - 1, 0)
-    starts = found.outputs.reshape(*number.shape, -1)
-    cut = run_is_cut(coupling.start_law, model, duration / num_steps, num_steps)
+    hits = rejection_sample(trial, rows, active, search)
+    trial_number = hits.number.reshape(-1, num_counts)
+    # A count is the gap between two hits in the sequence of trials, which begins with number 0.
+    previous = jnp.concatenate(
+        [jnp.full_like(trial_number[:, :1], -1), trial_number[:, :-1]], axis=1
+    )
+    last = jnp.maximum(hits.num_found - 1, 0)
+    # Each output row is the initial state of a trial that hit.
+    starts = hits.outputs.reshape(*trial_number.shape, -1)
+    is_cut = run_is_cut(coupling.start_law, model, duration / num_steps, num_steps)
     return HittingCounts(
-        jnp.where(number >= 0, number - before, -1),
-        active & ((found.num_found < num_counts) | cut),
-        found.num_trials,
-        found.num_nonfinite,
-        starts[jnp.arange(len(number)), last],
+        jnp.where(trial_number >= 0, trial_number - previous, -1),
+        active & ((hits.num_found < num_counts) | is_cut),
+        hits.num_trials,
+        hits.num_nonfinite,
+        starts[jnp.arange(len(trial_number)), last],
     )
 
 
@@ -255,40 +279,49 @@ def _trial(
     problem: Int[Array, " lanes"],
     number: Int[Array, " lanes"],
 ) -> Attempts:
+    """Run trial `number` of the bridge `problem` in each lane. The outputs are the initial
+    states."""
     num_steps = paths.shape[1] - 1
-    made = run_associated(
+    associated = run_associated(
         model,
         coupling,
         numbered_keys(keys, problem, number),
         jnp.moveaxis(paths[problem], 0, -1),
         duration[problem] / num_steps,
     )
-    return Attempts(made.hit, made.finite, made.start.T)
+    return Attempts(associated.hit, associated.finite, associated.start.T)
 
 
-def durations_of(bridges: BridgePaths) -> Float[Array, " P"]:
-    """The duration of each of the I × n bridges."""
+def bridge_durations(bridges: BridgePaths) -> Float[Array, " P"]:
+    """Return the durations of the P = I × n bridges, one for each bridge."""
     duration = bridges.times[..., -1]
     if bridges.times.ndim == 2:
+        # I durations, each shared by the n bridges of an interval.
         duration = duration[:, None]
     return jnp.broadcast_to(duration, bridges.met.shape).reshape(-1)
 
 
-def coupling_of(bridges: BridgePaths, start_law: AnyStartLaw | None) -> AbstractCoupling:
-    """The coupling that proposed the bridges, with this start law if there is one.
+def coupling_of_bridges(bridges: BridgePaths, start_law: AnyStartLaw | None) -> AbstractCoupling:
+    """Return the coupling that proposed the bridges, with `start_law` if it is not `None`.
 
-    **Raises:** `TypeError` or `ValueError` for anything but bridges by a coupling at all steps of
-    their grid.
+    **Raises:** `TypeError` if `bridges` are not bridges; `ValueError` if no coupling proposed them,
+    or if they are not stored at all steps of their grid.
     """
     if not isinstance(bridges, BridgePaths):
-        raise TypeError(f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}.")
+        raise TypeError(
+            f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}. Pass the "
+            "result of `sample_bridges`, `weigh_bridges` or `sample_exact_bridges`."
+        )
     if bridges.coupling is None:
-        raise ValueError("`bridges` must have been proposed by a `Coupling`.")
+        raise ValueError(
+            "`bridges` must come from proposals by a `Coupling`; got bridges of another proposal. "
+            "Sample them with a `Coupling`."
+        )
     if bridges.paths.shape[-2] != bridges.num_steps + 1:
         raise ValueError(
-            "whether a bridge is hit depends on its whole path, but these bridges were kept at "
-            f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points: sample them "
-            "without `save_at`, or use `sample_exact_bridges`, which takes it."
+            "`bridges` must be whole paths, because a hit may occur at any grid point; got "
+            f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points. Sample them "
+            "without `save_at`, or call `sample_exact_bridges`, which accepts it."
         )
     if start_law is None:
         return bridges.coupling
@@ -296,5 +329,5 @@ def coupling_of(bridges: BridgePaths, start_law: AnyStartLaw | None) -> Abstract
 
 
 def check_max_trials(max_trials: int | None, num_counts: int) -> Int[Array, ""]:
-    """The bound on the trials of a bridge."""
+    """Return the bound on the trials of a bridge; by default 10,000 for each count."""
     return check_bound("max_trials", max_trials, _MAX_TRIALS_PER_COUNT * num_counts)

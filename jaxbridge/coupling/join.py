@@ -1,12 +1,18 @@
 """Proposed bridges: a pair of coupled paths, joined where they meet (section 2.2).
 
-For each lane: simulate the time-reversed diffusion from the end point, which read forwards is
-X with X_T = b; recover the noise that drives it forwards, equation (Wrev); drive X' from the
-start point with the coupled noise, equations (simY') and (simW'); and join,
+Each lane makes one proposal in four steps:
+
+1. Simulate the time-reversed diffusion from the end point. Read forwards it is X with X_T = b.
+
+2. Recover the noise that drives X forwards, equation (Wrev).
+
+3. Drive X' from the start point by the coupled noise, equations (simY') and (simW').
+
+4. Join the two paths, equation (bridgesim):
 
     Z_i = X'_i for i < ρ,   Z_i = X_i for i ≥ ρ,
 
-equation (bridgesim), where ρ - 1 is the first step in which the two meet.
+where ρ - 1 is the index of the first step in which the two meet.
 """
 
 from typing import NamedTuple
@@ -30,7 +36,7 @@ from .rotation import driven_through_root
 
 
 class Inputs(NamedTuple):
-    """Everything a path may be differentiated with respect to."""
+    """The arguments in which a path may be differentiated."""
 
     model: Diffusion
     coupling: AbstractCoupling
@@ -40,9 +46,10 @@ class Inputs(NamedTuple):
 class Proposals(NamedTuple):
     """Joined paths, lanes in the last axis.
 
-    `paths` are kept at the K stored steps. `reverse_start` is X_0, the value of the reversed
-    path at time 0. `meeting_step` is ρ, between 1 and N, or N + 1 where the pair did not meet;
-    `finite` is false where one of the two paths left the finite numbers before the pair met.
+    - `paths`: the joined paths at the K stored steps.
+    - `reverse_start`: X_0, the value of the reversed path at time 0.
+    - `meeting_step`: ρ, between 1 and N, or N + 1 if the pair does not meet.
+    - `finite`: false if one of the two paths became non-finite before the pair met.
     """
 
     paths: Float[Array, "K d lanes"]
@@ -58,21 +65,24 @@ def propose(
     stored: Int[Array, " K"] | None = None,
     meeting_step: Int[Array, " lanes"] | None = None,
 ) -> Proposals:
-    """One proposal in each lane, whose random numbers depend on the lane's key alone.
+    """Propose one bridge in each lane.
 
-    The intervals of `inputs` have lanes in the last axis. `stored` are the steps among 0, ..., N
-    at which the joined path is kept, by default all.
-    With `meeting_step` the pair is joined there, not where the coupling's rule says: a replay.
+    The random numbers of a lane depend on the key of that lane only. The intervals of `inputs` have
+    lanes in the last axis. `stored` are the steps among 0, ..., N at which the joined path is
+    stored; by default all are. With `meeting_step` the function replays proposals: it joins each
+    pair at that step, and ignores the meeting rule.
     """
     model, coupling, (start, end, duration) = inputs
     like, dt = start[:, 0], duration / num_steps
+    # X, X' and a random γ have independent keys.
     reverse_keys, driven_keys, coupling_keys = split_each(keys, 3)
     backward = model.backward(like)
+    # Only the pair uses the triangular root. Any root of V gives the reversed path its law.
     forward = driven_through_root(coupling, model.forward(like), like)
     x_start, x_path = reverse_path(backward, coupling.scheme, reverse_keys, end, dt, num_steps)
     pairs = in_lanes(coupling, forward, like, coupling_keys, dt)
-    # A whole path is written next to its start; but not by a replay, which is there to be
-    # differentiated, and a store is slow in reverse mode.
+    # A store with room for the start avoids a copy of the whole path. A replay serves derivatives
+    # and does without: a store is slow in reverse mode.
     replayed, num_stored = meeting_step is not None, None if stored is None else len(stored)
     if decisions.stored_times(num_stored).simulated and not replayed:
         stored = jnp.arange(num_steps + 1)
@@ -81,7 +91,7 @@ def propose(
         forward, pairs, driven_keys, start, x_start, x_path, store, meeting_step
     )
     z_path = jnp.concatenate([start[None], z_path]) if store is None else z_path[:-1]
-    # What has exploded does not come back, so the last states tell.
+    # A non-finite path stays so, hence the last states show it.
     finite = jnp.all(is_finite(x_start) & is_finite(z_end), axis=0) | (rho <= num_steps)
     return Proposals(z_path, x_start, rho, finite)
 
@@ -94,7 +104,7 @@ def reverse_path(
     dt: Float[Array, " lanes"],
     num_steps: int,
 ) -> tuple[Float[Array, "d lanes"], Float[Array, "N d lanes"]]:
-    """The reversed path X_N = b, ..., X_0: the last, and the others as X_1, ..., X_N."""
+    """Simulate the reversed path X_N = b, ..., X_0. Return X_0, and X_1, ..., X_N as one array."""
     step = steps_in_lanes(scheme, backward, end[:, 0], dt)
     return noisy_scan(
         lambda x, inputs: (step(x, inputs[0]), x),
@@ -117,18 +127,23 @@ def _driven_path(
     store: Store | None,
     meeting_step: Int[Array, " lanes"] | None,
 ) -> tuple[Float[Array, "d lanes"], Int[Array, " lanes"], Float[Array, "rows d lanes"]]:
-    """X' until the pair meets and X from then on: its end, ρ, and the path after the start."""
+    """Simulate the joined path: X' until the pair meets, and X from then on.
+
+    Return its end, ρ, and the path after the start.
+    """
     lanes, axes = pairs
     num_steps, replayed = len(x_path), meeting_step is not None
 
     @over_lanes(-1, -1, -1, -1, -1, None, axes)
     def step_joined(x, z, rho, x_next, noise, i, lane):
+        # The forward noise of X, recovered from its path: equation (Wrev).
         dw = lane.scheme.noise(forward, x, x_next, lane.dt)
         pair = drive(forward, lane, x, x_next, dw, z, noise)
         if not replayed:
-            # The first meeting: a minimum over the steps, masked by whether they saw one.
+            # The minimum over all steps with a meeting is the first one.
             met = have_met(forward, lane.coupling, pair, noise)
             rho = jnp.where(met, jnp.minimum(rho, i + 1), rho)
+        # After the meeting Z follows X.
         return jnp.where(i + 1 >= rho, x_next, pair.driven_next), rho
 
     def step(carry, inputs):
@@ -137,6 +152,7 @@ def _driven_path(
         z, rho = step_joined(x, z, rho, x_next, noise, i, lanes)
         return (x_next, z, rho), z
 
+    # N + 1 stands for no meeting.
     never = jnp.full(lanes.dt.shape, num_steps + 1, jnp.int32)
     (_, z_end, rho), z_path = noisy_scan(
         step,
@@ -151,7 +167,8 @@ def _driven_path(
 
 
 def _store(stored: Int[Array, " K"], start: Float[Array, "d lanes"], num_steps: int) -> Store:
-    """Rows for the stored steps; all begin as the start, which is what step 0 keeps."""
+    """Return the store for the stored steps. Its rows begin as the start, the state at step 0."""
     rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *start.shape))
+    # Steps that are not stored write to the last row, which is discarded.
     slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(stored.shape[0]))
     return Store(slots[1:], rows)

@@ -1,26 +1,27 @@
-"""Have the two diffusions met between two grid points? (section 2.5 of the paper)
+"""Meeting rules: whether the pair meets between two grid points (section 2.5 of the paper).
 
-The pair is looked at in the whitened coordinates of the driven process, `σ(x')⁻¹`, where to
-leading order the gap `x - x'` moves only along its own direction u, as a Brownian motion: the
-coupling makes the components orthogonal to u equal. With
+The rules use the whitened coordinates of the driven process, `σ(x')⁻¹`. In them the gap `x - x'`
+moves along its own direction u only, to leading order, because the coupling makes the noise
+orthogonal to u equal. Along u it is a Brownian motion. With
 
     D_i = |σ(x'_i)⁻¹(x_i - x'_i)|,    D_{i+1} = uᵀσ(x'_i)⁻¹(x_{i+1} - x'_{i+1}),
 
-a meeting is a visit of that Brownian motion, from D_i to D_{i+1}, to zero.
+a meeting is a visit of this Brownian motion to zero, on its way from D_i to D_{i+1}.
 
-During a step the drift turns the gap, so with u from its beginning the two pass each other at a
-distance of O(δ^{3/2}), which is the error of what is joined there. Where σ is constant, schemes
-take u from the gap as it is when the noise of their step sets in (`AbstractScheme.frame`), which
-then moves it straight through zero. For a scheme x + m(x) + R ΔW, with constant R, that is after
-the drift,
+The direction of the gap needs care, because the drift turns the gap during the step. If u is the
+direction at the beginning of the step, the two pass each other at a distance of O(δ^{3/2}). The
+joined path then has a jump of that size. For constant σ the schemes therefore take u from the gap
+at the moment when the noise of the step begins to act (`AbstractScheme.frame`). The noise then
+moves the gap straight through zero. For a scheme x + m(x) + R ΔW with constant R, this is the gap
+after the drift:
 
-    D_i u = R⁻¹[x_i + m(x_i) - x'_i - m(x'_i)],    D_{i+1} = D_i + uᵀ(ΔW - ΔW'),
+    D_i u = R⁻¹[x_i + m(x_i) - x'_i - m(x'_i)],    D_{i+1} = D_i + uᵀ(ΔW - ΔW').
 
-and the joint law of (ΔW, ΔW') given what is orthogonal to uᵀ(ΔW - ΔW') stays the same if x_{i+1}
-and x'_{i+1} change places, but for the factor exp(-2 D_i D_{i+1} / (s δ)) in its density. That is
-the probability of a crossing, so, if X has the transition probabilities of the scheme, the joined
-path has exactly these: meetings have no error of their own at any δ. (With γ = -1 this is the
-maximal coupling of two normal laws by reflection; Bou-Rabee, Eberle & Zimmer 2020.)
+This choice is exact at any δ, by the following argument. Condition on the noise orthogonal to
+uᵀ(ΔW-ΔW'), and let x_{i+1} and x'_{i+1} change places. The density of (ΔW, ΔW') then changes by the
+factor exp(-2 D_i D_{i+1} / (s δ)) only, which is the probability of a crossing. So if X has the
+transition probabilities of the scheme, the joined path has exactly the same ones. For γ = -1 this
+is the maximal coupling of two normal laws by reflection (Bou-Rabee, Eberle & Zimmer 2020).
 """
 
 from abc import abstractmethod
@@ -37,11 +38,13 @@ from ..schemes import Frame
 
 
 class PairStep(NamedTuple):
-    """One time step of the pair: everything a meeting rule may look at.
+    """One time step of the pair: the data for a meeting rule.
 
-    `x`, `x_next` are the states of X and `driven`, `driven_next` those of X', shape (d,);
-    `frame` is what the noise of the step, of length `dt`, was coupled in; `gap_variance` is the
-    variance per unit of time of the gap along `frame.u`.
+    - `frame`: the frame in which the noise of the step is coupled.
+    - `x`, `x_next`: the states of X before and after the step, shape (d,).
+    - `driven`, `driven_next`: those of X', shape (d,).
+    - `dt`: the step size, shape ().
+    - `gap_variance`: variance of the gap along `frame.u` per unit of time, shape ().
     """
 
     frame: Frame
@@ -53,20 +56,21 @@ class PairStep(NamedTuple):
     gap_variance: Float[Array, ""]
 
     def along_u(self, vector: Float[Array, " d"]) -> Float[Array, ""]:
-        """uᵀσ(x'_i)⁻¹ applied to a vector."""
+        """Return uᵀσ(x'_i)⁻¹ `vector`."""
         return dot(self.frame.u, self.frame.sigma.solve(vector))
 
     def gap_next(self) -> Float[Array, ""]:
-        """D_{i+1}, negative where the two have passed each other."""
+        """Return D_{i+1}. It is negative if the two have passed each other."""
         return self.along_u(self.x_next - self.driven_next)
 
 
 class AbstractMeeting(eqx.Module):
-    """A rule that decides whether a pair met during a step.
+    """Base class of meeting rules, which decide whether a pair meets during a step.
 
-    `draws_uniform` says whether the rule needs a uniform number; where it does not, none is
-    drawn and `uniform` is `None`. `looks_ahead` says whether the pair is seen, and coupled, as it
-    is after the drift of the scheme's step, or as it is now, as in the paper.
+    - `draws_uniform`: whether the rule needs a uniform random number. If not, none is sampled and
+        `uniform` is `None`.
+    - `looks_ahead`: whether the frame of the pair is the one after the drift of the step. If not,
+        it is the one at the beginning of the step, as in the paper.
     """
 
     draws_uniform: ClassVar[bool]
@@ -76,14 +80,16 @@ class AbstractMeeting(eqx.Module):
     def met(
         self, step: PairStep, forward: Dynamics, uniform: Float[Array, ""] | None
     ) -> Bool[Array, ""]:
-        """Whether the pair met."""
+        """Return whether the pair meets in this step."""
 
 
 class SignTest(AbstractMeeting):
-    """Equation (crit1): the gap has changed its sign, `D_i D_{i+1} < 0`.
+    """Meeting rule of equation (crit1): the gap changes its sign, `D_i D_{i+1} < 0`.
 
-    Sees about half of the meetings, so what it decides is off by O(√δ). With a `radius`, in
-    units of space, `|x_i - x'_i| ≤ radius` is asked too; the paper uses 0.05.
+    It detects about half of the meetings, so results have an error of O(√δ). With a `radius`, in
+    units of space, it also requires `|x_i - x'_i| ≤ radius`; the paper uses 0.05.
+
+    **Raises:** `ValueError` for a `radius` that is not a positive number.
 
     **Example:**
 
@@ -101,10 +107,14 @@ class SignTest(AbstractMeeting):
         if self.radius is None:
             return
         if self.radius.shape != () or not (is_traced(self.radius) or self.radius > 0):
-            raise ValueError(f"`radius` must be a positive number; got {radius}.")
+            raise ValueError(
+                f"`radius` must be a positive number; got {radius}. Omit it for no bound."
+            )
 
     def met(self, step, forward, uniform):
+        # The first gap is a norm, so the product is negative if and only if the next gap is.
         crossed = step.frame.gap * step.gap_next() < 0
+        # A gap of zero has no sign to change, but the pair has met.
         touching = step.frame.gap == 0
         if self.radius is not None:
             crossed &= safe_norm(step.x - step.driven) <= self.radius
@@ -112,11 +122,12 @@ class SignTest(AbstractMeeting):
 
 
 class ReflectionPlane(AbstractMeeting):
-    """Equation (coupling), for γ = -1: X has crossed the plane in which X' mirrors it,
+    """Meeting rule of equation (coupling), for γ = -1: X crosses the plane in which X' mirrors it,
 
         uᵀσ⁻¹ (x_{i+1} - x_i - α(x_i) δ) ≤ -½ D_i.
 
-    The same test as `SignTest()` where the two share their drift, and off by O(√δ) as well.
+    If the drift of the two is the same, it is the same test as `SignTest()`. Results have an error
+    of O(√δ) as well.
 
     **Example:**
 
@@ -129,18 +140,21 @@ class ReflectionPlane(AbstractMeeting):
     looks_ahead: ClassVar[bool] = False
 
     def met(self, step, forward, uniform):
+        # The move of X without its drift: the plane reflects the noise only.
         noise = step.along_u(step.x_next - step.x - forward.drift(step.x) * step.dt)
         return noise <= -step.frame.gap / 2
 
 
 class BrownianCrossing(AbstractMeeting):
-    """Draw whether the Brownian gap reached zero between its two known ends,
+    """Random meeting rule: whether a Brownian gap reaches zero between its two known ends,
 
-        P(met | D_i, D_{i+1}) = min(1, exp(-2 D_i D_{i+1} / (s δ))),
+        P(met | D_i, D_{i+1}) = min(1, exp(-2 D_i D_{i+1} / (s δ))).
 
-    with s the variance of the gap per unit of time, 2(1-γ) for the γ-coupling. For constant σ
-    without error of its own with `Euler` and `GaussianTransition`, and off by O(δ²) with `Heun`;
-    off by O(δ) where σ depends on the state.
+    Here s is the variance of the gap per unit of time, 2(1-γ) for the γ-coupling. The error of the
+    rule depends on σ and on the scheme:
+
+    - constant σ: no error with `Euler` and `GaussianTransition`, O(δ²) with `Heun`;
+    - state-dependent σ: O(δ).
 
     **Example:**
 
@@ -155,8 +169,10 @@ class BrownianCrossing(AbstractMeeting):
     def met(self, step, forward, uniform):
         assert uniform is not None
         gap_next = step.gap_next()
-        moving = step.gap_variance > 0  # a gap that does not move is crossed only if closed
+        moving = step.gap_variance > 0  # a gap without noise cannot close
         scale = jnp.where(moving, step.gap_variance * step.dt, 1)
+        # Gaps of opposite signs give a positive exponent: the crossing is certain.
         exponent = jnp.where(moving, -2 * step.frame.gap * gap_next / scale, -jnp.inf)
+        # A gap that is already closed counts as a meeting, also at index 0.
         exponent = jnp.where(step.frame.gap > 0, exponent, 0)
         return uniform < jnp.exp(exponent)

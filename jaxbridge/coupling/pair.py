@@ -1,10 +1,11 @@
-"""One step of a coupled pair, in either direction (equations (simW') and (stjerne-dif)),
+"""One step of a coupled pair, in either direction (equations (simW') and (stjerne-dif)).
 
-    X drives X',  ΔW' = driven_noise(O ΔW);    X' drives X,  ΔW = Oᵀ driving_noise(ΔW'),
+    X drives X':  ΔW' = driven_noise(O ΔW);    X' drives X:  ΔW = Oᵀ driving_noise(ΔW').
 
-both maps the coupling's, in the frame in which the pair lies when the noise of the step sets in.
-Then the meeting rule is asked. A proposed bridge is made in the one direction (`join`), its
-associated diffusion in the other (`associated`).
+Both maps belong to the coupling. They use the frame of the pair at the moment when the noise of the
+step begins to act. After the step the meeting rule decides whether the pair met.
+
+Proposed bridges use the first direction (`join`), associated diffusions the second (`associated`).
 """
 
 from collections.abc import Callable
@@ -26,7 +27,8 @@ from .rotation import rotate, rotate_back, rotation_between
 
 
 class Lane(NamedTuple):
-    """What a pair is stepped with: its own coupling, and the scheme fitted to its steps."""
+    """Settings for the steps of one pair: its own coupling, and the scheme fitted to its step
+    size."""
 
     coupling: AbstractCoupling
     scheme: AbstractScheme
@@ -35,8 +37,11 @@ class Lane(NamedTuple):
 
 
 class PairNoise(NamedTuple):
-    """Random numbers of a step beyond the noise of the path that drives: N(0, 1) for dU and U(0, 1)
-    for the meeting rule, each only where it is called for."""
+    """Random numbers of a step besides the noise of the driving path.
+
+    - `normal`: N(0, 1) for dU, or `None` if the coupling needs none.
+    - `uniform`: U(0, 1) for the meeting rule, or `None` if the rule needs none.
+    """
 
     normal: Float[Array, "*steps"] | None
     uniform: Float[Array, "*steps"] | None
@@ -49,22 +54,25 @@ def in_lanes(
     keys: Key[Array, " lanes"],
     dt: Float[Array, " lanes"],
 ) -> tuple[Lane, Lane]:
-    """All lanes, in the precision of the point, and the axes of lanes in them."""
+    """Return the settings of all lanes, and their `vmap` axes. Arrays have the dtype of `like`."""
     coupling = cast_floats(coupling, like.dtype)
     realised = coupling.realise(keys)
+    # Only arrays that `realise` replaced have an axis of lanes.
     axes = jax.tree.map(lambda old, new: None if old is new else -1, coupling, realised)
     scheme = fitted_in_lanes(coupling.scheme, dynamics, like, dt)
     return Lane(realised, scheme, dt, jnp.sqrt(dt)), Lane._make((axes, -1, -1, -1))
 
 
 def pair_noise(coupling: AbstractCoupling, dtype) -> Callable[[Key[Array, ""], int], PairNoise]:
-    """`PairNoise` of k steps of a lane."""
-    own = decisions.independent_noise(coupling.independent_noise).simulated
-    crossing = decisions.crossing_uniforms(coupling.meeting.draws_uniform).simulated
+    """Return a function that samples the `PairNoise` of k steps of a lane from a key."""
+    needs_normals = decisions.independent_noise(coupling.independent_noise).simulated
+    needs_uniforms = decisions.crossing_uniforms(coupling.meeting.draws_uniform).simulated
 
     def draw(key, k):
-        normals, uniforms = normals_and_uniforms(key, own, crossing, k, dtype)
-        return PairNoise(normals[0] if own else None, uniforms[0] if crossing else None)
+        normals, uniforms = normals_and_uniforms(key, needs_normals, needs_uniforms, k, dtype)
+        return PairNoise(
+            normals[0] if needs_normals else None, uniforms[0] if needs_uniforms else None
+        )
 
     return draw
 
@@ -77,8 +85,12 @@ def relative_frame(
     driven: Float[Array, " d"],
     dt: Float[Array, ""],
 ) -> Frame:
-    """How the pair lies at the beginning of a step, as the meeting rule wants it; `scheme` is the
-    coupling's, fitted to the step."""
+    """Return the frame of the pair in a step from `x` and `driven`, as the meeting rule requires
+    it.
+
+    `scheme` is the coupling's scheme, fitted to the step size.
+    """
+    # The rule decides: the gap after the drift of the step, or the gap before it as in the paper.
     if coupling.meeting.looks_ahead:
         return scheme.frame(dynamics, x, driven, dt)
     return frame(dynamics.sigma(driven), x, driven)
@@ -93,11 +105,12 @@ def drive(
     driven: Float[Array, " d"],
     noise: PairNoise,
 ) -> PairStep:
-    """The step in which X, going to `x_next` by the noise `dw`, drives X'."""
-    seen, turn, du = _geometry(dynamics, lane, x, driven, noise)
-    driven_dw = lane.coupling.driven_noise(seen, rotate(turn, dw), du)
+    """Return the step in which X drives X'. X moves to `x_next` by the noise `dw`."""
+    pair_frame, rotation, du = _geometry(dynamics, lane, x, driven, noise)
+    # O rotates the noise of X before the coupling, and Oᵀ after it in the other direction.
+    driven_dw = lane.coupling.driven_noise(pair_frame, rotate(rotation, dw), du)
     driven_next = lane.scheme.step(dynamics, driven, lane.dt, driven_dw)
-    return _pair_step(lane, seen, x, x_next, driven, driven_next)
+    return _pair_step(lane, pair_frame, x, x_next, driven, driven_next)
 
 
 def drive_back(
@@ -109,28 +122,30 @@ def drive_back(
     driven_dw: Float[Array, " d"],
     noise: PairNoise,
 ) -> PairStep:
-    """The step in which X', going to `driven_next` by the noise `driven_dw`, drives X."""
-    seen, turn, du = _geometry(dynamics, lane, x, driven, noise)
-    dw = rotate_back(turn, lane.coupling.driving_noise(seen, driven_dw, du))
+    """Return the step in which X' drives X. X' moves to `driven_next` by the noise `driven_dw`."""
+    pair_frame, rotation, du = _geometry(dynamics, lane, x, driven, noise)
+    dw = rotate_back(rotation, lane.coupling.driving_noise(pair_frame, driven_dw, du))
     x_next = lane.scheme.step(dynamics, x, lane.dt, dw)
-    return _pair_step(lane, seen, x, x_next, driven, driven_next)
+    return _pair_step(lane, pair_frame, x, x_next, driven, driven_next)
 
 
 def have_met(
     dynamics: Dynamics, coupling: AbstractCoupling, step: PairStep, noise: PairNoise
 ) -> Bool[Array, ""]:
-    """Whether the pair met in this step, by the coupling's rule, in finite numbers."""
+    """Return whether the pair met in this step by the coupling's rule, with finite states."""
+    # NaN compares as false, but an infinite state could pass as a meeting.
     met = coupling.meeting.met(step, dynamics, noise.uniform)
     return met & all_finite(step.x_next) & all_finite(step.driven_next)
 
 
 def _geometry(dynamics, lane, x, driven, noise):
-    """The frame of the pair, its rotation, and the increment dU."""
-    seen = relative_frame(lane.coupling, lane.scheme, dynamics, x, driven, lane.dt)
-    turn = rotation_between(lane.coupling, dynamics.sigma(x), dynamics.sigma(driven))
-    return seen, turn, None if noise.normal is None else lane.root_dt * noise.normal
+    """Return the frame of the pair, its rotation (or `None`), and the increment dU (or `None`)."""
+    pair_frame = relative_frame(lane.coupling, lane.scheme, dynamics, x, driven, lane.dt)
+    # Both directions call this function, so they share O and u.
+    rotation = rotation_between(lane.coupling, dynamics.sigma(x), dynamics.sigma(driven))
+    return pair_frame, rotation, None if noise.normal is None else lane.root_dt * noise.normal
 
 
-def _pair_step(lane, seen, x, x_next, driven, driven_next) -> PairStep:
-    variance = lane.coupling.gap_variance(seen)
-    return PairStep(seen, x, x_next, driven, driven_next, lane.dt, variance)
+def _pair_step(lane, pair_frame, x, x_next, driven, driven_next) -> PairStep:
+    variance = lane.coupling.gap_variance(pair_frame)
+    return PairStep(pair_frame, x, x_next, driven, driven_next, lane.dt, variance)

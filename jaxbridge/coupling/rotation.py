@@ -1,9 +1,9 @@
-"""The rotation O(x, x') of a pair (section 2.1): it turns the noise of X so that σ(x')O points
-where σ(x) does.
+"""The rotation O(x, x') of a pair (section 2.1): it aligns σ(x')O with σ(x).
 
-Any O that both directions share is exact. With σ = L Q, L lower triangular and Q orthogonal, that
-which costs least is O(x, x') = Q(x')ᵀQ(x): then W̃ = Q W drives X through L, which tends to L(x')
-where x tends to x', and L solves by substitution (`driven_through_root`).
+Any O is exact if both directions share it. Let σ = L Q, with L lower triangular and Q orthogonal.
+The cheapest choice is O(x, x') = Q(x')ᵀQ(x). Then W̃ = Q W drives X through L
+(`driven_through_root`): L(x) tends to L(x') as x tends to x', and linear systems with L need only
+substitution.
 """
 
 import equinox as eqx
@@ -19,10 +19,10 @@ from .base import AbstractCoupling
 
 
 def polar_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
-    """O(x, x'), the orthogonal matrix closest to σ(x')ᵀσ(x), so that σ(x')O ≈ σ(x).
+    """Return O(x, x'), the orthogonal matrix closest to σ(x')ᵀσ(x), so that σ(x')O ≈ σ(x).
 
-    `sigma` is σ(x), `driven_sigma` σ(x'), shape (d, d). The paper prints its transpose,
-    `published_rotation`.
+    `sigma` is σ(x) and `driven_sigma` is σ(x'), both of shape (d, d). The paper prints the
+    transpose, which is `published_rotation`.
 
     **Example:**
 
@@ -35,9 +35,10 @@ def polar_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]
 
 
 def no_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
-    """O = I: as exact as any other rotation, but σ(x) and σ(x') may point elsewhere.
+    """Return `None`, for O = I.
 
-    `sigma` is σ(x), `driven_sigma` σ(x'), shape (d, d).
+    It is as exact as any other rotation, but σ(x) and σ(x') are not aligned. `sigma` is σ(x) and
+    `driven_sigma` is σ(x'), both of shape (d, d).
 
     **Example:**
 
@@ -49,10 +50,10 @@ def no_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
 
 
 def published_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]):
-    """The orthogonal factor of σ(x)ᵀσ(x') as printed in the paper: the transpose of the
-    rotation that aligns the two, so it turns the wrong way. For comparisons.
+    """Return the orthogonal factor of σ(x)ᵀσ(x'), as printed in the paper. For comparisons only.
 
-    `sigma` is σ(x), `driven_sigma` σ(x'), shape (d, d).
+    It is the transpose of the rotation that aligns σ(x) with σ(x'), so it turns the wrong way.
+    `sigma` is σ(x) and `driven_sigma` is σ(x'), both of shape (d, d).
 
     **Example:**
 
@@ -65,16 +66,17 @@ def published_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d
 
 
 def _as_matrices(sigma: Numbers, driven_sigma: Numbers) -> tuple[Array, Array]:
-    """Return both as square matrices of one shape.
+    """Return both arguments as square matrices of the same shape.
 
     **Raises:** `ValueError` for other shapes.
     """
     first, second = as_floating("sigma", sigma), as_floating("driven_sigma", driven_sigma)
     if first.ndim != 2 or first.shape[0] != first.shape[1] or second.shape != first.shape:
         raise ValueError(
-            "`sigma` and `driven_sigma` must have one shape, (d, d); got shapes "
-            f"{first.shape} and {second.shape}."
+            "`sigma` and `driven_sigma` must both have shape (d, d); got shapes "
+            f"{first.shape} and {second.shape}. Pass two square matrices of the same size."
         )
+    # The polar factor needs at least single precision.
     check_precision(
         "`sigma` and `driven_sigma`",
         min(first.dtype, second.dtype, key=lambda dtype: dtype.itemsize),
@@ -85,9 +87,10 @@ def _as_matrices(sigma: Numbers, driven_sigma: Numbers) -> tuple[Array, Array]:
 def rotation_between(
     coupling: AbstractCoupling, sigma: AbstractSigma, driven_sigma: AbstractSigma
 ) -> Float[Array, "d d"] | None:
-    """O(x, x'), or `None` where σ calls for no rotation."""
+    """Return O(x, x'), or `None` if the type of σ needs no rotation."""
     if not rotation_effect(coupling, type(sigma)).simulated:
         return None
+    # `rotation_effect` excludes all other types of σ: their directions do not vary.
     assert isinstance(sigma, Full | Triangular) and isinstance(driven_sigma, Full | Triangular)
     rotation = polar_rotation if coupling.rotation is None else coupling.rotation
     matrix = evaluated("rotation", rotation, sigma.matrix, driven_sigma.matrix)
@@ -95,19 +98,19 @@ def rotation_between(
     if matrix.shape != sigma.matrix.shape:
         raise ValueError(
             f"`rotation` must return a matrix of shape {sigma.matrix.shape}; it returned shape "
-            f"{matrix.shape}."
+            f"{matrix.shape}. Return an orthogonal matrix."
         )
     return matrix.astype(sigma.matrix.dtype)
 
 
 def rotation_effect(coupling: AbstractCoupling, sigma: type[AbstractSigma]) -> decisions.Effect:
-    """Whether the pair calls for a rotation."""
+    """Return the effect that states whether the pair needs a rotation."""
     rotation = coupling.rotation
     return decisions.rotation(sigma, rotation is not None, rotation is no_rotation)
 
 
 def root_effect(coupling: AbstractCoupling, sigma: type[AbstractSigma]) -> decisions.Effect:
-    """Whether the pair is driven through the triangular root of V."""
+    """Return the effect that states whether the triangular root of V drives the pair."""
     rotation_given, stratonovich = coupling.rotation is not None, coupling.scheme.stratonovich
     return decisions.triangular_root(sigma, rotation_given, stratonovich)
 
@@ -115,18 +118,22 @@ def root_effect(coupling: AbstractCoupling, sigma: type[AbstractSigma]) -> decis
 def driven_through_root(
     coupling: AbstractCoupling, dynamics: Dynamics, like: Float[Array, " d"]
 ) -> Dynamics:
-    """The same diffusion as the pair sees it: with σ = L Q driven by Q W through L, where that is
-    called for."""
+    """Return the same diffusion, driven through the triangular root where that helps the pair.
+
+    With σ = L Q it is the diffusion that Q W drives through L. Its law is the same.
+    """
+    # Abstract evaluation gives the type of σ without any computation.
     if not root_effect(coupling, type(eqx.filter_eval_shape(dynamics.sigma, like))).simulated:
         return dynamics
+    # Only V = σσᵀ determines the law, so any root of V gives the same diffusion.
     return dynamics._replace(sigma=lambda x: dynamics.sigma(x).root())
 
 
 def rotate(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Float[Array, " d"]:
-    """O w."""
+    """Return O w, with `rotation` for O; `None` is the identity."""
     return dw if rotation is None else matvec(rotation, dw)
 
 
 def rotate_back(rotation: Float[Array, "d d"] | None, dw: Float[Array, " d"]) -> Float[Array, " d"]:
-    """Oᵀ w."""
+    """Return Oᵀ w, with `rotation` for O; `None` is the identity."""
     return dw if rotation is None else matvec(rotation.T, dw)

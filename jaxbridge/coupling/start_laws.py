@@ -1,18 +1,19 @@
-"""Where the associated diffusion starts (section 2.3 of the paper, corrected).
+"""Start laws: the law of the initial state of the associated diffusion (section 2.3, corrected).
 
-Take X with X_0 ~ ν, X' from a driven by X, and exchange the two where they meet: by the strong
-Markov property (Z, Y) has the law of (X', X). So Y, the diffusion associated with Z, starts
-from the stationary density ν, independently of Z, and the proposals have the density
-`f_br(z) π_ν(z) / π` with π_ν(z) the probability that it hits z. (The paper starts it from
-p*_T(b, ·), the law of X_0 given X_T = b; but what is conditioned on is Z_T = b, and Z does not
-depend on X_0.)
+Take X with X_0 ~ ν, and X' from a driven by X. Exchange the two where they meet. By the strong
+Markov property the exchanged pair (Z, Y) has the law of (X', X). So Y, the diffusion associated
+with Z, starts from the stationary density ν, independently of Z. The proposals have the density
+`f_br(z) π_ν(z) / π`, where π_ν(z) is the probability that Y hits z.
 
-Another start law μ is exact too if it is paid for. With x_0 the time-0 value of the reversed
-path in the proposal, which has the density p*_T(b, ·) = ν(·) p_T(·, b) / ν(b),
+The paper starts Y from p*_T(b, ·), the law of X_0 given X_T = b. But the condition is Z_T = b, and
+Z does not depend on X_0.
+
+Another start law μ is exact too, with a factor in the weight. Let x_0 be the value of the reversed
+path at time 0 in the proposal. Its density is p*_T(b, ·) = ν(·) p_T(·, b) / ν(b). Then
 
     E[1{met} · ν(b)/ν(x_0) · μ(x_0) / π_μ(Z) · h(Z)] = p_T(a, b) E_bridge[h].
 
-It needs μ = 0 wherever ν = 0, π_μ > 0 and, for a finite variance, about ∫ μ²/ν < ∞.
+Conditions: μ = 0 wherever ν = 0, and π_μ > 0. A finite variance needs about ∫ μ²/ν < ∞.
 """
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -34,41 +35,48 @@ from ..models.dynamics import Dynamics
 from ..models.gaussian_law import GaussianLaw
 from ..schemes import AbstractScheme, steps_in_lanes
 
-# No run that replaces a sampler of ν takes more steps than this.
+# Bound on the steps of a run that replaces a sampler of ν.
 MOST_STEPS = 2**18
 
 
 @runtime_checkable
 class StartLaw(Protocol):
-    """Any law with a sampler and a normalised density; `GaussianLaw` is one.
+    """Interface of start laws: a sampler and a normalised density; `GaussianLaw` has both.
 
-    Make it an `equinox.Module` with arrays as its fields. Any other object serves too, but is
-    read once, when a program is compiled for it: later changes of its attributes are not seen.
+    Use an `equinox.Module` with arrays as fields. Any other object works too, but compilation reads
+    it once: later changes of its attributes have no effect.
     """
 
     def sample(self, key: Key[Array, ""], model: Diffusion) -> Float[Array, " d"]:
-        """One draw, shape (d,)."""
+        """Return one draw, shape (d,)."""
         ...
 
     def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
-        """The log density at a point, shape (d,)."""
+        """Return the log density at one point, shape (d,)."""
         ...
 
 
 class Stationary(eqx.Module):
-    """The stationary density ν: the corrected theorem's own start law, and the best one where
-    the end points are likely.
+    """The stationary density ν as start law: the law of the corrected theorem.
 
-    Draws come from the model's sampler. For a model without one, but with a density, weights and
-    chains start from 512 draws, smoothed: a law with a density of its own, near ν, with which
-    bridges are as exact. It is in their `proposal`.
+    It is the best start law for likely end points. The way to sample from ν depends on the model:
 
-    With a `burn_in`, and where ν itself is called for, as in `hitting_counts`, such a model is run:
-    the reversed diffusion starts at b and is taken after so many units of time, afresh for every
-    draw. By default that time is measured, as `measure_burn_in` does, and infinite where none was
-    found. A run takes no more than 2¹⁸ steps; where it should have taken more what was counted or
-    weighed is marked as `truncated`. What the start weighs after the run is less than 1e-5 for a
-    diffusion that forgets exponentially fast, but may be 2e-3 for one with heavy tails.
+    - A model with a sampler of ν: draws come from the sampler.
+    - A model with a density but without sampler: weights and chains use 512 smoothed draws as the
+        start law. That law has a density of its own, near ν, and the bridges are as exact. The
+        `proposal` of a result contains it.
+    - A model without sampler, if `burn_in` is set, or if ν itself is needed, as in
+        `hitting_counts`: each draw is the end of a new run of the reversed diffusion, from b and of
+        length `burn_in`.
+
+    By default the burn-in is measured as in `measure_burn_in`, and is infinite if no time is found.
+    A run takes at most 2¹⁸ steps. If that is shorter than the burn-in, results are marked as
+    `truncated`. The remaining distance to ν, in total variation, is below 1e-5 under exponential
+    mixing, but may be 2e-3 for heavy-tailed laws.
+
+    **Arguments:**
+
+    - `burn_in`: length of a run in units of time, shape (), or `None` (default).
 
     **Raises:** `ValueError` for a `burn_in` that is not a positive time, shape ().
 
@@ -91,8 +99,10 @@ class Stationary(eqx.Module):
 
 
 class Reversed(eqx.Module):
-    """p*_T(b, ·), the law of the time-reversed diffusion from b after the whole duration, as
-    the paper prints it. It does **not** give the exact law: for comparisons only.
+    """The start law p*_T(b, ·) as printed in the paper. For comparisons only.
+
+    It is the law of the time-reversed diffusion from b after the whole duration. Weights with it do
+    **not** give the exact law.
 
     **Example:**
 
@@ -103,7 +113,7 @@ class Reversed(eqx.Module):
 
 
 class _Identity:
-    """An object that equals itself only."""
+    """Wrapper that compares an object by identity."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -116,8 +126,10 @@ class _Identity:
 
 
 class Opaque(eqx.Module):
-    """A start law that is not made of arrays, kept out of the sight of JAX: what it does is
-    read once, when a program is compiled for it."""
+    """Wrapper for a start law with fields that are not arrays.
+
+    The law is static for JAX: changes after compilation have no effect.
+    """
 
     _sample: "_Method" = eqx.field(static=True)
     _log_density: "_Method" = eqx.field(static=True)
@@ -136,7 +148,7 @@ class Opaque(eqx.Module):
 
 
 class _Method(NamedTuple):
-    """A method of an object, equal for the same object."""
+    """A method of an object, equal to the same method of the same object."""
 
     law: _Identity
     name: str
@@ -149,14 +161,21 @@ AnyStartLaw = Stationary | Reversed | StartLaw
 
 
 def as_start_law(law: Any) -> AnyStartLaw:
-    """The law itself, if it is one, as a pytree of arrays."""
+    """Check a start law. Return it as a pytree of arrays.
+
+    **Raises:** `TypeError` if `law` is not a start law; `ValueError` for a `GaussianLaw` without a
+    finite mean and a positive definite covariance.
+    """
     if isinstance(law, type):
-        raise TypeError(f"`start_law` must be an object, not a class: write `{law.__name__}(...)`.")
+        raise TypeError(
+            f"`start_law` must be an object, not a class; got {law!r}. Pass `{law.__name__}(...)`."
+        )
     if not isinstance(law, Stationary | Reversed | StartLaw):
         raise TypeError(
             "`start_law` must be `Stationary()`, `GaussianLaw(mean, covariance)`, `Reversed()`, or "
             f"an object with `sample(key, model)` and `log_density(x)`; got {law!r}."
         )
+    # `GaussianLaw` accepts degenerate laws, which have no density.
     if isinstance(law, GaussianLaw) and not is_traced(law):
         matrix = np.asarray(law.covariance, float)
         if not (np.all(np.isfinite(law.mean)) and np.linalg.eigvalsh(matrix).min() > 0):
@@ -166,12 +185,15 @@ def as_start_law(law: Any) -> AnyStartLaw:
             )
     if not all(eqx.is_array_like(leaf) for leaf in jax.tree.leaves(law)):
         return Opaque(law)
-    return jax.tree.map(jnp.asarray, law)  # numbers are traced, so that they may change
+    # As arrays, numbers may change without a new compilation.
+    return jax.tree.map(jnp.asarray, law)
 
 
 def log_ratio(law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]) -> Float[Array, ""]:
-    """log (μ/ν)(x), up to the constant of ν; zero for `Stationary`, and taken to be zero for
-    `Reversed`, as printed."""
+    """Return log (μ/ν)(x), shape (), up to the constant of ν.
+
+    It is zero for `Stationary`. For `Reversed` it is set to zero, as in the printed algorithm.
+    """
     if isinstance(law, Stationary | Reversed):
         return jnp.zeros((), x.dtype)
     log_density = check_value("log_density", cast_floats(law, x.dtype).log_density(x), (), x)
@@ -179,19 +201,24 @@ def log_ratio(law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]) -> Floa
 
 
 def needs_burn_in(law: AnyStartLaw, model: Diffusion) -> bool:
-    """Whether ν must be sampled by a run whose length is not known."""
+    """Return whether samples from ν need a run of unknown length."""
     return isinstance(law, Stationary) and law.burn_in is None and not model.has_sampler
 
 
 def run_is_cut(
     law: AnyStartLaw, model: Diffusion, dt: Float[Array, " lanes"], num_steps: int
 ) -> Bool[Array, " lanes"]:
-    """Where the run that replaces a sampler of ν would have to be longer than it may be, so that
-    its end does not have the law ν: always if the burn-in is infinite, for it is not known."""
+    """Return, for each lane, whether the run that replaces a sampler of ν is shorter than its
+    burn-in.
+
+    Then the end of the run does not have the law ν. It is always true for an infinite burn-in,
+    which stands for an unknown one.
+    """
     if not isinstance(law, Stationary) or law.burn_in is None or model.has_sampler:
         return jnp.zeros(dt.shape, bool)
+    # Runs consist of whole repeats of `num_steps` steps.
     longest = (MOST_STEPS // num_steps) * num_steps * dt
-    return ~(law.burn_in.astype(dt.dtype) <= longest * (1 + 1e-4))  # of rounding
+    return ~(law.burn_in.astype(dt.dtype) <= longest * (1 + 1e-4))  # allow for rounding
 
 
 def draw_starts(
@@ -203,23 +230,24 @@ def draw_starts(
     dt: Float[Array, " lanes"],
     num_steps: int,
 ) -> Float[Array, "d lanes"]:
-    """A draw from the law in each lane."""
+    """Sample one start from the law in each lane."""
     if isinstance(law, Stationary) and not model.has_sampler:
+        # `with_burn_in` has set it before any program starts.
         assert law.burn_in is not None
         repeats = jnp.ceil(law.burn_in.astype(dt.dtype) / (num_steps * dt))
         repeats = jnp.minimum(repeats, MOST_STEPS // num_steps).astype(jnp.int32)
         return run_for(model.backward(end[:, 0]), scheme, keys, end, dt, num_steps, repeats)
     if isinstance(law, Reversed):
-        once = jnp.ones(dt.shape, jnp.int32)
-        return run_for(model.backward(end[:, 0]), scheme, keys, end, dt, num_steps, once)
+        one_run = jnp.ones(dt.shape, jnp.int32)
+        return run_for(model.backward(end[:, 0]), scheme, keys, end, dt, num_steps, one_run)
     if isinstance(law, Stationary):
         draws = jax.vmap(model.sample_stationary)(keys)
     else:
         draws = jax.vmap(lambda key: evaluated("start_law", law.sample, key, model))(keys)
     if draws.shape[1:] != end.shape[:1]:
         raise ValueError(
-            f"`start_law` must give points of shape {end.shape[:1]}, as the end points are; it "
-            f"gave {draws.shape[1:]}."
+            f"`start_law` must give points of shape {end.shape[:1]}, the shape of the end points; "
+            f"got points of shape {draws.shape[1:]}. Pass a start law of the same dimension."
         )
     return draws.T.astype(end.dtype)
 
@@ -233,10 +261,10 @@ def run_for(
     num_steps: int,
     repeats: Int[Array, " lanes"],
 ) -> Float[Array, "d lanes"]:
-    """The state after `repeats` times `num_steps` steps, in each lane."""
+    """Simulate `repeats` times `num_steps` steps in each lane. Return the last states."""
     step = steps_in_lanes(scheme, dynamics, x[:, 0], dt)
 
-    def once(repeat, x):
+    def run_once(repeat, x):
         end, _ = noisy_scan(
             lambda x, inputs: (step(x, inputs[0]), None),
             x,
@@ -245,6 +273,6 @@ def run_for(
             None,
             num_steps,
         )
-        return jnp.where(repeat < repeats, end, x)
+        return jnp.where(repeat < repeats, end, x)  # lanes with fewer repeats stop here
 
-    return lax.fori_loop(0, jnp.max(repeats), once, x)
+    return lax.fori_loop(0, jnp.max(repeats), run_once, x)

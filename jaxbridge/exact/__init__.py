@@ -1,14 +1,17 @@
-"""What is made of weights, on any proposal: bridges of the exact law (`exact_bridges`),
+"""Bridges with the exact law, from the weights w of any proposal:
 
-    E_bridge[h] = E[w h(path)] / E[w],    p_T(a, b) = E[w],
+    E_bridge[h] = E[w h(path)] / E[w],    p_T(a, b) = E[w].
 
-by importance sampling (`importance`) and by Markov chains (`chains`), which are kernels as well
-(`kernels`): `pseudo_marginal`, `renewal` and `crank_nicolson`, a method a module. Transition
-densities are means of weights (`density`), and `expectation` has derivatives that are right. Two
-grids make one estimate without their leading step error (`extrapolation`).
+- `exact_bridges` is the base class of results: means over exact bridges, and their errors.
+- `importance` weights independent bridges (importance sampling).
+- `chains` runs Markov chains of bridges. Their kernels are `pseudo_marginal`, `renewal` and
+    `crank_nicolson`, one module each, with common parts in `kernels`.
+- `density` estimates transition densities by means of weights.
+- `expectation` has correct derivatives of means over bridges.
+- `extrapolation` combines two grids into an estimate without the leading discretisation error.
 """
 
-# What the folders above use of this one.
+# Names for the packages that build on this one.
 from .chains import sample_exact_bridges as sample_exact_bridges
 from .density import (
     estimate_log_density as estimate_log_density,

@@ -1,11 +1,11 @@
-"""Markov chains whose law is that of the exact bridge: very many steps in one call.
+"""Markov chains whose stationary law is that of the exact bridge: many steps in one call.
 
-* Pseudo-marginal Metropolis–Hastings (`pseudo_marginal`), for every proposal.
-* Renewal (`renewal`), for couplings.
-* Preconditioned Crank–Nicolson moves of the noise (`crank_nicolson`), for proposals that are
-  pulled to the end point.
+There are three methods, each of which is also a kernel of two functions, `init` and `step`
+(`kernels`):
 
-Each comes as a kernel of two functions, `init` and `step`, too (`kernels`).
+- pseudo-marginal Metropolis–Hastings (`pseudo_marginal`), for every proposal;
+- renewal (`renewal`), for couplings;
+- preconditioned Crank–Nicolson moves of the noise (`crank_nicolson`), for guided proposals.
 """
 
 import functools
@@ -48,44 +48,46 @@ def sample_exact_bridges(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
 ) -> Chain:
-    """A Markov chain of bridges with the exact law: section 2.3 of the paper.
+    """Sample a Markov chain of bridges with the exact law: section 2.3 of the paper.
 
-    The law is exact up to the step error, which `num_steps` controls. Proposals do not depend
-    on the chain, so they and their counts are made ahead, thousands at a time; the renewal
-    chain runs in segments that are joined where they agree. The chain is, up to rounding, that
-    of the kernel: with `run_key, init_key = jax.random.split(key)`, the one that starts from
-    `init(position, init_key)` and steps with `jax.random.split(run_key, num_bridges)`.
+    The law is exact up to the discretisation error, which `num_steps` controls. Proposals do not
+    depend on the state of the chain. So thousands of proposals and their counts run at a time,
+    before the chain. The renewal chain runs in segments, which are joined where they agree.
+
+    Up to rounding the result is the chain of the kernel. That chain starts from `init(position,
+    init_key)`, and its steps have the keys `jax.random.split(run_key, num_bridges)`. Here `run_key`
+    and `init_key` are the two keys of `jax.random.split(key)`.
 
     **Arguments:**
 
-    - `key`: a typed key. With I intervals the i-th chain has the key
-        `jax.random.fold_in(key, i)`.
+    - `key`: a typed key. With I intervals the i-th chain has the key `jax.random.fold_in(key, i)`.
     - `model`, `start`, `end`, `duration`, `num_steps`, `save_at`: as in `sample_bridges`.
     - `num_bridges`: n, the number of iterations.
-    - `position`: the path from which the chain starts, shape (N+1, d), for instance the last of
-        another; (I, N+1, d) for I intervals. By default a first path is proposed.
-    - `proposal`: a `Coupling`, with its start law, by default `Coupling(gamma=0.0)`; or
-        `ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()` (the default of
-        "crank_nicolson"), whose target is made of the densities of their steps; or "auto",
-        which finds the best for each interval by a pilot run, or
-        what `choose_proposal` returns.
-    - `method`: "pseudo_marginal"; "renewal", for couplings, which needs many more iterations for
-        bridges as good, each of which costs less; or "crank_nicolson", for proposals that are
-        pulled to the end point, where few of them are accepted: it moves the noise of the current
-        path a little in each iteration.
-    - `num_counts`: N, hitting counts for each proposal of the pseudo-marginal chain; by default
-        one.
-    - `max_proposals`: bounds the tries for each new path; by default 10,000.
-    - `max_trials`: bounds the trials for the counts of each path; by default 10,000 for each
-        count. See `Chain.truncated`. It and `num_counts` are not for the renewal chain.
+    - `position`: the path from which the chain starts, shape (N+1, d), for instance the last one of
+        another chain; shape (I, N+1, d) for I intervals. By default the chain proposes its first
+        path.
+    - `proposal`: a `Coupling`, with its start law; a guided proposal (`ModifiedDiffusionBridge()`,
+        `ResidualBridge()` or `Guided()`), whose target is a product of step densities; "auto",
+        which selects the best one for each interval by a pilot run; or a result of
+        `choose_proposal`. The default is `Coupling(gamma=0.0)`, and `Guided()` for
+        "crank_nicolson".
+    - `method`: "pseudo_marginal", "renewal" or "crank_nicolson". "renewal" is for couplings: an
+        iteration costs less, but a good sample takes many more iterations. "crank_nicolson" is for
+        guided proposals with low acceptance: it moves the noise of the current path a little in
+        each iteration.
+    - `num_counts`: N, the number of hitting counts for each proposal of the pseudo-marginal chain;
+        by default one. Not for the renewal chain.
+    - `max_proposals`: bound on the attempts for each new path; by default 10,000.
+    - `max_trials`: bound on the trials for the counts of each path; by default 10,000 for each
+        count. See `Chain.truncated`. Not for the renewal chain.
     - `step_size`: β in (0, 1] of "crank_nicolson", by default 0.5; see `crank_nicolson`.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where the result is not `trustworthy`, or parameters are
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
         not finite.
 
-    **Returns:** `Chain`. Not differentiable.
+    **Returns:** `Chain`. It is not differentiable.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -104,21 +106,27 @@ def sample_exact_bridges(
     proposal = as_proposal(proposal, model, problem.like, budget)
     proposal.check(model, problem.intervals)
     if step_size is not None and method != "crank_nicolson":
-        raise ValueError('`step_size` is for method="crank_nicolson".')
+        raise ValueError(
+            f'`step_size` is for method="crank_nicolson"; got method="{method}". Omit `step_size`.'
+        )
     if method == "crank_nicolson":
         proposal = as_guided(proposal)
         run = functools.partial(run_crank_nicolson, beta=check_step_size(step_size))
     elif method == "renewal":
         proposal, run = as_pairs(proposal), run_renewal
+        # Silently ignored arguments would mislead, so they are refused.
         if not (num_counts is None and max_trials is None):
             raise ValueError(
-                "`num_counts` and `max_trials` are for the pseudo-marginal chain: the renewal "
-                "chain counts nothing."
+                "`num_counts` and `max_trials` are for the pseudo-marginal chain; got "
+                f"num_counts={num_counts} and max_trials={max_trials} for the renewal chain, which "
+                "counts nothing. Omit both."
             )
     else:
         run = run_pseudo_marginal
+    # Checks of arguments come first, so that errors come before any pilot run.
     first = check_position(position, problem)
     problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
+    # The pilot run of "auto" selects a concrete proposal here.
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     chain = run(key, model, proposal, problem, num_bridges, first, progress_meter)
     return throw_where_untrustworthy(chain, "paths", model) if throw else chain

@@ -1,14 +1,14 @@
-"""Preconditioned Crank–Nicolson moves on bridges: a chain that moves the noise a little.
+"""Preconditioned Crank–Nicolson moves on bridges: a chain that changes the noise a little.
 
-A proposal that is pulled to the end point (`guided`) maps noise ξ ~ N(0, I) to a path, and the
-bridge is that law weighted with w(ξ). The move
+A guided proposal (`guided`) maps noise ξ ~ N(0, I) to a path. The bridge is the law of that path,
+weighted by w(ξ). The move
 
     ξ' = √(1-β²) ξ + β η,    η ~ N(0, I),
 
-leaves N(0, I) invariant, so ξ' is accepted with probability min(1, w(ξ')/w(ξ)): for long or
-hard bridges, where paths that are proposed from scratch are hardly ever accepted. β = 1 is that
-again. The number of steps does not matter for the acceptance (Beskos, Roberts, Stuart & Voss
-2008; Cotter, Roberts, Stuart & White 2013).
+leaves N(0, I) invariant. So the chain accepts ξ' with probability min(1, w(ξ')/w(ξ)). It suits long
+or hard bridges, where independent proposals are rarely accepted. β = 1 gives independent proposals.
+The acceptance does not depend on the number of steps (Beskos, Roberts, Stuart & Voss 2008; Cotter,
+Roberts, Stuart & White 2013).
 """
 
 from typing import Any, NamedTuple
@@ -37,9 +37,14 @@ from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_position,
 
 
 class CrankNicolsonState(NamedTuple):
-    """`position`, the path, shape (N+1, d); the `noise` it is made from, (N-1, d); its
-    `log_weight`, -inf for a path that left the finite numbers; and its `log_halving`, the log of
-    the factor by which half as many steps would change that (`halving`)."""
+    """State of the chain.
+
+    - `position`: the path, shape (N+1, d).
+    - `noise`: the noise of the path, shape (N-1, d).
+    - `log_weight`: its log weight, -inf for a path that became non-finite.
+    - `log_halving`: log of the factor by which half as many steps would change the weight
+        (`halving`).
+    """
 
     position: Float[Array, "*I points d"]
     noise: Float[Array, "*I steps d"]
@@ -48,8 +53,12 @@ class CrankNicolsonState(NamedTuple):
 
 
 class CrankNicolsonInfo(NamedTuple):
-    """Of one step: the `acceptance_rate`, whether the move was accepted, and the log weight of
-    the path that was proposed, -inf where it left the finite numbers."""
+    """Report of one step of the chain.
+
+    - `acceptance_rate`: the acceptance probability of the move.
+    - `is_accepted`: whether the move was accepted.
+    - `log_weight`: log weight of the proposed path, -inf if it became non-finite.
+    """
 
     acceptance_rate: Float[Array, "*I"]
     is_accepted: Bool[Array, "*I"]
@@ -67,16 +76,18 @@ def crank_nicolson(
     proposal: Any = None,
     step_size: Numbers | None = None,
 ) -> Kernel:
-    """The preconditioned Crank–Nicolson kernel on (start, end, duration)-bridges.
+    """Return the preconditioned Crank–Nicolson kernel on (start, end, duration)-bridges.
 
-    `init(position, rng_key)` takes a path of shape (N+1, d), and so may enter a chain, as a block
-    of a Gibbs sampler; or `None`, for a first path by proposal. `step(rng_key, state)` gives a
+    `init(position, rng_key)` takes a path of shape (N+1, d), so the kernel can be a block of a
+    Gibbs sampler. With `None` it proposes a first path. `step(rng_key, state)` returns a
     `CrankNicolsonState` and a `CrankNicolsonInfo`.
 
-    **Arguments:** as in `sample_exact_bridges`, but `proposal` is by default `Guided()`;
-    `step_size` is β in (0, 1], by default 0.5: aim at accepting a quarter to a half.
+    **Arguments:** as in `sample_exact_bridges`, with these differences:
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    - `proposal`: by default `Guided()`.
+    - `step_size`: β in (0, 1], by default 0.5. Choose it for an acceptance of 25 to 50 %.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -119,12 +130,13 @@ def _init(
     model, proposal, intervals = nondifferentiable((model.prepared(), proposal, intervals))
     dynamics = model.forward(intervals.start[0])
     if paths is None:
-        noise = _normal(keys, num_steps, intervals)
+        noise = _sample_noise(keys, num_steps, intervals)
         paths, log_weights, log_halving = path_of(proposal, dynamics, intervals, noise)
     else:
         noise, log_weights, log_halving = noise_of(proposal, dynamics, intervals, paths)
-        noise = jnp.where(jnp.isfinite(noise), noise, 0)  # a path outside the state space is left
-    return CrankNicolsonState(paths, noise, _finite(log_weights), log_halving)
+        # A path outside the state space has no noise. Zeros let the chain leave it.
+        noise = jnp.where(jnp.isfinite(noise), noise, 0)
+    return CrankNicolsonState(paths, noise, _non_finite_to_neg_inf(log_weights), log_halving)
 
 
 @compiled_sooner
@@ -132,8 +144,8 @@ def _step(rng_key, state, model, proposal, intervals, beta):
     model, proposal, intervals = nondifferentiable((model.prepared(), proposal, intervals))
     dynamics = model.forward(intervals.start[0])
     state = jax.tree.map(lambda leaf: leaf[None], state)
-    moved = _move(rng_key[None], state, proposal, dynamics, intervals, beta)
-    return jax.tree.map(lambda leaf: leaf[0], moved)
+    state_and_info = _move(rng_key[None], state, proposal, dynamics, intervals, beta)
+    return jax.tree.map(lambda leaf: leaf[0], state_and_info)
 
 
 def _move(
@@ -144,23 +156,27 @@ def _move(
     intervals: Intervals,
     beta: Float[Array, ""],
 ) -> tuple[CrankNicolsonState, CrankNicolsonInfo]:
-    """One move of each of I chains."""
+    """Make one move of each of I chains."""
     noise_keys, accept_keys = split_each(keys, 2)
     dtype = state.noise.dtype
     beta = beta.astype(dtype)
-    fresh = _normal(noise_keys, state.noise.shape[1] + 1, intervals)
+    # N - 1 steps have noise: the last one ends in b.
+    fresh = _sample_noise(noise_keys, state.noise.shape[1] + 1, intervals)
+    # 1 - β² as a product keeps its digits near β = 1.
     noise = jnp.sqrt((1 - beta) * (1 + beta)) * state.noise + beta * fresh
     paths, log_weights, log_halving = path_of(proposal, dynamics, intervals, noise)
-    candidate = CrankNicolsonState(paths, noise, _finite(log_weights), log_halving)
+    candidate = CrankNicolsonState(paths, noise, _non_finite_to_neg_inf(log_weights), log_halving)
+    # The move leaves N(0, I) invariant, so the rate contains the weights only.
     rate = acceptance_rate(state.log_weight, candidate.log_weight)
     uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=dtype))(accept_keys)
     accepted = uniform < rate
 
-    def choose(new, old):
+    def select(new, old):
+        # Add axes so that one decision for each chain broadcasts over its arrays.
         return jnp.where(accepted.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     info = CrankNicolsonInfo(rate, accepted, candidate.log_weight)
-    return jax.tree.map(choose, candidate, state), info
+    return jax.tree.map(select, candidate, state), info
 
 
 @compiled_for(lambda key, model, proposal, problem, num, *_, beta: problem.num_path_steps(num))
@@ -174,9 +190,9 @@ def run_crank_nicolson(
     progress_meter: diffrax.AbstractProgressMeter | None,
     beta: Float[Array, ""],
 ) -> Chain:
-    """The chain of each interval, side by side, from its `position` if there is one."""
-    fixed = (model.prepared(), proposal, problem, position)
-    model, proposal, problem, position = nondifferentiable(fixed)
+    """Run the chains of all intervals side by side, from `position` if it is not `None`."""
+    arguments = (model.prepared(), proposal, problem, position)
+    model, proposal, problem, position = nondifferentiable(arguments)
     intervals, num_steps = problem.intervals, problem.num_steps
     dynamics = model.forward(problem.like)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)
@@ -184,13 +200,17 @@ def run_crank_nicolson(
 
     def step(state, keys):
         state, info = _move(keys, state, proposal, dynamics, intervals, beta)
-        kept = state._replace(position=problem.kept(state.position), noise=None)
-        return state, (kept, info)
+        # The noise is as large as the path and is not part of the result.
+        stored = state._replace(position=problem.kept(state.position), noise=None)
+        return state, (stored, info)
 
-    _, made = metered_scan(step, first, step_keys.T, progress_meter)
-    states, info = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), made)
+    _, outputs = metered_scan(step, first, step_keys.T, progress_meter)
+    # The scan puts steps first; results have intervals first.
+    states, info = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), outputs)
     met = states.log_weight > -jnp.inf
-    tried = jnp.concatenate([first.log_weight[:, None], info.log_weight], axis=1)
+    # The first path counts as a simulated path too.
+    log_weights_of_proposals = jnp.concatenate([first.log_weight[:, None], info.log_weight], axis=1)
+    # A state of weight zero, for instance a first path outside the state space, is missing.
     paths = jnp.where(met[..., None, None], states.position, jnp.nan)
     return Chain(
         times=problem.times(proposal.fractions(num_steps)),
@@ -199,9 +219,9 @@ def run_crank_nicolson(
         log_weights=problem.result(states.log_weight),
         met=problem.result(met),
         truncated=problem.result(jnp.zeros_like(met)),
-        num_simulated=problem.total(jnp.ones_like(tried)),
-        num_nonfinite=problem.total(tried == -jnp.inf),
-        num_truncated=problem.total(jnp.zeros_like(tried)),
+        num_simulated=problem.total(jnp.ones_like(log_weights_of_proposals)),
+        num_nonfinite=problem.total(log_weights_of_proposals == -jnp.inf),
+        num_truncated=problem.total(jnp.zeros_like(log_weights_of_proposals)),
         proposal=proposal,
         pareto_k=None,
         log_halving=problem.result(states.log_halving),
@@ -210,7 +230,7 @@ def run_crank_nicolson(
     )
 
 
-def _normal(
+def _sample_noise(
     keys: Key[Array, " I"], num_steps: int, intervals: Intervals
 ) -> Float[Array, "I steps d"]:
     _, d = intervals.start.shape
@@ -218,13 +238,15 @@ def _normal(
     return jax.vmap(lambda key: jax.random.normal(key, (num_steps - 1, d), dtype))(keys)
 
 
-def _finite(log_weights: Float[Array, " I"]) -> Float[Array, " I"]:
+def _non_finite_to_neg_inf(log_weights: Float[Array, " I"]) -> Float[Array, " I"]:
     return jnp.where(jnp.isfinite(log_weights), log_weights, -jnp.inf)
 
 
 def check_step_size(step_size: Numbers | None) -> Float[Array, ""]:
-    """β, in (0, 1]."""
+    """Check β and return it, by default 0.5."""
     beta = as_floating("step_size", 0.5 if step_size is None else step_size)
     if beta.shape != () or not (is_traced(beta) or 0 < np.asarray(beta) <= 1):
-        raise ValueError(f"`step_size` must be a number in (0, 1]; got {step_size}.")
+        raise ValueError(
+            f"`step_size` must be a number in (0, 1]; got {step_size}. Omit it for 0.5."
+        )
     return beta

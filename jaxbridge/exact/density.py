@@ -1,6 +1,6 @@
-"""Transition densities by Monte Carlo: p_T(a, b) = E[w] over weighted proposals.
+"""Transition densities by Monte Carlo: p_T(a, b) = E[w], a mean over weighted proposals.
 
-Unbiased on the natural scale, up to the step error, and so fit for pseudo-marginal
+The estimate of p_T is unbiased up to the discretisation error. So it suits pseudo-marginal
 Metropolis–Hastings over the parameters of a model.
 """
 
@@ -35,29 +35,35 @@ from ..schemes import StepError, dominates, step_fault, with_rounding
 
 
 class TransitionLogDensity(AbstractResult):
-    """What `transition_log_density` returns: estimates for one pair of points, shape (), or for I
-    of them.
+    """Result of `transition_log_density`: estimates for one pair of points, shape (), or for I
+    pairs.
 
-    - `value`: log p̂_T(a, b); `exp(value)` is unbiased. -inf where no proposal became a bridge.
-    - `standard_error`: that of `value`, by the delta method; infinite where nothing is known, and
-        where weights were cut off (`num_truncated`), for it would not tell by how much that shifts
-        the estimate. Only to be trusted where `effective_sample_size` is large.
+    - `value`: log p̂_T(a, b); `exp(value)` is unbiased. It is -inf if no proposal became a bridge.
+    - `standard_error`: standard error of `value`, by the delta method. It is infinite if the
+        weights do not determine it, or if weights were truncated (`num_truncated`), because it does
+        not include the bias of the truncation. It is reliable only for a large
+        `effective_sample_size`.
     - `effective_sample_size`: (Σw)²/Σw² over the proposals.
-    - `num_met`: how many proposals became bridges.
-    - `num_truncated`: how many of their weights were cut off by `max_trials`. Each makes the
-        estimate too small on average; more trials, or a start law that hits sooner, avoid it.
-    - `num_simulated`: paths simulated in all.
-    - `num_nonfinite`: how many of them left the state space or the finite numbers. Their mass is
-        missing, about -log(1 - share lost) of `value`, and more where weights are unequal. Where
-        that may be beyond 5 % and beyond the standard error `value` is not `trustworthy`.
-    - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
-    - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` can be trusted.
-    - `step_error`: an estimate of what `value` is too large by for the length of the steps, with
-        a standard error of it, `step_uncertainty`; with it is what rounding may add where steps
-        are very many, N d ε/2, ten thousand in single precision. NaN where it is not known, as of
-        one step, or of couplings whose σ(x) varies: run two grids and `extrapolate`.
-    - `step_share`: the step error as a share of what half as many steps change, infinite where that
-        says little of it (couplings with a σ(x) that varies); `num_steps`: N.
+    - `num_met`: number of proposals that became bridges.
+    - `num_truncated`: number of weights that `max_trials` truncated. Each makes the estimate too
+        small on average. More trials, or a start law that hits sooner, avoid it.
+    - `num_simulated`: number of simulated paths.
+    - `num_nonfinite`: number of these that left the state space or became non-finite. Their mass is
+        missing from `value`: about `-log(1-s)`, s being the share of lost paths, and more where
+        weights are unequal. The result is not `trustworthy` if that may exceed 5 % and the standard
+        error.
+    - `proposal`: the proposal of the paths. If its start law `Stationary` needs runs, it contains
+        their `burn_in`.
+    - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` is reliable.
+    - `step_error`: estimated discretisation bias of `value` (estimate minus limit). It is NaN if
+        unknown, for one step or for couplings with a state-dependent σ(x): use two grids and
+        `extrapolate`.
+    - `step_uncertainty`: standard error of `step_error`. For very many steps (about ten thousand in
+        single precision) it includes the rounding error, N d ε/2.
+    - `step_share`: the discretisation error divided by the change of the estimate under half as
+        many steps. It is infinite if that change is uninformative (couplings with a state-dependent
+        σ(x)).
+    - `num_steps`: N.
     """
 
     value: Float[Array, "*I"]
@@ -76,14 +82,21 @@ class TransitionLogDensity(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, "*I"]:
-        """Whether the step error is beyond the standard error, or not known well enough to say:
-        then more steps help, and more proposals do not."""
+        """Return whether the discretisation error is, or may be, larger than the standard error.
+
+        Then more steps help, and more proposals do not.
+        """
         return dominates(self._step_error, self.standard_error)
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: no bridge, weights cut off or with heavy tails, too many paths
-        lost, a step error that dominates and is beyond 0.05."""
+        """Return the possible faults, as a `Verdict`:
+
+        - no bridge;
+        - truncated weights, or weights with heavy tails;
+        - too many lost paths;
+        - a discretisation error that dominates and exceeds 0.05.
+        """
         return Verdict((*self._weight_faults, step_fault(self._step_error, self.standard_error)))
 
     @property
@@ -117,34 +130,36 @@ def transition_log_density(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
 ) -> TransitionLogDensity:
-    """An estimate of log p_T(a, b) with its standard error, for one pair or thousands.
+    """Estimate log p_T(a, b), with its standard error, for one pair of points or thousands.
 
     **Arguments:**
 
-    - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`. The
-        density is with respect to `end`, in units of space to the power -d.
-    - `num_proposals`: for each interval. One that does not meet counts as zero.
-    - `proposal`: a `Coupling`, with its start law; by default `Coupling(gamma=0.0)` if the model
-        is declared `normalised`. With `Stationary()` and `Reversed()` it must be (those of
-        `ornstein_uhlenbeck` and `hyperbolic` are), unless the model has no sampler, in whose
-        place `Stationary()` takes a law with a density; with a start law that has a density,
-        such as
-        `fit_start_law(..., for_density=True)` finds, it need not be, for the constant of
-        `log_stationary` cancels. Or `ModifiedDiffusionBridge()`,
-        `ResidualBridge()` or `Guided()`, which need no stationary law; or "auto", which tries
-        couplings only if the model is declared `normalised`; or what `choose_proposal` returns.
-    - `num_counts`: N hitting counts for each proposal, by default one.
-    - `max_trials`: bounds the trials of each proposal; by default 10,000 for each count.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where the result is not `trustworthy`, or parameters are
+    - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`. The density
+        is with respect to `end`, in units of space to the power -d.
+    - `num_proposals`: number of proposals for each interval. A proposal that does not meet counts
+        as zero.
+    - `proposal`: a `Coupling`, with its start law; a guided proposal (`ModifiedDiffusionBridge()`,
+        `ResidualBridge()` or `Guided()`), which needs no stationary law; "auto", which tries
+        couplings only if the model is declared `normalised`; or a result of `choose_proposal`. The
+        default is `Coupling(gamma=0.0)`, for a model that is declared `normalised`.
+    - `num_counts`: N, the number of hitting counts for each proposal; by default one.
+    - `max_trials`: bound on the trials of each proposal; by default 10,000 for each count.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
         not finite.
 
-    **Returns:** `TransitionLogDensity`. With proposals that are pulled to the end point `value` is
-    differentiable, forward and reverse: an estimate of the score. So it is with a choice between
-    such proposals, by `choose_proposal` or, where that tries no couplings, by "auto". With
-    couplings, and a choice that may take them, a derivative raises `TypeError`.
+    **Start laws.** A coupling with `Stationary()` or `Reversed()` needs a model that is declared
+    `normalised`, as `ornstein_uhlenbeck` and `hyperbolic` are. Two cases do not, because the
+    constant of `log_stationary` cancels: a start law with a density, such as one from
+    `fit_start_law(..., for_density=True)`, and `Stationary()` for a model without sampler, where a
+    law with a density replaces it.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Returns:** `TransitionLogDensity`. `value` is differentiable, in forward and reverse mode, for
+    guided proposals; the derivative estimates the score. The same holds for a choice between such
+    proposals, by `choose_proposal`, or by "auto" where it tries no couplings. For couplings, and
+    for a choice that may select them, a derivative raises `TypeError`.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -161,6 +176,7 @@ def transition_log_density(
     budget = Budget(num_counts, None, max_trials)
     proposal = as_proposal(proposal, model, problem.like, budget, for_density=True)
     proposal.check(model, problem.intervals)
+    # A density needs the constant of ν, bridges do not.
     proposal.check_for_density(model)
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)
     estimate = estimate_log_density(key, model, proposal, problem, num_proposals, progress_meter)
@@ -177,33 +193,40 @@ def estimate_log_density(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     held: bool = False,
 ) -> TransitionLogDensity:
-    """The estimates, for arguments that have been checked; `held` if a pseudo-marginal chain is to
-    hold on to them."""
+    """Estimate log densities, for arguments that are already checked.
+
+    `held` states that the estimate is the state of a pseudo-marginal chain, which changes the law
+    of its weights.
+    """
     model, intervals, num_steps = model.prepared(), problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
-    nothing = jnp.zeros(0, jnp.int32)  # no path is kept
-    drawn = proposal.draw(
+    no_steps = jnp.zeros(0, jnp.int32)  # no path is stored
+    weighted_paths = proposal.draw(
         problem.keys(key, num_proposals),
         model,
         intervals,
         num_steps,
-        nothing,
+        no_steps,
         True,
         progress_meter=progress_meter,
     )
-    log_mean, error, size = log_mean_and_error(drawn.log_weights)
-    cut = jnp.any(drawn.truncated, axis=1)
+    log_mean, error, size = log_mean_and_error(weighted_paths.log_weights)
+    # One truncated weight biases the whole mean, so the standard error becomes infinite.
+    is_truncated = jnp.any(weighted_paths.truncated, axis=1)
     share = proposal.share_in_regime(model, intervals, num_steps)
     varies = model.sigma_varies(problem.like)
-    step_error = drawn.step_error(share, num_steps, varies, held)
-    if proposal.by_coupling is None:  # weights of coupled pairs are no sums over steps
+    step_error = weighted_paths.step_error(share, num_steps, varies, held)
+    # Log weights of guided proposals are sums over steps, whose rounding errors add up. Weights of
+    # couplings are counts.
+    if proposal.by_coupling is None:
         step_error = with_rounding(step_error, num_steps, problem.like.shape[0])
-    value, error, size, shape, step_error, share = problem.result(
+    value, error, size, k_hat, step_error, share = problem.result(
         (
             log_mean,
-            jnp.where(cut, jnp.inf, error),
+            jnp.where(is_truncated, jnp.inf, error),
             size,
-            pareto_k(drawn.log_weights),
+            pareto_k(weighted_paths.log_weights),
+            # An error estimate is a diagnostic: it has no derivative.
             lax.stop_gradient(step_error),
             share,
         )
@@ -212,12 +235,12 @@ def estimate_log_density(
         value,
         error,
         size,
-        problem.total(drawn.found),
-        problem.total(drawn.truncated),
-        problem.total(drawn.num_simulated),
-        problem.total(drawn.num_nonfinite),
+        problem.total(weighted_paths.found),
+        problem.total(weighted_paths.truncated),
+        problem.total(weighted_paths.num_simulated),
+        problem.total(weighted_paths.num_nonfinite),
         proposal,
-        shape,
+        k_hat,
         step_error.value,
         step_error.uncertainty,
         share,
@@ -228,21 +251,26 @@ def estimate_log_density(
 def log_mean_and_error(
     log_weights: Float[Array, "I n"],
 ) -> tuple[Float[Array, " I"], Float[Array, " I"], Float[Array, " I"]]:
-    """The log of the mean of n weights, its standard error by the delta method, infinite where
-    nothing is known, and their effective number."""
+    """Return the log of the mean of n weights, its standard error, and the effective sample size.
+
+    The standard error is by the delta method. It is infinite for one weight, or if all weights are
+    zero.
+    """
     n = log_weights.shape[1]
-    # Relative to the largest, so that sums of squares keep their digits.
+    # Weights relative to the largest one, so that sums of squares keep their digits.
     largest = lax.stop_gradient(jnp.max(log_weights, axis=1, keepdims=True))
+    # If all weights are zero, -inf - (-inf) would be NaN.
     largest = jnp.where(largest > -jnp.inf, largest, 0)
     log_sum = logsumexp(log_weights - largest, axis=1)
     log_squares = logsumexp(2 * (log_weights - largest), axis=1)
-    some = log_sum > -jnp.inf
-    inverse_size = jnp.where(some, jnp.exp(log_squares - 2 * log_sum), jnp.inf)
-    # The variance of the mean, in squares of the mean. Σw²/(Σw)² - 1/n would be lost to rounding
-    # where weights are nearly equal.
-    log_mean = jnp.where(some, log_sum - math.log(n), 0)
+    is_positive = log_sum > -jnp.inf
+    inverse_size = jnp.where(is_positive, jnp.exp(log_squares - 2 * log_sum), jnp.inf)
+    # The variance of the mean, relative to the square of the mean. The form Σw²/(Σw)² - 1/n would
+    # cancel for nearly equal weights.
+    log_mean = jnp.where(is_positive, log_sum - math.log(n), 0)
     deviation = jnp.expm1(log_weights - largest - log_mean[:, None])
     variance = jnp.sum(deviation**2, axis=1) / n / max(n - 1, 1)
+    # One weight does not determine a variance.
     error = jnp.sqrt(variance) if n > 1 else jnp.full_like(variance, jnp.inf)
-    size = jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0)
-    return log_sum + largest[:, 0] - math.log(n), jnp.where(some, error, jnp.inf), size
+    size = jnp.where(is_positive, 1 / jnp.where(is_positive, inverse_size, 1), 0)
+    return log_sum + largest[:, 0] - math.log(n), jnp.where(is_positive, error, jnp.inf), size

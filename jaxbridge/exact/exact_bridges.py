@@ -1,4 +1,7 @@
-"""Means over exact bridges, whether by weights or by a chain, and how far to trust them."""
+"""Means over exact bridges, from weights or from a chain, and their errors.
+
+`WeightedBridges` and `Chain` share this base class, so all functions of exact bridges accept both.
+"""
 
 from abc import abstractmethod
 
@@ -22,15 +25,17 @@ from ..schemes import StepError, dominates, error_of_mean, root_mean_square_in_s
 
 
 class AbstractExactBridges(AbstractResult):
-    """Bridges with the exact law, up to the step error. Arrays have a leading axis I if there are
-    several intervals.
+    """Base class of results with bridges of the exact law, up to the discretisation error.
+
+    With I intervals arrays have a leading axis I.
 
     - `paths`, `met`: shapes (n, K, d) and (n,).
-    - `log_halving`: log of the factor by which the weight of a path would change with half as many
-        steps, NaN where none was worked out, shape (n,).
-    - `step_share`: the step error as a share of what that changes, shape (); infinite where that
-        says nothing of it, and then its uncertainty is, too: of couplings with a σ(x) that varies.
-    - `proposal`: what they were made with.
+    - `log_halving`: log of the factor by which half as many steps would change the weight of a
+        path, shape (n,); NaN where it was not computed.
+    - `step_share`: the discretisation error divided by the change of the estimate under half as
+        many steps, shape (). It is infinite if that change is uninformative, for couplings with a
+        state-dependent σ(x). The uncertainty of the error is then infinite too.
+    - `proposal`: the proposal of the paths.
     """
 
     paths: eqx.AbstractVar[Float[Array, "*I n K d"]]
@@ -41,49 +46,64 @@ class AbstractExactBridges(AbstractResult):
 
     @property
     def coupling(self) -> AbstractCoupling | None:
-        """That of the proposal, if it has one."""
+        """Return the coupling of the proposal, or `None` if it has none."""
         return self.proposal.by_coupling
 
     @property
     @abstractmethod
     def log_mean_weights(self) -> Float[Array, "*I n"]:
-        """The logs of the weights of means, -inf for a bridge that is missing."""
+        """Return the log weights that `mean` uses, shape (n,); -inf for a missing bridge."""
 
     @abstractmethod
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """The Monte Carlo error of `mean(fn)`, entry by entry."""
+        """Return the Monte Carlo standard error of `mean(fn)`, entry by entry."""
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """The mean of `fn(path)`, a function of one path of shape (K, d), by default the path
-        itself: an estimate of its expectation over exact bridges. NaN where there are none."""
+        """Return the mean of `fn(path)`: an estimate of its expectation over exact bridges.
+
+        `fn` takes one path of shape (K, d); by default it returns the path. The mean is NaN if
+        there are no bridges.
+        """
         return mean_over_paths(fn, normalised(self.log_mean_weights), self.paths, self.met)
 
     def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """What `mean(fn)` is too large by for the length of the steps, an estimate, entry by entry;
-        NaN where it is not known, as of one step, or of couplings whose σ(x) varies."""
+        """Return the estimated discretisation bias of `mean(fn)` (estimate minus limit), entry by
+        entry.
+
+        It is NaN if unknown, for one step or for couplings with a state-dependent σ(x).
+        """
         return jax.tree.map(lambda error: error.value, self._step_errors(fn), is_leaf=_is_error)
 
     def step_uncertainty(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """A standard error of `step_error(fn)`."""
+        """Return the standard error of `step_error(fn)`, entry by entry."""
         errors = self._step_errors(fn)
         return jax.tree.map(lambda error: error.uncertainty, errors, is_leaf=_is_error)
 
     def step_error_dominates(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """Whether the step error of `mean(fn)` is beyond its standard error, or not known well
-        enough to say: then more steps help, and more bridges do not. False of what is the same for
-        all bridges."""
+        """Return whether the discretisation error of `mean(fn)` is, or may be, larger than its
+        standard error.
 
-        def of_entry(error, standard_error):
+        Then more steps help, and more bridges do not. It is false for a value that is the same for
+        all bridges.
+        """
+
+        def dominates_entry(error, standard_error):
+            # A value that is the same for all bridges, such as an end point, has no error at all.
             return dominates(error, standard_error) & (standard_error > 0)
 
         errors = self._step_errors(fn)
-        return jax.tree.map(of_entry, errors, self.standard_error(fn), is_leaf=_is_error)
+        return jax.tree.map(dominates_entry, errors, self.standard_error(fn), is_leaf=_is_error)
 
     def step_error_in_sds(self) -> StepError:
-        """The step error of the mean path in standard deviations of the points of paths, root mean
-        square, shape ()."""
+        """Return the discretisation error of the mean path, relative to the spread of the paths,
+        shape ().
+
+        The unit is the standard deviation of the points of paths; the error is a root mean square
+        over them.
+        """
         weights, axis = normalised(self.log_mean_weights), self.met.ndim - 1
         paths, error = filled(self.paths, self.met), self._step_errors(lambda path: path)
+        # The weighted variance of each coordinate at each time gives the unit.
         deviation = paths - jnp.expand_dims(weighted_mean(weights, paths), axis)
         variance = weighted_mean(weights, deviation**2)
         return StepError(*(root_mean_square_in_sds(value, variance) for value in error))

@@ -1,15 +1,16 @@
-"""Expectations over exact bridges whose derivatives in the parameters are right.
+"""Expectations over exact bridges with correct derivatives in the parameters.
 
-With bridges Z of weights w, made at θ, and f_θ the density of a path relative to that of σW,
+Let the bridges Z with weights w come from parameters θ. Let f_θ be the density of a path relative
+to that of σW. At fixed paths the estimate is a function of θ':
 
-    E_θ'[h_θ'] ≈ Σ w (f_θ'/f_θ)(Z) h_θ'(Z) / Σ w (f_θ'/f_θ)(Z),
+    E_θ'[h_θ'] ≈ Σ w (f_θ'/f_θ)(Z) h_θ'(Z) / Σ w (f_θ'/f_θ)(Z).
 
-as a function of θ' at fixed paths. At θ' = θ it is the weighted mean, and its derivative is
+At θ' = θ it is the weighted mean. Its derivative is that of the expectation,
 
-    Cov(h, ∇ log f_θ(Z)) + E[∂_θ h_θ],
+    Cov(h, ∇ log f_θ(Z)) + E[∂_θ h_θ].
 
-that of the expectation: which bridge is proposed, met and accepted depends on θ as well, so the
-derivative of the paths themselves is not. Higher derivatives are right, too.
+The derivative of the paths alone is not the derivative of the expectation: θ also decides which
+proposal meets and is accepted. Higher derivatives of the estimate are correct too.
 """
 
 import jax
@@ -29,20 +30,21 @@ from .kernels import Chain
 
 @door
 def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffusion) -> PyTree:
-    """The mean of `fn(path)` over exact bridges, differentiable in the parameters of `model`.
+    """Estimate the mean of `fn(path)` over exact bridges, differentiable in the parameters of
+    `model`.
 
     **Arguments:**
 
     - `fn`: a function of one path, shape (N+1, d). It may depend on parameters itself.
-    - `bridges`: weighted ones, or a chain, at all steps of their grid (no `save_at`), made with
-        the same parameters. They are held fixed; so is σ, which must not depend on parameters
-        that derivatives are taken in.
-    - `model`: the model, at the parameters in which derivatives are taken.
+    - `bridges`: weighted bridges or a chain, with whole paths (no `save_at`) and the same
+        parameters. The paths stay fixed, and so does σ. So σ must not depend on the parameters of a
+        derivative.
+    - `model`: the model, with the parameters of the derivative.
 
-    **Returns:** what `fn` returns, averaged; with a leading axis I for I intervals. Bridges that
-    are missing have no weight; NaN where all of an interval are.
+    **Returns:** the mean of the values of `fn`, with a leading axis I for I intervals. Missing
+    bridges have no weight. The mean is NaN if all bridges of an interval are missing.
 
-    **Raises:** `TypeError` for other bridges; `ValueError` where they were not kept whole.
+    **Raises:** `TypeError` for other bridges; `ValueError` if their paths are not whole.
 
     **Example:**
 
@@ -58,26 +60,30 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
     check_diffusion(model)
     if not isinstance(bridges, AbstractExactBridges):
         raise TypeError(
-            "`bridges` must have the exact law: pass what `sample_weighted_bridges`, "
-            f"`weigh_bridges` or `sample_exact_bridges` returned; got {type(bridges).__name__}."
+            f"`bridges` must have the exact law; got {type(bridges).__name__}. Pass a result of "
+            "`sample_weighted_bridges`, `weigh_bridges` or `sample_exact_bridges`."
         )
     if bridges.paths.shape[-2] != bridges.num_steps + 1:
         raise ValueError(
-            "the likelihood of a bridge is that of its whole path, but these were kept at "
-            f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points: make them without "
-            "`save_at`."
+            "`bridges` must be whole paths, because the path density needs all steps; got "
+            f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points. Sample them "
+            "without `save_at`."
         )
+    # Missing paths become finite, so that their zero weight gives zero and not NaN.
     paths = lax.stop_gradient(filled(bridges.paths, bridges.met))
     log_weights = lax.stop_gradient(bridges.log_mean_weights)
-    # Of the grid, for differences of rounded times would not do where its steps are unequal.
+    # Step sizes come from the grid: differences of rounded times are inaccurate for unequal steps.
     fractions = np.diff(bridges.proposal.fractions(bridges.num_steps))
     duration = lax.stop_gradient(bridges.times)[..., -1:]
     steps = jnp.asarray(fractions, duration.dtype) * duration
     like = paths.reshape(-1, paths.shape[-1])[0]
+    # Bridges of the Euler scheme need its own path density; others take the most accurate one.
     targets = [single.target for single in bridges.proposal.singles]
     form = forms_of_targets(targets, model, like)[0]
     log_f = log_likelihood_of_steps(model, steps, paths, form)
+    # Relative to the largest weight, the exponentials cannot overflow.
     largest = jnp.max(log_weights, axis=-1, keepdims=True)
+    # The ratio f_θ'/f_θ is one in value; only its derivatives matter.
     ratios = jnp.exp(log_weights - largest + log_f - lax.stop_gradient(log_f))
     weights = ratios / jnp.sum(ratios, axis=-1, keepdims=True)
     return jax.tree.map(lambda value: weighted_mean(weights, value), values_of(fn, paths))

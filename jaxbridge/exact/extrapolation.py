@@ -1,16 +1,16 @@
-"""Richardson's extrapolation: two estimates, on N and on N/2 steps, without their leading error.
+"""Richardson's extrapolation: two grids, one estimate without the leading discretisation error.
 
-Where an estimate E_N of something has an error c δ^p + O(δ^{p+1}) from its steps δ,
+Let E_N be an estimate with N steps of size δ, with an error c δ^p + O(δ^{p+1}). Then
 
     E_N + (E_N - E_{N/2}) / (2^p - 1)
 
-has one of O(δ^{p+1}) only. For densities this is done on the natural scale, on which both are
-unbiased but for their steps, and so is their combination. The price is noise: for p = 1 it has
-four times the variance of E_N, and that of E_{N/2}.
+has an error of O(δ^{p+1}). Densities are combined on the natural scale, where both estimates, and
+so their combination, are unbiased up to the discretisation error. The price is variance: for p = 1
+it is four times the variance of E_N plus the variance of E_{N/2}.
 
-`step_error` tells the same from the paths of one grid, which are a sample for both step laws; but
-what it knows of is the law of normal steps, of which a coupling's is not the same function. Here
-nothing is assumed but the order.
+`step_error` estimates the same error from the paths of one grid, which are weighted for both step
+sizes. That assumes normal steps, which couplings do not have. Extrapolation assumes the order p
+only.
 """
 
 from typing import Any, overload
@@ -27,19 +27,19 @@ from .density import TransitionLogDensity
 from .importance import WeightedBridges
 
 _NEGATIVE = (
-    "Noise made the combination of the two estimates negative, or one of them is zero. Take more "
-    "`num_proposals`."
+    "The combination of the two estimates is negative because of their noise, or one of them is "
+    "zero. Take more `num_proposals`."
 )
 
 
 class ExtrapolatedLogDensity(AbstractResult):
-    """What `extrapolate` makes of two `TransitionLogDensity`.
+    """Result of `extrapolate` for two `TransitionLogDensity`.
 
-    - `value`: the log of the combination, unbiased on the natural scale but for an error of higher
-        order; -inf where noise made it negative.
-    - `standard_error`: that of `value`, by the delta method.
-    - `removed`: what `value` is smaller by than that of the finer grid.
-    - `fine`, `coarse`: the two.
+    - `value`: log of the combination, which is unbiased on the natural scale up to an error of
+        higher order. It is -inf if noise makes the combination negative.
+    - `standard_error`: standard error of `value`, by the delta method.
+    - `removed`: the value of the finer grid minus `value`, an estimate of its discretisation bias.
+    - `fine`, `coarse`: the two estimates.
     """
 
     value: Float[Array, "*I"]
@@ -50,64 +50,78 @@ class ExtrapolatedLogDensity(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, "*I"]:
-        """Whether half of what was removed, taken for a bound of what is left, is beyond three
-        standard errors. Of the next order two grids tell nothing: a third does."""
-        return dominates(self._left, self.standard_error)
+        """Return whether half of `removed`, a bound on the remaining error, exceeds three standard
+        errors.
+
+        Two grids do not determine the error of the next order; a third grid does.
+        """
+        return dominates(self._remaining_error, self.standard_error)
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults of both estimates, as in `TransitionLogDensity`, but for their step
-        errors; of these, the fault of what is left."""
+        """Return the possible faults, as a `Verdict`.
+
+        These are the faults of both estimates, as in `TransitionLogDensity`. The remaining
+        discretisation error replaces that of each estimate.
+        """
         weights = (*self.fine._weight_faults, *self.coarse._weight_faults)
-        left = step_fault(self._left, self.standard_error)
-        return Verdict((*weights, Fault(~jnp.isfinite(self.value), _NEGATIVE), left))
+        remaining = step_fault(self._remaining_error, self.standard_error)
+        return Verdict((*weights, Fault(~jnp.isfinite(self.value), _NEGATIVE), remaining))
 
     @property
-    def _left(self) -> StepError:
+    def _remaining_error(self) -> StepError:
         return StepError(jnp.zeros_like(self.removed), jnp.abs(self.removed) / 2)
 
 
 class ExtrapolatedBridges(AbstractResult):
-    """What `extrapolate` makes of two `WeightedBridges`, `fine` and `coarse`: their means,
-    combined."""
+    """Result of `extrapolate` for two `WeightedBridges`, `fine` and `coarse`: combined means."""
 
     fine: WeightedBridges
     coarse: WeightedBridges
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """The mean of `fn(path)` over exact bridges, but for an error of higher order in the steps.
-        `fn` must return the same shapes for paths of both grids: keep both `save_at` some
-        times."""
+        """Return the mean of `fn(path)` over exact bridges, up to a discretisation error of higher
+        order.
+
+        `fn` must return the same shapes for paths of both grids: store both at the same times
+        (`save_at`).
+        """
         return self._combined(fn, self.fine.mean(fn), self.coarse.mean(fn), _richardson)
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """That of `mean(fn)`, entry by entry."""
+        """Return the standard error of `mean(fn)`, entry by entry."""
         errors = self.fine.standard_error(fn), self.coarse.standard_error(fn)
         return self._combined(fn, *errors, _richardson_error)
 
     def removed(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """What `mean(fn)` is smaller by than that of the finer grid."""
+        """Return the mean of the finer grid minus `mean(fn)`: its estimated discretisation bias."""
         return jax.tree.map(jnp.subtract, self.fine.mean(fn), self.mean(fn))
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults of the weights of both. Of the step error only `removed(fn)` tells:
-        compare half of it with the standard error."""
+        """Return the faults of the weights of both results, as a `Verdict`.
+
+        It does not include the discretisation error: compare half of `removed(fn)` with the
+        standard error.
+        """
         return Verdict((*self.fine._weight_faults, *self.coarse._weight_faults))
 
     def _combined(self, fn, fine, coarse, combine):
+        # Extrapolation needs the order p only, so it also works where `step_share` is infinite.
         share = share_of_known_order(self.fine.step_share)
 
-        def of_entry(one, other):
-            if one.shape != other.shape:
+        def combine_entries(fine_entry, coarse_entry):
+            if fine_entry.shape != coarse_entry.shape:
                 raise ValueError(
-                    "`fn` must return the same shapes for paths of both grids, but it returned "
-                    f"{one.shape} and {other.shape}: keep both at the same times, `save_at=`."
+                    "`fn` must return the same shapes for paths of both grids; got "
+                    f"{fine_entry.shape} and {coarse_entry.shape}. Store both at the same times "
+                    "(`save_at`)."
                 )
-            each = share.reshape(*share.shape, *[1] * (one.ndim - share.ndim))
-            return combine(each, one, other)
+            # Each interval has one share; add axes so that it broadcasts over the entries.
+            factor = share.reshape(*share.shape, *[1] * (fine_entry.ndim - share.ndim))
+            return combine(factor, fine_entry, coarse_entry)
 
-        return jax.tree.map(of_entry, fine, coarse)
+        return jax.tree.map(combine_entries, fine, coarse)
 
 
 @overload
@@ -118,22 +132,22 @@ def extrapolate(
 def extrapolate(fine: WeightedBridges, coarse: WeightedBridges) -> ExtrapolatedBridges: ...
 @door
 def extrapolate(fine: Any, coarse: Any):
-    """Two estimates without the leading error of their steps: Richardson's extrapolation.
+    """Combine two estimates into one without the leading discretisation error (Richardson).
 
-    Worth its noise where steps, not draws, decide the error, as for a σ that depends on the state,
-    for which all schemes are of first order.
+    It is useful where the discretisation error exceeds the standard error. An example is a
+    state-dependent σ, for which all schemes are of first order.
 
     **Arguments:**
 
-    - `fine`, `coarse`: two results of `transition_log_density`, or two of
-        `sample_weighted_bridges` or `weigh_bridges`, that differ in two things only: `coarse` has
-        half as many steps, and a key of its own.
+    - `fine`, `coarse`: two results of `transition_log_density`, or two results of
+        `sample_weighted_bridges` or `weigh_bridges`. They must differ in two things only: `coarse`
+        has half as many steps, and another key.
 
     **Returns:** `ExtrapolatedLogDensity`, with `value` and `standard_error`, or
     `ExtrapolatedBridges`, with `mean(fn)` and `standard_error(fn)`.
 
-    **Raises:** `TypeError` for other results; `ValueError` where `coarse` has not half as many
-    steps, or the two come of different proposals, whose errors do not cancel.
+    **Raises:** `TypeError` for other results; `ValueError` if `coarse` does not have half as many
+    steps, or if the proposals differ, because their errors do not cancel.
 
     **Example:**
 
@@ -152,38 +166,43 @@ def extrapolate(fine: Any, coarse: Any):
         _check_pair(fine, coarse)
         return ExtrapolatedBridges(fine, coarse)
     raise TypeError(
-        "`fine` and `coarse` must both be what `transition_log_density` returned, or both what "
-        "`sample_weighted_bridges` or `weigh_bridges` did; got "
+        "`fine` and `coarse` must both be results of `transition_log_density`, or both results of "
+        "`sample_weighted_bridges` or `weigh_bridges`; got "
         f"{type(fine).__name__} and {type(coarse).__name__}."
     )
 
 
 def _check_pair(fine: Any, coarse: Any) -> None:
+    """Raise `ValueError` if the numbers of steps or the proposals do not fit together."""
     if fine.num_steps != 2 * coarse.num_steps:
         raise ValueError(
-            f"`coarse` must have half as many steps as `fine`; got {fine.num_steps} and "
-            f"{coarse.num_steps}."
+            f"`coarse` must have half as many steps as `fine`; got {fine.num_steps} "
+            f"(`fine`) and {coarse.num_steps} (`coarse`)."
         )
-    structures = [jax.tree.structure(one.proposal) for one in (fine, coarse)]
+    # The structure includes the types and static settings of a proposal, not its numbers.
+    structures = [jax.tree.structure(estimate.proposal) for estimate in (fine, coarse)]
     if structures[0] != structures[1] or len(fine.proposal.singles) > 1:
         raise ValueError(
-            "`fine` and `coarse` must come of the same single proposal, for the step errors of two "
-            "do not cancel: "
+            "`fine` and `coarse` must come from the same single proposal, because "
+            "the discretisation errors of different ones do not cancel; "
             f"got {fine.proposal.describe()} and {coarse.proposal.describe()}."
         )
 
 
 def _log_density(fine: TransitionLogDensity, coarse: TransitionLogDensity):
-    """Both relative to the finer, which keeps their digits."""
+    """Return the combination. It uses values relative to the finer grid, which keeps their
+    digits."""
     share = share_of_known_order(fine.step_share)
-    known = jnp.isfinite(fine.value) & (coarse.value < jnp.inf)
-    ratio = jnp.where(known, jnp.exp(coarse.value - jnp.where(known, fine.value, 0)), jnp.inf)
+    is_finite = jnp.isfinite(fine.value) & (coarse.value < jnp.inf)
+    ratio = jnp.where(
+        is_finite, jnp.exp(coarse.value - jnp.where(is_finite, fine.value, 0)), jnp.inf
+    )
     combined = _richardson(share, 1.0, ratio)
-    positive = known & (combined > 0)
+    # The safe value 1 keeps derivatives and logs finite where the combination is not positive.
+    positive = is_finite & (combined > 0)
     safe = jnp.where(positive, combined, 1)
-    coarse_error = jnp.where(
-        ratio > 0, ratio * coarse.standard_error, 0
-    )  # zero has no relative one
+    # The log of an estimate that is zero has an infinite error, but the estimate itself has none.
+    coarse_error = jnp.where(ratio > 0, ratio * coarse.standard_error, 0)
     error = _richardson_error(share, fine.standard_error, coarse_error) / safe
     return ExtrapolatedLogDensity(
         jnp.where(positive, fine.value + jnp.log(safe), -jnp.inf),
@@ -195,9 +214,11 @@ def _log_density(fine: TransitionLogDensity, coarse: TransitionLogDensity):
 
 
 def _richardson(share, fine, coarse):
+    """Return fine + (fine - coarse) / (2^p - 1), where `share` is 1 / (2^p - 1)."""
     return fine + share * (fine - coarse)
 
 
 def _richardson_error(share, fine, coarse):
-    """Of independent estimates."""
+    """Return the standard error of the combination of two independent estimates."""
+    # The combination is (1 + share) · fine - share · coarse.
     return jnp.hypot((1 + share) * fine, share * coarse)

@@ -1,8 +1,9 @@
-"""Importance sampling: bridges whose weights make them exact.
+"""Importance sampling of bridges: independent bridges with weights for the exact law,
 
-    E_bridge[h] = E[w h(path)] / E[w],
+    E_bridge[h] = E[w h(path)] / E[w].
 
-by weighing approximate bridges, or from any weighted proposal.
+The weights belong either to approximate bridges (`weigh_bridges`), or to the paths of any weighted
+proposal (`sample_weighted_bridges`).
 """
 
 from typing import Any
@@ -16,9 +17,9 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..coupling import (
     AnyStartLaw,
     Bridges,
-    counts_of,
-    coupling_of,
-    durations_of,
+    bridge_durations,
+    count_hits_of_bridges,
+    coupling_of_bridges,
     search_for_hits,
     with_start_law,
 )
@@ -62,22 +63,26 @@ from .exact_bridges import AbstractExactBridges
 
 
 class WeightedBridges(AbstractExactBridges):
-    """Bridges whose weights make them exact, from `weigh_bridges` or `sample_weighted_bridges`;
-    with I intervals arrays have a leading axis I.
+    """Result of `weigh_bridges` or `sample_weighted_bridges`: weighted bridges of the exact law.
+
+    With I intervals arrays have a leading axis I.
 
     - `times`, `paths`: as in `Bridges`, shapes (K,) and (n, K, d).
-    - `log_weights`: shape (n,), up to a common constant; -inf for a bridge that is missing.
+    - `log_weights`: log weights up to a common constant, shape (n,); -inf for a missing bridge.
     - `met`: whether the bridge was found, shape (n,).
-    - `truncated`: whether its counts were cut off by `max_trials`, shape (n,). Such a weight is
-        finite and too small on average, so that paths that are hard to hit weigh too little.
-        Also where the start law's density was not a number: then the weight is zero.
-    - `num_simulated`: paths simulated in all, proposals and trials.
-    - `num_nonfinite`: how many of them left the state space or the finite numbers; where
-        more than 5 % of the mass may be missing with them, that is a fault.
-    - `proposal`, `num_steps`: those they were made with. The coupling of a proposal has the
-        start law of the weights; a `Stationary` that had to be run has its `burn_in` in it.
-    - `log_halving`: log of the factor by which half as many steps would change a weight, NaN where
-        none was worked out; and `step_share`, the step error as a share of what that changes.
+    - `truncated`: whether `max_trials` truncated the counts of the bridge, shape (n,). The weight
+        is then finite, and too small on average: paths that are hard to hit get too little weight.
+        It is also true if the density of the start law is NaN; then the weight is zero.
+    - `num_simulated`: number of simulated paths, proposals and trials.
+    - `num_nonfinite`: number of these that left the state space or became non-finite. It is a
+        fault if more than 5 % of the mass may be missing with them.
+    - `proposal`, `num_steps`: the proposal and the number N of steps of the paths. The coupling of
+        a proposal has the start law of the weights. If it is `Stationary` and needs runs, it
+        contains their `burn_in`.
+    - `log_halving`: log of the factor by which half as many steps would change a weight, shape
+        (n,); NaN where it was not computed.
+    - `step_share`: the discretisation error divided by the change of the estimate under half as
+        many steps.
     """
 
     times: Float[Array, "*durations K"]
@@ -94,60 +99,75 @@ class WeightedBridges(AbstractExactBridges):
 
     @property
     def weights(self) -> Float[Array, "*I n"]:
-        """The weights, normalised to sum to one; all zero where no bridge was found."""
+        """Return the weights, normalised to sum to one, shape (n,); all zero if there is no
+        bridge."""
         return normalised(self.log_weights)
 
     @property
     def effective_sample_size(self) -> Float[Array, "*I"]:
-        """(Σw)²/Σw²: how many exact bridges these are worth, between 0 and n."""
+        """Return (Σw)²/Σw²: the equivalent number of unweighted exact bridges, between 0 and n."""
         return effective_size(self.weights)
 
     @property
     def efficiency(self) -> Float[Array, "*I"]:
-        """Effective sample size per simulated path."""
+        """Return the effective sample size per simulated path."""
         size = self.effective_sample_size
         return size / jnp.maximum(self.num_simulated, 1).astype(size.dtype)
 
     @property
     def log_mean_weights(self) -> Float[Array, "*I n"]:
-        """Those of the bridges."""
+        """Return the log weights of the bridges."""
         return self.log_weights
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """That of `mean(fn)`, by the delta method, entry by entry; infinite where weights were cut
-        off, for then the mean is off by more than it shows."""
+        """Return the standard error of `mean(fn)`, by the delta method, entry by entry.
+
+        It is infinite if weights were truncated, because it does not include the bias of the
+        truncation.
+        """
         weights, axis = self.weights, self.log_weights.ndim - 1
-        cut = jnp.any(self.truncated, axis=-1)
+        is_truncated = jnp.any(self.truncated, axis=-1)
 
         def error(value):
-            mean, each = weighted_mean(weights, value), expanded(weights, value)
+            mean, entry_weights = weighted_mean(weights, value), expanded(weights, value)
+            # The delta method for a ratio of means: Σ w² (h - mean)², with Σ w = 1.
             deviation = value - jnp.expand_dims(mean, axis)
-            squares = jnp.where(each > 0, (each * deviation) ** 2, 0)
-            lost = cut.reshape(*cut.shape, *[1] * (mean.ndim - cut.ndim))
-            whole = jnp.where(lost, jnp.inf, jnp.sqrt(jnp.sum(squares, axis)))
-            return jnp.where(jnp.isnan(mean), jnp.nan, whole)
+            # A value without weight may be infinite: 0 · ∞ would be NaN.
+            squares = jnp.where(entry_weights > 0, (entry_weights * deviation) ** 2, 0)
+            is_unknown = is_truncated.reshape(
+                *is_truncated.shape, *[1] * (mean.ndim - is_truncated.ndim)
+            )
+            value_or_inf = jnp.where(is_unknown, jnp.inf, jnp.sqrt(jnp.sum(squares, axis)))
+            return jnp.where(jnp.isnan(mean), jnp.nan, value_or_inf)
 
         return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
 
     @property
     def pareto_k(self) -> Float[Array, "*I"]:
-        """k̂ of the weights. Above 0.7 neither means nor their standard errors can be trusted."""
+        """Return k̂ of the weights. Above 0.7 neither means nor their standard errors are
+        reliable."""
         return pareto_k(self.log_weights)
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: missing bridges, weights cut off or with heavy tails, too many of
-        the paths lost, a step error of the mean path that dominates and is beyond 0.05 standard
-        deviations."""
-        error = 1 / jnp.sqrt(jnp.maximum(self.effective_sample_size, 1))  # in the same units
+        """Return the possible faults, as a `Verdict`:
+
+        - missing bridges;
+        - truncated weights, or weights with heavy tails;
+        - too many lost paths;
+        - a discretisation error of the mean path that dominates and exceeds 0.05 standard
+            deviations.
+        """
+        # In standard deviations, as is the discretisation error of the mean path.
+        error = 1 / jnp.sqrt(jnp.maximum(self.effective_sample_size, 1))
         return Verdict((*self._weight_faults, step_fault(self.step_error_in_sds(), error)))
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:
-        # One path each is simulated where a lost path is a miss, and not tried again.
         sizes = self.effective_sample_size, jnp.sum(self.log_weights > -jnp.inf, axis=-1)
-        tried_again = self.num_simulated > self.met.shape[-1]
-        missing = ~jnp.any(self.met, axis=-1) | (tried_again & jnp.any(~self.met, axis=-1))
+        # With one simulated path for each bridge a lost path counts as a miss, and is not a fault.
+        has_retries = self.num_simulated > self.met.shape[-1]
+        missing = ~jnp.any(self.met, axis=-1) | (has_retries & jnp.any(~self.met, axis=-1))
         return (
             missing_bridges(missing, self.proposal.coupled),
             truncated_weights(jnp.any(self.truncated, axis=-1)),
@@ -156,18 +176,22 @@ class WeightedBridges(AbstractExactBridges):
         )
 
     def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:
-        """Equally weighted paths by systematic resampling, shape (m, K, d): many effective ones
-        are needed for few repetitions. NaN where no bridge was found."""
+        """Sample m = `num_bridges` equally weighted paths by systematic resampling.
+
+        The result has shape (m, K, d). The effective sample size should be large compared to m,
+        otherwise many paths are repeated. The paths are NaN if there is no bridge.
+        """
         num_bridges = check_count("num_bridges", num_bridges)
 
         check_key(key)
 
         def one_interval(key, weights, paths):
+            # Systematic resampling uses one random shift for all points.
             shift = jax.random.uniform(key, dtype=weights.dtype)
             points = (jnp.arange(num_bridges, dtype=weights.dtype) + shift) / num_bridges
-            cumulated = jnp.cumsum(weights)
-            chosen = jnp.searchsorted(cumulated, points * cumulated[-1], side="right")
-            # Rounding may lead past the last positive weight.
+            cumulative = jnp.cumsum(weights)
+            chosen = jnp.searchsorted(cumulative, points * cumulative[-1], side="right")
+            # Rounding of the cumulative sum may select an index after the last positive weight.
             last = jnp.max(jnp.where(weights > 0, jnp.arange(len(weights)), 0))
             return paths[jnp.minimum(chosen, last)]
 
@@ -190,26 +214,26 @@ def weigh_bridges(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
 ) -> WeightedBridges:
-    """Weights that correct approximate bridges to the exact law: importance sampling.
+    """Estimate weights that correct approximate bridges to the exact law: importance sampling.
 
     **Arguments:**
 
     - `key`: a typed key.
-    - `model`: the model the bridges were made with.
-    - `bridges`: from `sample_bridges`, with their whole paths (no `save_at`).
-    - `num_counts`: N hitting counts for each bridge. More make a weight less noisy; one is often
-        the best use of time.
-    - `start_law`: μ, by default that of the bridges' coupling.
-    - `max_trials`: bounds the trials of each bridge; by default 10,000 for each count. See
+    - `model`: the model of the bridges.
+    - `bridges`: the result of `sample_bridges`, with whole paths (no `save_at`).
+    - `num_counts`: N, the number of hitting counts for each bridge. More counts make a weight less
+        noisy; one is often the most efficient.
+    - `start_law`: μ; by default the start law of the bridges' coupling.
+    - `max_trials`: bound on the trials of each bridge; by default 10,000 for each count. See
         `WeightedBridges.truncated`.
-    - `batch_size`: trials simulated side by side; changes results by rounding only.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where the result is not `trustworthy`, or parameters are
+    - `batch_size`: number of trials that run side by side. It changes results by rounding only.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
         not finite.
 
-    **Returns:** `WeightedBridges`. Not differentiable.
+    **Returns:** `WeightedBridges`. It is not differentiable.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -222,12 +246,13 @@ def weigh_bridges(
     check_diffusion(model)
     if not isinstance(bridges, Bridges):
         raise TypeError(
-            f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}. (Those of "
-            "`sample_exact_bridges` and `weigh_bridges` are exact already.)"
+            f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}. "
+            "Results of `sample_exact_bridges` and `weigh_bridges` need no weights: they are exact."
         )
-    coupling = coupling_of(bridges, start_law)
+    coupling = coupling_of_bridges(bridges, start_law)
     search = search_for_hits(bridges, num_counts, max_trials, batch_size, progress_meter)
     check_density(coupling.start_law, model)
+    # Any row serves: only its dimension and dtype matter.
     like = bridges.reverse_start.reshape(-1, bridges.paths.shape[-1])[0]
     pairs = as_proposal(coupling, model, like, Budget(search.wanted, None, max_trials))
     weighted = _weigh_bridges(key_for("weights", key), model, pairs, bridges, search)
@@ -237,9 +262,11 @@ def weigh_bridges(
 @compiled_for(lambda key, model, pairs, bridges, search: bridges.met.size * bridges.num_steps)
 def _weigh_bridges(key, model, pairs, bridges, search):
     paths = bridges.paths.reshape(-1, *bridges.paths.shape[-2:])
-    ends, durations = paths[:, -1], durations_of(bridges)
-    known = with_start_law(key, model, pairs.coupling, ends, durations, bridges.num_steps)
-    counts, coupling = counts_of(key, model, known, bridges, search)
+    ends, durations = paths[:, -1], bridge_durations(bridges)
+    coupling_for_weights = with_start_law(
+        key, model, pairs.coupling, ends, durations, bridges.num_steps
+    )
+    counts, coupling = count_hits_of_bridges(key, model, coupling_for_weights, bridges, search)
     d, shape = bridges.paths.shape[-1], bridges.met.shape
     model = model.prepared()
     log_weights = pair_log_weights(
@@ -249,10 +276,12 @@ def _weigh_bridges(key, model, pairs, bridges, search):
         bridges.reverse_start.reshape(-1, d),
         counts.mean.reshape(-1),
     ).reshape(shape)
+    # A weight that is NaN becomes zero, and the bridge is marked as truncated.
     log_weights, unusable = usable(log_weights, bridges.met)
     intervals = Intervals(paths[:, 0], ends, durations)
     log_halving = pairs.log_halving(model, intervals, paths, shape[-1]).reshape(shape)
     share = pairs.share_in_regime(model, intervals, bridges.num_steps)
+    # The share is the same for all bridges of an interval.
     share = share.reshape(shape)[..., 0]
     num_trials = jnp.sum(counts.num_trials, axis=-1, dtype=jnp.int32)
     num_nonfinite = jnp.sum(counts.num_nonfinite, axis=-1, dtype=jnp.int32)
@@ -264,6 +293,7 @@ def _weigh_bridges(key, model, pairs, bridges, search):
         truncated=counts.truncated | unusable,
         num_simulated=bridges.num_proposals + num_trials,
         num_nonfinite=bridges.num_nonfinite + num_nonfinite,
+        # The result contains the start law of its weights, with the measured burn-in.
         proposal=eqx.tree_at(lambda p: p.coupling, pairs, coupling),
         log_halving=log_halving,
         step_share=share,
@@ -289,26 +319,26 @@ def sample_weighted_bridges(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
 ) -> WeightedBridges:
-    """Independent weighted bridges from any proposal: importance sampling.
+    """Sample independent weighted bridges from any proposal: importance sampling.
 
     **Arguments:**
 
     - `key`, `model`, `start`, `end`, `duration`, `num_steps`, `save_at`: as in `sample_bridges`.
-    - `num_bridges`: n, for each interval.
+    - `num_bridges`: n, the number of bridges of each interval.
     - `proposal`, `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where the result is not `trustworthy`, or parameters are
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
         not finite.
 
     **Returns:** `WeightedBridges`.
 
-    **Gradients.** From proposals that are pulled to the end point (`ModifiedDiffusionBridge`,
-    `ResidualBridge`, `Guided`) paths and weights are smooth functions of `params`, `start`, `end`
-    and `duration`, so derivatives of weighted means, forward and reverse, are estimates of the
-    derivatives of expectations; a choice between such proposals has them, too. Those of
-    couplings, and of a choice that may take them, raise `TypeError`.
+    **Gradients.** Guided proposals are `ModifiedDiffusionBridge`, `ResidualBridge` and `Guided`.
+    Their paths and weights are smooth functions of `params`, `start`, `end` and `duration`. So
+    derivatives of weighted means, forward and reverse, estimate the derivatives of expectations. A
+    choice between such proposals has them too. For couplings, and for a choice that may select
+    them, a derivative raises `TypeError`.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -341,7 +371,7 @@ def _sample_weighted(
 ) -> WeightedBridges:
     model, intervals, num_steps = model.prepared(), problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
-    drawn = proposal.draw(
+    weighted_paths = proposal.draw(
         problem.keys(key, num_bridges),
         model,
         intervals,
@@ -350,17 +380,17 @@ def _sample_weighted(
         False,
         progress_meter=progress_meter,
     )
-    of_interval = problem.result(drawn)
+    results = problem.result(weighted_paths)
     return WeightedBridges(
         times=problem.times(proposal.fractions(num_steps)),
-        paths=of_interval.paths,
-        log_weights=of_interval.log_weights,
-        met=of_interval.found,
-        truncated=of_interval.truncated,
-        num_simulated=problem.total(drawn.num_simulated),
-        num_nonfinite=problem.total(drawn.num_nonfinite),
+        paths=results.paths,
+        log_weights=results.log_weights,
+        met=results.found,
+        truncated=results.truncated,
+        num_simulated=problem.total(weighted_paths.num_simulated),
+        num_nonfinite=problem.total(weighted_paths.num_nonfinite),
         proposal=proposal,
-        log_halving=of_interval.log_halving,
+        log_halving=results.log_halving,
         step_share=problem.result(proposal.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )

@@ -1,5 +1,4 @@
-"""What the Markov chains on bridges have in common: kernels of two functions, their keys, and the
-chain that many steps make."""
+"""Common parts of the Markov chains on bridges: kernels, their keys, and the result `Chain`."""
 
 import math
 from collections.abc import Callable
@@ -36,17 +35,18 @@ from ..proposals import AbstractWeightedProposal
 from ..schemes import step_fault
 from .exact_bridges import AbstractExactBridges
 
-# Of fewer moves a mean, and its error, mean nothing.
+# With fewer moves neither the mean of the chain nor its error is reliable.
 _FEWEST_MOVES = 5
-_STILL = (
-    "The chain hardly moves, so that its mean and its error rest on a few paths. Take more "
+_TOO_FEW_MOVES = (
+    "The chain hardly moves, so its mean and its error depend on a few paths. Take more "
     '`num_bridges`, another proposal, or `method="crank_nicolson"`.'
 )
 
 
 class Kernel(NamedTuple):
-    """A Markov kernel on bridges, from `pseudo_marginal`, `renewal` or `crank_nicolson`. Runners
-    that look for its two functions, such as BlackJAX's, take it as it is.
+    """Markov kernel on bridges, from `pseudo_marginal`, `renewal` or `crank_nicolson`.
+
+    Programs that run any pair of such functions, such as BlackJAX, accept it as it is.
 
     - `init`: a function `(position, rng_key) -> state`.
     - `step`: a function `(rng_key, state) -> (state, info)`.
@@ -57,29 +57,34 @@ class Kernel(NamedTuple):
 
 
 class Chain(AbstractExactBridges):
-    """What `sample_exact_bridges` returns: the states of a chain. With I intervals arrays have a
-    leading axis I.
+    """Result of `sample_exact_bridges`: the states of a chain.
+
+    With I intervals arrays have a leading axis I.
 
     - `times`: the K stored times, shape (K,); (I, K) for I durations.
-    - `paths`: the states of the chain after each step, shape (n, K, d); NaN until a first path
-        was found.
-    - `accepted`: whether the step took a new path, shape (n,).
-    - `log_weights`: those of the states, shape (n,); `None` for the renewal chain, which has none.
+    - `paths`: the states of the chain after each step, shape (n, K, d); NaN before the first path.
+    - `accepted`: whether the step accepted a new path, shape (n,).
+    - `log_weights`: log weights of the states, shape (n,); `None` for the renewal chain, which has
+        none.
     - `met`: whether there is a path, shape (n,).
-    - `truncated`: whether the state's counts were cut off by `max_trials`: then it has too
-        little weight, and the chain's law is not exact. Shape (n,), or `None` as `log_weights`.
-    - `num_simulated`: paths simulated in all, shape ().
-    - `num_nonfinite`: how many of them left the state space or the finite numbers; of more than
-        2 % the mass that is missing is a fault.
-    - `num_truncated`: how many proposals, accepted or not, had counts cut off; for the renewal
-        chain all its steps where the run that replaces a sampler of ν was (see `Stationary`).
-    - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
-    - `pareto_k`: k̂ of the weights of all proposals: above 0.7 states with large weights stay too
-        long for any error to be trusted. `None` where no new weights are proposed, as by renewal
-        and Crank–Nicolson moves.
+    - `truncated`: whether `max_trials` truncated the counts of the state, shape (n,). Then its
+        weight is too small on average, and the law of the chain is not exact. `None` for the
+        renewal chain.
+    - `num_simulated`: number of simulated paths, shape ().
+    - `num_nonfinite`: number of these that left the state space or became non-finite. More than 2 %
+        are a fault, because their mass is missing.
+    - `num_truncated`: number of proposals, accepted or not, with truncated counts. For the renewal
+        chain it is the number of steps if the run that replaces a sampler of ν is too short (see
+        `Stationary`), else 0.
+    - `proposal`: the proposal of the chain. If its start law `Stationary` needs runs, it contains
+        their `burn_in`.
+    - `pareto_k`: k̂ of the weights of all proposals. Above 0.7 states with large weights stay too
+        long, and no error is reliable. `None` for renewal and Crank–Nicolson chains, which propose
+        no independent weights.
     - `log_halving`: log of the factor by which half as many steps would change the weight of a
-        state, NaN where none was worked out; and `step_share`, the step error as a share of what
-        that changes.
+        state, shape (n,); NaN where it was not computed.
+    - `step_share`: the discretisation error divided by the change of the estimate under half as
+        many steps.
     - `num_steps`: N.
     """
 
@@ -100,52 +105,65 @@ class Chain(AbstractExactBridges):
 
     @property
     def acceptance_rate(self) -> Float[Array, "*I"]:
-        """The share of steps that took a new path."""
+        """Return the share of steps that accepted a new path."""
         return jnp.mean(self.accepted, axis=-1)
 
     @property
     def log_mean_weights(self) -> Float[Array, "*I n"]:
-        """All states count alike."""
+        """Return equal log weights (zero), -inf for a state without a path."""
         return jnp.where(self.met, 0.0, -jnp.inf).astype(self.paths.dtype)
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: missing bridges, weights cut off or with heavy tails, more than 2 % of
-        the paths lost, a chain that hardly moves, a step error of the mean path that dominates and
-        is beyond 0.05 standard deviations."""
+        """Return the possible faults, as a `Verdict`:
+
+        - missing bridges;
+        - truncated weights, or weights with heavy tails;
+        - more than 2 % of the paths lost;
+        - a chain that hardly moves;
+        - a discretisation error of the mean path that dominates and exceeds 0.05 standard
+            deviations.
+        """
         moves = jnp.sum(self.accepted, axis=-1)
-        # The renewal chain keeps no weights to be cut off, but its trials may start wrongly.
-        cut = self.num_truncated > 0
+        # The renewal chain has no weights, but its trials may start from a wrong law.
+        is_truncated = self.num_truncated > 0
         if self.truncated is not None:
-            cut = jnp.any(self.truncated, axis=-1)
+            is_truncated = jnp.any(self.truncated, axis=-1)
+        # A chain has no effective sample size of weights, so only k̂ decides.
         heavy = () if self.pareto_k is None else (heavy_tails(self.pareto_k, math.inf),)
-        # Each move is a new path at best.
+        # The number of moves bounds the effective sample size from above.
         error = 1 / jnp.sqrt(jnp.maximum(moves, 1).astype(self.paths.dtype))
         return Verdict(
             (
                 missing_bridges(jnp.any(~self.met, axis=-1), self.proposal.coupled),
-                truncated_weights(cut),
+                truncated_weights(is_truncated),
                 lost_paths(self.num_nonfinite, self.num_simulated),
                 *heavy,
-                Fault(moves < min(_FEWEST_MOVES, (self.accepted.shape[-1] + 1) // 2), _STILL),
+                Fault(
+                    moves < min(_FEWEST_MOVES, (self.accepted.shape[-1] + 1) // 2), _TOO_FEW_MOVES
+                ),
                 step_fault(self.step_error_in_sds(), error),
             )
         )
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """That of `mean(fn)`, from the effective sample size of the chain, of at least four states,
-        entry by entry."""
+        """Return the standard error of `mean(fn)`, entry by entry.
+
+        It uses the effective sample size of the chain, which needs at least four states.
+        """
         weights, axis = normalised(self.log_mean_weights), self.met.ndim - 1
         size = effective_sample_size
+        # With several intervals the chains are independent: one sample size for each.
         for _ in range(axis):
             size = jax.vmap(size)
 
         def error(value):
             deviation = value - jnp.expand_dims(weighted_mean(weights, value), axis)
-            there = expanded(self.met, value)
-            share = jnp.mean(there, axis=axis, dtype=value.dtype)
-            many = size(jnp.where(there, deviation, 0)) * share
-            return jnp.sqrt(weighted_mean(weights, deviation**2) / many)
+            has_path = expanded(self.met, value)
+            # States without a path carry no information, so they reduce the sample size.
+            share = jnp.mean(has_path, axis=axis, dtype=value.dtype)
+            sample_size = size(jnp.where(has_path, deviation, 0)) * share
+            return jnp.sqrt(weighted_mean(weights, deviation**2) / sample_size)
 
         return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
 
@@ -153,7 +171,12 @@ class Chain(AbstractExactBridges):
 def acceptance_rate(
     log_weight: Float[Array, "*I"], candidate: Float[Array, "*I"]
 ) -> Float[Array, "*I"]:
-    """min(1, ratio of the weights); a missing candidate is refused, a missing state left."""
+    """Return min(1, ratio of the weights), shape (I,).
+
+    It is zero for a missing candidate, and one for a missing state with a candidate that is not
+    missing.
+    """
+    # Both weights may be zero: -inf - (-inf) would be NaN.
     ratio = jnp.where(candidate > -jnp.inf, candidate - log_weight, -jnp.inf)
     return jnp.exp(jnp.minimum(ratio, 0))
 
@@ -161,7 +184,8 @@ def acceptance_rate(
 def chain_keys(
     key: Key[Array, ""], problem: BridgeProblem, num_bridges: int
 ) -> tuple[Key[Array, "I n"], Key[Array, " I"]]:
-    """The keys of the steps and of the first state of each interval's chain."""
+    """Return the keys of the steps, and of the first state, of the chain of each interval."""
+    # A single interval uses the key itself, so that a kernel with the same keys gives this chain.
     keys = problem.keys(key, 1)[:, 0] if problem.batched else key[None]
     run_keys, init_keys = split_each(keys, 2)
     return jax.vmap(lambda key: jax.random.split(key, num_bridges))(run_keys), init_keys
@@ -170,12 +194,16 @@ def chain_keys(
 def one_interval(
     model: Diffusion, start: Numbers, end: Numbers, duration: Numbers, num_steps: int
 ) -> BridgeProblem:
-    """The problem of a kernel."""
+    """Check the arguments of a kernel. Return its problem.
+
+    **Raises:** `ValueError` for several intervals, among other invalid arguments.
+    """
     problem = bridge_problem(model, start, end, duration, num_steps)
     if problem.batched:
         raise ValueError(
-            "a kernel is for one interval: `start` and `end` of shape (d,), `duration` (); use "
-            "`jax.vmap`, or `sample_exact_bridges`, for several."
+            "a kernel is for one interval: `start` and `end` of shape (d,), `duration` of shape "
+            f"(); got {problem.num_intervals} intervals with an axis I. Use `jax.vmap`, or "
+            "`sample_exact_bridges`, for several."
         )
     return problem
 
@@ -183,20 +211,32 @@ def one_interval(
 def check_position(
     position: Numbers | None, problem: BridgeProblem
 ) -> Float[Array, "I points d"] | None:
-    """A path of each interval, or none."""
+    """Check the initial paths. Return them with an axis I, or `None` for `None`.
+
+    **Raises:** `ValueError` for a wrong shape, for paths that are not finite, or for wrong end
+    points.
+    """
     if position is None:
         return None
     path, intervals = as_floating("position", position), problem.intervals
     num_intervals, d = intervals.start.shape
     shape = (num_intervals, problem.num_steps + 1, d)
-    wanted = shape if problem.batched else shape[1:]
-    if path.shape != wanted:
-        what = "paths, one of each interval" if problem.batched else "a path"
-        raise ValueError(f"`position` must be {what}, shape {wanted}, or `None`; got {path.shape}.")
+    required_shape = shape if problem.batched else shape[1:]
+    if path.shape != required_shape:
+        expected = "paths, one of each interval" if problem.batched else "a path"
+        raise ValueError(
+            f"`position` must be {expected}, shape {required_shape}, or `None`; got shape "
+            f"{path.shape}."
+        )
     paths = path.reshape(shape)
     if not is_traced(paths, intervals):
         ends = np.stack([intervals.start, intervals.end], axis=1)
-        mine = np.asarray(paths)
-        if not (np.all(np.isfinite(mine)) and np.allclose(mine[:, [0, -1]], ends, atol=1e-3)):
-            raise ValueError(f"`position` must be finite, from and to {problem.result(ends)}.")
+        # The tolerance allows for paths in single precision.
+        values = np.asarray(paths)
+        if not (np.all(np.isfinite(values)) and np.allclose(values[:, [0, -1]], ends, atol=1e-3)):
+            raise ValueError(
+                f"`position` must be finite, from and to {problem.result(ends)}; got from and to "
+                f"{problem.result(values[:, [0, -1]])}, or a value that is not finite. Pass a path "
+                "of this bridge."
+            )
     return paths.astype(intervals.start.dtype)

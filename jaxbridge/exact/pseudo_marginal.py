@@ -1,8 +1,8 @@
 """Pseudo-marginal Metropolis–Hastings on bridges (section 2.3 of the paper).
 
-Propose a weighted path, accept with the ratio of the weights. Weights are random but unbiased,
-and a state keeps its own. Proposals do not depend on the chain, so they are made ahead, all at
-once, and the chain itself is a scan over numbers.
+Each step proposes a weighted path, and accepts it with the ratio of the weights. The weights are
+random but unbiased, and a state keeps its weight. Proposals do not depend on the state of the
+chain. So all of them run first, side by side, and the chain itself is a scan over numbers.
 """
 
 from typing import Any, NamedTuple
@@ -25,9 +25,11 @@ from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_position,
 
 
 class PseudoMarginalState(NamedTuple):
-    """`position`, the path, shape (N+1, d); its `log_weight`; whether that was `truncated`.
+    """State of the chain.
 
-    A state without a path, where none was found, has weight -inf.
+    - `position`: the path, shape (N+1, d).
+    - `log_weight`: its log weight; -inf for a state without a path.
+    - `truncated`: whether that weight was truncated.
     """
 
     position: Float[Array, "points d"]
@@ -36,8 +38,13 @@ class PseudoMarginalState(NamedTuple):
 
 
 class PseudoMarginalInfo(NamedTuple):
-    """Of one step: the `acceptance_rate` and whether the proposal was accepted, its log weight
-    (-inf if none was found), and the number of paths simulated for it."""
+    """Report of one step of the chain.
+
+    - `acceptance_rate`: the acceptance probability of the proposal.
+    - `is_accepted`: whether the proposal was accepted.
+    - `log_weight`: log weight of the proposal, -inf if none was found.
+    - `num_simulated`: number of simulated paths.
+    """
 
     acceptance_rate: Float[Array, ""]
     is_accepted: Bool[Array, ""]
@@ -58,14 +65,16 @@ def pseudo_marginal(
     max_proposals: int | None = None,
     max_trials: int | None = None,
 ) -> Kernel:
-    """The pseudo-marginal Metropolis–Hastings kernel on (start, end, duration)-bridges.
+    """Return the pseudo-marginal Metropolis–Hastings kernel on (start, end, duration)-bridges.
 
-    `init(position, rng_key)` takes a path of shape (N+1, d), draws its weight from the law that
-    it has in the chain, and so may enter a chain, as a block of a Gibbs sampler; or `None`, for
-    a first path by proposal. `step(rng_key, state)` gives a `PseudoMarginalState` and a
-    `PseudoMarginalInfo`. Arguments are those of `sample_exact_bridges`.
+    `init(position, rng_key)` takes a path of shape (N+1, d), and samples its weight from the law of
+    that weight in the chain. So the kernel can be a block of a Gibbs sampler. With `None` it
+    proposes a first path. `step(rng_key, state)` returns a `PseudoMarginalState` and a
+    `PseudoMarginalInfo`.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Arguments:** as in `sample_exact_bridges`.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -86,7 +95,7 @@ def pseudo_marginal(
         check_key(rng_key)
         paths = check_position(position, problem)
         if paths is None:
-            return _draw_state(rng_key, *setting)[0]
+            return _propose_state(rng_key, *setting)[0]
         return _reweigh_state(rng_key, paths, *setting)
 
     @door
@@ -98,32 +107,36 @@ def pseudo_marginal(
 
 
 @compiled_sooner
-def _draw_state(rng_key, model, proposal, intervals, num_steps):
+def _propose_state(rng_key, model, proposal, intervals, num_steps):
     model, proposal, intervals = nondifferentiable((model.prepared(), proposal, intervals))
-    drawn = proposal.draw(rng_key[None, None], model, intervals, num_steps, None, False)
-    return _first(drawn), drawn.num_simulated[0, 0]
+    weighted_paths = proposal.draw(rng_key[None, None], model, intervals, num_steps, None, False)
+    return _first_state(weighted_paths), weighted_paths.num_simulated[0, 0]
 
 
 @compiled_sooner
 def _reweigh_state(rng_key, paths, model, proposal, intervals, num_steps):
-    fixed = (model.prepared(), proposal, intervals, paths)
-    model, proposal, intervals, paths = nondifferentiable(fixed)
-    return _first(proposal.reweigh(rng_key[None], model, intervals, paths))
+    arguments = (model.prepared(), proposal, intervals, paths)
+    model, proposal, intervals, paths = nondifferentiable(arguments)
+    return _first_state(proposal.reweigh(rng_key[None], model, intervals, paths))
 
 
-def _first(drawn: WeightedPaths) -> PseudoMarginalState:
-    return PseudoMarginalState(drawn.paths[0, 0], drawn.log_weights[0, 0], drawn.truncated[0, 0])
+def _first_state(weighted_paths: WeightedPaths) -> PseudoMarginalState:
+    """Return the first path of the first interval as a state."""
+    return PseudoMarginalState(
+        weighted_paths.paths[0, 0], weighted_paths.log_weights[0, 0], weighted_paths.truncated[0, 0]
+    )
 
 
 @compiled_sooner
 def _pseudo_marginal_step(rng_key, state, *setting):
+    # The same split as in `run_pseudo_marginal`, so both give the same chain.
     draw_key, accept_key = jax.random.split(rng_key)
-    candidate, num_simulated = _draw_state(draw_key, *setting)
+    candidate, num_simulated = _propose_state(draw_key, *setting)
     uniform = jax.random.uniform(accept_key, dtype=candidate.position.dtype)
     rate = acceptance_rate(state.log_weight, candidate.log_weight)
     accepted = uniform < rate
-    kept = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
-    return kept, PseudoMarginalInfo(rate, accepted, candidate.log_weight, num_simulated)
+    new_state = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
+    return new_state, PseudoMarginalInfo(rate, accepted, candidate.log_weight, num_simulated)
 
 
 @compiled_for(lambda key, model, proposal, problem, num, *_: problem.num_path_steps(num))
@@ -136,28 +149,32 @@ def run_pseudo_marginal(
     first: Float[Array, "I points d"] | None,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Chain:
-    """The chain of each interval, from its `first` path if there is one."""
-    fixed = (model.prepared(), proposal, problem, first)
-    model, proposal, problem, first = nondifferentiable(fixed)
+    """Run the chain of each interval, from its path `first` if that is not `None`."""
+    arguments = (model.prepared(), proposal, problem, first)
+    model, proposal, problem, first = nondifferentiable(arguments)
     intervals, num_steps = problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)
     draw_keys, accept_keys = split_each(step_keys.reshape(-1), 2)
     draw_keys = draw_keys.reshape(step_keys.shape)
-    # Row 0 of each interval is its first state, and row i the candidate of step i.
+    # Row 0 of each interval is its first state. Row i is the candidate of step i.
     if first is None:
         draw_keys = jnp.concatenate([init_keys[:, None], draw_keys], axis=1)
-    drawn = proposal.draw(
+    candidates = proposal.draw(
         draw_keys, model, intervals, num_steps, problem.stored, False, progress_meter=progress_meter
     )
     if first is not None:
-        weighed = proposal.reweigh(init_keys, model, intervals, first)
-        weighed = weighed._replace(paths=problem.kept(weighed.paths))
-        drawn = jax.tree.map(lambda *rows: jnp.concatenate(rows, axis=1), weighed, drawn)
+        first_state = proposal.reweigh(init_keys, model, intervals, first)
+        # `reweigh` returns whole paths, candidates only have the stored times.
+        first_state = first_state._replace(paths=problem.kept(first_state.paths))
+        candidates = jax.tree.map(
+            lambda *rows: jnp.concatenate(rows, axis=1), first_state, candidates
+        )
     uniform = jax.vmap(lambda k: jax.random.uniform(k, dtype=intervals.start.dtype))(accept_keys)
-    row, accepted = accept_reject(drawn.log_weights, uniform.reshape(step_keys.shape))
+    # The chain selects rows; paths are gathered once, after the scan.
+    row, accepted = accept_reject(candidates.log_weights, uniform.reshape(step_keys.shape))
     interval = jnp.arange(problem.num_intervals)[:, None]
-    states = problem.result(jax.tree.map(lambda leaf: leaf[interval, row], drawn))
+    states = problem.result(jax.tree.map(lambda leaf: leaf[interval, row], candidates))
     return Chain(
         times=problem.times(proposal.fractions(num_steps)),
         paths=states.paths,
@@ -165,11 +182,11 @@ def run_pseudo_marginal(
         log_weights=states.log_weights,
         met=states.found,
         truncated=states.truncated,
-        num_simulated=problem.total(drawn.num_simulated),
-        num_nonfinite=problem.total(drawn.num_nonfinite),
-        num_truncated=problem.total(drawn.truncated),
+        num_simulated=problem.total(candidates.num_simulated),
+        num_nonfinite=problem.total(candidates.num_nonfinite),
+        num_truncated=problem.total(candidates.truncated),
         proposal=proposal,
-        pareto_k=problem.result(pareto_k(drawn.log_weights)),
+        pareto_k=problem.result(pareto_k(candidates.log_weights)),
         log_halving=states.log_halving,
         step_share=problem.result(proposal.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
@@ -179,12 +196,18 @@ def run_pseudo_marginal(
 def accept_reject(
     log_weights: Float[Array, "I weights"], uniform: Float[Array, "I n"]
 ) -> tuple[Int[Array, "I n"], Bool[Array, "I n"]]:
-    """The chain on the weights alone: from the first of them n steps, each to the next one or not.
-    The number of the weight at which each step leaves the chain, and whether it moved."""
+    """Run the chains on the weights alone, for n steps.
+
+    Row 0 of the weights is the first state of each chain, and row i the candidate of step i. Return
+    the row of the state after each step, and whether the step accepted its candidate; both shape
+    (I, n).
+    """
 
     def step(state, inputs):
         row, log_weight = state
         i, candidate, uniform = inputs
+        # A candidate keeps its random weight for as long as it is the state: this makes the chain
+        # exact.
         accepted = uniform < acceptance_rate(log_weight, candidate)
         state = jnp.where(accepted, i, row), jnp.where(accepted, candidate, log_weight)
         return state, (state[0], accepted)

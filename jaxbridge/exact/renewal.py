@@ -1,12 +1,16 @@
 """The renewal chain, the paper's alternative algorithm (section 2.3).
 
-Run one diffusion associated with the current bridge; if it hits, take a new proposal. The chain
-keeps nothing but the path. Where μ is not ν, and the trial that hit had started in x_0, the
-proposal with x_0' is taken with probability `min(1, (μ/ν)(x_0') / (μ/ν)(x_0))`, for then
+Each step runs one diffusion associated with the current bridge. If it hits, a new proposal replaces
+the bridge. The path is the whole state of the chain.
+
+A start law μ other than ν needs an acceptance step. Let x_0 be the initial state of the trial that
+hit, and x_0' that of the proposal. The proposal is accepted with probability min(1, r), where r =
+(μ/ν)(x_0')/(μ/ν)(x_0). Let f be the density of the exact bridge, and h(z|x_0) the probability of a
+hit of z from x_0. Then
 
     f(z) μ(x_0) h(z|x_0) · ν(x_0') h(z'|x_0') f(z') · min(1, μ(x_0')ν(x_0) / ν(x_0')μ(x_0))
 
-is symmetric in (z, x_0) and (z', x_0'), h being the probability of a hit from x_0.
+is symmetric in (z, x_0) and (z', x_0'), so the chain is reversible.
 """
 
 from typing import NamedTuple
@@ -41,15 +45,20 @@ from .kernels import Chain, Kernel, chain_keys, check_position, one_interval
 
 
 class RenewalState(NamedTuple):
-    """`position`, the path, shape (N+1, d); NaN where none was found."""
+    """State of the chain: `position`, the path, shape (N+1, d); NaN if there is none."""
 
     position: Float[Array, "points d"]
 
 
 class RenewalInfo(NamedTuple):
-    """Of one step: whether the associated diffusion hit, whether the path was replaced, whether
-    none was found to replace it, the number of paths simulated, and of those that left the
-    finite numbers."""
+    """Report of one step of the chain.
+
+    - `is_hit`: whether the associated diffusion hit.
+    - `is_accepted`: whether a new path replaced the old one.
+    - `is_missing`: whether a new path was needed and not found.
+    - `num_simulated`: number of simulated paths.
+    - `num_nonfinite`: number of these that became non-finite.
+    """
 
     is_hit: Bool[Array, ""]
     is_accepted: Bool[Array, ""]
@@ -69,13 +78,14 @@ def renewal(
     proposal: AbstractCoupling | None = None,
     max_proposals: int | None = None,
 ) -> Kernel:
-    """The renewal kernel on (start, end, duration)-bridges, for couplings.
+    """Return the renewal kernel on (start, end, duration)-bridges, for couplings.
 
-    `init(position, rng_key)` takes a path of shape (N+1, d), or `None` for a first path by
-    proposal. `step(rng_key, state)` gives a `RenewalState` and a `RenewalInfo`. Arguments are
-    those of `sample_exact_bridges`.
+    `init(position, rng_key)` takes a path of shape (N+1, d). With `None` it proposes a first path.
+    `step(rng_key, state)` returns a `RenewalState` and a `RenewalInfo`.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Arguments:** as in `sample_exact_bridges`.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -109,39 +119,49 @@ def renewal(
 
 @compiled_sooner
 def _renewal_step(rng_key, state, model, pairs, intervals):
-    everything = jnp.ones(1, bool)
-    fixed = (model.prepared(), pairs, intervals, state.position)
-    model, pairs, intervals, path = nondifferentiable(fixed)
-    paths, info = renew(rng_key[None], model, pairs, intervals, path[None], everything)
+    all_active = jnp.ones(1, bool)
+    arguments = (model.prepared(), pairs, intervals, state.position)
+    model, pairs, intervals, path = nondifferentiable(arguments)
+    paths, info = renew(rng_key[None], model, pairs, intervals, path[None], all_active)
     return RenewalState(paths[0]), jax.tree.map(lambda leaf: leaf[0], info)
 
 
-# Segments of the renewal chain run side by side: as many as keep each this long, and no more
-# than fill the lanes. Those that must be run again are few, and run this many at a time.
+# The renewal chain runs in segments side by side. Each has at least this length, and they all
+# fit into the lanes.
 _SHORTEST_SEGMENT = 64
+# Few segments must run again: this many at a time.
 _REPAIR_WIDTH = 128
 
 
 class _Segments(NamedTuple):
-    """The trajectories of S segments of L steps, and the path in which each ends.
+    """Trajectories of S segments of L steps.
 
-    `stale` marks segments whose recorded trajectory did not begin with the path in which the
-    segment before it ends.
+    - `paths`: the path after each step, at the K stored times.
+    - `is_new`: whether the step accepted a new path.
+    - `ends`: the path after the last step.
+    - `stale`: whether the segment must run again: it did not start from the end of the one before
+        it.
+    - `num_simulated`, `num_nonfinite`: numbers of simulated paths, and of non-finite ones.
     """
 
     paths: Float[Array, "L S K d"]
-    moved: Bool[Array, "L S"]
+    is_new: Bool[Array, "L S"]
     ends: Float[Array, "S points d"]
     stale: Bool[Array, " S"]
     num_simulated: Int[Array, " S"]
     num_nonfinite: Int[Array, " S"]
 
 
-class _Runner(NamedTuple):
-    """What runs segments of the chains of a problem: all have one length, and as many are those of
-    one interval. `first` are the paths from which the chains start, and `keys` those of the steps
-    of each segment. The last steps of an interval's last segment may be too many: they repeat a
-    key, and are dropped."""
+class _SegmentRunner(NamedTuple):
+    """Data of the segments of all chains, and methods that run them.
+
+    All segments have the same length, and all intervals the same number of segments. The last steps
+    of the last segment of an interval may be surplus. They repeat a key, and are dropped.
+
+    - `first`: the paths from which the chains start.
+    - `keys`: the keys of the steps of each segment.
+    - `intervals`: the interval of each segment.
+    """
 
     model: Diffusion
     pairs: CoupledPairs
@@ -152,13 +172,16 @@ class _Runner(NamedTuple):
 
     @property
     def head(self) -> Bool[Array, " S"]:
-        """Which segments are the first of their interval."""
+        """Return which segments are the first of their interval."""
+        # Segments of an interval lie side by side, in the order of time.
         num_segments = len(self.keys) // self.problem.num_intervals
         return jnp.arange(len(self.keys)) % num_segments == 0
 
     def begin(self) -> _Segments:
-        """No steps, so that all are stale, and for each segment a guess of where the one before it
-        ends."""
+        """Return segments without steps, which are all stale.
+
+        The start of the chain is the guess for the end of each segment.
+        """
         num, length = self.keys.shape
         points, d = self.first.shape[1:]
         num_kept = points if self.problem.stored is None else len(self.problem.stored)
@@ -177,27 +200,32 @@ class _Runner(NamedTuple):
         chosen: Int[Array, " W"],
         progress_meter: diffrax.AbstractProgressMeter | None = None,
     ) -> _Segments:
-        """These segments, from where the ones before them end, until they rejoin what is recorded.
-        Numbers beyond the last only fill the width."""
-        num, length = self.keys.shape
-        place = jnp.minimum(chosen, num - 1)
-        intervals = jax.tree.map(lambda leaf: leaf[place], self.intervals)
+        """Run the chosen segments, from the ends of the segments before them.
 
-        def going_on(state):
+        A run stops where it rejoins the recorded trajectory. Indices beyond the last segment only
+        fill the width W.
+        """
+        num, length = self.keys.shape
+        index = jnp.minimum(chosen, num - 1)
+        intervals = jax.tree.map(lambda leaf: leaf[index], self.intervals)
+
+        def is_unfinished(state):
             i, _, active, _ = state
             return (i < length) & jnp.any(active)
 
         def one_step(state):
             i, positions, active, segments = state
             positions, info = renew(
-                self.keys[place, i], self.model, self.pairs, intervals, positions, active
+                self.keys[index, i], self.model, self.pairs, intervals, positions, active
             )
-            rejoined = info.is_accepted & segments.moved[i, place]
+            # Both accepted in this step, with the same key, so both have the same new path.
+            rejoined = info.is_accepted & segments.is_new[i, index]
+            # Index `num` is out of range: mode="drop" then leaves the record as it is.
             row = jnp.where(active, chosen, num)
-            kept = self.problem.kept(positions)
+            stored = self.problem.kept(positions)
             segments = segments._replace(
-                paths=segments.paths.at[i, row].set(kept, mode="drop"),
-                moved=segments.moved.at[i, row].set(info.is_accepted, mode="drop"),
+                paths=segments.paths.at[i, row].set(stored, mode="drop"),
+                is_new=segments.is_new.at[i, row].set(info.is_accepted, mode="drop"),
                 num_simulated=segments.num_simulated.at[row].add(info.num_simulated, mode="drop"),
                 num_nonfinite=segments.num_nonfinite.at[row].add(info.num_nonfinite, mode="drop"),
             )
@@ -206,26 +234,30 @@ class _Runner(NamedTuple):
         def progress(state):
             return state[0].astype(jnp.float32) / length
 
-        state = (jnp.int32(0), self._entries(segments)[place], chosen < num, segments)
-        state = metered_while_loop(going_on, one_step, state, progress, progress_meter)
+        state = (jnp.int32(0), self._starts(segments)[index], chosen < num, segments)
+        state = metered_while_loop(is_unfinished, one_step, state, progress, progress_meter)
         _, positions, changed, segments = state
+        # A run that rejoined leaves the recorded end as it is: the end is the same.
         ends = segments.ends.at[jnp.where(changed, chosen, num)].set(positions, mode="drop")
         stale = segments.stale.at[chosen].set(False, mode="drop")
+        # A run that did not rejoin has another end, and the next segment must run again.
         after = jnp.where(changed, chosen + 1, num)
+        # The first segment of an interval starts from the given path, so it is never stale again.
         stale = stale.at[after].set(True, mode="drop") & ~self.head
         return segments._replace(ends=ends, stale=stale)
 
     def repair(self, segments: _Segments) -> _Segments:
-        """Some of the stale segments, run again."""
+        """Run the first stale segments again, at most `_REPAIR_WIDTH` of them."""
         num = len(self.keys)
+        # `jnp.nonzero` needs a static size; the fill value is an index out of range.
         chosen = jnp.nonzero(segments.stale, size=min(_REPAIR_WIDTH, num), fill_value=num)[0]
         return self.run(segments, chosen)
 
-    def _entries(self, segments: _Segments) -> Float[Array, "S points d"]:
-        """Where each segment starts."""
-        before = jnp.maximum(jnp.arange(len(self.keys)) - 1, 0)
+    def _starts(self, segments: _Segments) -> Float[Array, "S points d"]:
+        """Return the path from which each segment starts."""
+        previous = jnp.maximum(jnp.arange(len(self.keys)) - 1, 0)
         first = jnp.repeat(self.first, len(self.keys) // len(self.first), axis=0)
-        return jnp.where(self.head[:, None, None], first, segments.ends[before])
+        return jnp.where(self.head[:, None, None], first, segments.ends[previous])
 
 
 @compiled_for(lambda key, model, proposal, problem, num, *_: problem.num_path_steps(num))
@@ -238,13 +270,17 @@ def run_renewal(
     first: Float[Array, "I points d"] | None,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Chain:
-    """Segments of the chain start from guesses, and are run again from where the segment before
-    them ends until all fit. Two trajectories that take new paths in the same step take the same
-    one, since a proposal depends on the key of its step only: from there on they are one, and
-    the rest of the record holds. So a repair is short, and the result that of one long run.
+    """Run the renewal chain of each interval, in segments side by side.
+
+    Segments start from guesses. A segment runs again, from the end of the segment before it, until
+    all segments fit. The result is that of one long run.
+
+    A repair is short, because a proposal depends only on the key of its step. If two trajectories
+    accept a new path in the same step, it is the same path. From there on the trajectories agree,
+    and the recorded steps that follow remain valid.
     """
-    fixed = (model.prepared(), pairs, problem, first)
-    model, pairs, problem, first = nondifferentiable(fixed)
+    arguments = (model.prepared(), pairs, problem, first)
+    model, pairs, problem, first = nondifferentiable(arguments)
     intervals, num_steps, num_intervals = (
         problem.intervals,
         problem.num_steps,
@@ -253,46 +289,54 @@ def run_renewal(
     pairs = pairs.prepared(key, model, intervals, num_steps)
     step_keys, init_keys = chain_keys(key, problem, num_bridges)
     if first is None:
-        begin, num_tried, num_failed = first_paths(init_keys, model, pairs, intervals, num_steps)
+        initial_paths, num_proposals, num_failed = first_paths(
+            init_keys, model, pairs, intervals, num_steps
+        )
     else:
-        begin, num_tried = first, jnp.zeros(num_intervals, jnp.int32)
-        num_failed = num_tried
-    most_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
-    num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, most_segments))
+        initial_paths, num_proposals = first, jnp.zeros(num_intervals, jnp.int32)
+        num_failed = num_proposals
+    max_segments = most_lanes(intervals.start.shape[1]) // 2 // num_intervals
+    num_segments = max(1, min(num_bridges // _SHORTEST_SEGMENT, max_segments))
     length = -(-num_bridges // num_segments)
+    # Surplus steps repeat the last key.
     steps = jnp.minimum(jnp.arange(num_segments * length), num_bridges - 1)
     keys = step_keys[:, steps].reshape(num_intervals * num_segments, length)
-    each = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_segments, axis=0), intervals)
-    runner = _Runner(model, pairs, problem, begin, keys, each)
+    segment_intervals = jax.tree.map(lambda leaf: jnp.repeat(leaf, num_segments, axis=0), intervals)
+    runner = _SegmentRunner(model, pairs, problem, initial_paths, keys, segment_intervals)
     segments = runner.begin()
     if len(keys) > _REPAIR_WIDTH or progress_meter is not None:
         segments = runner.run(segments, jnp.arange(len(keys)), progress_meter)
-    # Few segments are all run by the first repair, so that a step is compiled once. The first that
-    # is stale starts from where the chain is, so each pass settles it at least.
+    # Few segments all run in the first repair, so the step is compiled once. The first
+    # stale segment starts from a final state, so each pass makes at least that segment final.
     segments = lax.while_loop(lambda s: jnp.any(s.stale), runner.repair, segments)
 
-    def of_steps(leaf):
+    def join_segments(leaf):
         leaf = jnp.moveaxis(leaf, 0, 1).reshape(num_intervals, -1, *leaf.shape[2:])
         return problem.result(leaf[:, :num_bridges])
 
-    paths = of_steps(segments.paths)
-    # D of the states in which segments end, all but the last, which may be too long.
-    last = (steps == jnp.arange(len(steps))) & (jnp.arange(len(steps)) % length == length - 1)
-    ends = pairs.log_halving(model, each, segments.ends, 1).reshape(num_intervals, -1, 1)
-    log_halving = jnp.where(last.reshape(num_segments, -1), ends, jnp.nan)
+    paths = join_segments(segments.paths)
+    # Whole paths exist only at the ends of segments, so `log_halving` (D) is NaN elsewhere. The
+    # last segment may be too long; its end is then no state of the chain.
+    is_segment_end = (steps == jnp.arange(len(steps))) & (
+        jnp.arange(len(steps)) % length == length - 1
+    )
+    ends = pairs.log_halving(model, segment_intervals, segments.ends, 1).reshape(
+        num_intervals, -1, 1
+    )
+    log_halving = jnp.where(is_segment_end.reshape(num_segments, -1), ends, jnp.nan)
     log_halving = log_halving.reshape(num_intervals, -1)[:, :num_bridges]
-    # Nothing is counted, but no hit is what it should be if its trial did not start from μ.
-    cut = run_is_cut(pairs.coupling.start_law, model, intervals.duration / num_steps, num_steps)
+    # The chain has no counts to truncate, but hits have a wrong law if trials do not start from μ.
+    is_cut = run_is_cut(pairs.coupling.start_law, model, intervals.duration / num_steps, num_steps)
     return Chain(
         times=problem.times(pairs.fractions(num_steps)),
         paths=paths,
-        accepted=of_steps(segments.moved),
+        accepted=join_segments(segments.is_new),
         log_weights=None,
         met=jnp.all(jnp.isfinite(paths), axis=(-2, -1)),
         truncated=None,
-        num_simulated=problem.total(segments.num_simulated) + problem.total(num_tried),
+        num_simulated=problem.total(segments.num_simulated) + problem.total(num_proposals),
         num_nonfinite=problem.total(segments.num_nonfinite) + problem.total(num_failed),
-        num_truncated=problem.total(jnp.where(cut, num_bridges, 0)),
+        num_truncated=problem.total(jnp.where(is_cut, num_bridges, 0)),
         proposal=pairs,
         pareto_k=None,
         log_halving=problem.result(log_halving),
@@ -309,16 +353,21 @@ def renew(
     paths: Float[Array, "S points d"],
     active: Bool[Array, " S"],
 ) -> tuple[Float[Array, "S points d"], RenewalInfo]:
-    """One renewal step of each of S chains that is active: hit first, propose only then."""
+    """Make one renewal step of each active chain of S.
+
+    Only chains whose associated diffusion hit, and chains without a path, propose a new path.
+    """
     num_steps = paths.shape[1] - 1
     trial_keys, propose_keys, accept_keys = split_each(keys, 3)
     dt = intervals.duration / num_steps
     lanes = jnp.moveaxis(paths, 0, -1)
+    # Only a hit requires a proposal, which costs much more than a trial.
     associated = run_associated(model, pairs.coupling, trial_keys, lanes, dt)
+    # A chain without a path takes any proposal.
     missing = ~jnp.all(jnp.isfinite(paths), axis=(1, 2))
-    called_for = active & (associated.hit | missing)
-    proposed = propose_paths(propose_keys, model, pairs, intervals, called_for, num_steps)
-    found = proposed.num_found > 0
+    needs_path = active & (associated.hit | missing)
+    proposed = propose_paths(propose_keys, model, pairs, intervals, needs_path, num_steps)
+    is_found = proposed.num_found > 0
     new_paths, new_start, _ = proposed.outputs
 
     def ratio(x):
@@ -326,11 +375,11 @@ def renew(
 
     log_rate = over_points(ratio)(new_start) - over_lanes(-1)(ratio)(associated.start)
     uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=paths.dtype))(accept_keys)
-    accepted = found & (missing | (uniform < jnp.exp(jnp.minimum(log_rate, 0))))
+    accepted = is_found & (missing | (uniform < jnp.exp(jnp.minimum(log_rate, 0))))
     info = RenewalInfo(
         associated.hit & active,
         accepted,
-        called_for & ~found,
+        needs_path & ~is_found,
         active.astype(jnp.int32) + proposed.num_trials,
         (active & ~missing & ~associated.finite).astype(jnp.int32) + proposed.num_nonfinite,
     )
@@ -345,7 +394,11 @@ def propose_paths(
     active: Bool[Array, " I"] | None,
     num_steps: int,
 ) -> Accepted:
-    """A bridge by proposal for each interval; or for those that are active, which often are few."""
+    """Propose a bridge for each active interval; `None` makes all of them active.
+
+    Otherwise few intervals are expected to be active, so the default number of lanes is smaller.
+    """
+    # Few chains need a path in the same step: a quarter of them sets the number of lanes.
     num_wanted = len(keys) if active is None else len(keys) // 4
     active = jnp.ones(len(keys), bool) if active is None else active
     num_lanes = default_num_lanes(num_wanted, num_steps, intervals.start)
@@ -362,8 +415,11 @@ def first_paths(
     intervals: Intervals,
     num_steps: int,
 ) -> tuple[Float[Array, "I points d"], Int[Array, " I"], Int[Array, " I"]]:
-    """A bridge by proposal for each interval, NaN where none was found; how many proposals that
-    took, and how many of them left the finite numbers."""
+    """Propose a first bridge for each interval.
+
+    Return the paths (NaN for a missing one), the numbers of proposals, and the numbers of
+    non-finite ones.
+    """
     proposed = propose_paths(keys, model.prepared(), pairs, intervals, None, num_steps)
     joined: Joined = proposed.outputs
     paths = jnp.where((proposed.num_found > 0)[:, None, None], joined.paths, jnp.nan)

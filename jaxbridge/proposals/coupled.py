@@ -20,7 +20,7 @@ from ..coupling import (
     Stationary,
     count_hits,
     default_lanes,
-    described,
+    describe_coupling,
     find_bridges,
     ingredients,
     log_ratio,
@@ -79,7 +79,7 @@ class CoupledPairs(AbstractSingleProposal):
         return 1 / (1 + self.num_counts)
 
     def describe(self):
-        return described(self.coupling)
+        return describe_coupling(self.coupling)
 
     def relative_seconds(self, model, intervals):
         seconds, law = jnp.full_like(intervals.duration, _SECONDS), self.coupling.start_law
