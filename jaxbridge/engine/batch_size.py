@@ -35,10 +35,10 @@ _ENOUGH_LANES = 256
 
 
 def default_num_lanes(num_wanted: int, num_steps: int, points: Float[Array, "*axes d"]) -> int:
-    """Return the default number of lanes: the number of wanted successes, within memory bounds.
+    """Return the default number of lanes: one for each wanted success, at least 64, within bounds.
 
-    The paths on each device may take 16 MiB on a CPU and 1 GiB on an accelerator. On a CPU,
-    `_ENOUGH_LANES` lanes may take up to 512 MiB.
+    The paths on each device may take 16 MiB on a CPU and 1 GiB on an accelerator. Up to 256 lanes
+    may take more, at most 512 MiB. `most_lanes` bounds the number, too.
     """
     d = points.shape[-1]
     # A lane holds two paths and their noise, hence the factor 3.

@@ -5,9 +5,10 @@ closes over: its derivative with respect to them would be zero. Public functions
 values and pass them as leaves of `Captured`, the object that holds the user's functions. They are
 then treated like `params`.
 
-A value is found when a function is evaluated: the jaxpr of the function lists it as a constant. The
-first unknown constant ends the attempt, and the public function runs again with this value passed
-along. Outside of transformations there are no traced values, and nothing is done.
+Values are found when a function is evaluated: the jaxpr of the function lists them as constants.
+The first function with unknown constants ends the attempt, and the public function runs again with
+these values passed along. Outside of transformations there are no traced values, and nothing is
+done.
 """
 
 import contextvars
@@ -28,7 +29,7 @@ _MOST_ATTEMPTS = 64  # each attempt adds the captured values of one function
 
 
 class Captured:
-    """The functions of one object and the traced values that they close over, as a pytree.
+    """Functions of one object and the traced values that they close over, as a pytree.
 
     - `functions`: static, compared by identity or by their own equality.
     - `ids`: identities of the tracers in the closures, one for each of `values`.
@@ -111,7 +112,7 @@ class _Closed:
         arrays = [leaf if isinstance(leaf, _ARRAYS) else None for leaf in leaves]
         statics = []
 
-        def of_arrays(arrays):
+        def call_with_arrays(arrays):
             merged = [a if a is not None else b for a, b in zip(arrays, leaves, strict=True)]
             dynamic, static = eqx.partition(
                 function(*jax.tree.unflatten(structure, merged)), eqx.is_array
@@ -120,7 +121,7 @@ class _Closed:
             return dynamic
 
         with _context_set(None):  # nested functions must appear in this jaxpr as they are
-            self.jaxpr, shapes = jax.make_jaxpr(of_arrays, return_shape=True)(arrays)
+            self.jaxpr, shapes = jax.make_jaxpr(call_with_arrays, return_shape=True)(arrays)
         self.structure, self.static = jax.tree.structure(shapes), statics[-1]
         self.tracers = {id(c): c for c in self.jaxpr.consts if isinstance(c, jax.core.Tracer)}
 

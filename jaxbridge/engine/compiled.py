@@ -60,7 +60,7 @@ def compiled_for(num_path_steps: Callable[..., int]) -> Callable[[Callable], Cal
 
 
 def _compiled(fn: Callable, is_wanted_sooner: Callable[..., bool]) -> Callable:
-    """Compile `fn`; `is_wanted_sooner` selects the way of compilation from the arguments."""
+    """Compile `fn` in the way that `is_wanted_sooner` selects from its arguments."""
     inner_program = _program(fn)  # nested programs cannot have compiler options
     cpu_program = functools.cache(lambda sooner: _program(fn, compiler_options=cpu_options(sooner)))
 

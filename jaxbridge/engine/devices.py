@@ -50,7 +50,7 @@ def on_whole_batches(function: Callable[..., _Result], *args: Any, **kwargs: Any
     if not any(map(_is_split_by_vmap, leaves)):
         return function(*args, **kwargs)
 
-    def of_one(leaves):
+    def call_one(leaves):
         args, kwargs = eqx.combine(jax.tree.unflatten(treedef, leaves), static_inputs)
         return function(*args, **kwargs)
 
@@ -66,11 +66,11 @@ def on_whole_batches(function: Callable[..., _Result], *args: Any, **kwargs: Any
     @compute.def_vmap
     def compute_on_batch(size, are_batched, *leaves):
         axes = [0 if is_batched else None for is_batched in are_batched]
-        of_batch = eqx.filter_vmap(
-            of_one, in_axes=(axes,), out_axes=eqx.if_array(0), axis_size=size
+        call_batch = eqx.filter_vmap(
+            call_one, in_axes=(axes,), out_axes=eqx.if_array(0), axis_size=size
         )
         split = next(filter(_is_split, leaves))
-        results, static = eqx.partition(of_batch(_whole_as(split, leaves)), eqx.is_array)
+        results, static = eqx.partition(call_batch(_whole_as(split, leaves)), eqx.is_array)
         computed.append((_split_as(split, results), static))
         return leaves, tuple(are_batched)
 
@@ -78,14 +78,14 @@ def on_whole_batches(function: Callable[..., _Result], *args: Any, **kwargs: Any
     [(results, static)] = computed
 
     @custom_vmap
-    def hand_back(*_):
+    def return_results(*_):
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), results)
 
-    @hand_back.def_vmap
-    def hand_back_batch(*_):
+    @return_results.def_vmap
+    def return_batch(*_):
         return results, jax.tree.map(lambda _: True, results)
 
-    return eqx.combine(hand_back(*leaves), static)
+    return eqx.combine(return_results(*leaves), static)
 
 
 def _is_split_by_vmap(array: Array | np.ndarray | np.generic) -> bool:
@@ -98,16 +98,16 @@ def _is_split_by_vmap(array: Array | np.ndarray | np.generic) -> bool:
     batches = []
 
     @custom_vmap
-    def look(array):
+    def observe(array):
         return array
 
-    @look.def_vmap
-    def look_at_batch(size, is_batched, batch):
+    @observe.def_vmap
+    def observe_batch(size, is_batched, batch):
         batches.append(batch)
         return batch, True
 
     # Only the batch is of interest; without tangents, `custom_vmap` needs no derivative rule.
-    look(lax.stop_gradient(array))
+    observe(lax.stop_gradient(array))
     return any(map(_is_split, batches))
 
 
@@ -185,10 +185,10 @@ def over_devices(
 
         everywhere = PartitionSpec()
         # Without `check_vma`, JAX accepts results that differ between devices until `gather`.
-        shared = jax.shard_map(
+        on_all_devices = jax.shard_map(
             on_one_device, in_specs=everywhere, out_specs=everywhere, check_vma=False
         )
-        return shared(arrays, arguments)
+        return on_all_devices(arrays, arguments)
 
     return split
 

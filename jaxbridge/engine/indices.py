@@ -70,8 +70,8 @@ def _outside(axes, starts, sizes, shape) -> Iterator[tuple[int, int]]:
     for axis, start in zip(axes, starts, strict=True):
         if start is None:  # depends on values of the argument
             continue
-        wrong = (start < 0) | (start + sizes[axis] > shape[axis])
-        for index in np.atleast_1d(start)[np.atleast_1d(wrong)]:
+        is_outside = (start < 0) | (start + sizes[axis] > shape[axis])
+        for index in np.atleast_1d(start)[np.atleast_1d(is_outside)]:
             yield int(index) - (shape[axis] if index < 0 else 0), shape[axis]
 
 

@@ -233,12 +233,12 @@ def _of_one_shape(arrays: Sequence) -> list:
     """
     shape = np.broadcast_shapes(*map(np.shape, arrays))
 
-    def wide(array):
+    def broadcast(array):
         if np.shape(array) == shape:
             return array
         return lax.broadcast_in_dim(array, shape, range(len(shape) - np.ndim(array), len(shape)))
 
-    return list(map(wide, arrays))
+    return list(map(broadcast, arrays))
 
 
 def _broadcast(value, *, shape, broadcast_dimensions, **_):

@@ -38,11 +38,11 @@ def over_lanes(*in_axes: PyTree) -> Callable[[Callable], Callable[..., Any]]:
     """
 
     def decorate(function: Callable) -> Callable[..., Any]:
-        def over(*args):
+        def apply(*args):
             leaves, treedef = jax.tree.flatten(args)
             has_lanes = [axis is not None for axis in _axes_of_leaves(in_axes, args)]
 
-            def of_point(*values):
+            def call_at_point(*values):
                 values = iter(values)
                 merged = [
                     next(values) if with_lanes else leaf
@@ -55,7 +55,7 @@ def over_lanes(*in_axes: PyTree) -> Callable[[Callable], Callable[..., Any]]:
                 leaf for leaf, with_lanes in zip(leaves, has_lanes, strict=True) if with_lanes
             ]
             points = [jax.ShapeDtypeStruct(array.shape[:-1], array.dtype) for array in arrays]
-            closed, out = jax.make_jaxpr(of_point, return_shape=True)(*points)
+            closed, out = jax.make_jaxpr(call_at_point, return_shape=True)(*points)
             is_small = _count_numbers(closed.jaxpr) <= _MOST_NUMBERS
             form = Coordinates() if is_small else LanesLast()
             lanes = arrays[0].shape[-1]
@@ -63,7 +63,7 @@ def over_lanes(*in_axes: PyTree) -> Callable[[Callable], Callable[..., Any]]:
             results = [form.join(value, lanes) for value in values]
             return jax.tree.unflatten(jax.tree.structure(out), results)
 
-        return over
+        return apply
 
     return decorate
 
@@ -76,12 +76,12 @@ def over_points(function: Callable) -> Callable[..., Any]:
     point, for example a sum of features.
     """
 
-    def over(*args):
+    def apply(*args):
         lanes_last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), args)
         results = over_lanes(*len(args) * [-1])(function)(*lanes_last)
         return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), results)
 
-    return over
+    return apply
 
 
 def hold(tree: PyTree[Array]) -> PyTree[Array]:
@@ -350,10 +350,10 @@ def _as_function(
         for atom, operand in zip(equation.invars, operands, strict=True)
         if not isinstance(atom, Literal)
     }
-    alone = jaxpr.replace(
+    jaxpr_of_equation = jaxpr.replace(
         constvars=[], invars=list(arguments), outvars=equation.outvars, eqns=[equation]
     )
-    return jaxpr_as_fun(ClosedJaxpr(alone, [])), list(arguments.values())
+    return jaxpr_as_fun(ClosedJaxpr(jaxpr_of_equation, [])), list(arguments.values())
 
 
 _REDUCTIONS: dict[str, Callable] = {

@@ -197,14 +197,14 @@ def lower_factor(matrix: Float[Array, "d m"]) -> Float[Array, "d d"]:
     L: list[list[Array]] = []
     directions: list[Array] = []
     for i in range(d):
-        row, along = matrix[i], []
+        row, coefficients = matrix[i], []
         for direction in directions:
-            along.append(dot(row, direction))
-            row = row - along[-1] * direction
+            coefficients.append(dot(row, direction))
+            row = row - coefficients[-1] * direction
         square = dot(row, row)
         root = lax.rsqrt(square)
         directions.append(row * root)
-        L.append([*along, square * root])
+        L.append([*coefficients, square * root])
     return _lower(L)
 
 
@@ -220,15 +220,15 @@ def semidefinite_factor(matrix: Float[Array, "d n"]) -> Float[Array, "d d"]:
     L: list[list[Array]] = []
     directions: list[Array] = []
     for i in range(d):
-        row, along, norm_squared = matrix[i], [], dot(matrix[i], matrix[i])
+        row, coefficients, norm_squared = matrix[i], [], dot(matrix[i], matrix[i])
         for direction in directions:
-            along.append(dot(row, direction))
-            row = row - along[-1] * direction
+            coefficients.append(dot(row, direction))
+            row = row - coefficients[-1] * direction
         square = dot(row, row)
         is_zero = square <= (10 * d * jnp.finfo(matrix.dtype).eps) ** 2 * norm_squared
         root = jnp.where(is_zero, 0, lax.rsqrt(jnp.where(is_zero, 1, square)))
         directions.append(row * root)
-        L.append([*along, jnp.where(is_zero, 0, square * root)])
+        L.append([*coefficients, jnp.where(is_zero, 0, square * root)])
     return _lower(L)
 
 
@@ -321,8 +321,8 @@ def _looped_factor(matrix: Float[Array, "d n"]) -> Float[Array, "d d"]:
         is_zero = square <= (10 * d * eps) ** 2 * jnp.sum(matrix[k] ** 2)
         root = jnp.where(is_zero, 0, lax.rsqrt(jnp.where(is_zero, 1, square)))
         direction = rows[k] * root
-        along = jnp.where(jnp.arange(d) < k, 0, jnp.sum(rows * direction, axis=1))
-        return rows - along[:, None] * direction, L.at[:, k].set(along)
+        coefficients = jnp.where(jnp.arange(d) < k, 0, jnp.sum(rows * direction, axis=1))
+        return rows - coefficients[:, None] * direction, L.at[:, k].set(coefficients)
 
     return lax.fori_loop(0, d, column, (matrix, jnp.zeros((d, d), matrix.dtype)))[1]
 

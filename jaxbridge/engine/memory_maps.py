@@ -29,16 +29,16 @@ def mind_memory_maps(is_outermost: Callable[[], bool]) -> None:
     warn, once, if the process uses three quarters of the machine's memory.
     """
     _warn_of_memory(*_memory(int(time.monotonic() / _SECONDS)))
-    num, most = _num_maps(int(time.monotonic() / _SECONDS)), _most_maps()
-    if not most or num <= _WARN_SHARE * most:
+    num, limit = _num_maps(int(time.monotonic() / _SECONDS)), _most_maps()
+    if not limit or num <= _WARN_SHARE * limit:
         return
     action = "beyond nine tenths of them, all programs will be dropped"
-    if num > _DROP_SHARE * most and is_outermost():
+    if num > _DROP_SHARE * limit and is_outermost():
         jax.clear_caches()
         _num_maps.cache_clear()
         action = "all programs were dropped, and will be compiled again when called"
     warnings.warn(
-        f"Compiled programs use {num:,} of the {most:,} memory maps of this process, which aborts "
+        f"Compiled programs use {num:,} of the {limit:,} memory maps of this process, which aborts "
         f"when all are in use; {action}. Call `jax.clear_caches()` after trying many models, or "
         "raise the limit, `vm.max_map_count`. Each new function (each evaluation of a `lambda`) "
         "is compiled again, and a hundred of them use about 0.9 GB: define functions once, and "

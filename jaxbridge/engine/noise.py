@@ -88,8 +88,8 @@ def noisy_scan_until(
 ) -> PyTree:
     """Run the scan of `noisy_scan` until `is_over(carry)` holds in all lanes; return the carry.
 
-    Further steps must not change the carry of a lane that is over, because the test runs once for
-    each chunk.
+    The test runs once for each chunk, so further steps must not change the carry of a lane that is
+    over.
     """
     layout = _Chunks(num_steps, *chunks(num_steps))
     run_chunk, inputs = _chunk_of(step, keys, draw, layout), layout.inputs(xs, None)

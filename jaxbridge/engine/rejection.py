@@ -147,14 +147,16 @@ def over_problems(
     converted = eqx.filter_closure_convert(run_packed, problems, arrays)
     closed_over, converted = eqx.partition(converted, eqx.is_array)
 
-    def plain(closed_over, problems, arrays):
+    def run_one_batch(closed_over, problems, arrays):
         return eqx.combine(closed_over, converted)(problems, arrays)
 
     def run_folded(axis_size, in_batched, closed_over, problems, arrays):
         closed_over_differ, batched, shared_differ = in_batched
         if any(jax.tree.leaves((closed_over_differ, shared_differ))):
             in_axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
-            results = jax.vmap(plain, in_axes, axis_size=axis_size)(closed_over, problems, arrays)
+            results = jax.vmap(run_one_batch, in_axes, axis_size=axis_size)(
+                closed_over, problems, arrays
+            )
             return results, jax.tree.map(lambda _: True, results)
 
         def fold(leaf, batched):
@@ -170,7 +172,7 @@ def over_problems(
         results = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), results)
         return results, jax.tree.map(lambda _: True, results)
 
-    run_batched = jax.custom_batching.custom_vmap(plain)
+    run_batched = jax.custom_batching.custom_vmap(run_one_batch)
     run_batched.def_vmap(run_folded)
     return run_batched(closed_over, problems, arrays)
 
