@@ -154,7 +154,7 @@ MODELS = [
     *each("α", alpha, [0.0, -1.0, np.inf, NAN, B], "`alpha` must be one positive number"),
     ("α in words", hyperbolic("steep", 2), "`alpha` must be", TypeError),
     ("no dimension", hyperbolic(0.8, 0), "`dim` must be at least 1"),
-    ("half a dimension", hyperbolic(1.0, 2.0), "`dim` must be a Python integer", TypeError),
+    ("half a dimension", hyperbolic(1.0, 2.0), "`dim` must be a static Python integer", TypeError),
     ("log ν", of(jb.stationary_diffusion)(X), f"`log_density` {FUNCTION}", TypeError),
     ("V", stationary(V=np.eye(2)), f"`V` {FUNCTION}", TypeError),
     ("Q", stationary(Q=np.eye(2)), f"`Q` {FUNCTION}", TypeError),
@@ -189,7 +189,7 @@ MODELS = [
         TypeError,
     ),
     ("another model", at([0.5], HYPERBOLIC), "made by `ornstein_uhlenbeck`", TypeError),
-    *each("times", at, [[0.5, 0.2], [-0.1, 0.2], [0.5, 1.1], [NAN]], "`times` must increase"),
+    *each("times", at, [[0.5, 0.2], [-0.1, 0.2], [0.5, 1.1], [NAN]], "`times` must .*increas"),
     ("no times", gaussian(times=[]), "`times`"),
     ("time", gaussian(times=0.5), "`times` must have shape"),
     ("duration", gaussian(duration=-1.0), "`duration` must be positive"),
@@ -205,7 +205,7 @@ MODELS = [
     ("keys", simulate(key=jax.random.split(KEY)), "`key` must be a single key"),
     *each("times", on, [1.0, [1.0]], "`times` must have shape"),
     *each(
-        "times", on, [[0.0, 0.0], [0.0, 2.0, 1.0], [1.0, 0.0], [NAN] * 2], "`times` must increase"
+        "times", on, [[0.0, 0.0], [0.0, 2.0, 1.0], [1.0, 0.0], [NAN] * 2], "`times` must .*increas"
     ),
     *each("x0", lambda x: simulate(x0=x), [1.0, np.zeros((3, 2))], "`x0` must have shape"),
     ("x0 on a line", simulate(x0=[0.0]), r"at a point `x` of shape \(1,\)"),
@@ -252,9 +252,9 @@ SCHEMES = [
     *each("not linear", in_one, [HYPERBOLIC, VARYING], "`GaussianTransition` is for linear drift"),
     ("a point", path([0.0, 1.0], (2,)), "`path` must hold"),
     ("times", path([0.0, 1.0], (3, 2)), "`times` must have shape"),
-    ("equal times", path([0.0, 0.0, 1.0], (3, 2)), r"`times\[0\]` = 0.0 and .*merge the obs"),
-    ("a missing time", path([0.0, NAN, 1.0], (3, 2)), r"`times\[1\]` = nan is missing"),
-    ("no time", path([0.0, None, 1.0], (3, 2)), r"`times\[1\]` = nan is missing"),
+    ("equal times", path([0.0, 0.0, 1.0], (3, 2)), r"`times\[0\]` = 0.0 and .*Merge the obs"),
+    ("a missing time", path([0.0, NAN, 1.0], (3, 2)), r"`times\[1\]` = nan\. Remove"),
+    ("no time", path([0.0, None, 1.0], (3, 2)), r"`times\[1\]` = nan\. Remove"),
     ("times of two", path([[0.0, 1.0, 1.0]] * 2, (2, 3, 2)), "`times` must be finite and incr"),
     ("times since 1970", path(days, (6, 2)), "`times` are too far from zero"),
     ("form", path(TIMES, (3, 2), form="other"), "`form` must be"),
@@ -542,8 +542,8 @@ OF_A_RECORD = [
     ),
     ("a guess without noise", dict(observation=GUESSED), "`guess` must have positive variances"),
     ("fewer rows", dict(observations=VALUES[:3]), "a row for each of them"),
-    ("times go back", dict(times=AT[::-1]), "`times` must increase"),
-    ("a time is missing", dict(times=[0.0, NAN, 2.0, 3.0]), r"`times\[1\]` = nan is missing"),
+    ("times go back", dict(times=AT[::-1]), "`times` must .*increas"),
+    ("a time is missing", dict(times=[0.0, NAN, 2.0, 3.0]), r"`times\[1\]` = nan\. Remove"),
     ("one time", dict(times=AT[:1], observations=VALUES[:1]), "two times or more"),
     ("infinite", dict(observations=VALUES + np.inf), r"`observations\[0, 0\]` is infinite"),
     ("before the beginning", dict(initial_time=1.0), "`times` must begin at `initial_time`"),
@@ -591,7 +591,7 @@ RECORDS = [
     # Several records.
     ("one and two", several([TWO], [LINE[:2]] * 2), "got 1 and 2"),
     ("columns", several([TWO] * 2, [LINE[:2], VALUES[:2]]), r"columns.*\[1, 2\]"),
-    ("times go back", several([TWO, [0, -1.0]], [LINE[:2]] * 2), "in record 1: .*increase"),
+    ("times go back", several([TWO, [0, -1.0]], [LINE[:2]] * 2), "in record 1: .*increas"),
     (
         "path of two",
         reads("smooth")(times=[AT] * 2, observations=[VALUES] * 2),
@@ -676,26 +676,26 @@ TINY, MANY = dict(step_size=1e-9), dict(num_steps=2**26)
 
 INFERENCE = [
     # Too much.
-    *each("steps", lambda call: call(**TINY), [gibbs, pmmh, maximum], "`step_size` = .* pass 3"),
+    *each("steps", lambda call: call(**TINY), [gibbs, pmmh, maximum], "`step_size` = .* Pass 3"),
     *each("steps", lambda call: call(**MANY), [gibbs, pmmh, maximum], "`num_steps` = 67,108,864"),
-    ("steps of a record", of_noise(**TINY), "`step_size` = 1e-09 asks for 2e.09 steps"),
+    ("steps of a record", of_noise(**TINY), "`step_size` = 1e-09 needs 2e.09 steps"),
     ("meter", gibbs(progress_meter=True), "`progress_meter` must be `None` or", TypeError),
     ("where", gibbs(where=lambda params: params[9]), "`where` raised IndexError"),
     ("where", gibbs(where=lambda params: 2.0), "`where` must return parts of `model.params`"),
-    ("times", gibbs(times=[0.0, 2.0, 1.0]), r"`times\[1\]`.*sort them"),
-    ("missing time", gibbs(times=[0.0, NAN, 1.0]), r"`times\[1\]` = nan is missing"),
+    ("times", gibbs(times=[0.0, 2.0, 1.0]), r"`times\[1\]`.*Sort them"),
+    ("missing time", gibbs(times=[0.0, NAN, 1.0]), r"`times\[1\]` = nan\. Remove"),
     ("two times", gibbs(times=[0.0, 1.0]), "`observations` must have shape"),
     ("one time", gibbs(times=[0.0], observations=[[1.0]]), "must be two or more"),
     ("missing", gibbs(observations=[[0.0], [NAN], [1.0]]), r"`observations\[1\]`.*leave out"),
     ("no shape", gibbs(observations=1.0), "`observations` must have shape"),
-    ("twice", gibbs(times=[0.0, 1.0, 1.0]), r"`times\[1\]` = 1.0 .* equal: merge the observations"),
+    ("twice", gibbs(times=[0.0, 1.0, 1.0]), r"equal `times\[1\]` = 1.0 .*Merge the observations"),
     (
         "a start",
         gibbs(initial=[0.0], initial_time=0.0),
         "`initial` and `initial_time`: for records",
     ),
     ("dates", gibbs(times=np.array(DAYS, "datetime64[D]")), "got dates. Convert them", TypeError),
-    ("days", gibbs(times=np.array([0, 1, 2], "timedelta64[D]")), "differences of dates", TypeError),
+    ("days", gibbs(times=np.array([0, 1, 2], "timedelta64[D]")), "time differences", TypeError),
     ("late", gibbs(times=np.float32([7e4, 70_000.01, 70_000.02])), "`times` are too far from zero"),
     (
         "outside",
@@ -906,7 +906,7 @@ COUNTED = [
     (of(jb.simulate, KEY, HYPERBOLIC, A, TIMES), "num_paths num_steps"),
     (of(jb.measure_burn_in, KEY, HYPERBOLIC, A, 1.0), "num_steps"),
 ]
-INTEGER = "a Python integer"
+INTEGER = "a static Python integer"
 COUNTS = [(0, "at least [12]"), (-1, "at least [12]"), (2.5, INTEGER), (True, INTEGER)]
 KEYED = [
     of(jb.sample_bridges, **ENDS),

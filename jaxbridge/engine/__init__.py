@@ -1,16 +1,31 @@
-"""How programs run. Nothing here knows of diffusions.
+"""Compilation, validation and numerical building blocks, independent of diffusions.
 
-What is given becomes arrays, or an error that says what to change (`checks`). A random number is a
-function of its place in a tree of keys (`keys`), so nothing depends on what runs beside it. Points
-are small and lanes, one simulated path each, are many: a function of one point is evaluated with
-lanes in the last axis (`lanes`, whose values have one of the `lane_forms`), its algebra written
-out (`linalg`), in scans over time that draw their noise chunk by chunk (`noise`), or, where there
-is but one path, have the derivatives of all steps at once (`recursion`). Attempts are made side by
-side until each of many problems has its successes (`rejection`), on all `devices`, in loops that
-tell how far they are (`progress`).
+Input and errors:
 
-Of what comes out means are taken, Σ w h / Σ w (`averages`), whose weights have tails that allow it
-or not (`pareto`), and whose draws are worth so many independent ones (`diagnostics`). What is
-missing is a fault of the result, and an error at run time for those who ask for it (`verdict`). A
-process that has compiled more than it can hold is warned (`memory_maps`).
+- `checks` validates arrays, keys and counts; `arguments` validates functions and flags; `times`
+  validates times.
+- `indices` reports array indices that are out of bounds, which JAX would clamp.
+- `verdict` collects the faults of a result and raises them at run time on request.
+
+Random numbers and lanes:
+
+- `keys` derives each key from its place in a tree. No result depends on the batch that computes it.
+  `generator` provides a faster threefry.
+- `lanes` evaluates a function of one point for many simulated paths ("lanes"), with lanes in the
+  last axis. `lane_forms` stores the values, `linalg` provides the algebra.
+- `noise` scans over time and draws the noise in chunks of steps. `recursion` differentiates all
+  steps of one path at once.
+- `rejection` runs attempts for many problems side by side until each problem has its successes.
+- `devices` splits lanes over devices, `batch_size` chooses their number, `progress` adds progress
+  meters to loops.
+
+Compilation:
+
+- `entry` wraps public functions; `compiled` and `compiler` compile; `captured` handles closures
+  over traced values; `memory_maps` warns before compiled programs exhaust the memory.
+
+Statistics:
+
+- `averages` computes weighted means Σ w h / Σ w, `pareto` the tail shape k̂ of weights,
+  `diagnostics` effective sample sizes and R̂ of chains.
 """

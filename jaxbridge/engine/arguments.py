@@ -1,4 +1,4 @@
-"""Arguments that are no numbers: functions of the user, words, flags and progress meters."""
+"""Validation of arguments that are not numbers: functions, strings, flags and progress meters."""
 
 import functools
 import inspect
@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from .checks import is_traced
 
-# What JAX raises where a function needs the values of what is traced, as NumPy's functions do.
+# Errors of JAX when a function needs the values of traced arguments, as NumPy's functions do.
 _NEED_VALUES = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
@@ -21,13 +21,16 @@ _NEED_VALUES = (
     jax.errors.NonConcreteBooleanIndexError,
 )
 
-# What has a cause outside of the function: the device, the memory, guards against NaNs.
+# Errors with a cause outside of the function: the device, the memory, guards against NaNs.
 _NOT_THE_FUNCTIONS = (RuntimeError, FloatingPointError)
 
 
 def check_function(name: str, function: Any, *signatures: str, optional: bool = False) -> None:
-    """Raise `TypeError` unless `function` can be called with the positional arguments of one of the
-    signatures, such as "(x, params)", or is `None` where it is optional."""
+    """Raise `TypeError` unless `function` accepts the positional arguments of one of the
+    signatures.
+
+    Signatures are strings such as "(x, params)". With `optional`, the function may be `None`.
+    """
     if optional and function is None:
         return
     wanted = " or ".join(f"`{signature}`" for signature in signatures)
@@ -41,7 +44,7 @@ def check_function(name: str, function: Any, *signatures: str, optional: bool = 
 
 
 def _takes(function: Callable, number: int) -> bool:
-    """Return whether so many positional arguments fit, as far as the function shows it."""
+    """Return whether `number` positional arguments fit, as far as the signature is known."""
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):
@@ -54,23 +57,22 @@ def _takes(function: Callable, number: int) -> bool:
 
 
 def named(name: str, function: Callable) -> Callable:
-    """Return `function`, whose errors are raised with its name."""
+    """Return `function` such that its errors are raised with its name."""
     return functools.partial(evaluated, name, function)
 
 
 def evaluated(name: str, function: Callable, *args: Any) -> Any:
-    """Return `function(*args)`.
+    """Return `function(*args)`, with errors that state the name of the function.
 
-    **Raises:** `TypeError` where the function cannot be traced. The function's own errors are
-    raised again with its name, a `TypeError` as such, all others as `ValueError`.
+    **Raises:** `TypeError` if the function cannot be traced, or raises `TypeError` itself;
+    `ValueError` for its other errors.
     """
     try:
         return function(*args)
     except _NEED_VALUES as error:
         raise TypeError(
-            f"`{name}` cannot be traced by JAX, for it needs the values of its arguments: "
-            "write it with `jax.numpy` in the place of `numpy`, and `jnp.where` in the place "
-            "of `if`."
+            f"`{name}` cannot be traced by JAX, because it needs the values of its arguments. "
+            "Use `jax.numpy` instead of `numpy`, and `jnp.where` instead of `if`."
         ) from error
     except _NOT_THE_FUNCTIONS:
         raise
@@ -82,9 +84,12 @@ def evaluated(name: str, function: Callable, *args: Any) -> Any:
 
 
 def as_returned(name: str, value: Any, complex_too: bool = False) -> Array:
-    """Return what a function of the user returned as an array of real numbers, or of complex ones.
+    """Convert the result of a user function to an array of real numbers, or complex ones if
+    allowed.
 
-    **Raises:** `TypeError` for anything else.
+    Booleans are allowed, too.
+
+    **Raises:** `TypeError` for other results.
     """
     try:
         array = jnp.asarray(value)
@@ -94,8 +99,8 @@ def as_returned(name: str, value: Any, complex_too: bool = False) -> Array:
         ) from error
     if jnp.iscomplexobj(array) and not complex_too:
         raise TypeError(
-            f"`{name}` must return real numbers; it returned dtype {array.dtype}: write a complex "
-            "equation in its real and imaginary parts."
+            f"`{name}` must return real numbers; it returned dtype {array.dtype}. Split a complex "
+            "equation into real and imaginary parts."
         )
     if not (jnp.issubdtype(array.dtype, np.number) or array.dtype == bool):
         raise TypeError(f"`{name}` must return real numbers; it returned dtype {array.dtype}.")
@@ -103,7 +108,7 @@ def as_returned(name: str, value: Any, complex_too: bool = False) -> Array:
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> None:
-    """Raise `ValueError` unless `value` is one of the words."""
+    """Raise `ValueError` unless `value` is one of the choices."""
     if not (isinstance(value, str) and value in choices):
         *others, last = (f'"{choice}"' for choice in choices)
         raise ValueError(f"`{name}` must be {', '.join(others)} or {last}; got {shown(value)}.")
@@ -125,15 +130,15 @@ def check_meter(name: str, value: Any) -> None:
 
 
 def check_instance(name: str, value: Any, kind: type, what: str) -> None:
-    """Raise `TypeError` unless `value` is of this kind, which the message calls `what`."""
+    """Raise `TypeError` unless `value` is an instance of `kind`, which the message calls `what`."""
     if not isinstance(value, kind):
         raise TypeError(f"`{name}` must be {what}; got {shown(value)}.")
 
 
 def as_sequence(name: str, value: Any, what: str) -> tuple:
-    """Return the values of a list, a tuple or an array.
+    """Return the entries of a list, a tuple, a range or an array as a tuple.
 
-    **Raises:** `TypeError` for anything else.
+    **Raises:** `TypeError` for other types.
     """
     arrays = np.ndarray | jax.Array
     if not isinstance(value, list | tuple | range | arrays) or getattr(value, "ndim", 1) == 0:
@@ -142,14 +147,14 @@ def as_sequence(name: str, value: Any, what: str) -> tuple:
 
 
 def shown(value: Any) -> str:
-    """Return a value in at most 200 characters, and of what is traced its type."""
+    """Return a value's text for error messages: at most 200 characters, or its type if traced."""
     if is_traced(value):
         return f"a traced {type(value).__name__}".replace("Tracer", "value")
     text = f"the class `{value.__name__}`" if isinstance(value, type) else repr(value)
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
-# Arguments that mean the same in all public functions, and are checked where these are entered.
+# Checks of arguments that all public functions share; the decorator in `entry` applies them.
 SHARED = {
     "progress_meter": check_meter,
     "throw": check_flag,

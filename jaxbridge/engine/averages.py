@@ -1,4 +1,4 @@
-"""Means over bridges: Σ w h(path) of functions h of one path, shape (K, d)."""
+"""Weighted means Σ w h(path) over bridges, for functions h of one path of shape (K, d)."""
 
 from collections.abc import Callable
 
@@ -9,49 +9,62 @@ from jaxtyping import Array, Bool, Float, Inexact, PyTree, Shaped
 from .arguments import as_returned, check_function, named
 from .indices import check_indices
 
-# A function of one path; its values may be truth values and counts.
+# A function of one path. It may return Booleans and integers, which `path_function` converts.
 PathFunction = Callable[[Array], PyTree]
 
 
 def proper(log_weights: Float[Array, "*I"]) -> Float[Array, "*I"]:
-    """Log weights; -inf, no weight, where one is NaN or +inf."""
+    """Replace NaN and +inf among log weights by -inf, the log of a zero weight."""
     return jnp.where(log_weights < jnp.inf, log_weights, -jnp.inf)
 
 
 def normalised(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I n"]:
-    """The weights, normalised to sum to one; all zero where nothing has weight."""
+    """Return the weights, normalised to sum to one over the last axis.
+
+    All are zero where no weight is positive.
+    """
     largest = jnp.max(log_weights, axis=-1, keepdims=True)
+    # Subtracting the largest log weight keeps `exp` from overflowing.
     weights = jnp.exp(log_weights - jnp.where(jnp.isfinite(largest), largest, 0))
     total = jnp.sum(weights, axis=-1, keepdims=True)
     return weights / jnp.where(total > 0, total, 1)
 
 
 def effective_size(weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:
-    """1/Σw², for weights that sum to one: between 0, where nothing has weight, and n."""
+    """Return the effective sample size 1/Σw² of weights that sum to one, between 1 and n.
+
+    It is 0 where no weight is positive.
+    """
     squares = jnp.sum(weights**2, axis=-1)
     return jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1), 0)
 
 
 def filled(paths: Float[Array, "*I n K d"], met: Bool[Array, "*I n"]) -> Float[Array, "*I n K d"]:
-    """The first bridge that was found in place of those that were not, which are NaN."""
+    """Replace each missing path (NaN where `met` is false) by the first path that exists."""
+    # Missing paths have weight zero, but 0 · NaN is NaN in a mean and in its derivative.
     first = jnp.argmax(met, axis=-1)[..., None, None, None]
     return jnp.where(met[..., None, None], paths, jnp.take_along_axis(paths, first, axis=-3))
 
 
 def values_of(fn: PathFunction, paths: Float[Array, "*I n K d"]) -> PyTree:
-    """`fn` of every path, with leading axes (*I, n); truth values and counts as numbers."""
-    like = jax.ShapeDtypeStruct(paths.shape[-2:], paths.dtype)
-    each = path_function("fn", fn, like)
+    """Evaluate `fn` at every path; the results have leading axes (*I, n).
+
+    Booleans and integers among its values become floating point numbers.
+    """
+    path_type = jax.ShapeDtypeStruct(paths.shape[-2:], paths.dtype)
+    evaluate = path_function("fn", fn, path_type)
     for _ in paths.shape[:-2]:
-        each = jax.vmap(each)
-    return each(paths)
+        evaluate = jax.vmap(evaluate)
+    return evaluate(paths)
 
 
 def path_function(name: str, fn: PathFunction, like: jax.ShapeDtypeStruct) -> PathFunction:
-    """Return `fn` of paths like this one; truth values and counts among its values are numbers.
+    """Return `fn` with floating point values, for paths of the shape and dtype of `like`.
 
-    **Raises:** `TypeError` where it is no function of one path, or cannot be traced; `ValueError`
-    where it takes a point beyond the end of the path.
+    Booleans and integers among its values become numbers of the paths' dtype.
+
+    **Raises:** `TypeError` if `fn` is not a function of one path or cannot be traced; `ValueError`
+    if it indexes beyond the end of the path.
     """
     check_function(name, fn, "(path)")
 
@@ -68,12 +81,15 @@ def path_function(name: str, fn: PathFunction, like: jax.ShapeDtypeStruct) -> Pa
 def weighted_mean(
     weights: Float[Array, "*I n"], values: Inexact[Array, "..."]
 ) -> Inexact[Array, "..."]:
-    """Σ w h, for weights that sum to one and values of shape (*I, n, ...); NaN where nothing has
-    weight."""
+    """Compute Σ w h for weights that sum to one and values of shape (*I, n, ...).
+
+    The mean is NaN where no weight is positive. Values of weight zero are ignored, even NaN.
+    """
     axis = weights.ndim - 1
-    each = expanded(weights, values)
-    total = jnp.sum(jnp.where(each > 0, each * values, 0), axis)
-    return jnp.where(jnp.sum(each, axis) > 0, total, jnp.nan)
+    aligned = expanded(weights, values)
+    # 0 · NaN is NaN, so values of weight zero are masked.
+    total = jnp.sum(jnp.where(aligned > 0, aligned * values, 0), axis)
+    return jnp.where(jnp.sum(aligned, axis) > 0, total, jnp.nan)
 
 
 def mean_over_paths(
@@ -82,11 +98,11 @@ def mean_over_paths(
     paths: Float[Array, "*I n K d"],
     met: Bool[Array, "*I n"],
 ) -> PyTree:
-    """The weighted mean of `fn` over the paths that there are."""
+    """Compute the weighted mean of `fn` over the paths that exist."""
     values = values_of(fn, filled(paths, met))
     return jax.tree.map(lambda value: weighted_mean(weights, value), values)
 
 
 def expanded(weights: Shaped[Array, "*I n"], values: Inexact[Array, "..."]) -> Shaped[Array, "..."]:
-    """The weights with as many axes as the values."""
+    """Append axes of length one to the weights until they have as many axes as the values."""
     return weights.reshape(*weights.shape, *[1] * (values.ndim - weights.ndim))

@@ -1,13 +1,15 @@
-"""How our programs are compiled: `equinox.filter_jit`, with keys that take less of the compiler's
-time (`generator`), options that the installed compiler accepts (`compiler`), and an eye on the room
-that is left for programs (`memory_maps`).
+"""Compilation of the package's functions: `equinox.filter_jit` with four additions.
 
-On CPUs XLA up to JAX 0.11.0 can make its kernels in two ways. Those of its fusion emitters, the
-default, are up to twice as fast in a loop that works on many lanes, for they are vectorised where a
-number is overwritten by a function of itself; its former emitters take a third less time, and their
-programs a third of the memory maps. So what takes longer to compile than to run, as chains of
-parameters and all that is done once for each model, is `compiled_sooner`, and proposals are
-`compiled_for` their number.
+- Random keys use a generator that compiles faster (`generator`).
+- The compiler gets the options that its release accepts (`compiler`).
+- Compiled programs are dropped before they exhaust the memory maps (`memory_maps`).
+- Traced values in closures become arguments (`captured`).
+
+On CPUs, XLA up to JAX 0.11.0 generates kernels in two ways. The default fusion emitters vectorise
+loops that overwrite numbers in place, which makes loops over many lanes up to twice as fast. The
+former emitters need a third less time to compile and a third of the memory maps. Functions that
+take longer to compile than to run are therefore `compiled_sooner`, and proposals are `compiled_for`
+their number of steps.
 """
 
 import functools
@@ -21,37 +23,46 @@ from jax.extend.core import get_opaque_trace_state
 
 from .captured import call_with_captured
 from .compiler import cpu_options, warn_of_loop_fault
-from .generator import with_keys_written_out
+from .generator import with_unrolled_keys
 from .memory_maps import mind_memory_maps
 
-# Steps of paths, at some 10 ns more for each: 20 ms a call for .5 s to the first.
-_MANY = 2_000_000
+# Path steps in one call. The faster-compiled program needs about 10 ns more for each step, here
+# 20 ms, and saves about 0.5 s of compilation once.
+_MANY_STEPS = 2_000_000
 
 _LESS_MEMORY = (
-    "Memory does not suffice for these paths. Keep only some times of each path (`save_at=[...]`), "
-    "or ask for fewer paths, particles or steps in one call."
+    "These paths do not fit into memory. Store only some times of each path (`save_at=[...]`), "
+    "or request fewer paths, particles or steps in one call."
 )
 
 
 def compiled(fn: Callable) -> Callable:
-    """`fn`, compiled for each structure of its arguments; arrays in them are traced."""
+    """Compile `fn` once for each structure of its arguments; arrays in the arguments are traced."""
     return _compiled(fn, lambda *_, **__: False)
 
 
 def compiled_sooner(fn: Callable) -> Callable:
-    """As `compiled`, for what takes longer to compile than to run."""
+    """Compile `fn` as `compiled` does, with less compilation time and slower loops.
+
+    It suits functions that take longer to compile than to run.
+    """
     return _compiled(fn, lambda *_, **__: True)
 
 
 def compiled_for(num_path_steps: Callable[..., int]) -> Callable[[Callable], Callable]:
-    """As `compiled` where that many steps of paths, a function of `fn`'s arguments, are no fewer
-    than some millions, and else as `compiled_sooner`."""
-    return lambda fn: _compiled(fn, lambda *args, **kwargs: num_path_steps(*args, **kwargs) < _MANY)
+    """Compile `fn` as `compiled` for two million path steps or more, else as `compiled_sooner`.
+
+    `num_path_steps` computes the number of path steps from the arguments of `fn`.
+    """
+    return lambda fn: _compiled(
+        fn, lambda *args, **kwargs: num_path_steps(*args, **kwargs) < _MANY_STEPS
+    )
 
 
 def _compiled(fn: Callable, is_wanted_sooner: Callable[..., bool]) -> Callable:
-    within = _program(fn)  # JAX takes options for none but outermost programs
-    on_cpu = functools.cache(lambda sooner: _program(fn, compiler_options=cpu_options(sooner)))
+    """Compile `fn` in the way that `is_wanted_sooner` selects from its arguments."""
+    inner_program = _program(fn)  # nested programs cannot have compiler options
+    cpu_program = functools.cache(lambda sooner: _program(fn, compiler_options=cpu_options(sooner)))
 
     @functools.wraps(fn)
     def call(*args, **kwargs):
@@ -64,29 +75,32 @@ def _compiled(fn: Callable, is_wanted_sooner: Callable[..., bool]) -> Callable:
             raise
 
     def run(*args, **kwargs):
-        on_other = jax.default_backend() != "cpu"
-        if not on_other:
+        is_accelerator = jax.default_backend() != "cpu"
+        if not is_accelerator:
             warn_of_loop_fault()
         if not is_outermost():
-            return call_with_captured(within, args, kwargs)
-        if on_other:
-            return within(*args, **kwargs)
-        return on_cpu(is_wanted_sooner(*args, **kwargs))(*args, **kwargs)
+            return call_with_captured(inner_program, args, kwargs)
+        if is_accelerator:
+            return inner_program(*args, **kwargs)
+        return cpu_program(is_wanted_sooner(*args, **kwargs))(*args, **kwargs)
 
     return call
 
 
 def is_outermost() -> bool:
-    """Whether what is called now is run, and not traced or transformed."""
+    """Return whether the current call runs at once, outside of tracing and transformations."""
+    # The trace state inside of any transformation differs from that of eager evaluation.
     now = get_opaque_trace_state(convention="jaxbridge")
     with eval_context():
         return now == get_opaque_trace_state(convention="jaxbridge")
 
 
 def _program(fn: Callable, **options: Any) -> Callable:
+    """Compile `fn` by `equinox.filter_jit`, with its keys read by the faster-compiled generator."""
+
     @eqx.filter_jit(**options)
     @functools.wraps(fn)
     def program(*args, **kwargs):
-        return fn(*with_keys_written_out(args), **with_keys_written_out(kwargs))
+        return fn(*with_unrolled_keys(args), **with_unrolled_keys(kwargs))
 
     return program

@@ -1,11 +1,11 @@
-"""Lanes split over the devices of the ambient mesh, that of `jax.set_mesh`.
+"""Split of lanes over the devices of the ambient mesh (`jax.set_mesh`).
 
-Lanes know nothing of each other, so every device simulates its share of them and then tells the
-others. All else is little work and is done on every device alike: arrays hold the same numbers
-as on one device, and where lanes run changes results by rounding only.
+Lanes are independent, so each device simulates its share of them and sends the results to the
+others. All other work is small, and every device repeats it: arrays hold the same numbers as on one
+device. The number of devices changes results by rounding only.
 
-Along the explicit axes of a mesh JAX (0.10 to 0.12) has no `vmap` of loops that carry what is not
-mapped. What is called under such a `vmap` therefore runs on the whole batch (`on_whole_batches`).
+Along the explicit axes of a mesh, JAX 0.10 to 0.12 cannot `vmap` loops whose state has unmapped
+parts. Functions under such a `vmap` therefore run on the whole batch (`on_whole_batches`).
 """
 
 from collections.abc import Callable, Sequence
@@ -25,29 +25,38 @@ _Result = TypeVar("_Result")
 
 
 def whole(array: Array) -> Array:
-    """The array, handed whole to every device where its type says that they share it, as types do
-    along the explicit axes of a mesh: there a program cannot take single points out of it. Where no
-    mesh is in force, to the first device, for nothing else has such a type."""
+    """Replicate an array on every device if its type says that devices share it.
+
+    Arrays have such types along the explicit axes of a mesh; a program cannot index single points
+    of them. Without an ambient mesh, the array goes to the first device, because all other arrays
+    are there.
+    """
     if not _has_explicit_axes(array):
         return array
     sharding = jax.typeof(array).sharding
     if jax.sharding.get_abstract_mesh().empty and not isinstance(array, jax.core.Tracer):
-        return jnp.asarray(jax.device_get(array))  # by the host, for `device_put` keeps the type
+        return jnp.asarray(jax.device_get(array))  # via the host: `device_put` keeps the type
     return jax.sharding.reshard(array, NamedSharding(sharding.mesh, PartitionSpec()))
 
 
 def on_whole_batches(function: Callable[..., _Result], *args: Any, **kwargs: Any) -> _Result:
-    """Return `function(*args, **kwargs)`. If the call is under `jax.vmap` along an explicit axis of
-    a mesh, every device gets the whole batch, and results are split along that axis as before."""
-    arrays, rest = eqx.partition((args, kwargs), eqx.is_array)
+    """Return `function(*args, **kwargs)`, evaluated on the whole batch of a `jax.vmap`.
+
+    This applies to a `vmap` along an explicit axis of a mesh, and has no effect otherwise. Every
+    device gets the whole batch; the results are split along that axis as the arguments were.
+    """
+    arrays, static_inputs = eqx.partition((args, kwargs), eqx.is_array)
     leaves, treedef = jax.tree.flatten(arrays)
     if not any(map(_is_split_by_vmap, leaves)):
         return function(*args, **kwargs)
 
-    def of_one(leaves):
-        args, kwargs = eqx.combine(jax.tree.unflatten(treedef, leaves), rest)
+    def call_one(leaves):
+        args, kwargs = eqx.combine(jax.tree.unflatten(treedef, leaves), static_inputs)
         return function(*args, **kwargs)
 
+    # A `custom_vmap` function must know the shapes of its results before its rule sees the batch.
+    # So a first call only stores the results in `computed`; a second one, with known shapes,
+    # returns them.
     computed = []
 
     @custom_vmap
@@ -57,11 +66,11 @@ def on_whole_batches(function: Callable[..., _Result], *args: Any, **kwargs: Any
     @compute.def_vmap
     def compute_on_batch(size, are_batched, *leaves):
         axes = [0 if is_batched else None for is_batched in are_batched]
-        of_batch = eqx.filter_vmap(
-            of_one, in_axes=(axes,), out_axes=eqx.if_array(0), axis_size=size
+        call_batch = eqx.filter_vmap(
+            call_one, in_axes=(axes,), out_axes=eqx.if_array(0), axis_size=size
         )
         split = next(filter(_is_split, leaves))
-        results, static = eqx.partition(of_batch(_whole_as(split, leaves)), eqx.is_array)
+        results, static = eqx.partition(call_batch(_whole_as(split, leaves)), eqx.is_array)
         computed.append((_split_as(split, results), static))
         return leaves, tuple(are_batched)
 
@@ -69,40 +78,41 @@ def on_whole_batches(function: Callable[..., _Result], *args: Any, **kwargs: Any
     [(results, static)] = computed
 
     @custom_vmap
-    def hand_back(*_):
+    def return_results(*_):
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:], leaf.dtype), results)
 
-    @hand_back.def_vmap
-    def hand_back_batch(*_):
+    @return_results.def_vmap
+    def return_batch(*_):
         return results, jax.tree.map(lambda _: True, results)
 
-    return eqx.combine(hand_back(*leaves), static)
+    return eqx.combine(return_results(*leaves), static)
 
 
 def _is_split_by_vmap(array: Array | np.ndarray | np.generic) -> bool:
-    """Return whether the array is one of a batch that is split along an explicit axis of a mesh.
+    """Return whether the array belongs to a batch that is split along an explicit axis of a mesh.
 
-    Its type has the mesh, but not the axis: only rules of `vmap` get the batch.
+    Its own type lacks the batch axis; only a rule of `vmap` sees the batch.
     """
     if not isinstance(array, jax.core.Tracer) or not _has_explicit_axes(array):
         return False
     batches = []
 
     @custom_vmap
-    def look(array):
+    def observe(array):
         return array
 
-    @look.def_vmap
-    def look_at_batch(size, is_batched, batch):
+    @observe.def_vmap
+    def observe_batch(size, is_batched, batch):
         batches.append(batch)
         return batch, True
 
-    look(lax.stop_gradient(array))
+    # Only the batch is of interest; without tangents, `custom_vmap` needs no derivative rule.
+    observe(lax.stop_gradient(array))
     return any(map(_is_split, batches))
 
 
 def _whole_as(batch: Array, arrays: Sequence[Array]) -> list[Array]:
-    """Return the arrays whole on every device, of types that agree with that of the batch."""
+    """Replicate the arrays on every device, with types that agree with that of the batch."""
     if not isinstance(batch, jax.core.Tracer):
         return list(map(whole, arrays))
     everywhere = NamedSharding(jax.typeof(batch).sharding.mesh, PartitionSpec())
@@ -120,71 +130,81 @@ def _split_as(batch: Array, results: PyTree) -> PyTree:
 
 
 def _is_split(batch: Array) -> bool:
+    """Return whether the first axis of the batch is split along an explicit axis of a mesh."""
     spec = jax.typeof(batch).sharding.spec
     return _has_explicit_axes(batch) and len(spec) > 0 and spec[0] is not None
 
 
 def _has_explicit_axes(array: Array) -> bool:
+    """Return whether the mesh of the array's type has explicit axes."""
     return AxisType.Explicit in jax.typeof(array).sharding.mesh.axis_types
 
 
 def num_devices() -> int:
-    """How many devices share the lanes: one without a mesh, and where the caller has split the
-    work already, inside a `shard_map`."""
+    """Return the number of devices that share the lanes.
+
+    It is one without a mesh, and inside a `shard_map`, where the caller has split the work already.
+    """
     mesh = jax.sharding.get_abstract_mesh()
     return 1 if mesh.empty or AxisType.Manual in mesh.axis_types else mesh.size
 
 
 def share(num_lanes: int) -> int:
-    """How many of these lanes each device gets."""
-    return -(-num_lanes // num_devices())
+    """Return how many of these lanes each device simulates, rounded up."""
+    return -(-num_lanes // num_devices())  # division rounded up
 
 
 def over_devices(
     function: Callable[..., _Result], in_axes: tuple[int | None, ...], out_axis: int = 0
 ) -> Callable[..., _Result]:
-    """`function`, its lanes split over the devices; where there is one only, as it is.
+    """Return `function` with its lanes split over the devices; with one device, `function` itself.
 
-    Lanes are in those axes of the arguments that `in_axes` says (`None` for an argument without),
-    and in `out_axis` of all results. Traced arrays that `function` needs besides must be in an
-    `eqx.Partial`, for JAX lets a `shard_map` close over few of them.
+    - `in_axes`: the axis of lanes of each argument, `None` for an argument without lanes.
+    - `out_axis`: the axis of lanes of all results.
+
+    If `function` needs other traced arrays, pass an `eqx.Partial` that holds them: a `shard_map`
+    can close over few traced arrays.
     """
     if num_devices() == 1:
         return function
     names = jax.sharding.get_abstract_mesh().axis_names
-    arrays, rest = eqx.partition(function, eqx.is_array)
+    arrays, static_parts = eqx.partition(function, eqx.is_array)
 
     def split(*arguments):
         num_lanes = _num_lanes(arguments, in_axes)
         length = share(num_lanes)
 
         def on_one_device(arrays, arguments):
-            mine = lax.axis_index(names) * length + jnp.arange(length)
-            taken = (_take(*pair, mine) for pair in zip(arguments, in_axes, strict=True))
-            return jax.tree.map(gather, eqx.combine(arrays, rest)(*taken))
+            lanes = lax.axis_index(names) * length + jnp.arange(length)
+            own_arguments = (_take(*pair, lanes) for pair in zip(arguments, in_axes, strict=True))
+            return jax.tree.map(gather, eqx.combine(arrays, static_parts)(*own_arguments))
 
         def gather(leaf):
-            everything = lax.all_gather(leaf, names, axis=out_axis, tiled=True)
-            return lax.slice_in_dim(everything, 0, num_lanes, axis=out_axis)
+            gathered = lax.all_gather(leaf, names, axis=out_axis, tiled=True)
+            return lax.slice_in_dim(gathered, 0, num_lanes, axis=out_axis)
 
         everywhere = PartitionSpec()
-        # What devices do may vary as it will, until all are told.
-        shared = jax.shard_map(
+        # Without `check_vma`, JAX accepts results that differ between devices until `gather`.
+        on_all_devices = jax.shard_map(
             on_one_device, in_specs=everywhere, out_specs=everywhere, check_vma=False
         )
-        return shared(arrays, arguments)
+        return on_all_devices(arrays, arguments)
 
     return split
 
 
 def _take(argument: PyTree, axis: int | None, lanes: Int[Array, " lanes"]) -> PyTree:
-    """These lanes; for numbers beyond them, the last one."""
+    """Select these lanes of an argument; indices beyond the last lane select the last one.
+
+    The last device may have fewer lanes than its share; its surplus results are cut off later.
+    """
     if axis is None:
         return argument
     return jax.tree.map(lambda leaf: jnp.take(leaf, lanes, axis, mode="clip"), argument)
 
 
 def _num_lanes(arguments: tuple, in_axes: tuple[int | None, ...]) -> int:
+    """Return the number of lanes, which is the same in all arguments."""
     (size,) = {
         leaf.shape[axis]
         for argument, axis in zip(arguments, in_axes, strict=True)

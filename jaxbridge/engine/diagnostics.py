@@ -1,4 +1,4 @@
-"""How good is a chain?"""
+"""Diagnostics of Markov chains: effective sample sizes and potential scale reduction."""
 
 import math
 
@@ -12,23 +12,29 @@ from .doors import door
 
 @door
 def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
-    """How many independent draws a chain is worth: n / (1 + 2 Σ_t ρ_t), with autocorrelations
-    summed as far as sums of adjacent pairs are positive, and made to decrease (Geyer 1992). NaN
-    where a draw is.
+    """Estimate the effective sample size of one chain, n / (1 + 2 Σ_t ρ_t).
 
-    `draws`: one chain, shape (n, ...), for instance `chain.paths[:, 25]`.
+    The sum runs over the initial sequence of lags whose adjacent pairs of autocorrelations ρ_t have
+    positive sums, and these sums are made non-increasing (Geyer 1992). The result is NaN where a
+    draw is NaN, and 1 for a constant chain.
 
     **Example:**
 
     ```python
-    draws = jax.random.normal(key, (1000, 2))  # as, of a chain, `chain.paths[:, 25]`
+    draws = jax.random.normal(key, (1000, 2))  # such as `chain.paths[:, 25]`
     jb.effective_sample_size(draws)  # shape (2,)
     ```
+
+    **Arguments:** `draws`: one chain of at least 4 draws, shape (n, ...).
+
+    **Returns:** effective sample sizes, shape (...).
+
+    **Raises:** `ValueError` for fewer than 4 draws.
     """
     draws = as_floating("draws", draws)
     if draws.ndim == 0 or draws.shape[0] < 4:
         raise ValueError(
-            f"`draws` must be a chain of at least 4, shape (n, ...); got {draws.shape}."
+            f"`draws` must be a chain of at least 4 draws, shape (n, ...); got shape {draws.shape}."
         )
     return _effective_sample_size(draws)
 
@@ -37,49 +43,54 @@ def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
 def _effective_sample_size(draws):
     n = draws.shape[0]
     covariance = _autocovariance(draws)
-    moving = covariance[0] > 0
-    size = n / _correlation_time(covariance / jnp.where(moving, covariance[0], 1))
-    # A chain that alternates can be worth more than n, but how much is not well determined.
-    size = jnp.where(moving, jnp.minimum(size, n * math.log10(n)), 1)
+    varies = covariance[0] > 0
+    size = n / _correlation_time(covariance / jnp.where(varies, covariance[0], 1))
+    # Antithetic chains can exceed n, but the excess is poorly determined: bound it.
+    size = jnp.where(varies, jnp.minimum(size, n * math.log10(n)), 1)
     return jnp.where(jnp.isfinite(covariance[0]), size, jnp.nan)
 
 
 @jax.jit
 def effective_size_of_chains(draws: Float[Array, "chains n ..."]) -> Float[Array, "..."]:
-    """How many independent draws several chains are worth together, with correlations relative to
-    the variance of all draws,
+    """Estimate the joint effective sample size of several chains.
 
-        ρ_t = 1 - (W - mean of the chains' autocovariances at t) / V,   V = (n - 1)/n W + B,
+    Correlations are relative to the variance of all draws (Vehtari, Gelman, Simpson, Carpenter &
+    Bürkner 2021):
 
-    where W is the variance within chains and B that of their means (Vehtari, Gelman, Simpson,
-    Carpenter & Bürkner 2021): chains that disagree are worth few draws, however many they have. Of
-    a single chain as `effective_sample_size`."""
+        ρ_t = 1 - (W - mean of the chains' autocovariances at t) / V,   V = (n - 1)/n W + B.
+
+    W is the variance within chains and B the variance of their means. Chains that disagree
+    therefore have a small effective sample size, however long they are. For a single chain, the
+    result is that of `effective_sample_size`.
+    """
     num_chains, n = draws.shape[:2]
     if num_chains == 1:
         return effective_sample_size(draws[0])
     covariance = jnp.mean(jax.vmap(_autocovariance)(draws), axis=0) / (n - 1)
     within = covariance[0]
     overall = within * ((n - 1) / n) + jnp.var(jnp.mean(draws, axis=1), axis=0, ddof=1)
-    moving = overall > 0
-    correlation = 1 - (within - covariance) / jnp.where(moving, overall, 1)
+    varies = overall > 0
+    correlation = 1 - (within - covariance) / jnp.where(varies, overall, 1)
     total = num_chains * n
     size = total / _correlation_time(correlation.at[0].set(1))
-    size = jnp.where(moving, jnp.minimum(size, total * math.log10(total)), num_chains)
+    size = jnp.where(varies, jnp.minimum(size, total * math.log10(total)), num_chains)
     return jnp.where(jnp.isfinite(overall), size, jnp.nan)
 
 
 def _autocovariance(draws: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """n times that of one chain, for all lags."""
+    """Compute n times the autocovariance of one chain, for all lags."""
     n = draws.shape[0]
     centred = draws - jnp.mean(draws, axis=0)
+    # Padding to length 2n turns the circular convolution into a linear one.
     spectrum = jnp.fft.rfft(centred, 2 * n, axis=0)
     return jnp.fft.irfft(jnp.abs(spectrum) ** 2, 2 * n, axis=0)[:n]
 
 
 def _correlation_time(correlation: Float[Array, "n ..."]) -> Float[Array, "..."]:
-    """1 + 2 Σ_t ρ_t, summed as far as sums of adjacent pairs are positive, and made to decrease."""
+    """Estimate 1 + 2 Σ_t ρ_t by Geyer's initial monotone sequence."""
     n = correlation.shape[0]
     pairs = correlation[: n // 2 * 2].reshape(n // 2, 2, *correlation.shape[1:]).sum(1)
+    # Sums of adjacent pairs of a reversible chain are positive and decrease; noise hides that.
     positive = jnp.cumprod(pairs > 0, axis=0)
     pairs = jax.lax.cummin(jnp.where(positive, pairs, 0), axis=0)
     return jnp.maximum(2 * jnp.sum(pairs, axis=0) - 1, 1 / n)
@@ -87,21 +98,27 @@ def _correlation_time(correlation: Float[Array, "n ..."]) -> Float[Array, "..."]
 
 @door
 def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
-    """R̂ from the halves of several chains (Gelman & Rubin 1992, split): near one if they agree.
+    """Compute R̂ from the halves of several chains (split version of Gelman & Rubin 1992).
 
-    `draws`: shape (chains, n, ...).
+    It is close to one if the chains agree.
 
     **Example:**
 
     ```python
-    draws = jax.random.normal(key, (4, 1000, 2))  # as `theta` of a posterior of four chains
+    draws = jax.random.normal(key, (4, 1000, 2))  # such as `theta` of a posterior with four chains
     jb.potential_scale_reduction(draws)  # shape (2,)
     ```
+
+    **Arguments:** `draws`: shape (chains, n, ...), with n ≥ 4.
+
+    **Returns:** R̂, shape (...).
+
+    **Raises:** `ValueError` for fewer than 4 draws in each chain.
     """
     draws = as_floating("draws", draws)
     if draws.ndim < 2 or draws.shape[1] < 4:
         raise ValueError(
-            "`draws` must be chains of at least 4 draws each, shape (chains, n, ...); got "
+            "`draws` must be chains of at least 4 draws each, shape (chains, n, ...); got shape "
             f"{draws.shape}."
         )
     return _potential_scale_reduction(draws)

@@ -1,12 +1,11 @@
-"""How public functions are entered: with what the caller's guards would take for mistakes.
+"""Decorators of public functions: they switch off the caller's guards and check shared arguments.
 
-What is given, numbers and lists among it, is put on the device here, and what is refused is looked
-at: transfers, and meant. A NaN stands here for what is missing and -inf for the log of no weight,
-and each result says which. So `jax.transfer_guard`, `jax.debug_nans` and `jax.debug_infs`, by which
-a program looks for the mistakes of its own, are off inside, and as they were outside.
-
-Under a transformation of the caller's, traced values that user functions close over are passed
-along as arguments (`captured`).
+- Transfers are intended here: numbers and lists of the caller become arrays, and checks read
+  values. `jax.transfer_guard` is therefore off inside.
+- NaN marks missing values and -inf is the log of a zero weight, as each result documents.
+  `jax.debug_nans` and `jax.debug_infs` are therefore off inside.
+- Under a transformation, traced values that user functions close over become arguments
+  (`captured`).
 """
 
 import functools
@@ -26,8 +25,7 @@ _Result = TypeVar("_Result")
 
 
 def door(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`fn`, a public function, inside which the caller's guards are off, whose arguments that all
-    functions share are checked, and which passes along what functions close over."""
+    """Decorate a public function: as `guards_off`, and pass captured values as arguments."""
 
     @guards_off
     @functools.wraps(fn)
@@ -38,13 +36,12 @@ def door(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
 
 
 def guards_off(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """`fn`, inside which the caller's guards are off, and whose arguments that all functions share
-    are checked."""
+    """Decorate `fn`: switch the caller's guards off inside, and check the arguments in `SHARED`."""
     shared = [name for name in SHARED if name in inspect.signature(fn).parameters]
 
     @functools.wraps(fn)
     def entered(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        for name in shared:  # given by name only, in all of them
+        for name in shared:  # these arguments are keyword-only in all public functions
             if name in kwargs:
                 SHARED[name](name, kwargs[name])
         with jax.transfer_guard("allow"), jax.debug_nans(False), jax.debug_infs(False):

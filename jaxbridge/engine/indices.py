@@ -1,7 +1,8 @@
-"""Indices beyond an array, which JAX clamps without a word: `path[50]` of 20 points is the last.
+"""Detection of array indices that are out of bounds.
 
-A function is traced for arrays of given shapes; in its jaxpr the indices that do not depend on the
-values of these arrays are followed, and compared with the shapes.
+JAX clamps them silently: `path[50]` of 20 points is the last point. Here, a function is traced for
+arrays of given shapes. Its jaxpr yields all indices that do not depend on values of these arrays;
+these are compared with the shapes.
 """
 
 from collections.abc import Callable, Iterator
@@ -19,23 +20,25 @@ _CALLS = ("jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_
 
 
 def check_indices(name: str, function: Callable, like: Array | jax.ShapeDtypeStruct) -> None:
-    """Raise `ValueError` where `function`, given an array like this one, takes from an array what
-    is beyond its end."""
+    """Raise `ValueError` if `function` indexes beyond the end of an array.
+
+    `like` has the shape and dtype of the function's argument.
+    """
     closed = jax.make_jaxpr(function)(like)
     for index, length in _beyond(closed.jaxpr, [_value(c) for c in closed.consts], [None]):
         raise ValueError(
-            f"`{name}` takes the entry {index} of an axis of length {length}: it is given "
-            f"one array of shape {like.shape}."
+            f"`{name}` takes the entry {index} of an axis of length {length}; its argument is "
+            f"one array of shape {like.shape}. Use an index within the axis."
         )
 
 
 def _beyond(jaxpr: Any, consts: list, inputs: list) -> Iterator[tuple[int, int]]:
-    """Yield each known index that is out of bounds, with the length of the axis."""
-    known = dict(zip(jaxpr.constvars, consts, strict=True))
-    known |= dict(zip(jaxpr.invars, inputs, strict=True))
+    """Yield each known index that is out of bounds, with the length of its axis."""
+    constants = dict(zip(jaxpr.constvars, consts, strict=True))
+    constants |= dict(zip(jaxpr.invars, inputs, strict=True))
 
     def value_of(atom):
-        return np.asarray(atom.val) if isinstance(atom, core.Literal) else known.get(atom)
+        return np.asarray(atom.val) if isinstance(atom, core.Literal) else constants.get(atom)
 
     for equation in jaxpr.eqns:
         values = [value_of(atom) for atom in equation.invars]
@@ -50,29 +53,35 @@ def _beyond(jaxpr: Any, consts: list, inputs: list) -> Iterator[tuple[int, int]]
             sizes = equation.params["slice_sizes"]
             yield from _outside(range(len(shape)), values[1:], sizes, shape)
         elif name == "gather" and values[1] is not None:
+            # Other modes define the result beyond the end (clip, fill), perhaps on purpose.
             if equation.params["mode"] == lax.GatherScatterMode.PROMISE_IN_BOUNDS:
                 shape, sizes = equation.invars[0].aval.shape, equation.params["slice_sizes"]
                 axes = equation.params["dimension_numbers"].start_index_map
                 yield from _outside(axes, np.moveaxis(values[1], -1, 0), sizes, shape)
         if name in _EVALUATED and all(value is not None for value in values):
-            known[equation.outvars[0]] = _EVALUATED[name](*values, **equation.params)
+            constants[equation.outvars[0]] = _EVALUATED[name](*values, **equation.params)
 
 
 def _outside(axes, starts, sizes, shape) -> Iterator[tuple[int, int]]:
+    """Yield each start whose slice leaves the axis, with the length of the axis.
+
+    Negative starts are reported as the caller wrote them, relative to the end of the axis.
+    """
     for axis, start in zip(axes, starts, strict=True):
-        if start is None:
+        if start is None:  # depends on values of the argument
             continue
-        wrong = (start < 0) | (start + sizes[axis] > shape[axis])
-        for index in np.atleast_1d(start)[np.atleast_1d(wrong)]:
+        is_outside = (start < 0) | (start + sizes[axis] > shape[axis])
+        for index in np.atleast_1d(start)[np.atleast_1d(is_outside)]:
             yield int(index) - (shape[axis] if index < 0 else 0), shape[axis]
 
 
 def _value(const: Any) -> np.ndarray | None:
-    """Return a constant that is known, `None` for one that is traced."""
+    """Return the value of a constant, or `None` if it is traced."""
     return None if is_traced(const) else np.asarray(const)
 
 
 def _broadcast(value, *, shape, broadcast_dimensions, **_):
+    """Evaluate `broadcast_in_dim` by NumPy."""
     expanded = [1] * len(shape)
     for axis, length in zip(broadcast_dimensions, value.shape, strict=True):
         expanded[axis] = length
@@ -80,12 +89,13 @@ def _broadcast(value, *, shape, broadcast_dimensions, **_):
 
 
 def _iota(*, dtype, shape, dimension, **_):
+    """Evaluate `iota` by NumPy."""
     expanded = [1] * len(shape)
     expanded[dimension] = shape[dimension]
     return np.broadcast_to(np.arange(shape[dimension], dtype=dtype).reshape(expanded), shape)
 
 
-# What JAX makes of indices before it takes them.
+# Operations that JAX applies to indices before it uses them, such as wrapping negative ones.
 _EVALUATED = {
     "lt": lambda a, b, **_: np.less(a, b),
     "add": lambda a, b, **_: np.add(a, b),

@@ -1,17 +1,20 @@
-"""The tree of keys: what random numbers depend on, and so what they do not depend on.
+"""The tree of random keys: it defines the inputs of each random number.
 
-    key
-    ├─ interval i                       numbered(key, I)
-    │  └─ attempt j                     numbered_keys(keys, i, j)
-    │     ├─ reversed path | driven path | coupling         of a proposal, split_each(keys, 3)
-    │     │  └─ chunk c of steps        folded(keys, c), where there is more than one
-    │     │     └─ normal and uniform numbers, of one draw
-    │     └─ start | path | coupling    of an associated path, split_each(keys, 3)
-    │        └─ ...
-    └─ purpose                          key_for("burn-in", key)
+```text
+key
+├─ interval i                       numbered(key, I)
+│  └─ attempt j                     numbered_keys(keys, i, j)
+│     ├─ reversed path | driven path | coupling         of a proposal, split_each(keys, 3)
+│     │  └─ chunk c of steps        folded(keys, c), if there are several chunks
+│     │     └─ normal and uniform numbers, of one draw
+│     └─ start | path | coupling    of an associated path, split_each(keys, 3)
+│        └─ ...
+└─ purpose                          key_for("burn-in", key)
+```
 
-So a path is a function of its interval and its number: of no neighbour, no batch and no device.
-Methods that weigh or step have a split of the interval's key in the place of j.
+A path is therefore a function of its interval and its number. It does not depend on other paths, on
+the batch or on the device. Methods that weigh or step use a split of the interval's key in place of
+attempt j.
 """
 
 import zlib
@@ -22,28 +25,31 @@ from jaxtyping import Array, Int, Key
 
 
 def key_for(purpose: str, key: Key[Array, ""]) -> Key[Array, ""]:
-    """A key that no numbering leads to, so that a caller may use one key for several calls on the
-    same bridges."""
+    """Derive a key for a purpose, apart from the numbered keys.
+
+    A caller may therefore use one key for several calls on the same bridges.
+    """
+    # A checksum is the same in every process; Python's `hash` of a string is not.
     return jax.random.fold_in(key, zlib.crc32(purpose.encode()))
 
 
 def numbered(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
-    """The keys of the first `num` of anything."""
+    """Derive the keys with numbers 0, ..., `num` - 1."""
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num))
 
 
 def numbered_keys(
     keys: Key[Array, " P"], problem: Int[Array, " lanes"], number: Int[Array, " lanes"]
 ) -> Key[Array, " lanes"]:
-    """The key of each attempt, from that of its problem."""
+    """Derive the key of each attempt from the key of its problem and its number."""
     return jax.vmap(jax.random.fold_in)(keys[problem], number)
 
 
 def folded(keys: Key[Array, " lanes"], number: int | Int[Array, ""]) -> Key[Array, " lanes"]:
-    """The keys of what has this number in all lanes."""
+    """Fold one number into the key of each lane."""
     return jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
 
 
 def split_each(keys: Key[Array, " lanes"], num: int) -> Key[Array, "num lanes"]:
-    """Each key split in `num`, which come first."""
+    """Split each key into `num` keys, which are the first axis of the result."""
     return jax.vmap(lambda key: jax.random.split(key, num), out_axes=1)(keys)

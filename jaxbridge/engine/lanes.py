@@ -1,11 +1,12 @@
-"""Functions of one point over many lanes, written out in the coordinates of the points.
+"""Evaluation of functions of one point in many lanes, written out in the point's coordinates.
 
-`jax.vmap` takes lanes through a function as an axis of its arrays, the first wherever a number
-meets a vector: states are then interleaved lane by lane, and loops over time do not vectorise.
-Here a function of one small point is traced and evaluated, equation by equation, with lanes last:
-coordinate by coordinate if there are few, else array by array (`lane_forms`). Short sums and
-products of matrices are written out, and what is left to compile is arithmetic on arrays of
-lanes, which XLA fuses into a few passes. Equations that have no rule here go through `vmap`.
+`jax.vmap` puts the lanes first wherever a number meets a vector. States are then interleaved lane
+by lane, and loops over time do not vectorise. Here, a function of one small point is traced. Its
+equations are evaluated one by one with lanes last: coordinate by coordinate for few numbers, else
+array by array (`lane_forms`).
+
+Short sums and products of matrices are written out. Only arithmetic on arrays of lanes remains,
+which XLA fuses into a few passes. Equations without a rule here use `vmap`.
 """
 
 import math
@@ -22,85 +23,99 @@ from jaxtyping import Array, PyTree
 
 from .lane_forms import AbstractForm, Coordinates, LanesLast, aval, is_short
 
-# Beyond these, what is written out in coordinates takes long to compile.
+# Larger functions and points take long to compile when they are written out in coordinates.
 _MOST_NUMBERS = 1024
 _MOST_ROWS = 4
-# A matrix of so many, which all lanes share, is not written out.
+# A shared matrix of so many entries multiplies all lanes at once instead.
 _LEAST_WEIGHTS = 16
 
 
 def over_lanes(*in_axes: PyTree) -> Callable[[Callable], Callable[..., Any]]:
-    """`jax.vmap` of a function of one point, lanes in the last axis of arguments and results.
+    """Apply a function of one point in all lanes: `jax.vmap` with lanes in the last axis.
 
-    `in_axes` has for each argument, or each part of one, -1 or, for what lanes share, `None`.
+    `in_axes` has one entry for each argument, or a tree of entries for its parts: -1 for values
+    with lanes, `None` for values that all lanes share.
     """
 
     def decorate(function: Callable) -> Callable[..., Any]:
-        def over(*args):
+        def apply(*args):
             leaves, treedef = jax.tree.flatten(args)
-            in_lanes = [axis is not None for axis in _axes_of_leaves(in_axes, args)]
+            has_lanes = [axis is not None for axis in _axes_of_leaves(in_axes, args)]
 
-            def of_point(*values):
+            def call_at_point(*values):
                 values = iter(values)
-                each = [
-                    next(values) if own else leaf
-                    for leaf, own in zip(leaves, in_lanes, strict=True)
+                merged = [
+                    next(values) if with_lanes else leaf
+                    for leaf, with_lanes in zip(leaves, has_lanes, strict=True)
                 ]
-                return function(*jax.tree.unflatten(treedef, each))
+                return function(*jax.tree.unflatten(treedef, merged))
 
-            arrays = [leaf for leaf, own in zip(leaves, in_lanes, strict=True) if own]
+            # Shared values are closed over, so that they stay constants of the jaxpr.
+            arrays = [
+                leaf for leaf, with_lanes in zip(leaves, has_lanes, strict=True) if with_lanes
+            ]
             points = [jax.ShapeDtypeStruct(array.shape[:-1], array.dtype) for array in arrays]
-            closed, out = jax.make_jaxpr(of_point, return_shape=True)(*points)
-            few = _count_numbers(closed.jaxpr) <= _MOST_NUMBERS
-            form = Coordinates() if few else LanesLast()
+            closed, out = jax.make_jaxpr(call_at_point, return_shape=True)(*points)
+            is_small = _count_numbers(closed.jaxpr) <= _MOST_NUMBERS
+            form = Coordinates() if is_small else LanesLast()
             lanes = arrays[0].shape[-1]
             values = _evaluate(closed, [form.split(array) for array in arrays], form, lanes)
             results = [form.join(value, lanes) for value in values]
             return jax.tree.unflatten(jax.tree.structure(out), results)
 
-        return over
+        return apply
 
     return decorate
 
 
 def over_points(function: Callable) -> Callable[..., Any]:
-    """`jax.vmap(function)`, over the first axis of all arguments, written out: for functions of a
-    user's at more points than run side by side elsewhere. XLA's CPU compiler (JAX 0.10.2) leaves
-    all but the first 32,768 numbers of some reductions uncomputed, of which a model may have
-    several for each point, as in a sum of features."""
+    """Apply a function to points along the first axis of all arguments, as `jax.vmap(function)`.
 
-    def over(*args):
-        last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), args)
-        made = over_lanes(*len(args) * [-1])(function)(*last)
-        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), made)
+    Use it for user functions at many points: XLA's CPU compiler (JAX 0.10.2) computes only the
+    first 32,768 numbers of some reductions. A model may contain several such reductions for each
+    point, for example a sum of features.
+    """
 
-    return over
+    def apply(*args):
+        lanes_last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), args)
+        results = over_lanes(*len(args) * [-1])(function)(*lanes_last)
+        return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), results)
+
+    return apply
 
 
 def hold(tree: PyTree[Array]) -> PyTree[Array]:
-    """The numbers of a point as values of their own, which a compiler computes once however many
-    functions read them. Where lanes are written out, the numbers of a lane pass through one product
-    with the identity, in which 0 · ∞ is NaN: they pass as halves, ∞ as the least power of two of
-    which the double is infinite."""
+    """Make the compiler compute the numbers of a point once, however many functions read them.
+
+    In lanes, the numbers pass through a product with the identity (`_held`), where 0 · ∞ is NaN.
+    They pass as halves, and ±∞ passes as the least power of two whose double is infinite.
+    """
 
     def finite(array):
-        most = 2.0 ** (jnp.finfo(array.dtype).maxexp - 1)
-        return jnp.clip(array / 2, -most, most)
+        # The bound doubles to infinity, so the doubling below restores ±∞.
+        largest = 2.0 ** (jnp.finfo(array.dtype).maxexp - 1)
+        return jnp.clip(array / 2, -largest, largest)
 
     held = lax.optimization_barrier(jax.tree.map(finite, tree))
     return jax.tree.map(lambda array: 2 * array, held)
 
 
 class Rows(tuple[Array, ...]):
-    """The rows of an array as arrays of their own, for the state of a compiled loop: each step
-    would otherwise write them into one array, element by element."""
+    """Rows of an array as separate arrays, for the state of a compiled loop.
+
+    Each step would otherwise write the rows into one array, element by element.
+    """
 
 
 jax.tree_util.register_pytree_node(Rows, lambda rows: (rows, None), lambda _, rows: Rows(rows))
 
 
 def split_rows(tree: PyTree, axis: int = 0) -> PyTree:
-    """Every array of points in the tree, coordinates in this axis and lanes after it, as `Rows`."""
+    """Convert arrays of points to `Rows`, with coordinates in `axis` and lanes in the next, last
+    axis.
+
+    Other arrays and points of more than four coordinates stay as they are.
+    """
 
     def split(leaf):
         if leaf.ndim != axis + 2 or leaf.shape[axis] > _MOST_ROWS:
@@ -111,7 +126,7 @@ def split_rows(tree: PyTree, axis: int = 0) -> PyTree:
 
 
 def join_rows(tree: PyTree, axis: int = 0) -> PyTree:
-    """The inverse of `split_rows`."""
+    """Convert all `Rows` back to arrays, the inverse of `split_rows`."""
     are_rows = lambda leaf: isinstance(leaf, Rows)
     return jax.tree.map(
         lambda leaf: jnp.stack(leaf, axis) if are_rows(leaf) else leaf, tree, is_leaf=are_rows
@@ -119,30 +134,34 @@ def join_rows(tree: PyTree, axis: int = 0) -> PyTree:
 
 
 def _axes_of_leaves(in_axes: Sequence[PyTree], args: Sequence[PyTree]) -> list[int | None]:
-    def spread(axis, part):
+    """Return the lane axis of each leaf of the arguments, from one axis for each part of them."""
+
+    def repeat_axis(axis, part):
         return [axis] * len(jax.tree.leaves(part))
 
     is_none = lambda axis: axis is None
-    axes = jax.tree.map(spread, tuple(in_axes), tuple(args), is_leaf=is_none)
+    axes = jax.tree.map(repeat_axis, tuple(in_axes), tuple(args), is_leaf=is_none)
     return jax.tree.leaves(axes, is_leaf=is_none)
 
 
 def _inner(equation: JaxprEqn) -> ClosedJaxpr | None:
-    """The body of a call that is no more than its body."""
+    """Return the jaxpr that a `jit` equation calls, or `None` for other equations."""
     return equation.params["jaxpr"] if equation.primitive.name in ("jit", "pjit") else None
 
 
 def _count_numbers(jaxpr: Jaxpr) -> int | float:
-    """How many numbers the function computes in one lane; without end where some array is empty,
-    of which coordinates know nothing."""
+    """Count the numbers that the function computes in one lane.
 
-    def of(equation: JaxprEqn) -> int | float:
+    The count is infinite if an array is empty, because `Coordinates` cannot represent it.
+    """
+
+    def count_in(equation: JaxprEqn) -> int | float:
         inner, name = _inner(equation), equation.primitive.name
         if any(0 in aval(atom).shape for atom in (*equation.invars, *equation.outvars)):
             return math.inf
         if inner is not None:
             return _count_numbers(inner.jaxpr)
-        if name in Coordinates.moves:
+        if name in Coordinates.moves:  # happens while tracing
             return 0
         counted = equation.invars if name in _REDUCTIONS else equation.outvars
         numbers = sum(math.prod(aval(atom).shape) for atom in counted)
@@ -151,17 +170,18 @@ def _count_numbers(jaxpr: Jaxpr) -> int | float:
             numbers *= math.prod(aval(equation.invars[0]).shape[axis] for axis in axes)
         return numbers
 
-    return sum(map(of, jaxpr.eqns))
+    return sum(map(count_in, jaxpr.eqns))
 
 
 def _evaluate(closed: ClosedJaxpr, args: Sequence, form: AbstractForm, lanes: int) -> list:
+    """Evaluate a jaxpr with arguments in this form; return its results."""
     jaxpr = closed.jaxpr
     values: dict[Var, Any] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
 
     def read(atom):
         if isinstance(atom, Literal):
-            return np.asarray(atom.val, aval(atom).dtype)
+            return np.asarray(atom.val, aval(atom).dtype)  # `val` may be a Python number
         return values[atom]
 
     for equation in jaxpr.eqns:
@@ -174,9 +194,10 @@ def _evaluate(closed: ClosedJaxpr, args: Sequence, form: AbstractForm, lanes: in
 def _apply(
     jaxpr: Jaxpr, equation: JaxprEqn, operands: list, form: AbstractForm, lanes: int
 ) -> list:
+    """Evaluate one equation by the first rule that applies."""
     name, params = equation.primitive.name, equation.params
-    if not any(map(form.is_own, operands)):
-        function, operands = _alone(jaxpr, equation, operands)
+    if not any(map(form.is_own, operands)):  # the same for all lanes: computed once
+        function, operands = _as_function(jaxpr, equation, operands)
         return function(*operands)
     inner = _inner(equation)
     if inner is not None:
@@ -184,9 +205,9 @@ def _apply(
     if name in _ELEMENTWISE:
         return [form.elementwise(equation, operands)]
     if name in form.moves:
-        return form.moved(equation, operands)
+        return form.move_entries(equation, operands)
     if name in _REDUCTIONS and is_short(equation, params["axes"]):
-        return [form.reduced(_REDUCTIONS[name], operands[0], params["axes"])]
+        return [form.reduce_axes(_REDUCTIONS[name], operands[0], params["axes"])]
     if name == "dot_general" and _is_plain(equation) and not _is_layer(equation, operands, form):
         return [form.product(equation, *operands)]
     if name == "optimization_barrier":
@@ -197,36 +218,48 @@ def _apply(
 
 
 def _held(operands: list, form: AbstractForm, lanes: int) -> list:
-    """The operands as values of their own, those of them that are of one floating dtype. XLA's CPU
-    compiler drops barriers before it fuses, and then computes a function of a function's value
-    anew for each number that the outer one reads; through a product of matrices it does not fuse,
-    and I x is x. It is linear, for what is held may be tangents; infinite numbers are the affair of
-    `hold`."""
+    """Keep the operands of one floating dtype from being recomputed by their readers.
+
+    XLA's CPU compiler drops optimisation barriers before it fuses. It then recomputes an inner
+    function for each number that the outer function reads. It does not fuse through a product of
+    matrices, and I x = x.
+
+    The product is linear in x, so that it also holds tangents. Infinite numbers are made finite
+    beforehand, by `hold`.
+    """
     arrays = [form.join(operand, lanes) if form.is_own(operand) else None for operand in operands]
     floats = [a for a in arrays if a is not None and jnp.issubdtype(a.dtype, jnp.floating)]
-    alike = [a for a in floats if a.dtype == floats[0].dtype]
-    if not alike:
+    same_dtype = [a for a in floats if a.dtype == floats[0].dtype]
+    if not same_dtype:
         return operands
 
     def times_identity(*arrays):
         rows = jnp.concatenate([array.reshape(-1, lanes) for array in arrays])
         rows = jnp.dot(jnp.eye(len(rows), dtype=rows.dtype), rows)
-        each = jnp.split(rows, np.cumsum([array.size // lanes for array in arrays])[:-1])
-        return tuple(row.reshape(array.shape) for row, array in zip(each, arrays, strict=True))
+        parts = jnp.split(rows, np.cumsum([array.size // lanes for array in arrays])[:-1])
+        return tuple(row.reshape(array.shape) for row, array in zip(parts, arrays, strict=True))
 
     def barrier(*arrays):
         return lax.optimization_barrier(arrays)
 
-    held = iter(lax.platform_dependent(*alike, cpu=times_identity, default=barrier))
+    held = iter(lax.platform_dependent(*same_dtype, cpu=times_identity, default=barrier))
     return [
-        form.split(next(held)) if any(array is other for other in alike) else operand
+        form.split(next(held))
+        if any(array is float_array for float_array in same_dtype)
+        else operand
         for operand, array in zip(operands, arrays, strict=True)
     ]
 
 
 class _Loop(NamedTuple):
-    """A loop of known length: its body, and how many operands it reads as constants, carries from
-    step to step, and takes a slice of in each step; and how many results it stacks."""
+    """Loop of known length, with the number of its operands and results of each kind.
+
+    - `body`: jaxpr of one step.
+    - `num_consts`: operands that every step reads whole.
+    - `num_carried`: operands that pass from step to step.
+    - `num_read`: operands of which each step reads one slice.
+    - `num_stacked`: results that stack one slice of each step.
+    """
 
     body: ClosedJaxpr
     length: int
@@ -237,11 +270,17 @@ class _Loop(NamedTuple):
 
 
 def _loop(equation: JaxprEqn) -> _Loop:
-    """What a `scan` is, by its shapes: what is read or stacked has an axis more than in the body.
-    (How its parameters say so changes with JAX's versions.)"""
+    """Return the structure of a `scan`, inferred from shapes.
+
+    Arrays that are read or stacked slice by slice have one axis more outside than in the body. (The
+    parameters of `scan` also state this, in a form that differs between releases of JAX.)
+    """
     body = equation.params["jaxpr"]
     num_read, num_stacked = (
-        sum(aval(a).ndim > aval(b).ndim for a, b in zip(outside, inside, strict=True))
+        sum(
+            aval(outer).ndim > aval(inner).ndim
+            for outer, inner in zip(outside, inside, strict=True)
+        )
         for outside, inside in (
             (equation.invars, body.jaxpr.invars),
             (equation.outvars, body.jaxpr.outvars),
@@ -253,12 +292,13 @@ def _loop(equation: JaxprEqn) -> _Loop:
 
 
 def _is_plain_loop(equation: JaxprEqn) -> bool:
-    """Whether it is a loop of known length whose steps have no inputs or outputs of their own."""
+    """Return whether a `scan` has only constants and a state, and no inputs or outputs of steps."""
     loop = _loop(equation)
     return loop.num_read == loop.num_stacked == 0
 
 
 def _repeat(equation: JaxprEqn, operands: list, form: AbstractForm, lanes: int) -> list:
+    """Evaluate a plain loop by `lax.fori_loop`, whose state has lanes in the last axis."""
     loop = _loop(equation)
     consts, init = operands[: loop.num_consts], operands[loop.num_consts :]
 
@@ -266,20 +306,23 @@ def _repeat(equation: JaxprEqn, operands: list, form: AbstractForm, lanes: int) 
         carry = _evaluate(loop.body, [*consts, *map(form.split, arrays)], form, lanes)
         return [form.join(value, lanes) for value in carry]
 
+    # Written out, the body would appear once for each step.
     arrays = lax.fori_loop(0, loop.length, step, [form.join(value, lanes) for value in init])
     return list(map(form.split, arrays))
 
 
 def _is_plain(equation: JaxprEqn) -> bool:
-    """Whether it is a short sum of outer products."""
+    """Return whether the product sums over one short axis and has no batch axes."""
     (axes, _), batched = equation.params["dimension_numbers"]
     return not any(batched) and len(axes) == 1 and is_short(equation, axes)
 
 
 def _is_layer(equation: JaxprEqn, operands: list, form: AbstractForm) -> bool:
-    """Whether it takes a vector through a matrix that lanes share and that is large, as in a layer
-    of a network: for all lanes that is one product of two matrices, as are its derivatives, where
-    what is written out has a term for each weight."""
+    """Return whether a product applies one large shared matrix in all lanes.
+
+    A layer of a network is an example. For all lanes, this is one product of two matrices, and so
+    are its derivatives. Written out, it would have one term for each weight.
+    """
     shared = [operand for operand in operands if not form.is_own(operand)]
     return len(shared) == 1 and np.size(shared[0]) >= _LEAST_WEIGHTS
 
@@ -287,25 +330,30 @@ def _is_layer(equation: JaxprEqn, operands: list, form: AbstractForm) -> bool:
 def _by_vmap(
     jaxpr: Jaxpr, equation: JaxprEqn, operands: list, form: AbstractForm, lanes: int
 ) -> list:
-    function, operands = _alone(jaxpr, equation, operands)
-    own = [form.is_own(operand) for operand in operands]
+    """Evaluate one equation by `jax.vmap`, for primitives without a rule."""
+    function, operands = _as_function(jaxpr, equation, operands)
+    are_own = [form.is_own(operand) for operand in operands]
     arrays = [
-        form.join(operand, lanes) if mine else operand
-        for operand, mine in zip(operands, own, strict=True)
+        form.join(operand, lanes) if is_own else operand
+        for operand, is_own in zip(operands, are_own, strict=True)
     ]
-    results = jax.vmap(function, [-1 if mine else None for mine in own], -1)(*arrays)
+    results = jax.vmap(function, [-1 if is_own else None for is_own in are_own], -1)(*arrays)
     return [form.split(result) for result in results]
 
 
-def _alone(jaxpr: Jaxpr, equation: JaxprEqn, operands: list) -> tuple[Callable[..., list], list]:
-    """The equation as a function by itself, and its arguments."""
-    own = {
+def _as_function(
+    jaxpr: Jaxpr, equation: JaxprEqn, operands: list
+) -> tuple[Callable[..., list], list]:
+    """Return the equation as a function of its own, and its operands."""
+    arguments = {
         atom: operand
         for atom, operand in zip(equation.invars, operands, strict=True)
         if not isinstance(atom, Literal)
     }
-    alone = jaxpr.replace(constvars=[], invars=list(own), outvars=equation.outvars, eqns=[equation])
-    return jaxpr_as_fun(ClosedJaxpr(alone, [])), list(own.values())
+    jaxpr_of_equation = jaxpr.replace(
+        constvars=[], invars=list(arguments), outvars=equation.outvars, eqns=[equation]
+    )
+    return jaxpr_as_fun(ClosedJaxpr(jaxpr_of_equation, [])), list(arguments.values())
 
 
 _REDUCTIONS: dict[str, Callable] = {

@@ -1,9 +1,8 @@
-"""Can the mean of weights be trusted? The Pareto shape of the largest of them.
+"""Pareto shape k̂ of the largest weights: it decides whether a weighted mean is reliable.
 
-Beyond a high threshold the law of weights is nearly a generalised Pareto law, whose shape k says
-which moments are finite: the r-th where rk < 1. Its estimate k̂ says whether the mean of that many
-weights, with its standard error, means anything: below about 0.7 it does (Vehtari, Simpson,
-Gelman, Yao & Gabry 2024).
+Above a high threshold, the law of the weights is close to a generalised Pareto law of some shape k.
+The r-th moment is finite if rk < 1. The mean of the weights and its standard error are reliable if
+the estimate k̂ is below about 0.7 (Vehtari, Simpson, Gelman, Yao & Gabry 2024).
 """
 
 import functools
@@ -17,46 +16,53 @@ from jaxtyping import Array, Bool, Float, Int
 from .checks import Numbers, as_floating
 from .doors import door
 
-# A fit to fewer weights means nothing.
+# A fit to fewer weights is meaningless.
 _FEWEST = 5
 
-# Weights that are equal to this have a relative variance of 1e-6 at most, which no mean notices,
-# and rounding in single precision leaves no more of equal weights.
+# Log weights within this range have a relative variance of at most 1e-6, which is negligible. Equal
+# weights that are rounded in single precision are within it.
 _EQUAL = 1e-3
 
-# The prior of the shape counts as so many weights, and has this mean.
+# Weight of the prior of k, in numbers of weights, and its mean (Vehtari et al. 2024).
 _PRIOR_COUNT, _PRIOR_SHAPE = 10, 0.5
 
 
-# Above, the error of a mean falls too slowly with the number of weights, and is not seen in them.
+# Above this shape, the error of a mean decreases too slowly with the number of weights, and its
+# estimate is too small.
 _MOST_RELIABLE = 0.7
 
 
 def most_reliable(number: int) -> float:
-    """The largest shape with which the mean of so many weights is to be trusted: that of few is
-    not where the tail is lighter (Vehtari et al. 2024, section 3.2)."""
+    """Return the largest shape for which the mean of `number` weights is reliable.
+
+    Means of few weights need lighter tails: min(0.7, 1 - 1/log₁₀ number) (Vehtari et al. 2024,
+    section 3.2).
+    """
     return min(_MOST_RELIABLE, 1 - 1 / math.log10(number)) if number > 10 else 0.0
 
 
-# The same k̂ says more of weights that are very unequal, of which the tail is a large part, and less
-# of weights that are nearly equal: (effective share, largest k̂). Of means of 100 to 4,000 weights
-# beside exact numbers 14 % are wrong with k̂ from 0.6 to 0.7 and a share below 0.2, and 0.5 % with k̂
-# from 0.7 to 1 and a share above 0.8.
+# The same k̂ says more about very unequal weights, whose tail is a large part, and less about nearly
+# equal ones: (effective share, largest k̂). Among means of 100 to 4,000 weights, compared with exact
+# values, 14 % are wrong for k̂ from 0.6 to 0.7 and a share below 0.2, and 0.5 % are wrong for k̂ from
+# 0.7 to 1 and a share above 0.8.
 _UNEQUAL, _NEARLY_EQUAL = (0.2, 0.6), (0.8, 1.0)
 
-# A few weights far beyond many others hardly move the fit, but of fewer effective ones the log of
-# the mean and its error are off: of 100 weights twice as many trusted means are wrong with 5.
+# A few weights far above many others hardly change the fit of k. With few effective weights, the
+# log of the mean and its error are wrong nevertheless: for 100 weights, a bound of 5 accepts twice
+# as many wrong means.
 _FEWEST_EFFECTIVE = 20
 
 
-@jax.jit  # one program where it is called outside of any
+@jax.jit  # outside of other programs, one program for all operations
 def is_reliable(
     k: Float[Array, "*I"],
     effective: Float[Array, "*I"] | float = math.inf,
     number: Int[Array, "*I"] | None = None,
 ) -> Bool[Array, "*I"]:
-    """Return whether a mean of weights of this shape is to be trusted, given how many of them are
-    effective, and how many above zero."""
+    """Return whether the mean of weights of shape k is reliable.
+
+    It depends on the effective sample size and, if given, on the `number` of positive weights.
+    """
     most = _MOST_RELIABLE
     if number is not None:
         share = effective / jnp.maximum(number, 1).astype(k.dtype)
@@ -67,40 +73,45 @@ def is_reliable(
 
 @door
 def pareto_k(log_weights: Numbers) -> Float[Array, "*I"]:
-    """The Pareto shape k̂ of the min(n/5, 3√n) largest of n weights, in the last axis.
+    """Estimate the Pareto shape k̂ of the min(n/5, 3√n) largest of n weights, along the last axis.
 
-    Below 0.7 the mean of the weights, and its standard error, can be trusted. The estimate is that
-    of Zhang & Stephens (2009), with a weak prior (Vehtari et al. 2024). It has no derivative.
+    The mean of the weights and its standard error are reliable for k̂ below 0.7. The estimate is
+    that of Zhang & Stephens (2009) with a weak prior (Vehtari et al. 2024). Its derivative is zero.
 
     **Example:**
 
     ```python
-    jb.pareto_k(jax.random.normal(key, (1000,)))  # of log-normal weights
+    jb.pareto_k(jax.random.normal(key, (1000,)))  # log-normal weights
     ```
 
-    **Arguments:** `log_weights`, shape (..., n), logarithms of weights up to a constant. -inf is a
-    weight of zero, which counts as a weight; so is what adds nothing to the largest weight in its
-    precision.
+    **Arguments:** `log_weights`, shape (..., n): logarithms of weights up to a constant. -inf is a
+    weight of zero and counts among the n weights. So does a weight that is negligible beside the
+    largest one in their precision.
 
-    **Returns:** k̂, never NaN, which is
+    **Returns:** k̂, shape (...), never NaN. It is
 
-    - -inf where the largest weights are equal to 0.1 %: weights that are bounded, as of a proposal
-      that is exact;
-    - inf where there is nothing to judge by: fewer than 5 of the largest weights are above zero,
-      or n < 25 (unless all are equal), or a weight is infinite or NaN.
+    - -inf if the largest weights are equal up to 0.1 %: weights are bounded, as for an exact
+      proposal;
+    - inf if there are too few weights: fewer than 5 of the largest are positive, or n < 25 (unless
+      all are equal);
+    - inf if a weight is infinite or NaN.
+
+    **Raises:** `ValueError` for a single number.
     """
     log_weights = lax.stop_gradient(as_floating("log_weights", log_weights))
     if log_weights.ndim == 0:
-        raise ValueError("`log_weights` must have shape (..., n); got a single number.")
+        raise ValueError(
+            "`log_weights` must have shape (..., n); got a single number. Pass all weights."
+        )
     n = log_weights.shape[-1]
     size = min(n // 5, math.ceil(3 * math.sqrt(n)))
     if n < _FEWEST:
         return jnp.full(log_weights.shape[:-1], math.inf, log_weights.dtype)
-    return jnp.vectorize(functools.partial(_one, size), signature="(n)->()")(log_weights)
+    return jnp.vectorize(functools.partial(_k_of_sample, size), signature="(n)->()")(log_weights)
 
 
-def _one(size: int, log_weights: Float[Array, " n"]) -> Float[Array, ""]:
-    """k̂ of one sample, by its `size` largest weights."""
+def _k_of_sample(size: int, log_weights: Float[Array, " n"]) -> Float[Array, ""]:
+    """Estimate k̂ of one sample from its `size` largest weights."""
     can_fit = size >= _FEWEST
     finfo = jnp.finfo(log_weights.dtype)
     negligible = math.log(float(finfo.tiny)) / 2  # relative to the largest weight
@@ -110,33 +121,35 @@ def _one(size: int, log_weights: Float[Array, " n"]) -> Float[Array, ""]:
     positive = top > negligible
     count = jnp.sum(positive)
     least = jnp.min(top, initial=0, where=positive)
-    hopeless = ~jnp.isfinite(largest) | (count < _FEWEST)
+    unusable = ~jnp.isfinite(largest) | (count < _FEWEST)
     equal = least > -_EQUAL
     if can_fit:
-        # Of weights that tie with the least of the tail some may not be in it. The threshold must
-        # be below them all, or else what rounding leaves between ties passes for excesses.
+        # Some ties of the smallest weight of the tail may be outside of it. The threshold must be
+        # below all ties: otherwise rounding differences between them would count as excesses.
         tied = least - 4 * finfo.eps * jnp.maximum(1, jnp.abs(largest))
         threshold = jnp.max(log_weights, initial=-math.inf, where=log_weights < tied)
         threshold = jnp.maximum(threshold, 2 * negligible)
         excesses = -jnp.exp(top) * jnp.expm1(threshold - top)  # without cancellation
-        usual = ~hopeless & ~equal
-        excesses = jnp.where(usual, jnp.where(positive, excesses / excesses[0], 0), 1)
-        shape = _shape(excesses, jnp.where(usual, count, size))
-        # A few weights above ties do not move the fit, however large they are. But of `size`
-        # weights of a Pareto law the largest is about size^k times the least.
-        few = jnp.sum(top > tied + 2 * (least - tied)) < _FEWEST
-        shape = jnp.where(few, jnp.maximum(shape, -least / math.log(size)), shape)
+        can_use = ~unusable & ~equal
+        excesses = jnp.where(can_use, jnp.where(positive, excesses / excesses[0], 0), 1)
+        shape = _shape(excesses, jnp.where(can_use, count, size))
+        # A few weights above many ties do not change the fit, however large they are. But the
+        # largest of `size` weights of a Pareto law is about size^k times the smallest, which
+        # gives a lower bound on k.
+        few_above_ties = jnp.sum(top > tied + 2 * (least - tied)) < _FEWEST
+        shape = jnp.where(few_above_ties, jnp.maximum(shape, -least / math.log(size)), shape)
     else:
         shape = math.inf
-    return jnp.where(hopeless, math.inf, jnp.where(equal, -math.inf, shape))
+    return jnp.where(unusable, math.inf, jnp.where(equal, -math.inf, shape))
 
 
 def _shape(excesses: Float[Array, " m"], count: Int[Array, ""]) -> Float[Array, ""]:
-    """The shape k of a generalised Pareto law, of the first `count` numbers in descending order,
-    of which the largest is 1 and the others, after them, are 0.
+    """Estimate the shape k of a generalised Pareto law from its first `count` excesses.
 
-    With b = -k/σ the likelihood has its maximum over k at the mean of log(1 - bx). The estimate is
-    that mean at the posterior mean of b, for a prior that follows the lower quartile of the data.
+    `excesses` are in descending order. The largest is 1, and entries after the first `count` are 0.
+
+    With b = -k/σ, the likelihood is maximal over k at the mean of log(1 - bx). The estimate is this
+    mean at the posterior mean of b, for a prior scaled by the lower quartile of the data.
     """
     quartile = excesses[count - (count + 2) // 4]
     count = count.astype(excesses.dtype)
@@ -148,6 +161,7 @@ def _shape(excesses: Float[Array, " m"], count: Int[Array, ""]) -> Float[Array, 
         return jnp.sum(jnp.log1p(-b[:, None] * excesses), axis=1) / count
 
     k = mean_log(b)
+    # As b → 0, the law becomes exponential and its rate -b/k tends to 1 / (mean excess).
     exponential = jnp.abs(b) < jnp.finfo(b.dtype).tiny
     rate = jnp.where(exponential, count / jnp.sum(excesses), -b / jnp.where(exponential, 1, k))
     weights = jax.nn.softmax(count * (jnp.log(rate) - k - 1))

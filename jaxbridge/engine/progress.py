@@ -1,4 +1,4 @@
-"""Compiled loops that tell how far they are, by one of diffrax's progress meters."""
+"""Compiled loops that report their progress to one of diffrax's progress meters."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ _Context = TypeVar("_Context")
 
 
 def as_meter(progress_meter: diffrax.AbstractProgressMeter | None) -> diffrax.AbstractProgressMeter:
-    """The meter, by default one that tells nothing."""
+    """Return the given progress meter, or `NoProgressMeter()` for `None`."""
     return diffrax.NoProgressMeter() if progress_meter is None else progress_meter
 
 
@@ -26,16 +26,16 @@ def metered_scan(
     xs: PyTree,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> tuple[_State, Any]:
-    """`lax.scan` over `xs`."""
+    """Run `lax.scan` over `xs`, and report the share of steps that are complete."""
     meter, length = as_meter(progress_meter), len(jax.tree.leaves(xs)[0])
 
-    def told(carry, inputs):
+    def metered_step(carry, inputs):
         state, metered = carry
         i, x = inputs
         state, y = step(state, x)
         return (state, meter.step(metered, (i + 1).astype(jnp.float32) / length)), y
 
-    (state, metered), ys = lax.scan(told, (init, meter.init()), (jnp.arange(length), xs))
+    (state, metered), ys = lax.scan(metered_step, (init, meter.init()), (jnp.arange(length), xs))
     meter.close(metered)
     return state, ys
 
@@ -48,54 +48,63 @@ def metered_stages(
     num_kept: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> tuple[_State, Any]:
-    """`step`s with numbers from zero to `bounds[-1]`, in stages that end at `bounds`. With what
-    `begin` makes of the state, given the first number of a stage, go the steps of that stage. What
-    the last `num_kept` make is kept. All stages are one loop, however they differ in length."""
-    meter, length = as_meter(progress_meter), bounds[-1]
-    begin, step = eqx.filter_jit(begin), eqx.filter_jit(step)  # for shapes and in the loop once
+    """Run steps with numbers 0 to `bounds[-1]` - 1 in stages that end at `bounds`.
 
-    def both(state):
+    - `begin(state, i)` returns the state and the context of a stage, from the number i of its first
+      step.
+    - `step(context, state, i)` returns the state and the output of step i.
+
+    Return the last state and the outputs of the last `num_kept` steps. All stages are one loop,
+    which is compiled once, whatever their lengths.
+    """
+    meter, length = as_meter(progress_meter), bounds[-1]
+    # `filter_jit` traces each of them once, for the shapes and for the loop.
+    begin, step = eqx.filter_jit(begin), eqx.filter_jit(step)
+
+    def first_output(state):
         state, context = begin(state, jnp.int32(0))
         return step(context, state, jnp.int32(0))[1]
 
-    shapes = eqx.filter_eval_shape(both, init)
-    kept = jax.tree.map(lambda leaf: jnp.zeros((num_kept, *leaf.shape), leaf.dtype), shapes)
+    shapes = eqx.filter_eval_shape(first_output, init)
+    outputs = jax.tree.map(lambda leaf: jnp.zeros((num_kept, *leaf.shape), leaf.dtype), shapes)
 
-    def stage(carry, ends):
-        (state, kept), metered = carry
+    def run_stage(carry, ends):
+        (state, outputs), metered = carry
         state, context = begin(state, ends[0])
 
-        def one(i, carry):
-            (state, kept), metered = carry
-            state, made = step(context, state, i)
-            place = jnp.maximum(i - (length - num_kept), 0)  # what is not kept is written over
-            kept = jax.tree.map(lambda leaf, one: leaf.at[place].set(one), kept, made)
-            return (state, kept), meter.step(metered, (i + 1).astype(jnp.float32) / length)
+        def run_step(i, carry):
+            (state, outputs), metered = carry
+            state, output = step(context, state, i)
+            place = jnp.maximum(i - (length - num_kept), 0)  # earlier outputs are overwritten
+            outputs = jax.tree.map(lambda stored, new: stored.at[place].set(new), outputs, output)
+            return (state, outputs), meter.step(metered, (i + 1).astype(jnp.float32) / length)
 
-        return lax.fori_loop(ends[0], ends[1], one, ((state, kept), metered)), None
+        return lax.fori_loop(ends[0], ends[1], run_step, ((state, outputs), metered)), None
 
+    # The ends are traced numbers, so stages of different lengths share one compiled body.
     ends = jnp.asarray(list(itertools.pairwise((0, *bounds))), jnp.int32)
-    (made, metered), _ = lax.scan(stage, ((init, kept), meter.init()), ends)
+    (results, metered), _ = lax.scan(run_stage, ((init, outputs), meter.init()), ends)
     meter.close(metered)
-    return made
+    return results
 
 
 def metered_while_loop(
-    going_on: Callable[[_State], Bool[Array, ""]],
+    continues: Callable[[_State], Bool[Array, ""]],
     step: Callable[[_State], _State],
     init: _State,
     progress: Callable[[_State], Float[Array, ""]],
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> _State:
-    """`lax.while_loop`, of which `progress` says how much of it is done, from 0 to 1."""
+    """Run `lax.while_loop`; `progress(state)` returns the share that is complete, from 0 to 1."""
     meter = as_meter(progress_meter)
 
-    def told(carry):
+    # The state of the meter is a part of the loop's state.
+    def metered_step(carry):
         state, metered = carry
         state = step(state)
         return state, meter.step(metered, progress(state))
 
     carry = (init, meter.init())
-    state, metered = lax.while_loop(lambda carry: going_on(carry[0]), told, carry)
+    state, metered = lax.while_loop(lambda carry: continues(carry[0]), metered_step, carry)
     meter.close(metered)
     return state

@@ -1,13 +1,14 @@
-"""States one after the other, x_{i+1} = f(x_i, u_i), with the derivatives of all steps at once.
+"""Recursions x_{i+1} = f(x_i, u_i) whose derivatives are computed for all steps at once.
 
-Differentiated as it stands, a loop goes through its steps once more, each of dozens of kernels for
-a few numbers. But tangents solve a linear recursion,
+Automatic differentiation of a loop repeats its steps, each with dozens of kernels for a few
+numbers. Tangents, however, solve a linear recursion,
 
-    ẋ_{i+1} = J_i ẋ_i + b_i,   J_i = ∂f/∂x at (x_i, u_i),
+    ẋ_{i+1} = J_i ẋ_i + b_i,   J_i = ∂f/∂x at (x_i, u_i).
 
-where b_i is what the tangents of u_i, and of what f knows besides, make of f. At states that are
-known J_i and b_i follow for all steps side by side, and what is left for the loop is the product of
-a small matrix and a vector. Transposed it is the adjoint recursion of reverse differentiation.
+Here b_i is the derivative of f in the direction of the tangents of u_i and of all closed-over
+values. At known states, J_i and b_i follow for all steps side by side. The loop then only
+multiplies a small matrix by a vector in each step. Its transpose is the adjoint recursion of
+reverse-mode differentiation.
 """
 
 import functools
@@ -25,10 +26,10 @@ from .linalg import matvec
 
 
 class StateDerivative(NamedTuple):
-    """∂f/∂x of which more is known than its entries.
+    """Derivative ∂f/∂x with a known structure.
 
-    - `coefficients`: of f at (x, u), a function of these alone.
-    - `apply`: ∂f/∂x ẋ, from them and ẋ.
+    - `coefficients(x, u)`: the numbers that define ∂f/∂x.
+    - `apply(coefficients, ẋ)`: the product ∂f/∂x ẋ.
     """
 
     coefficients: Callable[[PyTree, PyTree], PyTree]
@@ -41,50 +42,60 @@ def recursion(
     inputs: PyTree,
     derivative: StateDerivative | None = None,
 ) -> tuple[Any, Any]:
-    """x_1, x_2, ..., from x_0 = `start`, and y_0, y_1, ..., for (x_{i+1}, y_i) = `step`(x_i, u_i),
-    with `inputs` u along the first axes of their arrays. `step` may know arrays that are
-    differentiated; where it has no `derivative` of its own, which is for steps that give no y, a
-    state is one vector, of not too many numbers."""
-    of_step = jax.tree.map(lambda leaf: leaf[0], inputs)
-    step, known = jax.closure_convert(step, start, of_step)
-    return _states(step, derivative, known, start, *eqx.partition(inputs, eqx.is_inexact_array))
+    """Compute x_1, x_2, ... and y_0, y_1, ... of (x_{i+1}, y_i) = `step`(x_i, u_i).
+
+    - `start` is x_0, and `inputs` holds u along the first axes of its arrays.
+    - `step` may close over arrays that are differentiated.
+    - Without `derivative`, the state must be one vector of few numbers.
+    - With `derivative`, steps must not return y.
+    """
+    first_input = jax.tree.map(lambda leaf: leaf[0], inputs)
+    # Closed-over arrays become arguments, so that the derivative rule receives their tangents.
+    step, closed_over = jax.closure_convert(step, start, first_input)
+    return _states(
+        step, derivative, closed_over, start, *eqx.partition(inputs, eqx.is_inexact_array)
+    )
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _states(step, derivative, known, start, inputs, others):
-    """With inputs that have derivatives, and others."""
+def _states(step, derivative, closed_over, start, inputs, other_inputs):
+    """Compute the states and outputs; `inputs` are differentiable, `other_inputs` are not."""
 
-    def one(x, inputs):
-        x, _ = step(x, eqx.combine(*inputs), *known)
+    def next_state(x, inputs):
+        x, _ = step(x, eqx.combine(*inputs), *closed_over)
         return x, x
 
-    def aside(x, inputs, others):
-        return step(x, eqx.combine(inputs, others), *known)[1]
+    def output(x, inputs, other_inputs):
+        return step(x, eqx.combine(inputs, other_inputs), *closed_over)[1]
 
-    states = lax.scan(one, start, (inputs, others))[1]
-    lanes = _moved((_before(start, states), inputs, others), 0, -1)
-    return states, _moved(over_lanes(-1, -1, -1)(aside)(*lanes), -1, 0)
+    # Outputs do not enter later states: the loop leaves them out, and all follow side by side.
+    states = lax.scan(next_state, start, (inputs, other_inputs))[1]
+    lanes = _move_axis((_before(start, states), inputs, other_inputs), 0, -1)
+    return states, _move_axis(over_lanes(-1, -1, -1)(output)(*lanes), -1, 0)
 
 
 @_states.defjvp
 def _tangents(step, derivative, primals, tangents):
-    known, start, inputs, others = primals
-    known_dot, start_dot, inputs_dot, _ = tangents
-    made = _states(step, derivative, known, start, inputs, others)
+    """Compute the tangents of states and outputs by the linear recursion."""
+    closed_over, start, inputs, other_inputs = primals
+    closed_over_dot, start_dot, inputs_dot, _ = tangents
+    results = _states(step, derivative, closed_over, start, inputs, other_inputs)
 
-    def one(x, inputs, others, inputs_dot):
-        def of(x, inputs, known):
-            return step(x, eqx.combine(inputs, others), *known)
+    def derivatives_of_step(x, inputs, other_inputs, inputs_dot):
+        def step_at(x, inputs, closed_over):
+            return step(x, eqx.combine(inputs, other_inputs), *closed_over)
 
         if derivative is None:
-            J = jax.jacfwd(of)(x, inputs, known)
+            J = jax.jacfwd(step_at)(x, inputs, closed_over)
         else:
-            J = derivative.coefficients(x, eqx.combine(inputs, others)), None
-        return J, jax.jvp(functools.partial(of, x), (inputs, known), (inputs_dot, known_dot))[1]
+            J = derivative.coefficients(x, eqx.combine(inputs, other_inputs)), None
+        return J, jax.jvp(
+            functools.partial(step_at, x), (inputs, closed_over), (inputs_dot, closed_over_dot)
+        )[1]
 
-    lanes = _moved((_before(start, made[0]), inputs, others, inputs_dot), 0, -1)
-    both = over_lanes(-1, -1, -1, -1)(one)(*lanes)
-    (J, J_aside), (b, b_aside) = _moved(both, -1, 0)
+    lanes = _move_axis((_before(start, results[0]), inputs, other_inputs, inputs_dot), 0, -1)
+    derivatives = over_lanes(-1, -1, -1, -1)(derivatives_of_step)(*lanes)
+    (J, J_output), (b, b_output) = _move_axis(derivatives, -1, 0)
     apply = matvec if derivative is None else derivative.apply
 
     def next_tangent(x_dot, step):
@@ -94,17 +105,19 @@ def _tangents(step, derivative, primals, tangents):
 
     states_dot = lax.scan(next_tangent, start_dot, (J, b))[1]
     if derivative is not None:
-        return made, (states_dot, b_aside)
-    of_states = jax.vmap(lambda J, x_dot: matvec(J.reshape(-1, len(x_dot)), x_dot))
+        return results, (states_dot, b_output)
+    # Tangents of the outputs: ẏ_i = ∂y/∂x ẋ_i + b_i, with the state before the step.
+    apply_output = jax.vmap(lambda J, x_dot: matvec(J.reshape(-1, len(x_dot)), x_dot))
     before_dot = _before(start_dot, states_dot)
-    add = lambda J, b: of_states(J, before_dot).reshape(b.shape) + b
-    return made, (states_dot, jax.tree.map(add, J_aside, b_aside))
+    add = lambda J, b: apply_output(J, before_dot).reshape(b.shape) + b
+    return results, (states_dot, jax.tree.map(add, J_output, b_output))
 
 
 def _before(start: PyTree, states: PyTree) -> PyTree:
-    """x_0, x_1, ..., but for the last."""
+    """Return x_0, x_1, ... without the last state: the state before each step."""
     return jax.tree.map(lambda x, xs: jnp.concatenate([x[None], xs[:-1]]), start, states)
 
 
-def _moved(tree: PyTree, source: int, destination: int) -> PyTree:
+def _move_axis(tree: PyTree, source: int, destination: int) -> PyTree:
+    """Move one axis of all arrays in the tree."""
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, source, destination), tree)

@@ -1,11 +1,12 @@
 """Rejection sampling of many problems side by side, until each has its successes.
 
-A problem is an interval that lacks bridges, or a bridge that lacks hits. Its attempts are
-numbered 0, 1, 2, ..., and what an attempt does depends on its problem and number only; the j-th
-success is the problem's j-th result. Thousands of attempts run at once, in lanes: each round
-gives every lane to a problem that still lacks successes, more lanes to those that lack more
-or succeed less often. So results do not depend on the number of lanes, and no lane waits for
-the slowest problem.
+A problem is an interval that needs bridges, or a bridge that needs hits. Its attempts are numbered
+0, 1, 2, .... An attempt depends on its problem and number only, and the j-th success is the
+problem's j-th result.
+
+Thousands of attempts run at once, one in each lane. Every round assigns all lanes to problems that
+still need successes; problems that need more, or succeed less often, get more lanes. Results
+therefore do not depend on the number of lanes, and no lane waits for the slowest problem.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,8 +23,12 @@ from .progress import metered_while_loop
 
 
 class Attempts(NamedTuple):
-    """What one attempt in each lane came to: `outputs` are arrays with lanes in the first axis,
-    `finite` is false where a path left the finite numbers."""
+    """Results of one attempt in each lane.
+
+    - `success`: whether the attempt succeeded.
+    - `finite`: false if the path left the finite numbers.
+    - `outputs`: arrays with lanes in the first axis.
+    """
 
     success: Bool[Array, " lanes"]
     finite: Bool[Array, " lanes"]
@@ -31,13 +36,13 @@ class Attempts(NamedTuple):
 
 
 class Accepted(NamedTuple):
-    """The successes of P problems, `wanted` rows for each, in order.
+    """Successes of P problems, in order, `wanted` rows for each problem.
 
-    - `outputs`: those of the successful attempts; rows that were not filled are as they were.
-    - `number`: of the successful attempt, -1 for a row that was not filled.
+    - `outputs`: outputs of the successful attempts; unfilled rows keep their initial values.
+    - `number`: number of the successful attempt, -1 for an unfilled row.
     - `num_found`: successes of each problem.
     - `num_trials`: attempts of each problem up to its last success, or up to the bound.
-    - `num_nonfinite`: how many of them left the finite numbers.
+    - `num_nonfinite`: number of these attempts that left the finite numbers.
     """
 
     outputs: PyTree
@@ -48,8 +53,13 @@ class Accepted(NamedTuple):
 
 
 class Search(NamedTuple):
-    """How many successes each problem wants, the bound on its attempts, how many of them run side
-    by side, and what shows progress."""
+    """Settings of a rejection sampler.
+
+    - `wanted`: successes that each problem needs.
+    - `max_attempts`: bound on the attempts of each problem.
+    - `num_lanes`: attempts that run side by side.
+    - `progress_meter`: meter that shows the share of successes found.
+    """
 
     wanted: int
     max_attempts: Int[Array, ""]
@@ -58,8 +68,10 @@ class Search(NamedTuple):
 
 
 class _State(NamedTuple):
+    """State of the loop over rounds."""
+
     accepted: Accepted
-    num_tried: Int[Array, " P"]  # with the attempts that turned out not to be needed
+    num_tried: Int[Array, " P"]  # including attempts after the last needed success
 
 
 def rejection_sample(
@@ -68,74 +80,83 @@ def rejection_sample(
     active: Bool[Array, " P"],
     search: Search,
 ) -> Accepted:
-    """Run `attempt(problem, number)` until each active problem has the successes that it wants, or
-    has run out of tries. `rows`: arrays with leading axis P × wanted, to be filled. Lanes are split
-    over devices: see `over_devices` for the arrays that `attempt` needs."""
+    """Run `attempt(problem, number)` until each active problem has its successes.
+
+    A problem also ends after `max_attempts`. `rows` are arrays with leading axis P × wanted, whose
+    rows successes replace. Lanes are split over devices: see `over_devices` for arrays that
+    `attempt` closes over.
+    """
     wanted, max_attempts, num_lanes, progress_meter = search
-    num_rows = active.shape[0] * wanted
+    num_rows = active.shape[0] * wanted  # results of one problem are adjacent
     attempts = over_devices(attempt, (0, 0))
 
     def pending(state: _State):
         return active & (state.accepted.num_found < wanted) & (state.num_tried < max_attempts)
 
-    def one_round(state: _State) -> _State:
+    def run_round(state: _State) -> _State:
         accepted, num_tried = state
         first, problem, place = _assign_lanes(
             accepted.num_found, num_tried, pending(state), wanted, num_lanes
         )
         number = num_tried[problem] + place
-        made = attempts(problem, number)
-        tried = number < max_attempts
-        success = tried & made.success
+        results = attempts(problem, number)
+        is_allowed = number < max_attempts
+        success = is_allowed & results.success
         rank = accepted.num_found[problem] + _before(success, first[problem])
-        needed = tried & (rank < wanted) & active[problem]
+        needed = is_allowed & (rank < wanted) & active[problem]
+        # Row `num_rows` does not exist: `_add` drops what is written there.
         row = jnp.where(success & needed, problem * wanted + rank, num_rows)
-        everyone = jnp.ones_like(tried)
-        counted = (row < num_rows, needed, needed & ~made.finite, everyone)
+        all_lanes = jnp.ones_like(is_allowed)
+        counted = (row < num_rows, needed, needed & ~results.finite, all_lanes)
         *counts, num_run = _count(counted, problem, len(active))
-        accepted = _add(accepted, made.outputs, number, row, counts)
+        accepted = _add(accepted, results.outputs, number, row, counts)
         return _State(accepted, num_tried + num_run)
 
     def progress(state: _State):
         return jnp.sum(state.accepted.num_found).astype(jnp.float32) / num_rows
 
-    nothing = jnp.zeros(active.shape, jnp.int32)
-    empty = Accepted(rows, jnp.full(num_rows, -1, jnp.int32), nothing, nothing, nothing)
-    init = _State(empty, nothing)
-    going_on = lambda state: jnp.any(pending(state))
-    return metered_while_loop(going_on, one_round, init, progress, progress_meter).accepted
+    zeros = jnp.zeros(active.shape, jnp.int32)
+    empty = Accepted(rows, jnp.full(num_rows, -1, jnp.int32), zeros, zeros, zeros)
+    init = _State(empty, zeros)
+    continues = lambda state: jnp.any(pending(state))
+    return metered_while_loop(continues, run_round, init, progress, progress_meter).accepted
 
 
 def over_problems(
-    run: Callable[[PyTree, PyTree, Search], PyTree], each: PyTree, shared: PyTree, search: Search
+    run: Callable[[PyTree, PyTree, Search], PyTree],
+    problems: PyTree,
+    shared: PyTree,
+    search: Search,
 ) -> PyTree:
-    """`run(each, shared, search)`, results in the order of the problems; `each` has arrays with
-    leading axis P, and all problems share the other.
+    """Return `run(problems, shared, search)`, with results in the order of the problems.
 
-    Under `vmap` the problems of all batches are run as those of one, which `vmap` by itself would
-    not do: each batch would have lanes of its own, and wait for the slowest. Where batches differ
-    in what their problems share, as in parameters, it is left to do so; also in what functions of
-    a model close over.
+    `problems` has arrays with leading axis P; all problems share `shared`.
+
+    Under `vmap`, the problems of all batches run as those of one batch. A plain `vmap` would give
+    each batch lanes of its own, which all wait for the slowest batch. It is used only if the
+    batches differ in `shared` (such as parameters) or in values that `run` closes over.
     """
-    arrays, rest = eqx.partition((shared, search.max_attempts), eqx.is_array)
+    arrays, static_parts = eqx.partition((shared, search.max_attempts), eqx.is_array)
 
-    def given(arrays):
-        shared, max_attempts = eqx.combine(arrays, rest)
+    def unpack(arrays):
+        shared, max_attempts = eqx.combine(arrays, static_parts)
         return shared, search._replace(max_attempts=max_attempts)
 
-    # What `run` closes over is an argument, too: the rule is told whether it is batched.
-    traced = lambda each, arrays: run(each, *given(arrays))
-    converted = eqx.filter_closure_convert(traced, each, arrays)
+    # Closed-over values become arguments, so that the batching rule sees whether they are batched.
+    run_packed = lambda problems, arrays: run(problems, *unpack(arrays))
+    converted = eqx.filter_closure_convert(run_packed, problems, arrays)
     closed_over, converted = eqx.partition(converted, eqx.is_array)
 
-    def plain(closed_over, each, arrays):
-        return eqx.combine(closed_over, converted)(each, arrays)
+    def run_one_batch(closed_over, problems, arrays):
+        return eqx.combine(closed_over, converted)(problems, arrays)
 
-    def folded(axis_size, in_batched, closed_over, each, arrays):
-        differ, batched, shared_differ = in_batched
-        if any(jax.tree.leaves((differ, shared_differ))):
+    def run_folded(axis_size, in_batched, closed_over, problems, arrays):
+        closed_over_differ, batched, shared_differ = in_batched
+        if any(jax.tree.leaves((closed_over_differ, shared_differ))):
             in_axes = jax.tree.map(lambda batched: 0 if batched else None, tuple(in_batched))
-            results = jax.vmap(plain, in_axes, axis_size=axis_size)(closed_over, each, arrays)
+            results = jax.vmap(run_one_batch, in_axes, axis_size=axis_size)(
+                closed_over, problems, arrays
+            )
             return results, jax.tree.map(lambda _: True, results)
 
         def fold(leaf, batched):
@@ -143,22 +164,24 @@ def over_problems(
                 leaf = jnp.broadcast_to(leaf, (axis_size, *leaf.shape))
             return leaf.reshape(-1, *leaf.shape[2:])
 
-        each = jax.tree.map(fold, each, batched)
-        shared, search = given(arrays)
-        num_wanted = len(jax.tree.leaves(each)[0]) * search.wanted
+        problems = jax.tree.map(fold, problems, batched)
+        shared, search = unpack(arrays)
+        num_wanted = len(jax.tree.leaves(problems)[0]) * search.wanted
         num_lanes = min(max(num_wanted, search.num_lanes), axis_size * search.num_lanes)
-        results = over_problems(run, each, shared, search._replace(num_lanes=num_lanes))
+        results = over_problems(run, problems, shared, search._replace(num_lanes=num_lanes))
         results = jax.tree.map(lambda leaf: leaf.reshape(axis_size, -1, *leaf.shape[1:]), results)
         return results, jax.tree.map(lambda _: True, results)
 
-    together = jax.custom_batching.custom_vmap(plain)
-    together.def_vmap(folded)
-    return together(closed_over, each, arrays)
+    run_batched = jax.custom_batching.custom_vmap(run_one_batch)
+    run_batched.def_vmap(run_folded)
+    return run_batched(closed_over, problems, arrays)
 
 
 def _before(success: Bool[Array, " lanes"], first: Int[Array, " lanes"]) -> Int[Array, " lanes"]:
-    """How many succeeded in the lanes from the `first` of the same problem up to this one: lanes of
-    one problem lie side by side, in the order of their numbers."""
+    """Count the successes of the same problem in earlier lanes.
+
+    Lanes of one problem are adjacent, in the order of their attempt numbers, and begin at `first`.
+    """
     before = jnp.cumsum(success, dtype=jnp.int32) - success.astype(jnp.int32)
     return before - before[first]
 
@@ -166,9 +189,9 @@ def _before(success: Bool[Array, " lanes"], first: Int[Array, " lanes"]) -> Int[
 def _count(
     lanes: tuple[Bool[Array, " lanes"], ...], problem: Int[Array, " lanes"], num_problems: int
 ) -> Int[Array, "kinds P"]:
-    """How many of the lanes of each kind each problem has."""
-    each = jnp.stack(lanes, axis=1).astype(jnp.int32)  # one loop over lanes for all
-    return jax.ops.segment_sum(each, problem, num_problems, indices_are_sorted=True).T
+    """Count, for each problem, its lanes of each kind."""
+    kinds = jnp.stack(lanes, axis=1).astype(jnp.int32)  # one loop over lanes for all
+    return jax.ops.segment_sum(kinds, problem, num_problems, indices_are_sorted=True).T
 
 
 def _add(
@@ -178,22 +201,23 @@ def _add(
     row: Int[Array, " lanes"],
     counts: Sequence[Int[Array, " P"]],
 ) -> Accepted:
-    """With the attempts that are kept, those with a row, and what was counted of all."""
+    """Return `accepted` with the rows of this round and its counts added."""
     num_found, num_needed, num_nonfinite = counts
 
-    def keep(rows, values):
+    def write_rows(rows, values):
         return rows.at[row].set(values, mode="drop")
 
     return Accepted(
-        jax.tree.map(keep, accepted.outputs, outputs),
-        keep(accepted.number, number),
+        jax.tree.map(write_rows, accepted.outputs, outputs),
+        write_rows(accepted.number, number),
         accepted.num_found + num_found,
         accepted.num_trials + num_needed,
         accepted.num_nonfinite + num_nonfinite,
     )
 
 
-_PARTS = 2**23  # of all lanes
+# Number of parts of all lanes. Sums of parts must be exact in float32: at most 2²⁴.
+_PARTS = 2**23
 
 
 def _assign_lanes(
@@ -203,17 +227,19 @@ def _assign_lanes(
     wanted: int,
     num_lanes: int,
 ) -> tuple[Int[Array, " P"], Int[Array, " lanes"], Int[Array, " lanes"]]:
-    """The first lane of each problem; each lane's problem, and its place among that problem's
-    lanes. Lanes go in proportion to the trials still expected to be needed."""
-    found, tried = num_found.astype(jnp.float32), num_tried.astype(jnp.float32)
-    rate = (found + 1) / (tried + 2)
-    need = jnp.where(pending, (wanted - found) / rate, 0)
-    # Sums of whole parts cannot decrease, which rounded sums may: a problem's lanes must not
-    # overlap the next's.
+    """Return the first lane of each problem, the problem of each lane, and the lane's place there.
+
+    Lanes are assigned in proportion to the expected number of further attempts.
+    """
+    successes, attempts = num_found.astype(jnp.float32), num_tried.astype(jnp.float32)
+    rate = (successes + 1) / (attempts + 2)  # Laplace's rule: positive before the first success
+    need = jnp.where(pending, (wanted - successes) / rate, 0)
+    # The lanes of one problem must not overlap those of the next. Sums of integer parts cannot
+    # decrease, whereas rounded sums of floats may.
     part = jnp.ceil(need / jnp.maximum(jnp.sum(need), 1) * _PARTS).astype(jnp.int32)
     sums = jnp.cumsum(part).astype(jnp.float32)
     last = jnp.round(sums / jnp.maximum(sums[-1], 1) * num_lanes).astype(jnp.int32)
-    last = last.at[-1].set(num_lanes)
+    last = last.at[-1].set(num_lanes)  # no lane is left over by rounding
     first = jnp.concatenate([jnp.zeros(1, jnp.int32), last[:-1]])
     lanes = jnp.arange(num_lanes, dtype=jnp.int32)
     problem = jnp.searchsorted(last, lanes, side="right").astype(jnp.int32)

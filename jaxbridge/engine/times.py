@@ -1,9 +1,9 @@
-"""Times of the caller's clock, which may be far from zero.
+"""Times on the caller's clock, which may be far from zero.
 
-Single precision holds the Julian date of a day of this century only to a quarter of a day. So all
-that follows from times follows from their differences, which are taken in double precision before
-anything is rounded. What depends on the time itself, as seasons do, gets the caller's time, rounded
-once; where that rounding is not small beside a step, it is refused.
+Single precision resolves a Julian date of this century only to a quarter of a day. All differences
+of times are therefore taken in double precision before rounding. Coefficients that depend on time
+itself, such as seasons, receive the caller's time, rounded once. Times are refused if this rounding
+is not small compared with a step.
 """
 
 from typing import NamedTuple
@@ -15,38 +15,47 @@ from jaxtyping import Array, Float
 
 from .checks import Numbers, as_floating, is_traced, missing_as_nan
 
-# By how much of their smallest difference single precision may have moved times that were given in
-# it, and by how much of a step it may move the times at which coefficients are evaluated.
-_MOST_MOVED, _MOST_OF_A_STEP = 0.01, 0.002
+# Largest rounding error of single-precision times, relative to their smallest difference.
+_MOST_MOVED = 0.01
+# Largest rounding error of the times at which coefficients are evaluated, relative to a step.
+_MOST_OF_A_STEP = 0.002
 
 
 class Clock(NamedTuple):
-    """The caller's clock: `origin` is the sum of two numbers, of which the second is what the
-    precision of the first leaves out."""
+    """Clock of the caller, as a function of the time since its origin.
+
+    `origin` is the sum of two numbers: the second is the rounding error of the first.
+    """
 
     origin: Float[Array, "2"]
 
     def __call__(self, since: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the caller's times, given times since the origin, rounded once."""
+        """Return the caller's times, rounded once, for times since the origin."""
         return self.origin[0] + (self.origin[1] + since)
 
     def exactly(self, since: Float[Array, " n"]) -> Float[Array | np.ndarray, " n"]:
-        """Return the same times as a NumPy array of double precision where the precision of
-        `since` cannot hold their differences."""
+        """Return the caller's times without loss of their differences.
+
+        They are a NumPy array of double precision if the precision of `since` cannot hold the
+        differences. Traced times stay in that precision.
+        """
         times = self(since)
         if is_traced(times):
             return times
-        known = np.asarray(since, float)
-        steps = np.diff(known)
+        elapsed = np.asarray(since, float)
+        steps = np.diff(elapsed)
         smallest = np.min(steps[steps > 0], initial=np.inf)
         if _spacing(np.max(np.abs(times), initial=0), since.dtype) <= _MOST_MOVED * smallest:
             return times
-        return np.sum(np.asarray(self.origin, float)) + known
+        return np.sum(np.asarray(self.origin, float)) + elapsed
 
 
 class Times(NamedTuple):
-    """Times, shape (..., n): `values`, of double precision unless they are traced; and `gaps`, the
-    differences of successive ones, in the last axis, in the precision in which times were given."""
+    """Times and their differences.
+
+    - `values`: shape (..., n), of double precision unless they are traced.
+    - `gaps`: differences of successive times along the last axis, in the precision of the input.
+    """
 
     values: np.ndarray | Array
     gaps: Float[Array, "*I gaps"]
@@ -60,19 +69,23 @@ class Times(NamedTuple):
         return self.gaps.dtype
 
     def preceded(self, name: str, first: Numbers) -> "Times":
-        """Return the same times with one before them, unless they begin with it.
+        """Return the same times with the time `first` before them, unless they begin with it.
 
-        **Raises:** `ValueError` where it is not before them, or either is traced; `TypeError` for
-        anything but a number.
+        **Raises:** `ValueError` if `first` is an array, not finite or after the first of the times,
+        or if either is traced; `TypeError` for other types than numbers.
         """
         if is_traced(self.values, first):
-            raise ValueError(f"`{name}` must be known when compiling, and so must `times`.")
+            raise ValueError(
+                f"`{name}` and `times` must be concrete; got traced values. Pass them as static "
+                "values, or close over them."
+            )
         if as_floating(name, first).shape != ():
             raise ValueError(f"`{name}` must be a number, shape (); got {first!r}.")
         values, first = np.asarray(self.values), np.asarray(first, float)
         if not np.isfinite(first) or (values.size and values.flat[0] < first):
             raise ValueError(
-                f"`times` must begin at `{name}` = {first} or later; they do at {values.flat[0]}."
+                f"`times` must begin at `{name}` = {first} or later; they begin at "
+                f"{values.flat[0]}. Pass an earlier `{name}`."
             )
         if values.ndim != 1 or values.size == 0 or values[0] == first:
             return self
@@ -87,16 +100,17 @@ class Times(NamedTuple):
             return Clock(jnp.stack([times[0], jnp.zeros_like(times[0])])), times - times[0]
         values = np.asarray(self.values)
         first = values[0].astype(dtype)
+        # Two numbers of single precision hold the origin to about twice its digits.
         origin = np.stack([first, (values[0] - first).astype(dtype)])
-        with jax.ensure_compile_time_eval():  # so that what is known stays so
+        with jax.ensure_compile_time_eval():  # concrete times stay concrete
             return Clock(jnp.asarray(origin)), jnp.asarray((values - values[0]).astype(dtype))
 
 
 def as_times(name: str, times: Numbers) -> Times:
-    """Validate times, and take their differences before they are rounded.
+    """Validate times, and compute their differences before rounding.
 
-    **Raises:** `TypeError` for anything but real numbers; `ValueError` where single precision, in
-    which they were given, has spoilt the differences, or for a single number.
+    **Raises:** `TypeError` for other types than real numbers; `ValueError` for a single number, and
+    if the precision of the input has spoilt the differences.
     """
     times = missing_as_nan(times)
     array = as_floating(name, times)
@@ -104,73 +118,77 @@ def as_times(name: str, times: Numbers) -> Times:
         raise ValueError(f"`{name}` must have shape (n,); got a single number, {times!r}.")
     if is_traced(times):
         return Times(array, jnp.diff(array))
-    known = np.asarray(times)
-    precision = known.dtype if np.issubdtype(known.dtype, np.floating) else np.dtype(float)
-    known = known.astype(float)
-    steps = np.diff(known)
+    values = np.asarray(times)
+    # Python numbers and integers lose nothing before this point.
+    precision = values.dtype if np.issubdtype(values.dtype, np.floating) else np.dtype(float)
+    values = values.astype(float)
+    steps = np.diff(values)
     smallest = np.min(np.abs(steps[steps != 0]), initial=np.inf)
-    rounded = np.any(known != np.round(known))  # whole numbers are exact, if they are distinct
-    spacing = _spacing(np.max(np.abs(known), initial=0), precision)
+    rounded = np.any(values != np.round(values))  # distinct integers are exact
+    spacing = _spacing(np.max(np.abs(values), initial=0), precision)
     if spacing > _MOST_MOVED * smallest and (rounded or spacing > 1):
         raise ValueError(
-            f"`{name}` are too far from zero for {precision}, in which they were given: neighbours "
-            f"differ by {smallest:g}, and numbers of this size are rounded to multiples of "
-            f"{spacing:g}. Pass them as a NumPy array of float64, or subtract the first "
-            "before they are rounded."
+            f"`{name}` are too far from zero for their dtype {precision}: neighbours differ by "
+            f"{smallest:g}, and numbers of this size are rounded to multiples of {spacing:g}. "
+            "Pass them as a NumPy array of float64, or subtract the first time in float64."
         )
     with jax.ensure_compile_time_eval():
-        return Times(known, jnp.asarray(steps, array.dtype))
+        return Times(values, jnp.asarray(steps, array.dtype))
 
 
 def check_increasing(times: Times) -> None:
-    """Raise `ValueError` where a time is missing, or is not after the one before it; silent while
-    tracing."""
+    """Raise `ValueError` if a time is missing or not after the one before it.
+
+    Traced times are not checked.
+    """
     if is_traced(times.values):
         return
     values = np.asarray(times.values)
     missing = np.flatnonzero(~np.isfinite(values))
     if missing.size:
         raise ValueError(
-            f"`times` must increase, but `times[{missing[0]}]` = {values[missing[0]]} is missing: "
-            "leave it out, with its observation."
+            f"`times` must be increasing numbers; got `times[{missing[0]}]` = "
+            f"{values[missing[0]]}. Remove this time and its observation."
         )
-    back = np.flatnonzero(np.asarray(times.gaps) <= 0)
-    if not back.size:
+    not_increasing = np.flatnonzero(np.asarray(times.gaps) <= 0)
+    if not not_increasing.size:
         return
-    i = back[0]
+    i = not_increasing[0]
     pair = f"`times[{i}]` = {values[i]} and `times[{i + 1}]` = {values[i + 1]}"
     if values[i] <= values[i + 1]:
         raise ValueError(
-            f"`times` must increase, but {pair} are equal: merge the observations of one time into "
-            "one row. Several readings are columns of the row, or their mean: `times, row = "
+            f"`times` must be increasing; got equal {pair}. Merge the observations of one time "
+            "into one row, with one column for each reading or with their mean: `times, row = "
             "np.unique(times, return_inverse=True)`, `observations = "
             "np.array([observations[row == i].mean(axis=0) for i in range(len(times))])`."
         )
     raise ValueError(
-        f"`times` must increase, but {pair} do not: sort them, with their observations: `order = "
+        f"`times` must be increasing; got {pair}. Sort them and their observations: `order = "
         "np.argsort(times)`, `times, observations = times[order], observations[order]`."
     )
 
 
 def check_resolved(clock: Clock, since: Array, steps: Array) -> None:
-    """Raise `ValueError` where the caller's times are so far from zero that their precision moves
-    them by much of a step, for coefficients that depend on time; silent while tracing."""
+    """Raise `ValueError` if rounding moves the caller's times by too large a part of a step.
+
+    It applies to coefficients that depend on time. Traced times are not checked.
+    """
     if is_traced(clock, since, steps):
         return
-    known = np.asarray(steps, float)
-    typical = np.median(known[known > 0]) if np.any(known > 0) else np.inf
+    sizes = np.asarray(steps, float)
+    typical = np.median(sizes[sizes > 0]) if np.any(sizes > 0) else np.inf
     first, second = np.asarray(clock.origin, float)
     furthest = np.max(np.abs(first + second + np.asarray(since, float)), initial=0)
     spacing = _spacing(furthest, since.dtype)
     if spacing / 2 > _MOST_OF_A_STEP * typical:
         raise ValueError(
             f"`times` are too far from zero for coefficients that depend on time in {since.dtype}: "
-            f"at {furthest:g} it holds time only to multiples of {spacing:g}, beside steps of "
-            f"{typical:g}. Subtract a constant from `times`, for instance `times[0]` or whole "
+            f"at {furthest:g}, times are rounded to multiples of {spacing:g}, while steps are "
+            f"{typical:g}. Subtract a constant from `times`, for example `times[0]` or whole "
             'periods, or compute in double precision: `jax.config.update("jax_enable_x64", True)`.'
         )
 
 
 def _spacing(size: float, dtype: np.dtype) -> float:
-    """Return the distance between neighbouring numbers of this size."""
+    """Return the distance between neighbouring floating point numbers of this size."""
     return float(jnp.finfo(dtype).eps) * 2.0 ** np.floor(np.log2(size)) if size > 0 else 0.0

@@ -1,7 +1,7 @@
-"""Can a result be trusted, and if not, why?
+"""Verdict on a result: whether it is trustworthy, and the reasons if it is not.
 
-Inside compiled code a fault is data: a weight that was cut off, a step error beyond the standard
-error, chains that disagree. Each result collects its faults in one `Verdict`, and from that follow
+Inside compiled code, a fault is data: a truncated weight, a discretisation error above the standard
+error, chains that disagree. Each result collects its faults in one `Verdict`. It provides
 `trustworthy` (an array), `why()` (sentences with remedies) and, for `throw=True`, an error at run
 time.
 """
@@ -21,23 +21,23 @@ from .checks import all_finite_leaves, is_traced
 from .pareto import is_reliable
 
 _NO_FAULT = "No fault was found."
-_PARAMETERS = "Some parameters of the model are not finite: nothing can be simulated with them."
+_PARAMETERS = "Some parameters of the model are not finite, so simulation is impossible."
 _MISSING = (
-    "Some bridges were not found within `max_proposals` proposals. Allow more, lengthen the "
-    "duration or choose a smaller `gamma`; on intervals much shorter than the relaxation time "
+    "Some bridges were not found within `max_proposals` proposals. Allow more proposals, lengthen "
+    "the duration or choose a smaller `gamma`. On intervals much shorter than the relaxation time, "
     "pairs hardly ever meet: use `ModifiedDiffusionBridge()` or `Guided()` there."
 )
 _FAILED = (
-    "Some paths left the finite numbers or the state space, or ended where they have no density, "
-    "so that intervals are without bridges. Take more steps, transform the coordinates, or check "
-    "that the end points lie in the state space."
+    "Some intervals have no bridges: paths left the finite numbers or the state space, or their "
+    "last step has no density. Use more steps, transform the coordinates, or check that the end "
+    "points lie in the state space."
 )
 _TRUNCATED = (
-    "Some weights were cut off by `max_trials`, because their paths are hardly ever hit. Allow "
+    "Some weights were truncated by `max_trials`, because their paths are hardly ever hit. Allow "
     "more trials, or fit a start law by `fit_start_law`. The cause may also be the run that "
-    "replaces a sampler of the stationary law, where its burn-in is unknown (infinite in the "
-    "result, as where `measure_burn_in` finds none) or longer than 2¹⁸ steps: give `Diffusion` a "
-    "`sample_stationary`, or the coupling a shorter `Stationary(burn_in=...)` or a start law with "
+    "replaces a sampler of the stationary law: its burn-in is unknown (infinite in the result, as "
+    "when `measure_burn_in` finds none) or longer than 2¹⁸ steps. Then pass `sample_stationary` "
+    "to `Diffusion`, or pass the coupling a shorter `Stationary(burn_in=...)` or a start law with "
     "a density."
 )
 _HEAVY = (
@@ -64,7 +64,7 @@ _FEWEST_IN_SUM = 5
 class Fault(eqx.Module):
     """One reason not to trust a result.
 
-    - `present`: whether it applies, shape (), or (I,) with one entry for each interval.
+    - `present`: whether the fault is present, shape (), or (I,) with one entry for each interval.
     - `sentence`: the fault and its remedy.
     """
 
@@ -73,7 +73,7 @@ class Fault(eqx.Module):
 
 
 class Verdict(eqx.Module):
-    """All faults that a result was examined for, present or not."""
+    """All faults for which a result was examined, present or not."""
 
     faults: tuple[Fault, ...]
 
@@ -83,9 +83,9 @@ class Verdict(eqx.Module):
         return ~reduce(jnp.logical_or, (fault.present for fault in self.faults))
 
     def why(self) -> str:
-        """Return a sentence for each fault that is present, one a line.
+        """Return one line for each fault that is present.
 
-        **Raises:** `TypeError` inside `jit`, where the numbers are not known yet.
+        **Raises:** `TypeError` inside `jit`, where the values are traced.
         """
         if is_traced(self):
             raise TypeError(
@@ -97,23 +97,25 @@ class Verdict(eqx.Module):
 
 
 class AbstractResult(eqx.Module):
-    """Result of an estimation, with a verdict on whether its numbers and errors can be trusted."""
+    """Result of an estimation, with a verdict on its numbers and their errors."""
 
     @property
     @abstractmethod
     def verdict(self) -> Verdict:
-        """Return all faults that this result is examined for."""
+        """Return all faults for which this result is examined."""
 
     @property
     def trustworthy(self) -> Bool[Array, "*I"]:
-        """Return whether the numbers, with the errors that they report, can be trusted: no fault
-        of `verdict` is present."""
+        """Return whether the numbers and their reported errors can be trusted, shape () or (I,).
+
+        They can if no fault of `verdict` is present.
+        """
         return self.verdict.trustworthy
 
     def why(self) -> str:
-        """Return why the result is not trustworthy: each fault with its remedy, one a line.
+        """Return why the result is not trustworthy: one line for each fault, with its remedy.
 
-        **Raises:** `TypeError` inside `jit`, where the numbers are not known yet.
+        **Raises:** `TypeError` inside `jit`, where the values are traced.
         """
         return self.verdict.why()
 
@@ -122,8 +124,11 @@ _Result = TypeVar("_Result", bound=AbstractResult)
 
 
 def throw_where_untrustworthy(result: _Result, field: str, model: PyTree) -> _Result:
-    """Return the result, whose `field` raises `RuntimeError` at run time if parameters of the model
-    are not finite or a fault of the verdict is present, with the sentence of the first."""
+    """Return the result; its `field` raises `RuntimeError` at run time if a fault is present.
+
+    The message is the sentence of the first fault. Parameters of the model that are not finite
+    count as a fault.
+    """
     value = getattr(result, field)
     parameters = Fault(~all_finite_leaves(model), _PARAMETERS)
     for fault in (parameters, *result.verdict.faults):
@@ -132,13 +137,15 @@ def throw_where_untrustworthy(result: _Result, field: str, model: PyTree) -> _Re
 
 
 def missing_bridges(missing: Bool[Array, "*I"], coupled: bool = True) -> Fault:
-    """Return the fault of bridges that were not found: pairs that did not meet if `coupled`, else
-    paths that failed."""
+    """Return the fault of missing bridges.
+
+    If `coupled`, pairs did not meet; otherwise paths failed.
+    """
     return Fault(missing, _MISSING if coupled else _FAILED)
 
 
 def truncated_weights(truncated: Bool[Array, "*I"]) -> Fault:
-    """Return the fault of weights that a bound on the work cut off."""
+    """Return the fault of weights that a bound on the number of trials truncated."""
     return Fault(truncated, _TRUNCATED)
 
 
@@ -175,11 +182,11 @@ def heavy_tails(
 
 
 def heavy_tails_in_sum(k: Float[Array, " I"], effective: Float[Array, " I"]) -> Fault:
-    """Return the fault of a sum over intervals, each with weights of its own.
+    """Return the fault of a sum over intervals, each with its own weights.
 
-    Of many intervals some look unreliable by chance, and each adds an error of its own size, while
-    the statistical error of the sum grows as √I: up to √I / 4 of them do not matter, if none has
-    fewer than five effective weights.
+    Among many intervals, some look unreliable by chance. Each of them adds an error of its own
+    size, while the statistical error of the sum grows as √I. Up to √I / 4 of them are therefore
+    harmless, if all intervals have at least five effective weights.
     """
     unreliable = jnp.sum(~is_reliable(k, effective))
     hopeless = jnp.any(~(effective >= _FEWEST_IN_SUM))
@@ -187,7 +194,7 @@ def heavy_tails_in_sum(k: Float[Array, " I"], effective: Float[Array, " I"]) -> 
 
 
 def _located(fault: Fault) -> str:
-    """Return the sentence, with the intervals that it applies to if there are several."""
+    """Return the sentence, preceded by the affected intervals if there are several."""
     present = np.asarray(jax.device_get(fault.present))
     if present.ndim == 0:
         return fault.sentence

@@ -1,4 +1,4 @@
-"""Keys that are written out give JAX's own numbers, by programs that have no loops but for single
+"""Keys of the unrolled generator give JAX's own numbers, by programs without loops but for single
 numbers."""
 
 import jax
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxbridge.engine.compiled import compiled
-from jaxbridge.engine.generator import with_keys_written_out
+from jaxbridge.engine.generator import with_unrolled_keys
 
 KEY = jax.random.key(3)
 
@@ -52,24 +52,24 @@ def test_there_are_no_loops():
     def num_loops(draw):
         return jax.jit(draw).lower(KEY).as_text().count("stablehlo.while")
 
-    assert num_loops(draw) > 0 == num_loops(lambda key: draw(with_keys_written_out(key)))
+    assert num_loops(draw) > 0 == num_loops(lambda key: draw(with_unrolled_keys(key)))
 
 
 def test_a_single_number_is_a_loop():
     """That a loop which reads it cannot have in its body."""
     for shape in ((), (1,)):
-        draw = lambda key, shape=shape: jax.random.uniform(with_keys_written_out(key), shape)
+        draw = lambda key, shape=shape: jax.random.uniform(with_unrolled_keys(key), shape)
         assert jax.jit(draw).lower(KEY).compile().as_text().count(" while(") == 1
 
 
 def test_keys_of_other_kinds_are_as_they_were():
     for impl in ("rbg", "unsafe_rbg"):
         key = jax.random.key(0, impl=impl)
-        assert with_keys_written_out(key) is key
+        assert with_unrolled_keys(key) is key
     with jax.threefry_partitionable(False):
-        assert with_keys_written_out(KEY) is KEY
+        assert with_unrolled_keys(KEY) is KEY
     tree = {"model": jnp.ones(2), "name": "x", "none": None}
-    assert with_keys_written_out(tree)["model"] is tree["model"]
+    assert with_unrolled_keys(tree)["model"] is tree["model"]
 
 
 def test_so_many_numbers_are_refused():
