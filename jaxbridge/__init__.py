@@ -12,7 +12,7 @@ Data flows one way, from folder to folder; each begins with its mathematics.
 - `records`: what was seen with noise, or in part: likelihoods, paths, innovations.
 - `tuning`: which proposal, and what accuracy costs.
 - `inference`: parameters from observations.
-- `plot`, `studies`: pictures; the paper's study and the measurements, clients of all this.
+- `plot`, `studies`: pictures; the paper's study, clients of all this.
 
 References to equations and sections are to Bladt, Finch & Sørensen, *Simulation of multivariate
 diffusion bridges*; equations go by their labels in its source.
