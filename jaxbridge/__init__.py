@@ -34,6 +34,8 @@ observations = jnp.array([[0.0, 0.0], [0.5, -0.3], [0.2, 0.4], [-0.3, 0.6]])
 ```
 """
 
+from importlib import metadata as _metadata
+
 from .coupling.base import AbstractCoupling
 from .coupling.bridges import Bridges, sample_bridges
 from .coupling.burn_in import measure_burn_in
@@ -132,6 +134,8 @@ from .tuning.hitting_variation import HittingVariation, hitting_variation
 from .tuning.settings import Setting, WorkPrecision
 from .tuning.start_law import Pilot, Tuning, fit_start_law, tune_coupling
 from .tuning.work_precision import work_precision
+
+__version__ = _metadata.version("jaxbridge")
 
 __all__ = [
     # A model, and its paths.

@@ -94,9 +94,12 @@ class Command(NamedTuple):
         print(f"{study.tables(results)}\n\n{study.what_to_see}\n")
         written = []
         for name, text in study.files(results).items():
-            with self.writing(options.out / name) as path:
-                path.write_text(text, encoding="utf-8")
-            written.append(options.out / name)
+            file = options.out / name
+            # A file of lines is a history: each run adds to it.
+            before = file.read_text(encoding="utf-8") if _is_history(file) else ""
+            with self.writing(file) as path:
+                path.write_text(before + text, encoding="utf-8")
+            written.append(file)
         try:
             figures = self.figures()
         except ImportError as error:
@@ -124,6 +127,10 @@ class Command(NamedTuple):
             _end_progress()
             print(f"{self.program}: cannot write {path}: {error.strerror}", file=sys.stderr)
             sys.exit(1)
+
+
+def _is_history(file: Path) -> bool:
+    return file.suffix == ".jsonl" and file.exists()
 
 
 class _Parser(argparse.ArgumentParser):

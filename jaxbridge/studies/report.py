@@ -23,7 +23,7 @@ class Study(NamedTuple):
     - `tables(results)`: the text that is printed.
     - `what_to_see`: printed below the tables.
     - `draw(figures, results)`: returns pictures by file name, from functions of a module `figures`.
-    - `files(results)`: returns texts by file name.
+    - `files(results)`: returns texts by file name; those of `.jsonl` files are appended.
     """
 
     title: str

@@ -294,11 +294,14 @@ def num_cores() -> int:
 
 
 def as_files(benchmark: Benchmark) -> dict[str, str]:
-    """Return all results as JSON, by the name of the file."""
+    """Return all results as JSON, and as a line of the history, by file name."""
     content = benchmark._asdict()
     for name in ("ratios", "rates", "first_calls"):
         content[name] = [row._asdict() for row in content[name]]
-    return {"benchmark.json": json.dumps(content, indent=1, ensure_ascii=False) + "\n"}
+    return {
+        "benchmark.json": json.dumps(content, indent=1, ensure_ascii=False) + "\n",
+        "benchmark_history.jsonl": json.dumps(content, ensure_ascii=False) + "\n",
+    }
 
 
 def load(path: Path) -> Benchmark:

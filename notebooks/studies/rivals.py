@@ -201,10 +201,10 @@ def as_page(rivals: Rivals) -> str:
     return f"""\
 # Beside other packages
 
-`python -m studies rivals`, in the folder `notebooks`, runs the same tasks by this package and by each peer that is
-installed, and writes this page and [rivals.json](rivals.json). All seconds are of one machine, in
-float32 for what runs in JAX and in float64 for what runs in NumPy. A first call compiles; "again"
-is the fastest of a few more.
+`python -m studies rivals`, in the folder `notebooks`, runs the same tasks by this package and by
+each peer that is installed, and writes this page and [rivals.json](rivals.json). All seconds are
+from one machine, in float32 for JAX and in float64 for NumPy. A first call compiles; "again" is
+the fastest of a few more.
 
 {_where(rivals)}
 

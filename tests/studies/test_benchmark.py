@@ -38,7 +38,8 @@ def made_up():
 
 
 def test_results_survive_their_file(tmp_path):
-    (tmp_path / "a.json").write_text(as_files(made_up())["benchmark.json"], encoding="utf-8")
+    files = as_files(made_up())
+    (tmp_path / "a.json").write_text(files["benchmark.json"], encoding="utf-8")
     assert load(tmp_path / "a.json") == made_up()
 
 
