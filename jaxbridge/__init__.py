@@ -16,7 +16,7 @@ its mathematics.
 - `records`: noisy, partial or missing observations: log-likelihoods, smoothed paths, innovations.
 - `tuning`: choices by pilot runs, and error against computing time.
 - `inference`: parameters from observations.
-- `plot`, `studies`: pictures; the study of the paper and the benchmarks.
+- `plot`, `studies`: pictures; the study of the paper.
 
 References to equations and sections are to Bladt, Finch & Sørensen, *Simulation of multivariate
 diffusion bridges*. Equations are cited by their labels in its source.
@@ -37,6 +37,8 @@ times = jnp.array([0.0, 0.5, 1.5, 2.0])
 observations = jnp.array([[0.0, 0.0], [0.5, -0.3], [0.2, 0.4], [-0.3, 0.6]])
 ```
 """
+
+from importlib import metadata as _metadata
 
 from .coupling.base import AbstractCoupling
 from .coupling.bridges import Bridges, sample_bridges
@@ -136,6 +138,8 @@ from .tuning.hitting_variation import HittingVariation, hitting_variation
 from .tuning.settings import Setting, WorkPrecision
 from .tuning.start_law import Pilot, Tuning, fit_start_law, tune_coupling
 from .tuning.work_precision import work_precision
+
+__version__ = _metadata.version("jaxbridge")
 
 __all__ = [
     # Models and their paths.

@@ -1,7 +1,7 @@
 """The associated diffusion in NumPy, written from the paper as an independent cross-check.
 
 Euler steps, σ = I, linear drift: `dX = -B X dt + dW` with symmetric B, so the time reversal has
-the same drift. (The approximate bridge in NumPy is `jaxbridge.studies.numpy_reference`.)
+the same drift. (The approximate bridge in NumPy is `studies.numpy_reference`, in `notebooks`.)
 """
 
 import itertools

@@ -2,20 +2,24 @@
 
 import errno
 import os
+import pathlib
 import subprocess
 import sys
 
 import pytest
 from helpers import slow_beyond
+from studies.benchmark import load
+from studies.rivals import load_rivals
 
-from jaxbridge.__main__ import _writing
-from jaxbridge.studies.benchmark import load
-from jaxbridge.studies.rivals import load_rivals
+from jaxbridge.__main__ import COMMAND
+
+STUDIES = pathlib.Path(__file__).parents[1] / "notebooks"
 
 
-def run(*arguments, cwd, **environment):
-    command = [sys.executable, "-m", "jaxbridge", *arguments]
+def run(*arguments, cwd, module="jaxbridge", **environment):
+    command = [sys.executable, "-m", module, *arguments]
     in_haste = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": "", **environment}
+    in_haste["PYTHONPATH"] = os.pathsep.join([str(STUDIES), os.environ.get("PYTHONPATH", "")])
     options = dict(capture_output=True, text=True, timeout=600)
     return subprocess.run(command, cwd=cwd, env=in_haste, **options)
 
@@ -29,6 +33,7 @@ def test_quick_run_prints_a_table_and_writes_pictures(tmp_path):
     assert "2,000 bridges a case" in done.stdout
     assert done.stdout.count("as published") >= 8
     assert "[16/16]" in done.stderr
+    assert "Written to pictures: bridges.png, " in done.stdout and "Read next: " in done.stdout
     assert len(list((tmp_path / "pictures").glob("*.png"))) == 9
     assert len(list((tmp_path / "pictures" / "programs").iterdir())) > 20
 
@@ -45,7 +50,7 @@ def test_quick_run_of_the_exact_part(tmp_path):
 
 @pytest.mark.slow
 def test_quick_run_of_the_benchmark(tmp_path):
-    done = run("bench", "--quick", "--out", "pictures", cwd=tmp_path)
+    done = run("bench", "--quick", "--out", "pictures", cwd=tmp_path, module="studies")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("auto / best") == 1 and "Guided" in done.stdout
     assert "NumPy" in done.stdout and "random numbers" in done.stdout
@@ -58,7 +63,7 @@ def test_quick_run_of_the_benchmark(tmp_path):
 
 @pytest.mark.slow
 def test_quick_run_of_the_accuracy_part(tmp_path):
-    done = run("accuracy", "--quick", "--out", "pictures", cwd=tmp_path)
+    done = run("accuracy", "--quick", "--out", "pictures", cwd=tmp_path, module="studies")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("accuracy 0.") == 6  # targets of three tables, and three more
     assert "Orders of the step error" in done.stdout and "Nanoseconds" in done.stdout
@@ -67,7 +72,7 @@ def test_quick_run_of_the_accuracy_part(tmp_path):
 
 @pytest.mark.slow
 def test_quick_run_beside_other_packages(tmp_path):
-    done = run("rivals", "--quick", "--out", "pictures", cwd=tmp_path)
+    done = run("rivals", "--quick", "--out", "pictures", cwd=tmp_path, module="studies")
     assert done.returncode == 0, done.stderr
     for words in ("score, learnt", "cuthbert", "particles", "numpyro", "DBridge"):
         assert words in done.stdout  # with figures, or "not installed"
@@ -89,9 +94,9 @@ def test_bad_arguments_end_with_one_line(arguments, tmp_path):
 
 
 def test_a_full_disk_ends_with_one_line_and_no_part_of_a_file(tmp_path, capsys):
-    with _writing(tmp_path / "first.json") as path:
+    with COMMAND.writing(tmp_path / "first.json") as path:
         path.write_text("{}")
-    with pytest.raises(SystemExit), _writing(tmp_path / "second.json") as path:
+    with pytest.raises(SystemExit), COMMAND.writing(tmp_path / "second.json") as path:
         path.write_text("{")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert [file.name for file in tmp_path.iterdir()] == ["first.json"]

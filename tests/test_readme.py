@@ -7,9 +7,9 @@ import re
 
 import jax.numpy as jnp
 import pytest
+from studies.benchmark import in_markdown, load
 
 import jaxbridge as jb
-from jaxbridge.studies.benchmark import in_markdown, load
 
 ROOT = pathlib.Path(__file__).parent.parent
 README, CONTRIBUTING = ROOT / "README.md", ROOT / "CONTRIBUTING.md"

@@ -1,6 +1,6 @@
-"""What `python -m jaxbridge` runs, and how its tables are written."""
+"""Studies, which a command runs, and the layout of their tables."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -11,16 +11,27 @@ Row = Sequence[str]
 Table = tuple[Row, Sequence[Row]]  # titles, and rows
 
 
+def _no_files(results: Any) -> Mapping[str, str]:
+    return {}
+
+
 class Study(NamedTuple):
-    """A part of the study: `run(key, quick, say)` gives its results, and `say`s what it is at;
-    `tables` of them are printed above `what_to_see`; `draw(figures, results)` makes pictures, by
-    their names, with the functions of the module `figures`."""
+    """A study that a command runs.
+
+    - `title`: printed first.
+    - `run(key, quick, say)`: returns the results; calls `say` with a line of progress.
+    - `tables(results)`: the text that is printed.
+    - `what_to_see`: printed below the tables.
+    - `draw(figures, results)`: returns pictures by file name, from functions of a module `figures`.
+    - `files(results)`: returns texts by file name; those of `.jsonl` files are appended.
+    """
 
     title: str
     run: Callable[[Key[Array, ""], bool, Say], Any]
     tables: Callable[[Any], str]
     what_to_see: str
     draw: Callable[[Any, Any], dict[str, Any]]
+    files: Callable[[Any], Mapping[str, str]] = _no_files
 
 
 def silent(what: str) -> None:

@@ -17,11 +17,11 @@ from helpers import (
     unswirl,
     warped_model,
 )
+from studies.numpy_reference import approximate_bridges
 
 import jaxbridge as jb
 import jaxbridge.coupling.bridges
 from jaxbridge.coupling.join import propose
-from jaxbridge.studies.numpy_reference import approximate_bridges
 
 NON_REVERSIBLE = np.array([[1.0, 1.5], [-1.0, 0.5]])
 

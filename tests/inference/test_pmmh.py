@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from helpers import assert_uniform_ranks
 from inference_oracles import ou_1d, ou_data, ou_log_likelihood
+from studies.rival_posteriors import data_sets, exact_posterior
 
 import jaxbridge as jb
 from jaxbridge.inference.parameters import Parameters
-from jaxbridge.studies.rival_posteriors import data_sets, exact_posterior
 
 TIMES = np.arange(0, 12, 0.5)
 DATA = ou_data(7, TIMES, rate=0.8, sigma=0.7)

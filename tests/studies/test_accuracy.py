@@ -4,10 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import jaxbridge as jb
-from jaxbridge.studies import figures
-from jaxbridge.studies.accuracy import (
+from studies import figures
+from studies.accuracy import (
     ACCURACY,
     EffectCost,
     curves,
@@ -15,6 +13,8 @@ from jaxbridge.studies.accuracy import (
     sinh_model,
     time_of_step,
 )
+
+import jaxbridge as jb
 from jaxbridge.studies.paper import study_model
 
 

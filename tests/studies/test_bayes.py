@@ -4,16 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
-import jaxbridge as jb
-from jaxbridge.studies import bayes, figures
-from jaxbridge.studies.bayes import (
+from studies import bayes, figures
+from studies.bayes import (
     brownian_posterior,
     format_bayes,
     hyperbolic_data,
     run_bayes,
     stationary_posterior,
 )
+
+import jaxbridge as jb
 
 
 @pytest.mark.slow

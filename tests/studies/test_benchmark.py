@@ -3,19 +3,19 @@
 import jax
 import numpy as np
 import pytest
-
-from jaxbridge.studies.benchmark import (
+from studies.benchmark import (
     Benchmark,
     Ratio,
+    as_files,
     draw_floor,
     in_markdown,
     in_plain_characters,
     load,
-    save,
 )
+from studies.crossover import Rate
+from studies.first_calls import FirstCall
+
 from jaxbridge.studies.clock import in_turns
-from jaxbridge.studies.crossover import Rate
-from jaxbridge.studies.first_calls import FirstCall
 
 
 def made_up():
@@ -38,7 +38,8 @@ def made_up():
 
 
 def test_results_survive_their_file(tmp_path):
-    save(made_up(), tmp_path / "a.json")
+    files = as_files(made_up())
+    (tmp_path / "a.json").write_text(files["benchmark.json"], encoding="utf-8")
     assert load(tmp_path / "a.json") == made_up()
 
 

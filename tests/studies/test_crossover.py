@@ -5,9 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate, stats
-
-from jaxbridge.studies import figures
-from jaxbridge.studies.crossover import (
+from studies import figures
+from studies.crossover import (
     Rate,
     crossover_table,
     double_well,

@@ -8,10 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate
-
-from jaxbridge.studies import figures, rival_bridges, rival_filters, rival_posteriors
-from jaxbridge.studies.peers import NOT_INSTALLED, in_r, where_installed
-from jaxbridge.studies.rivals import (
+from studies import figures, rival_bridges, rival_filters, rival_posteriors
+from studies.peers import NOT_INSTALLED, in_r, where_installed
+from studies.rivals import (
     Rivals,
     Sizes,
     as_page,

@@ -16,12 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 import jaxbridge as jb
-
-from ..engine.linalg import matvec, solve
-from .clock import fastest, timed
-from .exact import UNLIKELY
-from .paper import law_half_way, study_model
-from .report import Say, Study, Table, table
+from jaxbridge.engine.linalg import matvec, solve
+from jaxbridge.studies.clock import fastest, timed
+from jaxbridge.studies.exact import UNLIKELY
+from jaxbridge.studies.paper import law_half_way, study_model
+from jaxbridge.studies.report import Say, Study, Table, table
 
 _GAMMA = 0.5
 TARGETS = (0.1, 0.03, 0.01)

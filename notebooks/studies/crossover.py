@@ -16,11 +16,10 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 import jaxbridge as jb
-
-from ..proposals.auto import Budget, as_proposal, default_candidates
-from .clock import timed
-from .paper import Point, study_model
-from .report import Row, Say, Table
+from jaxbridge.proposals.auto import Budget, as_proposal, default_candidates
+from jaxbridge.studies.clock import timed
+from jaxbridge.studies.paper import Point, study_model
+from jaxbridge.studies.report import Row, Say, Table
 
 DURATIONS = (0.05, 0.25, 1.0, 5.0, 20.0, 50.0)
 # Durations from which on there are more steps, and twice as many of them in all.

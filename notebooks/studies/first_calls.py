@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -19,11 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbridge as jb
-
-from ..engine.memory_maps import count_maps
-from .clock import timed
-from .paper import study_model
-from .report import Say, Table, silent
+from jaxbridge.engine.memory_maps import count_maps
+from jaxbridge.studies.clock import timed
+from jaxbridge.studies.paper import study_model
+from jaxbridge.studies.report import Say, Table, silent
 
 
 class FirstCall(NamedTuple):
@@ -194,6 +194,9 @@ def first_calls_table(rows: Sequence[FirstCall]) -> Table:
 
 def _in_process(what: str, cache: str | None) -> dict[str, float]:
     environment = {k: v for k, v in os.environ.items() if k != "JAX_COMPILATION_CACHE_DIR"}
+    here = str(Path(__file__).parents[1])
+    paths = filter(None, [here, environment.get("PYTHONPATH")])
+    environment["PYTHONPATH"] = os.pathsep.join(paths)
     if cache is not None:
         environment |= {
             "JAX_COMPILATION_CACHE_DIR": cache,

@@ -18,10 +18,10 @@ from jaxtyping import Array, Float, Key
 from scipy import special, stats
 
 import jaxbridge as jb
+from jaxbridge.studies.clock import timed, timed_once_compiled
+from jaxbridge.studies.report import Say
 
-from .clock import timed, timed_once_compiled
 from .peers import where_installed
-from .report import Say
 
 NUM_STEPS = 10
 _LEVEL = 0.5

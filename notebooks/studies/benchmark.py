@@ -23,19 +23,19 @@ from jax import lax
 from jaxtyping import Array, Key
 
 import jaxbridge as jb
+from jaxbridge.coupling.join import Inputs, propose
+from jaxbridge.engine.batch_size import most_lanes
+from jaxbridge.models.bridge_problem import Intervals
+from jaxbridge.studies.clock import in_turns
+from jaxbridge.studies.exact import UNLIKELY
+from jaxbridge.studies.paper import study_model
+from jaxbridge.studies.report import Say, Study, Table, markdown, silent, table
 
-from ..coupling.join import Inputs, propose
-from ..engine.batch_size import most_lanes
-from ..models.bridge_problem import Intervals
 from .accuracy import run_sigma_costs, sigma_table
-from .clock import in_turns
 from .crossover import DURATIONS, LONG, Process, Rate, crossover_table, processes, run_crossover
-from .exact import UNLIKELY
 from .first_calls import ENTRIES, FirstCall, first_calls_table, run_first_calls
 from .numpy_reference import approximate_bridges
-from .paper import study_model
 from .peers import versions
-from .report import Say, Study, Table, markdown, silent, table
 
 _NUM_STEPS = 50
 # Divisors of the number of proposals, about as many as the package runs side by side, on a CPU and
@@ -293,17 +293,20 @@ def num_cores() -> int:
     return len(usable(0)) if usable else os.cpu_count() or 1
 
 
-def save(benchmark: Benchmark, path: Path) -> None:
-    """Everything as JSON."""
+def as_files(benchmark: Benchmark) -> dict[str, str]:
+    """Return all results as JSON, and as a line of the history, by file name."""
     content = benchmark._asdict()
     for name in ("ratios", "rates", "first_calls"):
         content[name] = [row._asdict() for row in content[name]]
-    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n")
+    return {
+        "benchmark.json": json.dumps(content, indent=1, ensure_ascii=False) + "\n",
+        "benchmark_history.jsonl": json.dumps(content, ensure_ascii=False) + "\n",
+    }
 
 
 def load(path: Path) -> Benchmark:
-    """What `save` wrote."""
-    content = json.loads(path.read_text())
+    """Read the file of `as_files`."""
+    content = json.loads(path.read_text(encoding="utf-8"))
     content["ratios"] = [Ratio(**row) for row in content["ratios"]]
     content["rates"] = [Rate(**row) for row in content["rates"]]
     content["first_calls"] = [FirstCall(**row) for row in content["first_calls"]]
@@ -375,4 +378,5 @@ alone. The step error is of second order for all: Heun for couplings, the It√¥‚Ä
 others. "auto" includes its pilot runs. Last, the seconds of a first call in a process, of a second,
 and of a first that finds its programs on disk; programs compiled, and memory maps left.""",
     lambda figures, made: {"crossover.png": figures.crossover(made.rates, LONG)},
+    as_files,
 )

@@ -16,9 +16,10 @@ from typing import Any, NamedTuple
 import jax
 from jaxtyping import Array, Key
 
+from jaxbridge.studies.report import Row, Say, Study, Table, markdown, silent, table
+
 from .benchmark import num_cores
 from .peers import versions
-from .report import Row, Say, Study, Table, markdown, silent, table
 from .rival_bridges import BridgeRow, run_bridges
 from .rival_filters import NUM_STEPS, FilterRow, run_filters
 from .rival_posteriors import PosteriorRow, run_posteriors
@@ -200,10 +201,10 @@ def as_page(rivals: Rivals) -> str:
     return f"""\
 # Beside other packages
 
-`python -m jaxbridge rivals` runs the same tasks by this package and by each peer that is
-installed, and writes this page and [rivals.json](rivals.json). All seconds are of one machine, in
-float32 for what runs in JAX and in float64 for what runs in NumPy. A first call compiles; "again"
-is the fastest of a few more.
+`python -m studies rivals`, in the folder `notebooks`, runs the same tasks by this package and by
+each peer that is installed, and writes this page and [rivals.json](rivals.json). All seconds are
+from one machine, in float32 for JAX and in float64 for NumPy. A first call compiles; "again" is
+the fastest of a few more.
 
 {_where(rivals)}
 
@@ -340,4 +341,5 @@ exact one, and the share of paths that count. Filters: the spread of one log lik
 filter of variance one would take. Posteriors: how far their means are off, in exact posterior
 standard deviations. What is not installed has a row that says so.""",
     lambda figures, made: {"how_to_choose.png": figures.how_to_choose()},
+    rivals_files,
 )

@@ -21,10 +21,10 @@ from jaxtyping import Array, Float, Key
 from scipy import linalg, stats
 
 import jaxbridge as jb
+from jaxbridge.studies.clock import fastest, timed
+from jaxbridge.studies.report import Say
 
-from .clock import fastest, timed
 from .peers import where_installed
-from .report import Say
 
 NUM_STEPS = 10
 LIBRARY = "here, `log_likelihood`"

@@ -23,9 +23,8 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float, Key
 
 import jaxbridge as jb
-
-from .clock import fastest, timed
-from .report import Say, Study, silent, table
+from jaxbridge.studies.clock import fastest, timed
+from jaxbridge.studies.report import Say, Study, silent, table
 
 ALPHA = 0.8
 PRIOR_MEAN, PRIOR_VARIANCE = 1.0, 1.0

@@ -23,10 +23,10 @@ from scipy import sparse, stats
 from scipy.sparse.linalg import splu
 
 import jaxbridge as jb
+from jaxbridge.studies.clock import fastest, timed
+from jaxbridge.studies.report import Say
 
-from .clock import fastest, timed
 from .peers import NOT_INSTALLED, in_r
-from .report import Say
 
 RADIAL = 4.0  # of dX = (4/X - X) dt + dW, the norm of a process in nine dimensions
 CELL_SIGMA, CELL_HALF = 0.1, 2.0**-4
