@@ -79,7 +79,7 @@ def unchecked():
 
 @pytest.fixture(autouse=True)
 def checked_by_default(request):
-    """Annotations are checked in what runs by default through the doors of the package, where they
+    """Annotations are checked in what runs by default through the public functions, where they
     reach everything: it takes a sixth of the time."""
     if "slow" in request.keywords or request.path.parent != _TESTS:
         request.getfixturevalue("unchecked")

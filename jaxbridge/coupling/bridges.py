@@ -16,8 +16,8 @@ from ..engine.batch_size import default_num_lanes
 from ..engine.checks import Numbers, check_bound, check_count, check_key, without_derivatives
 from ..engine.compiled import compiled_for
 from ..engine.devices import over_devices
-from ..engine.doors import door
-from ..engine.keys import numbered_keys
+from ..engine.entry import public_entry
+from ..engine.keys import attempt_keys
 from ..engine.rejection import Accepted, Attempts, Search, over_problems, rejection_sample
 from ..engine.verdict import AbstractResult, Verdict, missing_bridges, throw_where_untrustworthy
 from ..models.bridge_problem import (
@@ -67,7 +67,7 @@ class Bridges(AbstractResult):
         return Verdict((missing_bridges(jnp.any(~self.met, axis=-1)),))
 
 
-@door
+@public_entry
 def sample_bridges(
     key: Key[Array, ""],
     model: Diffusion,
@@ -263,7 +263,7 @@ def _propose_numbered(
     """
     start, end, duration = inputs.intervals
     lanes = Intervals(start[interval].T, end[interval].T, duration[interval] * time_scale)
-    lane_keys = numbered_keys(keys, interval, number)
+    lane_keys = attempt_keys(keys, interval, number)
     return propose(inputs._replace(intervals=lanes), lane_keys, num_steps, stored, meeting_step)
 
 

@@ -33,8 +33,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.arguments import check_instance
 from ..engine.checks import Numbers, check_key, check_num_steps, is_traced
 from ..engine.compiled import compiled
-from ..engine.doors import door
-from ..engine.keys import folded, key_for
+from ..engine.entry import public_entry
+from ..engine.keys import fold_in_each, key_for
 from ..engine.lanes import over_lanes
 from ..engine.linalg import is_finite
 from ..engine.noise import noisy_scan
@@ -114,7 +114,7 @@ def _smoothed_law(key, model, coupling, end, duration, num_steps) -> SmoothedDra
     return smoothed_draws(fit_key, draws.T, end[0], model.prepared())
 
 
-@door
+@public_entry
 def measure_burn_in(
     key: Key[Array, ""],
     model: Diffusion,
@@ -266,7 +266,7 @@ def _run_pairs(
         return noisy_scan(
             lambda pairs, inputs: (step_pair(*pairs, *inputs[0], lanes), None),
             pairs,
-            folded(keys, repeat),
+            fold_in_each(keys, repeat),
             draw,
             None,
             num_steps,

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, check_num_steps
-from ..engine.doors import door
-from ..engine.noise import chunks
+from ..engine.entry import public_entry
+from ..engine.noise import chunk_shape
 from ..models import decisions
 from ..models.decisions import Effects
 from ..models.diffusion import Diffusion, check_diffusion
@@ -27,7 +27,7 @@ from .rotation import driven_through_root, root_effect, rotation_effect
 _DIMENSIONS = (2, 1, *range(3, 65))
 
 
-@door
+@public_entry
 def effects(
     model: Diffusion,
     coupling: AbstractCoupling | None = None,
@@ -100,7 +100,7 @@ def effects(
         _corrector(coupling.scheme, scheme, forward),
         decisions.stratonovich(scheme.stratonovich, forward.sigma_varies),
         decisions.stored_times(None if save_at is None else as_floating("save_at", save_at).size),
-        decisions.early_stop(chunks(num_steps)[0]),
+        decisions.early_stop(chunk_shape(num_steps)[0]),
         noise_by_drift,
         time,
     )

@@ -23,8 +23,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.batch_size import default_num_lanes
 from ..engine.checks import check_bound, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled_for
-from ..engine.doors import door
-from ..engine.keys import key_for, numbered_keys
+from ..engine.entry import public_entry
+from ..engine.keys import attempt_keys, key_for
 from ..engine.rejection import Attempts, Search, over_problems, rejection_sample
 from ..engine.verdict import AbstractResult, Verdict, missing_bridges, truncated_weights
 from ..models.diffusion import Diffusion, check_diffusion
@@ -131,7 +131,7 @@ class HittingCounts(AbstractResult):
         return jnp.sum(self.counts > 0, axis=-1, dtype=jnp.int32)
 
 
-@door
+@public_entry
 def hitting_counts(
     key: Key[Array, ""],
     model: Diffusion,
@@ -285,7 +285,7 @@ def _trial(
     associated = run_associated(
         model,
         coupling,
-        numbered_keys(keys, problem, number),
+        attempt_keys(keys, problem, number),
         jnp.moveaxis(paths[problem], 0, -1),
         duration[problem] / num_steps,
     )

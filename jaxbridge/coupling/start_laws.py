@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.arguments import evaluated
 from ..engine.captured import Captured
 from ..engine.checks import Numbers, as_floating, cast_floats, is_traced
-from ..engine.keys import folded
+from ..engine.keys import fold_in_each
 from ..engine.noise import noisy_scan
 from ..models.diffusion import Diffusion, check_value
 from ..models.dynamics import Dynamics
@@ -268,7 +268,7 @@ def run_for(
         end, _ = noisy_scan(
             lambda x, inputs: (step(x, inputs[0]), None),
             x,
-            folded(keys, repeat),
+            fold_in_each(keys, repeat),
             lambda key, k: jax.random.normal(key, (k, x.shape[0]), x.dtype),
             None,
             num_steps,

@@ -9,16 +9,16 @@ from jaxtyping import Array, Bool, Float, Inexact, PyTree, Shaped
 from .arguments import as_returned, check_function, named
 from .indices import check_indices
 
-# A function of one path. It may return Booleans and integers, which `path_function` converts.
+# A function of one path. It may return Booleans and integers, which `as_path_function` converts.
 PathFunction = Callable[[Array], PyTree]
 
 
-def proper(log_weights: Float[Array, "*I"]) -> Float[Array, "*I"]:
+def nan_to_neg_inf(log_weights: Float[Array, "*I"]) -> Float[Array, "*I"]:
     """Replace NaN and +inf among log weights by -inf, the log of a zero weight."""
     return jnp.where(log_weights < jnp.inf, log_weights, -jnp.inf)
 
 
-def normalised(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I n"]:
+def normalise_weights(log_weights: Float[Array, "*I n"]) -> Float[Array, "*I n"]:
     """Return the weights, normalised to sum to one over the last axis.
 
     All are zero where no weight is positive.
@@ -39,26 +39,28 @@ def effective_size(weights: Float[Array, "*I n"]) -> Float[Array, "*I"]:
     return jnp.where(squares > 0, 1 / jnp.where(squares > 0, squares, 1), 0)
 
 
-def filled(paths: Float[Array, "*I n K d"], met: Bool[Array, "*I n"]) -> Float[Array, "*I n K d"]:
+def fill_missing_paths(
+    paths: Float[Array, "*I n K d"], met: Bool[Array, "*I n"]
+) -> Float[Array, "*I n K d"]:
     """Replace each missing path (NaN where `met` is false) by the first path that exists."""
     # Missing paths have weight zero, but 0 · NaN is NaN in a mean and in its derivative.
     first = jnp.argmax(met, axis=-1)[..., None, None, None]
     return jnp.where(met[..., None, None], paths, jnp.take_along_axis(paths, first, axis=-3))
 
 
-def values_of(fn: PathFunction, paths: Float[Array, "*I n K d"]) -> PyTree:
+def evaluate_on_paths(fn: PathFunction, paths: Float[Array, "*I n K d"]) -> PyTree:
     """Evaluate `fn` at every path; the results have leading axes (*I, n).
 
     Booleans and integers among its values become floating point numbers.
     """
     path_type = jax.ShapeDtypeStruct(paths.shape[-2:], paths.dtype)
-    evaluate = path_function("fn", fn, path_type)
+    evaluate = as_path_function("fn", fn, path_type)
     for _ in paths.shape[:-2]:
         evaluate = jax.vmap(evaluate)
     return evaluate(paths)
 
 
-def path_function(name: str, fn: PathFunction, like: jax.ShapeDtypeStruct) -> PathFunction:
+def as_path_function(name: str, fn: PathFunction, like: jax.ShapeDtypeStruct) -> PathFunction:
     """Return `fn` with floating point values, for paths of the shape and dtype of `like`.
 
     Booleans and integers among its values become numbers of the paths' dtype.
@@ -86,7 +88,7 @@ def weighted_mean(
     The mean is NaN where no weight is positive. Values of weight zero are ignored, even NaN.
     """
     axis = weights.ndim - 1
-    aligned = expanded(weights, values)
+    aligned = align_axes(weights, values)
     # 0 · NaN is NaN, so values of weight zero are masked.
     total = jnp.sum(jnp.where(aligned > 0, aligned * values, 0), axis)
     return jnp.where(jnp.sum(aligned, axis) > 0, total, jnp.nan)
@@ -99,10 +101,12 @@ def mean_over_paths(
     met: Bool[Array, "*I n"],
 ) -> PyTree:
     """Compute the weighted mean of `fn` over the paths that exist."""
-    values = values_of(fn, filled(paths, met))
+    values = evaluate_on_paths(fn, fill_missing_paths(paths, met))
     return jax.tree.map(lambda value: weighted_mean(weights, value), values)
 
 
-def expanded(weights: Shaped[Array, "*I n"], values: Inexact[Array, "..."]) -> Shaped[Array, "..."]:
+def align_axes(
+    weights: Shaped[Array, "*I n"], values: Inexact[Array, "..."]
+) -> Shaped[Array, "..."]:
     """Append axes of length one to the weights until they have as many axes as the values."""
     return weights.reshape(*weights.shape, *[1] * (values.ndim - weights.ndim))

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
-from .devices import whole
+from .devices import replicate
 
 # Anything that `jnp.asarray` accepts: an array, a number, a (nested) list of numbers.
 Numbers = ArrayLike | Sequence[Any]
@@ -36,7 +36,7 @@ def as_array(value: Numbers) -> Array:
       them.
     """
     with jax.transfer_guard("allow"):  # the caller intends this transfer
-        return whole(jnp.asarray(_without_wide_integers(value)))
+        return replicate(jnp.asarray(_without_wide_integers(value)))
 
 
 def _without_wide_integers(value: Numbers) -> Numbers:
@@ -62,7 +62,7 @@ def _is_real(entry: Any) -> bool:
     return isinstance(entry, Real) and not isinstance(entry, bool)
 
 
-def settled(array: Array) -> Array:
+def drop_weak_type(array: Array) -> Array:
     """Drop the weak type of an array if JAX computes in single precision only.
 
     Weak and strong types would otherwise each compile a program of their own. In double precision
@@ -168,7 +168,7 @@ def is_traced(*trees) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def taken(values: Array, index: Any) -> Array:
+def index_without_compiling(values: Array, index: Any) -> Array:
     """Return `values[index]`, computed by NumPy if both are concrete.
 
     This avoids compiling a program for each shape. Arrays that were committed to a device stay
@@ -274,9 +274,7 @@ def _refuse_choice(primals, tangents):
     )
 
 
-def steps_of_size(
-    durations: Array, num_steps: int | None, step_size: float
-) -> Int[np.ndarray, " I"]:
+def count_steps(durations: Array, num_steps: int | None, step_size: float) -> Int[np.ndarray, " I"]:
     """Return the number of steps of each interval, such that no step is longer than `step_size`.
 
     A step may be longer by a factor of 1 + 1e-4, so that rounded durations do not add a step.

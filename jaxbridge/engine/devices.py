@@ -24,7 +24,7 @@ from jaxtyping import Array, Int, PyTree
 _Result = TypeVar("_Result")
 
 
-def whole(array: Array) -> Array:
+def replicate(array: Array) -> Array:
     """Replicate an array on every device if its type says that devices share it.
 
     Arrays have such types along the explicit axes of a mesh; a program cannot index single points
@@ -114,7 +114,7 @@ def _is_split_by_vmap(array: Array | np.ndarray | np.generic) -> bool:
 def _whole_as(batch: Array, arrays: Sequence[Array]) -> list[Array]:
     """Replicate the arrays on every device, with types that agree with that of the batch."""
     if not isinstance(batch, jax.core.Tracer):
-        return list(map(whole, arrays))
+        return list(map(replicate, arrays))
     everywhere = NamedSharding(jax.typeof(batch).sharding.mesh, PartitionSpec())
     return [jax.sharding.reshard(array, everywhere) for array in arrays]
 
@@ -149,7 +149,7 @@ def num_devices() -> int:
     return 1 if mesh.empty or AxisType.Manual in mesh.axis_types else mesh.size
 
 
-def share(num_lanes: int) -> int:
+def lanes_per_device(num_lanes: int) -> int:
     """Return how many of these lanes each device simulates, rounded up."""
     return -(-num_lanes // num_devices())  # division rounded up
 
@@ -172,7 +172,7 @@ def over_devices(
 
     def split(*arguments):
         num_lanes = _num_lanes(arguments, in_axes)
-        length = share(num_lanes)
+        length = lanes_per_device(num_lanes)
 
         def on_one_device(arrays, arguments):
             lanes = lax.axis_index(names) * length + jnp.arange(length)

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .checks import Numbers, as_floating
-from .doors import door
+from .entry import public_entry
 
 
-@door
+@public_entry
 def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
     """Estimate the effective sample size of one chain, n / (1 + 2 Σ_t ρ_t).
 
@@ -96,7 +96,7 @@ def _correlation_time(correlation: Float[Array, "n ..."]) -> Float[Array, "..."]
     return jnp.maximum(2 * jnp.sum(pairs, axis=0) - 1, 1 / n)
 
 
-@door
+@public_entry
 def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
     """Compute R̂ from the halves of several chains (split version of Gelman & Rubin 1992).
 

@@ -2,10 +2,10 @@
 
 ```text
 key
-├─ interval i                       numbered(key, I)
-│  └─ attempt j                     numbered_keys(keys, i, j)
+├─ interval i                       first_keys(key, I)
+│  └─ attempt j                     attempt_keys(keys, i, j)
 │     ├─ reversed path | driven path | coupling         of a proposal, split_each(keys, 3)
-│     │  └─ chunk c of steps        folded(keys, c), if there are several chunks
+│     │  └─ chunk c of steps        fold_in_each(keys, c), if there are several chunks
 │     │     └─ normal and uniform numbers, of one draw
 │     └─ start | path | coupling    of an associated path, split_each(keys, 3)
 │        └─ ...
@@ -33,19 +33,19 @@ def key_for(purpose: str, key: Key[Array, ""]) -> Key[Array, ""]:
     return jax.random.fold_in(key, zlib.crc32(purpose.encode()))
 
 
-def numbered(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
+def first_keys(key: Key[Array, ""], num: int) -> Key[Array, " num"]:
     """Derive the keys with numbers 0, ..., `num` - 1."""
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num))
 
 
-def numbered_keys(
+def attempt_keys(
     keys: Key[Array, " P"], problem: Int[Array, " lanes"], number: Int[Array, " lanes"]
 ) -> Key[Array, " lanes"]:
     """Derive the key of each attempt from the key of its problem and its number."""
     return jax.vmap(jax.random.fold_in)(keys[problem], number)
 
 
-def folded(keys: Key[Array, " lanes"], number: int | Int[Array, ""]) -> Key[Array, " lanes"]:
+def fold_in_each(keys: Key[Array, " lanes"], number: int | Int[Array, ""]) -> Key[Array, " lanes"]:
     """Fold one number into the key of each lane."""
     return jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, number)
 

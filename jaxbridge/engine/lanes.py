@@ -84,7 +84,7 @@ def over_points(function: Callable) -> Callable[..., Any]:
     return apply
 
 
-def hold(tree: PyTree[Array]) -> PyTree[Array]:
+def compute_once(tree: PyTree[Array]) -> PyTree[Array]:
     """Make the compiler compute the numbers of a point once, however many functions read them.
 
     In lanes, the numbers pass through a product with the identity (`_held`), where 0 · ∞ is NaN.
@@ -225,7 +225,7 @@ def _held(operands: list, form: AbstractForm, lanes: int) -> list:
     matrices, and I x = x.
 
     The product is linear in x, so that it also holds tangents. Infinite numbers are made finite
-    beforehand, by `hold`.
+    beforehand, by `compute_once`.
     """
     arrays = [form.join(operand, lanes) if form.is_own(operand) else None for operand in operands]
     floats = [a for a in arrays if a is not None and jnp.issubdtype(a.dtype, jnp.floating)]

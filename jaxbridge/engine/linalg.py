@@ -37,7 +37,7 @@ def all_finite(vector: Float[Array, " d"]) -> Bool[Array, ""]:
     return is_finite(_sum([jnp.abs(x) for x in vector]))
 
 
-def total(terms: Float[Array, "d *shape"]) -> Float[Array, "*shape"]:
+def sum_first_axis(terms: Float[Array, "d *shape"]) -> Float[Array, "*shape"]:
     """Sum over the first axis."""
     return _sum([terms[i] for i in range(terms.shape[0])])
 
@@ -427,7 +427,12 @@ def polar_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
 
     def newton(_, factor):
         inverse_transpose = inverse(factor).T
-        scale = jnp.sqrt(jnp.sqrt(total(total(inverse_transpose**2)) / total(total(factor**2))))
+        scale = jnp.sqrt(
+            jnp.sqrt(
+                sum_first_axis(sum_first_axis(inverse_transpose**2))
+                / sum_first_axis(sum_first_axis(factor**2))
+            )
+        )
         return (scale * factor + inverse_transpose / scale) / 2
 
     return lax.fori_loop(0, _NEWTON_STEPS, newton, matrix)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree, Shaped
 
-from .keys import folded
+from .keys import fold_in_each
 from .lanes import Rows, join_rows, split_rows
 
 # Long chunks spread the cost of deriving keys. Noise of all steps at once would double the memory
@@ -33,7 +33,7 @@ class Store(NamedTuple):
     rows: Shaped[Array, "rows ..."]
 
 
-def chunks(num_steps: int) -> tuple[int, int]:
+def chunk_shape(num_steps: int) -> tuple[int, int]:
     """Return the number of chunks and the number of steps in each, at most 64."""
     num_chunks = -(-num_steps // _LONGEST_CHUNK)
     return num_chunks, -(-num_steps // num_chunks)
@@ -70,7 +70,7 @@ def noisy_scan(
       last step to the first.
     - With a `store`, only the requested rows are stored, and returned in place of all `y`.
     """
-    layout = _Chunks(num_steps, *chunks(num_steps), reverse)
+    layout = _Chunks(num_steps, *chunk_shape(num_steps), reverse)
     rows = None if store is None else store.rows
     run_chunk = _chunk_of(step, keys, draw, layout)
     (carry, rows), ys = layout.scan(run_chunk, (init, rows), layout.inputs(xs, store))
@@ -91,7 +91,7 @@ def noisy_scan_until(
     The test runs once for each chunk, so further steps must not change the carry of a lane that is
     over.
     """
-    layout = _Chunks(num_steps, *chunks(num_steps))
+    layout = _Chunks(num_steps, *chunk_shape(num_steps))
     run_chunk, inputs = _chunk_of(step, keys, draw, layout), layout.inputs(xs, None)
 
     def next_chunk(state):
@@ -179,7 +179,7 @@ def _chunk_of(
         carry, rows = state
         index, active, slots, xs = inputs
         # Each derivation of keys takes time to compile, so a single chunk uses the keys as given.
-        chunk_keys = keys if layout.num_chunks == 1 else folded(keys, index)
+        chunk_keys = keys if layout.num_chunks == 1 else fold_in_each(keys, index)
         noise = jax.vmap(lambda key: draw(key, layout.length), out_axes=-1)(chunk_keys)
         inputs = noise, active, slots, split_rows(xs, axis=1)
         init = split_rows(carry), rows

@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .checks import Numbers, as_floating
-from .doors import door
+from .entry import public_entry
 
 # A fit to fewer weights is meaningless.
 _FEWEST = 5
@@ -32,7 +32,7 @@ _PRIOR_COUNT, _PRIOR_SHAPE = 10, 0.5
 _MOST_RELIABLE = 0.7
 
 
-def most_reliable(number: int) -> float:
+def largest_reliable_k(number: int) -> float:
     """Return the largest shape for which the mean of `number` weights is reliable.
 
     Means of few weights need lighter tails: min(0.7, 1 - 1/log₁₀ number) (Vehtari et al. 2024,
@@ -71,7 +71,7 @@ def is_reliable(
     return (k < most) & (effective >= _FEWEST_EFFECTIVE)
 
 
-@door
+@public_entry
 def pareto_k(log_weights: Numbers) -> Float[Array, "*I"]:
     """Estimate the Pareto shape k̂ of the min(n/5, 3√n) largest of n weights, along the last axis.
 

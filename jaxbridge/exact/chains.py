@@ -16,7 +16,7 @@ from jaxtyping import Array, Key
 
 from ..engine.arguments import check_choice
 from ..engine.checks import Numbers, check_count, check_key
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.verdict import throw_where_untrustworthy
 from ..models.bridge_problem import bridge_problem
 from ..models.diffusion import Diffusion
@@ -27,7 +27,7 @@ from .pseudo_marginal import run_pseudo_marginal
 from .renewal import run_renewal
 
 
-@door
+@public_entry
 def sample_exact_bridges(
     key: Key[Array, ""],
     model: Diffusion,

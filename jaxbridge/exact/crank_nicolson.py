@@ -27,7 +27,7 @@ from ..engine.checks import (
     nondifferentiable,
 )
 from ..engine.compiled import compiled_for, compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.keys import split_each
 from ..engine.progress import metered_scan
 from ..models.bridge_problem import BridgeProblem, Intervals
@@ -65,7 +65,7 @@ class CrankNicolsonInfo(NamedTuple):
     log_weight: Float[Array, "*I"]
 
 
-@door
+@public_entry
 def crank_nicolson(
     model: Diffusion,
     start: Numbers,
@@ -103,14 +103,14 @@ def crank_nicolson(
     beta = check_step_size(step_size)
     setting = (model, proposal, problem.intervals)
 
-    @door
+    @public_entry
     def init(position, rng_key):
         check_key(rng_key)
         paths = check_position(position, problem)
         state = _init(rng_key[None], paths, *setting, num_steps)
         return jax.tree.map(lambda leaf: leaf[0], state)
 
-    @door
+    @public_entry
     def step(rng_key, state):
         check_key(rng_key)
         return _step(rng_key, state, *setting, beta)

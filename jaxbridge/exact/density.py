@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_for
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.pareto import pareto_k
 from ..engine.verdict import (
     AbstractResult,
@@ -114,7 +114,7 @@ class TransitionLogDensity(AbstractResult):
         return StepError(self.step_error, self.step_uncertainty)
 
 
-@door
+@public_entry
 def transition_log_density(
     key: Key[Array, ""],
     model: Diffusion,

@@ -13,10 +13,10 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ..coupling import AbstractCoupling
 from ..engine.averages import (
     PathFunction,
-    filled,
+    evaluate_on_paths,
+    fill_missing_paths,
     mean_over_paths,
-    normalised,
-    values_of,
+    normalise_weights,
     weighted_mean,
 )
 from ..engine.verdict import AbstractResult
@@ -64,7 +64,7 @@ class AbstractExactBridges(AbstractResult):
         `fn` takes one path of shape (K, d); by default it returns the path. The mean is NaN if
         there are no bridges.
         """
-        return mean_over_paths(fn, normalised(self.log_mean_weights), self.paths, self.met)
+        return mean_over_paths(fn, normalise_weights(self.log_mean_weights), self.paths, self.met)
 
     def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return the estimated discretisation bias of `mean(fn)` (estimate minus limit), entry by
@@ -101,8 +101,11 @@ class AbstractExactBridges(AbstractResult):
         The unit is the standard deviation of the points of paths; the error is a root mean square
         over them.
         """
-        weights, axis = normalised(self.log_mean_weights), self.met.ndim - 1
-        paths, error = filled(self.paths, self.met), self._step_errors(lambda path: path)
+        weights, axis = normalise_weights(self.log_mean_weights), self.met.ndim - 1
+        paths, error = (
+            fill_missing_paths(self.paths, self.met),
+            self._step_errors(lambda path: path),
+        )
         # The weighted variance of each coordinate at each time gives the unit.
         deviation = paths - jnp.expand_dims(weighted_mean(weights, paths), axis)
         variance = weighted_mean(weights, deviation**2)
@@ -112,7 +115,7 @@ class AbstractExactBridges(AbstractResult):
         def error(value):
             return error_of_mean(self.log_mean_weights, self.log_halving, self.step_share, value)
 
-        return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
+        return jax.tree.map(error, evaluate_on_paths(fn, fill_missing_paths(self.paths, self.met)))
 
 
 def _is_error(leaf) -> bool:

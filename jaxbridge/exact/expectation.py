@@ -19,8 +19,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import PyTree
 
-from ..engine.averages import PathFunction, filled, values_of, weighted_mean
-from ..engine.doors import door
+from ..engine.averages import PathFunction, evaluate_on_paths, fill_missing_paths, weighted_mean
+from ..engine.entry import public_entry
 from ..models.diffusion import Diffusion, check_diffusion
 from ..schemes import forms_of_targets, log_likelihood_of_steps
 from .exact_bridges import AbstractExactBridges
@@ -28,7 +28,7 @@ from .importance import WeightedBridges
 from .kernels import Chain
 
 
-@door
+@public_entry
 def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffusion) -> PyTree:
     """Estimate the mean of `fn(path)` over exact bridges, differentiable in the parameters of
     `model`.
@@ -70,7 +70,7 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
             "without `save_at`."
         )
     # Missing paths become finite, so that their zero weight gives zero and not NaN.
-    paths = lax.stop_gradient(filled(bridges.paths, bridges.met))
+    paths = lax.stop_gradient(fill_missing_paths(bridges.paths, bridges.met))
     log_weights = lax.stop_gradient(bridges.log_mean_weights)
     # Step sizes come from the grid: differences of rounded times are inaccurate for unequal steps.
     fractions = np.diff(bridges.proposal.fractions(bridges.num_steps))
@@ -86,4 +86,4 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
     # The ratio f_θ'/f_θ is one in value; only its derivatives matter.
     ratios = jnp.exp(log_weights - largest + log_f - lax.stop_gradient(log_f))
     weights = ratios / jnp.sum(ratios, axis=-1, keepdims=True)
-    return jax.tree.map(lambda value: weighted_mean(weights, value), values_of(fn, paths))
+    return jax.tree.map(lambda value: weighted_mean(weights, value), evaluate_on_paths(fn, paths))

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.averages import PathFunction
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..schemes import StepError, dominates, share_of_known_order, step_fault
 from .density import TransitionLogDensity
@@ -130,7 +130,7 @@ def extrapolate(
 ) -> ExtrapolatedLogDensity: ...
 @overload
 def extrapolate(fine: WeightedBridges, coarse: WeightedBridges) -> ExtrapolatedBridges: ...
-@door
+@public_entry
 def extrapolate(fine: Any, coarse: Any):
     """Combine two estimates into one without the leading discretisation error (Richardson).
 

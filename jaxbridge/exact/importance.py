@@ -25,16 +25,16 @@ from ..coupling import (
 )
 from ..engine.averages import (
     PathFunction,
+    align_axes,
     effective_size,
-    expanded,
-    filled,
-    normalised,
-    values_of,
+    evaluate_on_paths,
+    fill_missing_paths,
+    normalise_weights,
     weighted_mean,
 )
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_for
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..engine.pareto import pareto_k
 from ..engine.verdict import (
@@ -101,7 +101,7 @@ class WeightedBridges(AbstractExactBridges):
     def weights(self) -> Float[Array, "*I n"]:
         """Return the weights, normalised to sum to one, shape (n,); all zero if there is no
         bridge."""
-        return normalised(self.log_weights)
+        return normalise_weights(self.log_weights)
 
     @property
     def effective_sample_size(self) -> Float[Array, "*I"]:
@@ -129,7 +129,7 @@ class WeightedBridges(AbstractExactBridges):
         is_truncated = jnp.any(self.truncated, axis=-1)
 
         def error(value):
-            mean, entry_weights = weighted_mean(weights, value), expanded(weights, value)
+            mean, entry_weights = weighted_mean(weights, value), align_axes(weights, value)
             # The delta method for a ratio of means: Σ w² (h - mean)², with Σ w = 1.
             deviation = value - jnp.expand_dims(mean, axis)
             # A value without weight may be infinite: 0 · ∞ would be NaN.
@@ -140,7 +140,7 @@ class WeightedBridges(AbstractExactBridges):
             value_or_inf = jnp.where(is_unknown, jnp.inf, jnp.sqrt(jnp.sum(squares, axis)))
             return jnp.where(jnp.isnan(mean), jnp.nan, value_or_inf)
 
-        return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
+        return jax.tree.map(error, evaluate_on_paths(fn, fill_missing_paths(self.paths, self.met)))
 
     @property
     def pareto_k(self) -> Float[Array, "*I"]:
@@ -201,7 +201,7 @@ class WeightedBridges(AbstractExactBridges):
         return jax.vmap(one_interval)(keys, self.weights, self.paths)
 
 
-@door
+@public_entry
 def weigh_bridges(
     key: Key[Array, ""],
     model: Diffusion,
@@ -301,7 +301,7 @@ def _weigh_bridges(key, model, pairs, bridges, search):
     )
 
 
-@door
+@public_entry
 def sample_weighted_bridges(
     key: Key[Array, ""],
     model: Diffusion,

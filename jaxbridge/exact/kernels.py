@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import (
     PathFunction,
-    expanded,
-    filled,
-    normalised,
-    values_of,
+    align_axes,
+    evaluate_on_paths,
+    fill_missing_paths,
+    normalise_weights,
     weighted_mean,
 )
 from ..engine.checks import Numbers, as_floating, is_traced
@@ -151,7 +151,7 @@ class Chain(AbstractExactBridges):
 
         It uses the effective sample size of the chain, which needs at least four states.
         """
-        weights, axis = normalised(self.log_mean_weights), self.met.ndim - 1
+        weights, axis = normalise_weights(self.log_mean_weights), self.met.ndim - 1
         size = effective_sample_size
         # With several intervals the chains are independent: one sample size for each.
         for _ in range(axis):
@@ -159,13 +159,13 @@ class Chain(AbstractExactBridges):
 
         def error(value):
             deviation = value - jnp.expand_dims(weighted_mean(weights, value), axis)
-            has_path = expanded(self.met, value)
+            has_path = align_axes(self.met, value)
             # States without a path carry no information, so they reduce the sample size.
             share = jnp.mean(has_path, axis=axis, dtype=value.dtype)
             sample_size = size(jnp.where(has_path, deviation, 0)) * share
             return jnp.sqrt(weighted_mean(weights, deviation**2) / sample_size)
 
-        return jax.tree.map(error, values_of(fn, filled(self.paths, self.met)))
+        return jax.tree.map(error, evaluate_on_paths(fn, fill_missing_paths(self.paths, self.met)))
 
 
 def acceptance_rate(

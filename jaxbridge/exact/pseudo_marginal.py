@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_key, nondifferentiable
 from ..engine.compiled import compiled_for, compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.keys import split_each
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import BridgeProblem
@@ -52,7 +52,7 @@ class PseudoMarginalInfo(NamedTuple):
     num_simulated: Int[Array, ""]
 
 
-@door
+@public_entry
 def pseudo_marginal(
     model: Diffusion,
     start: Numbers,
@@ -90,7 +90,7 @@ def pseudo_marginal(
     proposal.check_prepared(model)
     setting = (model, proposal, problem.intervals, num_steps)
 
-    @door
+    @public_entry
     def init(position, rng_key):
         check_key(rng_key)
         paths = check_position(position, problem)
@@ -98,7 +98,7 @@ def pseudo_marginal(
             return _propose_state(rng_key, *setting)[0]
         return _reweigh_state(rng_key, paths, *setting)
 
-    @door
+    @public_entry
     def step(rng_key, state):
         check_key(rng_key)
         return _pseudo_marginal_step(rng_key, state, *setting)

@@ -33,7 +33,7 @@ from ..coupling import (
 from ..engine.batch_size import default_num_lanes, most_lanes
 from ..engine.checks import Numbers, check_key, nondifferentiable
 from ..engine.compiled import compiled_for, compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.keys import split_each
 from ..engine.lanes import over_lanes, over_points
 from ..engine.progress import metered_while_loop
@@ -67,7 +67,7 @@ class RenewalInfo(NamedTuple):
     num_nonfinite: Int[Array, ""]
 
 
-@door
+@public_entry
 def renewal(
     model: Diffusion,
     start: Numbers,
@@ -101,7 +101,7 @@ def renewal(
     pairs.check_prepared(model)
     setting = (model, pairs, problem.intervals)
 
-    @door
+    @public_entry
     def init(position, rng_key):
         check_key(rng_key)
         paths = check_position(position, problem)
@@ -109,7 +109,7 @@ def renewal(
             paths, *_ = first_paths(rng_key[None], *setting, num_steps)
         return RenewalState(paths[0])
 
-    @door
+    @public_entry
     def step(rng_key, state):
         check_key(rng_key)
         return _renewal_step(rng_key, state, *setting)

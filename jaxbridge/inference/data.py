@@ -16,9 +16,9 @@ from ..engine.checks import (
     check_key,
     check_num_steps,
     check_precision,
+    count_steps,
+    index_without_compiling,
     is_traced,
-    steps_of_size,
-    taken,
 )
 from ..engine.compiled import compiled_sooner
 from ..engine.times import as_times, check_increasing
@@ -74,7 +74,10 @@ def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Inter
     if not is_traced(observations):
         _check_finite(np.asarray(observations))
         _check_state_space(model, observations)
-    before, after = taken(observations, slice(-1)), taken(observations, slice(1, None))
+    before, after = (
+        index_without_compiling(observations, slice(-1)),
+        index_without_compiling(observations, slice(1, None)),
+    )
     intervals, _, _ = as_intervals(before, after, known.gaps)
     return intervals
 
@@ -150,13 +153,17 @@ def step_groups(
     def group(which: Int[np.ndarray, " I"], num_steps: int) -> Group:
         if len(which) == len(durations):
             return Group(intervals, which, num_steps)
-        return Group(jax.tree.map(lambda leaf: taken(leaf, which), intervals), which, num_steps)
+        return Group(
+            jax.tree.map(lambda leaf: index_without_compiling(leaf, which), intervals),
+            which,
+            num_steps,
+        )
 
     durations = intervals.duration
     if step_size is None:
         num_steps = check_num_steps(50 if num_steps is None else num_steps, len(durations))
         return (group(np.arange(len(durations)), num_steps),)
-    wanted = steps_of_size(durations, num_steps, step_size)
+    wanted = count_steps(durations, num_steps, step_size)
     levels = np.ceil(np.log2(wanted) * _LEVELS_PER_OCTAVE)
     alike = [wanted[levels == level] for level in np.unique(levels)]
     ends = _cheapest_groups(
@@ -195,7 +202,7 @@ class Problem(NamedTuple):
     @property
     def like(self) -> Float[Array, " d"]:
         """A point of the state space."""
-        return taken(self.intervals.start, 0)
+        return index_without_compiling(self.intervals.start, 0)
 
     @property
     def sigma_is_unknown(self) -> bool:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.progress import metered_scan
 from ..engine.verdict import Fault
 from ..models.diffusion import Diffusion
@@ -133,7 +133,7 @@ class GibbsPosterior(AbstractPosterior):
         return Fault(jnp.any(jnp.min(late, axis=-1) > 0), _MISSING), Fault(jnp.any(often), _CUT_OFF)
 
 
-@door
+@public_entry
 def gibbs(
     key: Key[Array, ""],
     model: Diffusion,

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from ..engine.averages import proper
+from ..engine.averages import nan_to_neg_inf
 from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
@@ -175,7 +175,9 @@ class RecordLikelihood(AbstractLikelihood):
 
     def estimate(self, key, model):
         value, variance = self._estimate(key, model, self.fine)
-        return Estimate(proper(value), variance, jnp.full_like(value, jnp.nan), jnp.int32(0))
+        return Estimate(
+            nan_to_neg_inf(value), variance, jnp.full_like(value, jnp.nan), jnp.int32(0)
+        )
 
     def log_step_error(self, key, model):
         problem = self.fine.records.stacked

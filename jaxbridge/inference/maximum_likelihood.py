@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.arguments import check_choice
 from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
@@ -126,7 +126,7 @@ class MaximumLikelihood(AbstractResult):
         return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
 
 
-@door
+@public_entry
 def maximum_likelihood(
     key: Key[Array, ""],
     model: Diffusion,

@@ -29,7 +29,7 @@ from ..engine.checks import (
     nondifferentiable,
 )
 from ..engine.compiled import compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..engine.linalg import matvec
 from ..engine.progress import metered_stages
@@ -194,7 +194,7 @@ class PMMHPosterior(AbstractPosterior):
         )
 
 
-@door
+@public_entry
 def pmmh(
     key: Key[Array, ""],
     model: Diffusion,

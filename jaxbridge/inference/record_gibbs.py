@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.averages import proper
+from ..engine.averages import nan_to_neg_inf
 from ..engine.checks import nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.keys import key_for
@@ -161,7 +161,9 @@ class RecordSampler(eqx.Module):
         there = self.completion.at(jnp.where(inside, proposed, theta))
         new_paths, new_weight = self.completion.of_noise(there, noise)
         new = jnp.where(inside, new_weight + self.log_prior(there.theta), -jnp.inf)
-        rate = acceptance_rate(proper(log_weight) + self.log_prior(theta), proper(new))
+        rate = acceptance_rate(
+            nan_to_neg_inf(log_weight) + self.log_prior(theta), nan_to_neg_inf(new)
+        )
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
 
         number = state.num_done + 1
@@ -176,14 +178,14 @@ class RecordSampler(eqx.Module):
             jnp.where(learning, scales, log_scales),
             number,
         )
-        has_weight = proper(jnp.where(accepted, new_weight, log_weight)) > -jnp.inf
+        has_weight = nan_to_neg_inf(jnp.where(accepted, new_weight, log_weight)) > -jnp.inf
         return GuidedState(moved, guides), (accepted, has_weight, taken)
 
     def log_ratio(self, key: Key[Array, ""], guided: GuidedState) -> Float[Array, ""]:
         """log w̃ / w, of steps of twice the length."""
         (state, guides), completion = guided, self.completion
         noise, log_weight = completion.noise(key, At(state.theta, guides), state.paths)
-        ratio = proper(completion.coarse_log_weight(state.theta, noise)) - log_weight
+        ratio = nan_to_neg_inf(completion.coarse_log_weight(state.theta, noise)) - log_weight
         return jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Key, PyTree
 
-from ..engine.averages import proper
+from ..engine.averages import nan_to_neg_inf
 from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
 from ..records import (
@@ -256,7 +256,7 @@ def likely_root(
         model = parameters.bind(theta)
         _, log_weight = _of_noise(grid.records, model, _guides(grid, model), jnp.zeros_like(points))
         allowed = parameters.allowed(theta)
-        return jnp.where(allowed, proper(log_weight) + log_prior(theta), -jnp.inf)
+        return jnp.where(allowed, nan_to_neg_inf(log_weight) + log_prior(theta), -jnp.inf)
 
     def turn(width, _):
         steps = jnp.diag(width)

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.averages import effective_size, expanded, normalised
+from ..engine.averages import align_axes, effective_size, normalise_weights
 from ..engine.checks import Numbers, check_count, nondifferentiable
 from ..engine.compiled import compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.pareto import pareto_k
 from ..engine.progress import metered_scan
 from ..engine.verdict import (
@@ -96,7 +96,7 @@ class Score(AbstractResult):
         )
 
 
-@door
+@public_entry
 def score(
     key: Key[Array, ""],
     model: Diffusion,
@@ -333,7 +333,7 @@ def _of_block(
     all_bridges = (*made[:4], made.rises)
     all_bridges = (join(leaf, at_once)[:, :num_bridges] for leaf in all_bridges)
     log_weights, truncated, g, H, rises = all_bridges
-    weights = normalised(log_weights)
+    weights = normalise_weights(log_weights)
     mean = jnp.sum(weights[..., None] * g, axis=1)
     deviation = g - mean[:, None]
     products = deviation[..., :, None] * deviation[..., None, :]
@@ -360,7 +360,7 @@ def _rises(
     weights: Float[Array, "I n"], each: Float[Array, "I n *shape"]
 ) -> Float[Array, "*shape"]:
     """Σ over intervals of the log of the weighted mean of exponentials, of those with bridges."""
-    weights = expanded(weights, each)
+    weights = align_axes(weights, each)
     used = (weights > 0) & (each < jnp.inf)
     largest = jnp.max(jnp.where(used, each, -jnp.inf), axis=1, keepdims=True)
     largest = jnp.where(jnp.isfinite(largest), largest, 0)

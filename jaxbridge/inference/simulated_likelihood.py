@@ -28,7 +28,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.averages import effective_size, normalised
+from ..engine.averages import effective_size, normalise_weights
 from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.pareto import pareto_k
@@ -264,7 +264,7 @@ def _of_block(
 
     at_theta = jnp.zeros_like(theta)
     information = -jax.jacfwd(jax.grad(total))(at_theta)
-    weights = normalised(jnp.where(found, made, -jnp.inf))
+    weights = normalise_weights(jnp.where(found, made, -jnp.inf))
     mean = jnp.sum(weights[..., None] * g, axis=1, keepdims=True)
     deviation = weights[..., None] * (g - mean)
     some = jnp.any(found, axis=1)

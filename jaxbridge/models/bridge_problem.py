@@ -21,7 +21,7 @@ from ..engine.checks import (
     check_precision,
     is_traced,
 )
-from ..engine.keys import numbered
+from ..engine.keys import first_keys
 from .diffusion import Diffusion, check_diffusion
 
 
@@ -92,7 +92,7 @@ class BridgeProblem(eqx.Module):
 
     def keys(self, key: Key[Array, ""], num: int) -> Key[Array, "I num"]:
         """Return `num` random keys per interval, shape (I, num)."""
-        return numbered(key, self.num_intervals * num).reshape(self.num_intervals, num)
+        return first_keys(key, self.num_intervals * num).reshape(self.num_intervals, num)
 
     def result(self, tree: PyTree) -> PyTree:
         """Return `tree`, whose arrays have an axis I; drop this axis unless the problem is

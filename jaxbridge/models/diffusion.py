@@ -37,8 +37,8 @@ from ..engine.checks import (
     cast_floats,
     check_key,
     check_precision,
+    drop_weak_type,
     is_traced,
-    settled,
 )
 from ..engine.linalg import lower_factor
 from . import decisions
@@ -745,12 +745,12 @@ def _as_leaf(leaf):
     """
     # Without weak types a Python float and an array share one compiled program.
     if isinstance(leaf, float):
-        return settled(as_array(float(leaf)))
+        return drop_weak_type(as_array(float(leaf)))
     arrays = np.ndarray | np.generic | jax.Array
     if not isinstance(leaf, arrays):
         return leaf
     try:
-        return settled(as_array(leaf))
+        return drop_weak_type(as_array(leaf))
     except (TypeError, ValueError) as error:
         raise TypeError(
             f"arrays in `params` must hold numbers; got an array of dtype {leaf.dtype}."

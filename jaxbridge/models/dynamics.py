@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..engine.linalg import total
+from ..engine.linalg import sum_first_axis
 from .sigma import AbstractSigma
 from .tracing import uses_argument
 
@@ -62,7 +62,7 @@ def weighted_divergence(
         def column(direction):
             return jax.jvp(lambda y: product(y, direction), (x,), (direction,))[1]
 
-        flux += total(jax.vmap(column)(jnp.eye(x.shape[0], dtype=x.dtype)))
+        flux += sum_first_axis(jax.vmap(column)(jnp.eye(x.shape[0], dtype=x.dtype)))
     return flux
 
 

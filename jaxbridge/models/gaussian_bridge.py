@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 
 from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.compiled import compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.linalg import any_cholesky, any_solve
 from .diffusion import Diffusion
 from .ornstein_uhlenbeck import (
@@ -84,7 +84,7 @@ def _paths(bridge: GaussianBridge, key, num_paths):
     return params.mean + jnp.moveaxis(path[:-1], 0, 1) + correction
 
 
-@door
+@public_entry
 def gaussian_bridge(
     model: Diffusion,
     start: Numbers,

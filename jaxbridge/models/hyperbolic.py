@@ -13,12 +13,12 @@ from jax import lax
 from jaxtyping import Array, Float, Key
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.linalg import dot
 from .diffusion import Diffusion, check_dimension
 
 
-@door
+@public_entry
 def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
     """Return the hyperbolic diffusion `dX = -α X / √(1+|X|²) dt + dW` in R^dim: equation
     (hyperbolicsde).

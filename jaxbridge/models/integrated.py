@@ -6,11 +6,11 @@ import functools
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..engine.doors import guards_off
+from ..engine.entry import disable_guards
 from .diffusion import Diffusion, check_diffusion, halves
 
 
-@guards_off
+@disable_guards
 def integrated(model: Diffusion) -> Diffusion:
     """Return the model of a diffusion X and its integral Z: the state is (Z, X), shape (2d,), with
 

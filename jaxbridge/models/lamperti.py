@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, Key, PyTree
 
 from ..engine.checks import Numbers, as_floating, check_count, is_traced
 from ..engine.compiled import compiled_sooner
-from ..engine.doors import guards_off
+from ..engine.entry import disable_guards
 from .diffusion import Diffusion, check_diffusion
 from .transform import Transformed, of_points
 
@@ -33,7 +33,7 @@ from .transform import Transformed, of_points
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 
-@guards_off
+@disable_guards
 def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 400) -> Transformed:
     """Return the one-dimensional model of Y = ∫_a^X du/σ(u), which has σ = 1.
 

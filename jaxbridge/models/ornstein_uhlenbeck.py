@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from ..engine.checks import Numbers, as_floating, check_precision, is_traced
 from ..engine.compiled import compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.linalg import any_cholesky, any_inverse, any_log_abs_det, dot, matvec, solve
 from .bridge_problem import as_intervals
 from .diffusion import Diffusion, check_dimension, check_invertible
@@ -68,7 +68,7 @@ class _Prepared(NamedTuple):
     reverse_B: Float[Array, "d d"]
 
 
-@door
+@public_entry
 def ornstein_uhlenbeck(
     B: Numbers, mean: Numbers | None = None, sigma: Numbers | None = None
 ) -> Diffusion:

@@ -33,7 +33,7 @@ from ..engine.linalg import (
     matvec,
     solve,
     solve_lower,
-    total,
+    sum_first_axis,
 )
 
 NO_INVERSE = (
@@ -158,7 +158,7 @@ class Diagonal(AbstractSigma):
         return Diagonal((self.diagonal + other.diagonal) / 2)
 
     def log_abs_det(self):
-        return total(jnp.log(jnp.abs(self.diagonal)))
+        return sum_first_axis(jnp.log(jnp.abs(self.diagonal)))
 
     def as_matrix(self, dim, dtype):
         return jnp.diag(self.diagonal)
@@ -212,7 +212,7 @@ class Triangular(AbstractMatrix):
         return solve_lower(self.matrix, vector)
 
     def log_abs_det(self):
-        return total(jnp.log(jnp.diagonal(self.matrix)))
+        return sum_first_axis(jnp.log(jnp.diagonal(self.matrix)))
 
     def root(self):
         return self

@@ -13,14 +13,14 @@ from jaxtyping import Array, Float, Key
 from ..engine.arguments import check_instance, shown
 from ..engine.checks import Numbers, as_floating, check_count, check_key, check_num_steps
 from ..engine.compiled import compiled
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.times import as_times, check_increasing, check_resolved
 from .diffusion import Diffusion, check_diffusion
 from .dynamics import Dynamics, ito_correction
 from .sigma import AbstractSigma, Diagonal
 
 
-@door
+@public_entry
 def simulate(
     key: Key[Array, ""],
     model: Diffusion,

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.checks import is_traced, nondifferentiable_choice, taken
+from ..engine.checks import index_without_compiling, is_traced, nondifferentiable_choice
 from ..engine.pareto import is_reliable
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
@@ -85,7 +85,7 @@ class Choice(AbstractWeightedProposal):
 
     def of(self, which):
         seconds, efficiency, step_error, shape, chosen = (
-            taken(leaf, (..., which))
+            index_without_compiling(leaf, (..., which))
             for leaf in (self.seconds, self.efficiency, self.step_error, self.pareto_k, self.chosen)
         )
         told = (seconds, efficiency, step_error, shape, chosen)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, Key
 
-from ..engine.devices import over_devices, share
+from ..engine.devices import lanes_per_device, over_devices
 from ..engine.progress import metered_scan, metered_while_loop
 from ..models.bridge_problem import Intervals
 from .base import WeightedPaths
@@ -22,7 +22,9 @@ def block_over_devices(function: Block) -> Block:
 
     def split(keys, intervals, active):
         num_intervals, num_draws = keys.shape
-        if share(num_intervals) * num_draws <= num_intervals * share(num_draws):
+        if lanes_per_device(num_intervals) * num_draws <= num_intervals * lanes_per_device(
+            num_draws
+        ):
             return over_devices(function, (0, 0, 0))(keys, intervals, active)
         return over_devices(function, (1, None, None), out_axis=1)(keys, intervals, active)
 

@@ -44,11 +44,11 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.averages import effective_size, normalised
+from ..engine.averages import effective_size, normalise_weights
 from ..engine.checks import is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.keys import key_for
-from ..engine.pareto import most_reliable, pareto_k
+from ..engine.pareto import largest_reliable_k, pareto_k
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..schemes import guessed
@@ -180,7 +180,7 @@ def _repeated(key: Key[Array, ""], pilots: list[_Pilot]) -> list[_Pilot]:
     the intervals where no candidate has enough effective paths of light tails."""
     sizes = [_size(pilot.seen.efficiency, pilot.seen.num_simulated) for pilot in pilots]
     shapes = [np.asarray(pilot.seen.pareto_k) for pilot in pilots]
-    light = [~(shape >= most_reliable(10**9)) for shape in shapes]  # NaN is of too few to tell
+    light = [~(shape >= largest_reliable_k(10**9)) for shape in shapes]  # NaN is of too few to tell
     best = np.max([np.where(ok, size, 0) for size, ok in zip(sizes, light, strict=True)], axis=0)
     poor = best < _FEWEST_EFFECTIVE
     return [
@@ -276,9 +276,9 @@ def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
     """
     num_intervals, n = log_weights.shape
     eighth = max(n // 8, 1)
-    share = effective_size(normalised(log_weights)) / n
+    share = effective_size(normalise_weights(log_weights)) / n
     parts = log_weights[:, : n // eighth * eighth].reshape(num_intervals, -1, eighth)
-    share_of_part = jnp.mean(effective_size(normalised(parts)), axis=1) / eighth
+    share_of_part = jnp.mean(effective_size(normalise_weights(parts)), axis=1) / eighth
     fall = jnp.minimum(share / jnp.where(share_of_part > 0, share_of_part, 1), 1)
     return n * share * fall**2
 

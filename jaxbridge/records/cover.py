@@ -26,7 +26,7 @@ import numpy as np
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
-from ..engine.averages import normalised, proper
+from ..engine.averages import nan_to_neg_inf, normalise_weights
 from ..engine.linalg import cholesky, is_finite, matmul, matvec, solve_lower
 from ..models.diffusion import Diffusion
 from .guided_steps import GuidedLaw, guided_start
@@ -86,7 +86,7 @@ class CoveredStart(NamedTuple):
 
 def chosen(log_shares: Float[Array, " J"], positions: Float[Array, " n"]):
     """Which are at these positions of [0, 1), in the order in which they come."""
-    bounds = jnp.cumsum(normalised(proper(log_shares)))
+    bounds = jnp.cumsum(normalise_weights(nan_to_neg_inf(log_shares)))
     bounds = bounds / jnp.maximum(bounds[-1], jnp.finfo(bounds.dtype).tiny)
     return jnp.minimum(jnp.searchsorted(bounds, positions, side="right"), len(bounds) - 1)
 
@@ -105,7 +105,7 @@ def cover(model: Diffusion, normal: NormalStep) -> Cover:
     for key in keys[1:]:
         points = law.points(evenly, jax.random.normal(key, (_NUM_KERNELS, d), dtype))
         log_ratio = jax.vmap(lambda x, law=law: model.log_stationary(x) - law.log_density(x))
-        law = _fitted(points, proper(log_ratio(points)), normal)
+        law = _fitted(points, nan_to_neg_inf(log_ratio(points)), normal)
     return law
 
 
@@ -116,7 +116,7 @@ def _fitted(
     (M, d), dtype = points.shape, points.dtype
     finite = jnp.all(is_finite(points), axis=1)
     points = jnp.where(finite[:, None], points, normal.mean)
-    weights = normalised(jnp.where(finite, log_weights, -jnp.inf))
+    weights = normalise_weights(jnp.where(finite, log_weights, -jnp.inf))
     mean = weights @ points
     # Some of the normal law's own, for draws that are all one point.
     S = (points - mean).T @ (weights[:, None] * (points - mean))

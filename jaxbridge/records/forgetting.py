@@ -27,7 +27,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ..engine.averages import proper
+from ..engine.averages import nan_to_neg_inf
 from .particle_filter import Filtered
 from .several import Records
 
@@ -97,7 +97,7 @@ def _score_and_variance(
     log_estimate, R = _not_lost(filtered.log_estimate), filtered.log_estimate.shape[1]
     variance = _variance(log_estimate, filtered, num_particles)
     mean = jnp.sum(jnp.mean(log_estimate, axis=1))
-    return proper(mean - 2 * jnp.sqrt(variance / R)), variance
+    return nan_to_neg_inf(mean - 2 * jnp.sqrt(variance / R)), variance
 
 
 def _not_lost(log_estimate: Float[Array, "records R"]) -> Float[Array, "records R"]:
@@ -124,7 +124,7 @@ def rate_for_several(
     def mean_and_equal(filtered: Filtered):
         log_estimate = _not_lost(filtered.log_estimate)
         variance = _variance(log_estimate, filtered, num_particles)
-        return proper(jnp.sum(jnp.mean(log_estimate, axis=1))), variance < _ALL_EQUAL
+        return nan_to_neg_inf(jnp.sum(jnp.mean(log_estimate, axis=1))), variance < _ALL_EQUAL
 
     def tried(settled, rate):
         def try_it():

@@ -16,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ..engine.averages import proper
+from ..engine.averages import nan_to_neg_inf
 from ..engine.captured import without_captured_derivatives
 from ..engine.checks import all_finite_leaves, without_derivatives
 from ..engine.compiled import compiled_sooner, is_outermost
@@ -157,7 +157,7 @@ def _path_without_noise(
         hidden = jnp.zeros_like(guide.first.values)
         noise = noise.at[0].set(guide.start.noise_and_log_weight(begin, solve, hidden)[0])
     path, log_weight = path_and_log_weight(problem, model, guide, noise)
-    return path, proper(log_weight)
+    return path, nan_to_neg_inf(log_weight)
 
 
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..engine.lanes import hold
+from ..engine.lanes import compute_once
 from ..engine.linalg import dot
 from ..models.dynamics import DynamicsAt
 from ..schemes import AbstractStepDensity, DegenerateLaw, StepLaw
@@ -62,7 +62,7 @@ class GuidedLaw(NamedTuple):
     ) -> tuple[Float[Array, " d"], Float[Array, ""]]:
         """Return where the noise ζ ~ N(0, I) leads, and the log weight of the step."""
         # Point and weight would else compute it twice.
-        pulled = hold(self.tilted.pulled(zeta))
+        pulled = compute_once(self.tilted.pulled(zeta))
         point = self.origin + self.tilted.point(pulled)
         return point, self.log_seen + self.tilted.log_ratio(zeta, pulled)
 

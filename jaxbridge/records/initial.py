@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..coupling import Stationary
 from ..engine.arguments import as_returned, check_function, evaluated
-from ..engine.averages import effective_size, normalised, proper
+from ..engine.averages import effective_size, nan_to_neg_inf, normalise_weights
 from ..engine.captured import Captured
 from ..engine.checks import as_floating, is_traced
 from ..engine.linalg import (
@@ -158,7 +158,7 @@ def _stationary(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     if is_normal(model, like):
         return mode
     points, log_weights = ladder(model, mode)
-    weights = normalised(log_weights)
+    weights = normalise_weights(log_weights)
     mean = weights @ points
     away = points - mean
     lack = 1 / (1 + effective_size(weights) / _ENOUGH) ** 2
@@ -179,7 +179,7 @@ def ladder(model: Diffusion, mode: NormalStep) -> tuple[Float[Array, "n d"], Flo
     # Of all laws, up to what they have in common.
     log_laws = -square[:, None] / (2 * widths**2) - d * jnp.log(widths)
     log_nu = jax.vmap(lambda x: model.log_stationary(x))(points)
-    return points, proper(log_nu - logsumexp(log_laws, axis=1))
+    return points, nan_to_neg_inf(log_nu - logsumexp(log_laws, axis=1))
 
 
 def likeliest(
@@ -193,7 +193,7 @@ def likeliest(
     points, _ = ladder(model, normal)
     log_nu = model.prepared().log_stationary
     logs = jax.vmap(lambda x: log_nu(x) + log_density_of(noisy, x))(points)
-    best, known = jnp.argmax(proper(logs)), jnp.any(logs > -jnp.inf)
+    best, known = jnp.argmax(nan_to_neg_inf(logs)), jnp.any(logs > -jnp.inf)
     return jnp.where(known, points[best], normal.mean)
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.checks import Numbers, is_traced
 from ..engine.compiled import compiled
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.verdict import Fault, Verdict
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
@@ -131,7 +131,7 @@ def _path_and_log_weight(problem: RecordProblem, points, params: PyTree, xi):
     return path, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
 
 
-@door
+@public_entry
 def innovations(
     model: Diffusion,
     times: Numbers,

@@ -24,9 +24,9 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.keys import key_for
-from ..engine.pareto import most_reliable
+from ..engine.pareto import largest_reliable_k
 from ..engine.times import as_times, check_increasing
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..exact import log_mean_and_error, transition_log_density
@@ -159,7 +159,7 @@ class LogLikelihood(AbstractResult):
 
     @property
     def _is_heavy(self) -> Bool[Array, ""]:
-        return jnp.any(self.pareto_k > most_reliable(self.num_weights) + _LARGEST_OF_MANY)
+        return jnp.any(self.pareto_k > largest_reliable_k(self.num_weights) + _LARGEST_OF_MANY)
 
     @property
     def _missing(self) -> Float[Array, ""]:
@@ -173,7 +173,7 @@ class LogLikelihood(AbstractResult):
         return counted & jnp.isfinite(self.value) & (self.standard_error < _MOST_SPREAD)
 
 
-@door
+@public_entry
 def log_likelihood(
     key: Key[Array, ""],
     model: Diffusion,

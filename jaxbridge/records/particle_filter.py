@@ -17,7 +17,7 @@ from jax import lax
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from ..engine.averages import effective_size, normalised
+from ..engine.averages import effective_size, normalise_weights
 from ..engine.lanes import over_lanes
 from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
@@ -96,7 +96,7 @@ def run_filters(
         finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & (change < most)
         log_weight = jnp.where(finite, log_weight, -jnp.inf)
         lost = jnp.sum(~finite & (state.log_weight > -jnp.inf), axis=1, dtype=jnp.int32)
-        weights = normalised(log_weight)
+        weights = normalise_weights(log_weight)
         size, relative = effective_size(weights), jnp.log(weights).ravel()
         state = state._replace(log_weight=log_weight, num_nonfinite=state.num_nonfinite + lost)
         poor = _is_poor(size, P)
@@ -177,7 +177,7 @@ def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) 
     """Those filters whose particles are poor with particles that are alike."""
     R, P = state.log_weight.shape
     dtype = state.log_weight.dtype
-    weights = normalised(state.log_weight)
+    weights = normalise_weights(state.log_weight)
     uniform = jax.random.uniform(key, (R, 1), dtype)
     positions = (uniform + jnp.arange(P, dtype=dtype)) / P
     bounds = jnp.cumsum(weights, axis=1)

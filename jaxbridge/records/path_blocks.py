@@ -28,7 +28,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.averages import proper
+from ..engine.averages import nan_to_neg_inf
 from ..engine.lanes import over_lanes
 from ..engine.linalg import matvec
 from ..exact import acceptance_rate
@@ -249,7 +249,7 @@ def move(
     lanes = _lanes_of(blocks, scale, paths)
     first = _new_starts(start_key, problem, model, blocks, lanes)
     last, new = _new_points(noise_key, problem, model, blocks, lanes, first)
-    rate = acceptance_rate(proper(last.log_old), proper(last.log_new))
+    rate = acceptance_rate(nan_to_neg_inf(last.log_old), nan_to_neg_inf(last.log_new))
     accepted = jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate
 
     # The blocks one after the other, without what reaches beyond the record.

@@ -19,9 +19,9 @@ from ..engine.checks import (
     as_floating,
     check_num_steps,
     check_precision,
+    count_steps,
     is_traced,
     missing_as_nan,
-    steps_of_size,
 )
 from ..engine.compiled import compiled_sooner
 from ..engine.times import Clock, Times, as_times, check_increasing
@@ -260,7 +260,7 @@ def _segments(
     if step_size is None:
         num_steps = check_num_steps(10 if num_steps is None else num_steps, gaps.shape[0])
         return num_steps, np.ones(gaps.shape[0], int)
-    wanted = steps_of_size(gaps, num_steps, step_size)
+    wanted = count_steps(gaps, num_steps, step_size)
 
     def cost(steps: int) -> int:
         return int(np.sum(-(-wanted // steps)) * (steps + _STEPS_PER_SEGMENT))

@@ -14,11 +14,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.averages import PathFunction, path_function
+from ..engine.averages import PathFunction, as_path_function
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
@@ -191,11 +191,11 @@ class Smoothed(AbstractResult):
 
     def _values(self, fn: PathFunction) -> PyTree:
         like = jax.ShapeDtypeStruct(self.paths.shape[-2:], self.paths.dtype)
-        values = jax.vmap(jax.vmap(path_function("fn", fn, like)))(self.paths)
+        values = jax.vmap(jax.vmap(as_path_function("fn", fn, like)))(self.paths)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, self.paths.dtype), values)
 
 
-@door
+@public_entry
 def smooth(
     key: Key[Array, ""],
     model: Diffusion,

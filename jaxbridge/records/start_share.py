@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
-from ..engine.averages import proper
+from ..engine.averages import nan_to_neg_inf
 from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
 from .cover import cover, covered_start
@@ -43,7 +43,7 @@ def start_share(
         seen = of_first(split_first(problem.rows)[0], x)
         to_cover = log_nu(x) - law.log_density(x) + start.log_integral
         to_normal = log_ratio(problem.initial, model, guide.initial, x) + guide.start.log_integral
-        return proper(seen + to_cover), proper(seen + to_normal)
+        return nan_to_neg_inf(seen + to_cover), nan_to_neg_inf(seen + to_normal)
 
     to_cover, to_normal = jax.vmap(both, in_axes=-1)(start.points(positions, zeta))
     log_num = math.log(_NUM_DRAWS)

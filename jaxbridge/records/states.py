@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..coupling import Coupling, Stationary, with_start_law
-from ..engine.averages import proper
+from ..engine.averages import nan_to_neg_inf
 from ..engine.checks import is_traced, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.keys import key_for
@@ -115,7 +115,7 @@ class StateSampler(eqx.Module):
             logs = logs.at[:, 0].add(jax.vmap(self.model.log_stationary)(x[:, 0]))
         elif isinstance(law, GaussianLaw):
             logs = logs.at[:, 0].add(jax.vmap(law.log_density)(x[:, 0]))
-        return proper(logs)
+        return nan_to_neg_inf(logs)
 
     def log_q(self, x: Float[Array, "C ends d"]) -> Float[Array, "C ends"]:
         """log q up to a constant."""
@@ -135,7 +135,7 @@ class StateSampler(eqx.Module):
         intervals = Intervals(x[:, :-1].reshape(num, d), x[:, 1:].reshape(num, d), durations)
         keys = jax.random.split(draw_key, (num, self.num_proposals))
         drawn = self.proposal.draw(keys, self.model, intervals, self.problem.num_steps, None, True)
-        log_weights = proper(drawn.log_weights)
+        log_weights = nan_to_neg_inf(drawn.log_weights)
         picked = jax.random.categorical(pick_key, log_weights)
         paths = jnp.take_along_axis(drawn.paths, picked[:, None, None, None], axis=1)[:, 0]
         log_mean = jax.nn.logsumexp(log_weights, axis=1) - math.log(self.num_proposals)
@@ -163,7 +163,7 @@ class StateSampler(eqx.Module):
             log_q = jnp.where(walk, 0, self.log_q(state.x))
             return beside[:, :-1] + beside[:, 1:] + self.log_target(state.x) - log_q
 
-        rate = acceptance_rate(proper(of_states(state)), proper(of_states(new)))
+        rate = acceptance_rate(nan_to_neg_inf(of_states(state)), nan_to_neg_inf(of_states(new)))
         accepted = mine & (jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate)
         beside = accepted[:, :-1] | accepted[:, 1:]
         return States(

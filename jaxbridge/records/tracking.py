@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int, Key
 
-from ..engine.averages import normalised, proper
+from ..engine.averages import nan_to_neg_inf, normalise_weights
 from ..engine.lanes import over_lanes
 from ..engine.linalg import dot, matvec
 from ..models.diffusion import Diffusion
@@ -66,7 +66,7 @@ def tracking_path(
     zeta = jax.random.normal(start_key, (d, P), dtype)
     starts = over_lanes(-1)(lambda zeta: initial.mean + matvec(initial.root, zeta))(zeta)
     ratio = over_lanes(-1)(lambda x: log_ratio(problem.initial, model, initial, x))(starts)
-    parents = _parents(uniform_key, log_weights(starts, first) + proper(ratio))
+    parents = _parents(uniform_key, log_weights(starts, first) + nan_to_neg_inf(ratio))
     inputs = 1 + jnp.arange(problem.num_segments), problem.record.steps(), rest
     _, (paths, later) = lax.scan(segment, starts[:, parents], inputs)
 
@@ -100,7 +100,7 @@ def _tempered(misfits: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
 def _parents(key: Key[Array, ""], log_weights: Float[Array, " lanes"]) -> Int[Array, " lanes"]:
     """Return the lanes that go on, by systematic resampling."""
     P, dtype = len(log_weights), log_weights.dtype
-    bounds = jnp.cumsum(normalised(proper(log_weights)))
+    bounds = jnp.cumsum(normalise_weights(nan_to_neg_inf(log_weights)))
     positions = (jax.random.uniform(key, (), dtype) + jnp.arange(P, dtype=dtype)) / P
     lanes = jnp.searchsorted(bounds / jnp.maximum(bounds[-1], jnp.finfo(dtype).tiny), positions)
     return jnp.minimum(lanes, P - 1).astype(jnp.int32)

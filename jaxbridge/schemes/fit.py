@@ -4,7 +4,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..engine.checks import all_finite_leaves, is_traced, taken
+from ..engine.checks import all_finite_leaves, index_without_compiling, is_traced
 from ..engine.compiled import compiled_sooner
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion, check_invertible
@@ -17,7 +17,7 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
 
     Shapes are checked wherever the model's functions are traced, so here only values are.
     """
-    model.check_invertible_sigma(taken(intervals.start, 0))
+    model.check_invertible_sigma(index_without_compiling(intervals.start, 0))
     if is_traced(model, intervals.start, intervals.end):
         return
     for name, points in [("start", intervals.start), ("end", intervals.end)]:

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 from jaxtyping import Array, Float
 
-from ..engine.lanes import hold
+from ..engine.lanes import compute_once
 from ..models import decisions
 from ..models.dynamics import Dynamics, ito_correction
 from .base import AbstractScheme
@@ -38,7 +38,7 @@ class Heun(AbstractScheme):
     def step(self, dynamics, x, dt, dw):
         drift, sigma = self._stratonovich_drift(dynamics, x), dynamics.sigma(x)
         # Computed before the drift there is, which would else compute it anew for each part.
-        predicted = hold(x + drift * dt + sigma.mv(dw))
+        predicted = compute_once(x + drift * dt + sigma.mv(dw))
         drift = (drift + self._stratonovich_drift(dynamics, predicted)) / 2
         return x + drift * dt + sigma.average(dynamics.sigma(predicted)).mv(dw)
 

@@ -46,9 +46,9 @@ from jaxtyping import Array, Float
 from ..engine.arguments import check_choice
 from ..engine.checks import Numbers, as_floating, check_precision, is_traced
 from ..engine.compiled import compiled
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.lanes import over_lanes
-from ..engine.linalg import dot, total
+from ..engine.linalg import dot, sum_first_axis
 from ..engine.times import as_times, check_increasing
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.dynamics import Dynamics
@@ -57,7 +57,7 @@ from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
 Form = Literal["girsanov", "trapezoid", "ito_taylor", "ito", "euler"]
 
 
-@door
+@public_entry
 def path_log_likelihood(
     model: Diffusion, times: Numbers, path: Numbers, *, form: Form | None = None
 ) -> Float[Array, "*batch"]:
@@ -198,7 +198,7 @@ def _ito(model: Diffusion, dynamics: Dynamics, steps, points) -> Float[Array, " 
         """½ [div α + αᵀ V⁻¹ α]."""
         alpha, slope = jax.linearize(dynamics.drift, x)
         directions = [jnp.asarray(direction, x.dtype) for direction in np.eye(x.shape[0])]
-        divergence = total(jnp.stack([slope(e)[i] for i, e in enumerate(directions)]))
+        divergence = sum_first_axis(jnp.stack([slope(e)[i] for i, e in enumerate(directions)]))
         beta = dynamics.sigma(x).root().solve(alpha)
         return (divergence + dot(beta, beta)) / 2
 
@@ -222,7 +222,7 @@ def _trapezoid(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
     before, (after, slope) = dynamics.drift(x), jax.linearize(dynamics.drift, x_next)
     before, after, dw = (sigma.solve(vector) for vector in (before, after, x_next - x))
     units = [jnp.asarray(unit, x.dtype) for unit in np.eye(x.shape[0])]
-    divergence = total(jnp.stack([slope(unit)[i] for i, unit in enumerate(units)]))
+    divergence = sum_first_axis(jnp.stack([slope(unit)[i] for i, unit in enumerate(units)]))
     squares = dot(before, before) + dot(after, after)
     return dot(before + after, dw) / 2 - dt / 4 * squares - dt / 2 * divergence
 

@@ -47,8 +47,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..engine.lanes import hold
-from ..engine.linalg import matmul, semidefinite_factor, total
+from ..engine.lanes import compute_once
+from ..engine.linalg import matmul, semidefinite_factor, sum_first_axis
 from ..models.dynamics import Dynamics
 from ..models.sigma import columns_of
 from .step_law import DegenerateLaw, StepLaw, root_of_length
@@ -165,10 +165,10 @@ class ItoTaylorDensity(AbstractStepDensity):
         along = [_along(dynamics.drift, x, column) for column in columns_of(sigma, x)]
         slopes, bends = zip(*along, strict=True)
         # What is made of them would else compute them anew for each of its numbers.
-        drift, slopes, bends = hold((dynamics.drift(x), slopes, bends))
+        drift, slopes, bends = compute_once((dynamics.drift(x), slopes, bends))
         beta = sigma.solve(drift)
         # σ (Aβ + ½ Δβ), and A with columns σ⁻¹ (∇α σ_k).
-        bent = total(jnp.stack([slopes[k] * beta[k] + bends[k] / 2 for k in range(d)]))
+        bent = sum_first_axis(jnp.stack([slopes[k] * beta[k] + bends[k] / 2 for k in range(d)]))
         A = jnp.stack([sigma.solve(slope) for slope in slopes], axis=1)
         twice, square, identity = A + A.T, matmul(A, A.T), jnp.eye(d, dtype=x.dtype)
 
@@ -269,7 +269,7 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
     columns = columns_of(sigma, x)
     slopes, bends = zip(*[_along(dynamics.drift, x, column) for column in columns], strict=True)
     # Fα + ½ Σ_k ∂²α(σ_k, σ_k), and Fσ.
-    bent = jax.jvp(dynamics.drift, (x,), (drift,))[1] + total(jnp.stack(bends)) / 2
+    bent = jax.jvp(dynamics.drift, (x,), (drift,))[1] + sum_first_axis(jnp.stack(bends)) / 2
     direct, early = jnp.stack(columns, axis=1), jnp.stack(slopes, axis=1)
     late = None  # ∇σ α
     if dynamics.sigma_varies:

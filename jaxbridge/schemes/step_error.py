@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Inexact
 
-from ..engine.averages import effective_size, expanded, normalised, weighted_mean
+from ..engine.averages import align_axes, effective_size, normalise_weights, weighted_mean
 from ..engine.linalg import spectral_radius
 from ..engine.verdict import Fault
 from ..models.bridge_problem import Intervals
@@ -92,7 +92,7 @@ def error_of_coupled_grids(
     """
     looked = ~jnp.isnan(log_coarse)
     logs = [jnp.where(looked, log, -jnp.inf) for log in (log_weights, log_coarse)]
-    weights, coarse = (normalised(log) for log in logs)
+    weights, coarse = (normalise_weights(log) for log in logs)
     fine_sum, coarse_sum = (logsumexp(log, axis=-1) for log in logs)
     some = jnp.isfinite(fine_sum) & jnp.isfinite(coarse_sum)
     change = jnp.where(some, coarse_sum, 0) - jnp.where(some, fine_sum, 0)
@@ -125,12 +125,14 @@ def error_of_mean(
     coarse_values = values if coarse_values is None else coarse_values
     weights, known = _known(log_weights, log_halving)
     D = jnp.where(known, log_halving, -jnp.inf)
-    coarse = normalised(jnp.where(weights > 0, jnp.log(jnp.where(weights > 0, weights, 1)) + D, D))
+    coarse = normalise_weights(
+        jnp.where(weights > 0, jnp.log(jnp.where(weights > 0, weights, 1)) + D, D)
+    )
     axis = weights.ndim - 1
     fine_mean, coarse_mean = weighted_mean(weights, values), weighted_mean(coarse, coarse_values)
-    each = expanded(coarse, values) * (coarse_values - jnp.expand_dims(coarse_mean, axis))
-    each -= expanded(weights, values) * (values - jnp.expand_dims(fine_mean, axis))
-    spread = jnp.sqrt(jnp.sum(jnp.where(expanded(known, values), each, 0) ** 2, axis))
+    each = align_axes(coarse, values) * (coarse_values - jnp.expand_dims(coarse_mean, axis))
+    each -= align_axes(weights, values) * (values - jnp.expand_dims(fine_mean, axis))
+    spread = jnp.sqrt(jnp.sum(jnp.where(align_axes(known, values), each, 0) ** 2, axis))
     overlap = _overlap(weights, coarse)
     share, overlap = (
         leaf.reshape(*leaf.shape, *[1] * (spread.ndim - leaf.ndim)) for leaf in (share, overlap)
@@ -249,7 +251,7 @@ def _known(
     not a number though it was worked out is that of steps out of all proportion: -∞."""
     looked = ~jnp.isnan(log_halving)
     known = looked & (log_weights > -jnp.inf)
-    return normalised(jnp.where(known, log_weights, -jnp.inf)), known
+    return normalise_weights(jnp.where(known, log_weights, -jnp.inf)), known
 
 
 def _told(share, change, spread, some):

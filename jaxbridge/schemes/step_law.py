@@ -20,7 +20,7 @@ from ..engine.linalg import (
     quadratic_form,
     semidefinite_factor,
     solve_lower,
-    total,
+    sum_first_axis,
 )
 from ..models.sigma import AbstractSigma
 
@@ -156,7 +156,7 @@ class DegenerateLaw(NamedTuple):
         Return NaN if the law has no density.
         """
         xi = self.solve(point - self.mean)
-        log_det = total(jnp.log(jnp.where(self._moves, jnp.diagonal(self.root), jnp.nan)))
+        log_det = sum_first_axis(jnp.log(jnp.where(self._moves, jnp.diagonal(self.root), jnp.nan)))
         return (xi.shape[0] - dot(xi, xi)) / 2 - log_det
 
     @property

@@ -13,7 +13,7 @@ from jaxtyping import Array, Key
 from ..coupling import Coupling
 from ..engine.arguments import as_sequence
 from ..engine.checks import Numbers, check_count, check_key, is_traced
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import Choice, choice_between, default_candidates, why_left_out
@@ -27,7 +27,7 @@ _TUNING_PILOT = 500
 _LARGEST_TUNING_GAIN = 10.0
 
 
-@door
+@public_entry
 def choose_proposal(
     key: Key[Array, ""],
     model: Diffusion,

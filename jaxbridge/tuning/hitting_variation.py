@@ -22,9 +22,9 @@ from jaxtyping import Array, Float, Int, Key
 
 from ..coupling import AnyStartLaw, hitting_counts
 from ..engine.arguments import as_sequence
-from ..engine.averages import normalised
+from ..engine.averages import normalise_weights
 from ..engine.checks import check_count, check_key
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..exact import AbstractExactBridges, Chain, WeightedBridges
 from ..models.diffusion import Diffusion
@@ -57,7 +57,7 @@ class HittingVariation(NamedTuple):
     num_truncated: Int[Array, ""]
 
 
-@door
+@public_entry
 def hitting_variation(
     key: Key[Array, ""],
     model: Diffusion,
@@ -116,7 +116,7 @@ def hitting_variation(
         max_trials=max_trials,
     )
     usable = bridges.met & ~hits.truncated
-    weights = jnp.where(usable, normalised(bridges.log_mean_weights), 0)
+    weights = jnp.where(usable, normalise_weights(bridges.log_mean_weights), 0)
     # The 1 is a placeholder: bridges that are not usable have weight zero.
     sums = jnp.cumsum(jnp.where(usable[:, None], hits.counts, 1), axis=1)
     ends = np.asarray(sizes)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key
 
 from ..coupling import sample_bridges
 from ..engine.arguments import as_returned, as_sequence
-from ..engine.averages import path_function
+from ..engine.averages import as_path_function
 from ..engine.checks import Numbers, as_floating, as_numbers, cast_floats
 from ..engine.diagnostics import effective_sample_size
 from ..engine.keys import key_for
@@ -86,7 +86,7 @@ class Scene(NamedTuple):
 
     def values(self, paths: Float[Array, "n K d"]) -> Float[np.ndarray, "n m"]:
         """Return `fn` of each path, flattened, in double precision."""
-        fn = path_function("fn", self.fn, jax.ShapeDtypeStruct(paths.shape[1:], paths.dtype))
+        fn = as_path_function("fn", self.fn, jax.ShapeDtypeStruct(paths.shape[1:], paths.dtype))
         return np.asarray(
             jax.vmap(lambda path: jnp.ravel(as_returned("fn", fn(path))))(paths), float
         )

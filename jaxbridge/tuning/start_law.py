@@ -36,7 +36,7 @@ from ..engine.arguments import as_sequence, check_instance
 from ..engine.batch_size import most_lanes
 from ..engine.checks import Numbers, check_count, check_key, is_traced
 from ..engine.compiled import compiled
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..exact import weigh_bridges
 from ..models.bridge_problem import BridgeProblem, Intervals, bridge_problem
@@ -97,7 +97,7 @@ class Tuning(NamedTuple):
         return "\n".join(lines)
 
 
-@door
+@public_entry
 def fit_start_law(
     key: Key[Array, ""],
     model: Diffusion,
@@ -144,7 +144,7 @@ def fit_start_law(
     return best_pilot(pilots).coupling.start_law
 
 
-@door
+@public_entry
 def tune_coupling(
     key: Key[Array, ""],
     model: Diffusion,

@@ -28,7 +28,7 @@ from jaxtyping import Array, Float, Key
 from ..coupling import Coupling
 from ..engine.arguments import as_sequence, check_function
 from ..engine.checks import Numbers, as_floating, as_numbers, check_count, check_key
-from ..engine.doors import door
+from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..engine.progress import as_meter
 from ..models.bridge_problem import bridge_problem
@@ -70,7 +70,7 @@ _NOTHING_TO_ESTIMATE = (
 _FOR_COUPLINGS, _FOR_GUIDED = ("approximate", "renewal"), ("crank_nicolson",)
 
 
-@door
+@public_entry
 def work_precision(
     key: Key[Array, ""],
     model: Diffusion,

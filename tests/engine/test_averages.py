@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
-from jaxbridge.engine.averages import filled, values_of, weighted_mean
+from jaxbridge.engine.averages import evaluate_on_paths, fill_missing_paths, weighted_mean
 from jaxbridge.exact.kernels import Chain
 
 
@@ -93,7 +93,9 @@ def test_missing_bridges_have_no_weight():
     paths = np.arange(12.0, dtype=np.float32).reshape(3, 2, 2)
     paths[1] = np.nan
     met, weights = jnp.array([True, False, True]), jnp.array([0.25, 0.0, 0.75])
-    values = values_of(lambda path: path @ path.T, filled(jnp.asarray(paths), met))
+    values = evaluate_on_paths(
+        lambda path: path @ path.T, fill_missing_paths(jnp.asarray(paths), met)
+    )
     expected = 0.25 * paths[0] @ paths[0].T + 0.75 * paths[2] @ paths[2].T
     np.testing.assert_allclose(weighted_mean(weights, values), expected, rtol=1e-6)
     assert np.isnan(weighted_mean(jnp.zeros(3), values)).all()

@@ -11,7 +11,7 @@ from jax import lax
 
 import jaxbridge as jb
 from jaxbridge.coupling.join import Inputs, propose
-from jaxbridge.engine.lanes import hold, join_rows, over_lanes, over_points, split_rows
+from jaxbridge.engine.lanes import compute_once, join_rows, over_lanes, over_points, split_rows
 from jaxbridge.engine.linalg import cholesky, inverse, polar_factor, safe_norm
 from jaxbridge.models.bridge_problem import Intervals
 from jaxbridge.proposals.coupled import pair_log_weights
@@ -209,7 +209,7 @@ def test_a_function_of_a_held_value_computes_that_once():
 
         return jax.jit(over_lanes(-1)(function))
 
-    held, plain = nested(hold), nested(lambda y: y)
+    held, plain = nested(compute_once), nested(lambda y: y)
     points = _points()
     _assert_close(held(points), plain(points))
     where_made = [
@@ -227,9 +227,9 @@ def test_infinite_numbers_do_not_reach_what_is_held_with_them():
     """And large and small numbers keep their value, and tangents theirs."""
     largest = jnp.finfo(jnp.float32).max
     points = jnp.array([[jnp.inf, 1.0], [-jnp.inf, largest], [-largest, 3e-38]]).T
-    held = jax.jit(over_lanes(-1)(hold))(points)
+    held = jax.jit(over_lanes(-1)(compute_once))(points)
     np.testing.assert_array_equal(held, points)
-    slope = jax.grad(lambda x: jnp.sum(over_lanes(-1)(hold)(x)[1]))(points)
+    slope = jax.grad(lambda x: jnp.sum(over_lanes(-1)(compute_once)(x)[1]))(points)
     np.testing.assert_array_equal(slope, [[0, 0, 0], [1, 1, 1]])
 
 

@@ -148,6 +148,6 @@ def test_no_derivative():
 
 
 def test_few_weights_are_trusted_with_lighter_tails_only():
-    assert pareto.most_reliable(10) == 0
-    np.testing.assert_allclose(pareto.most_reliable(100), 0.5)
-    assert pareto.most_reliable(10**4) == pareto.most_reliable(10**6) == 0.7
+    assert pareto.largest_reliable_k(10) == 0
+    np.testing.assert_allclose(pareto.largest_reliable_k(100), 0.5)
+    assert pareto.largest_reliable_k(10**4) == pareto.largest_reliable_k(10**6) == 0.7

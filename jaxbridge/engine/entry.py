@@ -24,10 +24,10 @@ _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
 
-def door(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Decorate a public function: as `guards_off`, and pass captured values as arguments."""
+def public_entry(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Decorate a public function: as `disable_guards`, and pass captured values as arguments."""
 
-    @guards_off
+    @disable_guards
     @functools.wraps(fn)
     def entered(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         return fn(*args, **kwargs) if is_outermost() else call_with_captured(fn, args, kwargs)
@@ -35,7 +35,7 @@ def door(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     return entered
 
 
-def guards_off(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+def disable_guards(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Decorate `fn`: switch the caller's guards off inside, and check the arguments in `SHARED`."""
     shared = [name for name in SHARED if name in inspect.signature(fn).parameters]
 
