@@ -154,7 +154,7 @@ def summary(posteriors: list[Posterior]) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Calibration of gibbs and pmmh")
     parser.add_argument("methods", nargs="*", default=["gibbs", "pmmh"])
     parser.add_argument("--count", type=int, default=60, help="records, at most 60")
     parser.add_argument("--out", type=Path, help="a JSON file for all posteriors")

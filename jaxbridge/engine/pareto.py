@@ -38,6 +38,12 @@ def most_reliable(number: int) -> float:
     return min(_MOST_RELIABLE, 1 - 1 / math.log10(number)) if number > 10 else 0.0
 
 
+# The same k̂ says more of weights that are very unequal, of which the tail is a large part, and less
+# of weights that are nearly equal: (effective share, largest k̂). Of means of 100 to 4,000 weights
+# beside exact numbers 14 % are wrong with k̂ from 0.6 to 0.7 and a share below 0.2, and 0.5 % with k̂
+# from 0.7 to 1 and a share above 0.8.
+_UNEQUAL, _NEARLY_EQUAL = (0.2, 0.6), (0.8, 1.0)
+
 # A few weights far beyond many others hardly move the fit, but of fewer effective ones the log of
 # the mean and its error are off: of 100 weights twice as many trusted means are wrong with 5.
 _FEWEST_EFFECTIVE = 20
@@ -45,10 +51,18 @@ _FEWEST_EFFECTIVE = 20
 
 @jax.jit  # one program where it is called outside of any
 def is_reliable(
-    k: Float[Array, "*I"], effective: Float[Array, "*I"] | float = math.inf
+    k: Float[Array, "*I"],
+    effective: Float[Array, "*I"] | float = math.inf,
+    number: Int[Array, "*I"] | None = None,
 ) -> Bool[Array, "*I"]:
-    """Whether a mean of weights of this shape is to be trusted, given how many are effective."""
-    return (k < _MOST_RELIABLE) & (effective >= _FEWEST_EFFECTIVE)
+    """Return whether a mean of weights of this shape is to be trusted, given how many of them are
+    effective, and how many above zero."""
+    most = _MOST_RELIABLE
+    if number is not None:
+        share = effective / jnp.maximum(number, 1).astype(k.dtype)
+        most = jnp.where(share < _UNEQUAL[0], _UNEQUAL[1], most)
+        most = jnp.where(share > _NEARLY_EQUAL[0], _NEARLY_EQUAL[1], most)
+    return (k < most) & (effective >= _FEWEST_EFFECTIVE)
 
 
 @door

@@ -41,20 +41,22 @@ _TRUNCATED = (
     "a density."
 )
 _HEAVY = (
-    "Some weights have tails so heavy (a Pareto shape k̂ above 0.7, or fewer than 20 effective "
-    "weights) that their mean and its error cannot be trusted. Choose another proposal, more "
+    "Some weights have tails so heavy (a Pareto shape k̂ above 0.7, or 0.6 where weights are very "
+    "unequal, or 1 where they are nearly equal; or fewer than 20 effective weights) that their "
+    "mean and its error cannot be trusted. Choose another proposal, more "
     'proposals, shorter intervals, or `method="crank_nicolson"`.'
 )
 _LOST = (
-    "More than 2 % of the simulated paths left the state space or the finite numbers "
-    "(`num_nonfinite`). Their mass is missing, so that densities are too small and bridges keep "
-    "away from the boundary. Take more steps, or coordinates in which steps cannot leave. Where "
-    "the diffusion attains its boundary (of dX = κ(θ - X) dt + σ√X dW where 2κθ < σ²) neither is a "
-    "remedy: no proposal of this package has paths that touch it."
+    "Many simulated paths left the state space or the finite numbers (`num_nonfinite`): 5 % if "
+    "weights are equal, fewer if not. Their mass is missing, so densities are too small and "
+    "bridges keep away from the boundary. Take more steps, or coordinates in which steps cannot "
+    "leave. Where the diffusion attains its boundary (of dX = κ(θ - X) dt + σ√X dW where "
+    "2κθ < σ²) neither is a remedy: no proposal of this package has paths that touch it."
 )
-# A larger share of lost paths is a fault. They are proposals, of which the diffusion has more than
-# the proposal where the boundary is attained: with 3 % lost half of the mass may be missing.
-_MOST_LOST = 0.02
+# A larger share of missing mass is a fault.
+_MOST_MISSING = 0.05
+# Σw² n / (Σw)² where it is not known, as of the states of a chain.
+_INEQUALITY = 2.5
 
 _FEWEST_IN_SUM = 5
 
@@ -140,17 +142,36 @@ def truncated_weights(truncated: Bool[Array, "*I"]) -> Fault:
     return Fault(truncated, _TRUNCATED)
 
 
-def lost_paths(num_lost: Int[Array, "*I"], num_simulated: Int[Array, "*I"]) -> Fault:
-    """Return the fault of paths that left the state space or the finite numbers: too large a share
-    of those that were simulated."""
+def lost_paths(
+    num_lost: Int[Array, "*I"],
+    num_simulated: Int[Array, "*I"],
+    effective: Float[Array, "*I"] | None = None,
+    number: Int[Array, "*I"] | None = None,
+) -> Fault:
+    """Return the fault of paths that left the state space or the finite numbers: the mass that may
+    be missing is beyond 5 % and beyond the standard error.
+
+    A lost path would have had any weight. It counts with Σw²/Σw, the mean weight of a path of the
+    target, which is number/effective times the mean of the weights above zero: where weights are
+    equal a share q of lost paths is a share q of the mass, and where a few have most of it the lost
+    ones may be among them.
+    """
     share = num_lost / jnp.maximum(num_simulated, 1)
-    return Fault(share > _MOST_LOST, _LOST)
+    if effective is None or number is None:
+        return Fault(share > _MOST_MISSING / _INEQUALITY, _LOST)
+    size = jnp.maximum(effective, 1)
+    missing = share.astype(size.dtype) * jnp.maximum(number.astype(size.dtype) / size, 1)
+    return Fault(missing > jnp.maximum(_MOST_MISSING, 1 / jnp.sqrt(size)), _LOST)
 
 
-def heavy_tails(k: Float[Array, "*I"], effective: Float[Array, "*I"] | float) -> Fault:
-    """Return the fault of weights whose mean a few large ones decide, by their Pareto shape and
-    their effective number."""
-    return Fault(~is_reliable(k, effective), _HEAVY)
+def heavy_tails(
+    k: Float[Array, "*I"],
+    effective: Float[Array, "*I"] | float,
+    number: Int[Array, "*I"] | None = None,
+) -> Fault:
+    """Return the fault of weights whose mean a few large ones decide, by their Pareto shape, their
+    effective number and the number of those above zero."""
+    return Fault(~is_reliable(k, effective, number), _HEAVY)
 
 
 def heavy_tails_in_sum(k: Float[Array, " I"], effective: Float[Array, " I"]) -> Fault:

@@ -31,7 +31,7 @@ from ..engine.verdict import (
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractProposal, AbstractWeightedProposal, Budget, as_proposal, resolve
-from ..schemes import StepError, dominates, error_of_log_mean, step_fault, with_rounding
+from ..schemes import StepError, dominates, step_fault, with_rounding
 
 
 class TransitionLogDensity(AbstractResult):
@@ -48,8 +48,8 @@ class TransitionLogDensity(AbstractResult):
         estimate too small on average; more trials, or a start law that hits sooner, avoid it.
     - `num_simulated`: paths simulated in all.
     - `num_nonfinite`: how many of them left the state space or the finite numbers. Their mass is
-        missing: `value` is too small by -log(1 - share lost) at least where the boundary is
-        attained, and with more than 2 % of them it is not `trustworthy`.
+        missing, about -log(1 - share lost) of `value`, and more where weights are unequal. Where
+        that may be beyond 5 % and beyond the standard error `value` is not `trustworthy`.
     - `proposal`: what proposed; a `Stationary` that had to be run has its `burn_in` in it.
     - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` can be trusted.
     - `step_error`: an estimate of what `value` is too large by for the length of the steps, with
@@ -82,17 +82,18 @@ class TransitionLogDensity(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: no bridge, weights cut off or with heavy tails, more than 2 % of the
-        paths lost, a step error that dominates and is beyond 0.05."""
+        """Return the faults: no bridge, weights cut off or with heavy tails, too many paths
+        lost, a step error that dominates and is beyond 0.05."""
         return Verdict((*self._weight_faults, step_fault(self._step_error, self.standard_error)))
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:
+        sizes = self.effective_sample_size, self.num_met
         return (
             missing_bridges(self.num_met == 0, self.proposal.coupled),
             truncated_weights(self.num_truncated > 0),
-            lost_paths(self.num_nonfinite, self.num_simulated),
-            heavy_tails(self.pareto_k, self.effective_sample_size),
+            lost_paths(self.num_nonfinite, self.num_simulated, *sizes),
+            heavy_tails(self.pareto_k, *sizes),
         )
 
     @property
@@ -193,7 +194,8 @@ def estimate_log_density(
     log_mean, error, size = log_mean_and_error(drawn.log_weights)
     cut = jnp.any(drawn.truncated, axis=1)
     share = proposal.share_in_regime(model, intervals, num_steps)
-    step_error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share, held)
+    varies = model.sigma_varies(problem.like)
+    step_error = drawn.step_error(share, num_steps, varies, held)
     if proposal.by_coupling is None:  # weights of coupled pairs are no sums over steps
         step_error = with_rounding(step_error, num_steps, problem.like.shape[0])
     value, error, size, shape, step_error, share = problem.result(

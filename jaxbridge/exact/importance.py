@@ -72,8 +72,8 @@ class WeightedBridges(AbstractExactBridges):
         finite and too small on average, so that paths that are hard to hit weigh too little.
         Also where the start law's density was not a number: then the weight is zero.
     - `num_simulated`: paths simulated in all, proposals and trials.
-    - `num_nonfinite`: how many of them left the state space or the finite numbers; of more than
-        2 % the mass that is missing is a fault.
+    - `num_nonfinite`: how many of them left the state space or the finite numbers; where
+        more than 5 % of the mass may be missing with them, that is a fault.
     - `proposal`, `num_steps`: those they were made with. The coupling of a proposal has the
         start law of the weights; a `Stationary` that had to be run has its `burn_in` in it.
     - `log_halving`: log of the factor by which half as many steps would change a weight, NaN where
@@ -136,7 +136,7 @@ class WeightedBridges(AbstractExactBridges):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: missing bridges, weights cut off or with heavy tails, more than 2 % of
+        """Return the faults: missing bridges, weights cut off or with heavy tails, too many of
         the paths lost, a step error of the mean path that dominates and is beyond 0.05 standard
         deviations."""
         error = 1 / jnp.sqrt(jnp.maximum(self.effective_sample_size, 1))  # in the same units
@@ -145,13 +145,14 @@ class WeightedBridges(AbstractExactBridges):
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:
         # One path each is simulated where a lost path is a miss, and not tried again.
+        sizes = self.effective_sample_size, jnp.sum(self.log_weights > -jnp.inf, axis=-1)
         tried_again = self.num_simulated > self.met.shape[-1]
         missing = ~jnp.any(self.met, axis=-1) | (tried_again & jnp.any(~self.met, axis=-1))
         return (
             missing_bridges(missing, self.proposal.coupled),
             truncated_weights(jnp.any(self.truncated, axis=-1)),
-            lost_paths(self.num_nonfinite, self.num_simulated),
-            heavy_tails(self.pareto_k, self.effective_sample_size),
+            lost_paths(self.num_nonfinite, self.num_simulated, *sizes),
+            heavy_tails(self.pareto_k, *sizes),
         )
 
     def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:

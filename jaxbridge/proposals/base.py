@@ -19,7 +19,13 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..coupling import AbstractCoupling
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..schemes import AbstractStepDensity, share_in_regime
+from ..schemes import (
+    AbstractStepDensity,
+    StepError,
+    error_of_coupled_grids,
+    error_of_log_mean,
+    share_in_regime,
+)
 
 
 class WeightedPaths(NamedTuple):
@@ -28,7 +34,8 @@ class WeightedPaths(NamedTuple):
     `log_weights` are -inf and `paths` NaN where none was `found`; `truncated` says where a
     weight is not exact because a bound on the work was reached; `num_simulated` counts the
     simulated paths, and `num_nonfinite` those that left the finite numbers. `log_halving` is D of
-    `halving`, NaN where none was worked out.
+    `halving`, and `log_coarse` the log weight of the path of half as many steps from the same noise
+    (`coupled_grids`), -inf if that path was lost; each is NaN where it was not computed.
     """
 
     paths: Float[Array, "I n K d"]
@@ -38,6 +45,16 @@ class WeightedPaths(NamedTuple):
     num_simulated: Int[Array, "I n"]
     num_nonfinite: Int[Array, "I n"]
     log_halving: Float[Array, "I n"]
+    log_coarse: Float[Array, "I n"]
+
+    def step_error(
+        self, share: Float[Array, " I"], num_steps: int, sigma_varies: bool, held: bool = False
+    ) -> StepError:
+        """Return the step error of the log of the mean of the weights; for paths of which nothing
+        is stored."""
+        if not sigma_varies:
+            return error_of_log_mean(self.log_weights, self.log_halving, share, held)
+        return error_of_coupled_grids(self.log_weights, self.log_coarse, share, num_steps, held)
 
 
 class AbstractProposal(eqx.Module):

@@ -242,7 +242,7 @@ def _draw_pulled_tangents(primals, tangents):
         return tuple(total)
 
     _, (paths, log_weights) = eqx.filter_jvp(again, (inputs,), (tangents[0],))
-    return drawn, WeightedPaths(paths, log_weights, *5 * [None])  # pyright: ignore
+    return drawn, WeightedPaths(paths, log_weights, *6 * [None])  # pyright: ignore
 
 
 def _pick(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:

@@ -199,6 +199,7 @@ class CoupledPairs(AbstractSingleProposal):
                 proposed.num_trials + counts.num_trials,
                 proposed.num_nonfinite + counts.num_nonfinite,
                 log_halving,
+                jnp.full_like(log_weights, jnp.nan),
             )
             return jax.tree.map(
                 lambda leaf: leaf.reshape(num_intervals, num_draws, *leaf.shape[1:]), made
@@ -231,6 +232,7 @@ class CoupledPairs(AbstractSingleProposal):
             counts.num_trials,
             counts.num_nonfinite,
             self.log_halving(model, intervals, paths, 1),
+            jnp.full_like(log_weights, jnp.nan),
         )
         return jax.tree.map(lambda leaf: leaf[:, None], made)
 

@@ -13,6 +13,15 @@ target over that under the proposal,
 so E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b] for the target without any further error, and for the
 diffusion up to the target's step error, O(δ), or O(δ²) by `ItoTaylorDensity`. No stationary law is
 called for.
+
+With noise ξ_i of its steps a path is a function of that noise, and half as many steps make another
+path of other noise. Where σ varies and only weights are wanted, the step error comes from pairs of
+such paths, whose noise has as much in common as it can have: in place of two steps a coarse one has
+
+    ξ = c ξ_i + s ξ_{i+1},   c² = δ_i (T - t_{i+2}) / [(δ_i + δ_{i+1}) (T - t_{i+1})] = 1 - s²,
+
+by which a coarse Brownian bridge is the fine one at every other point. The coarse weight is
+unbiased for half as many steps, and differs from the fine one by far less than e^D of `halving`.
 """
 
 from abc import abstractmethod
@@ -170,24 +179,36 @@ class AbstractGuidedProposal(AbstractSingleProposal):
     def reweigh(self, keys, model, intervals, paths, active=None):
         dynamics = model.forward(intervals.start[0])
         _, log_weights, log_halving = noise_of(self, dynamics, intervals, paths)
-        made = _weighted(paths[:, None], log_weights[:, None], log_halving[:, None])
+        unknown = jnp.full_like(log_halving, jnp.nan)
+        logs = (leaf[:, None] for leaf in (log_weights, log_halving, unknown))
+        made = _weighted(paths[:, None], *logs)
         return made if active is None else masked(made, active)
 
 
+class _CoarseSteps(NamedTuple):
+    """The step of half as many that ends with each step, and the share c of the earlier noise."""
+
+    guide: PyTree
+    dt: Float[Array, "*steps I"]
+    remaining: Float[Array, "*steps I"]
+    share: Float[Array, "*steps"]
+
+
 class _Steps(NamedTuple):
-    """What changes from step to step, for a scan: the fields of `Step`; and for `halving` the
-    length of the step before, and whether the two are a pair."""
+    """What changes from step to step, for a scan: the fields of `Step`; the length of the step
+    before, and whether the two are a pair; and the coarse step of both, if there are any."""
 
     guide: PyTree
     dt: Float[Array, "*steps I"]
     remaining: Float[Array, "*steps I"]
     before: Float[Array, "*steps I"]
     ends_pair: Bool[Array, "*steps"]
+    coarse: _CoarseSteps | None
 
 
-class _State(NamedTuple):
+class _Weighted(NamedTuple):
     """The point where a path is, and its log densities so far under the target and under the
-    proposal; for some of the paths the point before, and D of `halving` so far.
+    proposal.
 
     The two are summed apart because XLA's CPU compiler (JAX 0.10.2) does not vectorise a sum in
     place that reads a slice of the loop's inputs, as the noise is, and the target's takes most of
@@ -197,8 +218,24 @@ class _State(NamedTuple):
     x: Float[Array, "d *lanes"]
     log_target: Float[Array, "*lanes"]
     log_proposal: Float[Array, "*lanes"]
+
+    @property
+    def log_weight(self) -> Float[Array, "*lanes"]:
+        return self.log_target - self.log_proposal
+
+
+class _State(NamedTuple):
+    """Paths, and for some of them what their step error is estimated from: the point before and D
+    of `halving` so far; or the noise before and the coarse path so far."""
+
+    path: _Weighted
     before: Float[Array, "d *looked"]
     log_halving: Float[Array, "*looked"]
+    coarse: _Weighted | None
+
+    @property
+    def x(self) -> Float[Array, "d *lanes"]:
+        return self.path.x
 
 
 class _Lanes:
@@ -212,21 +249,20 @@ class _Lanes:
         intervals: Intervals,
         num_steps: int,
         num_draws: int = 1,
+        with_coarse: bool = False,
     ):
-        start, end, duration = intervals
-        fractions = proposal.remaining(num_steps)
-        dt = jnp.asarray(-np.diff(fractions), start.dtype)[:, None] * duration
-        remaining = jnp.asarray(fractions[:-1], start.dtype)[:, None] * duration
-        guide = jax.vmap(proposal.guide, in_axes=(None, 0, 0, 1), out_axes=-1)(
-            dynamics, start, end, dt
-        )
+        start, end, _ = intervals
+        guide, dt, remaining = _grid(proposal, dynamics, intervals, proposal.remaining(num_steps))
+        coarse, self._coarse_dt = None, None
+        if with_coarse:
+            coarse, self._coarse_dt = _coarse_grid(proposal, dynamics, intervals, num_steps)
         self._num_draws, self._num_steps = num_draws, num_steps
         self._num_looked = num_looked(num_draws, dynamics.sigma_varies)
         self._of_lane = None if start.shape[0] == 1 else -1
         self.start, self.end = start.T, end.T
-        each = (dt, remaining, jnp.roll(dt, 1, axis=0), jnp.arange(num_steps) % 2 == 1)
-        self.steps = _Steps(guide, *jax.tree.map(lambda leaf: leaf[:-1], each))
-        self._last = _Steps(None, *jax.tree.map(lambda leaf: leaf[-1], each))
+        before, ends = jnp.roll(dt, 1, axis=0), jnp.arange(num_steps) % 2 == 1
+        self.steps = _Steps(guide, dt[:-1], remaining[:-1], before[:-1], ends[:-1], coarse)
+        self._last = _Steps(None, dt[-1], remaining[-1], before[-1], ends[-1], None)
         self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.target
         self._of_pairs = jax.jit(self._log_halving)  # traced once, for the loop and for its end
 
@@ -238,41 +274,86 @@ class _Lanes:
         """Paths at their start, with weight one."""
         start = self.spread(self.start)
         some, zero = self._looked(start), jnp.zeros_like(start[0])
-        return _State(start, zero, zero, some, jnp.zeros_like(some[0]))
+        none = jnp.zeros_like(some[0])
+        coarse = None if self._coarse_dt is None else _Weighted(some, none, none)
+        return _State(_Weighted(start, zero, zero), some, none, coarse)
 
     def advance(self, state: _State, xi: Float[Array, "d lanes"], steps: _Steps) -> _State:
         """One step with the noise ξ, and the densities with their factors."""
+        step = self._of_each(self._step(steps), self._num_draws)
+        path = self._stepped(state.path, xi, step)
+        if state.coarse is None:
+            return self._moved(state, path, steps)
+        here = self._looked(xi)
+        coarse, coarse_steps = state.coarse, steps.coarse
+        if coarse_steps is None:  # the coarse path is of one step, its last
+            return state._replace(path=path)
+        coarse = lax.cond(
+            steps.ends_pair,
+            lambda: self._coarse_stepped(coarse, state.before, here, coarse_steps),
+            lambda: coarse,
+        )
+        return _State(path, here, state.log_halving, coarse)
 
-        def one(state, xi, step):
-            steps = self._density.steps_from(self._dynamics, state.x)
-            target = steps.law(step.dt)
-            law = self._proposal.step_law(step, state.x, target)
+    def _stepped(self, path: _Weighted, xi: Float[Array, "d lanes"], step: Step) -> _Weighted:
+        """Return paths after a step with this noise."""
+
+        def one(x, xi, step):
+            target = self._density.steps_from(self._dynamics, x).law(step.dt)
+            law = self._proposal.step_law(step, x, target)
             x_next = law.point(xi)
             return x_next, self._log_densities(target, law, x_next, xi)
 
-        each = (-1, -1, self._of_lane)
-        x_next, log_densities = over_lanes(*each)(one)(state, xi, self._of_each(self._step(steps)))
-        return self._moved(state, x_next, log_densities, steps)
+        made = over_lanes(-1, -1, self._of_lane)(one)(path.x, xi, step)
+        return self._weighted(path, *made)
+
+    def _coarse_stepped(
+        self,
+        coarse: _Weighted,
+        before: Float[Array, "d looked"],
+        xi: Float[Array, "d looked"],
+        steps: _CoarseSteps,
+    ) -> _Weighted:
+        """Return the coarse paths after a step with the noise of two fine ones."""
+        xi = steps.share * before + jnp.sqrt(1 - steps.share**2) * xi
+        step = Step(steps.guide, steps.dt, steps.remaining, self.end)
+        stepped = self._stepped(coarse, xi, self._of_each(step, self._num_looked))
+        return lax.stop_gradient(stepped)
+
+    @staticmethod
+    def _weighted(path: _Weighted, x_next, log_densities) -> _Weighted:
+        target, proposal = log_densities
+        return _Weighted(x_next, path.log_target + target, path.log_proposal + proposal)
 
     def retrace(
         self, state: _State, x_next: Float[Array, "d lanes"], steps: _Steps
     ) -> tuple[_State, Float[Array, "d lanes"]]:
         """The step to these points, and the noise ξ that it takes."""
 
-        def one(state, x_next, step):
-            steps = self._density.steps_from(self._dynamics, state.x)
-            target = steps.law(step.dt)
-            law = self._proposal.step_law(step, state.x, target)
+        def one(x, x_next, step):
+            target = self._density.steps_from(self._dynamics, x).law(step.dt)
+            law = self._proposal.step_law(step, x, target)
             xi = law.noise(x_next)
             return xi, self._log_densities(target, law, x_next, xi)
 
-        each = (-1, -1, self._of_lane)
-        xi, log_densities = over_lanes(*each)(one)(state, x_next, self._of_each(self._step(steps)))
-        return self._moved(state, x_next, log_densities, steps), xi
+        step = self._of_each(self._step(steps), self._num_draws)
+        xi, log_densities = over_lanes(-1, -1, self._of_lane)(one)(state.x, x_next, step)
+        return self._moved(state, self._weighted(state.path, x_next, log_densities), steps), xi
 
     def finish(self, state: _State) -> tuple[Float[Array, " lanes"], Float[Array, "I m"]]:
-        """The log weights with that of the last step, to b, and D of the paths that are looked
-        at."""
+        """The log weights with that of the last step, to b; and of the paths that are looked at
+        D, or the log weights of their coarse paths."""
+        path = self._finished(state.path, self._last.dt, self._num_draws)
+        if state.coarse is None or self._coarse_dt is None:
+            state = self._moved(state, path, self._last)
+            half = log_halving_of_all_steps(state.log_halving, self._num_steps)
+        else:
+            coarse = self._finished(state.coarse, self._coarse_dt, self._num_looked).log_weight
+            half = lax.stop_gradient(jnp.where(jnp.isfinite(coarse), coarse, -jnp.inf))
+        return path.log_weight, half.reshape(-1, self._num_looked)
+
+    def _finished(self, path: _Weighted, dt: Float[Array, " I"], num_draws: int) -> _Weighted:
+        """Return paths of so many lanes an interval after their last step, to b."""
 
         def one(x, last):
             # Steps may lead out of the state space, where no bridge ends.
@@ -282,22 +363,20 @@ class _Lanes:
             log_density = self._density.steps_from(self._dynamics, x).law(dt).log_density(end)
             return jnp.where(inside, log_density, jnp.nan)
 
-        last = self._of_each((self.end, self._last.dt))
-        log_density = over_lanes(-1, self._of_lane)(one)(state.x, last)
-        end = self.spread(self.end)
-        state = self._moved(state, end, (log_density, jnp.zeros_like(log_density)), self._last)
-        log_halving = log_halving_of_all_steps(state.log_halving, self._num_steps)
-        log_weights = state.log_target - state.log_proposal
-        return log_weights, log_halving.reshape(-1, self._num_looked)
+        last = self._of_each((self.end, dt), num_draws)
+        log_density = over_lanes(-1, self._of_lane)(one)(path.x, last)
+        end = jnp.repeat(self.end, num_draws, axis=-1)
+        return self._weighted(path, end, (log_density, jnp.zeros_like(log_density)))
 
     def _step(self, steps: _Steps) -> Step:
         return Step(steps.guide, steps.dt, steps.remaining, self.end)
 
-    def _of_each(self, of_intervals: PyTree) -> PyTree:
-        """For each lane; without an axis for a single interval, which all lanes share."""
+    def _of_each(self, of_intervals: PyTree, num_draws: int) -> PyTree:
+        """For each of so many lanes an interval; without an axis for a single interval, which all
+        lanes share."""
         if self._of_lane is None:
             return jax.tree.map(lambda leaf: leaf[..., 0], of_intervals)
-        return jax.tree.map(self.spread, of_intervals)
+        return jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=-1), of_intervals)
 
     def _looked(self, leaf: Float[Array, "*shape lanes"]) -> Float[Array, "*shape looked"]:
         """The first paths of each interval, of which D is worked out."""
@@ -308,18 +387,15 @@ class _Lanes:
     def _log_densities(target: StepLaw, law: StepLaw, point, xi):
         return target.log_relative(point), law.log_relative_of_noise(xi)
 
-    def _moved(self, state: _State, x_next, log_densities, steps: _Steps) -> _State:
-        """The state at x_next, given the log densities of the step."""
-        here, there = self._looked(state.x), self._looked(x_next)
+    def _moved(self, state: _State, path: _Weighted, steps: _Steps) -> _State:
+        """The state with these paths, which are one step on, and their D."""
+        here, there = self._looked(state.x), self._looked(path.x)
         change = lax.cond(
             steps.ends_pair,
             lambda: self._of_pairs(state.before, here, there, steps.before, steps.dt),
             lambda: jnp.zeros_like(state.log_halving),
         )
-        log_halving = state.log_halving + lax.stop_gradient(change)
-        target, proposal = log_densities
-        sums = state.log_target + target, state.log_proposal + proposal
-        return _State(x_next, *sums, here, log_halving)
+        return _State(path, here, state.log_halving + lax.stop_gradient(change), None)
 
     def _log_halving(self, before, x, x_next, *both):
         """The part of D of pairs of steps, of the paths that are looked at."""
@@ -328,10 +404,7 @@ class _Lanes:
             points = (before, x, x_next)
             return log_halving_of_pair(self._density, self._dynamics, points, both)
 
-        if self._of_lane is None:
-            both = self._of_each(both)
-        else:
-            both = [jnp.repeat(dt, self._num_looked) for dt in both]
+        both = self._of_each(both, self._num_looked)
         each = (-1, -1, -1, self._of_lane, self._of_lane)
         return over_lanes(*each)(one)(before, x, x_next, *both)
 
@@ -386,6 +459,7 @@ def _weighted(
     paths: Float[Array, "I n K d"],
     log_weights: Float[Array, "I n"],
     log_halving: Float[Array, "I n"],
+    log_coarse: Float[Array, "I n"],
 ) -> WeightedPaths:
     """One simulated path each; those that left the finite numbers are not found."""
     found = jnp.isfinite(log_weights)
@@ -397,7 +471,18 @@ def _weighted(
         jnp.ones(found.shape, jnp.int32),
         (~found).astype(jnp.int32),
         log_halving,
+        log_coarse,
     )
+
+
+class _Drawn(NamedTuple):
+    """Paths, their log weights, and what their step error is estimated from (`WeightedPaths`),
+    which has no derivatives."""
+
+    paths: Float[Array, "I n K d"]
+    log_weights: Float[Array, "I n"]
+    log_halving: Float[Array, "I n"]
+    log_coarse: Float[Array, "I n"]
 
 
 class _Inputs(NamedTuple):
@@ -423,8 +508,8 @@ def _draw_block(
 @eqx.filter_custom_jvp
 def _draw(
     inputs: _Inputs, keys: Key[Array, "I n"], stored: Int[Array, " K"] | None, num_steps: int
-) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"], Float[Array, "I n"]]:
-    """One path for each key, its log weight, and D, which has no derivatives."""
+) -> _Drawn:
+    """One path for each key, and its log weights."""
     return _simulate(inputs, keys, stored, num_steps, None)
 
 
@@ -434,14 +519,14 @@ def _draw_tangents(primals, tangents):
     in reverse mode a masked 0 · ∞ would be NaN."""
     inputs, keys, stored, num_steps = primals
     drawn = _draw(inputs, keys, stored, num_steps)
-    found = jnp.isfinite(drawn[1])
+    found = jnp.isfinite(drawn.log_weights)
 
     def again(inputs):
-        paths, log_weights, _ = _simulate(inputs, keys, stored, num_steps, found)
+        paths, log_weights, *_ = _simulate(inputs, keys, stored, num_steps, found)
         return jnp.where(found[..., None, None], paths, 0), jnp.where(found, log_weights, 0)
 
     _, along = eqx.filter_jvp(again, (inputs,), (tangents[0],))
-    return drawn, (*along, jnp.zeros_like(drawn[2]))
+    return drawn, _Drawn(*along, *map(jnp.zeros_like, drawn[2:]))
 
 
 def _simulate(
@@ -450,13 +535,16 @@ def _simulate(
     stored: Int[Array, " K"] | None,
     num_steps: int,
     noisy: Bool[Array, "I n"] | None,
-) -> tuple[Float[Array, "I n K d"], Float[Array, "I n"], Float[Array, "I n"]]:
-    """Paths, log weights and D; without noise where `noisy` is given and false."""
+) -> _Drawn:
+    """Paths and their log weights; without noise where `noisy` is given and false."""
     proposal, model, intervals = inputs
     dynamics = model.forward(intervals.start[0])
     (num_intervals, num_draws), (_, d) = keys.shape, intervals.start.shape
     dtype = intervals.start.dtype
-    lanes = _Lanes(proposal, dynamics, intervals, num_steps, num_draws)
+    # Half as many steps from the same noise are other paths, of no use where paths are wanted.
+    only_weights = stored is not None and stored.shape[0] == 0
+    with_coarse = only_weights and dynamics.sigma_varies and num_steps > 1
+    lanes = _Lanes(proposal, dynamics, intervals, num_steps, num_draws, with_coarse)
     state, end = lanes.begin(), lanes.spread(lanes.end)
     path = state.x[None][:0]
     store = slots = None
@@ -487,14 +575,48 @@ def _simulate(
         path = store.rows
     log_weights, some = lanes.finish(state)
     log_weights = log_weights.reshape(keys.shape)
-    unseen = jnp.full((num_intervals, num_draws - some.shape[1]), jnp.nan, dtype)
-    log_halving = jnp.concatenate([some, unseen], axis=1)
+    unknown = jnp.full(keys.shape, jnp.nan, dtype)
+    half = unknown.at[:, : some.shape[1]].set(some)
+    halves = (unknown, half) if with_coarse else (half, unknown)
     if slots is None:
         path = jnp.concatenate([start[None], path, end[None]])
     else:
         path = path.at[slots[-1]].set(end)[:-1]
     path = path.reshape(-1, d, num_intervals, num_draws)
-    return jnp.moveaxis(path, (2, 3), (0, 1)), log_weights, log_halving
+    return _Drawn(jnp.moveaxis(path, (2, 3), (0, 1)), log_weights, *halves)
+
+
+def _grid(
+    proposal: AbstractGuidedProposal,
+    dynamics: Dynamics,
+    intervals: Intervals,
+    fractions: Float[np.ndarray, " points"],
+) -> tuple[PyTree, Float[Array, "N I"], Float[Array, "N I"]]:
+    """Return the guide, the lengths of steps, and the time that remains at each, on the grid of
+    these fractions of the time that remains."""
+    start, end, duration = intervals
+    dt = jnp.asarray(-np.diff(fractions), start.dtype)[:, None] * duration
+    remaining = jnp.asarray(fractions[:-1], start.dtype)[:, None] * duration
+    guide = jax.vmap(proposal.guide, in_axes=(None, 0, 0, 1), out_axes=-1)
+    return guide(dynamics, start, end, dt), dt, remaining
+
+
+def _coarse_grid(
+    proposal: AbstractGuidedProposal, dynamics: Dynamics, intervals: Intervals, num_steps: int
+) -> tuple[_CoarseSteps | None, Float[Array, " I"]]:
+    """Return the steps of half as many, each once for the two that it replaces (`None` if there is
+    only the last), and the length of the last."""
+    fractions = proposal.remaining(num_steps)
+    points = np.append(np.arange(0, num_steps, 2), num_steps)
+    guide, dt, remaining = _grid(proposal, dynamics, intervals, fractions[points])
+    num_inner = len(points) - 2
+    if num_inner == 0:
+        return None, dt[-1]
+    before, middle, after = (fractions[i : i + 2 * num_inner : 2] for i in range(3))
+    share = np.sqrt((before - middle) * after / ((before - after) * middle))
+    steps = _CoarseSteps(guide, dt[:-1], remaining[:-1], jnp.asarray(share, dt.dtype))
+    which = np.minimum(np.arange(num_steps - 1) // 2, num_inner - 1)
+    return jax.tree.map(lambda leaf: leaf[which], steps), dt[-1]
 
 
 def deterministic_path(

@@ -118,6 +118,7 @@ def masked(made: WeightedPaths, active: Bool[Array, " I"]) -> WeightedPaths:
         keep(made.num_simulated, 0),
         keep(made.num_nonfinite, 0),
         keep(made.log_halving, jnp.nan),
+        keep(made.log_coarse, jnp.nan),
     )
 
 

@@ -40,7 +40,7 @@ from ..engine.keys import key_for
 from ..engine.pareto import most_reliable, pareto_k
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
-from ..schemes import error_of_log_mean, guessed
+from ..schemes import guessed
 from .base import AbstractSingleProposal
 from .choice import Choice, best_of_few, value_rates, worth_a_pilot
 
@@ -243,7 +243,8 @@ def _look(
     size = _extrapolated_size(log_weights)
     efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
     share = guessed(candidate.step_share(model, intervals))
-    error = error_of_log_mean(drawn.log_weights, drawn.log_halving, share)
+    varies = model.sigma_varies(intervals.start[0])
+    error = drawn.step_error(share, num_steps, varies)
     seen_error = jnp.maximum(jnp.abs(error.value) - 2 * error.uncertainty, 0)
     seen_error = jnp.where(jnp.isnan(seen_error), 0, seen_error)  # nothing is known of one step
     shape = jnp.full_like(efficiency, jnp.nan)

@@ -291,9 +291,9 @@ def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> Linearis
         return _Search(search.turn + 1, points, best, check, path, length, over)
 
     shapes = jax.eval_shape(at, points)[:2]
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    best, check = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     one = jnp.ones((), points.dtype)
-    init = _Search(jnp.int32(0), points, *nothing, points, one, jnp.zeros((), bool))
+    init = _Search(jnp.int32(0), points, best, check, points, one, jnp.zeros((), bool))
     goes_on = lambda search: ~search.over & (search.turn < _MOST_TURNS)
     made = lax.while_loop(goes_on, turn, init)
     return Linearised(*made.best, made.check)

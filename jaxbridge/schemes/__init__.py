@@ -60,6 +60,7 @@ from .step_density import (
 from .step_error import (
     StepError as StepError,
     dominates as dominates,
+    error_of_coupled_grids as error_of_coupled_grids,
     error_of_log_mean as error_of_log_mean,
     error_of_mean as error_of_mean,
     guessed as guessed,

@@ -11,6 +11,9 @@ nearly all of the weights w e^D, the two laws have little in common: steps are t
 for anything, and the uncertainty is infinite. So it is where steps are longer than the relaxation
 time of the drift. The log of a mean of few weights is on average too
 small, by half its relative variance to leading order, and that is made up for.
+
+Where σ varies e^D has heavy tails. Weights of half as many steps from the same noise have not, and
+take the place of w e^D where only the mean of weights is wanted (`error_of_coupled_grids`).
 """
 
 import math
@@ -18,6 +21,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import logsumexp
 from jaxtyping import Array, Bool, Float, Inexact
 
 from ..engine.averages import effective_size, expanded, normalised, weighted_mean
@@ -68,6 +72,35 @@ def error_of_log_mean(
     ratio = jnp.where(some, mean, 1)
     # Normalised before they are squared, for beside a large D the others are tiny.
     coarse = weights * factors / ratio[..., None]
+    change = jnp.log(ratio) + largest[..., 0]
+    return _error_of_log_ratio(weights, coarse, share, change, some, held)
+
+
+def error_of_coupled_grids(
+    log_weights: Float[Array, "*I n"],
+    log_coarse: Float[Array, "*I n"],
+    share: Float[Array, "*I"],
+    num_steps: int,
+    held: bool = False,
+) -> StepError:
+    """Return the step error of the log of the mean of the weights, from weights of paths of half as
+    many steps with the same noise: NaN where there is none, -inf where that path was lost.
+
+    An odd step is left as it is: of first order errors the grids have N and 2N - 1 parts, so that
+    the change counts for N/(N - 1).
+    """
+    looked = ~jnp.isnan(log_coarse)
+    logs = [jnp.where(looked, log, -jnp.inf) for log in (log_weights, log_coarse)]
+    weights, coarse = (normalised(log) for log in logs)
+    fine_sum, coarse_sum = (logsumexp(log, axis=-1) for log in logs)
+    some = jnp.isfinite(fine_sum) & jnp.isfinite(coarse_sum)
+    change = jnp.where(some, coarse_sum, 0) - jnp.where(some, fine_sum, 0)
+    share = share * num_steps / max(num_steps - num_steps % 2, 1)
+    return _error_of_log_ratio(weights, coarse, share, change, some, held)
+
+
+def _error_of_log_ratio(weights, coarse, share, change, some, held):
+    """Return the error from the log of the ratio of two means, by their normalised weights."""
     spread = jnp.sqrt(jnp.sum((coarse - weights) ** 2, axis=-1))
     # The mean of the log of a mean is too small by half its relative variance, and here are two;
     # under the law that the mean of the weights tilts, that of the log of their ratio by half its
@@ -75,9 +108,8 @@ def error_of_log_mean(
     fresh = jnp.sum(coarse**2, axis=-1) - jnp.sum(weights**2, axis=-1)
     overlap = _overlap(weights, coarse)
     bias = jnp.where(overlap, spread**2 if held else fresh, 0) / 2
-    change = jnp.log(ratio) + largest[..., 0] + bias
     spread = jnp.where(overlap, spread, jnp.inf)
-    return _told(share, change, spread, some)
+    return _told(share, change + bias, spread, some)
 
 
 def error_of_mean(

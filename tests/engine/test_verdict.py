@@ -62,6 +62,13 @@ def test_heavy_tails():
     assert heavy_tails(k, jnp.array([99.0, 99.0, 4.0, 99.0])).present.tolist() == [0, 1, 1, 1]
 
 
+def test_heavy_tails_beside_the_effective_share():
+    """Nearly equal weights may have a larger k̂ than others, very unequal ones a smaller."""
+    k, number = jnp.array([0.65, 0.65, 0.8, 0.8, 1.1]), jnp.full(5, 1000)
+    size = jnp.array([190.0, 210.0, 790.0, 810.0, 990.0])
+    assert heavy_tails(k, size, number).present.tolist() == [1, 0, 1, 0, 1]
+
+
 def test_heavy_tails_in_a_sum_are_counted():
     """Of 100 intervals two may look so by chance, unless few paths have all the weight of one."""
     k, size = jnp.full(100, 0.2), jnp.full(100, 99.0)
@@ -85,3 +92,12 @@ def test_every_result_has_a_verdict():
 
 def test_lost_paths():
     assert lost_paths(jnp.array([0, 20, 21]), jnp.array(3 * [1000])).present.tolist() == [0, 0, 1]
+
+
+def test_lost_paths_count_for_more_where_weights_are_unequal():
+    """4 % of equal weights are 4 % of the mass, and 4 % of weights of which half are effective 8 %,
+    which is told where the standard error is below that."""
+    number, effective = jnp.full(5, 1000), jnp.array([1000.0, 1000.0, 500.0, 50.0, 1000.0])
+    lost = jnp.array([40, 51, 40, 6, 0])
+    fault = lost_paths(lost, jnp.full(5, 1000), effective, number)
+    assert fault.present.tolist() == [0, 1, 1, 0, 0]

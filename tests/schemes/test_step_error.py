@@ -12,6 +12,7 @@ from jaxbridge.schemes.step_error import (
     UNKNOWN_SHARE,
     StepError,
     dominates,
+    error_of_coupled_grids,
     error_of_log_mean,
     error_of_mean,
     relative_change,
@@ -42,6 +43,57 @@ def test_error_of_a_log_density(density, refinement, curl, x64):
     assert abs(float(estimate.step_error) - error) < 0.25 * abs(error) + noise
     assert estimate.step_error_dominates
     assert bool(estimate.trustworthy) is (abs(float(estimate.step_error)) < 0.05)
+
+
+@pytest.mark.parametrize("num_steps", slow_beyond(1, [10, 2, 9, 40]))
+@pytest.mark.parametrize(
+    "proposal", slow_beyond(1, [jb.Guided(), jb.ModifiedDiffusionBridge(refinement=1.5)])
+)
+def test_error_where_sigma_varies(num_steps, proposal):
+    """It is what half as many steps change, from paths of the same noise: the difference from a run
+    of its own with half as many, and known far better than by weights of the same path."""
+    model = jb.Diffusion(lambda x, p: -x, lambda x, p: 0.6 * jnp.sqrt(1 + x**2))
+    ends, options = ([0.5], [-0.6], 1.0), dict(proposal=proposal)
+
+    def estimate(key, steps, number):
+        return jb.transition_log_density(
+            jax.random.key(key), model, *ends, num_proposals=number, num_steps=steps, **options
+        )
+
+    fine = estimate(0, num_steps, 20_000)
+    if num_steps % 2 == 0:
+        coarse = estimate(1, num_steps // 2, 20_000)
+        change, noise = (
+            coarse.value - fine.value,
+            np.hypot(coarse.standard_error, fine.standard_error),
+        )
+        assert abs(fine.step_error - change) < 5 * np.hypot(noise, fine.step_uncertainty)
+    else:  # the last step is left as it is: within the even grids beside it
+        shares = [estimate(0, steps, 20_000) for steps in (num_steps - 1, num_steps + 1)]
+        low, high = sorted(float(one.step_error) for one in shares)
+        noise = 5 * float(fine.step_uncertainty)
+        assert low - noise < fine.step_error < high + noise
+    if isinstance(proposal, jb.Guided) and num_steps > 2:
+        weighted = jb.sample_weighted_bridges(
+            jax.random.key(0), model, *ends, num_bridges=20_000, num_steps=num_steps, **options
+        )
+        by_path = error_of_log_mean(weighted.log_weights, weighted.log_halving, weighted.step_share)
+        assert fine.step_uncertainty < by_path.uncertainty / 2
+
+
+def test_error_of_coupled_grids_counts_lost_paths():
+    """A path that one grid has lost has no weight there and its weight on the other."""
+    fine = jnp.log(jnp.array([[1.0, 2.0, 0.0, 3.0] * 10]))
+    coarse = jnp.log(jnp.array([[2.0, 0.0, 1.0, 3.0] * 8 + 8 * [jnp.nan]]))
+    error = error_of_coupled_grids(fine, coarse, jnp.ones(1), 9)
+    weights, halved = (np.exp(np.asarray(x[0, :32], float)) for x in (fine, coarse))
+    weights, halved = weights / weights.sum(), halved / halved.sum()
+    bias = ((halved**2).sum() - (weights**2).sum()) / 2
+    np.testing.assert_allclose(error.value, 9 / 8 * (np.log(6 / 6) + bias), atol=1e-6)
+    spread = np.sqrt(((halved - weights) ** 2).sum())
+    np.testing.assert_allclose(error.uncertainty, 9 / 8 * spread, rtol=1e-5)
+    nothing = error_of_coupled_grids(fine, jnp.full_like(fine, jnp.nan), jnp.ones(1), 1)
+    assert np.isnan(nothing.value).all()
 
 
 @pytest.mark.slow
