@@ -15,14 +15,15 @@ from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.verdict import AbstractResult, Fault, Verdict
-from ..schemes import StepError, dominates, step_fault
+from ..schemes import StepError, dominates, step_fault, unknown_where
 from .parameters import Parameters, init_vectors, of_rows
 
 # Of about so many of the draws the step error is worked out: as many as tell a covariance, for it
 # takes a good part of the time of an iteration.
 _STEP_ERRORS = 256
-# Of fewer draws a covariance tells nothing.
-_FEWEST = 10
+# Of fewer draws a covariance tells nothing; nor if steps are too long for the drift in a larger
+# share of them.
+_FEWEST, _MOST_INFINITE = 10, 0.1
 # Limits of chains that agree, and of draws that are worth an error.
 _MOST_R_HAT, _FEWEST_EFFECTIVE = 1.1, 25
 _APART = (
@@ -107,7 +108,8 @@ class AbstractPosterior(AbstractResult):
     def step_error(self) -> Float[Array, " p"]:
         """What the posterior mean of each unknown parameter is too large by for the length of the
         steps, an estimate: to first order the covariance of θ and the error of the log likelihood,
-        `log_step_error`. NaN where that is not known, as of one step."""
+        `log_step_error`. NaN where that is not known, as of one step, or infinite in a tenth of the
+        draws, whose steps are too long for the drift: then the uncertainty is infinite."""
         return self._step_error.value
 
     @property
@@ -148,8 +150,12 @@ class AbstractPosterior(AbstractResult):
         spread = jnp.sqrt(jnp.sum(each**2, axis=0) / jnp.minimum(count * share, count)) / jnp.sqrt(
             count
         )
-        unknown = number < _FEWEST
-        return StepError(jnp.where(unknown, jnp.nan, mean), jnp.where(unknown, jnp.nan, spread))
+        few = number < _FEWEST
+        error = StepError(jnp.where(few, jnp.nan, mean), jnp.where(few, jnp.nan, spread))
+        infinite = jnp.sum(jnp.isinf(self.log_step_error)).astype(products.dtype)
+        return unknown_where(
+            infinite > _MOST_INFINITE * (infinite + number.astype(infinite.dtype)), error
+        )
 
     def to_arviz(self) -> Any:
         """As ArviZ's `InferenceData` (a `DataTree` since its version 1). Needs ArviZ."""

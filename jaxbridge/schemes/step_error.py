@@ -202,6 +202,8 @@ def share_of_order(order: int) -> float:
 
 # Of an error of which D says nothing: figures were wrong by factors of 10,000.
 UNKNOWN_SHARE = math.inf
+# A smaller share of intervals whose steps are too long does not matter to a sum over all.
+MOST_TOO_LONG = 0.02
 _GUESS = 3.0
 
 
@@ -228,6 +230,12 @@ def share_in_regime(
     rates = jax.vmap(rate)(jnp.concatenate([intervals.start, intervals.end])).reshape(2, -1)
     too_long = jnp.max(rates, axis=0) * intervals.duration / num_steps > _LONGEST_STEP
     return jnp.where(too_long & (share > 0), UNKNOWN_SHARE, share)
+
+
+def unknown_where(unknown: Bool[Array, ""], error: StepError) -> StepError:
+    """Return the step error, NaN with an infinite uncertainty where it is unknown."""
+    value, uncertainty = error
+    return StepError(jnp.where(unknown, jnp.nan, value), jnp.where(unknown, jnp.inf, uncertainty))
 
 
 def share_of_known_order(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
