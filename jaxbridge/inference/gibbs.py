@@ -20,7 +20,7 @@ from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.doors import door
 from ..engine.progress import metered_scan
-from ..engine.verdict import Fault
+from ..engine.verdict import Fault, lost_paths
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
 from ..records import Initial, Observation, as_record_problems
@@ -97,6 +97,7 @@ class GibbsPosterior(AbstractPosterior):
         that path. Where this does not go to zero choose another proposal for such intervals.
     - `num_truncated`: weights that `max_trials` cut off, shape (*chains, n): where there are many
         the law is not exact.
+    - `num_nonfinite`: paths that left the state space or the finite numbers, shape (*chains, n).
     - `log_step_error`: an estimate of the step error of the log density of the completed data at
         each draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
         `step_error`, that of the posterior mean, is made of.
@@ -114,6 +115,7 @@ class GibbsPosterior(AbstractPosterior):
     num_simulated: Int[Array, "*chains n"]
     num_missing: Int[Array, "*chains n"]
     num_truncated: Int[Array, "*chains n"]
+    num_nonfinite: Int[Array, "*chains n"]
     log_step_error: Float[Array, "*chains n"]
     sigma_varies: bool = eqx.field(static=True)
     state: GibbsState
@@ -129,7 +131,11 @@ class GibbsPosterior(AbstractPosterior):
         # Counted in every iteration: a stand-in that no proposal has replaced.
         late = self.num_missing[..., self.num_missing.shape[-1] // 2 :]
         often = jnp.mean(self.num_truncated > 0, axis=-1) > _MOST_TRUNCATED
-        return Fault(jnp.any(jnp.min(late, axis=-1) > 0), _MISSING), Fault(jnp.any(often), _CUT_OFF)
+        return (
+            Fault(jnp.any(jnp.min(late, axis=-1) > 0), _MISSING),
+            Fault(jnp.any(often), _CUT_OFF),
+            lost_paths(jnp.sum(self.num_nonfinite), jnp.sum(self.num_simulated)),
+        )
 
 
 @door
@@ -275,6 +281,7 @@ class GibbsInfo(NamedTuple):
     num_simulated: Int[Array, "*chains"]
     num_missing: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
+    num_nonfinite: Int[Array, "*chains"]
 
 
 class _Sampler(eqx.Module):
