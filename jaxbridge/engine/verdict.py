@@ -168,10 +168,15 @@ def lost_paths(
     """
     share = num_lost / jnp.maximum(num_simulated, 1)
     if effective is None or number is None:
-        return Fault(share > _MOST_MISSING / _INEQUALITY, _LOST)
+        return lost_share(share)
     size = jnp.maximum(effective, 1)
     missing = share.astype(size.dtype) * jnp.maximum(number.astype(size.dtype) / size, 1)
     return Fault(missing > jnp.maximum(_MOST_MISSING, 1 / jnp.sqrt(size)), _LOST)
+
+
+def lost_share(share: Float[Array, "*I"]) -> Fault:
+    """Return the fault of a share of lost paths whose weights are not known to be equal."""
+    return Fault(share > _MOST_MISSING / _INEQUALITY, _LOST)
 
 
 def heavy_tails(

@@ -186,7 +186,8 @@ class RecordSampler(eqx.Module):
         (state, guides), completion = guided, self.completion
         noise, log_weight = completion.noise(key, At(state.theta, guides), state.paths)
         ratio = nan_to_neg_inf(completion.coarse_log_weight(state.theta, noise)) - log_weight
-        return jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
+        ratio = jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
+        return jnp.where(completion.steps_are_too_long(state.theta, state.paths), jnp.inf, ratio)
 
 
 def sample_records(
@@ -279,7 +280,9 @@ def _sample_records(
     fields, (moved, taken, has_weight, log_ratio) = drawn(parameters, *draws)
     real = movable(records)
     ever = jnp.any(taken > 0, axis=-4)  # of all draws
-    change = relative_change(log_ratio, jnp.nanmedian(log_ratio))
+    too_long = log_ratio == jnp.inf
+    change = relative_change(log_ratio, jnp.nanmedian(jnp.where(too_long, jnp.nan, log_ratio)))
+    change = jnp.where(too_long, jnp.inf, change)
     posterior = RecordPosterior(
         **fields,
         parameters_moved=moved,

@@ -31,6 +31,7 @@ from ..schemes import (
     root_mean_square_in_sds,
     share_of_order,
     step_fault,
+    unknown_where,
 )
 from .guide_search import GuideCheck, Linearised, linearised
 from .guided_record import path_and_log_weight
@@ -39,6 +40,7 @@ from .observation import Observation
 from .path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep, tuned
 from .problem import RecordProblem, as_record_problem
 from .states import Draws, sample_states
+from .step_regime import steps_are_too_long
 
 # R̂ beyond which chains disagree.
 _MOST_R_HAT = 1.1
@@ -104,8 +106,9 @@ class Smoothed(AbstractResult):
 
         With half as many steps each path is e^D times as likely (`schemes.halving`). The estimate
         is NaN in three cases: one step, Euler steps of a σ with fewer columns than rows, and steps
-        so long that the variance of D exceeds 1 in some interval. If the scheme of a `proposal` is
-        more accurate than `density`, the estimate is too large.
+        so long that the variance of D exceeds 1 in some interval. If two steps of an interval are
+        longer than the relaxation time of the drift, it is NaN with infinite uncertainty. If the
+        scheme of a `proposal` is more accurate than `density`, the estimate is too large.
         """
         return self._step_errors(fn)[0]
 
@@ -186,6 +189,9 @@ class Smoothed(AbstractResult):
         varies = _noise_varies(problem, self.paths[0, 0])
         share = share_of_order(problem.density.order)
         each = [_change(leaf, D, share, varies) for leaf in leaves]
+        mean = jnp.mean(self.paths, axis=(0, 1))
+        too_long = steps_are_too_long(problem, problem.model, mean)
+        each = [unknown_where(too_long, error) for error in each]
         values, doubts = zip(*each, strict=True)
         return jax.tree.unflatten(treedef, values), jax.tree.unflatten(treedef, doubts)
 
