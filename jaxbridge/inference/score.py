@@ -92,7 +92,8 @@ class Score(AbstractResult):
         """The faults of the score, each with a remedy.
 
         They are: intervals without a bridge, weights that are truncated or have heavy tails, too
-        many lost paths in an interval, and a discretisation error that dominates and exceeds 0.05 standard deviations of the score.
+        many lost paths in an interval, and a discretisation error that dominates and exceeds 0.05
+        standard deviations of the score.
         """
         error = jnp.sqrt(jnp.maximum(jnp.diagonal(self.covariance), 0))
         sd = jnp.sqrt(jnp.maximum(jnp.diagonal(self.information), 0))
