@@ -84,7 +84,8 @@ class TransitionLogDensity(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults: no bridge, weights cut off or with heavy tails, too many paths
         lost, a step error that dominates and is beyond 0.05."""
-        return Verdict((*self._weight_faults, step_fault(self._step_error, self.standard_error)))
+        verdict = Verdict((*self._weight_faults, step_fault(self._step_error, self.standard_error)))
+        return verdict.with_finite(self.value, self.standard_error)
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:

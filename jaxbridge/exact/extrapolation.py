@@ -93,7 +93,8 @@ class ExtrapolatedBridges(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the weights of both. Of the step error only `removed(fn)` tells:
         compare half of it with the standard error."""
-        return Verdict((*self.fine._weight_faults, *self.coarse._weight_faults))
+        verdict = Verdict((*self.fine._weight_faults, *self.coarse._weight_faults))
+        return verdict.with_finite(self.fine.mean(), self.coarse.mean())
 
     def _combined(self, fn, fine, coarse, combine):
         share = share_of_known_order(self.fine.step_share)

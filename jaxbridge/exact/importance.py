@@ -140,7 +140,8 @@ class WeightedBridges(AbstractExactBridges):
         the paths lost, a step error of the mean path that dominates and is beyond 0.05 standard
         deviations."""
         error = 1 / jnp.sqrt(jnp.maximum(self.effective_sample_size, 1))  # in the same units
-        return Verdict((*self._weight_faults, step_fault(self.step_error_in_sds(), error)))
+        verdict = Verdict((*self._weight_faults, step_fault(self.step_error_in_sds(), error)))
+        return verdict.with_finite(self.mean(), self.standard_error())
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:

@@ -130,7 +130,7 @@ class Chain(AbstractExactBridges):
                 Fault(moves < min(_FEWEST_MOVES, (self.accepted.shape[-1] + 1) // 2), _STILL),
                 step_fault(self.step_error_in_sds(), error),
             )
-        )
+        ).with_finite(self.mean())
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """That of `mean(fn)`, from the effective sample size of the chain, of at least four states,
