@@ -22,6 +22,11 @@ from .pareto import is_reliable
 
 _NO_FAULT = "No fault was found."
 _PARAMETERS = "Some parameters of the model are not finite, so simulation is impossible."
+_NOT_FINITE = (
+    "The result or its error is not finite, and no other fault was found: a point, an observation "
+    "or a parameter exceeds the range of the floating-point numbers. Use other units, or double "
+    "precision."
+)
 _MISSING = (
     "Some bridges were not found within `max_proposals` proposals. Allow more proposals, lengthen "
     "the duration or choose a smaller `gamma`. On intervals much shorter than the relaxation time, "
@@ -82,6 +87,16 @@ class Verdict(eqx.Module):
     def trustworthy(self) -> Bool[Array, "*I"]:
         """Return whether no fault is present, shape () or (I,)."""
         return ~reduce(jnp.logical_or, (fault.present for fault in self.faults))
+
+    def with_finite(self, *numbers: Float[Array, "*shape"]) -> "Verdict":
+        """Return the same faults, and the fault that one of the numbers is not finite though no
+        other fault is present. Their first axes are those of `trustworthy`."""
+        sound = self.trustworthy
+        finite = [
+            jnp.all(jnp.isfinite(each), axis=tuple(range(sound.ndim, each.ndim)))
+            for each in numbers
+        ]
+        return Verdict((*self.faults, Fault(sound & ~reduce(jnp.logical_and, finite), _NOT_FINITE)))
 
     def why(self) -> str:
         """Return one line for each fault that is present.

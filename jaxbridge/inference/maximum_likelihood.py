@@ -114,7 +114,7 @@ class MaximumLikelihood(AbstractResult):
                 *self.score._weight_faults,
                 Fault(jnp.any(steps.present), steps.sentence),
             )
-        )
+        ).with_finite(self.theta, self.covariance)
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:

@@ -88,7 +88,7 @@ class AbstractPosterior(AbstractResult):
                 *self._faults,
                 Fault(jnp.any(steps.present), steps.sentence),
             )
-        )
+        ).with_finite(self.theta)
 
     @property
     def _chains(self) -> Float[Array, "chains n p"]:

@@ -137,7 +137,7 @@ class RecordMaximumLikelihood(AbstractResult):
                 self.guide.fault(stuck | apart | ~self.newton),
                 Fault(jnp.any(steps.present), steps.sentence),
             )
-        )
+        ).with_finite(self.theta, self.covariance)
 
     @property
     def _chains_disagree(self) -> Bool[Array, ""]:

@@ -98,7 +98,8 @@ class Score(AbstractResult):
         error = jnp.sqrt(jnp.maximum(jnp.diagonal(self.covariance), 0))
         sd = jnp.sqrt(jnp.maximum(jnp.diagonal(self.information), 0))
         steps = step_fault(StepError(self.step_error, self.step_uncertainty), error, sd)
-        return Verdict((*self._weight_faults, Fault(jnp.any(steps.present), steps.sentence)))
+        verdict = Verdict((*self._weight_faults, Fault(jnp.any(steps.present), steps.sentence)))
+        return verdict.with_finite(self.gradient, self.covariance)
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:

@@ -155,7 +155,7 @@ class LogLikelihood(AbstractResult):
                 Fault(self._missing > jnp.maximum(self.standard_error, _MOST_LOST), _LOST),
                 step_fault(error, self.standard_error),
             )
-        )
+        ).with_finite(self.value)
 
     @property
     def _is_heavy(self) -> Bool[Array, ""]:

@@ -159,7 +159,7 @@ class Smoothed(AbstractResult):
                 *guide,
                 step_fault(error, standard_error),
             )
-        )
+        ).with_finite(self.mean(), standard_error)
 
     @property
     def _chains_agree(self) -> Bool[Array, ""]:
