@@ -1,4 +1,8 @@
-"""The choice of a proposal for each interval, made once and by the clock."""
+"""Choice of the fastest proposal for each interval, by pilot runs with measured run times.
+
+`proposal="auto"` makes a similar choice in each call, but estimates run times by a rule, so that it
+also works inside `jit`.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -15,12 +19,12 @@ from ..models.diffusion import Diffusion
 from ..proposals import Choice, choice_between, default_candidates, why_left_out
 from .start_law import best_pilot, coupling_pilots
 
-# Bridges of a pilot run that looks for the coupling to compare with other proposals.
+# Bridges per pilot run of the coupling that is then compared with other proposals.
 _TUNING_PILOT = 500
 
 
-# What a fitted start law may gain.
-_GAIN_OF_TUNING = 10.0
+# Largest gain in efficiency to expect from a fitted start law (for unlikely bridges).
+_LARGEST_TUNING_GAIN = 10.0
 
 
 @door
@@ -36,30 +40,34 @@ def choose_proposal(
     num_pilot: int | None = None,
     for_density: bool = False,
 ) -> Choice:
-    """The proposal with most effective samples per second for each interval, by a pilot run.
+    """Choose the proposal with the most effective samples per second for each interval.
 
-    What `proposal="auto"` does in each call by a rule for the seconds, done once and by the
-    clock, compile time left out: for models whose functions take long, and to choose once and
-    use it often. Pass what it returns as `proposal=` for the same intervals. A choice made
-    outside `jit`; where two proposals are about as fast, either may be chosen.
+    Pilot runs measure effective samples and seconds; compilation is not counted. In contrast,
+    `proposal="auto"` chooses in each call and estimates the seconds by a rule. Use this function
+    for models with slow functions, or to choose once for many calls. Pass the result as `proposal=`
+    for the same intervals.
+
+    Call it outside `jit`. The choice between two proposals of similar speed may differ from run to
+    run.
 
     **Arguments:**
 
     - `key`, `model`, `start`, `end`, `duration`, `num_steps`: as in `sample_bridges`.
-    - `candidates`: proposals and couplings. By default `ModifiedDiffusionBridge`,
-        `Guided("end")` and `Guided("path")`; where the time reversal of the model is known
-        `Coupling(0.0)` and `Coupling(0.5)`; and for a single interval for which one of them comes
-        near the best, one with its start law tuned.
-    - `num_pilot`: pilot paths of each candidate for each interval; by default about 4,000 over
-        all intervals, at least 32 and at most 512.
-    - `for_density`: for `transition_log_density` and `pmmh`. Then couplings that start from the
-        stationary law are candidates only if the model is declared `normalised`; one with a fitted
-        law is tried where the others do badly on a single interval.
+    - `candidates`: proposals and couplings. The default candidates are:
+        - `ModifiedDiffusionBridge()`, `Guided("end")` and `Guided("path")`;
+        - `Coupling(0.0)` and `Coupling(0.5)` if the model has a time reversal;
+        - a coupling with a fitted start law, for a single interval, if the pilot runs suggest that
+          it may be the fastest.
+    - `num_pilot`: pilot paths per candidate and interval. By default about 4,000 over all
+        intervals, at least 32 and at most 512 per interval.
+    - `for_density`: true if the choice is for `transition_log_density` or `pmmh`. Then the default
+        couplings from the stationary law need a model that is declared `normalised`. On a single
+        interval where all other candidates are inefficient, a coupling with a fitted start law is
+        added.
 
-    **Returns:** `Choice`; printed, it is a table.
+    **Returns:** `Choice`, which prints as a table.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit; `TypeError` inside
-    `jit`.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments; `TypeError` inside `jit`.
 
     **Example:**
 
@@ -75,17 +83,17 @@ def choose_proposal(
     intervals, batched = problem.intervals, problem.batched
     if is_traced(key, model, intervals):
         raise TypeError(
-            "a choice by the clock cannot be made inside `jit` or `vmap`: make it before, or use "
-            '`proposal="auto"`.'
+            "`choose_proposal` measures run times, so it cannot run inside `jit` or `vmap`: call "
+            'it before, or pass `proposal="auto"`.'
         )
     if num_pilot is not None:
         num_pilot = check_count("num_pilot", num_pilot, 2)
     left_out = ""
     if candidates is None:
-        given = default_candidates(model, for_density)
+        base_candidates = default_candidates(model, for_density)
         left_out = why_left_out(model, for_density)
     else:
-        given = list(as_sequence("candidates", candidates, "proposals"))
+        base_candidates = list(as_sequence("candidates", candidates, "proposals"))
 
     def choose_between(candidates, left_out=""):
         auto = choice_between(candidates, num_pilot=num_pilot, left_out=left_out)
@@ -95,29 +103,38 @@ def choose_proposal(
             auto.check_for_density(model)
         return auto.choose(key, model, intervals, num_steps, timed=True)
 
-    choice = choose_between(given, left_out)
-    possible = model.has_reversal and (model.has_density or not for_density)
-    if candidates is None and not batched and possible and _worth_tuning(choice):
+    choice = choose_between(base_candidates, left_out)
+    # A fitted start law has a normalised density of its own, so that a density needs
+    # `log_stationary` only up to a constant.
+    tunable = model.has_reversal and (model.has_density or not for_density)
+    if candidates is None and not batched and tunable and _is_tuning_worthwhile(choice):
         tuned = _tuned_coupling(key, model, problem, for_density)
-        choice = choice if tuned is None else choose_between([*given, tuned])
+        choice = choice if tuned is None else choose_between([*base_candidates, tuned])
     return choice
 
 
-def _worth_tuning(choice: Choice) -> bool:
-    """Whether a coupling comes near the best proposal, so that a start law might put it first; or,
-    where none was tried, whether the best one at all might be put behind."""
+def _is_tuning_worthwhile(choice: Choice) -> bool:
+    """Return whether a coupling with a fitted start law may become the fastest proposal.
+
+    The criterion is the rate of the best coupling if there is one. Otherwise it is the efficiency
+    of all candidates.
+    """
     rates = np.asarray(choice.efficiency / choice.seconds)[:, 0]
     coupled = [candidate.coupled for candidate in choice.candidates]
+    # NaN: no pilot run, because the candidate could not be the fastest.
     rates = np.where(np.isnan(rates), 0, rates)
     if not any(coupled):
-        return bool(np.all(np.asarray(choice.efficiency)[:, 0] * _GAIN_OF_TUNING < 1))
-    return bool(np.max(rates, where=coupled, initial=0) * _GAIN_OF_TUNING > rates.max())
+        return bool(np.all(np.asarray(choice.efficiency)[:, 0] * _LARGEST_TUNING_GAIN < 1))
+    return bool(np.max(rates, where=coupled, initial=0) * _LARGEST_TUNING_GAIN > rates.max())
 
 
 def _tuned_coupling(
     key: Key[Array, ""], model: Diffusion, problem: BridgeProblem, for_density: bool
 ) -> Coupling | None:
-    """The best of a few couplings, `None` where no pilot run succeeded."""
+    """Return the most efficient of two couplings with fitted start laws.
+
+    Return `None` if no pilot run succeeded.
+    """
     num_pilot = max(_TUNING_PILOT, 20 * len(problem.like))
     pilots = []
     for coupling in (Coupling(0.0), Coupling(0.5)):

@@ -1,13 +1,15 @@
-"""How much do hitting probabilities vary over exact bridges?
+"""Variation of the hitting probability over exact bridges, by a regression.
 
-The approximate bridge has the density `f_bridge(z) π_T(z) / π_T`, equation (z-density): it is
-exact if π_T(z) is constant. With ρ̂_N the mean of N counts and B an exact bridge,
+π_T(z) is the probability that the associated diffusion hits the path z. By equation (z-density) the
+approximate bridge has the density `f_bridge(z) π_T(z) / π_T`. Hence approximate bridges are exact
+if π_T(z) is constant. Let ρ̂_N be the mean of N counts, and B an exact bridge. By equation
+(regression)
 
     V(ρ̂_N) = V(1/π_T(B)) + E[(1 - π_T(B)) / π_T(B)²] / N,
 
-equation (regression), so a regression of the variance of ρ̂_N on 1/N has V(1/π_T(B)) as its
-intercept. It holds for **fresh** counts drawn for each exact bridge; the counts that a chain
-itself has kept are size-biased.
+so a regression of the variance of ρ̂_N on 1/N has the intercept V(1/π_T(B)). The equation needs
+**fresh** counts for each exact bridge: the counts stored in a pseudo-marginal chain are
+size-biased.
 """
 
 from collections.abc import Sequence
@@ -29,17 +31,19 @@ from ..models.diffusion import Diffusion
 
 
 class HittingVariation(NamedTuple):
-    """What `hitting_variation` returns: the regression of V(ρ̂_N) on 1/N, with standard errors by
-    bootstrap over the bridges.
+    """Result of `hitting_variation`: the regression of V(ρ̂_N) on 1/N.
+
+    Standard errors are by bootstrap over the bridges. Scalars have shape ().
 
     - `num_counts`, `variances`: N and V(ρ̂_N), shape (K,).
-    - `intercept`, `intercept_error`: an estimate of V(1/π_T(B)), which chance can make negative,
-        and its error.
-    - `slope`: an estimate of E[(1-π)/π²].
-    - `mean`: of ρ̂, an estimate of E[1/π_T(B)].
-    - `ratio`, `ratio_error`: √intercept / mean, zero for a negative intercept: the variation of
-        1/π_T(B), and its error. Zero for a proposal that is exact as it is.
-    - `num_truncated`: bridges left out because their counts were cut off by `max_trials`.
+    - `intercept`, `intercept_error`: estimate of V(1/π_T(B)), and its standard error. The estimate
+        may be negative by chance.
+    - `slope`: estimate of E[(1 - π_T(B)) / π_T(B)²].
+    - `mean`: mean of ρ̂_N for the largest N, an estimate of E[1/π_T(B)].
+    - `ratio`, `ratio_error`: √intercept / mean, the coefficient of variation of 1/π_T(B), and its
+        standard error. A negative intercept gives zero. The exact value is zero if approximate
+        bridges are exact.
+    - `num_truncated`: number of bridges left out because `max_trials` truncated their counts.
     """
 
     num_counts: Int[Array, " K"]
@@ -63,21 +67,24 @@ def hitting_variation(
     start_law: AnyStartLaw | None = None,
     max_trials: int | None = None,
 ) -> HittingVariation:
-    """How much 1/π_T varies over exact bridges: section 3.2 of the paper.
+    """Estimate how much 1/π_T varies over exact bridges, as in section 3.2 of the paper.
+
+    A large variation means that approximate bridges are biased and that weights are unequal.
 
     **Arguments:**
 
     - `key`, `model`, `max_trials`: as in `hitting_counts`.
-    - `bridges`: exact ones, of one interval, with whole paths: from `sample_exact_bridges`
-        (thin the chain: states that repeat cost counts but say little) or `weigh_bridges`,
-        whose weights are taken into account.
-    - `num_counts`: increasing, at least two. The largest is what is simulated for each bridge.
-    - `start_law`: where the associated diffusion starts, by default as the bridges' coupling has
-        it.
+    - `bridges`: exact bridges of one interval with complete paths, paths of shape (n, N+1, d).
+        Pass a result of `weigh_bridges`, whose weights are used, or of `sample_exact_bridges`. Thin
+        the chain first, because repeated states need new counts but add little information.
+    - `num_counts`: the values of N, at least two and increasing. The largest is the number of
+        simulated counts per bridge.
+    - `start_law`: law of the associated diffusion at time zero, by default that of the bridges'
+        coupling.
 
     **Returns:** `HittingVariation`.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -89,18 +96,18 @@ def hitting_variation(
     check_key(key)
     sizes = [check_count("num_counts", n) for n in as_sequence("num_counts", num_counts, "counts")]
     if len(sizes) < 2 or sorted(set(sizes)) != sizes:
-        raise ValueError(f"`num_counts` must be two or more increasing numbers; got {num_counts}.")
+        raise ValueError(f"`num_counts` needs two or more increasing numbers; got {num_counts}.")
     if not isinstance(bridges, AbstractExactBridges):
         raise TypeError(
-            "`bridges` must have the exact law: pass what `weigh_bridges` or "
-            f"`sample_exact_bridges` returned; got {type(bridges).__name__}."
+            "`bridges` must have the exact law: pass a result of `weigh_bridges` or "
+            f"`sample_exact_bridges`; got {type(bridges).__name__}."
         )
     if bridges.paths.ndim != 3 or len(bridges.paths) < 2:
         raise ValueError(
-            "`bridges` must be two or more of one interval, paths of shape (n, N+1, d); got "
-            f"{bridges.paths.shape}."
+            "`bridges` needs two or more bridges of one interval, paths of shape (n, N+1, d); got "
+            f"paths of shape {bridges.paths.shape}."
         )
-    counted = hitting_counts(
+    hits = hitting_counts(
         key_for("variation", key),
         model,
         bridges,
@@ -108,15 +115,17 @@ def hitting_variation(
         start_law=start_law,
         max_trials=max_trials,
     )
-    usable = bridges.met & ~counted.truncated
+    usable = bridges.met & ~hits.truncated
     weights = jnp.where(usable, normalised(bridges.log_mean_weights), 0)
-    sums = jnp.cumsum(jnp.where(usable[:, None], counted.counts, 1), axis=1)
+    # The 1 is a placeholder: bridges that are not usable have weight zero.
+    sums = jnp.cumsum(jnp.where(usable[:, None], hits.counts, 1), axis=1)
     ends = np.asarray(sizes)
-    # ρ̂_N of each bridge, (n, K)
+    # ρ̂_N of each bridge, shape (n, K). The estimates share counts, so the errors are correlated
+    # over N: hence the bootstrap.
     rho = sums[:, ends - 1].astype(weights.dtype) / ends.astype(weights.dtype)
-    drawn = jax.random.randint(key_for("bootstrap", key), (200, len(rho)), 0, len(rho))
+    resampled = jax.random.randint(key_for("bootstrap", key), (200, len(rho)), 0, len(rho))
     estimates = _regress(rho, weights, ends)
-    replicates = _replicates(drawn, rho, weights, ends)
+    replicates = _replicates(resampled, rho, weights, ends)
     variances, intercept, slope, mean, ratio = estimates
     return HittingVariation(
         jnp.asarray(ends),
@@ -127,14 +136,14 @@ def hitting_variation(
         mean,
         ratio,
         jnp.nanstd(replicates[4]),
-        jnp.sum(counted.truncated),
+        jnp.sum(hits.truncated),
     )
 
 
 def _regress(
     rho: Float[Array, "n K"], weights: Float[Array, " n"], sizes: Int[Array | np.ndarray, " K"]
 ):
-    """V(ρ̂_N), then intercept and slope of its regression on 1/N, the mean and the ratio."""
+    """Return V(ρ̂_N), the intercept and slope of its regression on 1/N, the mean and the ratio."""
     weights = weights / jnp.sum(weights)
     mean = weights @ rho
     # With equal weights this is the variance with n - 1 in the denominator.
@@ -147,6 +156,6 @@ def _regress(
 
 
 @jax.jit
-def _replicates(drawn, rho, weights, sizes):
-    """The regression with bridges drawn anew, with replacement: the bootstrap."""
-    return jax.vmap(lambda i: _regress(rho[i], weights[i], sizes))(drawn)
+def _replicates(resampled, rho, weights, sizes):
+    """Repeat the regression for each bootstrap sample, given by bridge indices of shape (B, n)."""
+    return jax.vmap(lambda i: _regress(rho[i], weights[i], sizes))(resampled)

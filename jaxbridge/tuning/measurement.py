@@ -1,4 +1,7 @@
-"""Estimates of one quantity over bridges: by a setting, in closed form, and by a reference."""
+"""Estimates of one quantity over bridges: by a setting, in closed form, and by a reference run.
+
+`work_precision` chooses the settings; this module runs and times one of them.
+"""
 
 import time
 from collections.abc import Callable, Sequence
@@ -28,18 +31,21 @@ from ..models.ornstein_uhlenbeck import OrnsteinUhlenbeckParams, ou_transition
 from ..schemes import share_of_known_order
 from .settings import Setting
 
-# What is combined from two grids, and the method that is run on each.
+# Methods that combine two grids, and the method that runs on each grid.
 EXTRAPOLATED = {"extrapolated_weights": "weights", "extrapolated_density": "density"}
 
 
 def is_density(method: str) -> bool:
-    """Whether it estimates p_T(a, b)."""
+    """Return whether `method` estimates p_T(a, b)."""
     return EXTRAPOLATED.get(method, method) == "density"
 
 
 class Estimate(NamedTuple):
-    """The mean of m variables, its standard error and their standard deviation, from simulated
-    paths, or another source in words."""
+    """Estimated mean of m variables, with its standard error and their standard deviation.
+
+    `num_simulated` and `num_missing` count paths and unusable bridges. `source` describes the
+    origin of a reference.
+    """
 
     mean: Float[np.ndarray, " m"]
     error: Float[np.ndarray, " m"]
@@ -50,13 +56,19 @@ class Estimate(NamedTuple):
 
     @property
     def is_random(self) -> np.ndarray:
-        """Not the same for all bridges, as end points are, up to rounding."""
+        """Return which variables vary over bridges: end points, for instance, do not.
+
+        The threshold allows for rounding errors.
+        """
         scale = max(np.abs(self.mean).max(), self.sd.max())
         return self.sd > 1e-6 * scale
 
 
 class Scene(NamedTuple):
-    """What is estimated."""
+    """The estimated expectation: of `fn` of the bridge at the times `save_at`.
+
+    `is_path` is true if `fn` is the identity.
+    """
 
     model: Diffusion
     start: np.ndarray
@@ -67,12 +79,12 @@ class Scene(NamedTuple):
     is_path: bool
 
     def interval(self, dtype: str) -> tuple[Any, ...]:
-        """The model and the interval in one precision; x64 must be enabled for float64."""
+        """Return model, start, end and duration in one precision; float64 needs x64 mode."""
         points = (jnp.asarray(point, dtype) for point in (self.start, self.end))
         return cast_floats(self.model, dtype), *points, jnp.asarray(self.duration, dtype)
 
     def values(self, paths: Float[Array, "n K d"]) -> Float[np.ndarray, "n m"]:
-        """`fn` of each path."""
+        """Return `fn` of each path, flattened, in double precision."""
         fn = path_function("fn", self.fn, jax.ShapeDtypeStruct(paths.shape[1:], paths.dtype))
         return np.asarray(
             jax.vmap(lambda path: jnp.ravel(as_returned("fn", fn(path))))(paths), float
@@ -80,35 +92,37 @@ class Scene(NamedTuple):
 
 
 def check_precisions(scene: Scene, dtypes: Sequence[str]) -> None:
-    """Raise `TypeError` where the model's functions cannot be traced in all of these, before
-    anything is compiled: JAX remembers the precision in which it first saw a NumPy constant inside
-    a derivative, and then mixes that with another."""
+    """Raise `TypeError` if the model's functions cannot be traced in each of these precisions.
 
-    def look(model: Diffusion, x: Array):
+    The check precedes all compilation. The reason: JAX caches a NumPy constant inside a derivative
+    in the precision of the first trace, and a later trace in the other precision mixes both.
+    """
+
+    def evaluate(model: Diffusion, x: Array):
         forward = model.forward(x)
-        seen = [jax.jacfwd(forward.drift)(x), forward.sigma(x).as_matrix(x.shape[0], x.dtype)]
+        values = [jax.jacfwd(forward.drift)(x), forward.sigma(x).as_matrix(x.shape[0], x.dtype)]
         if model.has_density:
-            seen.append(jax.grad(model.log_stationary)(x))
+            values.append(jax.grad(model.log_stationary)(x))
         if model.has_reversal:
-            seen.append(model.backward(x).drift(x))
-        return seen
+            values.append(model.backward(x).drift(x))
+        return values
 
     for dtype in dict.fromkeys(dtypes):
         with jax.enable_x64(dtype == "float64"):
             model, x, *_ = scene.interval(dtype)
             try:
-                eqx.filter_eval_shape(eqx.filter_jit(look), model, x)
+                eqx.filter_eval_shape(eqx.filter_jit(evaluate), model, x)
             except TypeError as error:
                 raise TypeError(
-                    "the model's functions do not serve in single and in double precision, in "
-                    "which settings and the reference are run: take constants to the precision of "
-                    "the point, `jnp.asarray(constant, x.dtype)`, or give them to `Diffusion` "
-                    f"among its `params`. ({error})"
+                    "the model's functions must work in single and in double precision, because "
+                    "the settings and the reference use both; JAX reports the error below. Convert "
+                    "constants to the dtype of the point, `jnp.asarray(constant, x.dtype)`, or "
+                    f"give them to `Diffusion` in its `params`. ({error})"
                 ) from error
 
 
 class Run(NamedTuple):
-    """A setting: a method with a proposal, in a precision and so many steps and bridges."""
+    """One setting to run: method, proposal, precision, number of steps and number of bridges."""
 
     method: str
     proposal: Any
@@ -117,7 +131,7 @@ class Run(NamedTuple):
     num_bridges: int
 
     def result(self, key: Key[Array, ""], scene: Scene) -> Any:
-        """The result of the call that is timed."""
+        """Return the result of the library call that this setting stands for."""
         if self.method in EXTRAPOLATED:
             fine = self._replace(method=EXTRAPOLATED[self.method])
             coarse = fine._replace(num_steps=self.num_steps // 2)
@@ -139,10 +153,10 @@ class Run(NamedTuple):
 
 
 def _estimate(scene: Scene, method: str, result: Any) -> Estimate:
-    """Means and their errors, in double precision, from what a run returned."""
+    """Convert the result of `Run.result` to an `Estimate`, in double precision."""
     if method in EXTRAPOLATED:
         fine, coarse = (
-            _estimate(scene, EXTRAPOLATED[method], one) for one in (result.fine, result.coarse)
+            _estimate(scene, EXTRAPOLATED[method], part) for part in (result.fine, result.coarse)
         )
         share = float(share_of_known_order(result.fine.step_share))
         mean = fine.mean + share * (fine.mean - coarse.mean)
@@ -154,8 +168,9 @@ def _estimate(scene: Scene, method: str, result: Any) -> Estimate:
             fine.num_missing + coarse.num_missing,
         )
     if method == "density":
-        found = np.isfinite(result.value)
-        value = np.where(found, np.exp(np.asarray(result.value, float)), np.nan)[None]
+        is_usable = np.isfinite(result.value)
+        value = np.where(is_usable, np.exp(np.asarray(result.value, float)), np.nan)[None]
+        # The standard error of log p̂ is the relative error of p̂, to first order.
         relative = float(result.standard_error)
         simulated, truncated = int(result.num_simulated), int(result.num_truncated)
         return Estimate(value, value * relative, value, simulated, truncated)
@@ -171,28 +186,30 @@ def _estimate(scene: Scene, method: str, result: Any) -> Estimate:
         weights = np.asarray(result.weights, float)[met]
         weights /= weights.sum()
         mean = weights @ values
+        # Standard error of a self-normalised estimate, by the delta method.
         deviations = (values - mean) ** 2
         error, sd = np.sqrt(weights**2 @ deviations), np.sqrt(weights @ deviations)
     else:
         mean, sd = values.mean(0), values.std(0)
+        # Approximate bridges are independent; the states of a chain are not.
         independent = method == "approximate"
         size = len(values) if independent else np.asarray(effective_sample_size(values), float)
         error = sd / np.sqrt(size)
     return Estimate(mean, error, sd, int(simulated), missing)
 
 
-def given(reference: tuple[Numbers, Numbers] | None) -> Estimate | None:
-    """The mean and the standard deviation that the user knows."""
+def user_estimate(reference: tuple[Numbers, Numbers] | None) -> Estimate | None:
+    """Return the user's mean and standard deviation as an `Estimate` without error."""
     if reference is None:
         return None
     if len(as_sequence("reference", reference, "a mean and a standard deviation")) != 2:
-        raise ValueError("`reference` must be a mean and a standard deviation, `(mean, sd)`.")
+        raise ValueError(f"`reference` must be a pair `(mean, sd)`; got {len(reference)} entries.")
     mean, sd = (np.ravel(np.asarray(as_floating("reference", part))) for part in reference)
     return Estimate(mean, np.zeros_like(mean), sd)
 
 
-def given_density(log_density: Numbers | None) -> Estimate | None:
-    """The density that the user knows."""
+def user_density(log_density: Numbers | None) -> Estimate | None:
+    """Return the user's density as an `Estimate` without error."""
     if log_density is None:
         return None
     value = np.exp(np.asarray(as_numbers({"log_density": log_density})["log_density"]))[None]
@@ -202,8 +219,11 @@ def given_density(log_density: Numbers | None) -> Estimate | None:
 def closed_form(
     key: Key[Array, ""], scene: Scene, density: bool, num_draws: int
 ) -> Estimate | None:
-    """The exact values for an Ornstein–Uhlenbeck process, of which only a function of the user's
-    own needs draws."""
+    """Return the exact values for an Ornstein–Uhlenbeck process, `None` for other models.
+
+    An `fn` of the user needs `num_draws` draws of the exact bridge; the path itself and the density
+    need none.
+    """
     if not isinstance(scene.model.params, OrnsteinUhlenbeckParams):
         return None
     model, start, end, duration = scene.interval("float64")
@@ -222,7 +242,11 @@ def closed_form(
 
 
 def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
-    """A fine run by the best scheme there is; to its error belongs what half the steps change."""
+    """Return the reference: a run with many steps by the most accurate scheme of its proposal.
+
+    The error includes the change between half the steps and all steps, as a bound of the
+    discretisation error.
+    """
     best = run.proposal.most_accurate(*scene.interval("float64")[:2])
     limit = run._replace(proposal=best)
     half = limit._replace(num_steps=max(run.num_steps // 2, 1))
@@ -231,19 +255,20 @@ def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
     words = limit.proposal.describe()
     if not np.all(np.isfinite(fine.mean) & np.isfinite(coarse.mean)):
         raise ValueError(
-            f"the reference, {words} in {run.num_steps} steps, found no bridges: choose other "
-            "`proposals`, or pass what is known as `reference`."
+            f"the reference run ({words}, {run.num_steps} steps) found no bridges: choose other "
+            "`proposals`, or pass known values as `reference` or `log_density`."
         )
-    chance = fine.error**2 + coarse.error**2
-    changed = np.maximum((fine.mean - coarse.mean) ** 2 - chance, 0)
+    # The squared difference minus its expectation under pure Monte Carlo noise.
+    noise = fine.error**2 + coarse.error**2
+    squared_change = np.maximum((fine.mean - coarse.mean) ** 2 - noise, 0)
     words += f", {run.method}, {run.num_steps} steps, {run.num_bridges:,} bridges"
-    return fine._replace(error=np.sqrt(fine.error**2 + changed), source=words)
+    return fine._replace(error=np.sqrt(fine.error**2 + squared_change), source=words)
 
 
 def measure(
     key: Key[Array, ""], scene: Scene, run: Run, exact: Estimate, limit: Estimate, repeats: int
 ) -> Setting:
-    """Run one setting, time it and compare."""
+    """Run and time one setting, and compare its estimate with the exact value and its limit."""
 
     def timed():
         begin = time.perf_counter()
@@ -251,16 +276,18 @@ def measure(
         return result, time.perf_counter() - begin
 
     with jax.enable_x64(run.dtype == "float64"):
+        # The first run compiles.
         result, first = timed()
         seconds = float(np.median([timed()[1] for _ in range(repeats)]))
-        found = _estimate(scene, run.method, result)
+        estimate = _estimate(scene, run.method, result)
         shape = getattr(getattr(result, "fine", result), "pareto_k", None)
 
-    def size(difference):
+    def rms(difference):
+        """Return the root mean square in standard deviations of the estimated variables."""
         ratio = difference[exact.is_random] / exact.sd[exact.is_random]
         return float(np.sqrt(np.mean(ratio**2)))
 
-    monte_carlo = size(found.error)
+    monte_carlo = rms(estimate.error)
     effective = monte_carlo**-2 if monte_carlo > 0 else np.nan
     scheme, meeting, gamma = run.proposal.ingredients()
     return Setting(
@@ -271,17 +298,17 @@ def measure(
         gamma,
         run.dtype,
         run.num_steps,
-        size(found.mean - exact.mean),
-        size(np.hypot(found.error, exact.error)),
-        size(found.mean - limit.mean),
-        size(np.hypot(found.error, limit.error)),
-        size(limit.mean - exact.mean),
+        rms(estimate.mean - exact.mean),
+        rms(np.hypot(estimate.error, exact.error)),
+        rms(estimate.mean - limit.mean),
+        rms(np.hypot(estimate.error, limit.error)),
+        rms(limit.mean - exact.mean),
         monte_carlo,
         seconds,
         max(first - seconds, 0.0),
-        found.num_simulated,
+        estimate.num_simulated,
         effective,
         effective / seconds,
-        found.num_missing,
+        estimate.num_missing,
         np.nan if shape is None else float(shape),
     )

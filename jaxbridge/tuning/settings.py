@@ -1,4 +1,7 @@
-"""What accuracy costs in time: the settings that were measured, and the cheapest of them."""
+"""Results of `work_precision`: the measured settings, their table and the cheapest setting.
+
+The module needs no simulation: it works on numbers that `measurement` produced.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -10,22 +13,27 @@ from ..engine.pareto import is_reliable
 
 
 class Setting(NamedTuple):
-    """One setting of `work_precision`, and what it came to.
+    """One setting of `work_precision` with its measured errors and times.
 
-    - `method`, `proposal`, `scheme`, `meeting`, `gamma`, `dtype`, `num_steps`: the setting;
-        `scheme` is the target density of proposals that are pulled to the end point, and `gamma`
-        NaN where there is none.
-    - `error`: of the estimate, in standard deviations of the estimated variable (of a density:
-        relative), with its `uncertainty`, a standard error.
-    - `step_error` with its `step_uncertainty`, `method_error`, `monte_carlo_error`: its parts.
-    - `seconds` of a run, and `compile_seconds`, which are apart.
-    - `num_simulated`: paths simulated.
-    - `effective_samples`: how many independent exact bridges have this Monte Carlo error.
-    - `per_second`: those, per second.
-    - `num_missing`: bridges that were not found, or whose weights were cut off: the estimate is
-        that of the others, or NaN if there are none.
-    - `pareto_k`: k̂ of the weights, NaN where there are none. Above 0.7 no figure of the row is to
-        be trusted.
+    Errors are in standard deviations of the estimated variable; errors of a density are relative.
+
+    - `method`, `proposal`, `scheme`, `meeting`, `gamma`, `dtype`, `num_steps`: the setting.
+        `scheme` is the scheme of a coupling or the target density of a guided proposal. `gamma` is
+        NaN for proposals without γ.
+    - `error`, `uncertainty`: distance of the estimate from the reference, and its standard error.
+    - `step_error`, `step_uncertainty`: discretisation error, and its standard error.
+    - `method_error`: distance of the method's limit from the exact law. Zero except for approximate
+        bridges.
+    - `monte_carlo_error`: standard error of the estimate by the number of samples.
+    - `seconds`: median duration of one run, without compilation.
+    - `compile_seconds`: additional duration of the first run.
+    - `num_simulated`: number of simulated paths.
+    - `effective_samples`: number of independent exact bridges with the same Monte Carlo error.
+    - `per_second`: effective samples per second.
+    - `num_missing`: number of bridges that were not found, or whose weights were truncated. The
+        estimate uses the other bridges and is NaN if there are none.
+    - `pareto_k`: k̂ of the weights, NaN for methods without weights. Above 0.7 the whole row is
+        unreliable.
     """
 
     method: str
@@ -51,35 +59,41 @@ class Setting(NamedTuple):
 
     @property
     def curve(self) -> str:
-        """All but the number of steps, in words."""
+        """Return the setting in words, without the number of steps."""
         words = (self.method, self.proposal, self.scheme, self.meeting, self.dtype)
         return ", ".join(word for word in words if word)
 
     def seconds_for(self, target: float) -> float:
-        """Seconds until the root of the sum of both squared errors is below `target`: the one that
-        stays, at its upper end, and the Monte Carlo error of a longer run. Infinite where the
-        former is above, be it for its uncertainty alone."""
-        stays = self.error + self.uncertainty
-        if not stays < target:
+        """Return the seconds that this setting needs for a total error of `target`.
+
+        The total error is the root of the sum of two squares: the upper bound `error +
+        uncertainty` of the error that does not shrink with the number of samples, and the Monte
+        Carlo error. The result is infinite if that bound is not below `target`.
+        """
+        bias_bound = self.error + self.uncertainty
+        # `not <` instead of `>=`: an error of NaN gives infinity, too.
+        if not bias_bound < target:
             return np.inf
-        return 1 / (target**2 - stays**2) / self.per_second
+        return 1 / (target**2 - bias_bound**2) / self.per_second
 
 
 class Order(NamedTuple):
-    """The fitted exponent of the step error in the step length, and its standard error, in which
-    the error of the reference, common to all points, is not counted; NaN where fewer than two step
-    errors can be told from noise."""
+    """Fitted order of convergence: the exponent of the discretisation error in the step size.
+
+    - `order`: the exponent, NaN if fewer than two step counts have significant errors.
+    - `error`: its standard error. It omits the error of the reference, which all points share.
+    """
 
     order: float
     error: float
 
 
 class WorkPrecision(NamedTuple):
-    """What `work_precision` returns.
+    """Result of `work_precision`.
 
-    - `settings`: a tuple of `Setting`; `pandas.DataFrame(result.settings)` is a table.
-    - `reference`: "exact", or how the finest run was made.
-    - `target`: the accuracy asked for, or `None`.
+    - `settings`: tuple of `Setting`. `pandas.DataFrame(result.settings)` converts it to a table.
+    - `reference`: "exact", or a description of the reference run.
+    - `target`: the required accuracy, or `None`.
     """
 
     settings: tuple[Setting, ...]
@@ -87,29 +101,34 @@ class WorkPrecision(NamedTuple):
     target: float | None
 
     def as_dict(self) -> dict[str, np.ndarray]:
-        """The table as one array for each column."""
+        """Return the table as a dictionary with one array per column."""
         columns = zip(*self.settings, strict=True)
         return {
             name: np.array(column) for name, column in zip(Setting._fields, columns, strict=True)
         }
 
     def cheapest(self, target: float | None = None) -> Setting | None:
-        """The setting that reaches an accuracy, by default `target`, in the least time; `None`
-        where none does, or the uncertainty of their errors is too large to tell."""
+        """Return the setting that reaches an accuracy (by default `self.target`) in the least time.
+
+        Return `None` if no setting reaches it, or if the uncertainties are too large to decide.
+        Raise `ValueError` if there is no target.
+        """
         target = self.target if target is None else target
         if target is None:
-            raise ValueError("`cheapest` needs a `target`: an error in standard deviations.")
+            raise ValueError(
+                "`cheapest` needs a `target`; got None. Pass an error in standard deviations."
+            )
         best = min(self.settings, key=lambda setting: setting.seconds_for(target))
         return best if np.isfinite(best.seconds_for(target)) else None
 
     def statement(self, target: float | None = None) -> str:
-        """What an accuracy costs here, in a sentence."""
+        """Return one sentence with the cheapest setting for an accuracy, or with advice."""
         target = self.target if target is None else target
         best = self.cheapest(target)
         if target is None or best is None:
             return (
-                f"accuracy {target:g}: none of these settings is seen to reach it; take more "
-                "steps, or more bridges"
+                f"accuracy {target:g}: no setting is shown to reach it; use more steps, or more "
+                "bridges"
             )
         seconds = best.seconds_for(target)
         return (
@@ -117,11 +136,11 @@ class WorkPrecision(NamedTuple):
         )
 
     def orders(self) -> dict[str, Order]:
-        """The order of the step error of each curve."""
+        """Return the fitted order of convergence of each curve, by the curve's name."""
         return {curve: _fit_order(group) for curve, group in self.curves()}
 
     def curves(self) -> Iterator[tuple[str, list[Setting]]]:
-        """The settings that differ in the number of steps only, by what they share."""
+        """Iterate over curves: a name, and the settings that differ in the number of steps only."""
         for curve in dict.fromkeys(setting.curve for setting in self.settings):
             yield curve, [setting for setting in self.settings if setting.curve == curve]
 
@@ -149,14 +168,15 @@ class WorkPrecision(NamedTuple):
 
 
 def _fit_order(group: Sequence[Setting]) -> Order:
-    """Least squares of log step error against log number of steps, weighted by how well each is
-    known; those within two standard errors of zero are left out."""
-    known = [s for s in group if s.step_error > 2 * s.step_uncertainty]
-    if len({s.num_steps for s in known}) < 2:
+    """Fit the log of the step error to the log of the step size by weighted least squares."""
+    # Errors within two standard errors of zero are mostly noise: their logarithms would mislead.
+    significant = [s for s in group if s.step_error > 2 * s.step_uncertainty]
+    if len({s.num_steps for s in significant}) < 2:
         return Order(np.nan, np.nan)
-    x = -np.log([s.num_steps for s in known])
-    y = np.log([s.step_error for s in known])
-    weight = np.array([(s.step_error / s.step_uncertainty) ** 2 for s in known])
+    x = -np.log([s.num_steps for s in significant])
+    y = np.log([s.step_error for s in significant])
+    # By the delta method log(error) has the standard error uncertainty / error.
+    weight = np.array([(s.step_error / s.step_uncertainty) ** 2 for s in significant])
     centred = x - np.average(x, weights=weight)
     spread = weight @ centred**2
     return Order(float(weight * centred @ y / spread), float(spread**-0.5))

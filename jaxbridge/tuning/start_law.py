@@ -1,11 +1,16 @@
-"""Which start law, and which γ? By pilot runs: the one with most effective samples per
-simulated path, proposals and trials alike (end of section 3 of the paper: an open question).
-And which proposal at all? The one with most effective samples per second (`choose_proposal`).
+"""Choice of γ and of the start law μ of a coupling, by pilot runs.
 
-Start laws are sought between ν, the best one for likely end points, and the Gaussian fit G to
-the starts X*_T of the reversed paths that met, which hits an unlikely bridge far more often:
-`μ ∝ N_ν^{1-λ} G^λ` with N_ν the Gaussian fit to ν, and λ = 0 standing for ν itself. (A fit to
-all starts, met or not, is worse where few pairs meet.)
+The criterion is the number of effective samples per simulated path, where proposals and trials both
+count as simulated paths. The end of section 3 of the paper leaves this choice open.
+
+The candidates lie between two laws. The stationary law ν is the best one for likely end points. The
+Gaussian fit G to the time-0 values of the reversed paths that met hits an unlikely bridge far more
+often. With N_ν the Gaussian fit to ν, the candidates are
+
+    μ ∝ N_ν^{1-λ} G^λ,
+
+and λ = 0 stands for ν itself. G uses only the paths that met: a fit to all reversed paths is worse
+if few pairs meet.
 """
 
 import itertools
@@ -41,12 +46,12 @@ from ..models.gaussian_law import GaussianLaw
 _SHARES = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 
-# Efficiencies this close are not told apart by a pilot run; of such laws the one closest to ν
-# is taken, whose weights are bounded more safely.
+# A pilot run cannot distinguish efficiencies within this factor. Among such laws we choose the one
+# closest to ν, because the ratio μ/ν in its weights is bounded more safely.
 _TOLERANCE = 1.1
 
 
-# Pilot counts that take longer are cut off: the law is not a candidate then.
+# Maximum of trials per pilot count. A law that needs more for over 1 % of the bridges is rejected.
 _PILOT_TRIALS = 1_000
 
 
@@ -54,12 +59,12 @@ class Pilot(NamedTuple):
     """One pilot run of `tune_coupling`.
 
     - `gamma`: γ.
-    - `fit_share`: λ, the share of the Gaussian fit in the start law.
-    - `acceptance`: the share of proposals that met.
-    - `trials_per_count`: trials for a hitting count.
-    - `efficiency`: effective samples per simulated path, NaN where counts took too long or too few
-        pairs met.
-    - `coupling`: with this γ and start law.
+    - `fit_share`: λ, the share of the Gaussian fit in the start law; 0 is the stationary law.
+    - `acceptance`: fraction of proposed pairs that met.
+    - `trials_per_count`: mean number of trials per hitting count.
+    - `efficiency`: effective samples per simulated path. NaN if too many counts were truncated or
+        too few pairs met.
+    - `coupling`: the coupling with this γ and start law.
     """
 
     gamma: float
@@ -71,8 +76,12 @@ class Pilot(NamedTuple):
 
 
 class Tuning(NamedTuple):
-    """What `tune_coupling` returns: the `coupling` with most effective samples per simulated path
-    (up to a tenth), and all `pilots`. Printed, it is a table."""
+    """Result of `tune_coupling`, which prints as a table.
+
+    - `coupling`: the chosen coupling. Its effective samples per simulated path are within 10 % of
+        the best pilot run.
+    - `pilots`: list of all pilot runs, each a `Pilot`.
+    """
 
     coupling: Coupling
     pilots: list[Pilot]
@@ -101,23 +110,26 @@ def fit_start_law(
     num_pilot: int = 2000,
     for_density: bool = False,
 ) -> AnyStartLaw:
-    """The start law μ with most effective samples per simulated path, between ν and a Gaussian
-    fit to the reversed paths' starts. Of laws that come within a tenth of the most, the one closest
-    to ν is taken, whose weights are bounded more safely.
+    """Choose the start law μ of a coupling for one interval.
 
-    A choice made outside `jit`, of one interval: it looks at numbers.
+    The candidates lie between the stationary law ν and a Gaussian fit to the time-0 values of the
+    reversed paths that met. The criterion is the number of effective samples per simulated path in
+    a pilot run. Among laws within 10 % of the best, the one closest to ν is chosen, because the
+    ratio μ/ν in its weights is bounded more safely. Call it outside `jit`.
 
-    **Arguments:** as in `sample_bridges`; `num_pilot` is the number of bridges of the pilot run;
-    `for_density` is for transition densities, whose size with ν itself rests on a normalised
-    `log_stationary`: where the model is not declared so, only laws with a density of their own are
-    tried, from the Gaussian fit to ν on. Where ν has far lighter tails than that, or is bent, their
-    weights vary much, and proposals that are pulled to the end point are the better choice.
+    **Arguments:** as in `sample_bridges`, and:
 
-    **Returns:** `Stationary()` or a `GaussianLaw`; with `for_density` the latter, unless the model
-    is declared `normalised`.
+    - `num_pilot`: number of bridges in the pilot run.
+    - `for_density`: true if the coupling is for transition densities. With ν itself a density
+        needs a normalised `log_stationary`. If the model is not declared `normalised`, only
+        Gaussian laws are tried. Their weights vary much if ν is far from Gaussian (much lighter
+        tails, or curved contours); then use a guided proposal.
 
-    **Raises:** `ValueError` where too few pilot bridges are found, or for arguments that do not
-    fit; `TypeError` inside `jit`.
+    **Returns:** `Stationary()` or a `GaussianLaw`. With `for_density` it is a `GaussianLaw`, unless
+    the model is declared `normalised`.
+
+    **Raises:** `ValueError` if too few pilot bridges are found, or for invalid arguments;
+    `TypeError` inside `jit`.
 
     **Example:**
 
@@ -145,18 +157,22 @@ def tune_coupling(
     num_pilot: int = 2000,
     for_density: bool = False,
 ) -> Tuning:
-    """The γ and the start law with most effective samples per simulated path; within a tenth of the
-    most, the law closest to ν, as in `fit_start_law`.
+    """Choose γ and the start law of a coupling for one interval.
 
-    A choice made outside `jit`, of one interval: it looks at numbers.
+    The criterion is the number of effective samples per simulated path in pilot runs. Among
+    candidates within 10 % of the best, the law closest to ν is chosen, as in `fit_start_law`. Call
+    it outside `jit`.
 
-    **Arguments:** as in `sample_bridges`; `couplings` are the candidates, by default those with
-    γ = -1, 0, 0.5 and 0.9, and each is tried with start laws between ν and a Gaussian fit;
-    `num_pilot` is the number of bridges of each pilot run; `for_density` as in `fit_start_law`.
+    **Arguments:** as in `sample_bridges`, and:
 
-    **Returns:** `Tuning`; printed, it is a table.
+    - `couplings`: candidates, by default those with γ = -1, 0, 0.5 and 0.9. Each is tried with
+        several start laws between ν and a Gaussian fit.
+    - `num_pilot`: number of bridges in each pilot run.
+    - `for_density`: as in `fit_start_law`.
 
-    **Raises:** as `fit_start_law`.
+    **Returns:** `Tuning`, which prints as a table.
+
+    **Raises:** the same errors as `fit_start_law`.
 
     **Example:**
 
@@ -171,7 +187,7 @@ def tune_coupling(
         couplings = [Coupling(gamma) for gamma in (-1.0, 0.0, 0.5, 0.9)]
     couplings = as_sequence("couplings", couplings, "couplings")
     if not couplings:
-        raise ValueError("`couplings` must have at least one candidate.")
+        raise ValueError("`couplings` must contain at least one candidate; got none.")
     for coupling in couplings:
         check_instance("couplings", coupling, Coupling, "a sequence of `Coupling`s")
     problem = bridge_problem(model, start, end, duration, num_steps)
@@ -191,24 +207,30 @@ def coupling_pilots(
     num_pilot: int,
     for_density: bool,
 ) -> list[Pilot]:
+    """Run one pilot per start law for this coupling; all use the same bridges.
+
+    If too few pairs met, return a single pilot with an efficiency of NaN.
+    """
     check_key(key)
     if for_density and not model.has_density:
         raise ValueError(
-            "densities by couplings need the stationary one, with any start law: give `Diffusion` "
-            "a `log_stationary` (up to a constant), or choose a proposal that is pulled to the end "
-            "point."
+            "transition densities by couplings need the stationary density, with any start law, "
+            "and this model has none: give `Diffusion` a `log_stationary` (up to a constant), or "
+            "use a guided proposal."
         )
     if not isinstance(coupling, Coupling):
         raise TypeError(
-            f"`coupling` must be a `Coupling`, whose start law is chosen; got {coupling!r}."
+            f"`coupling` must be a `Coupling`, because its start law is replaced; got {coupling!r}."
         )
     if is_traced(key, model, coupling, problem):
         raise TypeError(
-            "a start law is chosen by looking at numbers, which `jit` and `vmap` hide: choose it "
-            "before, and pass the coupling that has it."
+            "a start law is chosen by the numbers of a pilot run, so it cannot be chosen inside "
+            "`jit` or `vmap`: choose it before, and pass the coupling with this start law."
         )
     if problem.batched:
-        raise ValueError("a start law is chosen for one interval: `start` of shape (d,).")
+        raise ValueError(
+            "a start law is chosen for one interval: pass `start` and `end` of shape (d,)."
+        )
     (start,), (end,), (duration,) = problem.intervals
     intervals, num_steps, d = problem.intervals, problem.num_steps, start.shape[0]
     num_pilot = check_count("num_pilot", num_pilot, 20 * d)
@@ -225,6 +247,7 @@ def coupling_pilots(
     )
     gamma, met = float(np.asarray(coupling.gamma)), np.asarray(bridges.met)
     acceptance = met.sum() / float(bridges.num_proposals)
+    # A fit of mean and covariance needs several draws per dimension.
     if met.sum() < 10 * d:
         return [Pilot(gamma, 0.0, acceptance, np.nan, np.nan, coupling)]
     starts = np.asarray(bridges.reverse_start, float)[met]
@@ -233,11 +256,13 @@ def coupling_pilots(
     if model.has_density:
         fits = (_gaussian_fit(draws), _gaussian_fit(starts))
         gaussian: list[AnyStartLaw] = [
-            _between(*fits, share, bridges.paths.dtype) for share in _SHARES
+            _geometric_mean(*fits, share, bridges.paths.dtype) for share in _SHARES
         ]
+        # A density needs a normalised μ, and ν is normalised only if the model says so.
         only_gaussian = for_density and not model.normalised
         laws = gaussian if only_gaussian else [stationary, *gaussian[1:]]
     pilots = []
+    # The same key for all laws: common random numbers make the efficiencies comparable.
     for share, law in zip(_SHARES, laws, strict=False):
         weighted = weigh_bridges(weigh_key, model, bridges, start_law=law, max_trials=_PILOT_TRIALS)
         trials = (float(weighted.num_simulated) - float(bridges.num_proposals)) / met.sum()
@@ -249,11 +274,15 @@ def coupling_pilots(
 
 
 def best_pilot(pilots: list[Pilot]) -> Pilot:
+    """Return the pilot closest to ν among those whose efficiency is within 10 % of the largest.
+
+    Raise `ValueError` if no pilot run succeeded.
+    """
     if all(np.isnan(pilot.efficiency) for pilot in pilots):
         raise ValueError(
-            "no pilot run succeeded: either the pair hardly ever meets here, or bridges are hardly "
-            f"ever hit (met share, trials per count: "
-            f"{[(p.acceptance, p.trials_per_count) for p in pilots]}). Lengthen the duration or "
+            "no pilot run succeeded, because pairs rarely meet or bridges are rarely hit; got "
+            f"(fraction met, trials per count) = "
+            f"{[(p.acceptance, p.trials_per_count) for p in pilots]}. Lengthen the duration or "
             "choose a smaller `gamma`."
         )
     best = np.nanmax([pilot.efficiency for pilot in pilots])
@@ -269,9 +298,9 @@ def _stationary_draws(
     num_steps: int,
     num_draws: int,
 ) -> tuple[Stationary, Float[np.ndarray, "n d"]]:
-    """ν as a start law, with a burn-in where the model needs one, and draws from it."""
-    given = coupling.start_law
-    law = given if isinstance(given, Stationary) else Stationary()
+    """Return ν as a start law, with a burn-in if the model needs one, and draws from ν."""
+    current_law = coupling.start_law
+    law = current_law if isinstance(current_law, Stationary) else Stationary()
     if needs_burn_in(law, model):
         _, end, duration = intervals
         burn_in = measure_burn_in(
@@ -295,16 +324,20 @@ def _draw_stationary(law, model, scheme, keys, intervals, num_steps):
 def _gaussian_fit(
     draws: Float[np.ndarray, "n d"],
 ) -> tuple[Float[np.ndarray, " d"], Float[np.ndarray, "d d"]]:
-    """Mean and precision."""
+    """Return mean and precision matrix of the finite draws."""
     draws = draws[np.all(np.isfinite(draws), axis=1)]
     return draws.mean(0), np.linalg.inv(np.atleast_2d(np.cov(draws.T)))
 
 
-def _between(stationary, reverse, share: float, dtype) -> GaussianLaw:
-    """The normalised `N_ν^{1-λ} G^λ`."""
+def _geometric_mean(stationary, reverse, share: float, dtype) -> GaussianLaw:
+    """Return the normalised law `N_ν^{1-λ} G^λ`, from two pairs (mean, precision) and λ.
+
+    A product of Gaussian powers is Gaussian: precisions and precision-weighted means add up.
+    """
     (mean, precision), (other_mean, other_precision) = stationary, reverse
     combined = (1 - share) * precision + share * other_precision
     covariance = np.linalg.inv(combined)
     shift = (1 - share) * precision @ mean + share * other_precision @ other_mean
+    # Rounding errors make the inverse slightly asymmetric.
     covariance = (covariance + covariance.T) / 2
     return GaussianLaw(jnp.asarray(covariance @ shift, dtype), jnp.asarray(covariance, dtype))

@@ -1,17 +1,18 @@
-"""What accuracy costs in time, for a model and end points of the user's own.
+"""Error against computing time, for the user's model and end points.
 
-An expectation over bridges is estimated by many settings: kinds of proposals with their schemes
-and meeting rules, numbers of steps, precisions and methods. Each estimate has three errors,
-which are told apart:
+`work_precision` estimates one expectation over bridges by many settings. A setting combines a
+proposal (with its scheme and meeting rule), a number of steps, a precision and a method. The error
+of each estimate has three parts, which are reported separately:
 
-* the step error, the distance of the setting from its own limit as the steps shrink;
-* the error of the method, the distance of that limit from the exact law: zero but for
-  approximate bridges, whose law is that of bridges that are hit (Theorem 1);
-* the Monte Carlo error, which only more samples reduce.
+* discretisation error: distance from the limit of the same setting for small steps;
+* method error: distance of that limit from the exact law. It is zero except for approximate
+  bridges, which have the law of bridges that are hit (Theorem 1);
+* Monte Carlo error: standard error, which only more samples reduce.
 
-All are in units of standard deviations of what is estimated, root mean squares over its
-entries, so that n independent exact bridges have a Monte Carlo error of n^{-1/2}. The reference
-is the closed form where there is one, otherwise a finer and longer run that no setting shares.
+The unit is the standard deviation of the estimated variable. For several variables the error is the
+root mean square. Hence n independent exact bridges have a Monte Carlo error of n^{-1/2}. The
+reference is a closed form if there is one. Otherwise it is a separate run with more steps and more
+bridges.
 """
 
 import itertools
@@ -43,10 +44,10 @@ from .measurement import (
     check_precisions,
     closed_form,
     finest,
-    given,
-    given_density,
     is_density,
     measure,
+    user_density,
+    user_estimate,
 )
 from .settings import WorkPrecision
 
@@ -62,7 +63,10 @@ METHODS = (
 )
 
 
-_NOTHING_TO_ESTIMATE = "`fn` at `save_at` is the same for all bridges: nothing to estimate."
+_NOTHING_TO_ESTIMATE = (
+    "`fn` at `save_at` has the same value for all bridges, so there is nothing to estimate: choose "
+    "times inside the interval, or another `fn`."
+)
 _FOR_COUPLINGS, _FOR_GUIDED = ("approximate", "renewal"), ("crank_nicolson",)
 
 
@@ -89,42 +93,47 @@ def work_precision(
     repeats: int = 3,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> WorkPrecision:
-    """What accuracy costs in time, for this model and these end points.
+    """Measure error and computing time of many settings, for one model and one interval.
 
-    Each setting is compiled: some seconds each, which are reported apart.
+    Each setting is compiled separately, which takes some seconds; compile times are reported in
+    their own column.
 
     **Arguments:**
 
-    - `key`: a typed key; all settings have it, the reference another.
+    - `key`: typed key. All settings use it; the reference uses another.
     - `model`, `start`, `end`, `duration`: one interval, as in `sample_bridges`.
-    - `num_steps`: numbers of steps, each with the times `save_at` on its grid.
-    - `proposals`: couplings, with their γ, scheme and meeting rule, and proposals that are pulled
-        to the end point. By default `Coupling(gamma=0.0)` with `Heun()` and with `Euler()`, and
-        for linear drift and constant σ with `GaussianTransition()`.
-    - `methods`: "approximate" for couplings; "weights", "pseudo_marginal", "renewal",
-        "crank_nicolson" for exact bridges; "density" for p_T(a, b), whose error is relative. Where
-        a proposal does not fit a method the pair is left out. "extrapolated_weights" and
-        "extrapolated_density" add half as many steps to each number of steps, and combine the two
-        (`extrapolate`).
-    - `dtypes`: "float32", "float64". The latter needs no configuration, but constants in the
-        model's functions must be of the precision of the point, or in `params`: the reference is
-        in double precision whatever is asked for here.
-    - `num_bridges`: samples of each setting: what their number leaves of uncertainty cannot be
-        told from a step error.
-    - `fn`: what to estimate, a function of the path at `save_at`, shape (K, d), to an array; by
+    - `num_steps`: numbers of steps. The times `save_at` must be on each grid.
+    - `proposals`: couplings (with γ, scheme and meeting rule) and guided proposals. By default
+        `Coupling(gamma=0.0)` with `Heun()` and with `Euler()`, and also with `GaussianTransition()`
+        for linear drift and constant σ.
+    - `methods`: any of the following. Pairs of a method and a proposal that do not fit are left
+        out.
+        - "approximate": approximate bridges, for couplings;
+        - "weights", "pseudo_marginal", "renewal", "crank_nicolson": exact bridges. "renewal" is for
+            couplings, "crank_nicolson" for guided proposals;
+        - "density": p_T(a, b), with relative errors;
+        - "extrapolated_weights", "extrapolated_density": results on N and N/2 steps, combined by
+            `extrapolate`.
+    - `dtypes`: "float32", "float64". Double precision needs no configuration of JAX, but the
+        model's functions must work in both precisions, because the reference is in double
+        precision. Convert constants to the dtype of the point, or put them in `params`.
+    - `num_bridges`: samples per setting. Discretisation errors below the Monte Carlo error are not
+        detected.
+    - `fn`: the estimated function, from the path at `save_at`, shape (K, d), to an array. By
         default the path itself.
     - `save_at`: times, shape (K,), by default half the duration.
-    - `target`: an accuracy in standard deviations, for which the cheapest setting is named.
-    - `reference`, `log_density`: the exact mean and standard deviation of `fn`, and log p_T(a, b),
-        where you know them. Those of Ornstein–Uhlenbeck processes are known.
-    - `reference_steps`, `reference_bridges`: of the reference, where there is no closed form; by
-        default four times the most steps, and four times as many bridges.
-    - `repeats`: runs of which the median is timed.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `target`: required accuracy in standard deviations. The printed table then ends with the
+        cheapest setting that reaches it.
+    - `reference`, `log_density`: the exact mean and standard deviation of `fn` as a pair, and
+        log p_T(a, b), if you know them. For Ornstein–Uhlenbeck processes they are computed.
+    - `reference_steps`, `reference_bridges`: size of the reference run if there is no closed form.
+        By default four times the largest number of steps, and 4 × `num_bridges`.
+    - `repeats`: number of timed runs; their median is reported.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
-    **Returns:** `WorkPrecision`, a table when printed.
+    **Returns:** `WorkPrecision`, which prints as a table.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -139,7 +148,9 @@ def work_precision(
     check_key(key)
     problem = bridge_problem(model, start, end, duration, 1)
     if problem.batched:
-        raise ValueError("`work_precision` looks at one interval: `start` and `end` of shape (d,).")
+        raise ValueError(
+            "`work_precision` takes one interval: pass `start` and `end` of shape (d,)."
+        )
     num_steps = as_sequence("num_steps", num_steps, "numbers of steps")
     methods = as_sequence("methods", methods, "methods")
     dtypes = as_sequence("dtypes", dtypes, "dtypes")
@@ -153,12 +164,12 @@ def work_precision(
         save_at = [float(problem.intervals.duration[0]) / 2]
         if any(n % 2 for n in steps):
             raise ValueError(
-                "`num_steps` must be even where `save_at` is left to its default, half the "
+                "`num_steps` must be even if `save_at` is omitted, because its default is half the "
                 f"duration; got {tuple(steps)}."
             )
     grids = [*steps, *(n // 2 for n in steps)] if set(methods) & set(EXTRAPOLATED) else steps
     if len(grids) > len(steps) and any(n % 2 for n in steps):
-        raise ValueError(f"to extrapolate, `num_steps` must be even; got {tuple(steps)}.")
+        raise ValueError(f"`num_steps` must be even for extrapolation; got {tuple(steps)}.")
     for candidate, n in itertools.product(candidates, grids):
         problem.keep(save_at, duration, candidate.fractions(n))
     runs = _runs(methods, candidates, dtypes, steps, num_bridges)
@@ -166,36 +177,38 @@ def work_precision(
     if any(is_density(method) for method in methods):
         for candidate in candidates:
             candidate.check_for_density(model)
-    finest_steps, most = reference_steps, reference_bridges
+    finest_steps, num_reference = reference_steps, reference_bridges
     finest_steps = 4 * max(steps) if finest_steps is None else finest_steps
-    most = 4 * num_bridges if most is None else most
+    num_reference = 4 * num_bridges if num_reference is None else num_reference
     finest_run = Run(
         "weights",
         candidates[0],
         "float64",
         check_count("reference_steps", finest_steps),
-        check_count("reference_bridges", most),
+        check_count("reference_bridges", num_reference),
     )
-    whole = (lambda points: points) if fn is None else fn
+    function = (lambda points: points) if fn is None else fn
     start_point, end_point = (np.asarray(point[0]) for point in problem.intervals[:2])
     length = float(problem.intervals.duration[0])
     times = np.asarray(as_floating("save_at", save_at), float)
     inside = (times > 0) & (times < length)
     if not inside.any() and not all(map(is_density, methods)):
         raise ValueError(_NOTHING_TO_ESTIMATE)
-    scene = Scene(model, start_point, end_point, length, times, whole, fn is None)
-    given_values = {False: given(reference), True: given_density(log_density)}
-    alone = all(m != "approximate" and given_values[is_density(m)] for m in methods)
-    check_precisions(scene, dtypes if alone else ("float32", "float64"))
+    scene = Scene(model, start_point, end_point, length, times, function, fn is None)
+    given_values = {False: user_estimate(reference), True: user_density(log_density)}
+    # Without a reference run in double precision the model must work in the given dtypes only.
+    needs_no_run = all(m != "approximate" and given_values[is_density(m)] for m in methods)
+    check_precisions(scene, dtypes if needs_no_run else ("float32", "float64"))
     exact, limits = _references(key_for("reference", key), scene, runs, finest_run, given_values)
     meter = as_meter(progress_meter)
     state = meter.init()
     settings = []
-    for done, run in enumerate(runs, 1):
+    for num_finished, run in enumerate(runs, 1):
         truth = exact[is_density(run.method)]
+        # Approximate bridges converge to a law of their own, not to the exact one.
         limit = limits[id(run.proposal)] if run.method == "approximate" else truth
         settings.append(measure(key, scene, run, truth, limit, repeats))
-        state = meter.step(state, jnp.asarray(done / len(runs)))
+        state = meter.step(state, jnp.asarray(num_finished / len(runs)))
     meter.close(state)
     sources = dict.fromkeys(estimate.source for estimate in exact.values())
     return WorkPrecision(tuple(settings), "; ".join(sources), target)
@@ -208,7 +221,7 @@ def _runs(
     steps: Sequence[int],
     num_bridges: int,
 ) -> list[Run]:
-    """All settings, but the pairs of a method and a proposal that do not fit."""
+    """Return all settings, without the pairs of a method and a proposal that do not fit."""
     runs = [
         Run(method, candidate, dtype, n, num_bridges)
         for method, candidate in itertools.product(methods, candidates)
@@ -216,7 +229,10 @@ def _runs(
         for dtype, n in itertools.product(dtypes, steps)
     ]
     if not runs:
-        raise ValueError(f"none of `proposals` fits any of `methods`; got {tuple(methods)}.")
+        raise ValueError(
+            f"no proposal of `proposals` fits any of `methods`; got {tuple(methods)}. "
+            '"approximate" and "renewal" need a coupling, "crank_nicolson" a guided proposal.'
+        )
     return runs
 
 
@@ -240,11 +256,11 @@ def _check_settings(
     steps: Sequence[int], methods: Sequence[str], dtypes: Sequence[str], target: float | None
 ) -> None:
     if not steps:
-        raise ValueError("`num_steps` must have at least one number of steps.")
+        raise ValueError("`num_steps` must contain at least one number of steps; got none.")
     if not methods or not all(isinstance(m, str) and m in METHODS for m in methods):
-        raise ValueError(f"`methods` must be some of {METHODS}; got {tuple(methods)}.")
+        raise ValueError(f"`methods` must contain names out of {METHODS}; got {tuple(methods)}.")
     if not dtypes or not all(isinstance(d, str) and d in _DTYPES for d in dtypes):
-        raise ValueError(f'`dtypes` must be "float32" or "float64"; got {tuple(dtypes)}.')
+        raise ValueError(f'`dtypes` must contain "float32" or "float64"; got {tuple(dtypes)}.')
     if target is not None and not as_numbers({"target": target})["target"] > 0:
         raise ValueError(f"`target` must be positive; got {target}.")
 
@@ -259,7 +275,10 @@ def _candidates(
     proposals = as_sequence("proposals", proposals, "proposals")
     candidates = [as_proposal(proposal, model, like, name="proposals") for proposal in proposals]
     if any(len(candidate.singles) > 1 for candidate in candidates):
-        raise ValueError('`proposals` must be single ones; "auto" chooses between several.')
+        raise ValueError(
+            '`proposals` must be single proposals; "auto" and a result of `choose_proposal` stand '
+            "for several. Pass the candidates instead."
+        )
     return candidates
 
 
@@ -268,14 +287,19 @@ def _references(
     scene: Scene,
     runs: Sequence[Run],
     finest_run: Run,
-    known: dict[bool, Estimate | None],
+    user_values: dict[bool, Estimate | None],
 ) -> tuple[dict[bool, Estimate], dict[int, Estimate]]:
-    """What is exact, of paths and of the density, as far as they are asked for; and the limits of
-    approximate bridges, by their proposals. They are made in double precision."""
+    """Estimate the references in double precision.
+
+    Return two dictionaries. The first has the exact values of the methods in `runs`: for paths
+    (key False) and for the density (key True). The second has the limits of approximate bridges, by
+    the `id` of their proposals.
+    """
+    # More draws than those of the settings, so that the error of the reference is negligible.
     num_draws = min(20 * finest_run.num_bridges, 1_000_000)
     with jax.enable_x64(True):
         exact = {
-            density: known[density]
+            density: user_values[density]
             or closed_form(key, scene, density, num_draws)
             or finest(key, scene, finest_run._replace(method=name))
             for name, density in [("weights", False), ("density", True)]
