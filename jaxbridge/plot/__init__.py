@@ -1,5 +1,7 @@
-"""Pictures of bridges, of their law beside an exact one, and of what is inferred by them. Each
-function takes the axes to draw in, `ax`, or makes them, and returns them. Needs the extra `plot`.
+"""Pictures of bridges, of their law against an exact law, of posteriors and of work–precision.
+
+Each function draws in the axes `ax`, or creates new axes, and returns the axes. The module is
+separate because it needs Matplotlib: install the extra `plot`.
 
 ```python
 from jaxbridge import plot

@@ -1,4 +1,4 @@
-"""The pictures themselves."""
+"""The drawing functions of `jaxbridge.plot`, one per picture."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -22,12 +22,12 @@ from .style import (
     Reals,
     axes_or_new,
     finish,
-    found,
-    there,
+    finite_draws,
+    finite_paths,
 )
 
 LEVELS = np.array([0.05, 0.25, 0.5, 0.75, 0.95])
-SCORES = ndtri(LEVELS)
+SCORES = ndtri(LEVELS)  # the same quantiles of N(0, 1)
 
 
 def paths_in_space(
@@ -36,13 +36,19 @@ def paths_in_space(
     ax: Axes | None = None,
     num_paths: int = 3,
 ) -> Axes:
-    """The first few two-dimensional bridges with time upwards, as in the paper's first figure.
+    """Plot a few two-dimensional bridges in space, with time upwards (the paper's first figure).
 
-    `times`, shape (K,), and `paths`, (n, K, 2), as `sample_bridges` returns them; bridges not found
-    are left out, and of the others `num_paths` are drawn. `ax`, if it is given, must be made with
-    `projection="3d"`.
+    **Arguments:**
 
-    **Raises:** `ValueError` for paths that do not have two coordinates; `TypeError` for flat axes.
+    - `times`, `paths`: shapes (K,) and (n, K, 2), as returned by `sample_bridges`. Bridges that
+        were not found (NaN) are left out.
+    - `ax`: axes created with `projection="3d"`; by default new ones.
+    - `num_paths`: number of paths to draw, the first ones.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` for paths without exactly two coordinates or without a finite path;
+    `TypeError` for two-dimensional axes.
 
     **Example:**
 
@@ -52,8 +58,11 @@ def paths_in_space(
     """
     space = axes_or_new(ax, projection="3d")
     if not isinstance(space, Axes3D):
-        raise TypeError('`ax` must be made with `projection="3d"`; got flat axes.')
-    times, (paths, _) = np.asarray(times, float), found(paths)
+        raise TypeError(
+            "`ax` must be three-dimensional; got two-dimensional axes. Create the axes with "
+            '`projection="3d"`.'
+        )
+    times, (paths, _) = np.asarray(times, float), finite_paths(paths)
     if paths.shape[-1] != 2:
         raise ValueError(f"`paths` must have two coordinates; got shape {paths.shape}.")
     for i, path in enumerate(paths[:num_paths]):
@@ -80,15 +89,28 @@ def bridge_fan(
     data: tuple[Float[Reals, " m"], Float[Reals, " m"]] | None = None,
     data_sd: Number | Float[Reals, " m"] = 0.0,
 ) -> Axes:
-    """One coordinate of many bridges: median, 50 % and 90 % bands, and the first few paths.
+    """Plot one coordinate of many bridges: median, 50 % and 90 % bands, and a few paths.
 
-    `times`, shape (K,), and `paths`, (n, K, d), as `sample_bridges` returns them, or (chains, n, K,
-    d), as `smooth` does; bridges not found are left out. `coordinate` counts from zero; `num_paths`
-    are drawn. `weights`, shape (n,), are those of weighted bridges, by which the paths that are
-    drawn are chosen too. The same quantiles of an `exact` law, a result of `gaussian_bridge` at
-    these times, are dashed. `data` are times and values at which this coordinate was seen, NaN
-    where it was not, with noise of standard deviation `data_sd`, drawn twice either way. `ax` is
-    where to draw.
+    **Arguments:**
+
+    - `times`: shape (K,).
+    - `paths`: shape (n, K, d), as returned by `sample_bridges`, or (chains, n, K, d), as returned
+        by `smooth`. Bridges that were not found (NaN) are left out.
+    - `ax`: axes to draw in; by default new ones.
+    - `coordinate`: index of the coordinate, from zero.
+    - `num_paths`: number of single paths to draw: the first ones, or a systematic resample if there
+        are weights.
+    - `exact`: result of `gaussian_bridge` at the same times. Its quantiles are drawn as dashed
+        lines.
+    - `weights`: weights of weighted bridges, shape (n,).
+    - `data`: pair of observation times and observed values of this coordinate, with NaN for missing
+        values.
+    - `data_sd`: standard deviation of the observation noise. Error bars extend two standard
+        deviations to either side.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` for paths of another shape or without a finite path.
 
     **Example:**
 
@@ -98,12 +120,13 @@ def bridge_fan(
     """
     ax = axes_or_new(ax)
     times, paths = np.asarray(times, float), np.asarray(paths)
-    kept, index = found(paths.reshape(-1, *paths.shape[2:]) if paths.ndim == 4 else paths)
-    values = kept[..., coordinate]
+    finite, index = finite_paths(paths.reshape(-1, *paths.shape[2:]) if paths.ndim == 4 else paths)
+    values = finite[..., coordinate]
     if weights is None:
         shown, curves = values[:num_paths], np.quantile(values, LEVELS, axis=0)
     else:
         mass = np.asarray(weights, float)[index]
+        # Systematic resampling: the paths drawn represent the weighted law.
         places = (np.arange(num_paths) + 0.5) / max(num_paths, 1) * mass.sum()
         shown = values[np.searchsorted(np.cumsum(mass), places)]
         curves = np.quantile(values, LEVELS, axis=0, weights=mass, method="inverted_cdf")
@@ -121,10 +144,12 @@ def bridge_fan(
         lines = ax.plot(times, curves, color=EXACT, linewidth=0.9, linestyle=DASHES[0])
         lines[2].set_label("exact")
     if data is not None:
-        when, seen = (np.asarray(each, float) for each in data)
-        error = np.where(np.isnan(seen), np.nan, 2 * np.asarray(data_sd, float))
+        data_times, observed = (np.asarray(part, float) for part in data)
+        error = np.where(np.isnan(observed), np.nan, 2 * np.asarray(data_sd, float))
         style = {"fmt": ".", "color": COLOURS[1], "markersize": 5, "elinewidth": 0.9, "zorder": 3}
-        ax.errorbar(when, seen, error if np.any(error > 0) else None, label="seen", **style)
+        ax.errorbar(
+            data_times, observed, error if np.any(error > 0) else None, label="observed", **style
+        )
     ax.set(xlabel="time", ylabel=f"$Z^{{({coordinate + 1})}}_t$", xlim=(times[0], times[-1]))
     return finish(ax)
 
@@ -135,12 +160,21 @@ def qq(
     sd: Number,
     ax: Axes | None = None,
 ) -> Axes:
-    """Q-Q plot of one margin against N(mean, sd²), each method in its own colour.
+    """Plot the quantiles of one marginal law against those of N(mean, sd²), for each method.
 
-    `samples` are the draws of each method by its name, shape (n,), of which those that are NaN, of
-    bridges not found, are left out; `mean` and `sd` those of the exact law. Quantiles are shown at
-    levels that are evenly spaced on the normal scale, out to the most extreme draws; on the
-    diagonal the two laws agree. `ax` is where to draw.
+    Points on the diagonal show agreement. The levels are evenly spaced on the normal scale, out to
+    the most extreme draws.
+
+    **Arguments:**
+
+    - `samples`: draws of shape (n,), by the name of the method. Draws that are NaN (bridges not
+        found) are left out.
+    - `mean`, `sd`: mean and standard deviation of the exact law.
+    - `ax`: axes to draw in; by default new ones.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` if a sample has no finite draw.
 
     **Example:**
 
@@ -151,11 +185,11 @@ def qq(
     ```
     """
     ax, mean, sd = axes_or_new(ax), float(mean), float(sd)
-    kept = {name: there(name, values) for name, values in samples.items()}
-    largest = max(len(values) for values in kept.values())
+    finite = {name: finite_draws(name, values) for name, values in samples.items()}
+    largest = max(len(values) for values in finite.values())
     reach = mean + sd * np.array([-1, 1]) * _scores(largest)[-1]
     ax.plot(reach, reach, color=EXACT, linewidth=0.8, label="exact")
-    for i, (name, values) in enumerate(kept.items()):
+    for i, (name, values) in enumerate(finite.items()):
         scores = _scores(len(values))
         quantiles = np.quantile(values, ndtr(scores), method="hazen")
         colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
@@ -171,12 +205,19 @@ def copula_levels(
     levels: Sequence[float] = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9),
     ax: Axes | None = None,
 ) -> Axes:
-    """Level curves of the copula: exact (full drawn) and of each method's draws (dashed).
+    """Plot level curves of a copula: exact (solid) and of the draws of each method (dashed).
 
-    `samples` are the draws of each method by its name, shape (n, 2), of which those that are NaN,
-    of bridges not found, are left out; `covariance`, (2, 2), is that
-    of the exact, Gaussian law; `levels` are those of the curves, between 0 and 1. `ax` is where to
-    draw.
+    **Arguments:**
+
+    - `samples`: draws of shape (n, 2), by the name of the method. Draws that are NaN (bridges not
+        found) are left out.
+    - `covariance`: covariance of the exact Gaussian law, shape (2, 2).
+    - `levels`: levels of the curves, between 0 and 1.
+    - `ax`: axes to draw in; by default new ones.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` if a sample has no finite draw.
 
     **Example:**
 
@@ -199,21 +240,28 @@ def copula_levels(
     handles = [Line2D([], [], color=EXACT, linewidth=0.8, label="exact")]
     for i, (name, values) in enumerate(samples.items()):
         colour, dashes = COLOURS[i % len(COLOURS)], DASHES[i % len(DASHES)]
-        copula = empirical_copula(there(name, values), resolution)
+        copula = empirical_copula(finite_draws(name, values), resolution)
         draw(copula, colors=colour, linewidths=1.4, linestyles=[dashes])
         handles.append(Line2D([], [], color=colour, linewidth=1.4, linestyle=dashes, label=name))
-    # No labels on the curves: C(1, v) = v, so each ends on the right at its own level.
+    # The curves need no labels: C(1, v) = v, so the curve of level v ends on the right at v.
     ax.set(xlabel="$u$", ylabel="$v$", xticks=levels, yticks=levels)
     return finish(ax, handles=handles, loc="lower left")
 
 
 def work_precision(result: jb.WorkPrecision, ax: Axes | None = None) -> Axes:
-    """Error against time, a curve for each proposal and method, its points labelled with their
-    numbers of steps.
+    """Plot error against computing time, one curve per proposal and method.
 
-    `result` is what `jaxbridge.work_precision` returned. The error is that which stays however many
-    bridges are made, ± its uncertainty; the time is that of 1,000 effective samples. The dotted
-    line is the Monte Carlo error of so many. `ax` is where to draw.
+    The vertical axis has the error that does not shrink with the number of bridges, ± its
+    uncertainty. The horizontal axis has the seconds for 1,000 effective samples. Labels show the
+    number of steps. The dotted line is the Monte Carlo error of 1,000 effective samples, the dashed
+    line the required accuracy.
+
+    **Arguments:**
+
+    - `result`: result of `jaxbridge.work_precision`.
+    - `ax`: axes to draw in; by default new ones.
+
+    **Returns:** the axes.
 
     **Example:**
 
@@ -254,11 +302,21 @@ def posterior(
     ax: Axes | None = None,
     bins: int = 60,
 ) -> Axes:
-    """Histograms of each sampler's draws of one parameter, over densities that are known.
+    """Plot histograms of the draws of one parameter, with exact densities if they are known.
 
-    `draws` are those of each sampler by its name, shape (n,), or (chains, n), taken together;
-    `curves` densities on the `grid`, both of shape (m,), likewise. `label` names the parameter.
-    `ax` is where to draw, `bins` how many bins there are over the range of all draws.
+    **Arguments:**
+
+    - `draws`: draws of shape (n,) or (chains, n), by the name of the sampler. All chains of one
+        sampler share a histogram. Draws that are not finite are left out.
+    - `grid`: parameter values of the densities, shape (m,).
+    - `curves`: densities on the grid, shape (m,), by their names.
+    - `label`: name of the parameter.
+    - `ax`: axes to draw in; by default new ones.
+    - `bins`: number of bins over the range of all draws.
+
+    **Returns:** the axes.
+
+    **Raises:** `ValueError` if a sampler has no finite draw.
 
     **Example:**
 
@@ -269,9 +327,9 @@ def posterior(
     ```
     """
     ax = axes_or_new(ax)
-    flat = {name: there(name, np.ravel(values)) for name, values in draws.items()}
-    everything = np.concatenate(list(flat.values()))
-    edges = np.linspace(everything.min(), everything.max(), bins + 1)
+    flat = {name: finite_draws(name, np.ravel(values)) for name, values in draws.items()}
+    all_draws = np.concatenate(list(flat.values()))
+    edges = np.linspace(all_draws.min(), all_draws.max(), bins + 1)
     for i, (name, values) in enumerate(flat.items()):
         colour = COLOURS[i % len(COLOURS)]
         ax.hist(
@@ -286,8 +344,8 @@ def posterior(
     for i, (name, density) in enumerate(curves.items()):
         dashes = ("-", *DASHES)[i % (len(DASHES) + 1)]
         ax.plot(grid, density, color=EXACT, linestyle=dashes, linewidth=1.0, label=name)
-    spread = everything.max() - everything.min()
-    ax.set_xlim(everything.min() - spread / 2, everything.max() + spread / 2)
+    spread = all_draws.max() - all_draws.min()
+    ax.set_xlim(all_draws.min() - spread / 2, all_draws.max() + spread / 2)
     ax.set(xlabel=label, ylabel="density")
     return finish(ax)
 
@@ -298,11 +356,17 @@ def trace(
     label: str = "parameter",
     ax: Axes | None = None,
 ) -> Axes:
-    """The draws of one parameter in the order in which they were made, by each sampler.
+    """Plot the draws of one parameter against the iteration, for each sampler.
 
-    `draws` are those of each sampler by its name, shape (n,), or (chains, n), drawn over each
-    other. A line is drawn at `level`, where it is given, for instance at the true value. `label`
-    names the parameter. `ax` is where to draw.
+    **Arguments:**
+
+    - `draws`: draws of shape (n,) or (chains, n), by the name of the sampler. The chains of one
+        sampler share a colour.
+    - `level`: height of a horizontal line, for instance the true value; by default there is none.
+    - `label`: name of the parameter.
+    - `ax`: axes to draw in; by default new ones.
+
+    **Returns:** the axes.
 
     **Example:**
 
@@ -323,6 +387,6 @@ def trace(
 
 
 def _scores(n: int) -> Float[np.ndarray, " scores"]:
-    """Evenly spaced normal scores, out to those of the extremes of n draws."""
+    """Return 61 evenly spaced normal scores, up to the scores of the extremes of n draws."""
     last = -ndtri(0.5 / n)
     return np.linspace(-last, last, 61)
