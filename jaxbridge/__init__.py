@@ -1,23 +1,27 @@
-"""Diffusion bridges by coupling, in JAX.
+"""Diffusion bridges and inference for stochastic differential equations from discrete data, in JAX.
 
-Data flows one way, from folder to folder; each begins with its mathematics.
+A *bridge* is a path of a diffusion between two given points. The library samples bridges, estimates
+transition densities and likelihoods, and infers parameters from exact or noisy observations.
 
-- `engine`: how programs run; it knows no diffusion.
-- `models`: what diffuses, and its time reversal.
-- `schemes`: one step, made, inverted, and its density; the likelihood of a path, and how far so
-  many steps are from the limit.
-- `coupling`: pairs of paths that meet, the bridges joined of them, and how often these are hit.
-- `proposals`: a path with an unbiased weight, by a coupling or pulled to the end point.
-- `exact`: what is made of weights: means, chains, transition densities.
-- `records`: what was seen with noise, or in part: likelihoods, paths, innovations.
-- `tuning`: which proposal, and what accuracy costs.
+Each folder imports only from folders above it in this list. The docstring of a folder begins with
+its mathematics.
+
+- `engine`: batches, noise, compilation and checks of arguments. It contains nothing about
+  diffusions.
+- `models`: diffusions, their time reversal, and ready models.
+- `schemes`: numerical schemes, step densities, path likelihoods and discretisation errors.
+- `coupling`: pairs of paths that meet, approximate bridges and hitting counts.
+- `proposals`: paths with unbiased weights, by couplings or by guided proposals.
+- `exact`: importance sampling, Markov chains and transition densities from weights.
+- `records`: noisy, partial or missing observations: log-likelihoods, smoothed paths, innovations.
+- `tuning`: choices by pilot runs, and error against computing time.
 - `inference`: parameters from observations.
-- `plot`, `studies`: pictures; the paper's study and the measurements, clients of all this.
+- `plot`, `studies`: pictures; the study of the paper and the benchmarks.
 
 References to equations and sections are to Bladt, Finch & Sørensen, *Simulation of multivariate
-diffusion bridges*; equations go by their labels in its source.
+diffusion bridges*. Equations are cited by their labels in its source.
 
-What examples take for granted:
+All examples in docstrings assume these lines:
 
 ```python
 import jax
@@ -134,7 +138,7 @@ from .tuning.start_law import Pilot, Tuning, fit_start_law, tune_coupling
 from .tuning.work_precision import work_precision
 
 __all__ = [
-    # A model, and its paths.
+    # Models and their paths.
     "Diffusion",
     "ornstein_uhlenbeck",
     "OrnsteinUhlenbeckParams",
@@ -145,7 +149,7 @@ __all__ = [
     "lamperti",
     "Transformed",
     "simulate",
-    # Models with noise in a part of the state, or of time.
+    # Hypoelliptic and time-dependent models.
     "fitzhugh_nagumo",
     "FitzHughNagumoParams",
     "underdamped_langevin",
@@ -157,7 +161,7 @@ __all__ = [
     "sample_bridges",
     "Bridges",
     "Coupling",
-    # How a pair is stepped, joined and turned.
+    # Schemes, meeting rules and rotations of couplings.
     "Heun",
     "HeunOrEuler",
     "Euler",
@@ -170,14 +174,14 @@ __all__ = [
     "polar_rotation",
     "no_rotation",
     "published_rotation",
-    # Proposals that are pulled to the end point.
+    # Guided proposals and their target densities.
     "ModifiedDiffusionBridge",
     "Guided",
     "ResidualBridge",
     "EulerDensity",
     "HypoellipticDensity",
     "ItoTaylorDensity",
-    # Exact bridges, by Markov chains or weights.
+    # Exact bridges, by Markov chains or by weights.
     "sample_exact_bridges",
     "Chain",
     "sample_weighted_bridges",
@@ -187,7 +191,7 @@ __all__ = [
     "extrapolate",
     "ExtrapolatedBridges",
     "ExtrapolatedLogDensity",
-    # The same chains as kernels.
+    # The same Markov chains as kernels.
     "pseudo_marginal",
     "renewal",
     "crank_nicolson",
@@ -195,7 +199,7 @@ __all__ = [
     # Transition densities.
     "transition_log_density",
     "TransitionLogDensity",
-    # Where the associated diffusion starts.
+    # Start laws of the associated diffusion.
     "Stationary",
     "GaussianLaw",
     "Reversed",
@@ -208,7 +212,7 @@ __all__ = [
     "tune_coupling",
     "Tuning",
     "Pilot",
-    # Records with noise, or seen in part.
+    # Records: noisy, partial or missing observations.
     "LinearGaussian",
     "ObservationDensity",
     "log_likelihood",
@@ -233,7 +237,7 @@ __all__ = [
     "Score",
     "NormalPrior",
     "path_log_likelihood",
-    # What to trust, what it costs, and what is simulated.
+    # Diagnostics and costs.
     "hitting_counts",
     "HittingCounts",
     "hitting_variation",
@@ -250,7 +254,7 @@ __all__ = [
     "GaussianBridge",
     "ou_stationary",
     "ou_transition",
-    # What to subclass, and what such classes are given.
+    # Base classes to subclass, and the arguments of their methods.
     "AbstractCoupling",
     "Frame",
     "AbstractMeeting",
