@@ -1,4 +1,7 @@
-"""`python -m jaxbridge`: the paper's simulation study, in numbers and pictures."""
+"""Command line `python -m jaxbridge`: run the paper's simulation study and the benchmarks.
+
+It prints tables and writes pictures. The default is the study of the paper.
+"""
 
 import argparse
 import contextlib
@@ -29,46 +32,51 @@ _PARTS = {
 }
 _QUICK = " (--quick: expect larger errors, and times of little meaning)"
 _GROUPS = {"paper": ("approximate", "exact"), "all": tuple(_PARTS)}
-# Parts of which no figure is the time that compilation takes.
-_PROGRAMS_KEPT = ("paper", "approximate", "exact")
+# Parts that do not report compile times, so that stored programs do not falsify their results.
+_WITHOUT_COMPILE_TIMES = ("paper", "approximate", "exact")
 
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        """One line instead of argparse's usage and message."""
+        """Exit with one line instead of argparse's usage and message."""
         self.exit(2, f"{self.prog}: {message} (see --help)\n")
 
 
 def _seed(text: str) -> int:
     if not text.isdecimal() or int(text) >= 2**32:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to 2^32 - 1")
+        raise argparse.ArgumentTypeError(
+            f"the seed must be an integer from 0 to 2^32 - 1; got {text!r}"
+        )
     return int(text)
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = _Parser(
         prog="python -m jaxbridge",
-        description="Approximate and exact Ornstein-Uhlenbeck bridges, section 3 of "
-        "Bladt, Finch & Sorensen, Simulation of multivariate diffusion bridges, and other "
-        "proposals beside them.",
+        description="Run the simulation study of Bladt, Finch & Sorensen, Simulation of "
+        "multivariate diffusion bridges (section 3: approximate and exact Ornstein-Uhlenbeck "
+        "bridges), or a benchmark.",
     )
     parser.add_argument(
         "part",
         nargs="?",
         choices=("paper", *_PARTS, "all"),
         default="paper",
-        help="approximate or exact bridges, or both: the paper's study (the default); what "
-        "accuracy costs in time; Bayesian inference, the paper's section 4; how fast it is, and "
-        "which proposal is best for which duration; other packages beside this one; or all",
+        help="paper: approximate and exact bridges, the paper's study (the default); "
+        "approximate, exact: one half of it; accuracy: error against computing time; bayes: "
+        "Bayesian inference, the paper's section 4; bench: speed, and the best proposal for each "
+        "duration; rivals: comparison with other packages; all: everything",
     )
-    parser.add_argument("--quick", action="store_true", help="a twenty-fifth of the bridges")
-    parser.add_argument("--seed", type=_seed, default=0, help="of the random numbers (default 0)")
+    parser.add_argument("--quick", action="store_true", help="use 1/25 of the bridges")
+    parser.add_argument(
+        "--seed", type=_seed, default=0, help="seed of the random numbers (default 0)"
+    )
     parser.add_argument(
         "--out",
         type=Path,
         default=Path("jaxbridge-output"),
         metavar="DIR",
-        help="where pictures go, and compiled programs for another time (default %(default)s)",
+        help="folder for pictures, tables and compiled programs (default %(default)s)",
     )
     options = parser.parse_args(arguments)
     try:
@@ -81,20 +89,28 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the studies, print their tables and write their pictures."""
+    """Run the studies, print their tables and write their pictures.
+
+    `arguments` replace those of the command line. Exit with status 2 and one line for invalid
+    arguments, with status 1 if a file cannot be written.
+    """
     options = _parse(arguments)
     begin = time.perf_counter()
-    if options.part in _PROGRAMS_KEPT and not jax.config.values["jax_compilation_cache_dir"]:
-        _keep_programs(options.out / "programs")
+    if (
+        options.part in _WITHOUT_COMPILE_TIMES
+        and not jax.config.values["jax_compilation_cache_dir"]
+    ):
+        _store_programs(options.out / "programs")
     print(f"JAX {jax.__version__} on {jax.devices()[0].device_kind}\n")
     for part in _GROUPS.get(options.part, (options.part,)):
         for study in _PARTS[part]:
-            _run(study, options)
+            _run_study(study, options)
     print(f"{time.perf_counter() - begin:.0f} s in all")
 
 
-def _keep_programs(folder: Path) -> None:
-    """Compiled programs go there, so that the same study takes half as long a second time."""
+def _store_programs(folder: Path) -> None:
+    """Store compiled programs in this folder, so that a second run takes half as long."""
+    # The defaults of JAX store large and slow programs only; these limits store all.
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
@@ -102,8 +118,11 @@ def _keep_programs(folder: Path) -> None:
 
 @contextlib.contextmanager
 def _writing(path: Path) -> Iterator[Path]:
-    """Give a name to write to; the file becomes `path` once it is complete. If it cannot be
-    written, end with one line and without a part of it; earlier files and tables stay."""
+    """Yield a temporary path to write to, and rename it to `path` once the file is complete.
+
+    If writing fails, remove the partial file and exit with one line. Earlier files and tables
+    remain.
+    """
     partial = path.with_name(f".{path.name}")
     try:
         yield partial
@@ -115,20 +134,20 @@ def _writing(path: Path) -> Iterator[Path]:
         sys.exit(1)
 
 
-def _run(study: Study, options: argparse.Namespace) -> None:
+def _run_study(study: Study, options: argparse.Namespace) -> None:
     print(f"{study.title}{_QUICK if options.quick else ''}\n")
-    results = study.run(jax.random.key(options.seed), options.quick, _say)
+    results = study.run(jax.random.key(options.seed), options.quick, _show_progress)
     _end_progress()
     print(f"{study.tables(results)}\n\n{study.what_to_see}\n")
     if isinstance(results, Benchmark):
         with _writing(options.out / "benchmark.json") as path:
             save(results, path)
-        print(f"all figures in {options.out / 'benchmark.json'}")
+        print(f"all results in {options.out / 'benchmark.json'}")
     if isinstance(results, Rivals):
         for name, text in rivals_files(results).items():
             with _writing(options.out / name) as path:
                 path.write_text(text, encoding="utf-8")
-        print(f"all figures in {options.out / 'rivals.json'}, and as a page beside it")
+        print(f"all results in {options.out / 'rivals.json'}, and as a page next to it")
     try:
         from .studies import figures
     except ImportError as error:
@@ -138,18 +157,20 @@ def _run(study: Study, options: argparse.Namespace) -> None:
     for name, figure in pictures.items():
         with _writing(options.out / name) as path:
             figure.savefig(path, dpi=150, format=Path(name).suffix[1:])
-    some = "a picture" if len(pictures) == 1 else f"{len(pictures)} pictures"
-    print(f"{some} in {options.out}\n")
+    count = "one picture" if len(pictures) == 1 else f"{len(pictures)} pictures"
+    print(f"{count} in {options.out}\n")
 
 
-def _say(what: str) -> None:
+def _show_progress(message: str) -> None:
+    """Write a progress message to stderr; on a terminal it replaces the previous one."""
     if sys.stderr.isatty():
-        print(f"\r\033[K{what}", end="", file=sys.stderr, flush=True)
+        print(f"\r\033[K{message}", end="", file=sys.stderr, flush=True)
     else:
-        print(what, file=sys.stderr, flush=True)
+        print(message, file=sys.stderr, flush=True)
 
 
 def _end_progress() -> None:
+    """Erase the last progress message on a terminal."""
     if sys.stderr.isatty():
         print("\r\033[K", end="", file=sys.stderr, flush=True)
 
