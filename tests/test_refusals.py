@@ -249,8 +249,8 @@ FULL = jb.Diffusion(DECAY, lambda x, p: jnp.diag(1 + x**2))
 
 SCHEMES = [
     ("full noise", step(jb.Milstein(), FULL), "scalar or diagonal noise"),
-    *each("not linear", in_one, [HYPERBOLIC, VARYING], "`GaussianTransition` is for linear drift"),
-    ("a point", path([0.0, 1.0], (2,)), "`path` must hold"),
+    *each("not linear", in_one, [HYPERBOLIC, VARYING], "`GaussianTransition` needs linear drift"),
+    ("a point", path([0.0, 1.0], (2,)), "`path` must have shape"),
     ("times", path([0.0, 1.0], (3, 2)), "`times` must have shape"),
     ("equal times", path([0.0, 0.0, 1.0], (3, 2)), r"`times\[0\]` = 0.0 and .*merge the obs"),
     ("a missing time", path([0.0, NAN, 1.0], (3, 2)), r"`times\[1\]` = nan is missing"),
@@ -313,7 +313,7 @@ COUPLING = [
     ("a time", bridges(save_at=0.5), "`save_at` must be times"),
     ("no reversal", bridges(model=FREE), "time reversal of this model is unknown"),
     *each("σ", lambda m: bridges(model=m), [OF_ROOTS, SINGULAR], "must be invertible"),
-    ("α is missing", bridges(model=HYPERBOLIC.with_params(NAN)), "`params` .* not finite"),
+    ("α is missing", bridges(model=HYPERBOLIC.with_params(NAN)), "`params` .* must be finite"),
     ("1/0", bridges(model=INFINITE), "not finite at `start`"),
     ("in space", bridges(model=IN_SPACE), r"shape \(2, m\)"),
     ("full", bridges(model=OF_OTHERS, coupling=MILSTEIN), "needs diagonal noise"),
@@ -348,18 +348,18 @@ refined = jb.Guided(refinement=4.0)
 
 PROPOSALS = [
     *each("word", of(jb.Guided), ["start", "sideways"], LINEARISATION),
-    ("vector", of(jb.Guided)([1.0, 2.0]), r"must be a matrix, shape \(d, d\)"),
+    ("vector", of(jb.Guided)([1.0, 2.0]), r"must be a matrix of shape \(d, d\)"),
     ("missing", of(jb.Guided)([[NAN]]), "must be finite"),
     (
         "matrix in space",
         sample(proposal=jb.Guided(jnp.eye(3))),
-        r"must have shape \(2, 2\) for points in 2 dimensions",
+        r"must have shape \(2, 2\) for points of 2 dimensions",
     ),
     ("coarser", modified(refinement=0.5), "`refinement` must be between 1"),
     ("word", modified(refinement="2"), "`refinement` must be a Python number", TypeError),
     ("density", of(jb.Guided)("end", 2.0), "`density` must be `EulerDensity", TypeError),
     ("density", modified(density="exact"), "`density` must be", TypeError),
-    ("too fine", sample(num_steps=2000, proposal=refined), "too short to be told from none"),
+    ("too fine", sample(num_steps=2000, proposal=refined), "shorter than rounding errors"),
     ("off the grid", sample(save_at=[0.5], proposal=refined), "lie on the grid"),
     ("counts", sample(num_counts=2, proposal=GUIDED), "`num_counts`, `max_proposals` and `max_tr"),
     *(
@@ -374,9 +374,9 @@ PROPOSALS = [
     ("varying σ", bent(proposal=TAYLOR), "is for constant σ"),
     ("no ν", bent(proposal=PAIRS), "does not need it, such as `ModifiedDiffusionBridge"),
     # Choices.
-    ("words", exact(proposal="best"), 'what `choose_proposal` returns, or "auto"', TypeError),
+    ("words", exact(proposal="best"), 'a result of `choose_proposal`, or "auto"', TypeError),
     ("kernel", kernel(PAPER, A, B, 1.0, proposal="auto"), "a kernel makes no pilot run"),
-    ("duration is traced", traced(choose_in_jit, 1.0), "by the clock", TypeError),
+    ("duration is traced", traced(choose_in_jit, 1.0), "measures run times", TypeError),
     ("none", choose(candidates=[]), "at least one proposal"),
     ("two grids", choose(candidates=[GUIDED, refined]), "on one grid"),
     ("another choice", exact(proposal=choice(3, BRIDGE)), "one for 3 intervals, but there are 1"),
@@ -450,7 +450,7 @@ EXACT = [
     ("start law", weigh(approximate, start_law=lambda k: k), "`start_law` must be", TypeError),
     ("class", weigh(approximate, start_law=jb.Stationary), "write `Stationary", TypeError),
     ("no counts", weigh(approximate, num_counts=0), "at least 1"),
-    ("another law", weigh(approximate, BLIND, start_law=LAW), "paid for"),
+    ("another law", weigh(approximate, BLIND, start_law=LAW), "need the stationary density"),
     *each("derivative", lambda d: traced(d(middle), X), [jax.jacfwd, jax.jacrev], *STOP),
     *each("coupling", lambda d: traced(d(with_gamma), 0.5), [jax.grad, jax.jacfwd], *STOP),
     # Chains.
@@ -530,7 +530,7 @@ OF_A_RECORD = [
     (
         "a part without a matrix",
         dict(observations=VALUES[:, :1], initial=None),
-        "`observations` have 1 components, and without a `matrix`",
+        "`observations` have 1 components, but without a `matrix`",
     ),
     ("other components", seen([B], 0.1), "`observations` must have 1 components"),
     ("noise of others", seen(covariance=np.eye(3)), "`covariance` must have shape"),
@@ -541,10 +541,10 @@ OF_A_RECORD = [
         "`matrix` and `covariance` side by side have rank 1",
     ),
     ("a guess without noise", dict(observation=GUESSED), "`guess` must have positive variances"),
-    ("fewer rows", dict(observations=VALUES[:3]), "a row for each of them"),
+    ("fewer rows", dict(observations=VALUES[:3]), "one row per time"),
     ("times go back", dict(times=AT[::-1]), "`times` must increase"),
     ("a time is missing", dict(times=[0.0, NAN, 2.0, 3.0]), r"`times\[1\]` = nan is missing"),
-    ("one time", dict(times=AT[:1], observations=VALUES[:1]), "two times or more"),
+    ("one time", dict(times=AT[:1], observations=VALUES[:1]), "at least two times"),
     ("infinite", dict(observations=VALUES + np.inf), r"`observations\[0, 0\]` is infinite"),
     ("before the beginning", dict(initial_time=1.0), "`times` must begin at `initial_time`"),
     ("two kinds of steps", dict(num_steps=4, step_size=0.1), "not both"),
@@ -578,9 +578,17 @@ RECORDS = [
         ("outside the domain", outside(reader, *seen), message)
         for reader in ("innovations", "log_likelihood")
         for *seen, message in (
-            (EXACTLY, [1.0, -1.0], r"`observations\[1\]` is the state .* `domain`"),
-            (jb.LinearGaussian([[-2.0]]), [-1.0, 2.0], r"`observations\[1\]` is the state"),
-            (SEEN, [1.0, -1.0], -1.0, "`initial` = .* `domain`"),
+            (
+                EXACTLY,
+                [1.0, -1.0],
+                r"`observations\[1\]` is an exact observation of the state .* `domain`",
+            ),
+            (
+                jb.LinearGaussian([[-2.0]]),
+                [-1.0, 2.0],
+                r"`observations\[1\]` is an exact observation of the state",
+            ),
+            (SEEN, [1.0, -1.0], -1.0, "`initial` must be inside .* `domain`"),
         )
     ),
     ("no beginning", reads("innovations", FREE)(initial=None), "`initial` is missing"),
@@ -595,14 +603,14 @@ RECORDS = [
     (
         "path of two",
         reads("smooth")(times=[AT] * 2, observations=[VALUES] * 2),
-        "2 records, and here there is a path of one",
+        "2 records, but this function takes one",
     ),
     # Paths between what was seen.
     ("no proposal", between(proposal=None, num_proposals=3), "`num_proposals` is for a `proposal`"),
     ("blocks", between(block_length=3), "`block_length` is for paths without"),
     ("free", smooth(FREE, TIMES, LINE), "leave out `proposal`, so that paths are guided by the"),
     ("no ν", of_draws(proposal=PAIRS), "give `Diffusion` a `log_stationary`"),
-    ("no noise", between(observation=EXACTLY), "every component that is seen must have noise"),
+    ("no noise", between(observation=EXACTLY), "every observed component must have noise"),
     ("half known", between(initial=jb.GaussianLaw([0.0], [[0.0]])), "covariance of `initial`"),
     ("proposal", between(proposal=3), "`proposal` must be a `Coupling`", TypeError),
     ("no proposals", between(num_proposals=0), "`num_proposals` must"),
@@ -615,16 +623,22 @@ rough_cost = of(jb.work_precision, KEY, UNKNOWN, *POINT, proposals=[PAIRS], meth
 variation = lambda bridges, **how: lambda: jb.hitting_variation(KEY, PAPER, bridges(), **how)
 
 TUNING = [
-    ("no ν", fit(BLIND, *POINT, for_density=True), "need the stationary one, with any start law"),
+    (
+        "no ν",
+        fit(BLIND, *POINT, for_density=True),
+        "need the stationary density, with any start law",
+    ),
     ("constant", choose_pairs(for_density=True), "in proportion to `log_stationary`"),
     (
         "in jit",
         traced(lambda a: fit(PAPER, a, a, 1.0)(), X),
-        "which `jit` and `vmap` hide",
+        "cannot be chosen inside `jit`",
         TypeError,
     ),
     ("intervals", fit(PAPER, [A] * 2, [A] * 2, 1.0, num_pilot=40), "one interval"),
-    *each("methods", lambda m: precision(methods=m), [("exact",), ()], "`methods` must be some of"),
+    *each(
+        "methods", lambda m: precision(methods=m), [("exact",), ()], "`methods` must be names among"
+    ),
     ("method", precision(methods=("crank_nicolson",)), "none of `proposals` fits"),
     ("half precision", precision(dtypes=("float16",)), "`dtypes` must be"),
     ("no error", precision(target=0.0), "`target` must be positive"),
@@ -633,7 +647,7 @@ TUNING = [
     ("an odd number of steps", precision(num_steps=(5,)), "`num_steps` must be even"),
     ("no bridges", precision(num_bridges=0), "`num_bridges` must be at least 1"),
     ("intervals", precision(start=[A] * 2), "one interval"),
-    ("auto", precision(proposals=["auto"]), "must be single ones"),
+    ("auto", precision(proposals=["auto"]), "must be single proposals"),
     ("constant", rough_cost(log_density=-0.4), "in proportion to `log_stationary`"),
     ("a number", of(jb.hitting_variation)(KEY, HYPERBOLIC, 3.0), "`bridges`", TypeError),
     ("not exact", variation(approximate), "must have the exact law", TypeError),
@@ -722,14 +736,14 @@ INFERENCE = [
     ("no law to start from", gibbs(model=UNKNOWN_RATE, where=None, proposal=PAIRS), "burn_in"),
     ("covariance", pmmh(covariance=np.ones(3)), "`covariance` must have shape"),
     ("covariance", pmmh(covariance=[-1.0, 0.1]), "`cov.* must be finite, symmetric and positive"),
-    ("no ν", with_pairs(model=UNKNOWN_RATE), "stationary one"),
+    ("no ν", with_pairs(model=UNKNOWN_RATE), "need the stationary density"),
     ("no constant", with_pairs(model=RATED), "normalised=True"),
     ("method", drift_of(method="other"), "`method` must be"),
     ("optimizer", drift_of(optax.sgd(0.1), method="em"), "takes no `optimizer`"),
     ("σ", drift_of(method="em", where=None), "σ depends"),
     *each("pairs", by, [PAIRS, UNDECIDED], "with couplings its estimates have no derivative"),
     ("counts", maximum(num_counts=2), "`num_counts`"),
-    ("EM", maximum(method="em"), "EM would never leave it"),
+    ("EM", maximum(method="em"), "EM would never change it"),
     ("EM", of_noise(method="em"), "for complete observations without noise"),
     ("guided", of_noise(proposal="guided"), "for complete observations without noise"),
     ("counts", of_noise(num_counts=2), "`num_counts`: for complete observations"),
@@ -838,11 +852,11 @@ in_space = of(plot.paths_in_space, TIMES[:2])
 FLAT_AXES = lambda: in_space(np.ones((1, 2, 2)), plt.subplots()[1])()
 
 PLOT = [
-    ("nothing", draw(np.full((3, 2, 2), NAN)), "`paths` must have a bridge to draw"),
+    ("nothing", draw(np.full((3, 2, 2), NAN)), "`paths` must contain a finite path"),
     ("points", draw(np.ones(2)), "`paths` must have shape"),
     ("space", in_space(np.ones((1, 2, 3))), "two coordinates"),
     ("flat axes", FLAT_AXES, "`ax` must be made with", TypeError),
-    ("missing", of(plot.qq)({"none": np.full(3, NAN)}, 0.0, 1.0), "finite; none is"),
+    ("missing", of(plot.qq)({"none": np.full(3, NAN)}, 0.0, 1.0), "must contain finite draws"),
 ]
 
 # What every function refuses.

@@ -1,9 +1,9 @@
-"""Data augmentation: the observations completed by bridges.
+"""Data augmentation: completion of the observations by bridges.
 
-Given θ the bridges of all intervals are independent, and each is renewed by a Markov kernel of its
-own (`bridge_kernels`). Given the bridges the log likelihood of θ is that of the completed path:
-where the drift is linear in θ it is quadratic, which is read off the program that computes its
-Hessian: there θ does not occur.
+Given θ the bridges of all intervals are independent, and a separate Markov kernel renews each of
+them (`bridge_kernels`). Given the bridges the log-likelihood of θ is that of the completed path. It
+is quadratic if the drift is linear in θ. The module detects this from the program of the Hessian,
+in which θ does not occur.
 """
 
 import math
@@ -68,14 +68,16 @@ class Augmentation(eqx.Module):
         if shapes != wanted:
             raise ValueError(
                 f"`init` is a state with paths of shapes {shapes}, but these observations and "
-                f"numbers of steps call for {wanted}."
+                f"numbers of steps need {wanted}: pass the same observations and `num_steps` as "
+                "before, or unknown parameters as `init`."
             )
         for block, mine in zip(self.blocks, paths, strict=True):
             ends = (block.intervals.start, block.intervals.end)
             for end, found in zip(ends, (mine[..., 0, :], mine[..., -1, :]), strict=True):
                 if not is_traced(end, found) and not np.allclose(found, end, atol=1e-6, rtol=1e-4):
                     raise ValueError(
-                        "`init` is a state whose paths do not join these observations."
+                        "`init` is a state whose paths do not join these observations: pass the "
+                        "same observations as before, or unknown parameters as `init`."
                     )
 
     def first(self, key: Key[Array, ""], model: Diffusion) -> tuple[Paths, Bool[Array, " I"]]:
@@ -180,7 +182,7 @@ def augment(
     if method is not None:
         check_choice("method", method, ("pseudo_marginal", "renewal"))
     if bridges == "approximate" and method is not None:
-        raise ValueError("`method` is for exact bridges: approximate ones need none.")
+        raise ValueError('`method` is for exact bridges: omit it with `bridges="approximate"`.')
     use = "weights" if bridges == "exact" else "approximate"
     if method == "renewal":
         use = "renewal"
@@ -189,8 +191,8 @@ def augment(
     by_pairs = method is None and isinstance(proposal, AbstractCoupling)
     if use != "weights" or by_pairs:
         reason = (
-            'for `method="pseudo_marginal"`: the renewal chain and approximate bridges count no '
-            "hittings"
+            'for `method="pseudo_marginal"`: the renewal chain and approximate bridges use no '
+            "hitting counts"
         )
         budget._replace(max_proposals=None).refuse(reason)
     model = problem.parameters.bind(theta)

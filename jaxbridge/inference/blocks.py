@@ -1,4 +1,7 @@
-"""The proposals of all intervals, in blocks of one number of steps each."""
+"""Proposals of all intervals, in blocks of intervals with the same number of steps.
+
+A block is one program. The module selects its proposal for all parameters that a chain may visit.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import Any, Literal
@@ -34,8 +37,8 @@ from ..schemes import (
 from .data import Group, Problem
 
 _NO_SAMPLER = (
-    "the parameters move, and with them the time that replaces a sampler of the stationary law "
-    "(`Diffusion(..., sample_stationary=)`)"
+    "without a sampler of the stationary law (`Diffusion(..., sample_stationary=)`) they need a "
+    "burn-in, whose length changes with the parameters"
 )
 _FOR_APPROXIMATE = ('bridges="approximate"', 'bridges="exact"')
 
@@ -157,9 +160,8 @@ def _check_for_moving(proposal: AbstractProposal, model: Diffusion) -> None:
     density serves at all.)"""
     if any(single.must_measure(model) for single in proposal.singles) and not model.has_density:
         raise ValueError(
-            "this model has no sampler of its stationary law, and how long a run takes that "
-            "replaces it depends on the parameters: pass `sample_stationary=` or "
-            "`log_stationary=` to `Diffusion`, give the coupling `Stationary(burn_in=...)` that is "
-            "long enough for all parameters to come, or choose proposals that are pulled to the "
-            "end point."
+            "this model has no sampler of its stationary law, and the length of a burn-in depends "
+            "on the parameters: pass `sample_stationary=` or `log_stationary=` to `Diffusion`, "
+            "give the coupling a `Stationary(burn_in=...)` that is long enough for all "
+            "parameters, or use guided proposals."
         )

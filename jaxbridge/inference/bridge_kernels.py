@@ -1,14 +1,15 @@
-"""The bridges given the parameters: one step of a Markov kernel on the path of each interval.
+"""Markov kernels for the bridges given the parameters: one step for the path of each interval.
 
-A kernel leaves the exact law of a bridge invariant whatever θ it was made with (section 2.3 of the
-paper):
+The first two kernels leave the exact law of a bridge at the current θ invariant (section 2.3 of the
+paper), also if the path was drawn at another θ:
 
-* `ByRenewal` keeps a bridge until a diffusion associated with it hits it, for couplings. It
-  keeps nothing but the path.
-* `ByWeights` accepts a new weighted proposal with the ratio of the weights, which for the path
-  at hand is drawn anew from its law given θ and the path: for the counts of a coupling that is
-  the size-biased law, for proposals that are pulled to the end point a function of the path.
-* `Unweighted` takes each new proposal of a coupling: approximate, as in section 4 of the paper.
+- `ByRenewal`, for couplings, holds a bridge until its associated diffusion hits it. The path is its
+  only state.
+- `ByWeights` accepts a new weighted proposal with the ratio of the weights. It redraws the weight
+  of the current path from its law given θ and the path. For the counts of a coupling this is the
+  size-biased law; for guided proposals the weight is a function of the path.
+- `Unweighted` accepts each new proposal of a coupling. It is approximate, as in section 4 of the
+  paper.
 """
 
 from abc import abstractmethod

@@ -1,5 +1,8 @@
-"""Discrete observations of a diffusion, the steps of the intervals between them, and what is to be
-inferred from them."""
+"""Discrete exact observations as intervals with steps, and their combination with the parameters.
+
+The module validates `times`, `observations`, `num_steps` and `step_size` for all functions that
+take exact observations.
+"""
 
 from typing import NamedTuple
 
@@ -56,11 +59,11 @@ def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Inter
     known = as_times("times", _unmasked("times", times))
     observations = as_rows(_unmasked("observations", observations))
     if len(known.shape) != 1:
-        raise ValueError(f"`times` must have shape (n + 1,); got {known.shape}.")
+        raise ValueError(f"`times` must have shape (n + 1,); got shape {known.shape}.")
     if observations.ndim != 2 or observations.shape[0] != known.shape[0]:
         raise ValueError(
-            f"`observations` must have shape ({known.shape[0]}, d), a row for each of `times`; got "
-            f"{observations.shape}."
+            f"`observations` must have shape ({known.shape[0]}, d), one row per entry of `times`; "
+            f"got shape {observations.shape}."
         )
     if known.shape[0] < 2:
         raise ValueError(f"`observations` must be two or more; got {known.shape[0]}.")
@@ -86,8 +89,8 @@ def _check_finite(observations: np.ndarray) -> None:
         which = ", ".join(map(str, np.flatnonzero(~finite[i])))
         raise ValueError(
             f"`observations[{i}]` = {observations[i]} has no finite number for coordinate {which}, "
-            "but observations must be complete, all coordinates at a time: leave out this row, "
-            "with its time."
+            "but exact observations must be complete: leave out this row, with its time, or pass "
+            "an `observation` to functions that take records."
         )
     raise ValueError(
         f"`observations[{i}]` = {observations[i]} is not finite: leave out observations that are "
@@ -106,8 +109,8 @@ def _unmasked(name: str, values: Numbers) -> Numbers:
         whole = place.size < 2 or mask[place[0]].all()
         coordinate = "" if whole else f", in coordinate {place[1]},"
         raise ValueError(
-            f"{which} is masked{coordinate} but observations must be complete: leave out what is "
-            "masked, the whole row with its time."
+            f"{which} is masked{coordinate} but observations must be complete: leave out the whole "
+            "row with its time."
         )
     return values.data
 
@@ -120,8 +123,9 @@ def _check_state_space(model: Diffusion, observations: Array) -> None:
     if not is_traced(good) and not np.all(np.asarray(good)):
         i = int(np.argmin(good))
         raise ValueError(
-            f"`observations[{i}]` = {np.asarray(observations[i])} is outside the state space: the "
-            "coefficients or the stationary density of the model are not finite there."
+            f"`observations[{i}]` = {np.asarray(observations[i])} is outside the state space: "
+            "drift, σ or the stationary density of the model is not finite there. Check the "
+            "observation and the model's `params`."
         )
 
 
@@ -204,7 +208,7 @@ class Problem(NamedTuple):
         self.parameters.model.check_invertible_sigma(self.like)
         if self.sigma_is_unknown:
             raise ValueError(
-                "σ depends on the unknown parameters, and given a whole path σ is known: " + instead
+                "σ depends on the unknown parameters, but a complete path determines σ: " + instead
             )
 
 

@@ -1,9 +1,9 @@
 """Bayesian inference by Gibbs sampling (section 4 of the paper, for any model).
 
-The path between the observations is part of the state: bridges of all intervals given θ and the
-data (`augmentation`), and θ given the whole path (`parameter_kernels`), in turn. With exact bridges
-the posterior is exact up to the step error; with approximate ones, as in the paper, it is
-shifted by the error of the bridges.
+The state of the chain contains the path between the observations. The sampler draws the bridges of
+all intervals given θ (`augmentation`), and θ given the complete path (`parameter_kernels`), in
+turn. With exact bridges the posterior is exact up to the discretisation error. With approximate
+bridges, as in the paper, it has the bias of the bridges in addition.
 """
 
 from collections.abc import Callable
@@ -53,24 +53,25 @@ from .record_paths import check_no_bridges, check_no_record
 # Weights that are cut off in a larger share of iterations spoil the law.
 _MOST_TRUNCATED = 0.01
 _MISSING = (
-    "Some intervals have no bridge of the proposal (`num_missing` does not go to zero), and the "
-    "posterior is given stand-ins. Choose another `proposal`, or allow more `max_proposals`."
+    "The proposal found no bridge for some intervals (`num_missing` does not fall to zero), so the "
+    "posterior is conditional on placeholder paths. Use another `proposal`, or increase "
+    "`max_proposals`."
 )
 _CUT_OFF = (
-    "Weights were cut off by `max_trials` in more than 1 % of the iterations, so that the law is "
-    "not exact. Allow more trials, or choose another `proposal`."
+    "`max_trials` truncated weights in more than 1 % of the iterations, so the law is not exact. "
+    "Increase `max_trials`, or use another `proposal`."
 )
 
 
 class GibbsState(NamedTuple):
-    """Where a chain of `gibbs` is, with chains in a leading axis if there are several.
+    """State of a chain of `gibbs`. Several chains have a leading axis.
 
     - `theta`: θ, shape (p,).
-    - `paths`: those of all intervals, in blocks of one number of steps.
-    - `found`: which of them the proposal has found, shape (I,), in the same order. The others are
-        stand-ins, for a chain must start somewhere.
-    - `num_done`: draws so far. Going on with the same key draws the random numbers of those that
-        come after.
+    - `paths`: paths of all intervals, in blocks of intervals with the same number of steps.
+    - `found`: whether the proposal found the path, shape (I,), in the same order. The other paths
+        are placeholders from the start of the chain.
+    - `num_done`: number of draws so far. A continued chain with the same key uses the subsequent
+        random numbers.
     """
 
     theta: Float[Array, "*chains p"]
@@ -80,31 +81,31 @@ class GibbsState(NamedTuple):
 
 
 class GibbsPosterior(AbstractPosterior):
-    """What `gibbs` returns: draws of the unknown parameters. Arrays have a leading axis of chains
-    if there are several.
+    """Posterior draws of the unknown parameters, from `gibbs`.
+
+    Arrays have a leading axis of chains if there are several.
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
-    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
-    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
-        the keys are in alphabetical order.
+    - `theta`: the unknown parameters as vectors, shape (*chains, n, p).
+    - `names`: names of the entries of θ, for instance "alpha" or "B[0,1]". The keys of a dictionary
+        are in alphabetical order.
     - `parameters_moved`: whether θ moved, shape (*chains, n).
-    - `bridges_moved`: the share of bridges that were replaced, shape (*chains, n).
-    - `num_simulated`: paths simulated or weighed, shape (*chains, n).
-    - `num_missing`: bridges that were not found, though called for, within `max_proposals`, shape
-        (*chains, n). They stayed as they were: the law is right, but the chain moves less. Also,
-        in every iteration, those whose first path is a stand-in that nothing has replaced yet: a
-        stand-in that is hardly ever hit calls for no proposal, and the posterior is then given
-        that path. Where this does not go to zero choose another proposal for such intervals.
-    - `num_truncated`: weights that `max_trials` cut off, shape (*chains, n): where there are many
-        the law is not exact.
-    - `num_nonfinite`: paths that left the state space or the finite numbers, shape (*chains, n).
-    - `log_step_error`: an estimate of the step error of the log density of the completed data at
-        each draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
-        `step_error`, that of the posterior mean, is made of.
+    - `bridges_moved`: fraction of the bridges that were replaced, shape (*chains, n).
+    - `num_simulated`: number of simulated or reweighted paths, shape (*chains, n).
+    - `num_missing`: number of bridges that were needed but not found within `max_proposals`, shape
+        (*chains, n). They remain unchanged: the law is exact, but the chain moves less. The number
+        includes placeholders from the start that no proposal has replaced. If it does not fall to
+        zero, the posterior is conditional on these placeholders; then use another proposal.
+    - `num_truncated`: number of weights that `max_trials` truncated, shape (*chains, n). With many
+        of them the law is not exact.
+    - `num_nonfinite`: number of paths that diverged or left the state space, shape (*chains, n).
+    - `log_step_error`: estimated discretisation error of the log density of the completed data at
+        each draw, up to a constant, shape (*chains, n). NaN at draws without an estimate.
+        `step_error`, that of the posterior mean, is computed from it.
     - `sigma_varies`: whether σ depends on the state.
-    - `state`: where it ended; pass it as `init` to go on.
+    - `state`: last state; pass it as `init` to continue.
     - `exact_parameters`: whether θ is drawn from its normal law given the path.
-    - `completion`: how the observations were completed, with the proposals that were chosen.
+    - `completion`: the data augmentation, with the chosen proposals.
     """
 
     params: PyTree
@@ -168,52 +169,54 @@ def gibbs(
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> GibbsPosterior | RecordPosterior:
-    """Draws from the posterior of a model's parameters, given discrete observations.
+    """Sample from the posterior of a model's parameters, given discrete observations.
 
     **Arguments:**
 
-    - `key`: a typed key.
-    - `model`: its `params` are where chains start. σ must not depend on those that are unknown,
-        unless there is an `observation`.
-    - `times`: increasing, shape (n + 1,), in the model's units of time.
-    - `observations`: of the diffusion at these times, shape (n + 1, d), or (n + 1,) in one
-        dimension. Several records, which are independent given the parameters, are lists of both,
-        or have a leading axis.
-    - `prior`: a `NormalPrior`, or a function that maps the unknown parameters to the log of a
-        density. It is restricted to `constraint`.
-    - `num_iterations`: draws that are kept; between two of them are `thin` iterations.
-    - `num_steps`: N for each interval, by default 50, or 10 with an `observation`; or
-        `step_size`, the longest step, from which each interval gets its own number of steps.
+    - `key`: typed key.
+    - `model`: the diffusion. Chains start from its `params`. Without an `observation` σ must not
+        depend on the unknown parameters.
+    - `times`: increasing, shape (n + 1,), in the model's unit of time.
+    - `observations`: values of the diffusion at these times, shape (n + 1, d), or (n + 1,) in one
+        dimension. Pass several independent records as lists of `times` and `observations`, or with
+        a leading axis.
+    - `prior`: a `NormalPrior`, or a function from the unknown parameters to a log density. It is
+        restricted to `constraint`.
+    - `num_iterations`: number of stored draws. Between two of them the chain makes `thin`
+        iterations.
+    - `num_steps`, `step_size`: pass one of the two. `num_steps` is N for each interval, by default
+        50, or 10 with an `observation`. `step_size` is the maximum step size, from which the number
+        of steps of each interval follows.
     - `proposal`: a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, `Guided()`, or
-        "auto", the default, which finds the best for each interval by a pilot run; or, for
-        approximate bridges or where a `method` is given, a `Coupling`, by default
-        `Coupling(gamma=0.0)`.
+        "auto", the default, which selects the best one for each interval by pilot runs. Approximate
+        bridges and `method` need a `Coupling`, by default `Coupling(gamma=0.0)`.
     - `bridges`: "exact", or "approximate" as in the paper.
-    - `method`: of exact bridges by a coupling, "renewal" (the default if `proposal` is one) or
-        "pseudo_marginal".
-    - `where`: a function that picks the unknown ones from `model.params`, by default all, for
-        instance `lambda params: params.B`. Prior and constraint are about these.
-    - `constraint`: a function that maps the unknown parameters to whether they are allowed, for
-        instance `lambda alpha: alpha > 0`, without which the model is not ergodic.
-    - `parameter_kernel`: makes a kernel `(init, step)` from a log density of the unknown
-        parameters, as BlackJAX does. By default θ is drawn from its normal law given the path
-        where the log likelihood is quadratic and the prior normal; otherwise moved by
+    - `method`: method for exact bridges by a coupling: "renewal" (the default if `proposal` is a
+        coupling) or "pseudo_marginal".
+    - `where`: a function that selects the unknown parameters from `model.params`, for instance
+        `lambda params: params.B`; by default all. `prior` and `constraint` take these parameters.
+    - `constraint`: a function from the unknown parameters to whether they are allowed, for instance
+        `lambda alpha: alpha > 0` if the model is ergodic only then.
+    - `parameter_kernel`: a function from a log density of the unknown parameters to a kernel
+        `(init, step)`, as in BlackJAX. By default θ is drawn from its normal law given the path if
+        the log-likelihood is quadratic and the prior normal. Otherwise it moves by
         Metropolis–Hastings with Newton steps.
-    - `num_chains`: several chains at once, which then have a leading axis in all results.
-    - `init`: unknown parameters to start from, with a leading axis of chains if there are
-        several and they differ; or the `state` of earlier draws, to go on from there.
-    - `observation`, `initial`, `initial_time`: for a record that was seen with noise or in part, as
-        in `innovations`. Then parameters of σ and of the noise may be unknown too, and `num_warmup`
-        iterations before, by default 500, learn the size of moves and what guides paths;
-        `covariance` as in `pmmh`.
+    - `num_chains`: number of parallel chains, which are a leading axis in all results.
+    - `init`: unknown parameters to start from, with a leading axis if chains have different ones;
+        or the `state` of earlier draws, to continue them.
+    - `observation`, `initial`, `initial_time`: observation model and initial law of a noisy or
+        partial record, as in `innovations`. Then parameters of σ and of the noise may be unknown,
+        too.
+    - `num_warmup`, `covariance`: for such records only. The warm-up, by default of 500 iterations,
+        adapts the sizes of moves and the guide. `covariance` is as in `pmmh`.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
-    The functions among these are compared by identity: define them once to compile once.
+    Arguments that are functions are compared by identity: define them once to compile once.
 
     **Returns:** `GibbsPosterior`; with an `observation`, `RecordPosterior`. Not differentiable.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -254,7 +257,9 @@ def gibbs(
     for_records = {"initial": initial, "initial_time": initial_time}
     check_no_record(num_warmup=num_warmup, covariance=covariance, **for_records)
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
-    problem.check_sigma_known("use `pmmh`, which needs no path, or pick the others with `where=`.")
+    problem.check_sigma_known(
+        "use `pmmh`, which needs no path, or select other parameters by `where=`."
+    )
     check_kernel(parameter_kernel)
     log_prior = as_log_prior(prior, parameters, problem.theta)
     theta, state = starting_points(

@@ -1,8 +1,8 @@
-"""Unbiased estimates of the likelihood at any parameters, of which `pmmh` is made.
+"""Unbiased estimates of the likelihood at given parameters, for `pmmh`.
 
-Of complete observations without noise it is a product of transition densities, of which weighted
-proposals give estimates, interval by interval; of a record that was seen with noise or in part,
-what a guided particle filter makes.
+The likelihood of exact observations is a product of transition densities, which weighted proposals
+estimate interval by interval. The likelihood of a noisy or partial record is estimated by guided
+particle filters.
 """
 
 from abc import abstractmethod

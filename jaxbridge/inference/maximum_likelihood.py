@@ -1,13 +1,14 @@
-"""Maximum likelihood: by stochastic approximation over bridges, or of a simulated likelihood.
+"""Maximum likelihood by stochastic approximation over bridges, or by a simulated likelihood.
 
-Where σ is known, the search is by `stochastic_approximation` over bridges: with an optimiser it
-ends in the average of the second half of the iterates, by EM in the last. From there Newton's
-method (`newton`) goes on by scores and information of independent bridges, new ones in each pass.
+For known σ, `stochastic_approximation` searches with random bridges. With an optimiser the result
+is the average of the second half of the iterates; with EM it is the last iterate. From there
+Newton's method (`newton`) continues with scores and information from new, independent bridges in
+each pass.
 
-Where σ depends on the unknown parameters paths are of no use, and the maximum is that of the
-likelihood by simulation (`simulated_likelihood`).
+If σ depends on the unknown parameters, a complete path determines them, so bridges cannot be used.
+Then the simulated likelihood is maximised (`simulated_likelihood`).
 
-Of records that were seen with noise or in part see `record_maximum`.
+`record_maximum` is the method for noisy or partial records.
 """
 
 from collections.abc import Callable
@@ -54,34 +55,33 @@ _ADAM = optax.adam(1e-2)
 
 
 class MaximumLikelihood(AbstractResult):
-    """The maximum likelihood estimate, from `maximum_likelihood`.
+    """Maximum likelihood estimate, from `maximum_likelihood`.
 
-    - `params`: all parameters of the model, the unknown ones estimated.
-    - `standard_errors`: a pytree like the unknown parameters, from the observed information.
-    - `monte_carlo_errors`: likewise, of the search for the maximum; more `num_bridges` make them
-        smaller.
-    - `theta`, `covariance`: the unknown parameters as a vector, shape (p,), and the inverse of
-        the observed information, shape (p, p).
-    - `step_error`: what `theta` is too large by for the length of the steps, an estimate, shape
-        (p,), with a standard error of it, `step_uncertainty`. NaN where it is not known.
-    - `iterates`: of the stochastic approximation, shape (n, p).
-    - `score`: where the last pass of Newton's method was, before its step; where σ is unknown, at
-        the estimate, so that its gradient is about zero, and the covariance of that by the noise of
-        the bridges is what matters. Errors can be trusted where its `effective_sample_size` is
-        large in all intervals.
-    - `num_missing`: iterations' bridges that were not found, in all.
-    - `num_truncated`: weights that `max_trials` cut off.
-    - `num_refused`: iterations whose step led out of the constraint, or to what is not finite, and
-        was not made.
-    - `newton`: whether Newton's method converged to a maximum: the next step is short beside the
-        standard errors or the Monte Carlo errors, the information is positive definite, and no
-        Monte Carlo error, in any direction, is more than half a standard error. If not, `params`
-        are no estimate: more iterations are needed, longer steps or more bridges, unless the
-        maximum lies out of the constraint.
-    - `fall`: by how much the log-likelihood falls where a parameter is one standard error below and
-        above the estimate, and the others follow, shape (2, p). It is 0.5 if the log-likelihood is
-        quadratic, and near zero or below where it levels off, so that no maximum is inside;
-        infinite out of the constraint.
+    - `params`: all parameters of the model, with estimates of the unknown ones.
+    - `standard_errors`: pytree like the unknown parameters, from the observed information.
+    - `monte_carlo_errors`: Monte Carlo errors of the search, in the same form. More `num_bridges`
+        reduce them.
+    - `theta`, `covariance`: the estimate as a vector, shape (p,), and the inverse of the observed
+        information, shape (p, p).
+    - `step_error`, `step_uncertainty`: estimated discretisation bias of `theta` (estimate minus
+        limit), shape (p,), and its standard error. NaN if it cannot be estimated.
+    - `iterates`: iterates of the stochastic approximation, shape (n, p).
+    - `score`: score at the last pass of Newton's method, before its step. For unknown σ it is at
+        the estimate; then its gradient is about zero, and its covariance shows the Monte Carlo
+        error. Its errors are reliable if its `effective_sample_size` is large in all intervals.
+    - `num_missing`: total number of bridges that were not found in the iterations.
+    - `num_truncated`: number of weights that `max_trials` truncated.
+    - `num_refused`: number of iterations without a step, because it would have left the constraint
+        or led to values that are not finite.
+    - `newton`: whether Newton's method converged to a maximum. This means that the next step is
+        short compared with the standard errors or the Monte Carlo errors, that the information is
+        positive definite, and that the Monte Carlo error in every direction is at most half a
+        standard error. If false, `params` are not an estimate: use more iterations, a larger
+        learning rate or more bridges, unless the maximum is outside the constraint.
+    - `fall`: decrease of the log-likelihood one standard error below and above the estimate in each
+        parameter, with the others optimised to second order, shape (2, p). It is 0.5 for a
+        quadratic log-likelihood. Values near or below zero show that there is no maximum inside;
+        outside the constraint it is infinite.
     """
 
     params: PyTree
@@ -101,8 +101,11 @@ class MaximumLikelihood(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: no maximum, or none inside, the faults of the weights of `score`, a
-        step error that dominates and is beyond 0.05 standard errors."""
+        """The faults of the estimate, each with a remedy.
+
+        They are: no maximum, or none inside; those of the weights of `score`; and a discretisation
+        error that dominates and exceeds 0.05 standard errors.
+        """
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
         steps = step_fault(StepError(self.step_error, self.step_uncertainty), sd, sd)
         return Verdict(
@@ -115,8 +118,10 @@ class MaximumLikelihood(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:
-        """Whether the step error is beyond the standard error of the estimate, or not known well
-        enough to say: then more steps are needed."""
+        """Whether the discretisation error exceeds the standard error, or may do so; shape (p,).
+
+        Then use more steps.
+        """
         error = StepError(self.step_error, self.step_uncertainty)
         return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
 
@@ -145,46 +150,49 @@ def maximum_likelihood(
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> MaximumLikelihood | RecordMaximumLikelihood:
-    """The maximum likelihood estimate of a model's parameters, given discrete observations.
+    """Estimate a model's parameters by maximum likelihood, given discrete observations.
 
     **Arguments:**
 
-    - `key`: a typed key.
-    - `model`: its `params` are where the search starts. σ may depend on the unknown parameters:
-        then the maximum is that of the likelihood by simulation, as below.
+    - `key`: typed key.
+    - `model`: the diffusion. The search starts from its `params`. If σ depends on the unknown
+        parameters, a simulated likelihood is maximised (see below).
     - `times`, `observations`, `num_steps`, `step_size`, `proposal`, `where`, `constraint`: as in
-        `gibbs`. A step that would leave the constraint is not made.
-    - `optimizer`: any of optax's, by default `optax.adam(0.01)`; it is given the gradient of minus
-        the mean log likelihood per interval, in the unknown parameters as a vector. Optimisers are
-        compared by identity: make one once to compile once.
-    - `method`: "gradient", or "em", which takes no optimiser and needs fewer iterations, and a
-        known σ.
-    - `num_iterations`: of the stochastic approximation.
-    - `num_bridges`: weighted bridges of each interval in each pass of Newton's method, which follow
-        the iterations, and for the errors; where σ is unknown, for the likelihood whose maximum is
-        the estimate.
-    - `observation`, `initial`, `initial_time`: for records that were seen with noise or in part, as
-        in `innovations`. Any parameters may be unknown there, and `num_bridges` are draws of each
-        of eight chains of paths.
+        `gibbs`. Steps that would leave the constraint are skipped.
+    - `optimizer`: an optimiser of optax, by default `optax.adam(0.01)`. Its objective is minus the
+        mean log-likelihood per interval, as a function of the unknown parameters in a vector.
+        Optimisers are compared by identity: create one once to compile once.
+    - `method`: "gradient", or "em", which uses no optimiser and needs fewer iterations, but a known
+        σ.
+    - `num_iterations`: iterations of the stochastic approximation.
+    - `num_bridges`: weighted bridges per interval in each pass of Newton's method after these
+        iterations, and for the errors. For unknown σ: paths per interval in the simulated
+        likelihood.
+    - `observation`, `initial`, `initial_time`: observation model and initial law of noisy or
+        partial records, as in `innovations`. Then any parameters may be unknown, and `num_bridges`
+        is the number of draws from each of eight chains of paths.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
-    **Where σ is unknown** a path of its own tells nothing: given the whole of it σ is known. There
-    the transition densities of `transition_log_density` are differentiated, which takes proposals
-    that are pulled to the end point, by default the best of them. After the optimiser's steps, each
-    with a few new paths, Newton's method goes to the maximum of the likelihood by `num_bridges`
-    paths of each interval with fixed noise, a smooth function of θ. Half the estimated relative
-    variance of each density is added to its logarithm, whose mean is too small by that; what is
-    left of the bias falls with the square of `num_bridges`, and is small beside a standard error
-    where the root of the number of intervals is small beside the square of
-    `effective_sample_size`. For a σ that varies with the state the density's step error is of first
-    order: `num_steps` matters. Only σ σᵀ is in the law of the data: of a matrix, leave unknown
-    what that determines.
+    **Unknown σ.** A complete path determines σ, so paths cannot be fixed while σ changes. Instead
+    the estimated transition densities are differentiated, which requires guided proposals; by
+    default the best ones are selected.
+
+    - First the optimiser makes steps, each with a few new paths. Then Newton's method finds the
+      maximum of the likelihood from `num_bridges` paths per interval with fixed noise. This
+      likelihood is a smooth function of θ.
+    - The mean of a log density estimate is too small by half its relative variance. An estimate of
+      this bias is added. The remaining bias falls with the square of `num_bridges`. Compared with a
+      standard error it is small if the root of the number of intervals is small compared with the
+      square of `effective_sample_size`.
+    - For a state-dependent σ the discretisation error is of first order, so `num_steps` matters.
+    - The law of the data depends on σ σᵀ only. If σ is a matrix, choose unknown entries that σ σᵀ
+      determines.
 
     **Returns:** `MaximumLikelihood`; with an `observation`, `RecordMaximumLikelihood`. Not
     differentiable.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -200,10 +208,11 @@ def maximum_likelihood(
     check_choice("method", method, ("gradient", "em"))
     if not (optimizer is None or isinstance(optimizer, optax.GradientTransformation)):
         raise TypeError(
-            f"`optimizer` must be one of optax's, such as `optax.adam(1e-2)`; got {optimizer!r}."
+            f"`optimizer` must be an optimiser of optax, such as `optax.adam(1e-2)`; got "
+            f"{optimizer!r}."
         )
     if method == "em" and optimizer is not None:
-        raise ValueError('`method="em"` takes no `optimizer`.')
+        raise ValueError('`method="em"` takes no `optimizer`: omit it, or use `method="gradient"`.')
     parameters = as_parameters(model, where, constraint)
     optimizer = _ADAM if optimizer is None else optimizer
     if observation is not None:
@@ -231,9 +240,8 @@ def maximum_likelihood(
         return _by_bridges(key, problem, proposal, budget, search, num_bridges)
     if method == "em":
         raise ValueError(
-            "σ depends on the unknown parameters, and given a whole path σ is known, so that "
-            'EM would never leave it: use `method="gradient"`, or pick the other parameters '
-            "with `where=`."
+            "σ depends on the unknown parameters, but a complete path determines σ, so EM would "
+            'never change it: use `method="gradient"`, or select other parameters by `where=`.'
         )
     return _by_simulation(key, problem, proposal, budget, search, num_bridges)
 

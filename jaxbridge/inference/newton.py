@@ -1,16 +1,17 @@
-"""Newton's method for a log-likelihood whose derivatives have Monte Carlo errors, and checks of
-where it ends.
+"""Newton's method for a log-likelihood with Monte Carlo errors, and checks of its result.
 
 A pass estimates the gradient g of log L at θ, the covariance S of its Monte Carlo error, and the
-observed information I. The method has converged where the next step, I⁻¹g, is short:
+observed information I. The method has converged if the next step I⁻¹g is short,
 
     gᵀI⁻¹g ≤ max(10⁻³, 4 tr I⁻¹S),
 
-in squares of standard errors. This is a maximum if I is positive definite, and larger than S by
-far. But far out on a slope that levels off, as of a likelihood whose maximum is at infinity, steps
-are short as well, and I is small and positive. There log L does not fall as its curvature says. So
-each pass measures log L at θ ± d_j as well, where entry j is one standard error away and the others
-follow, d_j = I⁻¹e_j / √(I⁻¹)_jj, and compares
+in squares of standard errors. The point is a maximum if I is positive definite and much larger than
+S.
+
+A likelihood whose maximum is at infinity needs a further check: far out, steps are short, too, and
+I is small and positive. But there log L does not fall as its curvature predicts. Hence each pass
+also measures log L at θ ± d_j, with d_j = I⁻¹e_j / √(I⁻¹)_jj. This moves entry j by one standard
+error and the others to their conditional optimum. The pass compares
 
     log L(θ) + gᵀd - log L(θ + d)   with   ½ dᵀId.
 """
@@ -38,14 +39,14 @@ _NOISE = 0.5
 _LEAST_FALL = 0.1
 
 _NO_MAXIMUM = (
-    "No maximum was found (`newton` is false). Take more `num_iterations`, a larger learning rate, "
-    "more `num_bridges`, or check that the likelihood has a maximum inside the constraint."
+    "No maximum was found (`newton` is false). Use more `num_iterations`, a larger learning rate "
+    "or more `num_bridges`, or check that the likelihood has a maximum inside the constraint."
 )
 _NOT_INSIDE = (
-    "There is no maximum inside: one standard error from the estimate the log-likelihood hardly "
-    "falls (`fall` is below 0.1, and not 0.5), as where its maximum is at infinity. The data do "
-    "not determine these parameters: hold some fixed by `where=`, or use `gibbs` or `pmmh` with a "
-    "prior."
+    "There is no maximum inside: one standard error from the estimate the log-likelihood barely "
+    "falls (`fall` is below 0.1 instead of 0.5), for instance because its maximum is at infinity. "
+    "The data do not determine these parameters: fix some of them by `where=`, or use `gibbs` or "
+    "`pmmh` with a prior."
 )
 
 

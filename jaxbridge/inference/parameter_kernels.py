@@ -1,18 +1,19 @@
-"""The parameters given the paths: one step of a Markov kernel on θ.
+"""Markov kernels for the parameters given the paths: one step on θ.
 
-Where the log likelihood is quadratic in θ, as it is if the drift is linear in θ, and the prior
-normal, θ given the paths is normal, and is drawn:
+*Exact draw.* Let the prior be normal and the log-likelihood ℓ quadratic in θ, which holds if the
+drift is linear in θ. Then θ given the paths is normal,
 
     N(θ_0 + P⁻¹ g, P⁻¹),    g = ∇(ℓ + log π)(θ_0),    P = -∇²(ℓ + log π),
 
-by autodiff, at any θ_0; drawn again until it satisfies the constraint.
+with derivatives by automatic differentiation at any θ_0. The kernel repeats the draw until it
+satisfies the constraint.
 
-Otherwise by Metropolis–Hastings with normal proposals that would be exact for a quadratic,
+*Metropolis–Hastings.* Otherwise the proposals are normal and would be exact for a quadratic,
 
     θ' ~ N(θ + (1 - √(1-τ²)) G⁻¹ g, τ² G⁻¹),    G = ∫ Jᵀ J dt + (prior precision),  J = ∂_θ σ⁻¹α,
 
-with g and the information G of the paths at θ, and τ = 1, a Newton step, or less, by chance.
-With τ = 1 and constant G this is the draw above, always accepted.
+with the gradient g and the information G of the paths at θ. The factor τ is random: 1 (a Newton
+step) or smaller. With τ = 1 and constant G the proposal is the exact draw and always accepted.
 """
 
 from abc import abstractmethod
@@ -163,7 +164,7 @@ class GivenKernel(AbstractParameterKernel):
             if not all(callable(getattr(kernel, part, None)) for part in ("init", "step")):
                 raise TypeError(
                     "`parameter_kernel` must return a kernel with functions `init(position)` and "
-                    f"`step(key, state)`, as those of BlackJAX; it returned {shown(kernel)}."
+                    f"`step(key, state)`, as in BlackJAX; it returned {shown(kernel)}."
                 )
             state, _ = kernel.step(key, kernel.init(params))
             return data.parameters.vector(state.position)
@@ -171,8 +172,8 @@ class GivenKernel(AbstractParameterKernel):
         moved = evaluated("parameter_kernel", step, key, data.parameters.select(theta))
         if moved.shape != theta.shape:
             raise ValueError(
-                "`parameter_kernel` must keep the structure of the unknown parameters; it "
-                f"returned {moved.size} numbers in the place of {theta.size}."
+                "`parameter_kernel` must preserve the structure of the unknown parameters; it "
+                f"returned {moved.size} numbers instead of {theta.size}."
             )
         ok = data.parameters.allowed(moved)
         moved = jnp.where(ok, moved, theta)

@@ -1,10 +1,10 @@
-"""Normal random walks of θ, whose covariance S Sᵀ is learnt in a warm-up (Vihola 2012),
+"""Normal random walks of θ, with a covariance S Sᵀ that the warm-up adapts (Vihola 2012):
 
     S Sᵀ ← e^{2 κ_i (α_i - α*)} S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,
 
-from the acceptance rates α_i of moves S ξ. The first factor, with κ_i = 6 / (i + 5), finds the size
-of the moves in tens of iterations, where the second alone needs hundreds (Garthwaite, Fan & Sisson
-2016, from whom κ is: 1 / (α* (1 - α*)) over i).
+from the acceptance rates α_i of moves S ξ. The first factor, with κ_i = 6 / (i + 5), adapts the
+size of the moves in tens of iterations; the second factor alone needs hundreds. κ follows
+Garthwaite, Fan & Sisson (2016): 1 / (α* (1 - α*)) divided by i.
 """
 
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def first_root(
         matrix = as_floating("covariance", covariance).astype(theta.dtype)
         if matrix.shape not in ((p,), (p, p)):
             raise ValueError(
-                f"`covariance` must have shape ({p},) or ({p}, {p}); got {matrix.shape}."
+                f"`covariance` must have shape ({p},) or ({p}, {p}); got shape {matrix.shape}."
             )
         matrix = jnp.diag(matrix) if matrix.ndim == 1 else matrix
         if not is_traced(matrix):

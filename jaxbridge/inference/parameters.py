@@ -1,9 +1,8 @@
-"""What is not known: the parameters to be inferred, as a vector θ in R^p.
+"""The unknown parameters as a vector θ in R^p.
 
-All parameters of the model are unknown, or those that a function `where(params)` picks, as in
-`equinox.tree_at`. What is observed in between is a path in the coordinates of the model, so σ must
-not depend on θ wherever paths are part of the state: two σ's give singular laws of paths, and a
-path would never let go of the θ it was made with.
+All parameters of the model are unknown, or those that a function `where(params)` selects, as for
+`equinox.tree_at`. If paths are part of the state of a chain, σ must not depend on θ. Two different
+σ give mutually singular laws of paths, so a path would determine θ and the chain would not move.
 """
 
 import warnings
@@ -87,7 +86,7 @@ class Parameters(eqx.Module):
         value = as_returned("constraint", value)
         if value.shape != () or value.dtype != bool:
             raise ValueError(
-                "`constraint` must map the unknown parameters to one truth value; it returned "
+                "`constraint` must return one truth value for the unknown parameters; it returned "
                 f"shape {value.shape} and dtype {value.dtype}."
             )
         return finite & value
@@ -98,7 +97,7 @@ class Parameters(eqx.Module):
         if not is_traced(ok) and not np.all(np.asarray(ok)):
             row = theta.reshape(-1, theta.shape[-1])[int(np.argmin(ok))]
             why = "are not finite" if self.constraint is None else "do not satisfy `constraint`"
-            raise ValueError(f"the parameters to start from, {self.select(row)}, {why}.")
+            raise ValueError(f"the start parameters {self.select(row)} {why}.")
 
 
 @compiled_sooner
@@ -149,7 +148,8 @@ def _with_named_integers(
         ]
         warnings.warn(
             f"the integers {', '.join(f'`{name}`' for name in names)} among `params` are held "
-            "fixed: write 1.0 for 1 to infer them, or pick the unknown parameters by `where=`.",
+            "fixed: pass floats (1.0 instead of 1) to infer them, or select the unknown "
+            "parameters by `where=`.",
             stacklevel=5,
         )
     return params
@@ -165,7 +165,7 @@ def pick(where: Callable[[PyTree], PyTree], params: PyTree) -> PyTree:
         eqx.tree_at(where, params, picked)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            "`where` must return parts of `model.params`, each once, such as "
+            "`where` must return parts of `model.params`, each at most once, such as "
             f"`lambda params: params.mean`; it returned {shown(picked)}."
         ) from error
     return picked
@@ -194,21 +194,21 @@ def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p
     theta = parameters.vector(cast_floats(parameters.params, dtype))
     if theta.size == 0:
         raise ValueError(
-            "this model has no parameters to be inferred: give `Diffusion` its unknown numbers as "
-            "`params=`, as floating point numbers, for integers are held fixed, and let `where`, "
-            "if given, pick some of them."
+            "this model has no parameters to infer: pass its unknown numbers to `Diffusion` as "
+            "`params=`, as floats, because integers are held fixed. If you pass `where`, let it "
+            "select some of them."
         )
     if not is_traced(theta) and not np.all(np.isfinite(theta)):
         raise ValueError(
-            f"the unknown ones among `params` must be finite; the model has {parameters.params}."
+            f"the unknown parameters among `params` must be finite; got {parameters.params}."
         )
     if uses_argument(lambda theta: parameters.bind(theta).coordinate_values(), theta):
         raise ValueError(
-            "the coordinates of `lamperti` depend on the unknown parameters, those of σ, but the "
-            "observations were mapped to them at fixed ones: infer in the original coordinates, "
-            "or in those of `jb.transform(model, jnp.log, jnp.exp)`, which depend on no "
-            "parameters, by `pmmh` or `maximum_likelihood`; or hold the parameters of σ fixed by "
-            "`where=`."
+            "the coordinates of `lamperti` depend on the unknown parameters of σ, but the "
+            "observations were transformed with fixed parameters. Infer by `pmmh` or "
+            "`maximum_likelihood` in the original coordinates, or in coordinates without "
+            "parameters, as of `jb.transform(model, jnp.log, jnp.exp)`; or fix the parameters of "
+            "σ by `where=`."
         )
     return theta
 
@@ -221,8 +221,8 @@ def init_vectors(
     known = parameters.params
     if jax.tree.structure(init) != jax.tree.structure(known):
         raise ValueError(
-            "`init` must be the `state` of earlier draws, or have the structure of the unknown "
-            f"parameters, {jax.tree.structure(known)}; got {jax.tree.structure(init)}."
+            "`init` must be the `state` of earlier draws, or a pytree like the unknown parameters, "
+            f"{jax.tree.structure(known)}; got {jax.tree.structure(init)}."
         )
     init = jax.tree.map(
         lambda leaf, given: as_floating("init", given) if eqx.is_inexact_array(leaf) else None,

@@ -1,13 +1,13 @@
-"""Particle-marginal Metropolis–Hastings over any parameters, those of σ included.
+"""Particle-marginal Metropolis–Hastings over any parameters, including those of σ.
 
-The likelihood of the observations is a product of transition densities, of which weighted
-proposals give unbiased estimates (`exact.density`). A chain that accepts with the ratio of
-estimates, and keeps that of its state, has the exact posterior (Andrieu & Roberts 2009), up to
-the step error. Proposals are normal random walks, whose covariance S Sᵀ is learnt in a warm-up
+The likelihood of exact observations is a product of transition densities, and weighted proposals
+estimate it without bias (`exact.density`). A chain that accepts with the ratio of estimates, and
+stores the estimate of its state, has the exact posterior up to the discretisation error (Andrieu &
+Roberts 2009). Proposals of θ are normal random walks. The warm-up adapts their covariance S Sᵀ,
 
     S Sᵀ ← S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,    η_i = min(1, p i^(-2/3)),
 
-from the acceptance rates α_i (Vihola 2012; `parameter_walk`), and fixed thereafter.
+from the acceptance rates α_i (Vihola 2012; `parameter_walk`). After the warm-up it is fixed.
 """
 
 from collections.abc import Callable
@@ -67,17 +67,17 @@ from .warm_up import stages
 # A noisier estimate, or weights that are cut off in a larger share of iterations, spoil the chain.
 _MOST_VARIANCE, _MOST_TRUNCATED = 5.0, 0.01
 _NOISY = (
-    "The variance of the log-likelihood estimates (`log_likelihood_variance`) is above 5, so that "
-    "the chain holds on to lucky ones. Take more `num_proposals`, or a better `proposal`."
+    "The variance of the log-likelihood estimates (`log_likelihood_variance`) is above 5, so the "
+    "chain stays long at large estimates. Use more `num_proposals`, or a better `proposal`."
 )
 _TRUNCATED = (
-    "Weights were cut off by `max_trials` in more than 1 % of the iterations, so that the law is "
-    "not exact. Allow more trials, or choose another `proposal`."
+    "`max_trials` truncated weights in more than 1 % of the iterations, so the law is not exact. "
+    "Increase `max_trials`, or use another `proposal`."
 )
 _NOISY_IN_PART = (
-    "In a tenth of the draws the variance of the log-likelihood estimates is above 5: where it is "
-    "large a chain seldom goes and then stays, so that a tail may not have been visited and errors "
-    "are too small. Take more `num_proposals`."
+    "For 10 % of the draws the variance of the log-likelihood estimates is above 5. A chain rarely "
+    "enters such regions and then stays long, so it may have missed a tail, and errors are too "
+    "small. Use more `num_proposals`."
 )
 # For so many parameters it is decided how likelihoods are estimated.
 _NUM_LIKELY = 8
@@ -94,17 +94,17 @@ class _Chain(NamedTuple):
 
 
 class PMMHState(NamedTuple):
-    """Where a chain of `pmmh` is, with chains in a leading axis if there are several.
+    """State of a chain of `pmmh`. Several chains have a leading axis.
 
     - `theta`: θ, shape (p,).
-    - `log_likelihood`: the estimate that the chain holds, shape ().
-    - `variance`: that of this estimate, shape (), and `log_step_error`, its step error.
+    - `log_likelihood`: estimate at this state, shape ().
+    - `variance`, `log_step_error`: its variance and its discretisation error, shape ().
     - `root`: S of the covariance S Sᵀ of proposals, shape (p, p).
-    - `num_done`: iterations so far, with those of the warm-up. Going on with the same key draws
-        the random numbers of those that come after.
-    - `proposals`: of the paths, decided, for each group of intervals with one number of steps; none
-        for records that were seen with noise or in part.
-    - `guide`: what guides the filters of such records, and was found in the warm-up; else `None`.
+    - `num_done`: number of iterations so far, with the warm-up. A continued chain with the same key
+        uses the subsequent random numbers.
+    - `proposals`: chosen proposals of the paths, one per group of intervals with the same number of
+        steps; empty with an `observation`.
+    - `guide`: guide of the particle filters, from the warm-up; `None` without an `observation`.
     """
 
     theta: Float[Array, "*chains p"]
@@ -118,37 +118,39 @@ class PMMHState(NamedTuple):
 
 
 class PMMHPosterior(AbstractPosterior):
-    """What `pmmh` returns: draws of the unknown parameters. Arrays have a leading axis of chains
-    if there are several.
+    """Posterior draws of the unknown parameters, from `pmmh`.
+
+    Arrays have a leading axis of chains if there are several.
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
-    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
-    - `names`: those of θ's entries, for instance "alpha" or "B[0,1]": of parameters in a dictionary
-        the keys are in alphabetical order.
-    - `log_likelihood`: the estimates that the chain holds, shape (*chains, n).
-    - `log_likelihood_variance`: the variance of these estimates given θ, the median over the draws,
-        shape (*chains,): that of log p̂ by the delta method, summed over the intervals, which with
-        heavy tails of the weights is too small. It should be about one. Much above, say at more
-        than three, the chain holds on to lucky estimates and hardly moves: take as many times more
-        `num_proposals`, or a better `proposal`; far below, fewer make iterations cheaper. Infinite
-        where weights were cut off (`num_truncated`), and with one proposal.
-    - `variance_in_part`: what the variance of these estimates exceeds in a tenth of the draws,
-        shape (*chains,).
-    - `log_step_error`: an estimate of the step error of each of these, NaN where none was worked
-        out, shape (*chains, n): what `step_error`, that of the posterior mean, is made of.
+    - `theta`: the unknown parameters as vectors, shape (*chains, n, p).
+    - `names`: names of the entries of θ, for instance "alpha" or "B[0,1]". The keys of a dictionary
+        are in alphabetical order.
+    - `log_likelihood`: the likelihood estimates of the chain's states, shape (*chains, n).
+    - `log_likelihood_variance`: variance of these estimates given θ, median over the draws, shape
+        (*chains,). It is the sum over the intervals of the variances of log p̂ by the delta method,
+        and too small if weights have heavy tails. It should be about 1.
+        - Above 3 the chain stays long at large estimates: increase `num_proposals` in proportion,
+          or use a better `proposal`.
+        - Far below 1 fewer proposals make iterations cheaper.
+        - It is infinite if weights were truncated (`num_truncated`), and with a single proposal.
+    - `variance_in_part`: 90 % quantile of this variance over the draws, shape (*chains,).
+    - `log_step_error`: estimated discretisation error of each estimate, shape (*chains, n). NaN at
+        draws where it was not computed. `step_error`, that of the posterior mean, is computed from
+        it.
     - `sigma_varies`: whether σ depends on the state.
-    - `accepted`: shape (*chains, n).
-    - `num_without_estimate`: iterations, with those of the warm-up, in which the proposed
-        parameters were refused because no estimate was to be had, shape (*chains,). With couplings
-        also where no pair met, which is an estimate of zero and leaves the law exact.
-    - `num_truncated`: weights that `max_trials` cut off, in all these iterations, shape
-        (*chains,): where there are many the law is not exact.
-    - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
-    - `guide`: diagnostics of the guide of each record, found last in the warm-up; `None` without an
-        `observation`. A poor one is a fault where the chain suffers.
-    - `share_lost`: the share of paths that left the state space or the finite numbers, the mean
-        over estimates and intervals, or of particles in all, shape (*chains,). It is a fault where
-        the mass that may be missing is beyond 5 %.
+    - `accepted`: whether the proposed parameters were accepted, shape (*chains, n).
+    - `num_without_estimate`: number of iterations, with the warm-up, that rejected the proposed
+        parameters for lack of an estimate, shape (*chains,). Couplings count iterations in which no
+        pair met, too; this is an estimate of zero, and the law remains exact.
+    - `num_truncated`: number of weights that `max_trials` truncated in all iterations, shape
+        (*chains,). With many of them the law is not exact.
+    - `state`: last state; pass it as `init`, with `num_warmup=0`, to continue.
+    - `guide`: diagnostics of the last guide of each record, from the warm-up; `None` without an
+        `observation`. A poor guide is a fault only if the chain mixes poorly, too.
+    - `share_lost`: fraction of the paths that diverged or left the state space, shape (*chains,). It
+        is the mean over estimates and intervals, with an `observation` the fraction of all
+        particles. It is a fault if more than 5 % of the mass may be missing.
     """
 
     params: PyTree
@@ -168,8 +170,11 @@ class PMMHPosterior(AbstractPosterior):
 
     @property
     def stuck(self) -> Bool[Array, "*chains"]:
-        """Whether a chain never moved, shape (*chains,): then its draws are not those of the
-        posterior, `effective_sample_size` is zero and `standard_error` infinite."""
+        """Whether a chain never moved, shape (*chains,).
+
+        Then its draws do not represent the posterior, `effective_sample_size` is zero, and
+        `standard_error` is infinite.
+        """
         return ~jnp.any(self.accepted, axis=-1)
 
     @property
@@ -221,43 +226,42 @@ def pmmh(
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> PMMHPosterior:
-    """Draws from the posterior of any parameters of a model, given discrete observations.
+    """Sample from the posterior of any parameters of a model, including those of σ.
 
     **Arguments:**
 
-    - `key`: a typed key.
-    - `model`: its `params` are where chains start.
+    - `key`: typed key.
+    - `model`: the diffusion. Chains start from its `params`.
     - `times`, `observations`, `prior`, `num_iterations`, `num_steps`, `step_size`, `where`,
-        `constraint`, `num_chains`, `thin`: as in `gibbs`. Parameters of σ are allowed; where σ
-        needs it to be invertible, say so in `constraint`.
-    - `num_warmup`: iterations before, in which the covariance of proposals is learnt.
-    - `num_proposals`: weighted paths for each interval in each estimate. The variance of the
-        estimated log likelihood, `log_likelihood_variance` of the result, should be about one:
-        with n intervals that takes in proportion to n.
-    - `proposal`: as in `transition_log_density`, but "auto" by default. Densities by a
-        coupling from the stationary law rest on a normalised `log_stationary`, whose constant
-        depends on the parameters.
-    - `covariance`: of the first proposals, shape (p,) for a diagonal or (p, p), in the order of the
-        result's `names`, which is that of `jax.tree.leaves(params)`; by default a tenth of the
-        prior's standard deviations, or a tenth of θ where the prior is not normal, and of records
-        with an `observation` as wide as the likelihood is.
-    - `init`: unknown parameters to start from, or the `state` of earlier draws, which go on with
-        the proposals of paths, and their bounds, that they had, or with what guided their filters.
-        Another `proposal` than "auto" takes the place of theirs; the estimate that the chain holds
-        is still one of theirs.
-    - `observation`, `initial`, `initial_time`: for a record that was seen with noise or in part, as
-        in `innovations`; `num_proposals` is then the number of particles, of which few do.
-        What guides them, and how soon that forgets what is seen later, is found anew in the
-        warm-up, by pilots. By default the state was seen whole and without noise. Unknown
-        parameters of the noise are parameters of the model that `LinearGaussian(covariance=)` is a
-        function of.
+        `constraint`, `num_chains`, `thin`: as in `gibbs`. Parameters of σ may be unknown, too. Use
+        `constraint` to exclude parameters for which σ is not invertible.
+    - `num_warmup`: number of iterations of the warm-up, which adapts the covariance of the
+        proposals of θ.
+    - `num_proposals`: weighted paths per interval in each estimate. Choose it such that
+        `log_likelihood_variance` of the result is about 1; it must grow in proportion to the number
+        of intervals.
+    - `proposal`: as in `transition_log_density`, but "auto" by default. Couplings that start from
+        the stationary law need a normalised `log_stationary`, because its constant depends on the
+        parameters.
+    - `covariance`: covariance of the first proposals of θ, shape (p,) for a diagonal or (p, p), in
+        the order of the result's `names`, which is that of `jax.tree.leaves(params)`. The default
+        has a tenth of the prior's standard deviations, or of θ if the prior is not normal. With an
+        `observation` it has the width of the likelihood.
+    - `init`: unknown parameters to start from, or the `state` of earlier draws. A continued chain
+        uses the proposals of paths, their bounds and the guide of the state. A `proposal` other
+        than "auto" replaces these proposals, except in the stored estimate of the state.
+    - `observation`, `initial`, `initial_time`: observation model and initial law of a noisy or
+        partial record, as in `innovations`. By default observations are exact and complete.
+        `num_proposals` is then the number of particles, and a small one suffices. The warm-up finds
+        the guide and its discount rate by pilot runs. For unknown parameters of the noise make them
+        parameters of the model, and `covariance` of `LinearGaussian` a function of them.
     - `num_counts`, `max_trials`: as in `transition_log_density`.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
     **Returns:** `PMMHPosterior`. Not differentiable.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit; `ValueError` where a
-    chain never came to parameters whose likelihood is finite.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments; `ValueError` if a chain never
+    reaches parameters with a finite log-likelihood.
 
     **Example:**
 
@@ -285,7 +289,9 @@ def pmmh(
         def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
             budget = Budget(num_counts, None, max_trials)
             if state is not None and isinstance(proposal, str) and proposal == "auto":
-                budget.refuse("for a new start: the proposals of a state as `init` have their own")
+                budget.refuse(
+                    "for a new start, because the proposals of a state as `init` have their own"
+                )
                 blocks = _blocks_of_state(state, problem, model)
             else:
                 blocks = make_blocks(pilot_key, model, problem, proposal, budget, "density")
@@ -326,9 +332,9 @@ def _blocks_of_state(
     groups = problem.groups
     if len(state.proposals) != len(groups):
         raise ValueError(
-            f"`init` is a state of draws whose intervals had {len(state.proposals)} numbers of "
-            f"steps, but here they have {len(groups)}: go on with the same `times`, `num_steps` "
-            "and `step_size`, or start anew from `init=` unknown parameters."
+            f"`init` is a state of draws whose intervals had {len(state.proposals)} different "
+            f"numbers of steps, but here they have {len(groups)}: pass the same `times`, "
+            "`num_steps` and `step_size` as before, or unknown parameters as `init`."
         )
     for group, proposal in zip(groups, state.proposals, strict=True):
         proposal.check(pilot_model, group.intervals)
@@ -344,8 +350,8 @@ def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLi
     shapes = [jax.tree.map(jnp.shape, each) for each in (state.guide, likelihood.guide)]
     if state.guide is None or shapes[0] != shapes[1]:
         raise ValueError(
-            "`init` is a state of draws from other records: go on with the same `times`, "
-            "`num_steps` and `step_size`, or start anew from `init=` unknown parameters."
+            "`init` is a state of draws from other records: pass the same `times`, `num_steps` "
+            "and `step_size` as before, or unknown parameters as `init`."
         )
     return likelihood.guided_by(state.guide)
 

@@ -1,4 +1,7 @@
-"""Draws from a posterior, and how far to trust them."""
+"""Posterior draws: diagnostics, and the parts that `gibbs` and `pmmh` share.
+
+The shared parts are the start, the continuation and the parallel run of chains.
+"""
 
 from abc import abstractmethod
 from collections.abc import Callable
@@ -27,28 +30,29 @@ _FEWEST, _MOST_INFINITE = 10, 0.1
 # Limits of chains that agree, and of draws that are worth an error.
 _MOST_R_HAT, _FEWEST_EFFECTIVE = 1.1, 25
 _APART = (
-    "Chains, or halves of one, disagree (R̂ above 1.1 for some parameter): they have not converged. "
-    "Take more `num_iterations` and `num_warmup`, or start nearer by `init=`."
+    "Chains, or halves of a chain, disagree (R̂ above 1.1 for some parameter): they have not "
+    "converged. Use more `num_iterations` and `num_warmup`, or start from likelier parameters by "
+    "`init=`."
 )
 _FEW = (
-    "Fewer than 25 effective draws of some parameter: its mean and its error are not determined. "
-    "Take more `num_iterations`."
+    "The effective sample size of some parameter is below 25: its mean and its error are "
+    "unreliable. Use more `num_iterations`."
 )
 # A walk that is refused more often is not adapted, or estimates are too noisy.
 _LEAST_ACCEPTED = 0.05
 _REFUSED = (
-    "Fewer than one in twenty of the proposed parameters were accepted in some chain: it stays "
-    "where it is for long, and its errors are too small where it has not been. Take more "
-    "`num_warmup`, start nearer by `init=`, or give the first `covariance` of the moves."
+    "Some chain accepted less than 5 % of the proposed parameters: it moves slowly, so errors may "
+    "be too small. Use more `num_warmup`, start from likelier parameters by "
+    "`init=`, or pass the first `covariance` of the moves."
 )
 _STUCK = (
-    "A parameter, or a block of the path, never moved. Take more `num_iterations`, or start from "
+    "A parameter, or a block of the path, never moved. Use more `num_iterations`, or start from "
     "likelier parameters by `init=`."
 )
 
 
 class AbstractPosterior(AbstractResult):
-    """Draws of unknown parameters, and their errors by their number and by the steps."""
+    """Base class of posterior draws, with their Monte Carlo and discretisation errors."""
 
     params: eqx.AbstractVar[PyTree]
     theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
@@ -68,9 +72,12 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: something that never moved, chains that disagree, few effective draws,
-        a step error that dominates and is beyond 0.05 posterior standard deviations, and those of
-        the sampler."""
+        """The faults of the draws, each with a remedy.
+
+        They are: a parameter or block that never moved, chains that disagree, few effective draws,
+        those of the sampler, and a discretisation error that dominates and exceeds 0.05 posterior
+        standard deviations.
+        """
         sd = jnp.std(self.theta, axis=tuple(range(self.theta.ndim - 1)))
         steps = step_fault(self._step_error, self.standard_error, sd)
         return Verdict(
@@ -89,8 +96,11 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def effective_sample_size(self) -> Float[Array, " p"]:
-        """Of each unknown parameter, from all chains: few where they disagree, and zero where it,
-        or a path that is drawn with it, never moved in one of the chains."""
+        """Effective sample size of each unknown parameter, from all chains, shape (p,).
+
+        It is small if chains disagree. It is zero if the parameter, or a path drawn with it, never
+        moved in some chain.
+        """
         return jnp.where(self._moved, effective_size_of_chains(self._chains), 0)
 
     @property
@@ -101,36 +111,45 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def r_hat(self) -> Float[Array, " p"]:
-        """R̂ of each unknown parameter, from the halves of all chains."""
+        """R̂ of each unknown parameter, from the halves of all chains, shape (p,)."""
         return potential_scale_reduction(self._chains)
 
     @property
     def step_error(self) -> Float[Array, " p"]:
-        """What the posterior mean of each unknown parameter is too large by for the length of the
-        steps, an estimate: to first order the covariance of θ and the error of the log likelihood,
-        `log_step_error`. NaN where that is not known, as of one step, or infinite in a tenth of the
-        draws, whose steps are too long for the drift: then the uncertainty is infinite."""
+        """Estimated discretisation bias of the posterior means (estimate minus limit), shape (p,).
+
+        To first order it is the covariance of θ and `log_step_error`. NaN if that is not available,
+        for instance with one step. It is also NaN, with an infinite uncertainty, if the steps are
+        too long for the drift (`log_step_error` is infinite) in more than a tenth of the draws.
+        """
         return self._step_error.value
 
     @property
     def step_uncertainty(self) -> Float[Array, " p"]:
-        """A standard error of `step_error`; where σ varies with the state not below `step_error`
-        itself, of which what half as many steps tell may there be two or three times too large."""
+        """Standard error of `step_error`, shape (p,).
+
+        For a state-dependent σ it is at least `step_error` itself, because the estimate from half
+        as many steps may be too large by a factor of two or three.
+        """
         value, noise = self._step_error
         return jnp.hypot(noise, value) if self.sigma_varies else noise
 
     @property
     def standard_error(self) -> Float[Array, " p"]:
-        """The Monte Carlo error of the posterior mean of each unknown parameter; infinite where it,
-        or a path that is drawn with it, never moved in one of the chains."""
+        """Monte Carlo error of the posterior mean of each unknown parameter, shape (p,).
+
+        It is infinite if the parameter, or a path drawn with it, never moved in some chain.
+        """
         draws = self.theta.reshape(-1, self.theta.shape[-1])
         made = jnp.std(draws, axis=0) / jnp.sqrt(self.effective_sample_size)
         return jnp.where(self._moved, made, jnp.inf)
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:
-        """Whether the step error is beyond the Monte Carlo error, or not known well enough to say:
-        then more steps help, and more iterations do not."""
+        """Whether the discretisation error exceeds the Monte Carlo error, or may do so; shape (p,).
+
+        Then more steps help, and more iterations do not.
+        """
         # Not by `step_uncertainty`: beside a doubt of its own size no error would be seen.
         return dominates(self._step_error, self.standard_error)
 
@@ -158,7 +177,10 @@ class AbstractPosterior(AbstractResult):
         )
 
     def to_arviz(self) -> Any:
-        """As ArviZ's `InferenceData` (a `DataTree` since its version 1). Needs ArviZ."""
+        """Return the draws as ArviZ's `InferenceData` (`DataTree` since its version 1).
+
+        This needs the package ArviZ.
+        """
         import arviz
 
         def of_chains(leaf):
@@ -185,10 +207,10 @@ def check_likelihood_was_found(never: Bool[Array, "*chains"]) -> None:
     finite; under `jit` the draws are flagged instead."""
     if not is_traced(never) and (stuck := np.flatnonzero(np.asarray(never))).size:
         raise ValueError(
-            f"the likelihood at the parameters to start from is zero, guided by all observations "
-            f"too, and none of the moves found a positive one (chain {stuck[0]} of {never.size}). "
-            "Start from likelier parameters by `init=` or the model's `params`, take more "
-            "`num_steps`, or allow for outliers in the noise of the observations."
+            f"the likelihood at the start parameters is zero, also with paths guided by all "
+            f"observations, and none of the moves found a positive one (chain {stuck[0]} of "
+            f"{never.size}). Start from likelier parameters by `init=` or the model's `params`, "
+            "use more `num_steps`, or allow for outliers in the noise of the observations."
         )
 
 
@@ -207,11 +229,13 @@ def starting_points(
         p, theta = theta.shape[0], state.theta
         if theta.shape[-1] != p:
             raise ValueError(
-                f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are {p}."
+                f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are {p}: "
+                "pass the `where` of the earlier draws."
             )
         if theta.shape[:-1] != chains and num_chains is not None:
             raise ValueError(
-                f"`init` is a state of chains {theta.shape[:-1]}, but `num_chains` is {num_chains}."
+                f"`init` is a state of chains {theta.shape[:-1]}, but `num_chains` is "
+                f"{num_chains}: omit `num_chains`."
             )
     elif init is not None:
         theta = init_vectors(parameters, init, chains).astype(theta.dtype)
@@ -223,8 +247,8 @@ def starting_points(
         i = int(np.argmin(good))
         row = theta.reshape(-1, theta.shape[-1])[i]
         raise ValueError(
-            f"`prior` is {values[i]} at the parameters to start from, {parameters.select(row)}: "
-            "start where its density is positive, by `init=`."
+            f"`prior` is {values[i]} at the start parameters {parameters.select(row)}: pass start "
+            "parameters with a positive prior density as `init`."
         )
     return theta, state
 
@@ -232,7 +256,9 @@ def starting_points(
 def check_covariance_is_used(covariance: Any, state: Any) -> None:
     """Raise `ValueError` for a `covariance` beside a state to go on from."""
     if state is not None and covariance is not None:
-        raise ValueError("`covariance` is for a new start: a state as `init` has its own.")
+        raise ValueError(
+            "`covariance` is for a new start: omit it, because a state as `init` has its own."
+        )
 
 
 def first_chain(theta: Float[Array, "*chains p"]) -> Float[Array, " p"]:

@@ -1,4 +1,4 @@
-"""The prior of the parameters."""
+"""Priors of the unknown parameters, and their conversion to log densities of the vector θ."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,15 +18,17 @@ from .parameters import Parameters
 
 
 class NormalPrior(eqx.Module):
-    """A normal prior of the unknown parameters.
+    """Normal prior of the unknown parameters.
 
     **Arguments:**
 
-    - `mean`: a number for all of them, a vector of shape (p,), or a pytree like the parameters.
-    - `variance`: likewise; or a covariance matrix of shape (p, p). A vector has the parameters in
-        the order of `jax.flatten_util.ravel_pytree`.
+    - `mean`: a number for all parameters, a vector of shape (p,), or a pytree like the parameters.
+    - `variance`: the same forms, or a covariance matrix of shape (p, p).
 
-    **Raises:** `ValueError`, by the function it is passed to, if shapes do not fit the parameters.
+    Vectors and matrices have the order of `jax.flatten_util.ravel_pytree`.
+
+    **Raises:** `ValueError` if shapes do not fit the parameters; the function that takes the prior
+    raises it.
 
     **Example:**
 
@@ -66,7 +68,9 @@ class GivenDensity(eqx.Module):
         value = named("prior", self.captured.call)(self.function, self.parameters.select(theta))
         value = as_returned("prior", value)
         if value.shape != ():
-            raise ValueError(f"`prior` must return a number; it returned shape {value.shape}.")
+            raise ValueError(
+                f"`prior` must return a scalar, shape (); it returned shape {value.shape}."
+            )
         return value.astype(theta.dtype)
 
 
@@ -129,8 +133,8 @@ def _as_array(
             leaf = as_floating(f"prior.{name}", leaf)
             if leaf.shape not in ((), known.shape):
                 raise ValueError(
-                    f"`prior.{name}` has a leaf of shape {leaf.shape} for parameters of shape "
-                    f"{known.shape}."
+                    f"`prior.{name}` must have leaves of the shapes of the parameters; got shape "
+                    f"{leaf.shape} for parameters of shape {known.shape}."
                 )
             full.append(jnp.broadcast_to(leaf, known.shape).ravel())
         value = jnp.concatenate(full)
@@ -145,8 +149,8 @@ def as_log_prior(
         return as_normal(prior, parameters, theta)
     if not callable(prior):
         raise TypeError(
-            "`prior` must be a `NormalPrior`, or a function that maps the unknown parameters to "
-            f"the log of a density; got {prior!r}."
+            "`prior` must be a `NormalPrior`, or a function from the unknown parameters to a log "
+            f"density; got {prior!r}."
         )
     check_function("prior", prior, "(unknown)")
     return GivenDensity(parameters, prior)

@@ -1,17 +1,21 @@
-"""Gibbs sampling of parameters and paths of records that were seen with noise or in part.
+"""Gibbs sampling of parameters and paths, given noisy or partial records.
 
-The state is (θ, path). In turn the path moves given θ; then it is read as the noise ξ that makes it
-(`record_paths`), and θ moves given ξ: by a normal random walk from π(θ) w(θ, ξ), which takes the
-path along. So parameters of σ, of the noise and of the initial law are as good as those of the
-drift, however small the steps.
+The state is (θ, path). Two moves alternate:
 
-The guide is linearised along a path that is likely at some θ, and may be a bad one where θ is far
-off. Neither the law of the path given θ nor that of θ given ξ depends on it; so a warm-up finds it
-anew (`warm_up`).
+- the path moves given θ;
+- the path is converted to its noise ξ (`record_paths`), and θ moves given ξ by a normal random walk
+  with the target π(θ) w(θ, ξ). The path changes with θ.
 
-The step error of the likelihood is that of E[w̃ / w] (`record_paths`), with D = log w̃ / w and
-`relative_change` in the place of e^D. Where half as many steps are too long for the drift a path
-may leave the finite numbers: its w̃ is zero.
+Hence the sampler works for parameters of σ, of the noise and of the initial law as well as for
+those of the drift, for every step size.
+
+The guide is linearised along a path that is likely at some θ. It may be poor at a θ far away.
+Neither the law of the path given θ nor that of θ given ξ depends on the guide, so the warm-up
+replaces it (`warm_up`).
+
+The discretisation error of the likelihood is that of E[w̃ / w] (`record_paths`), with D = log w̃ / w
+and `relative_change` instead of e^D. If half as many steps are too long for the drift, a path may
+diverge; then its w̃ is zero.
 """
 
 from typing import NamedTuple
@@ -57,13 +61,13 @@ from .warm_up import stages
 
 
 class RecordState(NamedTuple):
-    """Where a chain of `gibbs` is, given an `observation`, with chains in a leading axis if there
-    are several.
+    """State of a chain of `gibbs` with an `observation`. Several chains have a leading axis.
 
     - `theta`: θ, shape (p,).
-    - `paths`: of R records, at the points of their grids.
-    - `root`: S of the covariance S Sᵀ of moves of θ; `log_scales`: log β of those of the blocks.
-    - `num_done`: iterations so far.
+    - `paths`: paths of R records, at the points of their grids.
+    - `root`: S of the covariance S Sᵀ of moves of θ, shape (p, p).
+    - `log_scales`: log β of the moves of the blocks.
+    - `num_done`: number of iterations so far.
     """
 
     theta: Float[Array, "*chains p"]
@@ -81,23 +85,24 @@ class GuidedState(NamedTuple):
 
 
 class RecordPosterior(AbstractPosterior):
-    """What `gibbs` returns for a record that was seen with noise or in part: draws of the unknown
-    parameters. Arrays have a leading axis of chains if there are several.
+    """Posterior draws of the unknown parameters, from `gibbs` with an `observation`.
+
+    Arrays have a leading axis of chains if there are several.
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
-    - `theta`: the unknown ones as vectors, shape (*chains, n, p).
-    - `names`: those of θ's entries.
+    - `theta`: the unknown parameters as vectors, shape (*chains, n, p).
+    - `names`: names of the entries of θ.
     - `parameters_moved`: whether θ moved, shape (*chains, n).
-    - `blocks_moved`: the share of the blocks of the path that moved, shape (*chains, n).
-    - `stuck`: whether there is a block that never did, shape (*chains): then the draws are not
-        those of the posterior, and `standard_error` is infinite.
-    - `log_step_error`: an estimate of the step error of the log density of data and noise at each
-        draw, up to a constant, NaN where none was worked out, shape (*chains, n): what
-        `step_error`, that of the posterior mean, is made of.
+    - `blocks_moved`: fraction of the blocks of the path that moved, shape (*chains, n).
+    - `stuck`: whether some block never moved, shape (*chains). Then the draws do not represent the
+        posterior, and `standard_error` is infinite.
+    - `log_step_error`: estimated discretisation error of the log density of data and noise at each
+        draw, up to a constant, shape (*chains, n). NaN at draws without an estimate. `step_error`,
+        that of the posterior mean, is computed from it.
     - `sigma_varies`: whether σ depends on the state.
-    - `state`: where it ended; pass it as `init`, with `num_warmup=0`, to go on.
-    - `guide`: diagnostics of the guide of each record, found last in the warm-up. A poor one is a
-        fault where chains suffer.
+    - `state`: last state; pass it as `init`, with `num_warmup=0`, to continue.
+    - `guide`: diagnostics of the last guide of each record, from the warm-up. A poor guide is a
+        fault only if chains mix poorly, too.
     """
 
     params: PyTree

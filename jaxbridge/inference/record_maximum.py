@@ -1,30 +1,31 @@
-"""Maximum likelihood from records that were seen with noise or in part.
+"""Maximum likelihood from noisy or partial records.
 
-With ξ ~ N(0, I) and the path of ξ at θ (`record_paths`) the likelihood is E[w(θ, ξ)]; the law of ξ
-does not know θ, so that Fisher's identity and Louis's (1982) are
+With ξ ~ N(0, I) and the path of ξ at θ (`record_paths`) the likelihood is E[w(θ, ξ)]. The law of ξ
+does not depend on θ. Hence Fisher's identity and that of Louis (1982) are
 
     ∇ log L(θ) = E[∇ log w | y],    -∇² log L(θ) = -E[∇² log w | y] - Cov(∇ log w | y),
 
-means over ξ given θ and the data, derivatives in θ. Parameters of σ, of the noise and of the
-initial law are as good as those of the drift, however small the steps.
+with means over ξ given θ and the data, and derivatives in θ. They hold for parameters of σ, of the
+noise and of the initial law as well as for those of the drift, for every step size.
 
-Chains of paths move given the current θ, are read as ξ, and θ makes a step of an optimiser along
-the mean of ∇ log w, which takes the paths along (Gu & Kong 1998). From the average of the second
-half of the iterates Newton's method goes on (`newton`), in passes in which the chains run with θ
-fixed. Log L(θ + d) - log L(θ) is the log of the mean of w(θ + d) / w(θ) given the data, taken to
-second order in the cumulants of its logarithm.
+In each iteration chains of paths move given the current θ. The paths are converted to ξ, and an
+optimiser moves θ along the mean of ∇ log w, which changes the paths with θ (Gu & Kong 1998).
+Newton's method continues from the average of the second half of the iterates (`newton`). In its
+passes the chains run with fixed θ. It estimates log L(θ + d) - log L(θ), the log of the mean of
+w(θ + d) / w(θ) given the data, by the first two cumulants of the log ratio.
 
-∇² log w is the difference of ∇ log w at θ ± h e_j, which takes a third of the time to compile that
-its derivative takes. h is a share of 1 / √D_j, with D_j the mean of -∂²_j log w: of what a standard
-error would be, were ξ known.
+∇² log w is a difference of ∇ log w at θ ± h e_j, because derivatives take three times as long to
+compile. h is a fraction of 1 / √D_j, with D_j the mean of -∂²_j log w. This would be the standard
+error if ξ were known.
 
-The step error e = log L_N - log L of the likelihood, about a share of log L_{N/2} - log L_N, moves
-the maximum by I⁻¹ ∇e, and with the weight w̃ of half as many steps and D = log w̃ / w,
+Let e = log L_N - log L be the discretisation error of the log-likelihood, about a fixed fraction of
+log L_{N/2} - log L_N. It moves the maximum by I⁻¹ ∇e. With the weight w̃ of half as many steps and
+D = log w̃ / w,
 
     ∇ log L_{N/2} = E[(w̃ / w) ∇ log w̃ | y] / E[w̃ / w | y]
-                  ≈ E[∇ log w̃ | y] + Cov(D + ½ (D - ED)², ∇ log w̃ | y),
+                  ≈ E[∇ log w̃ | y] + Cov(D + ½ (D - ED)², ∇ log w̃ | y).
 
-where the square is of the order of D's mean if σ varies with the state.
+For a state-dependent σ the square has the order of the mean of D.
 """
 
 from collections.abc import Callable
@@ -67,35 +68,37 @@ _MOST_R_HAT = 1.1
 # Chains that disagree by no more than rounding agree: beside this Monte Carlo error, in standard
 # errors, R̂ matters.
 _MATTERS = 0.01
-_STUCK = "A block of a path never moved. Take more `num_bridges` or more steps."
-_APART = "Chains of paths disagree (R̂ above 1.1 of the gradient). Take more `num_bridges`."
+_STUCK = "A block of a path never moved. Use more `num_bridges` or more steps."
+_APART = "Chains of paths disagree (R̂ of the gradient above 1.1). Use more `num_bridges`."
 
 
 class RecordMaximumLikelihood(AbstractResult):
-    """The maximum likelihood estimate, from `maximum_likelihood`, of records that were seen with
-    noise or in part.
+    """Maximum likelihood estimate from noisy or partial records, from `maximum_likelihood`.
 
-    - `params`: all parameters of the model, the unknown ones estimated.
-    - `standard_errors`: a pytree like the unknown parameters, from the observed information.
-    - `monte_carlo_errors`: likewise, of the search for the maximum; more `num_bridges` make them
-        smaller.
-    - `theta`, `covariance`: the unknown parameters as a vector, shape (p,), and the inverse of
-        the observed information, shape (p, p).
-    - `step_error`: what `theta` is too large by for the length of the steps, an estimate, shape
-        (p,), with a standard error of it, `step_uncertainty`. NaN of one step.
-    - `iterates`: of the stochastic approximation, shape (n, p).
-    - `gradient`: of the log likelihood where the last pass of Newton's method was, before its step,
-        shape (p,), with the `effective_sample_size` of its draws and `r_hat` over the chains.
-    - `stuck`: chains in which a block of a path never moved, of those at the end, shape (chains,).
-    - `num_refused`: iterations whose step led out of the constraint, or to what is not finite, and
-        was not made.
-    - `newton`: whether Newton's method converged to a maximum: the next step is short beside the
-        standard errors or the Monte Carlo errors, and the information is positive definite, by far.
-    - `fall`: by how much the log-likelihood falls where a parameter is one standard error below and
-        above the estimate, and the others follow, shape (2, p). It is 0.5 if the log-likelihood is
-        quadratic, and near zero or below where it levels off, so that no maximum is inside;
-        infinite out of the constraint.
-    - `guide`: diagnostics of the guide of each record. A poor one is a fault where chains suffer.
+    - `params`: all parameters of the model, with estimates of the unknown ones.
+    - `standard_errors`: pytree like the unknown parameters, from the observed information.
+    - `monte_carlo_errors`: Monte Carlo errors of the search, in the same form. More `num_bridges`
+        reduce them.
+    - `theta`, `covariance`: the estimate as a vector, shape (p,), and the inverse of the observed
+        information, shape (p, p).
+    - `step_error`, `step_uncertainty`: estimated discretisation bias of `theta` (estimate minus
+        limit), shape (p,), and its standard error. NaN with one step.
+    - `iterates`: iterates of the stochastic approximation, shape (n, p).
+    - `gradient`: gradient of the log-likelihood at the last pass of Newton's method, before its
+        step, shape (p,).
+    - `effective_sample_size`, `r_hat`: those of the draws of the gradient, over the chains.
+    - `stuck`: whether a block of a path never moved in the last pass, shape (chains,).
+    - `num_refused`: number of iterations without a step, because it would have left the constraint
+        or led to values that are not finite.
+    - `newton`: whether Newton's method converged to a maximum. This means that the next step is
+        short compared with the standard errors or the Monte Carlo errors, and that the information
+        is positive definite by a wide margin.
+    - `fall`: decrease of the log-likelihood one standard error below and above the estimate in each
+        parameter, with the others optimised to second order, shape (2, p). It is 0.5 for a
+        quadratic log-likelihood. Values near or below zero show that there is no maximum inside;
+        outside the constraint it is infinite.
+    - `guide`: diagnostics of the guide of each record. A poor guide is a fault only if chains mix
+        poorly, too.
     """
 
     params: PyTree
@@ -117,8 +120,12 @@ class RecordMaximumLikelihood(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: no maximum, or none inside, a block of a path that never moved, chains
-        that disagree, a step error that dominates and is beyond 0.05 standard errors."""
+        """The faults of the estimate, each with a remedy.
+
+        They are: no maximum, or none inside; a block of a path that never moved; chains that
+        disagree; a poor guide; and a discretisation error that dominates and exceeds 0.05 standard
+        errors.
+        """
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
         steps = step_fault(StepError(self.step_error, self.step_uncertainty), sd, sd)
         stuck, apart = jnp.any(self.stuck), self._chains_disagree
@@ -140,8 +147,10 @@ class RecordMaximumLikelihood(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:
-        """Whether the step error is beyond the standard error of the estimate, or not known well
-        enough to say: then more steps are needed."""
+        """Whether the discretisation error exceeds the standard error, or may do so; shape (p,).
+
+        Then use more steps.
+        """
         error = StepError(self.step_error, self.step_uncertainty)
         return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
 

@@ -1,12 +1,13 @@
-"""Paths of records as functions of θ and of noise ξ, and moves of them given θ.
+"""Paths of records as functions of θ and of noise ξ, and moves of these paths given θ.
 
-A path moves given θ in blocks (`records.path_blocks`); it is read as the noise ξ that makes it,
-guided through its record at θ; and ξ makes another path at another θ. Given a whole path its σ
-would be known, given ξ it is not (Roberts & Stramer 2001; van der Meulen & Schauer 2017).
+Given θ a path moves in blocks (`records.path_blocks`). It is a function of θ and of noise ξ, by
+guided steps through its record. The function has an inverse, so a path at θ gives ξ, and ξ gives a
+path at another θ. A complete path determines σ, but ξ does not (Roberts & Stramer 2001; van der
+Meulen & Schauer 2017).
 
-The step error of the likelihood is that of w. From ξ steps of twice the length have the noise
-(ζ_i + ζ_{i+1}) / √2, which is N(0, I) as well, and a weight w̃; so L̃(θ) = E[w̃ / w] L(θ), the mean
-over ξ given θ and the data.
+The discretisation error of the likelihood is that of w. Steps of twice the size have the noise
+(ζ_i + ζ_{i+1}) / √2, which is N(0, I) as well, and a weight w̃. Hence L̃(θ) = E[w̃ / w] L(θ), with
+the mean over ξ given θ and the data.
 """
 
 from collections.abc import Callable
@@ -179,7 +180,7 @@ def check_no_bridges(**given: Any) -> None:
     if asked:
         raise ValueError(
             f"{' and '.join(f'`{name}`' for name in asked)}: for complete observations without "
-            "noise. Leave this out where there is an `observation`."
+            "noise. Omit this argument, or omit `observation`."
         )
 
 
@@ -190,7 +191,7 @@ def check_no_record(**given: Any) -> None:
     if asked:
         raise ValueError(
             f"{' and '.join(asked)}: for records with an `observation`. Pass one, for instance "
-            "`observation=jb.LinearGaussian(covariance=0.01)`, or leave this out."
+            "`observation=jb.LinearGaussian(covariance=0.01)`, or omit this argument."
         )
 
 

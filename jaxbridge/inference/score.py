@@ -1,11 +1,12 @@
-"""The score of discrete observations, by Fisher's identity, and the observed information.
+"""Score and observed information of discrete observations, by the identities of Fisher and Louis.
 
 With Z the exact bridge of an interval and f_θ the density of its path,
 
     ∇ log p_T(a, b) = E[∇ log f_θ(Z)],
-    -∇² log p_T(a, b) = E[-∇² log f_θ(Z)] - Cov(∇ log f_θ(Z)),
+    -∇² log p_T(a, b) = E[-∇² log f_θ(Z)] - Cov(∇ log f_θ(Z)).
 
-the latter by Louis (1982); both are sums over the intervals. Means are over weighted bridges.
+The second identity is due to Louis (1982). Both are summed over the intervals. The means are over
+weighted bridges.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,24 +54,24 @@ class PathCounts(NamedTuple):
 
 
 class Score(AbstractResult):
-    """What `score` returns: the gradient of the log likelihood at the model's parameters, with
-    Monte Carlo errors.
+    """Score, the gradient of the log-likelihood at the model's parameters, from `score`.
 
-    - `value`, `standard_error`: pytrees like the unknown parameters.
-    - `gradient`, `covariance`: the same as a vector of shape (p,) with the covariance of its
-        Monte Carlo error, shape (p, p).
-    - `information`: the observed information, -∇² of the log likelihood, shape (p, p).
-    - `effective_sample_size`: of the bridges of each interval, shape (I,). Errors can be trusted
-        where it is large.
-    - `pareto_k`: k̂ of the weights of each interval, shape (I,): where it is above 0.7 neither
-        its part of the score nor the error of that can be trusted.
-    - `step_error`: what `gradient` is too large by for the length of the steps, an estimate, shape
-        (p,), with a standard error of it, `step_uncertainty`. NaN where it is not known.
-    - `num_missing`: intervals without any bridge. They are left out. If there are no others, the
-        score is NaN and its error infinite.
-    - `num_truncated`: weights that `max_trials` cut off.
-    - `counts`: the numbers of bridges, of simulated paths, and of those that left the state space
-        or the finite numbers, in each interval.
+    - `value`, `standard_error`: score and its Monte Carlo error, pytrees like the unknown
+        parameters.
+    - `gradient`, `covariance`: score as a vector, shape (p,), and the covariance of its Monte Carlo
+        error, shape (p, p).
+    - `information`: observed information, minus the Hessian of the log-likelihood, shape (p, p).
+    - `effective_sample_size`: that of the bridges of each interval, shape (I,). Errors are reliable
+        if it is large.
+    - `pareto_k`: k̂ of the weights of each interval, shape (I,). Above 0.7 neither the contribution
+        of the interval nor its error is reliable.
+    - `step_error`, `step_uncertainty`: estimated discretisation bias of `gradient` (estimate minus
+        limit), shape (p,), and its standard error. NaN if it cannot be estimated.
+    - `num_missing`: number of intervals without a bridge. They are left out. If all are missing,
+        the score is NaN and its error infinite.
+    - `num_truncated`: number of weights that `max_trials` truncated.
+    - `counts`: numbers of bridges, of simulated paths, and of paths that diverged or left the state
+        space, for each interval.
     """
 
     value: PyTree
@@ -88,9 +89,12 @@ class Score(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: intervals without a bridge, weights cut off or with heavy tails, too
-        many lost paths in an interval, a step error that dominates and is beyond 0.05 standard
-        deviations of the score."""
+        """The faults of the score, each with a remedy.
+
+        They are: intervals without a bridge; weights that are truncated or have heavy tails; too
+        many lost paths in an interval; and a discretisation error that dominates and exceeds 0.05
+        standard deviations of the score.
+        """
         error = jnp.sqrt(jnp.maximum(jnp.diagonal(self.covariance), 0))
         sd = jnp.sqrt(jnp.maximum(jnp.diagonal(self.information), 0))
         steps = step_fault(StepError(self.step_error, self.step_uncertainty), error, sd)
@@ -131,21 +135,21 @@ def score(
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> Score:
-    """The score and the observed information of discrete observations, at `model.params`.
+    """Estimate the score and the observed information of discrete observations at `model.params`.
 
     **Arguments:**
 
-    - `key`: a typed key.
+    - `key`: typed key.
     - `model`, `times`, `observations`, `num_steps`, `step_size`, `where`: as in `gibbs`.
-    - `num_bridges`: weighted bridges for each interval. Means over them have a bias of the order
-        of one over their effective number, beside the Monte Carlo error.
-    - `proposal`: anything that `sample_weighted_bridges` takes; by default "auto".
+    - `num_bridges`: weighted bridges per interval. Apart from the Monte Carlo error, means over
+        weighted bridges have a bias of the order of 1 / (effective sample size).
+    - `proposal`: as in `sample_weighted_bridges`, but "auto" by default.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_weighted_bridges`.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
     **Returns:** `Score`. Not differentiable.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -158,8 +162,8 @@ def score(
     parameters = as_parameters(model, where)
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
     problem.check_sigma_known(
-        "differentiate `transition_log_density` with a proposal that is pulled to the end point, "
-        "or pick the others with `where=`."
+        "differentiate `transition_log_density` with a guided proposal, or select other parameters "
+        "by `where=`."
     )
     budget = Budget(num_counts, max_proposals, max_trials)
     theta = problem.theta

@@ -1,20 +1,22 @@
-"""The maximum of a simulated likelihood: where σ is unknown too.
+"""Maximum of a simulated likelihood, for unknown parameters of σ.
 
-Given a whole path σ is known, so there nothing can be learnt from completed paths (Fisher's
-identity, EM). But paths that are pulled to the end point are smooth functions of θ and of their
-noise, and so are their weights: with the noise of n paths of each interval held fixed,
+A complete path determines σ, so methods with completed paths (Fisher's identity, EM) do not apply.
+But guided paths are smooth functions of θ and of their noise, and so are their weights. With fixed
+noise of n paths per interval,
 
     ℓ̂(θ) = Σ_k log p̂_k(θ),    p̂_k = (1/n) Σ_j w_kj(θ),
 
-is a smooth function, simulated maximum likelihood (Pedersen 1995; Durham & Gallant 2002). Since
-E[p̂] = p, the mean of log p̂ is below log p, by half the relative variance of p̂ to leading order.
-That depends on θ, so that the maximum is off by O(1/n), in the same direction in all intervals.
-Therefore half of its estimate, [Σ w²/(Σ w)² - 1/n] n/(n - 1), is added to each log p̂_k, which
-leaves O(1/n²); where weights are so uneven that this is no small correction it is at most one half.
+is a smooth function of θ. Its maximum is the simulated maximum likelihood estimate (Pedersen 1995;
+Durham & Gallant 2002).
 
-The search begins with an optimiser's steps along noisy gradients, few new paths in each, and ends
-with Newton's steps at fixed noise. All derivatives are forward ones, so that memory does not grow
-with the number of steps: that takes p² of them, for p unknown parameters.
+*Bias.* E[p̂] = p, so the mean of log p̂ is below log p, to leading order by half the relative
+variance of p̂. This depends on θ. Hence the maximum has a bias of O(1/n), with the same sign in all
+intervals. Adding half of the estimated variance, [Σ w²/(Σ w)² - 1/n] n/(n - 1), to each log p̂_k
+leaves O(1/n²). For very unequal weights the correction is limited to one half.
+
+*Search.* First an optimiser makes steps along noisy gradients, each with a few new paths. Newton
+steps with fixed noise follow. All derivatives are in forward mode, so memory does not grow with the
+number of steps. This takes p² derivatives for p unknown parameters.
 """
 
 from dataclasses import replace
@@ -87,8 +89,8 @@ class Maximum(NamedTuple):
 
 
 _NO_DERIVATIVE = (
-    "σ depends on the unknown parameters, and given a whole path σ is known: the likelihood itself "
-    "is differentiated, and with couplings its estimates have no derivative"
+    "σ depends on the unknown parameters, so the likelihood itself is differentiated, "
+    "but with couplings its estimates have no derivative"
 )
 
 
@@ -104,8 +106,8 @@ def as_pulled(
     given = as_proposal(proposal, model, like, budget)
     if given.coupled:
         raise ValueError(
-            f"{_NO_DERIVATIVE}. Choose proposals that are pulled to the end point, such as "
-            '`Guided()`, `ModifiedDiffusionBridge()` or "auto", or use `pmmh`.'
+            f"{_NO_DERIVATIVE}. Use a guided proposal, such as `Guided()` or "
+            '`ModifiedDiffusionBridge()`, or "auto", or the function `pmmh`.'
         )
     return given
 
@@ -126,8 +128,8 @@ def _decided(block: Block) -> Block:
     """One candidate for all intervals. The error of ℓ̂ is Σ 1/(effective paths) over them."""
     if is_traced(block.proposal):
         raise ValueError(
-            '`proposal="auto"` decides by a pilot run, which cannot be looked at inside `jit`: '
-            "name a proposal that is pulled to the end point, such as `Guided()`."
+            '`proposal="auto"` needs pilot runs, which cannot run inside `jit`: pass a guided '
+            "proposal, such as `Guided()`."
         )
     return replace(block, proposal=block.proposal.for_all())
 

@@ -1,12 +1,12 @@
-"""Stochastic approximation: θ moved by what random bridges say, with new ones in each iteration.
+"""Stochastic approximation of the maximum likelihood estimate, with new bridges in each iteration.
 
-Bridges are moved by their exact kernel at the current θ, once an iteration (Gu & Kong 1998), and θ
-by what the completed path says:
+In each iteration the exact kernel at the current θ moves the bridges once (Gu & Kong 1998). Then θ
+moves by the completed path:
 
-* "gradient": a step of an optimiser along ∇ log f_θ(Z), whose mean over bridges is the score.
-* "em": with c and P of the expansion of log f at θ, cᵀθ - ½ θᵀPθ, averaged over iterations, θ
-  becomes P⁻¹c. For a drift that is linear in θ this is the EM algorithm with averaged
-  statistics (Delyon, Lavielle & Moulines 1999); in any case a fixed point has score zero.
+- "gradient": an optimiser makes a step along ∇ log f_θ(Z), whose mean over bridges is the score.
+- "em": let log f = cᵀθ - ½ θᵀPθ be the expansion at θ, with c and P averaged over iterations. The
+  new θ is P⁻¹c. For a drift linear in θ this is the EM algorithm with averaged statistics (Delyon,
+  Lavielle & Moulines 1999). In every case a fixed point has score zero.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,8 @@
-"""The warm-up of chains that are guided through a record, in stages.
+"""Stages of the warm-up of chains with guided paths, at which the guide is replaced.
 
-Where chains start θ may be far off, and then the path along which the process is linearised is,
-and the guide with it: weights vary too much, blocks hardly move. So the path is found anew, at
-the θ where the first chain is, while there still is a warm-up to go.
+The start of a chain may be far from likely parameters. Then the path of the linearisation and its
+guide are poor: weights vary much, and blocks rarely move. Hence each stage of the warm-up finds a
+new path at the current θ of the first chain.
 """
 
 # After these shares of the warm-up.

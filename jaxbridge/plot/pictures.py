@@ -59,14 +59,15 @@ def paths_in_space(
     space = axes_or_new(ax, projection="3d")
     if not isinstance(space, Axes3D):
         raise TypeError(
-            "`ax` must be three-dimensional; got two-dimensional axes. Create the axes with "
-            '`projection="3d"`.'
+            '`ax` must be made with `projection="3d"`; got two-dimensional axes. Use '
+            '`plt.subplots(subplot_kw={"projection": "3d"})`.'
         )
     times, (paths, _) = np.asarray(times, float), finite_paths(paths)
     if paths.shape[-1] != 2:
         raise ValueError(f"`paths` must have two coordinates; got shape {paths.shape}.")
     for i, path in enumerate(paths[:num_paths]):
         space.plot(*path.T, times, color=COLOURS[i % len(COLOURS)], linewidth=0.9)
+    # All bridges share both end points, so one path suffices.
     for end in (0, -1):
         space.plot(*paths[:1, end].T, times[end], "o", color=EXACT, markersize=4)
     space.set(xlabel="$Z^{(1)}$", ylabel="$Z^{(2)}$")
@@ -129,6 +130,7 @@ def bridge_fan(
         # Systematic resampling: the paths drawn represent the weighted law.
         places = (np.arange(num_paths) + 0.5) / max(num_paths, 1) * mass.sum()
         shown = values[np.searchsorted(np.cumsum(mass), places)]
+        # NumPy supports weights only with this method.
         curves = np.quantile(values, LEVELS, axis=0, weights=mass, method="inverted_cdf")
     low, lower, median, upper, high = curves
     colour = COLOURS[0]
@@ -140,11 +142,13 @@ def bridge_fan(
     if exact is not None:
         mean = np.asarray(exact.mean, float)[:, coordinate]
         variance = np.asarray(exact.covariance, float)[:, coordinate, coordinate]
+        # Rounding errors may give small negative variances near the end points.
         curves = mean[:, None] + np.sqrt(np.maximum(variance, 0))[:, None] * SCORES
         lines = ax.plot(times, curves, color=EXACT, linewidth=0.9, linestyle=DASHES[0])
         lines[2].set_label("exact")
     if data is not None:
         data_times, observed = (np.asarray(part, float) for part in data)
+        # NaN hides the error bars of missing values.
         error = np.where(np.isnan(observed), np.nan, 2 * np.asarray(data_sd, float))
         style = {"fmt": ".", "color": COLOURS[1], "markersize": 5, "elinewidth": 0.9, "zorder": 3}
         ax.errorbar(
@@ -191,6 +195,7 @@ def qq(
     ax.plot(reach, reach, color=EXACT, linewidth=0.8, label="exact")
     for i, (name, values) in enumerate(finite.items()):
         scores = _scores(len(values))
+        # Hazen's positions (i - 1/2) / n agree with the scores of the extremes.
         quantiles = np.quantile(values, ndtr(scores), method="hazen")
         colour, marker = COLOURS[i % len(COLOURS)], MARKERS[i % len(MARKERS)]
         style = {"color": colour, "markersize": 3.5, "markeredgewidth": 0.8, "fillstyle": "none"}
@@ -281,6 +286,7 @@ def work_precision(result: jb.WorkPrecision, ax: Axes | None = None) -> Axes:
         below = np.minimum(uncertainty, 0.9 * error)  # the axis is logarithmic
         style: dict[str, Any] = {"color": COLOURS[i % 5], "marker": MARKERS[i % 4]}
         style |= {"markersize": 4, "linewidth": 1.1, "capsize": 2, "elinewidth": 0.7}
+        # The colours repeat after five curves; dashes distinguish the next five.
         style["linestyle"] = "-" if i < len(COLOURS) else "--"
         ax.errorbar(seconds, error, [below, uncertainty], label=curve, **style)
         for s, x, y in zip(group, seconds, error, strict=True):
@@ -344,6 +350,7 @@ def posterior(
     for i, (name, density) in enumerate(curves.items()):
         dashes = ("-", *DASHES)[i % (len(DASHES) + 1)]
         ax.plot(grid, density, color=EXACT, linestyle=dashes, linewidth=1.0, label=name)
+    # A margin on both sides shows the tails of the densities.
     spread = all_draws.max() - all_draws.min()
     ax.set_xlim(all_draws.min() - spread / 2, all_draws.max() + spread / 2)
     ax.set(xlabel=label, ylabel="density")

@@ -1,19 +1,25 @@
-"""Ways to propose bridges. A proposal is a path with an unbiased weight (`base`),
+"""Proposals of bridges: paths with unbiased weights.
 
-    E[w h(path)] = p_T(a, b) E_bridge[h],
+A proposal (`base`) draws paths with weights w such that, for every function h,
 
-and answers for itself: what it costs, what its bridges are exact for, what it must know before.
-The pairs of a coupling have random weights (`coupled`). Paths that are pulled to the end point have
-the density of their steps under the target over that under the proposal (`guided`): they are
-pulled as if nothing changed on the way (`modified_bridge`), along a deterministic path
-(`residual_bridge`), or by the transition density of a linear process (`linear_guide`). Each
-interval may have its own (`choice`), found by pilot runs (`pilots`) between those that are given
-(`auto`).
+    E[w h(path)] = p_T(a, b) E_bridge[h].
 
-Another proposal is another file here; to be tried by "auto" it is named in `auto`.
+It also reports its cost, its target law and the quantities to measure before use.
+
+- `coupled`: coupled pairs, with random weights from hitting counts.
+- `guided`: guided proposals. Their steps are normal and lead to the end point; the weight is the
+  density of the path under the target over its density under the proposal. There are three:
+    - `modified_bridge` keeps drift and σ fixed at the current point;
+    - `residual_bridge` subtracts a deterministic path first;
+    - `linear_guide` uses the transition density of a linear process.
+- `choice`: a separate proposal for each interval. `auto` collects the candidates for it, and
+  `pilots` compares them by pilot runs.
+- `memory_blocks`: draw paths in blocks that fit in memory.
+
+To add a proposal, add a module. To make it a candidate of "auto", name it in `auto`.
 """
 
-# What the folders above use of this one.
+# The names that other folders import from this one.
 from .auto import (
     Budget as Budget,
     as_proposal as as_proposal,

@@ -1,14 +1,12 @@
-"""Which proposal for which interval? The one with the least error for a second of work.
+"""Candidates of `proposal="auto"`, and conversion of the argument `proposal` (`as_proposal`).
 
-On short intervals proposals that are pulled to the end point are nearly exact, and coupled
-pairs do not meet; on long ones it is the other way round. Where the one becomes better than
-the other depends on the model, the end points and the step, so pilot runs decide, interval
-by interval (`pilots`).
+On short intervals guided proposals are nearly exact, and coupled pairs rarely meet. On long
+intervals the opposite holds. The crossover depends on the model, the end points and the step size.
+Hence pilot runs select the proposal with the least error per second for each interval (`pilots`).
 
-Their paths are not used again, so weights stay what they are whatever is chosen; but a pilot
-of finite size can be deceived, by a second way to the end point that it never saw for instance.
-
-What a user may give as `proposal` is told apart here, too (`as_proposal`).
+The paths of pilot runs are not used again, so weights remain unbiased for every choice. But a pilot
+run of finite size may select a poor proposal. For instance, it may miss a second way to the end
+point.
 """
 
 import dataclasses
@@ -80,8 +78,8 @@ class Auto(AbstractProposal):
 
     def check_prepared(self, model):
         raise ValueError(
-            'a kernel makes no pilot run, so `proposal="auto"` has nothing to go by: choose '
-            "with `choose_proposal` before, and pass what it returns."
+            'a kernel makes no pilot run, so `proposal="auto"` is not possible: call '
+            "`choose_proposal` before, and pass its result."
         )
 
     def prepared(self, key, model, intervals, num_steps):
@@ -168,13 +166,13 @@ def _given(proposal: Any, budget: Budget, name: str = "proposal") -> AbstractPro
         if any(value is not None for value in budget):
             raise ValueError(
                 "`num_counts`, `max_proposals` and `max_trials` are for a `Coupling`; this "
-                "`proposal` has its own, or none."
+                "`proposal` has its own values, or needs none: omit these arguments."
             )
         return proposal
     if not isinstance(proposal, AbstractCoupling):
         raise TypeError(
             f"`{name}` must be a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, "
-            f'`Guided()`, what `choose_proposal` returns, or "auto"; got {proposal!r}.'
+            f'`Guided()`, a result of `choose_proposal`, or "auto"; got {proposal!r}.'
         )
     num_counts = 1 if budget.num_counts is None else check_count("num_counts", budget.num_counts)
     return CoupledPairs(
@@ -196,7 +194,7 @@ def choice_between(
     **Raises:** `ValueError` for a budget where there are none, which `left_out` explains.
     """
     if len(candidates) == 0:
-        raise ValueError("`candidates` must have at least one proposal.")
+        raise ValueError("`candidates` must contain at least one proposal; got none.")
     if not any(isinstance(each, AbstractCoupling) for each in candidates):
         budget.refuse(f'for couplings, which `proposal="auto"` leaves out here: {left_out}')
     proposals = tuple(
@@ -204,10 +202,12 @@ def choice_between(
         for each in candidates
     )
     if not all(isinstance(proposal, AbstractSingleProposal) for proposal in proposals):
-        raise ValueError("`candidates` must be single proposals, not choices.")
+        raise ValueError(
+            "`candidates` must be single proposals; got a result of `choose_proposal`."
+        )
     grids = {tuple(proposal.fractions(8)) for proposal in proposals}
     if len(grids) > 1:
-        raise ValueError("`candidates` must be on one grid: give all the same `refinement`.")
+        raise ValueError("`candidates` must be on one grid: use the same `refinement` for all.")
     return Auto(proposals, num_pilot, left_out)  # pyright: ignore
 
 
@@ -227,12 +227,12 @@ def why_left_out(model: Diffusion, for_density: bool) -> str:
     """Why there are no couplings among `default_candidates`; empty where there are."""
     if not model.has_reversal:
         return (
-            "the time reversal of the model is not known (give `Diffusion` a `log_stationary`, a "
+            "the model has no time reversal (give `Diffusion` a `log_stationary`, a "
             "`reverse_drift` or `reversible=True`)"
         )
     if for_density and not model.normalised:
         return (
-            "their densities rest on `log_stationary`, which is not declared to be normalised "
-            "(`Diffusion(..., normalised=True)`)"
+            "their densities need a normalised `log_stationary`, and this one is not declared to "
+            "be normalised (`Diffusion(..., normalised=True)`)"
         )
     return ""

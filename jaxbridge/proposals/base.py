@@ -1,10 +1,10 @@
-"""Weighted proposals: a bridge proposal is a path with an unbiased weight,
+"""Interface of the proposals: paths with unbiased weights,
 
     E[w h(path)] = p_T(a, b) E_bridge[h].
 
-Chains, importance means and transition densities are written on this alone. A coupling gives
-random weights (`coupled`), proposals that are pulled to the end point weights that are functions of
-the path (`guided`), and each interval may have its own (`choice`).
+Markov chains, importance sampling and transition densities use only this interface. The weights of
+a coupling are random (`coupled`). Those of a guided proposal are functions of the path (`guided`).
+Each interval may have a separate proposal (`choice`).
 """
 
 from abc import abstractmethod
@@ -31,11 +31,14 @@ from ..schemes import (
 class WeightedPaths(NamedTuple):
     """n weighted paths of each of I intervals.
 
-    `log_weights` are -inf and `paths` NaN where none was `found`; `truncated` says where a
-    weight is not exact because a bound on the work was reached; `num_simulated` counts the
-    simulated paths, and `num_nonfinite` those that left the finite numbers. `log_halving` is D of
-    `halving`, and `log_coarse` the log weight of the path of half as many steps from the same noise
-    (`coupled_grids`), -inf if that path was lost; each is NaN where it was not computed.
+    - `paths`, `log_weights`: NaN and -inf for paths that were not found.
+    - `found`: whether a path was found.
+    - `truncated`: whether the weight is inexact because a bound on the work was reached.
+    - `num_simulated`: number of simulated paths.
+    - `num_nonfinite`: number of simulated paths with NaN or infinity.
+    - `log_halving`: D of `halving`, NaN if it was not computed.
+    - `log_coarse`: log weight of the path of half as many steps from the same noise
+        (`coupled_grids`); -inf if that path was lost, NaN if it was not computed.
     """
 
     paths: Float[Array, "I n K d"]
@@ -58,86 +61,96 @@ class WeightedPaths(NamedTuple):
 
 
 class AbstractProposal(eqx.Module):
-    """What may be given as `proposal`: one way to propose bridges, or several to choose between."""
+    """Base class of all values of `proposal=`: a single proposal, or a choice between several."""
 
     @property
     @abstractmethod
     def singles(self) -> tuple["AbstractSingleProposal", ...]:
-        """The ways that may be used."""
+        """The single proposals that may be used."""
 
     @property
     def coupled(self) -> bool:
-        """Whether any interval may have a coupling, of which no derivative may be taken."""
+        """Whether any interval may have a coupling; couplings have no derivatives."""
         return any(single.by_coupling is not None for single in self.singles)
 
     @property
     @abstractmethod
     def by_coupling(self) -> AbstractCoupling | None:
-        """The coupling whose pairs are proposed, if there is one way and that is it."""
+        """The coupling, if this is a single proposal by a coupling; otherwise `None`."""
 
     @abstractmethod
     def describe(self) -> str:
-        """The proposal in a few words."""
+        """Return a short description for tables and messages."""
 
     @abstractmethod
     def fractions(self, num_steps: int) -> Float[np.ndarray, "N+1"]:
-        """The grid, t_i / T, from 0 to 1."""
+        """Return the grid t_i / T, from 0 to 1, shape (N+1,)."""
 
     @abstractmethod
     def for_model(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractProposal":
-        """The proposal with all decided that it leaves to the model, for points like this one."""
+        """Return the proposal with all defaults that depend on the model set.
+
+        `like` is a point of the right shape and dtype.
+        """
 
     @abstractmethod
     def check(self, model: Diffusion, intervals: Intervals) -> None:
-        """Raise `ValueError` for a model or end points that do not fit, as far as visible."""
+        """Raise `ValueError` if the model or the end points do not fit; skip traced values."""
 
     @abstractmethod
     def check_prepared(self, model: Diffusion) -> None:
-        """Raise `ValueError` where `prepared` would have to measure something."""
+        """Raise `ValueError` if `prepared` would have to run a simulation."""
 
     def check_for_density(self, model: Diffusion) -> None:
-        """Raise `ValueError` where the size of weights rests on what is not known."""
+        """Raise `ValueError` if the weights are known only up to a constant."""
         for single in self.singles:
             single.check_size(model)
 
     @property
     @abstractmethod
     def is_open(self) -> bool:
-        """Whether there is a choice yet to be made."""
+        """Whether a choice between several proposals is still open."""
 
     @abstractmethod
     def of(self, which: Int[np.ndarray, " J"]) -> "AbstractProposal":
-        """The proposal for some of the intervals that it is for."""
+        """Return the proposal for the intervals with the indices `which`."""
 
     @abstractmethod
     def prepared(
         self, key: Key[Array, ""], model: Diffusion, intervals: Intervals, num_steps: int
     ) -> "AbstractWeightedProposal":
-        """The proposal with everything measured that it must know of these intervals."""
+        """Return the proposal with all quantities measured that these intervals need."""
 
 
 class AbstractWeightedProposal(AbstractProposal):
-    """A proposal that has been prepared: paths, each with an unbiased weight.
+    """Base class of proposals that are ready to draw paths, each with an unbiased weight.
 
-    Intervals that are not `active`, where that is given, cost no work, and have no paths.
+    The methods `draw` and `reweigh` take an optional mask `active` of shape (I,). Other intervals
+    cost no work and have no paths.
     """
 
     @abstractmethod
     def for_all(self) -> "AbstractSingleProposal":
-        """One way for all intervals. Not under `jit` where there are several."""
+        """Return one single proposal for all intervals; not inside `jit` if there are several."""
 
     @abstractmethod
     def split(self) -> Sequence[tuple[Int[np.ndarray, " J"] | slice, "AbstractSingleProposal"]]:
-        """The intervals of each way. Not under `jit` where there are several."""
+        """Return pairs of interval indices and their single proposal.
+
+        Not inside `jit` if there are several proposals.
+        """
 
     @abstractmethod
     def step_share(self, model: Diffusion, intervals: Intervals) -> Float[Array, " I"]:
-        """The step error as a share of what half as many steps change (`step_error`)."""
+        """Return the factor from the change by half as many steps to the discretisation error.
+
+        See `schemes.step_error`; shape (I,).
+        """
 
     def share_in_regime(
         self, model: Diffusion, intervals: Intervals, num_steps: int
     ) -> Float[Array, " I"]:
-        """Return that share, infinite where steps are too long for it to say anything."""
+        """Return `step_share`, with infinity where steps are too long for an estimate."""
         return share_in_regime(self.step_share(model, intervals), model, intervals, num_steps)
 
     @abstractmethod
@@ -152,10 +165,11 @@ class AbstractWeightedProposal(AbstractProposal):
         active: Bool[Array, " I"] | None = None,
         progress_meter: diffrax.AbstractProgressMeter | None = None,
     ) -> WeightedPaths:
-        """One weighted path for each key, a function of that key and its interval.
+        """Draw one weighted path per key; it is a function of this key and its interval only.
 
-        With `misses_count` a proposal that does not become a bridge has weight zero, so that
-        `E[w] = p_T(a, b)`; otherwise it is tried again, and weights are in proportion only.
+        - `stored`: indices of the grid points to store, shape (K,), or `None` for all.
+        - `misses_count`: if true, a failed attempt has weight zero, so that `E[w] = p_T(a, b)`.
+            Otherwise failed attempts are repeated, and weights are correct up to a constant factor.
         """
 
     @abstractmethod
@@ -167,12 +181,15 @@ class AbstractWeightedProposal(AbstractProposal):
         paths: Float[Array, "I points d"],
         active: Bool[Array, " I"] | None = None,
     ) -> WeightedPaths:
-        """Given paths, one for each interval, with weights from their conditional law under the
-        target of a chain."""
+        """Return the given paths, one per interval, with new weights.
+
+        The weights have their conditional law, given the path, under the target of a
+        pseudo-marginal chain.
+        """
 
 
 class AbstractSingleProposal(AbstractWeightedProposal):
-    """One way to propose bridges, and what a choice between several must know of it."""
+    """Base class of single proposals, with the properties that a choice between several needs."""
 
     @property
     def singles(self):
@@ -184,7 +201,10 @@ class AbstractSingleProposal(AbstractWeightedProposal):
 
     @abstractmethod
     def for_model(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractSingleProposal":
-        """The proposal with all decided that it leaves to the model, for points like this one."""
+        """Return the proposal with all defaults that depend on the model set.
+
+        `like` is a point of the right shape and dtype.
+        """
 
     def of(self, which):
         return self
@@ -198,42 +218,45 @@ class AbstractSingleProposal(AbstractWeightedProposal):
     @property
     @abstractmethod
     def target(self) -> AbstractStepDensity | None:
-        """The law of the steps of the chain of which its bridges are exact; `None` where that is
-        the diffusion itself, but for the error of a scheme."""
+        """The step density of the target chain.
+
+        `None` for couplings: their target is the diffusion, up to the error of the scheme.
+        """
 
     @property
     @abstractmethod
     def efficiency_bound(self) -> float:
-        """Effective samples per simulated path, at most."""
+        """Upper bound of the effective samples per simulated path."""
 
     @abstractmethod
     def relative_seconds(self, model: Diffusion, intervals: Intervals) -> Float[Array, " I"]:
-        """Seconds per simulated path beside those of a modified diffusion bridge, as measured for
-        models whose functions cost little beside the random numbers."""
+        """Return the seconds per simulated path relative to a modified diffusion bridge.
+
+        The values were measured for models with cheap functions; shape (I,).
+        """
 
     @abstractmethod
     def ingredients(self) -> tuple[str, str, float]:
-        """The scheme, or the law of the target's steps, the meeting rule, and γ."""
+        """Return the names of scheme (or target step density) and meeting rule, and γ."""
 
     @abstractmethod
     def most_accurate(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractSingleProposal":
-        """The same with the smallest step error that it can have."""
+        """Return the proposal with the most accurate scheme or target for this model."""
 
     @abstractmethod
     def for_pilot(self) -> "AbstractSingleProposal":
-        """The same, which gives up early what is not worth waiting for."""
+        """Return the proposal with the tighter bounds on the work that pilot runs use."""
 
     @abstractmethod
     def prepared(
         self, key: Key[Array, ""], model: Diffusion, intervals: Intervals, num_steps: int
     ) -> "AbstractSingleProposal":
-        """The proposal with everything measured that it must know of these intervals."""
+        """Return the proposal with all quantities measured that these intervals need."""
 
     @abstractmethod
     def must_measure(self, model: Diffusion) -> bool:
-        """Whether `prepared` has something to measure."""
+        """Return whether `prepared` has to run a simulation."""
 
     @abstractmethod
     def check_size(self, model: Diffusion) -> None:
-        """Raise `ValueError` where the size of the weights, and not only their proportion, rests on
-        what is not known."""
+        """Raise `ValueError` if the weights are known only up to a constant."""

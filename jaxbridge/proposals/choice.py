@@ -1,4 +1,8 @@
-"""A proposal for each interval: what "auto" comes to (`auto`), each drawn by its own."""
+"""A separate proposal for each interval: the result of "auto" and of `choose_proposal`.
+
+The module has the criterion of the choice, too: effective samples per second, with penalties for
+discretisation errors and for heavy tails.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -29,25 +33,27 @@ _SPARED = 0.05
 
 
 class Choice(AbstractWeightedProposal):
-    """A proposal for each interval, and why: what `proposal="auto"` comes to, and what
-    `choose_proposal` returns. Printed, it is a table.
+    """Chosen proposal for each interval, with the results of the pilot runs.
 
-    - `candidates`: C proposals.
-    - `seconds`: per simulated path, shape (C, I): by rule relative to those of a modified
-        diffusion bridge, or measured where that could change the choice.
-    - `efficiency`: effective samples per simulated path in the pilot run, extrapolated to
-        a larger one, shape (C, I); NaN where none was made because the candidate could not win, or
-        would gain next to nothing over all intervals.
-    - `step_error`: of log p̂, as far as it was seen, and `pareto_k`, k̂ of the weights, both in the
-        pilot run and of shape (C, I); k̂ is NaN where too few paths were drawn to tell.
-    - `chosen`: the number of each interval's candidate, shape (I,).
-    - `used`: the numbers of those that were chosen for any interval; inside `jit`, where that is
-        not known, of all. Only they are compiled, so that another set compiles again.
-    - `left_out`: why "auto" does not try couplings, empty where it does: for a density the constant
-        of `log_stationary` must be known, and without a time reversal there are none.
+    `choose_proposal` returns it, and functions with `proposal="auto"` use it. It prints as a table.
 
-    Where all that are used are pulled to the end point, paths and weights are differentiable,
-    forward and reverse, each interval by its own proposal. Others have no derivatives.
+    - `candidates`: tuple of C proposals.
+    - `seconds`: seconds per simulated path, shape (C, I). They are estimated by a rule, relative to
+        a modified diffusion bridge, or measured if a measurement could change the choice.
+    - `efficiency`: effective samples per simulated path, shape (C, I), extrapolated from the pilot
+        run to a larger sample. NaN without a pilot run: the candidate could not be the best, or its
+        gain over all intervals would be negligible.
+    - `step_error`: discretisation error of log p̂ in the pilot run, shape (C, I), reduced by twice
+        its uncertainty.
+    - `pareto_k`: k̂ of the weights in the pilot run, shape (C, I). NaN if there were too few paths.
+    - `chosen`: index of the candidate of each interval, shape (I,).
+    - `used`: indices of the candidates that are chosen for any interval; inside `jit`, of all
+        candidates. Only these are compiled, so another set compiles again.
+    - `left_out`: the reason why "auto" does not try couplings, empty if it does. Without a time
+        reversal there are no couplings. Densities need a normalised `log_stationary`.
+
+    If all used candidates are guided proposals, paths and weights are differentiable, in forward
+    and reverse mode. Couplings have no derivatives.
     """
 
     candidates: tuple[AbstractSingleProposal, ...]
@@ -96,7 +102,7 @@ class Choice(AbstractWeightedProposal):
         if self.chosen.shape != intervals.duration.shape:
             raise ValueError(
                 f"this choice is one for {self.chosen.shape[0]} intervals, but there are "
-                f"{len(intervals.duration)}: use `choose_proposal` with the same intervals."
+                f"{len(intervals.duration)}: call `choose_proposal` with the same intervals."
             )
 
     def check_prepared(self, model):

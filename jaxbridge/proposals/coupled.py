@@ -1,9 +1,11 @@
-"""The proposals of a coupling, with the random weight that makes them exact (section 2.3),
+"""Proposals by a coupling, with random weights that make them exact (section 2.3 of the paper).
+
+The weight of a pair is
 
     w = 1{met} · ν(b)/ν(x_0) · μ(x_0) · (mean of N hitting counts),
 
-where x_0 is the reversed path at time 0 and μ the law from which the associated diffusion
-starts: `start_laws` has the derivation.
+where x_0 is the reversed path at time 0 and μ the start law of the associated diffusion.
+`start_laws` has the derivation.
 """
 
 import equinox as eqx
@@ -52,13 +54,14 @@ _LOOKED = 4
 
 
 class CoupledPairs(AbstractSingleProposal):
-    """The proposals of a coupling, weighted by hitting counts: `proposal` of what
-    `sample_exact_bridges` and others return where they were given a `Coupling`.
+    """Proposal by a coupling, weighted by hitting counts.
 
-    - `coupling`: with its start law.
-    - `max_proposals`: bounds the tries for a pair that meets.
-    - `max_trials`: bounds the trials for the counts of each path.
-    - `num_counts`: N, hitting counts for each path.
+    `sample_exact_bridges` and other functions return it as `proposal` if they receive a `Coupling`.
+
+    - `coupling`: the coupling with its start law.
+    - `max_proposals`: maximum of attempts for a pair that meets.
+    - `max_trials`: maximum of trials for the counts of one path.
+    - `num_counts`: N, the number of hitting counts per path.
     """
 
     coupling: AbstractCoupling
@@ -110,37 +113,40 @@ class CoupledPairs(AbstractSingleProposal):
     def check_prepared(self, model):
         if self.must_measure(model):
             raise ValueError(
-                "this model has no sampler of its stationary law, so the length of the run that "
-                "replaces it must be known: use `Stationary(burn_in=...)`, in units of time, for "
-                "instance from `measure_burn_in`; or pass `sample_stationary=` to `Diffusion`, "
-                "or choose a start law with a density (`fit_start_law`)."
+                "this model has no sampler of its stationary law, so the coupling needs a burn-in: "
+                "pass `Stationary(burn_in=...)`, in units of time, for instance from "
+                "`measure_burn_in`; or pass `sample_stationary=` to `Diffusion`; or use a start "
+                "law with a density (`fit_start_law`)."
             )
 
     def must_measure(self, model):
         return needs_burn_in(self.coupling.start_law, model)
 
     def check_size(self, model):
-        """A coupling's weights have the factor ν(b)/ν(x_0) · μ(x_0), in which the constant of ν
-        cancels if μ has a density of its own. From ν itself, and from the law that the paper
-        prints, whose weights are taken to be those of ν, the factor is ν(b): in proportion to
-        `log_stationary`."""
+        """Raise `ValueError` if the weights are known only up to a constant.
+
+        The weights have the factor ν(b)/ν(x_0) · μ(x_0). If μ has a normalised density, the
+        constant of ν cancels. If μ is ν or `Reversed`, whose weights are treated like those of ν,
+        the factor is ν(b), which needs a normalised `log_stationary`.
+        """
         if not model.has_density:
             raise ValueError(
-                "with couplings the transition density needs the stationary one: give `Diffusion` "
-                "a `log_stationary`, normalised if the start law is `Stationary()`; or choose a "
-                "proposal that does not need it, such as `ModifiedDiffusionBridge()` or `Guided()`."
+                "transition densities by couplings need the stationary density, and this model has "
+                "none: give `Diffusion` a `log_stationary`, normalised if the start law is "
+                "`Stationary()`; or use a proposal that does not need it, such as "
+                "`ModifiedDiffusionBridge()` or `Guided()`."
             )
         law = self.coupling.start_law
         smoothed = needs_burn_in(law, model)  # then it gives way to one with a density (`prepared`)
         if isinstance(law, Stationary | Reversed) and not (model.normalised or smoothed):
             raise ValueError(
                 "a coupling from the stationary law gives densities in proportion to "
-                "`log_stationary`, which is not declared to be normalised, so that they may be "
-                "wrong by any factor: if it is normalised, for all parameters, say so by "
-                "`Diffusion(..., normalised=True)`; otherwise give the coupling a start law with a "
-                "density, `Coupling(..., start_law=fit_start_law(..., for_density=True))`, or "
-                'choose `proposal="auto"` or one that is pulled to the end point, such as '
-                "`ModifiedDiffusionBridge()` or `Guided()`."
+                "`log_stationary`, which is not declared to be normalised, so densities may be "
+                "wrong by any factor. If it is normalised for all parameters, pass "
+                "`Diffusion(..., normalised=True)`. Otherwise use a start law with a density, "
+                "`Coupling(..., start_law=fit_start_law(..., for_density=True))`, or pass "
+                '`proposal="auto"` or a guided proposal, such as `ModifiedDiffusionBridge()` or '
+                "`Guided()`."
             )
 
     def prepared(self, key, model, intervals, num_steps):
@@ -284,8 +290,8 @@ def check_density(law: AnyStartLaw, model: Diffusion) -> None:
     """Raise `ValueError` where a start law has a density but the model's ν is not known."""
     if not isinstance(law, Stationary | Reversed) and not model.has_density:
         raise ValueError(
-            "a start law other than `Stationary()` is paid for with ν(x): give `Diffusion` a "
-            "`log_stationary` (up to a constant)."
+            "the weights of a start law other than `Stationary()` need the stationary density: "
+            "give `Diffusion` a `log_stationary` (up to a constant)."
         )
 
 
@@ -297,6 +303,6 @@ def as_pairs(
     """The proposal, which must be a coupling's for this method."""
     if not isinstance(proposal, CoupledPairs):
         raise TypeError(
-            f"{method} is for couplings: pass a `Coupling` as `proposal`, or choose {instead}."
+            f"{method} is for couplings: pass a `Coupling` as `proposal`, or use {instead}."
         )
     return proposal

@@ -1,27 +1,29 @@
-"""Proposals that are pulled to the end point: a chain of normal steps with bent noise.
+"""Guided proposals: chains of normal steps that end in b.
 
-On a grid 0 = t_0 < ... < t_N = T with steps δ_i the target is a chain (`step_density`) of steps
+On a grid 0 = t_0 < ... < t_N = T with steps δ_i, the target is a chain (`step_density`) with steps
 
-    x_{i+1} ~ N(μ_i, δ_i σ(x_i) S_i σ(x_i)ᵀ);
+    x_{i+1} ~ N(μ_i, δ_i σ(x_i) S_i σ(x_i)ᵀ).
 
-the Euler scheme has μ_i = x_i + α(x_i) δ_i and S = I. A proposal goes steps of another normal law
+The Euler scheme has μ_i = x_i + α(x_i) δ_i and S = I. A proposal has steps of another normal law
 q_i(x_{i+1}| x_i) with the same σ, and x_N = b. Its weight is the density of the path under the
-target over that under the proposal,
+target over its density under the proposal,
 
-    w = p_{N-1}(b| x_{N-1}) Π_{i<N-1} p_i(x_{i+1}| x_i) / q_i(x_{i+1}| x_i),
+    w = p_{N-1}(b| x_{N-1}) Π_{i<N-1} p_i(x_{i+1}| x_i) / q_i(x_{i+1}| x_i).
 
-so E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b] for the target without any further error, and for the
-diffusion up to the target's step error, O(δ), or O(δ²) by `ItoTaylorDensity`. No stationary law is
-called for.
+Hence E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b], exactly for the target chain. For the diffusion the
+discretisation error of the target remains: O(δ), or O(δ²) with `ItoTaylorDensity`. Guided proposals
+need no stationary law.
 
-With noise ξ_i of its steps a path is a function of that noise, and half as many steps make another
-path of other noise. Where σ varies and only weights are wanted, the step error comes from pairs of
-such paths, whose noise has as much in common as it can have: in place of two steps a coarse one has
+*Discretisation error.* A path is a function of the noise ξ_i of its steps. Half as many steps with
+other noise give another path. For a state-dependent σ, and if only weights are needed, the error is
+estimated from pairs of such paths with strongly correlated noise. A coarse step replaces two fine
+steps and has the noise
 
-    ξ = c ξ_i + s ξ_{i+1},   c² = δ_i (T - t_{i+2}) / [(δ_i + δ_{i+1}) (T - t_{i+1})] = 1 - s²,
+    ξ = c ξ_i + s ξ_{i+1},   c² = δ_i (T - t_{i+2}) / [(δ_i + δ_{i+1}) (T - t_{i+1})] = 1 - s².
 
-by which a coarse Brownian bridge is the fine one at every other point. The coarse weight is
-unbiased for half as many steps, and differs from the fine one by far less than e^D of `halving`.
+With this choice a coarse Brownian bridge equals the fine one at every other point. The coarse
+weight is unbiased for half as many steps, and its ratio to the fine weight varies much less than
+e^D of `halving`.
 """
 
 from abc import abstractmethod
@@ -61,11 +63,11 @@ _SHORTEST_STEP = 1e-10
 
 
 class Step(NamedTuple):
-    """One step of one interval, as `step_law` of an `AbstractGuidedProposal` sees it.
+    """One step of one interval: argument of `step_law` of an `AbstractGuidedProposal`.
 
-    - `guide`: what the proposal worked out for the step.
-    - `dt`: its length δ_i, in units of time.
-    - `remaining`: T - t_i, the time from its beginning to the end.
+    - `guide`: the entry of `guide` for this step.
+    - `dt`: δ_i, in units of time.
+    - `remaining`: T - t_i, the time from the beginning of the step to the end of the interval.
     - `end`: b, shape (d,).
     """
 
@@ -76,12 +78,14 @@ class Step(NamedTuple):
 
 
 class AbstractGuidedProposal(AbstractSingleProposal):
-    """Paths in steps as the target's, but pulled so that they end in b.
+    """Base class of guided proposals, whose normal steps lead to the end point b.
 
-    A proposal is another law of each step, `step_law`, and what can be worked out for it before
-    any path is simulated, `guide`. `density` is that of the target's steps, `None` until the model
-    is known (`for_model`) if the most accurate is wanted, and `refinement` is ρ in
-    t_i = T [1 - (1 - i/N)^ρ].
+    A subclass defines two methods: `guide` computes quantities before any path is simulated, and
+    `step_law` returns the law of one step.
+
+    - `density`: step density of the target. `None` stands for the most accurate one, which
+        `for_model` selects.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ].
     """
 
     density: eqx.AbstractVar[AbstractStepDensity | None]
@@ -131,11 +135,17 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         end: Float[Array, " d"],
         dt: Float[Array, " N"],
     ) -> PyTree:
-        """Anything with leading axis N - 1, of which `step_law` sees one entry per step."""
+        """Return quantities for the steps, with leading axis N - 1, or `None`.
+
+        `step_law` receives one entry per step as `step.guide`. `dt` has shape (N,).
+        """
 
     @abstractmethod
     def step_law(self, step: Step, x: Float[Array, " d"], target: StepLaw) -> StepLaw:
-        """The law of the proposal's step from x_i = x, with the same σ, given the target's."""
+        """Return the law of the proposal's step from x_i = `x`.
+
+        `target` is the law of the target's step from `x`; the result has the same σ.
+        """
 
     def check(self, model, intervals):
         check_model(model, intervals, Euler())
@@ -153,11 +163,11 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return jnp.full_like(intervals.duration, share_of_order(self.target.order))
 
     def remaining(self, num_steps: int) -> Float[np.ndarray, " points"]:
-        """(T - t_i) / T, down to zero."""
+        """Return (T - t_i) / T for all i, from 1 to 0, shape (N+1,)."""
         if num_steps**-self.refinement < _SHORTEST_STEP:
             raise ValueError(
-                f"`refinement` = {self.refinement:g} makes the last of {num_steps} steps too short "
-                "to be told from none: choose a smaller one."
+                f"`refinement` = {self.refinement:g} makes the last of {num_steps} steps shorter "
+                "than rounding errors of time: use a smaller `refinement` or fewer `num_steps`."
             )
         return (1 - np.arange(num_steps + 1) / num_steps) ** self.refinement
 
@@ -643,7 +653,8 @@ def bridge_law(step: Step, target: StepLaw, mean: Float[Array, " d"]) -> StepLaw
 def check_refinement(refinement: float) -> float:
     if isinstance(refinement, bool) or not isinstance(refinement, int | float):
         raise TypeError(
-            f"`refinement` must be a Python number, known when compiling; got {refinement!r}."
+            f"`refinement` must be a Python number, because it is static under `jit`; got "
+            f"{refinement!r}."
         )
     if not 1 <= refinement <= 4:
         raise ValueError(f"`refinement` must be between 1 (equal steps) and 4; got {refinement}.")
@@ -654,7 +665,8 @@ def as_guided(proposal: AbstractProposal) -> AbstractGuidedProposal:
     """The proposal itself, if it makes paths from normal noise."""
     if not isinstance(proposal, AbstractGuidedProposal):
         raise TypeError(
-            "Crank–Nicolson moves are for a `proposal` that makes paths from normal noise: "
-            "`ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()`."
+            "Crank–Nicolson moves need a `proposal` that makes paths from normal noise: pass "
+            "`ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()`; got "
+            f"{proposal.describe()}."
         )
     return proposal

@@ -1,22 +1,22 @@
-"""Guided proposals: pulled by the transition density of a linear process.
+"""Guided proposals by the transition density of a linear process.
 
-The law q_i of a step (`guided`) follows from a guess h_{i+1}(x) of the density of b seen from x at
-t_{i+1}. Where log h is quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h, tilting the target's step
-by h gives
+The law q_i of a step (`guided`) follows from an h-function: h_{i+1}(x) approximates the transition
+density from x at t_{i+1} to b. Let log h be quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h. The
+step of the target, tilted by h, is
 
     q_i = N(μ_i + δ L C Lᵀ r̃, δ L C Lᵀ),    C = S (I + δ Lᵀ H̃ L S)⁻¹,    L Lᵀ = V(x_i)
 
 (r̃ and H̃ as in Schauer, van der Meulen & van Zanten 2017; the discrete form as in Whitaker,
-Golightly, Boys & Sherlock 2017). With the true density in the place of h this is Doob's
-h-transform, and w is constant.
+Golightly, Boys & Sherlock 2017). With the true density for h this is Doob's h-transform, and w is
+constant.
 
-A guess of a linear process has a Ṽ = L̃ L̃ᵀ of its own. Where V(x) is larger it pulls too hard,
-where V(x) is smaller not hard enough, and the weights have heavy tails. What V is on the way to b
-is nearer to the mean V̄ = L̄ L̄ᵀ of the two, to which the guess's deviations are scaled:
+The linear process has its own Ṽ = L̃ L̃ᵀ. If V(x) is larger than Ṽ, the h-function guides too
+strongly; if V(x) is smaller, too weakly. Both give weights with heavy tails. The mean V̄ = L̄ L̄ᵀ of
+V(x) and Ṽ is closer to V on the way to b. Hence the deviations from b are scaled to V̄:
 
-    H̃ := L̄⁻ᵀ L̃ᵀ H L̃ L̄⁻¹,    r̃ := L̄⁻ᵀ [(L̄⁻¹ L̃)ᵀ L̃ᵀ ρ - L̃ᵀ H L̃ L̄⁻¹ (μ_i - b)],
+    H̃ := L̄⁻ᵀ L̃ᵀ H L̃ L̄⁻¹,    r̃ := L̄⁻ᵀ [(L̄⁻¹ L̃)ᵀ L̃ᵀ ρ - L̃ᵀ H L̃ L̄⁻¹ (μ_i - b)].
 
-which where V(x) = Ṽ is the guess itself.
+For V(x) = Ṽ this is the h-function without scaling.
 """
 
 from typing import Literal, NamedTuple
@@ -57,27 +57,31 @@ class _NoiseGuess(NamedTuple):
 
 
 class Guided(AbstractGuidedProposal):
-    """Guided proposals (Schauer, van der Meulen & van Zanten 2017): h is the transition density
-    of a linear process
+    """Guided proposal of Schauer, van der Meulen & van Zanten (2017).
 
-        dX̃ = [α̃ + F (X̃ - b)] dt + σ̃ dW,
+    Its h-function is the transition density of a linear process
 
-    in steps as the target's, so that for an Ornstein–Uhlenbeck process all weights are equal.
-    Where σ varies its deviations are scaled to the mean of V(x) and Ṽ (not in that paper): else the
-    weights have heavy tails, and far fewer paths count than it seems.
+        dX̃ = [α̃ + F (X̃ - b)] dt + σ̃ dW
+
+    in the steps of the target. For an Ornstein–Uhlenbeck process all weights are equal. For a
+    state-dependent σ the deviations from b are scaled to the mean of V(x) and Ṽ = σ̃σ̃ᵀ. This is not
+    in that paper; without it the weights have heavy tails, and the effective sample size is
+    overestimated.
 
     **Arguments:**
 
-    - `linearisation`: "end", the drift linearised at b, F = ∇α(b), α̃ = α(b), σ̃ = σ(b); "path", all
-        of them linearised along the deterministic path dξ = α(ξ) dt from the start, bent so that
-        it ends in b, and straight where steps are so long that they throw it far out; or a matrix
-        F of shape (d, d), with α(b) and σ(b).
-    - `density`: of the target's steps, by default the most accurate: `ItoTaylorDensity()` for
-        constant σ, `EulerDensity()` where σ depends on the state.
-    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
-        which pays where σ varies much on the way.
+    - `linearisation`: one of
+        - "end": linearised at b, F = ∇α(b), α̃ = α(b), σ̃ = σ(b);
+        - "path": linearised along the deterministic path dξ = α(ξ) dt from the start, plus a linear
+            function of time such that the path ends in b. If long steps make this path diverge, it
+            is replaced by a straight line;
+        - a matrix F of shape (d, d), with α̃ = α(b) and σ̃ = σ(b).
+    - `density`: step density of the target. The default is the most accurate one:
+        `ItoTaylorDensity()` for constant σ, `EulerDensity()` for a state-dependent σ.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ], between 1 (equal steps) and 4. Above 1 the steps
+        shrink towards the end, which helps if σ varies much along the path.
 
-    **Raises:** `ValueError` and `TypeError` for anything else.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -110,14 +114,14 @@ class Guided(AbstractGuidedProposal):
         self._along, self._matrix = "end", as_floating("linearisation", linearisation)
         if self._matrix.ndim != 2 or self._matrix.shape[0] != self._matrix.shape[1]:
             raise ValueError(
-                f"`linearisation` must be a matrix, shape (d, d); got {self._matrix.shape}."
+                f"`linearisation` must be a matrix of shape (d, d); got shape {self._matrix.shape}."
             )
         if not is_traced(self._matrix) and not np.all(np.isfinite(self._matrix)):
             raise ValueError(f"`linearisation` must be finite; got {self._matrix}.")
 
     @property
     def linearisation(self) -> str:
-        """What the drift is linearised along, in a word."""
+        """The kind of linearisation: '"end"', '"path"' or 'matrix'."""
         return f'"{self._along}"' if self._matrix is None else "matrix"
 
     def describe(self):
@@ -130,8 +134,8 @@ class Guided(AbstractGuidedProposal):
         d = end.shape[0]
         if self._matrix is not None and self._matrix.shape != (d, d):
             raise ValueError(
-                f"the matrix of `Guided` must have shape ({d}, {d}) for points in {d} dimensions; "
-                f"got {self._matrix.shape}."
+                f"the matrix of `Guided` must have shape ({d}, {d}) for points of {d} dimensions; "
+                f"got shape {self._matrix.shape}."
             )
         points = end[None]
         if self._along == "path":

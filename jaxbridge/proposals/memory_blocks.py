@@ -1,4 +1,4 @@
-"""Weighted paths in blocks that fit in memory, over devices, of active intervals only."""
+"""Evaluation of weighted paths in blocks that fit in memory, over devices, for active intervals."""
 
 import math
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""The modified diffusion bridge."""
+"""The modified diffusion bridge, a guided proposal for short intervals."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,20 +8,20 @@ from .guided import AbstractGuidedProposal, bridge_law, check_refinement
 
 
 class ModifiedDiffusionBridge(AbstractGuidedProposal):
-    """The modified diffusion bridge of Durham & Gallant (2002): as if α and V stayed as they are
-    at the current point,
+    """Modified diffusion bridge of Durham & Gallant (2002), a guided proposal with the steps
 
         x_{i+1} ~ N(x_i + (b - x_i) δ_i/(T - t_i), V(x_i) δ_i (T - t_{i+1})/(T - t_i)).
 
-    The best and cheapest proposal on intervals so short that the drift matters little. For
-    σ = I it is the Brownian bridge.
+    Each step is that of a bridge whose drift and V stay constant from the current point on. For
+    σ = I it is the Brownian bridge. It is the best and cheapest proposal for intervals on which the
+    drift matters little.
 
     **Arguments:**
 
-    - `density`: of the target's steps, by default the most accurate: `ItoTaylorDensity()` for
-        constant σ, `EulerDensity()` where σ depends on the state.
-    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
-        which pays where σ varies much on the way.
+    - `density`: step density of the target. The default is the most accurate one:
+        `ItoTaylorDensity()` for constant σ, `EulerDensity()` for a state-dependent σ.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ], between 1 (equal steps) and 4. Above 1 the steps
+        shrink towards the end, which helps if σ varies much along the path.
 
     **Example:**
 

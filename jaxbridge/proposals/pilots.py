@@ -1,25 +1,36 @@
-"""Pilot runs: each candidate draws a few weighted paths of each interval, and
+"""Comparison of candidate proposals by pilot runs.
 
-    rate = effective samples / (simulated paths × seconds per path)
+Each candidate draws a few weighted paths of each interval. The criterion is
 
-is compared, as it would be in a larger sample, after two deductions. Candidates have different
-targets, at so many steps, and so different step errors (`step_error`). More paths do not reduce
-them: with W seconds the mean square error of log p̂ is about 1 / (W rate) + (step error)², which is
-that of a rate of
+    rate = effective samples / (simulated paths × seconds per path),
 
-    rate / (1 + W rate (step error)²),
+extrapolated to a larger sample, with two corrections.
 
-with W the seconds of ten thousand of the cheapest paths, and the step error as far as it is seen
-beyond two of its own standard errors. And weights with a Pareto shape above 0.7 come last, where
-there are enough of them to tell and they are not nearly equal.
+*Discretisation error.* Candidates have different targets and so different discretisation errors
+(`step_error`), which more paths do not reduce. With W seconds the mean square error of log p̂ is
+about 1 / (W rate) + (step error)². This equals the error of a rate of
 
-A candidate makes no pilot run where it could not win: of a coupling's simulated paths at most one
-in 1 + N is an effective sample, for each proposal needs N hitting counts. Nor where it would win
-next to nothing over all intervals, for each candidate is to be compiled. Where no candidate has
-five effective paths of light tails, couplings whose pairs hardly met are unknown and not worthless:
-their pilot runs are repeated, up to 16 times, before they are compared. (Not inside `jit`, where
-what was seen is not known in time.) Seconds go by a rule, so
-that one key gives one choice; or by the clock, where `choose_proposal` makes the choice.
+    rate / (1 + W rate (step error)²).
+
+W is the time of ten thousand paths of the cheapest candidate. The step error counts only as far as
+it exceeds two of its standard errors.
+
+*Heavy tails.* Weights with a Pareto k̂ above 0.7 rank last, if there are enough weights for an
+estimate of k̂ and they are not nearly equal.
+
+Some candidates need no pilot run on an interval:
+
+- a candidate that cannot be the best. For a coupling at most one in 1 + N simulated paths is an
+  effective sample, because each proposal needs N hitting counts;
+- a candidate with a negligible gain over all intervals, because each candidate in use has to be
+  compiled.
+
+If no candidate has five effective paths with light tails, pilot runs of couplings whose pairs
+rarely met are repeated up to 16 times. (Inside `jit` they are not repeated, because the results are
+not yet available.)
+
+Seconds are estimated by a rule, so that a key determines the choice. Only `choose_proposal`
+measures them.
 """
 
 import functools

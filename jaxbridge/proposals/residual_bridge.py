@@ -1,4 +1,4 @@
-"""The residual bridge."""
+"""The residual bridge, a guided proposal along a deterministic path."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,20 +13,21 @@ from .guided import (
 
 
 class ResidualBridge(AbstractGuidedProposal):
-    """The residual bridge of Whitaker, Golightly, Boys & Sherlock (2017): the modified diffusion
-    bridge of x - ξ, where ξ solves dξ = α(ξ) dt from the start,
+    """Residual bridge of Whitaker, Golightly, Boys & Sherlock (2017), a guided proposal.
+
+    It is the modified diffusion bridge of x - ξ, where ξ solves dξ = α(ξ) dt from the start:
 
         x_{i+1} = x_i + Δξ_i + (b - ξ_N - (x_i - ξ_i)) δ_i/(T - t_i) + noise.
 
-    Better where the drift carries all paths along, on intervals that are short beside the time
-    in which it would pull them together.
+    Compared with `ModifiedDiffusionBridge` it is better if the drift moves all paths in the same
+    direction. The interval must be short compared with the relaxation time of the drift.
 
     **Arguments:**
 
-    - `density`: of the target's steps, by default the most accurate: `ItoTaylorDensity()` for
-        constant σ, `EulerDensity()` where σ depends on the state.
-    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ]: above one, steps shrink towards the end,
-        which pays where σ varies much on the way.
+    - `density`: step density of the target. The default is the most accurate one:
+        `ItoTaylorDensity()` for constant σ, `EulerDensity()` for a state-dependent σ.
+    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ], between 1 (equal steps) and 4. Above 1 the steps
+        shrink towards the end, which helps if σ varies much along the path.
 
     **Example:**
 

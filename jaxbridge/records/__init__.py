@@ -1,28 +1,30 @@
-"""Records: a diffusion seen at times t_0 < ... < t_K with noise, in part, or not at all.
+"""Records: noisy, partial or missing observations of a diffusion at times t_0 < ... < t_K.
 
-What is seen of the state is y_k ~ g(· | X(t_k)) (`observation`), and X(t_0) has a law (`initial`).
-Times, values and steps make a `record`. A linear process along a path (`linearisation`) has a
-density of all that is still to be seen, given the state,
+The observation model is y_k ~ g(· | X(t_k)) (`observation`), and X(t_0) has a law (`initial`).
+Times, values and steps form a `record`. A linear process along a path (`linearisation`) has a
+backward h-function, the density of all later observations given the state,
 
     h_i(x) = p̃(y_k: t_k > t_i | X(t_i) = x) ∝ exp(rᵀ(x - ξ_i) - ½ (x - ξ_i)ᵀ H (x - ξ_i)),
 
-by the backward information filter (`information_filter`). Paths whose steps are tilted by it
-(`tilted_step`, `guided_steps`) have weights w whose mean is the likelihood of the whole record:
+computed by the backward information filter (`information_filter`). Guided paths, whose steps are
+tilted by h (`tilted_step`, `guided_steps`), have weights with the likelihood of the record as their
+mean:
 
-    w = Z_0 Π_i [∫ p_i(x'| x_i) g(y| x') h_{i+1}(x') dx' / h_i(x_i)],
+    w = Z_0 Π_i [∫ p_i(x'| x_i) g(y| x') h_{i+1}(x') dx' / h_i(x_i)].
 
-all equal where the model is linear; the density of a bridge's guided proposal (van der Meulen &
-Schauer 2017; Mider, Schauer & van der Meulen 2021) with data on the way. On it are built
+For a linear model all weights are equal. This extends guided proposals of bridges to several
+observations (van der Meulen & Schauer 2017; Mider, Schauer & van der Meulen 2021). The functions
+are:
 
-* `log_likelihood`: particles that are resampled where data are (`particle_filter`), an unbiased
-  estimate, however long the record is, and its errors; guides that trust what is seen much later
-  too much forget it (`forgetting`);
-* `innovations`: path and weight as smooth functions of parameters and of normal noise;
-* `smooth`: paths given the whole record, by moves of the noise in blocks (`path_blocks`), or across
-  long gaps by moves of the states with new bridges on both sides (`states`).
+- `log_likelihood`: an unbiased estimate by particle filters with resampling at observations
+  (`particle_filter`), for records of any length. A guide may overrate observations far ahead; then
+  it discounts them (`forgetting`);
+- `innovations`: path and weight as smooth functions of parameters and of normal noise;
+- `smooth`: paths given the whole record. Either the noise moves in blocks (`path_blocks`), or,
+  across long gaps, the states move with new bridges on both sides (`states`).
 """
 
-# What the folders above use of this one.
+# The names that other folders import from this one.
 from .forgetting import half_will_do as half_will_do, rate_for_several as rate_for_several
 from .guide_search import (
     GuideCheck as GuideCheck,

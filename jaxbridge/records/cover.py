@@ -1,19 +1,21 @@
-"""A law that covers ν, for the beginning of a record where ν is not normal.
+"""Mixture of normal laws that covers ν, for the initial state of a record if ν is not normal.
 
-One normal law may leave out a mode of ν, or fall off faster than ν does: then what is weighed by
-their ratio has no bound, and tells a small error of a wrong number. A mixture of normal laws,
+A single normal law may miss a mode of ν or have lighter tails. Then the importance ratio is
+unbounded, and an estimate may be wrong with a small reported error. The mixture
 
-    q(x) = ½ Σ_j w_j N(x; x_j, r_j² S) + ½ Σ_c N(x; m_c, S_c) / C,
+    q(x) = ½ Σ_j w_j N(x; x_j, r_j² S) + ½ Σ_c N(x; m_c, S_c) / C
 
-has kernels at draws x_j of ν, with weights w_j, whose mean and covariance are m and S, each as wide
-as it is far to a sixteenth of the others; and wide laws for what is beyond them, up to eight times
-as wide as ν. Given what is seen, and tilted by h, it is a mixture again: its shares are multiplied
-by the integrals. What is left to weigh is ν/q.
+avoids both. The first part has kernels at draws x_j of ν with weights w_j; S is their covariance.
+The width r_j of a kernel is the distance that contains a sixteenth of the other draws. The second
+part has wide laws for the tails, up to eight times as wide as ν. Given observations, and tilted by
+h, the law is a mixture again; its weights are multiplied by the integrals. The importance ratio is
+ν/q.
 
-Draws are those of the model's sampler; without one they are the points of a ladder around the
-normal law in place of ν (`initial`), weighed by ν, and twice more draws of the mixture that they
-make (population Monte Carlo; Cappé, Guillin, Marin & Robert 2004). Keys are fixed, so q depends on
-parameters only. What rests on q is exact whatever it is; how many draws count is not.
+The draws come from the model's sampler of ν. Without a sampler they start as points of a ladder
+around the normal law in place of ν (`initial`), weighted by ν. Two rounds of draws from the
+resulting mixture follow (population Monte Carlo; Cappé, Guillin, Marin & Robert 2004). Keys are
+fixed, so q depends on parameters only. Results are exact for every q; only the effective sample
+size depends on q.
 """
 
 from typing import NamedTuple

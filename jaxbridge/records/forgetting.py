@@ -1,22 +1,22 @@
-"""How soon a guide forgets what is seen later.
+"""Discount rate of a guide: how fast it reduces the influence of later observations.
 
-The path that guides a record is one of many. Where others lead elsewhere (wells, spikes, chaos), a
-linear process along it is too sure of what is seen much later, and particles that keep to it may
-miss what weighs most. So h_i is made of h_{i+1} to the power exp(-γ δ), at a rate γ. Weights are
-exact whatever h is: only their variance depends on γ.
+A guide is linearised along one of many possible paths. Other paths may lead elsewhere (wells,
+spikes, chaos). Then the linear process is too certain about observations far ahead, and guided
+particles may miss the paths of largest weight. Hence h_i is computed from h_{i+1} to the power
+exp(-γ δ), with a discount rate γ. Weights are exact for every h; only their variance depends on γ.
 
-By Jensen's inequality E log p̂ is below log p, by about half the variance of log p̂ and by all that
-particles miss (Maddison et al. 2017). So the rate is the one of several with the largest mean of
-log p̂ of pilot filters, less two standard errors: of a linear model, whose weights are equal without
-forgetting, it is zero. Of several the luckiest is best, so it must be better than none on another
-look, too.
+*Choice of the rate.* By Jensen's inequality E log p̂ is below log p, by about half the variance of
+log p̂ plus the effect of missed paths (Maddison et al. 2017). Hence the chosen rate maximises the
+mean of log p̂ over pilot filters, minus two standard errors. For a linear model all weights are
+equal without a discount, and the rate is zero. The best of several rates may be best by chance. So
+it must also be better than no discount in a second set of pilot runs.
 
-A chain over parameters has one rate for all of them, and must not miss what weighs most at any:
-where nearly every p̂ is too small it will not go, and then knows nothing of it. So what the mean of
-log p̂ is below that at the best rate is worked out at several parameters, all about as likely as
-those where the chains are, and the rate is the one that loses least in the mean over these. (The
-log of the mean of p̂ is a worse criterion: of few pilots one that is lucky decides it, and a rate
-too low, at which chains stay where it is good enough, is confirmed there by what they see.)
+*Chains over parameters* use one rate for all parameters. If nearly every p̂ is too small in a
+region, the chain avoids this region and cannot detect the error. Hence the loss of a rate (the mean
+of log p̂ below that at the best rate) is computed at several parameters, which are about as likely
+as those of the chains. The chosen rate has the smallest mean loss. The log of the mean of p̂ would
+be a worse criterion for two reasons. With few pilot runs a single large estimate decides it. And
+with a rate that is too low, chains stay where it is sufficient, which seems to confirm it.
 """
 
 from collections.abc import Callable

@@ -1,9 +1,9 @@
-"""The search for the path along which a record is linearised, and a check of what was found.
+"""Search for the path of the linearisation of a record, and a check of the resulting guide.
 
-The first search starts from the path of the extended Kalman filter. Where that is thrown off, it
-finds no path whose weight is finite, or one that is far from what is seen. Then searches start from
-paths of particles that stay near what is seen (`tracking`), made likely by damped iterations
-(`likely_path`). The best path of all searches is the result.
+The first search starts from the path of the extended Kalman filter. If this filter diverges, the
+search finds no path of finite weight, or one far from the observations. Then further searches start
+from paths of particles that stay near the observations (`tracking`), improved by damped iterations
+(`likely_path`). The result is the best path of all searches.
 """
 
 import functools
@@ -45,23 +45,24 @@ _NO_WEIGHT = 1e20
 
 
 _POOR = (
-    "The guide of a record is poor: the path along which it is linearised has no weight, or is "
-    "further from an observation than √(2 log n) + 1 standard deviations of its noise, n the "
-    "number of observations. Start from likelier parameters (the model's `params`, or `init=`), "
-    "take more `num_steps`, or check for outliers, which the noise must allow for."
+    "The guide of a record is poor: its path has weight zero, or its distance from an observation "
+    "exceeds √(2 log n) + 1 standard deviations of the noise, with n observations. Start from "
+    "likelier parameters (the model's `params`, or `init=`), use more `num_steps`, or check for "
+    "outliers, which the noise must allow for."
 )
 
 
 class GuideCheck(NamedTuple):
-    """Diagnostics of the guide of a record, or of each of several in a leading axis, at the
-    parameters that it was made for.
+    """Diagnostics of the guide of a record, at the parameters for which it was found.
 
-    - `log_weight`: of the guided path without noise; -inf where that path leaves the finite numbers
-        or the state space, or explains no observation.
-    - `largest_residual`: the largest distance of an observation from the path of linearisation, in
-        standard deviations of its noise. Exact observations do not count. inf where the guide is
+    Several records have a leading axis.
+
+    - `log_weight`: log weight of the guided path without noise. -inf if this path diverges, leaves
+        the state space, or does not explain an observation.
+    - `largest_residual`: largest distance of an observation from the path of the linearisation, in
+        standard deviations of the noise. Exact observations do not count. Infinite if the guide is
         not finite.
-    - `num_observed`: the number of observed components.
+    - `num_observed`: number of observed components.
     """
 
     log_weight: Float[Array, "*R"]
@@ -70,27 +71,34 @@ class GuideCheck(NamedTuple):
 
     @property
     def is_usable(self) -> Bool[Array, "*R"]:
-        """Whether the guided path without noise has a weight at all: where it has none, paths with
-        noise seldom do."""
+        """Whether the guided path without noise has a positive weight.
+
+        If not, paths with noise rarely have one.
+        """
         return self.log_weight > -jnp.inf
 
     @property
     def is_near(self) -> Bool[Array, "*R"]:
-        """Whether the guide is usable and as near to the observations as their noise explains."""
+        """Whether the guide is usable and its residuals are consistent with the noise."""
         number = jnp.maximum(self.num_observed, 1).astype(self.largest_residual.dtype)
         largest = jnp.sqrt(2 * jnp.log(number)) + _BEYOND_NOISE
         return self.is_usable & (self.largest_residual < largest)
 
     @property
     def rank(self) -> Float[Array, "*R"]:
-        """How good the guide is beside others: its log weight, or far below all of these where it
-        has none, the further the larger its residuals are."""
+        """Score for comparing guides: the log weight if it is finite.
+
+        Otherwise a value below all log weights, which falls with the largest residual.
+        """
         unusable = -_NO_WEIGHT * (1 + self.largest_residual)
         return jnp.where(self.is_usable, self.log_weight, unusable)
 
     def fault(self, hampered: Bool[Array, ""] | bool = True) -> Fault:
-        """Return the fault of a poor guide. Weights and chains are exact with any guide: where a
-        result has diagnostics of its own, it is a fault if these show that it `hampered` them."""
+        """Return the fault of a poor guide.
+
+        Weights and chains are exact with any guide. A result with other diagnostics passes as
+        `hampered` whether these show a problem; only then is a poor guide a fault.
+        """
         return Fault(jnp.any(~self.is_near) & hampered, _POOR)
 
 

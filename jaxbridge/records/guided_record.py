@@ -1,4 +1,4 @@
-"""A whole record, guided: what the steps of its paths need, worked out before any is simulated."""
+"""Guide of a whole record: the quantities of all guided steps, computed before the simulation."""
 
 import functools
 from collections.abc import Callable

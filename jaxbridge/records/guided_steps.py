@@ -1,19 +1,20 @@
-"""The steps of a path that is guided through a record, and their inverse.
+"""Steps of a path that is guided through a record, and their inverse.
 
-From x at the beginning of a step the target's step N(μ(x), Λ Λᵀ) is made that of the path given
-what is seen at its end and h_{i+1} (`tilted_step`). Its weight is the density of the target's step
-over that of the guided one. With z the noise that makes the target's step go where the noise ζ
-makes the guided one go,
+From x at the beginning of a step, the target's step N(μ(x), Λ Λᵀ) is conditioned on the observation
+at its end and tilted by h_{i+1} (`tilted_step`). The weight is the density of the target's step
+over that of the guided step. Let the noise ζ of the guided step and the noise z of the target's
+step lead to the same point. Then
 
     w = p(y| x) N(z; 0, I) / (N(ζ; 0, I) det ℛ),    det ℛ ≥ 1,
 
-with p(y| x) the density of what is seen at the end of the step. So log w of a whole path is at most
-½|ζ|² plus the largest log density of what is seen, and rounding cannot lift it beyond that.
+with p(y| x) the density of the observation at the end of the step. Hence log w of a whole path is
+at most ½|ζ|² plus the maximum log density of the observations. Rounding errors cannot exceed this
+bound.
 
-The same weight is ∫ p(x'| x) g(y| x') h_{i+1}(x') dx' / h_i(x) times h_i(x) / h_{i+1}(x'), whose
-product over a path telescopes. It must not be summed in that form: explicit steps that are far too
-long for the drift (δ |∇drift| above two) carry a path to where log h is -1e30, differences of such
-numbers are rounded to ±1e14, and a path that hardly any noise makes gets a weight of e^{1e14}.
+The weight also equals ∫ p(x'| x) g(y| x') h_{i+1}(x') dx' / h_i(x) times h_i(x) / h_{i+1}(x'),
+whose product over a path telescopes. The code must not sum this form. Explicit steps that are far
+too long for the drift (δ |∇drift| above 2) may lead to log h = -1e30. Differences of such numbers
+have rounding errors of ±1e14, so a very unlikely path would get a weight of e^{1e14}.
 """
 
 from collections.abc import Callable

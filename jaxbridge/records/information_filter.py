@@ -1,20 +1,21 @@
-"""The backward information filter: h_i from h_{i+1}, and from what is seen at t_{i+1}.
+"""Backward information filter: h_i from h_{i+1} and from the observations at t_{i+1}.
 
-For a linear step u' = A u + a + Λ ζ everything that is seen later makes log h_i quadratic. Numbers
-that are seen at its end come first (`tilted_step.given`): they make the mean e = E u + f of the
-step, with E = A and f = a at first, and log h_i what the log densities of their residuals are. Then
-h_{i+1} is integrated: with W = ℛ⁻¹ Λᵀ H,
+For a linear step u' = A u + a + Λ ζ, log h_i is quadratic. First the step is conditioned on the
+scalar observations at its end (`tilted_step.given`). This gives the mean e = E u + f of the step,
+starting from E = A and f = a. The log densities of the residuals are the first part of log h_i.
+Then h_{i+1} is integrated: with W = ℛ⁻¹ Λᵀ H,
 
     log h_i += (r - Wᵀℛ⁻¹Λᵀr)ᵀ e - ½ eᵀ (H - WᵀW) e.
 
-What h_i owes to h_{i+1} needs no derivative of this. Given all that is seen later u' has a mean
-Γu + m, the tilted step's, and a small change of log h_{i+1} changes log h_i by its mean, so that
+The derivative of h_i with respect to h_{i+1} has a simpler form. Given all later observations, u'
+has the mean Γu + m of the tilted step. A small change of log h_{i+1} changes log h_i by its
+conditional mean. Hence
 
     Ḣ_i = Γᵀ Ḣ Γ,   ṙ_i = Γᵀ (ṙ - Ḣ m),   Γ = (I - G H) E,   m = (I - G H) f + G r,
 
-with G = Λ (ℛ ℛᵀ)⁻¹ Λᵀ, the covariance of u' given all that.
+with G = Λ (ℛ ℛᵀ)⁻¹ Λᵀ, the covariance of u' given all later observations.
 
-Where a guide forgets (`forgetting`), it is h_{i+1} to a power below one that goes through the step.
+With a discount rate (`forgetting`), a power of h_{i+1} below one enters the step.
 """
 
 from collections.abc import Callable

@@ -1,10 +1,12 @@
-"""The law of the state at the beginning of a record: a normal law, and what is left to weigh.
+"""Law of the state at the beginning of a record: a normal law and an importance ratio.
 
-Where that is ν, and ν is not normal, in its place is a normal law with the mean and covariance of
-ν: by as much as it is wider than each of the wells of ν noise can lead to all of them. Both are
-weighted means over a ladder of normal laws around a mode, of which each is twice as wide as the
-last, at fixed noise: a smooth function of the parameters. Where so few points count that they tell
-no covariance, as in many dimensions, that at the mode is added.
+If the law is ν, and ν is not normal, a normal law with the mean and covariance of ν replaces it.
+This law is wide enough to reach all wells of ν.
+
+Mean and covariance are weighted means over a ladder of normal laws around a mode; each law is twice
+as wide as the previous one. The noise is fixed, so both are smooth functions of the parameters. If
+the effective number of points is too small for a covariance, for instance in many dimensions, the
+covariance at the mode is added.
 """
 
 import math
@@ -79,7 +81,7 @@ def check_initial(initial: Initial, model: Diffusion, like: Float[Array, " d"]) 
         return
     inside = model.state_space()
     if inside is not None and not inside(jnp.asarray(point, like.dtype)):
-        raise ValueError(f"`initial` = {point} is outside the model's `domain`.")
+        raise ValueError(f"`initial` must be inside the model's `domain`; got {point}.")
 
 
 def log_ratio(

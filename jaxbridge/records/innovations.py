@@ -1,9 +1,10 @@
-"""Paths as smooth functions of parameters and normal noise (section 4 of van der Meulen & Schauer
-2017: the noise does not know the parameters).
+"""Paths as smooth functions of parameters and normal noise.
 
-The path of a record is G_θ(ξ), guided by all that was seen, with ξ ~ N(0, I) under the law of the
-guided paths; so (θ, ξ) has the posterior density π(θ) N(ξ; 0, I) w(θ, ξ). Given ξ the path moves
-with θ, and θ may be a parameter of σ, of the noise or of the initial law, however small the steps.
+The method is that of section 4 of van der Meulen & Schauer (2017). The path of a record is G_θ(ξ),
+guided by all observations, with ξ ~ N(0, I) under the law of the guided paths. Hence (θ, ξ) has the
+posterior density π(θ) N(ξ; 0, I) w(θ, ξ). The law of ξ does not depend on θ, and given ξ the path
+changes with θ. So θ may contain parameters of σ, of the noise and of the initial law, for every
+step size.
 """
 
 import math
@@ -29,21 +30,22 @@ from .problem import RecordProblem, as_record_problem
 from .start_share import start_share
 
 _NOT_FINITE = (
-    "Paths of some noise ξ ~ N(0, I) have no weight: they left the finite numbers or the state "
-    "space. A sampler of ξ stops there, and means of weights miss their mass. Take more "
-    "`num_steps`: explicit steps explode where they are long for the drift."
+    "Paths of some noise ξ ~ N(0, I) have weight zero, because they diverged or left the state "
+    "space. A sampler of ξ stops there, and means of weights are too small. Use more `num_steps`: "
+    "explicit steps diverge if they are too long for the drift."
 )
 # So many draws of ξ are tried.
 _NUM_TRIED = 10
 
 
 class Innovations(NamedTuple):
-    """Paths of a record as functions of noise ξ, shape (`size`,), from `innovations`. Its methods
-    may be given to `jax.jit` and `jax.grad` as they are.
+    """Paths of a record as functions of noise ξ, shape (`size`,), from `innovations`.
 
-    - `problem`: the model, what was seen of it, and how.
-    - `points`: along which it is linearised, shape (M + 1, d).
-    - `guide`: diagnostics of the guide along these points.
+    Its methods may be passed directly to `jax.jit` and `jax.grad`.
+
+    - `problem`: the model, its record and the observation model.
+    - `points`: the path of the linearisation, shape (M + 1, d).
+    - `guide`: diagnostics of the guide along this path.
     """
 
     problem: RecordProblem
@@ -52,41 +54,51 @@ class Innovations(NamedTuple):
 
     @property
     def size(self) -> int:
-        """How many numbers ξ has: d for x_0, and d for each step."""
+        """Number of entries of ξ: d for x_0, and d for each step."""
         return self.points.size
 
     @property
     def times(self) -> Float[Array | np.ndarray, " points"]:
-        """Times of the points of paths, shape (M + 1,); a NumPy array of double precision where
-        they are too far from zero for the precision of paths."""
+        """Times of the points of paths, shape (M + 1,).
+
+        It is a NumPy array of double precision if the precision of paths cannot resolve the times.
+        """
         record = self.problem.record
         return record.clock.exactly(record.grid())
 
     def path(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, "points d"]:
-        """The path that this noise makes at these parameters of the model."""
+        """Return the path of the noise `xi` at the parameters `params`, shape (M + 1, d)."""
         return self._run(params, xi)[0]
 
     def log_weight(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, ""]:
-        """log w, whose mean of w over ξ ~ N(0, I) is the likelihood; -∞ of a path that left the
-        state space."""
+        """Return log w(θ, ξ), -inf for a path that left the state space.
+
+        The mean of w over ξ ~ N(0, I) is the likelihood.
+        """
         return self._run(params, xi)[1]
 
     def log_density(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, ""]:
-        """log of the joint density of ξ and of what was seen, given the parameters: with a prior's
-        log density it is the target of any sampler."""
+        """Return the joint log density of ξ and the observations, given the parameters.
+
+        The sum with a log prior is a target for any sampler.
+        """
         return self.log_weight(params, xi) - (xi @ xi + self.size * math.log(2 * math.pi)) / 2
 
     def start_share(self) -> Float[Array, ""]:
-        """The share of draws of x_0 by normal noise that count, at the parameters of the model: one
-        where its law is normal. Near zero the normal law in the place of the stationary one leaves
-        out a mode or falls off too fast: then means of w over ξ are not to be trusted, and a
-        sampler may not find its way; `log_likelihood` covers that law with several."""
+        """Effective fraction of the draws of x_0 by normal noise, at the parameters of the model.
+
+        It is 1 if the initial law is normal. Near 0 the normal law in place of the stationary law
+        misses a mode or has too light tails. Then means of w over ξ are unreliable, and a sampler
+        may miss a mode. `log_likelihood` uses a mixture of normal laws instead.
+        """
         return start_share(self.problem, self.problem.model, self.points)
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults at the parameters of the model: a poor guide, and paths without a
-        weight for ξ = 0 or one of ten random ξ."""
+        """The faults at the parameters of the model, each with a remedy.
+
+        They are: a poor guide, and paths of weight zero for ξ = 0 or for one of ten random ξ.
+        """
         params, dtype = self.problem.model.params, self.points.dtype
         keys = jax.random.split(jax.random.key(0), _NUM_TRIED)
         tried = jax.vmap(lambda key: jax.random.normal(key, (self.size,), dtype))(keys)
@@ -97,13 +109,13 @@ class Innovations(NamedTuple):
 
     @property
     def trustworthy(self) -> Bool[Array, ""]:
-        """Return whether no fault of `verdict` is present."""
+        """Whether `verdict` has no fault."""
         return self.verdict.trustworthy
 
     def why(self) -> str:
-        """Return each fault with its remedy, one a line.
+        """Return the faults with their remedies, one per line.
 
-        **Raises:** `TypeError` inside `jit`, where the numbers are not known yet.
+        **Raises:** `TypeError` inside `jit`, because it needs concrete numbers.
         """
         return self.verdict.why()
 
@@ -132,33 +144,37 @@ def innovations(
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
 ) -> Innovations:
-    """The paths of a record as smooth functions of parameters and noise, guided by what was seen.
+    """Return the paths of a record as smooth functions of parameters and noise.
+
+    The paths are guided by all observations. Use them with any sampler or optimiser.
 
     **Arguments:**
 
-    - `model`: along its paths at its `params` the guide is linearised, once: what is made at other
-        parameters is as exact, but guided best near these.
-    - `times`: of the observations, shape (n,), increasing numbers in the model's unit of time.
-        Their zero does not matter: differences are taken in double precision. Coefficients that
-        depend on time get these times; where single precision cannot resolve them beside a step,
-        that is refused. Of traced times neither is possible: subtract a constant from them.
-    - `observations`: shape (n, m), or (n,) of one component; NaN or `None` where a component was
-        not seen.
-    - `observation`: how the state was seen, a `LinearGaussian` or an `ObservationDensity`.
-    - `initial`: the law of the state at the first time: a point, shape (d,), a `GaussianLaw`,
-        whose covariance is singular where part of the state is known, `Stationary()`, which is the
-        default, or a function of params to one of these. Likelihoods from the stationary law rest
-        on a `normalised` model. Where that is not normal x_0 is made from noise by the normal law
-        with its mean and covariance, and weighed: exact, but see `start_share`.
-    - `num_steps`: steps between two times, by default 10; or `step_size`, how long a step may be.
-    - `initial_time`: of `initial`, where that is before the first of `times`.
-    - `density`: of the steps, by default `ItoTaylorDensity()` for constant σ, else
-        `EulerDensity()`, or `HypoellipticDensity()` where σ has fewer columns than rows.
+    - `model`: the diffusion. The guide is linearised once, at its `params`. Results at other
+        parameters are exact, too, but the guide is best near these.
+    - `times`: times of the observations, shape (n,), increasing, in the model's unit of time.
+        - The origin of time does not matter, because differences are computed in double precision.
+        - Time-dependent coefficients receive these times. Times at which single precision cannot
+          resolve a step are refused with `ValueError`.
+        - For traced times neither is possible: subtract a constant from them.
+    - `observations`: shape (n, m), or (n,) for one component. NaN or `None` marks a missing value.
+    - `observation`: observation model, a `LinearGaussian` or an `ObservationDensity`.
+    - `initial`: law of the state at the first time, or a function of `params` that returns it:
+        - a point, shape (d,);
+        - a `GaussianLaw`, whose covariance may be singular if part of the state is known;
+        - `Stationary()`, the default. Likelihoods then need a `normalised` model. If the stationary
+          law is not normal, x_0 is drawn from the normal law with its mean and covariance, and
+          weighted. This is exact, but check `start_share`.
+    - `num_steps`, `step_size`: pass one of the two, the number of steps between two times, by
+        default 10, or the maximum step size.
+    - `initial_time`: time of `initial`, if it is before the first of `times`.
+    - `density`: step density. By default `ItoTaylorDensity()` for constant σ. For a state-dependent
+        σ it is `EulerDensity()`, or `HypoellipticDensity()` if σ has fewer columns than rows.
 
-    **Returns:** `Innovations`, differentiable in parameters and noise. Its `why()` names what is
-    wrong with the guide; there is a warning where the likelihood at ξ = 0 is zero.
+    **Returns:** `Innovations`, differentiable in parameters and noise. Its `why()` reports faults
+    of the guide. There is a warning if the likelihood at ξ = 0 is zero.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -182,8 +198,8 @@ def innovations(
     points, _, check = linearised(problem, model)
     if not is_traced(check) and not check.is_usable:
         warnings.warn(
-            "the likelihood at ξ = 0 and the model's parameters is zero, so that no sampler can "
-            "start there: see `why()` of the result.",
+            "the likelihood at ξ = 0 and the model's parameters is zero, so no sampler can start "
+            "there: see `why()` of the result.",
             stacklevel=3,
         )
     return Innovations(problem, points, check)

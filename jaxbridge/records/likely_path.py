@@ -1,13 +1,13 @@
-"""The likeliest path given what is seen, from a path of the diffusion, by damped iterations.
+"""Most likely path given the observations, by damped iterations from a path of the diffusion.
 
-A path is a function of its noise u. Levenberg and Marquardt's iteration minimises
+A path is a function of its noise u. The Levenberg–Marquardt iteration minimises
 
     J(u) = ½ |u|² + ½ Σ (y - c·x)² / ρ
 
-by Gauss and Newton's steps with a penalty ½ λ |u - u_last|², where λ grows until J falls (for
+by Gauss–Newton steps with a penalty ½ λ |u - u_last|². It increases λ until J decreases (for
 smoothers: Särkkä & Svensson 2020). With the penalty the noise of a step has the law
-N(λ/(1+λ) u_last, I/(1+λ)), so that the information filter solves the linear problem. The steps of
-the diffusion, guided by it, make the new path, which is one of its paths again.
+N(λ/(1+λ) u_last, I/(1+λ)), so the information filter solves the linear problem. The guided steps of
+the diffusion then give a new path of the diffusion.
 """
 
 from typing import NamedTuple

@@ -1,9 +1,9 @@
-"""A linear process along a path ξ_0, ..., ξ_M, and the path itself.
+"""Linear process along a path ξ_0, ..., ξ_M, and the path of the extended Kalman filter.
 
-From ξ_i a step goes to N(ξ_i + A_i u + a_i, Λ_i Λ_iᵀ), where u = x - ξ_i and A is the derivative of
-the mean: what the law of a step is for states near the path. The path is that of the extended
-Kalman filter, and then, a few times, the path without noise that is guided along the last one:
-Gauss and Newton's iteration for the most likely path (Bell 1994; `guide_search`).
+A step from near ξ_i has the law N(ξ_i + A_i u + a_i, Λ_i Λ_iᵀ), where u = x - ξ_i and A is the
+derivative of the mean. The first path is that of the extended Kalman filter. Each further path is
+the path without noise that is guided along the previous one. This is the Gauss–Newton iteration for
+the most likely path (Bell 1994; `guide_search`).
 """
 
 from collections.abc import Callable

@@ -1,15 +1,16 @@
-"""The likelihood of a record, however long it is, by guided particle filters.
+"""Log-likelihood of a record of any length, by guided particle filters.
 
-Several independent filters make a mean, and their spread gives its error: a single filter
-underestimates its error because it sees only the surviving particles. Errors that all filters
-share, as where rare particles far from the guide would weigh more than all others, show in the
-shape k̂ of the largest weights at each observation. Coarser grids give the step error.
+The estimate is the mean of several independent filters, and their spread gives its error. A single
+filter underestimates its error because it sees only the surviving particles. All filters may share
+an error, for instance if rare particles far from the guide would have the largest weights. The
+shape k̂ of the largest weights at each observation shows such errors. Coarser grids give the
+discretisation error.
 
-The log of a filter's estimate is nearly normal, with a variance s² (Bérard, Del Moral & Doucet
-2014). Of a few such estimates the largest is often missing, and with it most of their variance. The
-relative variance of their mean is therefore (e^{s²} - 1) / n, with s² from the logs, unless that of
-the estimates themselves is larger. It is a variance with about n - 1 degrees of freedom. The
-standard error is so much larger that two of them hold 95 %, as those of Student's law do.
+*Standard error.* The log of a filter's estimate is nearly normal, with a variance s² (Bérard, Del
+Moral & Doucet 2014). A small sample of such estimates often lacks large ones, and with them most of
+the variance. Hence the relative variance of the mean of n estimates is (e^{s²} - 1) / n, with s²
+from the logs, unless that of the estimates themselves is larger. It has about n - 1 degrees of
+freedom. The standard error is enlarged so that two of them contain 95 % of Student's law.
 """
 
 import dataclasses
@@ -59,53 +60,53 @@ _STUDENT = (
 _LARGEST_VARIANCE = 80.0
 
 _UNEXPLAINED = (
-    "No particle explains some observation (`unexplained` is its number). Check whether it is an "
-    "outlier for the noise of `observation`, or take more steps or particles."
+    "No particle explains some observation (`unexplained` is its index). Check whether it is an "
+    "outlier for the noise of `observation`, or use more steps or particles."
 )
 _DISAGREE = (
-    "So few particles are effective somewhere, or filters disagree so much, that the likelihood "
-    "and its error cannot be trusted. Take more `num_particles`; across gaps in which the "
-    "diffusion could have gone several ways add observations, or use `smooth` with a `proposal`."
+    "The effective sample size is too small at some observation, or filters disagree, so the "
+    "likelihood and its error are unreliable. Use more `num_particles`. If several ways are "
+    "possible across a gap, add observations, or use `smooth` with a `proposal`."
 )
 _HEAVY = (
-    "At some observation the largest weights are so much larger than the others (`pareto_k` above "
-    "0.8, of few particles above less, and infinite of fewer than 25) that particles of larger "
-    "weight may never have been drawn. Take more `num_particles`, and check that `value` stays."
+    "At some observation the weights have heavy tails (`pareto_k` above 0.8; for few particles the "
+    "limit is lower, and for fewer than 25 `pareto_k` is infinite). Particles of larger weight may "
+    "be missing. Use more `num_particles`, and check that `value` does not change."
 )
 _LOST = (
-    "So many particles left the state space or the finite numbers (`num_nonfinite`) that the mass "
-    "that is missing may make the likelihood too small by more than its standard error and 0.05. "
-    "Take more steps, or coordinates in which steps cannot leave; where the diffusion attains its "
-    "boundary (of dX = κ(θ - X) dt + σ√X dW where 2κθ < σ²) no particle touches it."
+    "Many particles left the state space or diverged (`num_nonfinite`). The log-likelihood may be "
+    "too small by more than its standard error and 0.05. Use more steps, or coordinates without a "
+    "boundary. If the diffusion attains its boundary (for dX = κ(θ - X) dt + σ√X dW if 2κθ < σ²), "
+    "no particle represents these paths."
 )
 # In units of log L.
 _MOST_LOST = 0.05
 
 
 class LogLikelihood(AbstractResult):
-    """What `log_likelihood` returns.
+    """Estimated log-likelihood of a record, from `log_likelihood`.
 
-    - `value`: log p̂(y); `exp(value)` is unbiased up to the step error. -inf where no particle
-        explains what was seen.
-    - `standard_error`: that of `value`, from the spread of the filters, widened as Student's law
-        is for few of them; infinite of a single one.
+    - `value`: log p̂(y). `exp(value)` is unbiased up to the discretisation error. It is -inf if no
+        particle explains the observations.
+    - `standard_error`: standard error of `value`, from the spread of the filters, enlarged by
+        Student's law for few filters. Infinite for a single filter.
     - `log_estimates`: log p̂ of each filter, shape (num_filters,).
-    - `effective_sample_size`: how many particles count before each observation is followed by
-        resampling, the mean over the filters, shape (n,).
-    - `pareto_k`: k̂ of the weights of the particles of all filters at each observation, shape (n,),
-        or, without an `observation`, of each transition. Above 0.7, or with fewer than a thousand
-        particles in all above less, `value` is mostly too small, by more than `standard_error`
-        tells; inf of fewer than 25, unless all weigh the same.
-    - `num_weights`: how many weights each k̂ is of.
-    - `num_nonfinite`: how many particles left the finite numbers or the state space.
-    - `step_error`: an estimate of what `value` is too large by for the length of the steps, from
-        half as many; `step_uncertainty` is its Monte Carlo error and what it leaves out, by a
-        quarter as many, infinite where what steps change does not shrink with them. NaN of one
-        step.
-    - `forgetting`: γ, the rate at which what guides the particles forgets what is seen later, in
-        units of one over time: zero where all of it is a help, as it is where the model is linear.
-    - `guide`: diagnostics of the guide of each record; `None` without an `observation`. A poor one
-        is a fault where weights suffer.
+    - `effective_sample_size`: effective number of particles at each observation, before resampling,
+        mean over the filters, shape (n,).
+    - `pareto_k`: k̂ of the weights of all filters at each observation, shape (n,); without an
+        `observation` that of each transition. Above 0.7 (with fewer than 1,000 particles in total
+        above a lower limit) `value` is usually too small by more than `standard_error`. Infinite
+        for fewer than 25 particles, unless all weights are equal.
+    - `num_weights`: number of weights behind each k̂.
+    - `num_nonfinite`: number of particles that diverged or left the state space.
+    - `step_error`: estimated discretisation bias of `value` (estimate minus limit), from a grid
+        with half as many steps. NaN with one step.
+    - `step_uncertainty`: its Monte Carlo error and omitted higher-order terms, from a grid with a
+        quarter as many steps. Infinite if changes do not shrink with the step size.
+    - `forgetting`: discount rate γ of the guide, in units of 1 / time. It is zero if all later
+        observations help, as for a linear model.
+    - `guide`: diagnostics of the guide of each record; `None` without an `observation`. A poor
+        guide is a fault only if weights are poor, too.
     """
 
     value: Float[Array, ""]
@@ -122,22 +123,26 @@ class LogLikelihood(AbstractResult):
 
     @property
     def unexplained(self) -> Int[Array, ""]:
-        """The number of the first observation that no particle explains; -1 where there is none."""
+        """Index of the first observation that no particle explains; -1 if there is none."""
         lost = self.effective_sample_size == 0
         return jnp.where(jnp.any(lost), jnp.argmax(lost), -1)
 
     @property
     def step_error_dominates(self) -> Bool[Array, ""]:
-        """Whether the step error is beyond the standard error, or not known well enough to say:
-        then more steps help, and more particles do not."""
+        """Whether the discretisation error exceeds the standard error, or may do so.
+
+        Then more steps help, and more particles do not.
+        """
         return dominates(StepError(self.step_error, self.step_uncertainty), self.standard_error)
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: an observation that no particle explains, few effective particles or
-        filters that disagree, so that their spread is unknown, heavy tails of the weights, a poor
-        guide beside one of these, lost particles, and a step error that dominates and is beyond
-        0.05."""
+        """The faults of the estimate, each with a remedy.
+
+        They are: an observation that no particle explains; few effective particles, or filters that
+        disagree; heavy tails of the weights; a poor guide together with one of these; lost
+        particles; and a discretisation error that dominates and exceeds 0.05.
+        """
         error = StepError(self.step_error, self.step_uncertainty)
         lost, apart, heavy = self.unexplained >= 0, ~self._filters_agree, self._is_heavy
         guide = () if self.guide is None else (self.guide.fault(lost | apart | heavy),)
@@ -185,28 +190,29 @@ def log_likelihood(
     density: AbstractStepDensity | None = None,
     throw: bool = False,
 ) -> LogLikelihood:
-    """log p(y) of a record that was seen with noise or in part, unbiased on the natural scale.
+    """Estimate the log-likelihood of a record by guided particle filters.
+
+    The likelihood estimate `exp(value)` is unbiased up to the discretisation error.
 
     **Arguments:**
 
-    - `key`: a typed key.
+    - `key`: typed key.
     - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
-        `initial_time`, `density`: as in `innovations`. Lists of `times` and of `observations`, or
-        a leading axis, are several records, independent given the parameters.
-        Without an `observation` the state was seen whole and exactly: the sum of the log transition
-        densities by `transition_log_density(proposal="auto")`, given the first.
-    - `num_particles`: of each filter; without an `observation` weighted paths of each interval.
-    - `num_filters`: independent filters, by default 8, whose spread gives the error. Only with an
-        `observation`.
-    - `throw`: raise an error at run time where the result is not `trustworthy`.
+        `initial_time`, `density`: as in `innovations`. Pass several independent records as lists of
+        `times` and `observations`, or with a leading axis. Without an `observation` the state is
+        observed exactly. Then the result is the sum of the log transition densities by
+        `transition_log_density(proposal="auto")`, given the first state.
+    - `num_particles`: particles per filter; without an `observation` weighted paths per interval.
+    - `num_filters`: number of independent filters, by default 8, whose spread gives the error. Only
+        with an `observation`.
+    - `throw`: raise an error at run time if the result is not `trustworthy`.
 
     **Returns:** `LogLikelihood`. For a linear model all weights are equal, and `value` is that of
-    the Kalman filter of the steps. A stationary law that is not normal is covered by a mixture of
-    normal laws at draws of it, and wider ones beyond: `effective_sample_size` says how well in its
-    first number. Not differentiable where particles are resampled:
-    `innovations` is.
+    the Kalman filter for the same steps. A stationary initial law that is not normal is covered by
+    a mixture of normal laws; the first entry of `effective_sample_size` shows how well. The result
+    is not differentiable where particles are resampled; use `innovations` for derivatives.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -222,7 +228,7 @@ def log_likelihood(
         for_records = (initial, initial_time, density, num_filters)
         if any(value is not None for value in for_records):
             raise ValueError(
-                "without an `observation` the first state is given, and steps and errors are those "
+                "without an `observation` the first state is fixed, and steps and errors are those "
                 "of `transition_log_density`: leave out `initial`, `initial_time`, `density` and "
                 "`num_filters`."
             )
@@ -341,7 +347,7 @@ def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Arr
     known, points = as_times("times", times), as_rows(observations)
     if len(known.shape) != 1 or points.ndim != 2 or points.shape[0] != known.shape[0]:
         raise ValueError(
-            "`times` must have shape (n,) and `observations` (n, d), a row for each of them; got "
+            "`times` must have shape (n,) and `observations` (n, d), one row per time; got "
             f"{known.shape} and {points.shape}."
         )
     check_increasing(known)

@@ -1,10 +1,10 @@
-"""How the state is seen: y_k given X(t_k).
+"""Observation models: the law of y_k given X(t_k).
 
-The components of a normal observation, y = L x + N(0, R), are made independent by R = U D Uᵀ with
-U unit triangular, for those that were seen: each is then a number c·x + N(0, ρ), with ρ = 0 for one
-that is exact. They are taken one by one, so nothing needs R to be invertible, and what was not seen
-is left out. So is what follows from other numbers that are exact, where it agrees with them; where
-it does not, or R has a negative variance, nothing explains what was seen.
+A normal observation y = L x + N(0, R) becomes a series of independent scalars. The factorisation
+R = U D Uᵀ of the observed components, with U unit triangular, gives scalars c·x + N(0, ρ), with
+ρ = 0 for exact ones. They are used one after the other. Hence R need not be invertible, and missing
+components are left out. A scalar that follows from exact ones is left out, too, if it agrees with
+them. If it does not agree, or if R has a negative variance, the likelihood is zero.
 """
 
 from collections.abc import Callable
@@ -42,19 +42,19 @@ class Row(NamedTuple):
 
 
 class LinearGaussian(eqx.Module):
-    """Linear observations with normal noise: y = L x + N(0, R).
+    """Observation model with linear observations and normal noise: y = L x + N(0, R).
 
-    A component that was not seen is NaN, of any row; R may be singular, and zero for what is seen
-    exactly.
+    NaN marks missing components of an observation. R may be singular, and zero for exact
+    components.
 
     **Arguments:**
 
-    - `matrix`: L, shape (m, d); `None` for all of the state.
-    - `covariance`: R, shape (m, m); (m,) for its diagonal; () for a multiple of I; or a function
-        `params -> R` of the model's parameters, where it is unknown, or `(params, t)`, of time
-        as well. In units of y, squared.
+    - `matrix`: L, shape (m, d); `None` if the whole state is observed.
+    - `covariance`: R in squared units of y, with shape (m, m), (m,) for a diagonal matrix, or ()
+        for a multiple of I. For unknown or time-dependent noise pass a function `params -> R` of
+        the model's parameters, or `(params, t) -> R`.
 
-    **Raises:** `ValueError` and `TypeError` for a matrix or a covariance that cannot be.
+    **Raises:** `ValueError` and `TypeError` for an invalid matrix or covariance.
 
     **Example:**
 
@@ -74,7 +74,7 @@ class LinearGaussian(eqx.Module):
         self.matrix = None if matrix is None else as_floating("matrix", matrix)
         if self.matrix is not None:
             if self.matrix.ndim != 2:
-                raise ValueError(f"`matrix` must have shape (m, d); got {self.matrix.shape}.")
+                raise ValueError(f"`matrix` must have shape (m, d); got shape {self.matrix.shape}.")
             if not is_traced(self.matrix) and not np.all(np.isfinite(self.matrix)):
                 raise ValueError(f"`matrix` must be finite; got {self.matrix}.")
         if callable(covariance):
@@ -87,16 +87,16 @@ class LinearGaussian(eqx.Module):
 
     @property
     def linear(self) -> "LinearGaussian":
-        """By what paths are guided: itself."""
+        """The linear observation model of the guide: this one."""
         return self
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether R does."""
+        """Whether R depends on time."""
         return takes_time(self._function, 1)
 
     def covariance_for(self, params: PyTree, m: int, time: Float[Array, ""]) -> Float[Array, "m m"]:
-        """R as a matrix."""
+        """Return R as a matrix, shape (m, m)."""
         value, dtype = self.covariance, time.dtype
         if self._function is not None:
             arguments = (params, time) if self.depends_on_time else (params,)
@@ -106,30 +106,30 @@ class LinearGaussian(eqx.Module):
         if value.shape not in ((), (m,), (m, m)):
             raise ValueError(
                 f"`covariance` must have shape (), ({m},) or ({m}, {m}) for observations of {m} "
-                f"components; it has {value.shape}."
+                f"components; got shape {value.shape}."
             )
         value = value.astype(dtype)
         return value if value.ndim == 2 else value * np.eye(m, dtype=dtype)
 
     def matrix_for(self, d: int, m: int, dtype) -> Float[Array, "m d"]:
-        """L as a matrix."""
+        """Return L as a matrix, shape (m, d)."""
         if self.matrix is None:
             return jnp.eye(d, dtype=dtype)
         return self.matrix.astype(dtype)
 
     def check(self, m: int, like: Array, time: Float[Array, ""], params: PyTree) -> None:
-        """Raise `ValueError` where observations of m components of a state do not fit."""
+        """Raise `ValueError` if observations of m components of a state do not fit."""
         (d,) = like.shape
         rows = d if self.matrix is None else self.matrix.shape[0]
         if self.matrix is not None and self.matrix.shape[1] != d:
             raise ValueError(
-                f"`matrix` must have shape (m, {d}) for a state of {d} dimensions; got "
+                f"`matrix` must have shape (m, {d}) for a state of {d} dimensions; got shape "
                 f"{self.matrix.shape}."
             )
         if rows != m:
             raise ValueError(
-                f"`observations` must have {rows} components, as many as the observation of the "
-                f"state has; got {m}."
+                f"`observations` must have {rows} components, as many as the observation model "
+                f"has; got {m}."
             )
         matrix, R = self.matrix_for(d, m, like.dtype), self.covariance_for(params, m, time)
         if is_traced(matrix, R):
@@ -139,13 +139,13 @@ class LinearGaussian(eqx.Module):
         rank = np.linalg.matrix_rank(np.hstack([a / max(np.abs(a).max(), 1e-300) for a in each]))
         if rank < m:
             raise ValueError(
-                f"{m} components are seen, but `matrix` and `covariance` side by side have rank "
-                f"{rank}: leave out those that follow from others without noise, or give them a "
-                "variance of their own."
+                f"{m} components are observed, but `matrix` and `covariance` side by side have "
+                f"rank {rank}: leave out components that follow from others without noise, or give "
+                "them a variance."
             )
 
     def scalars(self, row: Row, params: PyTree, d: int) -> Scalars:
-        """What is seen, as independent numbers."""
+        """Return the observations as independent scalars."""
         y, time = row
         m, seen = y.shape[0], jnp.isfinite(y)
         rows = jnp.where(seen[:, None], self.matrix_for(d, m, y.dtype), 0)
@@ -166,22 +166,23 @@ class LinearGaussian(eqx.Module):
         return jax.tree.map(lambda a, b: jnp.where(explained, a, b), made, never)
 
     def correction(self, row, x, params):
-        """log g - log of its guess: nothing."""
+        """Return log g minus the log density of the guide's model: zero."""
         return jnp.zeros((), x.dtype)
 
 
 class ObservationDensity(eqx.Module):
-    """Observations with any density g(y | x): counts, angles, what is rounded or cut off.
+    """Observation model with any density g(y | x): counts, angles, rounded or censored values.
 
     **Arguments:**
 
     - `log_density`: log g, a function `(y, x, params) -> ()` of an observation, shape (m,), a
-        state, shape (d,), and the model's parameters; or `(y, x, params, t)`, of time as well. A
-        row with a NaN in every component was not seen; one with some reaches the function as it is.
-    - `guess`: a `LinearGaussian` like it, with positive variances, by which paths are guided. The
-        law does not depend on it, but how many paths count does.
+        state, shape (d,), and the model's parameters; or a function `(y, x, params, t) -> ()`. A
+        row with NaN in every component is missing. The function receives rows with some NaN
+        unchanged.
+    - `guess`: a similar `LinearGaussian` with positive variances, which guides the paths. The law
+        does not depend on it, but the effective sample size does.
 
-    **Raises:** `TypeError` for anything else; `ValueError` for a guess without noise.
+    **Raises:** `TypeError` for invalid arguments; `ValueError` for a guess without noise.
 
     **Example:**
 
@@ -208,25 +209,25 @@ class ObservationDensity(eqx.Module):
 
     @property
     def linear(self) -> LinearGaussian:
-        """By what paths are guided."""
+        """The linear observation model of the guide: `guess`."""
         return self.guess
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether g or its guess does."""
+        """Whether g or the guess depends on time."""
         return takes_time(self._log_density, 3) or self.guess.depends_on_time
 
     def check(self, m: int, like: Array, time: Float[Array, ""], params: PyTree) -> None:
-        """Raise `ValueError` where observations of m components of a state do not fit."""
+        """Raise `ValueError` if observations of m components of a state do not fit."""
         self.guess.check(m, like, time, params)
         _check_positive(self.guess.covariance_for(params, m, time))
 
     def scalars(self, row: Row, params: PyTree, d: int) -> Scalars:
-        """The guess, as independent numbers."""
+        """Return the observations under the guess as independent scalars."""
         return self.guess.scalars(row, params, d)
 
     def correction(self, row: Row, x: Float[Array, " d"], params: PyTree) -> Float[Array, ""]:
-        """log g(y | x) - log of the guess."""
+        """Return log g(y | x) minus the log density of the guess."""
         y, time = row
         seen = jnp.any(jnp.isfinite(y))
         shown = jnp.where(seen, y, jnp.zeros_like(y))
@@ -315,7 +316,7 @@ def check_observation(observation) -> None:
 
 def _check_covariance(R: Array) -> None:
     if R.ndim > 2 or (R.ndim == 2 and R.shape[0] != R.shape[1]):
-        raise ValueError(f"`covariance` must have shape (), (m,) or (m, m); got {R.shape}.")
+        raise ValueError(f"`covariance` must have shape (), (m,) or (m, m); got shape {R.shape}.")
     if is_traced(R):
         return
     known = np.asarray(R, float)
@@ -328,8 +329,8 @@ def _check_covariance(R: Array) -> None:
         good = np.abs(known - known.T).max() <= size and np.linalg.eigvalsh(known).min() >= -size
     if not good:
         raise ValueError(
-            "`covariance` must be symmetric, without negative variances (zero for what is seen "
-            f"exactly); got {known}."
+            "`covariance` must be symmetric, without negative variances (zero for exact "
+            f"components); got {known}."
         )
 
 

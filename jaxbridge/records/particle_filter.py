@@ -1,12 +1,12 @@
-"""The guided particle filter: an unbiased estimate of the likelihood of a record.
+"""Guided particle filter: an unbiased estimate of the likelihood of a record.
 
-P particles take guided steps. At the end of each segment their weights are those of paths that end
-here, tilted by h: of what is seen later they know as much as the linear process does. Where few of
-them count they are resampled, systematically, and go on with equal weights. The product of the
-means of the weights, p̂(y), is unbiased (Del Moral 2004, theorem 7.4.2), up to the step error.
+P particles make guided steps. At the end of each segment their weights are those of paths that end
+there, times h, the linear process's density of later observations. If the effective sample size is
+small, systematic resampling gives particles with equal weights. The product p̂(y) of the means of
+the weights is unbiased up to the discretisation error (Del Moral 2004, theorem 7.4.2).
 
-Within a segment weights are those of paths (`guided_steps`), to which no h comes in; at its end a
-particle takes h there, and gives back h at its beginning.
+Within a segment the weights are those of paths without h (`guided_steps`). At its end a weight is
+multiplied by h there and divided by h at the beginning.
 """
 
 from typing import NamedTuple

@@ -1,21 +1,21 @@
-"""New paths for blocks of a record, given both ends of each.
+"""Moves of the path of a record in blocks, given both ends of each block.
 
-Given its ends a block's path is independent of all others. A record of K segments is cut into
-blocks of J, in two ways, the second shifted by half a block, and all blocks of one cut move at
-once: the end of a block is a state that is seen exactly, its beginning one without noise. Where the
-record begins it is the law of x_0, and where it ends nothing is known. What a block reaches beyond
-the record is filled with steps of length zero.
+Given its ends, the path of a block is independent of all others. A record of K segments has two
+partitions into blocks of J segments; the second is shifted by half a block. All blocks of one
+partition move at once. The end of a block is an exact observation of the state, its beginning a
+fixed state. At the beginning of the record it is the law of x_0; at the end of the record the state
+is free. Steps of length zero fill a block beyond the record.
 
-The path of a block is that of noise ζ ~ N(0, I) with the weight w(ζ), so that
+The path of a block is a function of noise ζ ~ N(0, I) with the weight w(ζ). Hence the move
 
     ζ' = √(1 - β²) ζ + β η,  η ~ N(0, I),    accepted with probability min(1, w(ζ') / w(ζ)),
 
-leaves its law alone (Neal 1998; Cotter, Roberts, Stuart & White 2013), and is accepted often, with
-β = 1 even, where guiding is good. Both paths go through one scan: the old one tells ζ.
+leaves its law invariant (Neal 1998; Cotter, Roberts, Stuart & White 2013). With a good guide it is
+accepted often, even for β = 1. One scan computes both paths and recovers ζ from the old one.
 
-A chain may begin with a path of no weight, as where the first guided path left the finite numbers.
-Any path that has a weight is accepted in its stead; and a chain in which a block never moved is
-told of, for its draws do not tell their own error.
+A chain may start from a path of weight zero, for instance if the first guided path diverged. Any
+path of positive weight replaces it. The result reports chains with a block that never moved,
+because their draws do not show their error.
 """
 
 import functools

@@ -1,4 +1,4 @@
-"""What is asked of a record: the model, what was seen and how, and where it began."""
+"""Validated problem of a record: model, observations, observation model and initial law."""
 
 import equinox as eqx
 import jax
@@ -75,8 +75,8 @@ def as_record_problem(
     seen = split_records(times, observations)
     if len(seen) > 1:
         raise ValueError(
-            f"`observations` are {len(seen)} records, and here there is a path of one: given the "
-            "parameters they are independent, so take one after the other."
+            f"`observations` contain {len(seen)} records, but this function takes one: call it for "
+            "each record, because records are independent given the parameters."
         )
     (record,) = as_records(seen, num_steps, step_size, initial_time)
     return problem_of(model, record, observation, initial, density, any_constant)
@@ -105,17 +105,17 @@ def problem_of(
     if initial is None:
         if not model.has_density:
             raise ValueError(
-                "`initial` is missing: give a point, a `GaussianLaw`, or the model a "
-                "`log_stationary`, whose law is where records begin by default."
+                "`initial` is missing, and the model has no stationary law to use by default: pass "
+                "a point or a `GaussianLaw` as `initial`, or a `log_stationary` to `Diffusion`."
             )
         initial = Stationary()
     initial = as_initial(initial)
     if isinstance(bound(initial, model), Stationary) and not (model.normalised or any_constant):
         raise ValueError(
             "`initial` is the stationary law, whose constant is part of the likelihood and may "
-            "depend on parameters, but this model is not declared `normalised`: declare it, if "
-            "`log_stationary` is the log of a density, or give `initial=` a point or a "
-            "`GaussianLaw`."
+            "depend on parameters, but this model is not declared `normalised`: declare it if "
+            "`log_stationary` is the log of a density, or pass a point or a `GaussianLaw` as "
+            "`initial`."
         )
     check_initial(initial, model, like)
     check_domain(model, observation, record)
@@ -136,14 +136,14 @@ def _check_dimension(model: Diffusion, guess: LinearGaussian, like: Float[Array,
         return
     if guess.matrix is None:
         raise ValueError(
-            f"`observations` have {d} components, and without a `matrix` they are all of the "
-            f"state, which has {fits[0]}: give `LinearGaussian` the `matrix` of what is seen, "
-            f"shape ({d}, {fits[0]})."
+            f"`observations` have {d} components, but without a `matrix` the whole state of "
+            f"{fits[0]} components is observed: pass the `matrix` of the observation model to "
+            f"`LinearGaussian`, shape ({d}, {fits[0]})."
         )
     rows = guess.matrix.shape[0]
     raise ValueError(
         f"`matrix` must have shape ({rows}, {fits[0]}) for a state of {fits[0]} dimensions; got "
-        f"{guess.matrix.shape}."
+        f"shape {guess.matrix.shape}."
     )
 
 
@@ -192,6 +192,7 @@ def check_domain(model: Diffusion, observation: Observation, record: Record) -> 
     outside = np.flatnonzero(whole & ~np.asarray(inside))
     if outside.size:
         raise ValueError(
-            f"`observations[{outside[0]}]` is the state {states[outside[0]]}, seen without noise, "
-            "and that is outside the model's `domain`: give it noise, or leave it out as NaN."
+            f"`observations[{outside[0]}]` is an exact observation of the state "
+            f"{states[outside[0]]}, which is outside the model's `domain`: give it noise, or "
+            "replace it by NaN."
         )

@@ -1,7 +1,7 @@
-"""Times and values as a record of segments, each of the same number of steps.
+"""Times and values as a record of segments with the same number of steps.
 
-Between two times that are far apart there are several segments, at whose ends nothing is seen. So
-every record is K segments of N steps, whatever its times, and one program.
+A long interval between two times consists of several segments, with missing observations at their
+ends. Hence every record has K segments of N steps, for any times, and needs one program only.
 """
 
 import dataclasses
@@ -109,8 +109,8 @@ def as_records(
     widths = [values.shape[1] for _, values in each]
     if len(set(widths)) > 1:
         raise ValueError(
-            "several records must be seen alike, with as many columns of `observations`; got "
-            f"{widths}."
+            "several records must have the same number of observed components (columns of "
+            f"`observations`); got {widths}."
         )
     with jax.ensure_compile_time_eval():  # so that gaps that are known stay so
         gaps = jnp.concatenate([times.gaps for times, _ in each])
@@ -139,8 +139,8 @@ def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, 
         when = list(times)  # pyright: ignore[reportArgumentType]
     if len(rows) == 0 or len(when) != len(rows):
         raise ValueError(
-            "several records are a list of `times` and a list of `observations`, as long and not "
-            f"empty; got {len(when)} and {len(rows)}."
+            "several records need a list of `times` and a list of `observations` of the same "
+            f"length, at least one; got {len(when)} and {len(rows)}."
         )
     return list(zip(when, rows, strict=True))
 
@@ -203,13 +203,13 @@ def _checked(
         values = jnp.concatenate([nothing.astype(values.dtype), values])
     if len(known.shape) != 1 or values.ndim != 2 or values.shape[0] != known.shape[0]:
         raise ValueError(
-            "`times` must have shape (n,) and `observations` (n, m), a row for each of them; got "
+            "`times` must have shape (n,) and `observations` (n, m), one row per time; got "
             f"{known.shape} and {values.shape}."
         )
     if known.shape[0] < 2 or values.shape[1] == 0:
         raise ValueError(
-            "a record has two times or more, at each of which there is something to be seen: "
-            f"`observations` have shape {values.shape}."
+            "a record needs at least two times and one observed component; got `observations` of "
+            f"shape {values.shape}."
         )
     check_precision("`times` and `observations`", _dtype(known, values))
     check_increasing(known)
@@ -217,7 +217,7 @@ def _checked(
         infinite = np.argwhere(np.isinf(values))
         if infinite.size:
             i, j = infinite[0]
-            raise ValueError(f"`observations[{i}, {j}]` is infinite: NaN says it was not seen.")
+            raise ValueError(f"`observations[{i}, {j}]` is infinite: pass NaN for a missing value.")
     return known, values
 
 
@@ -247,7 +247,9 @@ def _filled(name: str, values: Numbers) -> Numbers:
     if not isinstance(values, np.ma.MaskedArray):
         return values
     if name == "times" and np.ma.getmaskarray(values).any():
-        raise ValueError("`times` has masked entries: leave them out, with their observations.")
+        raise ValueError(
+            "`times` has masked entries: leave them out, together with their observations."
+        )
     return np.ma.filled(values.astype(float), np.nan)
 
 

@@ -1,4 +1,4 @@
-"""Arrays over the steps of a record, by segments, axes (K, N), or one after the other."""
+"""Conversion of arrays over the steps of a record between axes (K, N) and a single axis."""
 
 import jax
 import jax.numpy as jnp

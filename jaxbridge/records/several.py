@@ -1,8 +1,8 @@
-"""Several records that share a model: given the parameters they are independent.
+"""Several records that share a model.
 
-So likelihoods multiply, and paths move each by themselves. Records are lanes: all are given as many
-segments as the longest, those beyond the end of a record of steps of length zero, at which nothing
-is seen.
+Given the parameters records are independent, so likelihoods multiply and paths move separately. The
+records are lanes of one program. Each has as many segments as the longest one; additional segments
+have steps of length zero and missing observations.
 """
 
 import dataclasses

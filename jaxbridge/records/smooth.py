@@ -1,5 +1,8 @@
-"""Paths given a whole record: a Markov chain of paths, which move in blocks (`path_blocks`), or of
-states and the bridges between them (`states`)."""
+"""Markov chains of paths given a whole record.
+
+Paths move in blocks (`path_blocks`), or states move together with the bridges between them
+(`states`).
+"""
 
 import dataclasses
 from typing import Any
@@ -49,29 +52,29 @@ _MOST_VARIANCE = 1.0
 _CONSTANT = 1e-3
 
 _STUCK = (
-    "A block of the path never moved. Take more `num_draws`, a shorter `block_length` or more "
-    "steps; where the diffusion could have gone several ways, a `proposal`."
+    "A block of the path never moved. Use more `num_draws`, a shorter `block_length` or more "
+    "steps. If several ways are possible between observations, pass a `proposal`."
 )
 _CUT_OFF = (
-    "Some weights of the `proposal` were cut off at its bound on the work. Allow more trials, or "
-    "choose another."
+    "Some weights of the `proposal` were truncated at its bound on the work. Increase the bound, "
+    "or use another proposal."
 )
-_APART = "Chains disagree (R̂ above 1.1 at some points). Take more `num_draws` and `num_warmup`."
+_APART = "Chains disagree (R̂ above 1.1 at some points). Use more `num_draws` and `num_warmup`."
 
 
 class Smoothed(AbstractResult):
-    """What `smooth` returns: draws of the path given all that was seen.
+    """Draws of the path given all observations, from `smooth`.
 
-    - `times`: of the points, shape (K,); a NumPy array of double precision where they are too far
-        from zero for the precision of paths.
+    - `times`: times of the points, shape (K,). It is a NumPy array of double precision if the
+        precision of paths cannot resolve the times.
     - `paths`: shape (chains, n, K, d).
-    - `accepted`: the share of moves that were accepted, of each block in both ways to cut the
-        record into blocks, shape (2, B); or of each state, shape (ends,), with a `proposal`.
-    - `stuck`: the chains in which a block never moved, shape (chains,): `standard_error` is
-        infinite if there is one, for draws of a path that stays tell nothing of their error.
-    - `num_truncated`: how many weights of a `proposal` were cut off at a bound on the work, by
-        which draws are not exact.
-    - `guide`: diagnostics of the guide of the paths. A poor one is a fault where chains suffer.
+    - `accepted`: acceptance rate of each block in both partitions into blocks, shape (2, B); with a
+        `proposal` that of each state, shape (ends,).
+    - `stuck`: whether a block never moved, shape (chains,). If so in any chain, `standard_error` is
+        infinite, because the draws do not show their error.
+    - `num_truncated`: number of weights of a `proposal` that were truncated at a bound on the work.
+        If there are any, draws are not exact.
+    - `guide`: diagnostics of the guide. A poor guide is a fault only if chains mix poorly, too.
     """
 
     times: Float[Array | np.ndarray, " K"]
@@ -83,11 +86,14 @@ class Smoothed(AbstractResult):
     guide: GuideCheck | None = None
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """The mean of `fn(path)`, a function of one path of shape (K, d), by default itself."""
+        """Return the mean of `fn(path)` over all draws.
+
+        `fn` is a function of one path of shape (K, d), by default the path itself.
+        """
         return jax.tree.map(lambda leaf: jnp.mean(leaf, axis=(0, 1)), self._values(fn))
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """The Monte Carlo error of `mean(fn)`, entry by entry."""
+        """Return the Monte Carlo error of `mean(fn)`, entry by entry."""
 
         def error(leaf):
             made = jnp.std(leaf, axis=(0, 1)) / jnp.sqrt(effective_size_of_chains(leaf))
@@ -96,43 +102,55 @@ class Smoothed(AbstractResult):
         return jax.tree.map(error, self._values(fn))
 
     def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """Estimate the discretisation bias of `mean(fn)`, entry by entry, to its leading term.
+        """Estimate the discretisation bias of `mean(fn)` to leading order, entry by entry.
 
-        With half as many steps each path is e^D times as likely (`halving` in `schemes`). NaN where
-        nothing is known: one step, Euler's steps where σ has fewer columns than rows, and steps so
-        long that in some interval the variance of D is above 1, or that two of them are longer than
-        the relaxation time of the drift, where the uncertainty is infinite. With a `proposal` of a
-        scheme that is more accurate than `density` the estimate is too large.
+        With half as many steps each path is e^D times as likely (`schemes.halving`). If the scheme
+        of a `proposal` is more accurate than `density`, the estimate is too large. It is NaN in
+        these cases:
+
+        - one step;
+        - Euler steps of a σ with fewer columns than rows;
+        - steps so long that the variance of D exceeds 1 in some interval;
+        - steps longer than the relaxation time of the drift. Then the uncertainty is infinite.
         """
         return self._step_errors(fn)[0]
 
     def step_uncertainty(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """Estimate the standard error of `step_error(fn)`, entry by entry. Where σ varies, or the
-        noise ∇α σ that the drift leads on, it is at least `step_error` itself, which is known
-        there up to a factor only."""
+        """Estimate the standard error of `step_error(fn)`, entry by entry.
+
+        If σ depends on the state, or in a hypoelliptic model ∇α σ does, it is at least
+        `step_error(fn)` itself. Then this error is known only up to a factor.
+        """
         return self._step_errors(fn)[1]
 
     def step_error_dominates(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """Whether the step error of `mean(fn)` is beyond its standard error, or not known well
-        enough to say, entry by entry: then more steps help, and more draws do not."""
+        """Return whether the discretisation error exceeds the Monte Carlo error, or may do so.
+
+        Then more steps help, and more draws do not. The result is for `mean(fn)`, entry by entry.
+        """
         told = map(StepError, *map(jax.tree.leaves, self._step_errors(fn)))
         errors, treedef = jax.tree.flatten(self.standard_error(fn))
         return jax.tree.unflatten(treedef, list(map(dominates, told, errors)))
 
     def effective_sample_size(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """How many independent draws of `fn(path)` these are worth, entry by entry: few where
-        chains disagree, as where each found one of two wells."""
+        """Return the effective sample size of `fn(path)`, entry by entry.
+
+        It is small if chains disagree, for instance in different wells.
+        """
         return jax.tree.map(effective_size_of_chains, self._values(fn))
 
     def r_hat(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """R̂ of `fn(path)`, from the halves of all chains: near one if they agree."""
+        """Return R̂ of `fn(path)`, from the halves of all chains: near 1 if they agree."""
         return jax.tree.map(potential_scale_reduction, self._values(fn))
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults: a block that never moved, weights cut off, chains that disagree at
-        some points, a poor guide beside one of these, a step error of the mean path that dominates
-        and is beyond 0.05 standard deviations (root mean square)."""
+        """The faults of the draws, each with a remedy.
+
+        They are: a block that never moved; truncated weights; chains that disagree at some points;
+        a poor guide together with one of these; and a discretisation error of the mean path that
+        dominates and exceeds 0.05 standard deviations (root mean square).
+        """
         error, standard_error = self._errors_in_sds
         stuck, apart = jnp.any(self.stuck), ~self._chains_agree
         guide = () if self.guide is None else (self.guide.fault(stuck | apart),)
@@ -208,31 +226,34 @@ def smooth(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
 ) -> Smoothed:
-    """Draws of the path given a whole record, exact in the limit of many, up to the step error.
+    """Sample paths given a whole record, by Markov chains.
+
+    The law of the draws converges to the law of the path given all observations, up to the
+    discretisation error.
 
     **Arguments:**
 
-    - `key`: a typed key.
+    - `key`: typed key.
     - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
         `initial_time`, `density`: as in `innovations`.
-    - `num_draws`: of each chain, after `num_warmup` in which the size of moves is learnt.
-    - `num_chains`: chains, which start from guided paths that know nothing of each other.
-    - `block_length`: how many intervals between observations move at once, by default 10: more
-        where they are so close that neighbours tell much of each other, fewer where blocks are
-        seldom accepted. Not with a `proposal`.
-    - `proposal`: by default paths are guided by all that was seen, as by a linear process. Across
-        gaps in which the diffusion could have gone several ways (wells, many relaxation times)
-        give a proposal of bridges, as `sample_exact_bridges` takes them: a `Coupling`, or "auto",
-        which tries several on each gap. Then the states at the times of observations move, with
-        new bridges on both sides. That asks for a stationary law and for noise in all that is seen.
-    - `num_proposals`: how many bridges of a `proposal` are made for each move of each gap, by
-        default 10.
-    - `progress_meter`: one of diffrax's, for instance `diffrax.TextProgressMeter()`.
-    - `throw`: raise an error at run time where the result is not `trustworthy`.
+    - `num_draws`: number of draws per chain.
+    - `num_warmup`: number of iterations before the draws, which adapt the size of moves.
+    - `num_chains`: number of chains, which start from independent guided paths.
+    - `block_length`: number of intervals between observations that move at once, by default 10. Use
+        more if observations are so close that neighbouring states are strongly correlated, and
+        fewer if blocks are rarely accepted. Not with a `proposal`.
+    - `proposal`: by default paths are guided by all observations through a linear process. If
+        several ways are possible across a gap (wells, many relaxation times), pass a proposal of
+        bridges as for `sample_exact_bridges`, for instance a `Coupling`, or "auto", which tries
+        several on each gap. Then the states at observation times move, with new bridges on both
+        sides. This needs a stationary law, and noise in all observed components.
+    - `num_proposals`: number of bridges of the `proposal` for each move of each gap, by default 10.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
+    - `throw`: raise an error at run time if the result is not `trustworthy`.
 
-    **Returns:** `Smoothed`. Not differentiable: `innovations` is.
+    **Returns:** `Smoothed`. Not differentiable; use `innovations` for derivatives.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 
@@ -246,9 +267,9 @@ def smooth(
     counts = (check_count("num_draws", num_draws), check_count("num_warmup", num_warmup, 0))
     num_chains = check_count("num_chains", num_chains)
     if proposal is None and num_proposals is not None:
-        raise ValueError("`num_proposals` is for a `proposal`: give one, or leave this out.")
+        raise ValueError("`num_proposals` is for a `proposal`: pass one, or omit `num_proposals`.")
     if proposal is not None and block_length is not None:
-        raise ValueError("`block_length` is for paths without a `proposal`: leave it out.")
+        raise ValueError("`block_length` is for paths without a `proposal`: omit one of the two.")
     block_length = check_count("block_length", 10 if block_length is None else block_length, 2)
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}

@@ -1,7 +1,7 @@
-"""How many draws of x_0 by normal noise count, told by draws that leave nothing out.
+"""Effective fraction of the draws of x_0 by normal noise, estimated from a law that covers ν.
 
-With f the density of x_0 times what it is tilted by, n the normal law in its place, tilted, and q
-the cover, tilted, the share is (∫f)² / ∫ f²/n = (E_q f/q)² / E_q (f/q)(f/n).
+Let f be the tilted density of x_0, n the tilted normal law in its place, and q the tilted mixture
+of `cover`. The fraction is (∫f)² / ∫ f²/n = (E_q f/q)² / E_q (f/q)(f/n).
 """
 
 import math

@@ -1,20 +1,22 @@
-"""Paths of a record across gaps in which the diffusion could have gone several ways: the states at
-the ends of segments are part of the chain, and bridges from any proposal join them.
+"""Paths of a record across gaps in which several ways are possible.
 
-A proposal of bridges is a path from a to b with a weight w, E[w h(path)] = p(b|a) E_bridge[h]. So
-does the mean ŵ of several, with one of them drawn in proportion to its weight. The chain holds the
-states x_k, and for each segment such a path and its ŵ; and (Andrieu & Roberts 2009)
+The states at the ends of segments are part of the chain, and bridges from any proposal join them.
+
+A proposal of bridges is a path from a to b with a weight w such that
+E[w h(path)] = p(b|a) E_bridge[h]. The same holds for the mean ŵ of several weights with one path
+drawn in proportion to its weight. The state of the chain has the states x_k, and such a path with
+its ŵ for each segment. The density
 
     π(x_0) Π_k ŵ_k g(y_k|x_k)
 
-is a density on all of it, of which what the record says of states and paths is a marginal. States
-with even and with odd k move in turn, all of one kind at once: x_k' with new paths on both of its
-sides is accepted with probability
+has the conditional law of states and paths given the record as a marginal (Andrieu & Roberts 2009).
+States with even and with odd k move in turn, all of one kind at once. A new state x_k' with new
+paths on both sides is accepted with probability
 
-    min{1, ŵ'_left ŵ'_right g(y_k|x_k') q(x_k) / (ŵ_left ŵ_right g(y_k|x_k) q(x_k'))},
+    min{1, ŵ'_left ŵ'_right g(y_k|x_k') q(x_k) / (ŵ_left ŵ_right g(y_k|x_k) q(x_k'))}.
 
-from a random walk, where q falls out, and every other time from a normal law q, the stationary
-mean and covariance as the observation corrects them. Then each segment is offered a new path
+Two kinds of proposals of x_k' alternate: a random walk, for which q cancels, and a normal law q,
+the normal approximation of ν conditioned on the observation. Then each segment proposes a new path
 between the same two states.
 """
 
@@ -260,32 +262,32 @@ def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars)
     model, law = problem.model, bound(problem.initial, problem.model)
     if model.depends_on_time or not model.sigma_is_invertible(problem.like):
         raise ValueError(
-            "bridges of a `proposal` are for coefficients that do not depend on time and σ with an "
-            "inverse: leave out `proposal`, so that paths are guided by the whole record."
+            "bridges of a `proposal` need coefficients that do not depend on time, and an "
+            "invertible σ: leave out `proposal`, so that paths are guided by the whole record."
         )
     if not (model.has_sampler or model.has_density):
         raise ValueError(
-            "states at the times of observations are proposed by the moments of the stationary "
-            "law: give `Diffusion` a `log_stationary` or `sample_stationary`, or leave out "
-            "`proposal`, so that paths are guided by the whole record."
+            "a `proposal` needs the moments of the stationary law, for states at the times of "
+            "observations: give `Diffusion` a `log_stationary` or `sample_stationary`, or leave "
+            "out `proposal`, so that paths are guided by the whole record."
         )
     if proposal.coupled and not model.has_density:
         raise ValueError(
-            "a coupling weighs the states that move by the stationary density: give `Diffusion` a "
-            "`log_stationary` (up to a constant), or choose a proposal that does not need it, such "
-            "as `ModifiedDiffusionBridge()` or `Guided()`."
+            "the weights of a coupling need the stationary density at the moving states: give "
+            "`Diffusion` a `log_stationary` (up to a constant), or use a proposal that does not "
+            "need it, such as `ModifiedDiffusionBridge()` or `Guided()`."
         )
     if not is_traced(scalars) and np.any(scalars.seen & (scalars.variances <= 0)):
         raise ValueError(
-            "with a `proposal` every component that is seen must have noise, but `covariance` has "
+            "with a `proposal` every observed component must have noise, but `covariance` has "
             "variances of zero: leave out `proposal`, so that paths are guided by the record."
         )
     if isinstance(law, GaussianLaw) and not is_traced(law):
         if np.any(np.diagonal(semidefinite_cholesky(law.covariance)) == 0):
             raise ValueError(
-                "with a `proposal` the first state is known or has a density, but the covariance "
-                "of `initial` is singular: leave out `proposal`, so that paths are guided by the "
-                "record."
+                "with a `proposal` the first state must be a point or have a density, but the "
+                "covariance of `initial` is singular: leave out `proposal`, so that paths are "
+                "guided by the record."
             )
 
 

@@ -1,17 +1,18 @@
-"""A normal step, given what is seen at its end, and tilted by what is seen later.
+"""Normal step, conditioned on observations at its end and tilted by later observations.
 
-Points are counted from a point ξ' of the path along which the process is linearised, u = x' - ξ'.
-A step u ~ N(e, Λ Λᵀ), Λ of shape (d, m), given a number y = c·u + N(0, ρ) is, with b = Λᵀc and
-s = |b|² + ρ,
+Points are relative to a point ξ' of the path of the linearisation, u = x' - ξ'. Let a step be
+u ~ N(e, Λ Λᵀ), with Λ of shape (d, m). Given a scalar y = c·u + N(0, ρ), with b = Λᵀc and
+s = |b|² + ρ, its law is
 
-    N(e + Λ b (y - c·e) / s, Λ⁺ Λ⁺ᵀ),    Λ⁺ = Λ (I - b bᵀ / (s (1 + √(ρ/s)))),
+    N(e + Λ b (y - c·e) / s, Λ⁺ Λ⁺ᵀ),    Λ⁺ = Λ (I - b bᵀ / (s (1 + √(ρ/s)))).
 
-which is Potter's square root (Bierman 1977, chapter V), and is right for ρ = 0: then Λ⁺ᵀ c = 0.
-Tilted by h(u) = exp(rᵀu - ½ uᵀH u), with M = I + ΛᵀHΛ = ℛ ℛᵀ and v = ℛ⁻¹ Λᵀ (r - He), it is
+This is Potter's square root (Bierman 1977, chapter V). It allows ρ = 0; then Λ⁺ᵀ c = 0.
+Tilted by h(u) = exp(rᵀu - ½ uᵀH u), with M = I + ΛᵀHΛ = ℛ ℛᵀ and v = ℛ⁻¹ Λᵀ (r - He), the step is
 
     e + Λ ℛ⁻ᵀ (v + ζ),  ζ ~ N(0, I),    ∫ h dN = exp(rᵀe - ½ eᵀHe + ½ |v|²) / det ℛ.
 
-Neither calls for an inverse of Λ, so it may be singular, zero, or of fewer columns than rows.
+Neither formula needs an inverse of Λ. Hence Λ may be singular, zero, or have fewer columns than
+rows.
 """
 
 from typing import NamedTuple

@@ -1,10 +1,10 @@
-"""A path of the diffusion that stays near what is seen, to start the search for a guide from.
+"""Path of the diffusion that stays near the observations, as a start of the search for a guide.
 
-Where the extended Kalman filter is thrown off (a first state that is hardly known, between two
-wells or on an unstable branch; spikes), the path of its means is far from every path that explains
-what is seen. Particles go several ways, and those that come near what is seen go on. They need not
-come as near as the noise of the observations asks: weights are tempered at each observation, so
-that several particles count at all of them.
+The extended Kalman filter may diverge, for instance if the first state is uncertain, between two
+wells or on an unstable branch, or if there are spikes. Then the path of its means is far from every
+path that explains the observations. Here particles follow several ways, and resampling selects
+those near the observations. The weights are tempered at each observation, so that several particles
+remain effective although they are further away than the noise suggests.
 """
 
 import jax

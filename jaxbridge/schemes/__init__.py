@@ -1,18 +1,33 @@
-"""One step, x' = step(x, ΔW) with ΔW ~ N(0, δ I): made, inverted, and its density.
+"""Numerical schemes, densities of one step, and discretisation errors.
 
-A scheme (`base`) makes the step, says which noise made it, ΔW = noise(x, x'), and how a pair of
-points lies for that noise, by the direction u and the length of σ(x')⁻¹(x - x') (`relative_frame`).
-Schemes are `euler` and `milstein`, `heun` of second order for constant σ, `semi_implicit` for stiff
-drift, and for a linear one its own transition (`gaussian_transition`); whether scheme, model and
-points fit is checked (`fit`); by default it is the one that the scene calls for
-(`heun_or_euler`). The density of a step (`step_density`), a normal law N(μ(x), δ σ S σᵀ), which is
-singular where noise does not reach the whole state (`step_law`), makes the likelihood of a path,
-Σ log q(x_i, x_{i+1}) (`path_likelihood`). The same of every other point says what half as many
-steps would give (`halving`), and so how far N steps are from the limit (`step_error`); or estimates
-on coarser and coarser grids do (`coarse_grids`).
+A scheme (`base`) has three functions. With noise ΔW ~ N(0, δ I):
+
+- `step` computes the next point, x' = step(x, ΔW);
+- `noise` inverts the step, ΔW = noise(x, x');
+- `frame` returns the direction and the length of σ(x')⁻¹(x - x') for a coupled pair
+  (`relative_frame`).
+
+The schemes are:
+
+- `euler` and `milstein`;
+- `heun`, of weak order 2 for constant σ;
+- `semi_implicit`, for stiff drift;
+- `gaussian_transition`, exact for linear drift and constant σ;
+- `heun_or_euler`, the default, which selects by the model.
+
+`fit` checks that scheme, model and end points fit together; `nearest_law` relates a scheme to a
+step density.
+
+A step density (`step_density`) is a normal law N(μ(x), δ σ S σᵀ) of one step. It is singular if
+noise does not enter all coordinates (`step_law`). The sum Σ log q(x_i, x_{i+1}) is the
+log-likelihood of a path (`path_likelihood`).
+
+Two methods estimate the discretisation error. `halving` compares N with N/2 steps on the same
+paths, and `step_error` derives the error from this comparison. `coarse_grids` compares estimates on
+coarser grids.
 """
 
-# What the folders above use of this one.
+# The names that other folders import from this one.
 from .base import (
     AbstractScheme as AbstractScheme,
     fitted_in_lanes as fitted_in_lanes,

@@ -1,10 +1,11 @@
-"""One step of a path: made, inverted, and seen by a pair. Steps have length δ, in units of time;
-noise increments are N(0, δ I).
+"""Interface of the numerical schemes: a step, its inverse, and the frame of a coupled pair.
 
-A bridge is built from a path that was simulated backwards, so each scheme must also answer:
-which noise drives the forward equation along a given path? (equation (Wrev) of the paper for
-Euler). The inverse must use the forward drift. To take the negative of the noise that generated the
-reversed path would be wrong by O(δ) per step, which adds up to the drift itself.
+Steps have length δ in units of time; noise increments are N(0, δ I).
+
+A coupled bridge contains a path that was simulated backwards. Hence each scheme must also compute
+the noise that drives the forward equation along a given path (equation (Wrev) of the paper for
+Euler). This inverse must use the forward drift. The negative of the noise that generated the
+reversed path would be wrong by O(δ) per step; these errors add up to the drift itself.
 """
 
 from abc import abstractmethod
@@ -22,9 +23,11 @@ from .relative_frame import Frame
 
 
 class AbstractScheme(eqx.Module):
-    """A one-step scheme. All methods act on one point of shape (d,); `dt` is a scalar.
+    """Base class of one-step schemes.
 
-    `stratonovich` says whether it works with Stratonovich's form of the equation.
+    All methods act on one point of shape (d,), with a scalar step size `dt`. `dynamics` has the
+    functions `drift` and `sigma` of the equation. The class attribute `stratonovich` states whether
+    the scheme uses the Stratonovich form of the equation.
     """
 
     stratonovich: ClassVar[bool]
@@ -33,8 +36,11 @@ class AbstractScheme(eqx.Module):
     def fitted(
         self, dynamics: Dynamics, like: Float[Array, " d"], dt: Float[Array, ""]
     ) -> "AbstractScheme":
-        """The scheme with all that depends on the equation and the step size but not on the
-        point, such as matrix functions, worked out. One without such things returns itself."""
+        """Return the scheme with all quantities computed that do not depend on the point.
+
+        Examples are matrix functions of the equation and of `dt`. `like` is a point of the right
+        shape and dtype. Schemes without such quantities return `self`.
+        """
 
     @abstractmethod
     def step(
@@ -44,7 +50,7 @@ class AbstractScheme(eqx.Module):
         dt: Float[Array, ""],
         dw: Float[Array, " d"],
     ) -> Float[Array, " d"]:
-        """The point reached from `x` after `dt` with noise increment `dw`."""
+        """Return the point after one step from `x` with the noise increment `dw`."""
 
     @abstractmethod
     def noise(
@@ -54,7 +60,7 @@ class AbstractScheme(eqx.Module):
         x_next: Float[Array, " d"],
         dt: Float[Array, ""],
     ) -> Float[Array, " d"]:
-        """The noise increment that takes `x` to `x_next` in `dt`: the inverse of `step`."""
+        """Return the noise increment of the step from `x` to `x_next`: the inverse of `step`."""
 
     @abstractmethod
     def frame(
@@ -64,7 +70,10 @@ class AbstractScheme(eqx.Module):
         driven: Float[Array, " d"],
         dt: Float[Array, ""],
     ) -> Frame:
-        """How a pair lies for the noise of the step, once the drift of it is done (`meeting`)."""
+        """Return the frame of the pair (`x`, `driven`) after the drift of the step.
+
+        Couplings and meeting rules use it.
+        """
 
 
 def fitted_in_lanes(

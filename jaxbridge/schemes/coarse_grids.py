@@ -1,21 +1,22 @@
-"""How far is an estimate from its limit, by what longer steps change?
+"""Discretisation error of an estimate, from estimates on two coarser grids.
 
-Grids of steps that are 1, 2 and 4 times as long (the first what is left of N) give L_0, L_1 and
-L_2. Where the error of a step of k times the length is C k^{p+1}, up to what is of higher order,
-that of a grid is C S, with S the sum of k^{p+1} over its steps, and so
+Grids with step sizes 1, 2 and 4 times as large give the estimates L_0, L_1 and L_2. (The first step
+of a coarser grid is shorter if N is not divisible.) To leading order, the error of one step of k
+times the size is C k^{p+1}. Hence the error of a grid is C S, with S the sum of k^{p+1} over its
+steps. With c_1 = L_1 - L_0 and c_2 = L_2 - L_1 it follows
 
-    error of L_0 = S_0 / (S_1 - S_0) · (L_1 - L_0) = s c_1,   c_2 = L_2 - L_1 = m c_1,
-    m = (S_2 - S_1) / (S_1 - S_0),
+    error of L_0 = s c_1,        s = S_0 / (S_1 - S_0),
+    c_2 = m c_1,                 m = (S_2 - S_1) / (S_1 - S_0).
 
-which for N a power of two are s = (2^p - 1)⁻¹ and m = 2^p. By how much c_2 is not m c_1 tells what
-s c_1 leaves out. If changes go on to shrink from grid to grid as they did from the third to the
-second, by ρ = c_2 / c_1, that is
+For N a power of two these are s = (2^p - 1)⁻¹ and m = 2^p. The difference c_2 - m c_1 measures the
+terms of higher order that s c_1 omits. Suppose that changes continue to shrink from grid to grid by
+the ratio ρ = c_2 / c_1. Then the omitted part is
 
-    s |c_2 - m c_1| / (ρ - 1),
+    s |c_2 - m c_1| / (ρ - 1).
 
-which is more than what is left out if there are two orders only, and infinite where changes do
-not shrink or go to and fro. Two orders may agree by chance, so that a share of s c_1 is doubted
-whatever they do; and all of it where there are too few steps for a third grid.
+This is an upper bound if the error has terms of two orders only. It is infinite if changes do not
+shrink or alternate in sign. Terms of two orders may also cancel by chance. Hence the uncertainty
+always includes a fraction of s c_1, and all of it if N is too small for a third grid.
 """
 
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Euler and Maruyama's scheme."""
+"""The Euler–Maruyama scheme."""
 
 from typing import ClassVar
 
@@ -7,9 +7,9 @@ from .relative_frame import frame_after_drift
 
 
 class Euler(AbstractScheme):
-    """Euler–Maruyama, `x + α(x)δ + σ(x)ΔW`, as in the paper. Its inverse is exact.
+    """Euler–Maruyama scheme, `x + α(x)δ + σ(x)ΔW`, as in the paper.
 
-    Strong order ½ (1 for constant σ), weak order 1.
+    It has strong order ½ (1 for constant σ) and weak order 1. Its inverse is exact.
 
     **Example:**
 

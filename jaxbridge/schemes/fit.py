@@ -1,4 +1,4 @@
-"""Do the model, the end points and the scheme fit?"""
+"""Checks that the model, the end points and the scheme fit together."""
 
 import jax
 import numpy as np
@@ -28,11 +28,11 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
         for value in (drift, sigma):
             bad = ~np.all(np.isfinite(value).reshape(len(value), -1), axis=1)
             if bad.any() and not all_finite_leaves(model.params):
-                raise ValueError(f"the `params` of the model are not finite: {model.params}.")
+                raise ValueError(f"the `params` of the model must be finite; got {model.params}.")
             if bad.any():
                 raise ValueError(
-                    f"the coefficients of the model are not finite at `{name}` = "
-                    f"{points[bad.argmax()]}: is that point inside the state space?"
+                    f"drift or σ of the model is not finite at `{name}` = {points[bad.argmax()]}: "
+                    "pass a point inside the state space."
                 )
         worst = np.linalg.cond(sigma).argmax()
         check_invertible(f"diffusion` at `{name}", sigma[worst])
@@ -41,8 +41,8 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
         other_coordinates = 1 - np.eye(points.shape[1])[:, None, :]
         if np.any(slopes * other_coordinates != 0):
             raise ValueError(
-                "`Milstein` needs diagonal noise in which σ_i depends on x_i alone; here it "
-                "depends on other coordinates too. Choose `Heun` or `Euler`."
+                "`Milstein` needs diagonal noise in which σ_i depends on x_i alone; here σ_i "
+                "depends on other coordinates, too. Use `Heun` or `Euler`."
             )
 
 

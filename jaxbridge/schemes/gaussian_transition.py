@@ -1,4 +1,4 @@
-"""The exact transition of a linear diffusion."""
+"""The exact transition of a linear diffusion, as a scheme without discretisation error."""
 
 from typing import ClassVar
 
@@ -14,19 +14,20 @@ from .relative_frame import frame_of
 
 
 class GaussianTransition(AbstractScheme):
-    """The exact transition of a linear diffusion, α(x) = α(0) + A x with constant σ,
+    """Exact transition of a linear diffusion, α(x) = α(0) + A x with constant σ:
 
-        x + M_δ α(x) + R ΔW,    M_δ = ∫_0^δ e^{sA} ds,   R Rᵀ δ = Γ_δ,
+        x + M_δ α(x) + R ΔW,    M_δ = ∫_0^δ e^{sA} ds,   R Rᵀ δ = Γ_δ.
 
-    with the root R = σ L, L lower triangular, that tends to σ as δ → 0. Paths of the diffusion
-    and of its time reversal have no step error at all, nor have bridges made of them, and
-    transition densities by these, if the meeting rule is `BrownianCrossing`: at its grid points
-    one step is as good as many. That is so for given parameters only. Where parameters are
-    inferred from the paths (`gibbs`, `score`, `maximum_likelihood`) the likelihood of a path has a
-    step error of its own, whatever the scheme, so there `num_steps` still counts.
+    Γ_δ is the covariance of a step. R = σ L, with L lower triangular, tends to σ as δ → 0.
 
-    **Raises:** `ValueError`, when it is used, for a drift that is not linear, or σ that depends on
-    the state.
+    Paths of the diffusion and of its time reversal have no discretisation error. With the meeting
+    rule `BrownianCrossing` the same holds for bridges and transition densities made from them: at
+    the grid points one step is as accurate as many. This holds for given parameters only. Functions
+    that infer parameters from paths (`gibbs`, `score`, `maximum_likelihood`) use a path likelihood
+    with a discretisation error of its own, so there `num_steps` still matters.
+
+    **Raises:** `ValueError`, at the first use, for a drift that is not linear or a σ that depends
+    on the state.
 
     **Example:**
 
@@ -41,9 +42,9 @@ class GaussianTransition(AbstractScheme):
     def fitted(self, dynamics, like, dt):
         if not is_linear(dynamics, like):
             raise ValueError(
-                "`GaussianTransition` is for linear drift and constant σ; this model has "
-                f"{'a σ that depends on the state' if dynamics.sigma_varies else 'another drift'}. "
-                "Leave `scheme=` out."
+                "`GaussianTransition` needs linear drift and constant σ; this model has "
+                f"{'a state-dependent σ' if dynamics.sigma_varies else 'a nonlinear drift'}. "
+                "Omit `scheme=` to use the default scheme."
             )
         sigma = dynamics.sigma(like).as_matrix(like.shape[0], like.dtype)
         moments = linear_transition(jax.jacfwd(dynamics.drift)(like), matmul(sigma, sigma.T), dt)

@@ -1,26 +1,30 @@
-"""What half as many steps would have given, from the same paths.
+"""Estimates for N/2 steps from paths of N steps, without further simulation.
 
-Every other point of a path on the grid is a path on the grid of half as many steps, whose law has
-steps of twice the length, of density q_2δ. With points between of some density r(x'| x, x'') that
-is a law of whole paths, and so, with weights w for the law of N steps,
+Every other point of a path is a path on the grid of N/2 steps. Its target law has steps of twice
+the size, with the density q_2δ. Together with any density r(x'| x, x'') of the points between, this
+defines a law of complete paths. With weights w for the law of N steps,
 
-    E[w e^D h(path)] = the same for N/2 steps,
+    E[w e^D h(path)] = the same expectation for N/2 steps,
     D = Σ log [q_2δ(x, x'') r(x'| x, x'')] - log [q_δ(x, x') q_δ(x', x'')],
 
-a sum over every other step, and nothing need be simulated anew. The nearer r is to what it is for
-N steps, the less random is D. It is here what it would be if the drift were linear, as it is seen
-from x, and σ were as it is there: then the second step has a density n(x''| x, x'), normal with a
-mean linear in x', both steps together a normal density n_2(x''| x), and r = q_δ n / n_2, so that
+a sum over pairs of steps. D varies less the closer r is to the law of x' under N steps. The module
+takes r from the model linearised at x, with σ as at x. There the second step has a density
+n(x''| x, x'), normal with a mean linear in x', and both steps together have a normal density
+n_2(x''| x). Then r = q_δ n / n_2, and
 
     D = Σ log [q_2δ(x, x'') / n_2(x''| x)] + log [n(x''| x, x') / q_δ(x', x'')].
 
-Where σ is constant its variance is O(δ²), or O(δ) where σ has fewer columns than rows and leads
-noise on by a ∇α σ that is constant: differences are known to a fraction of a standard error.
-Otherwise it is of O(1), like log weights themselves, or little less; and of Euler's steps of such a
-σ there is no density. An error of O(δ^p) is the (2^p - 1)-th part of the difference (`step_error`).
+The variance of D depends on the model:
 
-Of an odd number of steps the last is left as it is, and D counts for a little more; of one step
-nothing is known.
+- constant, invertible σ: O(δ²). The difference then has an error of a fraction of the standard
+  error of the estimate;
+- constant σ with fewer columns than rows, and constant ∇α σ: O(δ);
+- otherwise O(1), like log weights, or slightly less.
+
+Euler steps of a σ with fewer columns than rows have no density, and so no D. An error of O(δ^p) is
+the difference divided by 2^p - 1 (`step_error`).
+
+If N is odd, the last step is left out and D is scaled up. For N = 1 D is NaN.
 """
 
 import jax.numpy as jnp

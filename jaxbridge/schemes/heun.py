@@ -1,4 +1,4 @@
-"""Heun's scheme."""
+"""The scheme of Heun, a predictor–corrector for the Stratonovich form."""
 
 from typing import ClassVar
 
@@ -12,15 +12,16 @@ from .relative_frame import frame, frame_after_drift
 
 
 class Heun(AbstractScheme):
-    """Heun's predictor–corrector for the Stratonovich form of the equation,
+    """Predictor–corrector scheme of Heun, for the Stratonovich form of the equation:
 
-        x + ½ [α_S(x) + α_S(x̃)] δ + ½ [σ(x) + σ(x̃)] ΔW,    α_S = α - ½ Σ_jk ∂_kσ_·j σ_kj,
+        x + ½ [α_S(x) + α_S(x̃)] δ + ½ [σ(x) + σ(x̃)] ΔW,    α_S = α - ½ Σ_jk ∂_kσ_·j σ_kj.
 
-    with x̃ the Euler point of the same form. Weak order 2 for constant σ, 1 otherwise.
+    The predictor x̃ is the Euler step of the same form. The weak order is 2 for constant σ, and 1
+    otherwise.
 
-    The inverse is that of the trapezoid rule along the path,
-    `½ [σ(x) + σ(x⁺)] ξ = x⁺ - x - ½ [α_S(x) + α_S(x⁺)] δ`; after a predictor–corrector step it
-    returns the noise up to O(δ^{3/2}), for constant σ up to O(δ^{5/2}).
+    The inverse ξ solves the trapezoid rule along the path,
+    `½ [σ(x) + σ(x⁺)] ξ = x⁺ - x - ½ [α_S(x) + α_S(x⁺)] δ`. After a predictor–corrector step it
+    returns the noise up to O(δ^{3/2}), and up to O(δ^{5/2}) for constant σ.
 
     **Example:**
 

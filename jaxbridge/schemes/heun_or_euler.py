@@ -1,4 +1,4 @@
-"""The scheme that a scene calls for."""
+"""The default scheme: selection between `Heun` and `Euler` by the model."""
 
 from typing import ClassVar
 
@@ -10,11 +10,11 @@ from .heun import Heun
 
 
 class HeunOrEuler(AbstractScheme):
-    """`Heun` where σ is constant, `Euler` where it depends on the state.
+    """Default scheme: `Heun` for constant σ, `Euler` for a state-dependent σ.
 
-    For constant σ the corrector takes the weak order from 1 to 2 for one more drift. Where σ
-    depends on the state both are of weak order 1, and Stratonovich's correction, which calls for
-    the derivatives of σ, is an effect that nothing asks for.
+    For constant σ the corrector raises the weak order from 1 to 2, at the cost of one more
+    evaluation of the drift. For a state-dependent σ both schemes have weak order 1, but Heun also
+    needs the derivatives of σ.
 
     **Example:**
 

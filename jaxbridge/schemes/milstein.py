@@ -1,4 +1,4 @@
-"""Milstein's scheme."""
+"""The scheme of Milstein, for diagonal noise."""
 
 from typing import ClassVar
 
@@ -13,16 +13,18 @@ from .relative_frame import frame_after_drift
 
 
 class Milstein(AbstractScheme):
-    """Milstein's scheme for diagonal noise, where σ_i depends on x_i alone (which covers d = 1):
+    """Milstein scheme for diagonal noise, in which σ_i depends on x_i alone (for instance d = 1):
 
         x_i + α_i δ + σ_i ΔW_i + ½ σ_i ∂_iσ_i (ΔW_i² - δ).
 
-    Strong order 1. The inverse solves the quadratic for the root that tends to the Euler
-    noise as ∂σ → 0; it is exact as long as `1 + ∂_iσ_i ΔW_i > 0`, which fails with a
-    probability that vanishes faster than any power of δ. Of a step that no increment explains it
-    is the fold, ΔW_i = -1/∂_iσ_i, whose step comes nearest. For constant σ this is Euler.
+    It has strong order 1. For constant σ it is the Euler scheme.
 
-    **Raises:** `ValueError`, when it is used, for a σ that is a full, state-dependent matrix.
+    The inverse solves the quadratic equation for the root that tends to the Euler noise as ∂σ → 0.
+    It is exact if `1 + ∂_iσ_i ΔW_i > 0`. The probability that this fails vanishes faster than any
+    power of δ. For a step without a solution, the inverse returns ΔW_i = -1/∂_iσ_i, which gives the
+    nearest step.
+
+    **Raises:** `ValueError`, at the first use, if σ is a full, state-dependent matrix.
 
     **Example:**
 
@@ -73,8 +75,8 @@ class Milstein(AbstractScheme):
             if y.shape[0] == 1:
                 return sigma.as_matrix(1, y.dtype)[0]
             raise ValueError(
-                "`Milstein` is for scalar or diagonal noise: let `diffusion` return the "
-                "diagonal of σ, shape (d,), or choose `Heun` or `Euler`."
+                "`Milstein` needs scalar or diagonal noise, but `diffusion` returns a matrix: "
+                "return the diagonal of σ, shape (d,), or use `Heun` or `Euler`."
             )
 
         return jax.jvp(diagonal, (x,), (jnp.ones_like(x),))[1]

@@ -1,4 +1,4 @@
-"""The normal law of a step that comes nearest to that of a scheme, for its step error."""
+"""Choice of the step density nearest to a scheme, for the estimate of its discretisation error."""
 
 from ..models.dynamics import Dynamics
 from .base import AbstractScheme

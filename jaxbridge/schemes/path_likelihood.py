@@ -1,33 +1,35 @@
-"""The likelihood of a path (section 4 of the paper, for any model).
+"""Log-likelihood of a path, observed at times t_0 < ... < t_K (section 4 of the paper, any model).
 
-Of a path seen at times t_0 < ... < t_K, relative to the law of σW where σ does not depend on the
-parameters. By Girsanov's theorem its logarithm is
+If σ does not depend on the parameters, the likelihood is a density relative to the law of σW. By
+Girsanov's theorem its logarithm is
 
-    ∫ αᵀ V⁻¹ dX - ½ ∫ αᵀ V⁻¹ α dt,
+    ∫ αᵀ V⁻¹ dX - ½ ∫ αᵀ V⁻¹ α dt.
 
-in three forms that have one limit, and as the Euler density itself. Orders are those of means
-over paths: path by path "girsanov" is off by O(√δ), and so is "ito_taylor" where the drift has a
-curl, for then the points of a path do not determine the integral; without one it is off by O(δ).
+Four forms have this limit as δ → 0; a fifth one is the Euler density itself.
 
-* "girsanov": sums over left points, the Euler density without what does not depend on the drift.
-  For any σ(x); an error of O(δ).
-* "trapezoid": for constant σ and a drift without a curl, that is in one dimension and for models
-  declared reversible, the trapezoid rule in Stratonovich's form,
+* "girsanov": sums with the coefficients at the left points. It is the Euler density without the
+  terms that do not depend on the drift. For any σ(x); the error is O(δ).
+* "trapezoid": trapezoid rule in Stratonovich form,
 
       Σ ½ (β + β') · Δw - ¼ (|β|² + |β'|²) δ - ½ div β' δ,    β = σ⁻¹α,
 
-  where div β' at the end of each step makes up for what the rule is too large by in the first term;
-  an error of O(δ²). Quadratic in a β that is linear in parameters, and concave.
-* "ito_taylor": for constant σ, `ItoTaylorDensity` step by step; an error of O(δ²).
-* "ito": for a gradient drift V⁻¹α = ∇A with constant V, that is for reversible models, where
-  A = ½ log ν. By Itô's formula no stochastic integral is left,
+  for constant σ and a drift without curl: in one dimension, or for models declared reversible. The
+  divergence is at the end of each step, which corrects the bias of the first term. The error is
+  O(δ²). If β is linear in parameters, the form is quadratic and concave in them.
+* "ito_taylor": `ItoTaylorDensity` step by step, for constant σ. The error is O(δ²).
+* "ito": for constant V and a gradient drift V⁻¹α = ∇A, that is for reversible models, where
+  A = ½ log ν. By Itô's formula the logarithm contains no stochastic integral:
 
       A(X_T) - A(X_0) - ½ ∫ [tr(V ∇²A) + ∇AᵀV ∇A] dt,
 
-  in which tr(V ∇²A) = div α; the integral is by the trapezoid rule, with an error of O(δ²). For
-  the hyperbolic diffusion this is α H_T - ½ α² B_T, equation (likelihood).
-* "euler": Σ log N(x_{i+1}; x_i + α(x_i) δ_i, V(x_i) δ_i), a density in the points of the path.
-  The one form in which σ may depend on parameters.
+  in which tr(V ∇²A) = div α. The trapezoid rule gives the integral with an error of O(δ²). For the
+  hyperbolic diffusion this form is α H_T - ½ α² B_T, equation (likelihood).
+* "euler": Σ log N(x_{i+1}; x_i + α(x_i) δ_i, V(x_i) δ_i), a density of the points of the path. It
+  is the only form in which σ may depend on parameters.
+
+The orders hold for means over paths. For a single path the error of "girsanov" is O(√δ). So is that
+of "ito_taylor" if the drift has a curl, because then the points of a path do not determine the
+integral; without a curl it is O(δ).
 """
 
 import math
@@ -59,24 +61,27 @@ Form = Literal["girsanov", "trapezoid", "ito_taylor", "ito", "euler"]
 def path_log_likelihood(
     model: Diffusion, times: Numbers, path: Numbers, *, form: Form | None = None
 ) -> Float[Array, "*batch"]:
-    """The log likelihood of paths, differentiable in the parameters of the drift.
+    """Return the log-likelihood of paths, differentiable in the parameters of the drift.
 
     **Arguments:**
 
     - `model`: the diffusion.
-    - `times`: increasing, shape (K,); or (I, K), for each of I intervals its own.
-    - `path`: points at these times, shape (..., K, d); (I, ..., K, d) with times of shape (I, K).
-        So the paths of bridges fit, for one interval or several.
-    - `form`: "girsanov", "trapezoid", "ito_taylor", "ito" or "euler"; by default the most accurate
-        that the model has: for constant σ "ito" if it is reversible with a known ν, "trapezoid" if
-        it is reversible or one-dimensional, else "ito_taylor"; "girsanov" for a σ that varies.
+    - `times`: increasing, shape (K,). For I intervals with separate times, shape (I, K).
+    - `path`: points at these times, shape (..., K, d), or (I, ..., K, d) with times of shape
+        (I, K). The paths of bridges of one or several intervals have these shapes.
+    - `form`: "girsanov", "trapezoid", "ito_taylor", "ito" or "euler". The default is the most
+        accurate form for the model:
+        - "girsanov" for a state-dependent σ. The following are for constant σ:
+        - "ito" for a reversible model with a stationary density;
+        - "trapezoid" for other reversible or one-dimensional models;
+        - "ito_taylor" otherwise.
 
-    **Returns:** shape (...), in the dtype of `path`: relative to the law of σW, or, as "euler",
-    to Lebesgue's measure.
+    **Returns:** log-likelihoods of shape (...), in the dtype of `path`. They are relative to the
+    law of σW, for "euler" to Lebesgue measure.
 
-    **Raises:** `ValueError` for shapes that do not fit, times that do not increase, or a form
-    that the model does not have; `TypeError` where a derivative is taken in parameters of σ,
-    except as "euler".
+    **Raises:** `ValueError` for shapes that do not fit, times that do not increase, or a form that
+    is invalid for the model. `TypeError` for a derivative in parameters of σ, except with
+    "euler".
 
     **Example:**
 
@@ -94,8 +99,8 @@ def path_log_likelihood(
     times, steps = known
     if path.ndim < 2 or path.shape[-2] < 2:
         raise ValueError(
-            "`path` must hold two or more points in the axis before the last, shape (..., K, d); "
-            f"got {path.shape}."
+            "`path` must have shape (..., K, d) with at least two points, K >= 2; got shape "
+            f"{path.shape}."
         )
     check_precision("`path`", path.dtype)
     num_times = path.shape[-2]
@@ -104,14 +109,16 @@ def path_log_likelihood(
     )
     if not fits:
         raise ValueError(
-            f"`times` must have shape ({num_times},), as many as the path has points, or (I, "
+            f"`times` must have shape ({num_times},), the number of points of the path, or (I, "
             f"{num_times}) for paths of shape (I, ..., {num_times}, d); got {times.shape} for "
             f"paths of shape {path.shape}."
         )
     if times.ndim == 1:
         check_increasing(known)
     elif not is_traced(steps) and not np.all(np.asarray(steps) > 0):
-        raise ValueError("`times` must be finite and increase.")
+        raise ValueError(
+            "`times` must be finite and increase strictly: sort them and remove duplicates."
+        )
     return log_likelihood_of_steps(model, steps.astype(path.dtype), path, form)
 
 
@@ -142,9 +149,9 @@ def known_sigma(sigma: Array) -> Array:
 @known_sigma.def_jvp
 def _refuse(primals, tangents):
     raise TypeError(
-        "σ depends on parameters in which a derivative is taken, and paths have no density that "
-        "depends on σ: differentiate in the parameters of the drift only, or, for the density of "
-        'the Euler scheme at the points of the path, choose `form="euler"`.'
+        "σ depends on parameters in which a derivative is taken, but a path has no density "
+        "relative to the law of σW that depends on σ: differentiate in the parameters of the drift "
+        'only, or pass `form="euler"` for the Euler density of the points of the path.'
     )
 
 
@@ -270,12 +277,12 @@ def _form(model: Diffusion, like: Float[Array, " d"], form: Form | None) -> Form
         return form
     if form == "trapezoid" and "ito_taylor" in forms:
         raise ValueError(
-            '`form="trapezoid"` is for one dimension and models with `reversible=True`, whose '
-            'drift is a gradient: choose "ito_taylor".'
+            '`form="trapezoid"` needs a one-dimensional model, or one with `reversible=True`: pass '
+            'form="ito_taylor".'
         )
     if "ito_taylor" not in forms:
-        raise ValueError(f'`form="{form}"` is for constant σ: choose "girsanov" or "euler".')
+        raise ValueError(f'`form="{form}"` needs constant σ: pass form="girsanov" or form="euler".')
     raise ValueError(
-        '`form="ito"` is for models with `reversible=True` and a `log_stationary`, whose drift is '
-        'a gradient: choose "ito_taylor".'
+        '`form="ito"` needs a gradient drift, that is a model with `reversible=True` and a '
+        '`log_stationary`: pass form="ito_taylor".'
     )

@@ -1,4 +1,4 @@
-"""How a pair of copies of the diffusion lies, seen from the driven one (section 2.1)."""
+"""Relative position of a coupled pair in noise coordinates (section 2.1 of the paper)."""
 
 from typing import NamedTuple
 
@@ -11,12 +11,14 @@ from ..models.sigma import AbstractSigma
 
 
 class Frame(NamedTuple):
-    """How the pair (x, x') lies, seen from the driven process x'.
+    """Relative position of the pair (x, x') in the noise coordinates of the driven process x'.
 
-    `sigma` is σ(x'), or the root R of the scheme's noise; `u`, shape (d,), the unit vector along
-    `σ(x')⁻¹(x - x')`, zero where the two are equal; `gap` the length of that vector, in square
-    roots of a unit of time. Schemes may look at the pair after the drift of their step; `Heun`
-    takes u after half of it, and the gap before.
+    - `sigma`: σ(x'), or the matrix R that multiplies the noise in the scheme.
+    - `u`: unit vector along `σ(x')⁻¹(x - x')`, shape (d,); zero if x = x'.
+    - `gap`: length of `σ(x')⁻¹(x - x')`, in square roots of the unit of time.
+
+    Schemes may evaluate u and the gap after the drift of their step. `Heun` evaluates u after half
+    of the drift, and the gap before it.
     """
 
     sigma: AbstractSigma

@@ -1,4 +1,4 @@
-"""The linearly implicit trapezoid rule."""
+"""The linearly implicit trapezoid rule, for stiff or superlinear drift."""
 
 from typing import ClassVar
 
@@ -15,17 +15,19 @@ from .relative_frame import frame_of
 
 
 class SemiImplicit(AbstractScheme):
-    """The linearly implicit trapezoid rule, for stiff or superlinear drift,
+    """Linearly implicit trapezoid rule, for stiff or superlinear drift:
 
         x + L⁻¹ [α(x) δ + σ(x) ΔW],    L = I - ½ δ ∇α(x),
 
-    with ∇α by automatic differentiation. A step is one solve, and its inverse is explicit,
-    `σ⁻¹ [L (x⁺ - x) - α δ]`. It does not overflow where explicit schemes do: of a linear drift it
-    keeps the stationary law exactly however long the steps, and for α = -x³ far out a step
-    leads to x/3. Strong order ½ (1 for constant σ), weak order 1, 2 for linear drift.
+    with ∇α by automatic differentiation. A step solves one linear system. Its inverse is explicit,
+    `σ⁻¹ [L (x⁺ - x) - α δ]`.
 
-    Steps must be short beside the inverse of the positive eigenvalues of ½∇α, at which L is
-    singular: those of the barrier in a double well.
+    The scheme stays stable for step sizes at which explicit schemes overflow. For linear drift it
+    preserves the stationary law exactly, for every step size. For α = -x³ a step from a large x
+    leads to x/3. The strong order is ½ (1 for constant σ), the weak order 1 (2 for linear drift).
+
+    The step size must be much smaller than 1/λ for each positive eigenvalue λ of ½∇α, because L is
+    singular at δ = 1/λ. Positive eigenvalues occur, for instance, at the barrier of a double well.
 
     **Example:**
 

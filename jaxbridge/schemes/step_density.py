@@ -1,37 +1,40 @@
-"""The law of one step, from x in a time δ: what a path's weight is made of.
+"""Normal law of one step from x of length δ: the factors of the weight of a path.
 
-The target of a weighted path is a Markov chain on its grid, whose steps are normal,
+The target of a weighted path is a Markov chain on its grid, with normal steps
 
     x' ~ N(μ(x), δ σ(x) S(x) σ(x)ᵀ).
 
-Each step has a probability density, so the weights have the chain's own transition density as
-their mean: finite, whatever the model. How near that is to p_T is the step error.
+Each step has a probability density. Hence the mean of the weights is the transition density of the
+chain, which is finite for every model. Its distance from p_T is the discretisation error.
 
-`EulerDensity`, μ = x + αδ and S = I, is O(δ) away, for any σ. For constant σ more is known. In the
-coordinates of the noise, with β = σ⁻¹α and A = ∇β, the first terms of Itô's and Taylor's expansion
-(Kloeden & Platen 1992, section 14.2) are normal as well, `ItoTaylorDensity`,
+*Euler.* `EulerDensity` has μ = x + αδ and S = I. Its error is O(δ), for any σ.
+
+*Constant σ.* In noise coordinates, let β = σ⁻¹α and A = ∇β. The first terms of the Itô–Taylor
+expansion (Kloeden & Platen 1992, section 14.2) are normal as well. `ItoTaylorDensity` is the law of
 
     x + βδ + ½δ² (Aβ + ½Δβ) + ∫_0^δ [I + (δ-s) A] dW_s,
 
-with S = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ ≥ ¼ I however long the step, and O(δ²) away from p_T.
+with S = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ ≥ ¼ I for every step size. Its error is O(δ²).
 
-Noise that reaches only a part of the state, σ of fewer columns than rows, comes to the rest by way
-of the drift. Euler's step moves nothing else than that part. The expansion is the same, in the
-coordinates of the state: with F = ∇α its noise is
+*Hypoelliptic models*, with fewer columns than rows in σ. Noise enters only some coordinates, and
+the drift carries it to the others. An Euler step has no noise in the others. The expansion above
+holds in state coordinates: with F = ∇α its noise is
 
-    ∫_0^δ [I + (δ-s) F] σ dW_s = √δ (σ + ½δ Fσ) ζ_1 + δ^{3/2} / √12 Fσ ζ_2,    ζ ~ N(0, I),
+    ∫_0^δ [I + (δ-s) F] σ dW_s = √δ (σ + ½δ Fσ) ζ_1 + δ^{3/2} / √12 Fσ ζ_2,    ζ ~ N(0, I).
 
-the strong scheme of order 1.5 (Kloeden & Platen, section 10.4; for hypoelliptic diffusions
-Ditlevsen & Samson 2019). Such a σ that depends on the state adds l (∫ s dW_s), with l = ∇σ α:
+This is the strong scheme of order 1.5 (Kloeden & Platen, section 10.4; for hypoelliptic diffusions
+Ditlevsen & Samson 2019). A state-dependent σ adds l (∫ s dW_s), with l = ∇σ α. The noise of
+`HypoellipticDensity` is therefore
 
-    √δ (σ + ½δ [Fσ + l]) ζ_1 + δ^{3/2} / √12 [Fσ - l] ζ_2,
+    √δ (σ + ½δ [Fσ + l]) ζ_1 + δ^{3/2} / √12 [Fσ - l] ζ_2.
 
-`HypoellipticDensity`. What is left out, Σ ∇σ_k σ_j ∫∫ dW_j dW_k, is not normal: O(δ) along a path,
-but O(δ²) where each ∇σ_k σ_j vanishes, as where σ depends only on what noise does not reach at
-once; with them vanish the second derivatives of σ that would belong to l. In place of l_k stands
-l_k / √(1 + δ² |l_k|² / |σ_k|²), which is as near, so that σ + δl is nowhere zero where σ is not.
+The omitted term Σ ∇σ_k σ_j ∫∫ dW_j dW_k is not normal. Its contribution along a path is O(δ). If
+each ∇σ_k σ_j vanishes, the total error is O(δ²). One such case is a σ that depends only on
+coordinates without direct noise. In this case the second derivatives of σ that belong to l vanish,
+too. The code replaces l_k by l_k / √(1 + δ² |l_k|² / |σ_k|²), which has the same order of accuracy.
+Then σ + δl is nonzero wherever σ is.
 
-Where coefficients depend on time they are taken in the middle of a step, which keeps both orders.
+Time-dependent coefficients are evaluated in the middle of a step, which preserves both orders.
 """
 
 from abc import abstractmethod
@@ -52,8 +55,10 @@ from .step_law import DegenerateLaw, StepLaw, root_of_length
 
 
 class LinearStep(NamedTuple):
-    """A step of dX = [c + F X] dt + σ dW: x' ~ N(`decay` x + `integral` c, `covariance`), with
-    matrices of shape (d, d)."""
+    """Step of the linear process dX = [c + F X] dt + σ dW.
+
+    Its law is x' ~ N(`decay` x + `integral` c, `covariance`), with matrices of shape (d, d).
+    """
 
     decay: Float[Array, "d d"]
     integral: Float[Array, "d d"]
@@ -61,11 +66,12 @@ class LinearStep(NamedTuple):
 
 
 class StepsFrom(NamedTuple):
-    """Steps from one point, as functions of their length δ.
+    """Steps from one point, as two functions of the step size δ.
 
-    - `law`: the law of the step, a `DegenerateLaw` where σ has no inverse.
-    - `decay`: the derivative of the mean of σ⁻¹x' in σ⁻¹x, shape (d, d), where the drift is linear;
-        of x' in x where σ has no inverse.
+    - `law`: returns the law of the step, a `StepLaw`, or a `DegenerateLaw` if σ is not invertible.
+    - `decay`: returns the derivative of the mean of x' with respect to x for the linearised drift,
+        shape (d, d). It is in noise coordinates (σ⁻¹x' and σ⁻¹x), or in state coordinates if σ is
+        not invertible.
     """
 
     law: Callable[[Float[Array, ""]], Any]
@@ -73,25 +79,29 @@ class StepsFrom(NamedTuple):
 
 
 class AbstractStepDensity(eqx.Module):
-    """The normal law of a step. `order` is p of the error O(δ^p) that it adds up to along a path,
-    in the mean over paths."""
+    """Base class of step densities: the normal law of one step of a target chain.
+
+    The class attribute `order` is p in the error O(δ^p) along a path, in the mean over paths.
+    """
 
     order: ClassVar[int]
 
     @abstractmethod
     def steps_from(self, dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
-        """The law of a step from x."""
+        """Return the law of a step from `x` as functions of the step size."""
 
     @abstractmethod
     def linear_step(
         self, F: Float[Array, "d d"], V: Float[Array, "d d"], dt: Float[Array, ""]
     ) -> LinearStep:
-        """The same of a linear process with V = σσᵀ, of which it is a closed form."""
+        """Return the step of a linear process with drift matrix `F` and V = σσᵀ, in closed form."""
 
 
 class EulerDensity(AbstractStepDensity):
-    """The Euler scheme, N(x + α(x) δ, V(x) δ), for any σ: O(δ) along a path. What noise does not
-    reach at once is not moved by it within a step.
+    """Step density of the Euler scheme, N(x + α(x) δ, V(x) δ), for any σ.
+
+    Its error is O(δ) along a path. In a hypoelliptic model the coordinates without direct noise
+    have no noise within a step.
 
     **Example:**
 
@@ -125,12 +135,13 @@ class EulerDensity(AbstractStepDensity):
 
 
 class ItoTaylorDensity(AbstractStepDensity):
-    """Itô's and Taylor's expansion of weak order 2, for constant σ: O(δ²) along a path.
+    """Step density of the Itô–Taylor expansion of weak order 2, for constant σ.
 
-    It calls for the first and second derivatives of the drift along the columns of σ, by autodiff.
-    Where σ has fewer columns than rows noise comes within a step to what the drift leads it to.
+    Its error is O(δ²) along a path. It needs the first and second derivatives of the drift along
+    the columns of σ, which automatic differentiation computes. In a hypoelliptic model the drift
+    carries noise to further coordinates within a step.
 
-    **Raises:** `ValueError`, when it is used, for a σ that depends on the state.
+    **Raises:** `ValueError`, at the first use, for a state-dependent σ.
 
     **Example:**
 
@@ -144,8 +155,9 @@ class ItoTaylorDensity(AbstractStepDensity):
     def steps_from(self, dynamics, x):
         if dynamics.sigma_varies:
             raise ValueError(
-                "`ItoTaylorDensity` is for constant σ, but this one depends on the state: choose "
-                "`EulerDensity()`, or `HypoellipticDensity()` for σ of fewer columns than rows."
+                "`ItoTaylorDensity` is for constant σ, but σ of this model depends on the state: "
+                "use `EulerDensity()`, or `HypoellipticDensity()` for a σ with fewer columns than "
+                "rows."
             )
         sigma, d = dynamics.sigma(x), x.shape[0]
         if not sigma.invertible:
@@ -174,16 +186,21 @@ class ItoTaylorDensity(AbstractStepDensity):
 
 
 class HypoellipticDensity(AbstractStepDensity):
-    """Itô's and Taylor's expansion for a σ(x) of fewer columns than rows, whose noise the drift
-    leads on within the step: O(δ) along a path, O(δ²) where noise does not change σ at once, as
-    where the noise of velocities depends on positions. Step errors are told as for O(δ). Where σ is
-    constant it is `ItoTaylorDensity`; near a boundary at which σ has no slope, as of a square root,
-    Euler's step may be nearer.
+    """Step density of the Itô–Taylor expansion for hypoelliptic models with a state-dependent σ(x).
 
-    It calls for the first and second derivatives of the drift along the columns of σ, and for the
-    first of σ along the drift, by autodiff.
+    σ has fewer columns than rows, and the drift carries noise to further coordinates within a step.
 
-    **Raises:** `ValueError`, when it is used, for a σ that has an inverse.
+    - The error is O(δ) along a path, and discretisation errors are estimated accordingly.
+    - The error is O(δ²) if noise does not change σ directly. An example is a noise of velocities
+        that depends on positions.
+    - For constant σ it equals `ItoTaylorDensity`.
+    - Near a boundary where the derivative of σ is not finite (for instance of a square root) the
+        Euler step may be more accurate.
+
+    It needs the first and second derivatives of the drift along the columns of σ, and the first
+    derivative of σ along the drift. Automatic differentiation computes them.
+
+    **Raises:** `ValueError`, at the first use, for an invertible σ.
 
     **Example:**
 
@@ -198,8 +215,8 @@ class HypoellipticDensity(AbstractStepDensity):
     def steps_from(self, dynamics, x):
         if dynamics.sigma(x).invertible:
             raise ValueError(
-                "`HypoellipticDensity` is for σ of fewer columns than rows, but this one has as "
-                "many: choose `ItoTaylorDensity()` for constant σ, else `EulerDensity()`."
+                "`HypoellipticDensity` needs a σ with fewer columns than rows, but σ of this model "
+                "is invertible: use `ItoTaylorDensity()` for constant σ, else `EulerDensity()`."
             )
         return _degenerate_ito_taylor(dynamics, x)
 

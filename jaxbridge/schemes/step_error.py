@@ -1,19 +1,20 @@
-"""How far is an estimate from its limit as the steps shrink?
+"""Discretisation error of an estimate: its distance from the limit for small steps.
 
-With D of `halving`, paths with weights w are paths of half as many steps with weights w e^D. What
-an estimate changes by when it takes those is (2^p - 1) times its error, where that is O(δ^p),
+With D of `halving`, paths with weights w e^D have the law of half as many steps. If the error is
+O(δ^p), its leading term is
 
-    error = (2^p - 1)⁻¹ [estimate of N/2 steps - estimate of N steps],
+    error = (2^p - 1)⁻¹ [estimate of N/2 steps - estimate of N steps].
 
-in its leading term. The two share their paths, and so the difference has far less Monte Carlo
-error than either where D is small; what it has is told beside it. Where a few of the paths have
-nearly all of the weights w e^D, the two laws have little in common: steps are too long for this, or
-for anything, and the uncertainty is infinite. So it is where steps are longer than the relaxation
-time of the drift. The log of a mean of few weights is on average too
-small, by half its relative variance to leading order, and that is made up for.
+Both estimates use the same paths. Hence their difference has a much smaller Monte Carlo error than
+either of them if D is small. This error is reported as the uncertainty.
 
-Where σ varies e^D has heavy tails. Weights of half as many steps from the same noise have not, and
-take the place of w e^D where only the mean of weights is wanted (`error_of_coupled_grids`).
+The uncertainty is infinite in two cases: if few paths carry nearly all of the weights w e^D, and if
+a step is longer than the relaxation time of the drift. In both cases the steps are too long for an
+estimate. The log of a mean of few weights is too small on average, by half the relative variance to
+leading order; the estimate corrects this bias.
+
+For a state-dependent σ e^D has heavy tails. Weights of half as many steps from the same noise do
+not. They replace w e^D if only the mean of the weights is needed (`error_of_coupled_grids`).
 """
 
 import math
@@ -39,10 +40,10 @@ _MATTERS = 0.05
 # What rounding adds to log p is no matter below this.
 _FELT = 1e-3
 _STEPS = (
-    "The step error (`step_error`, `step_uncertainty`) is beyond the standard error and beyond "
-    "0.05 (of a log density, or of a standard deviation), or it is not known well enough. Take "
-    "more `num_steps`; for stiff drift use the scheme `SemiImplicit()`; for couplings whose σ(x) "
-    "varies run two grids and `extrapolate`."
+    "The discretisation error (`step_error`, `step_uncertainty`) exceeds the standard error and "
+    "0.05 (of a log density, or of a standard deviation), or its estimate is too uncertain. Use "
+    "more `num_steps`; for stiff drift use the scheme `SemiImplicit()`; for couplings with a "
+    "state-dependent σ(x) run two grids and `extrapolate`."
 )
 
 

@@ -1,9 +1,9 @@
-"""The normal law of a step, from x in a time δ.
+"""Normal law of one step from x, of length δ, in two representations.
 
-Where σ has an inverse it is kept in the coordinates of the noise, N(μ, δ σ S σᵀ) with S near I
-(`StepLaw`). Where noise reaches only a part of the state at once, and the rest by way of the drift,
-it is N(μ, Λ Λᵀ) with Λ lower triangular (`DegenerateLaw`): what the step does not move at all has a
-zero on the diagonal of Λ, and then there is no density.
+- `StepLaw`, for an invertible σ: N(μ, δ σ S σᵀ), stored in noise coordinates, with S near I.
+- `DegenerateLaw`, for hypoelliptic models, in which noise enters only some coordinates directly:
+  N(μ, Λ Λᵀ) with Λ lower triangular. A coordinate without noise has a zero on the diagonal of Λ,
+  and then there is no density.
 """
 
 from typing import NamedTuple
@@ -26,12 +26,11 @@ from ..models.sigma import AbstractSigma
 
 
 class StepLaw(NamedTuple):
-    """N(μ, δ σ S σᵀ), the law of a step from one point in a time δ.
+    """Normal law N(μ, δ σ S σᵀ) of one step of length δ from one point, for an invertible σ.
 
     - `mean`: μ, shape (d,).
     - `sigma`: σ at the point.
-    - `covariance`: S in the coordinates of the noise, shape (d, d), or a number, shape (), for a
-        multiple of I.
+    - `covariance`: S in noise coordinates, shape (d, d), or a scalar for a multiple of I.
     - `dt`: δ.
     """
 
@@ -42,37 +41,40 @@ class StepLaw(NamedTuple):
 
     @property
     def matrix(self) -> Float[Array, "d d"]:
-        """S, also where it is a number."""
+        """S as a matrix of shape (d, d), also if `covariance` is a scalar."""
         S, d = self.covariance, self.mean.shape[0]
         return S * jnp.eye(d, dtype=self.mean.dtype) if S.ndim == 0 else S
 
     @property
     def root(self) -> Float[Array, "d d"]:
-        """Λ of N(μ, Λ Λᵀ), zero of a step of length zero."""
+        """Λ of N(μ, Λ Λᵀ), shape (d, d); zero for δ = 0."""
         root = self.sigma.as_matrix(self.mean.shape[0], self.mean.dtype) * root_of_length(self.dt)
         S = self.covariance
         return root * jnp.sqrt(S) if S.ndim == 0 else matmul(root, cholesky(S))
 
     def solve(self, displacement: Float[Array, " d"]) -> Float[Array, " d"]:
-        """Λ⁻¹ of it, zero of a step of length zero."""
+        """Return Λ⁻¹ times the displacement; zero for δ = 0."""
         moving = self.dt > 0
         safe = self._replace(dt=jnp.where(moving, self.dt, 1))
         return jnp.where(moving, safe.noise(safe.mean + displacement), 0)
 
     def point(self, xi: Float[Array, " d"]) -> Float[Array, " d"]:
-        """μ + √δ σ L ξ, with S = L Lᵀ."""
+        """Return the point μ + √δ σ L ξ, with S = L Lᵀ."""
         S = self.covariance
         noise = jnp.sqrt(S) * xi if S.ndim == 0 else matvec(cholesky(S), xi)
         return self.mean + jnp.sqrt(self.dt) * self.sigma.mv(noise)
 
     def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
-        """ξ of the step to this point."""
+        """Return ξ, the normalised noise of the step to `point`: the inverse of `point`."""
         S, scaled = self.covariance, self._scaled(point)
         return scaled / jnp.sqrt(S) if S.ndim == 0 else solve_lower(cholesky(S), scaled)
 
     def log_relative(self, point: Float[Array, " d"]) -> Float[Array, ""]:
-        """log of the density, but for factors that all laws with this σ and δ share:
-        ½ (d - |ξ|² - log det S), of which sums along a path stay small."""
+        """Return ½ (d - |ξ|² - log det S), the log density without a term of σ, δ and d.
+
+        All laws with the same σ and δ share the omitted term. Sums along a path stay small, which
+        limits rounding errors.
+        """
         scaled = self._scaled(point)
         if self.covariance.ndim == 0:
             square, log_det = dot(scaled, scaled) / self.covariance, self._log_det()
@@ -81,25 +83,27 @@ class StepLaw(NamedTuple):
         return (scaled.shape[0] - square - log_det) / 2
 
     def log_relative_of_noise(self, xi: Float[Array, " d"]) -> Float[Array, ""]:
-        """The same at the point of this noise."""
+        """Return `log_relative` at the point with the noise `xi`."""
         return (xi.shape[0] - dot(xi, xi) - self._log_det()) / 2
 
     @property
     def log_scale(self) -> Float[Array, ""]:
-        """log |det σ|, which `log_relative` leaves out."""
+        """log |det σ|, which `log_relative` omits."""
         return self.sigma.log_abs_det()
 
     def carried(
         self, decay: Float[Array, "d d"], displacement: Float[Array, " d"]
     ) -> Float[Array, " d"]:
-        """Where a linear step leads from there, with `decay` in the coordinates of the noise."""
+        """Return the displacement after a linear step, with `decay` in noise coordinates."""
         return self.sigma.mv(matvec(decay, self.sigma.solve(displacement)))
 
     def after(
         self, first: "StepLaw", decay: Float[Array, "d d"], x: Float[Array, " d"]
     ) -> "StepLaw":
-        """The law of two steps from x: of `first`, and of a linear step that from x has this
-        law."""
+        """Return the law of two steps from x: `first`, then a linear step.
+
+        Started in x, the linear step would have the law `self`.
+        """
         dt = first.dt + self.dt
         if first.sigma is self.sigma:
             covariance = first.dt * matmul(matmul(decay, first.matrix), decay.T)
@@ -112,7 +116,7 @@ class StepLaw(NamedTuple):
         return StepLaw(mean, self.sigma, covariance, dt)
 
     def log_density(self, point: Float[Array, " d"]) -> Float[Array, ""]:
-        """Of the step to this point, in units of space to the power -d."""
+        """Return the log density of the step to `point`, in units of space to the power -d."""
         scale = self.log_scale + point.shape[0] * jnp.log(2 * np.pi * self.dt) / 2
         return self.log_relative(point) - point.shape[0] / 2 - scale
 
@@ -126,10 +130,11 @@ class StepLaw(NamedTuple):
 
 
 class DegenerateLaw(NamedTuple):
-    """N(μ, Λ Λᵀ), which may be singular.
+    """Normal law N(μ, Λ Λᵀ) of one step of length δ, which may be singular.
 
     - `mean`: μ, shape (d,).
-    - `root`: Λ, lower triangular, zeros on its diagonal where nothing moves.
+    - `root`: Λ, lower triangular, shape (d, d). Coordinates without noise have a zero on its
+        diagonal.
     - `dt`: δ.
     """
 
@@ -142,32 +147,36 @@ class DegenerateLaw(NamedTuple):
         return jnp.diagonal(self.root) > 0
 
     def solve(self, displacement: Float[Array, " d"]) -> Float[Array, " d"]:
-        """Λ⁻¹ of it, zero along what Λ does not move."""
+        """Return Λ⁻¹ times the displacement; zero for coordinates without noise."""
         return solve_root(self.root, displacement)
 
     def log_relative(self, point: Float[Array, " d"]) -> Float[Array, ""]:
-        """log of the density, but for factors that all laws share: ½ (d - |ξ|²) - log det Λ. NaN
-        where there is none."""
+        """Return ½ (d - |ξ|²) - log det Λ, the log density without a term that depends on d only.
+
+        Return NaN if the law has no density.
+        """
         xi = self.solve(point - self.mean)
         log_det = total(jnp.log(jnp.where(self._moves, jnp.diagonal(self.root), jnp.nan)))
         return (xi.shape[0] - dot(xi, xi)) / 2 - log_det
 
     @property
     def log_scale(self) -> Float[Array, ""]:
-        """What `log_relative` leaves out: nothing."""
+        """Zero: `log_relative` omits no term that depends on the law."""
         return jnp.zeros((), self.mean.dtype)
 
     def carried(
         self, decay: Float[Array, "d d"], displacement: Float[Array, " d"]
     ) -> Float[Array, " d"]:
-        """Where a linear step leads from there, with `decay` in the coordinates of the state."""
+        """Return the displacement after a linear step, with `decay` in state coordinates."""
         return matvec(decay, displacement)
 
     def after(
         self, first: "DegenerateLaw", decay: Float[Array, "d d"], x: Float[Array, " d"]
     ) -> "DegenerateLaw":
-        """The law of two steps from x: of `first`, and of a linear step that from x has this
-        law."""
+        """Return the law of two steps from x: `first`, then a linear step.
+
+        Started in x, the linear step would have the law `self`.
+        """
         mean = self.mean + self.carried(decay, first.mean - x)
         both = jnp.concatenate([matmul(decay, first.root), self.root], axis=1)
         return DegenerateLaw(mean, semidefinite_factor(both), first.dt + self.dt)

@@ -104,7 +104,7 @@ def hitting_variation(
         )
     if bridges.paths.ndim != 3 or len(bridges.paths) < 2:
         raise ValueError(
-            "`bridges` needs two or more bridges of one interval, paths of shape (n, N+1, d); got "
+            "`bridges` must be two or more of one interval, with paths of shape (n, N+1, d); got "
             f"paths of shape {bridges.paths.shape}."
         )
     hits = hitting_counts(
@@ -127,6 +127,7 @@ def hitting_variation(
     estimates = _regress(rho, weights, ends)
     replicates = _replicates(resampled, rho, weights, ends)
     variances, intercept, slope, mean, ratio = estimates
+    # `nanstd`: a bootstrap sample without a usable bridge has no estimate.
     return HittingVariation(
         jnp.asarray(ends),
         variances,
@@ -151,6 +152,7 @@ def _regress(
     x = (1 / sizes).astype(variances.dtype)
     slope = jnp.sum((x - x.mean()) * variances) / jnp.sum((x - x.mean()) ** 2)
     intercept = variances.mean() - slope * x.mean()
+    # The variance of 1/π is not negative, but its estimate may be.
     ratio = jnp.sqrt(jnp.maximum(intercept, 0)) / mean[-1]
     return variances, intercept, slope, mean[-1], ratio
 

@@ -60,6 +60,7 @@ class Estimate(NamedTuple):
 
         The threshold allows for rounding errors.
         """
+        # The largest scale of all variables, because a single one may be zero.
         scale = max(np.abs(self.mean).max(), self.sd.max())
         return self.sd > 1e-6 * scale
 
@@ -158,12 +159,13 @@ def _estimate(scene: Scene, method: str, result: Any) -> Estimate:
         fine, coarse = (
             _estimate(scene, EXTRAPOLATED[method], part) for part in (result.fine, result.coarse)
         )
+        # Extrapolation to small steps. The two runs are independent, so squared errors add up.
         share = float(share_of_known_order(result.fine.step_share))
         mean = fine.mean + share * (fine.mean - coarse.mean)
         return Estimate(
             mean,
             np.hypot((1 + share) * fine.error, share * coarse.error),
-            fine.sd,
+            fine.sd,  # a scale only
             fine.num_simulated + coarse.num_simulated,
             fine.num_missing + coarse.num_missing,
         )
@@ -175,6 +177,7 @@ def _estimate(scene: Scene, method: str, result: Any) -> Estimate:
         simulated, truncated = int(result.num_simulated), int(result.num_truncated)
         return Estimate(value, value * relative, value, simulated, truncated)
     met = np.asarray(result.met)
+    # Missing bridges are NaN, so they must not enter the sums.
     values = scene.values(result.paths)[met]
     truncated = np.asarray(getattr(result, "truncated", False))
     missing = int(np.sum(~met | truncated))
@@ -247,6 +250,7 @@ def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
     The error includes the change between half the steps and all steps, as a bound of the
     discretisation error.
     """
+    # The limit does not depend on the scheme, so the most accurate one serves for all settings.
     best = run.proposal.most_accurate(*scene.interval("float64")[:2])
     limit = run._replace(proposal=best)
     half = limit._replace(num_steps=max(run.num_steps // 2, 1))
@@ -298,6 +302,7 @@ def measure(
         gamma,
         run.dtype,
         run.num_steps,
+        # Each uncertainty includes the error of the value to compare with.
         rms(estimate.mean - exact.mean),
         rms(np.hypot(estimate.error, exact.error)),
         rms(estimate.mean - limit.mean),
@@ -305,7 +310,7 @@ def measure(
         rms(limit.mean - exact.mean),
         monte_carlo,
         seconds,
-        max(first - seconds, 0.0),
+        max(first - seconds, 0.0),  # noise of the clock may exceed the compile time
         estimate.num_simulated,
         effective,
         effective / seconds,

@@ -127,8 +127,8 @@ class WorkPrecision(NamedTuple):
         best = self.cheapest(target)
         if target is None or best is None:
             return (
-                f"accuracy {target:g}: no setting is shown to reach it; use more steps, or more "
-                "bridges"
+                f"accuracy {target:g}: none of these settings is shown to reach it; use more "
+                "steps, or more bridges"
             )
         seconds = best.seconds_for(target)
         return (

@@ -233,6 +233,7 @@ def coupling_pilots(
         )
     (start,), (end,), (duration,) = problem.intervals
     intervals, num_steps, d = problem.intervals, problem.num_steps, start.shape[0]
+    # Twice the number of pairs that the fit below needs, because some pairs do not meet.
     num_pilot = check_count("num_pilot", num_pilot, 20 * d)
     bridge_key, law_key, weigh_key = jax.random.split(key, 3)
     bridges = sample_bridges(
@@ -266,6 +267,7 @@ def coupling_pilots(
     for share, law in zip(_SHARES, laws, strict=False):
         weighted = weigh_bridges(weigh_key, model, bridges, start_law=law, max_trials=_PILOT_TRIALS)
         trials = (float(weighted.num_simulated) - float(bridges.num_proposals)) / met.sum()
+        # Truncated counts are too small, so the efficiency would be too large.
         usable = np.asarray(weighted.truncated).mean() < 0.01
         efficiency = float(weighted.efficiency) if usable else np.nan
         tuned = eqx.tree_at(lambda c: c.start_law, coupling, law)
@@ -285,6 +287,7 @@ def best_pilot(pilots: list[Pilot]) -> Pilot:
             f"{[(p.acceptance, p.trials_per_count) for p in pilots]}. Lengthen the duration or "
             "choose a smaller `gamma`."
         )
+    # NaN marks pilot runs that failed; comparisons with NaN below are false.
     best = np.nanmax([pilot.efficiency for pilot in pilots])
     near_best = [pilot for pilot in pilots if pilot.efficiency > best / _TOLERANCE]
     return min(near_best, key=lambda pilot: (pilot.fit_share, -pilot.efficiency))
@@ -307,6 +310,7 @@ def _stationary_draws(
             key, model, end[0], duration[0], num_steps=num_steps, coupling=coupling
         )
         law = Stationary(burn_in)
+    # One batch only, because each draw may need a burn-in.
     num_draws = min(num_draws, most_lanes(intervals.end.shape[1]))
     keys = jax.random.split(key_for("stationary draws", key), num_draws)
     draws = _draw_stationary(law, model, coupling.scheme, keys, intervals, num_steps)

@@ -146,6 +146,7 @@ def work_precision(
     ```
     """
     check_key(key)
+    # A single step here: the grids of the settings are checked below.
     problem = bridge_problem(model, start, end, duration, 1)
     if problem.batched:
         raise ValueError(
@@ -170,6 +171,7 @@ def work_precision(
     grids = [*steps, *(n // 2 for n in steps)] if set(methods) & set(EXTRAPOLATED) else steps
     if len(grids) > len(steps) and any(n % 2 for n in steps):
         raise ValueError(f"`num_steps` must be even for extrapolation; got {tuple(steps)}.")
+    # Raise if a time of `save_at` is missing on some grid.
     for candidate, n in itertools.product(candidates, grids):
         problem.keep(save_at, duration, candidate.fractions(n))
     runs = _runs(methods, candidates, dtypes, steps, num_bridges)
@@ -191,6 +193,7 @@ def work_precision(
     start_point, end_point = (np.asarray(point[0]) for point in problem.intervals[:2])
     length = float(problem.intervals.duration[0])
     times = np.asarray(as_floating("save_at", save_at), float)
+    # End points are the same for all bridges.
     inside = (times > 0) & (times < length)
     if not inside.any() and not all(map(is_density, methods)):
         raise ValueError(_NOTHING_TO_ESTIMATE)
@@ -207,6 +210,7 @@ def work_precision(
         truth = exact[is_density(run.method)]
         # Approximate bridges converge to a law of their own, not to the exact one.
         limit = limits[id(run.proposal)] if run.method == "approximate" else truth
+        # The same key for all settings reduces the noise of comparisons.
         settings.append(measure(key, scene, run, truth, limit, repeats))
         state = meter.step(state, jnp.asarray(num_finished / len(runs)))
     meter.close(state)
@@ -230,7 +234,7 @@ def _runs(
     ]
     if not runs:
         raise ValueError(
-            f"no proposal of `proposals` fits any of `methods`; got {tuple(methods)}. "
+            f"none of `proposals` fits any of `methods`; got {tuple(methods)}. "
             '"approximate" and "renewal" need a coupling, "crank_nicolson" a guided proposal.'
         )
     return runs
@@ -241,14 +245,15 @@ def _check_references(
 ) -> None:
     """Raise `ValueError` for arguments that none of the methods uses."""
     of_density = {is_density(run.method) for run in runs}
+    # The options that the methods in use ignore.
     of_paths = {"fn": fn, "reference": reference} if of_density == {True} else {}
     of_densities = {"log_density": log_density} if of_density == {False} else {}
-    for wanted, values in (("of paths", of_paths), ('"density"', of_densities)):
+    for kind, values in (("of paths", of_paths), ('"density"', of_densities)):
         names = [f"`{name}`" for name, value in values.items() if value is not None]
         if names:
             raise ValueError(
-                f"{' and '.join(names)}: for a method {wanted}, which is not among `methods`. "
-                "Leave this out."
+                f"{' and '.join(names)}: for a method {kind}, which is not among `methods`. Omit "
+                "the option, or add such a method."
             )
 
 
@@ -258,9 +263,9 @@ def _check_settings(
     if not steps:
         raise ValueError("`num_steps` must contain at least one number of steps; got none.")
     if not methods or not all(isinstance(m, str) and m in METHODS for m in methods):
-        raise ValueError(f"`methods` must contain names out of {METHODS}; got {tuple(methods)}.")
+        raise ValueError(f"`methods` must be names among {METHODS}; got {tuple(methods)}.")
     if not dtypes or not all(isinstance(d, str) and d in _DTYPES for d in dtypes):
-        raise ValueError(f'`dtypes` must contain "float32" or "float64"; got {tuple(dtypes)}.')
+        raise ValueError(f'`dtypes` must be "float32" or "float64" or both; got {tuple(dtypes)}.')
     if target is not None and not as_numbers({"target": target})["target"] > 0:
         raise ValueError(f"`target` must be positive; got {target}.")
 
@@ -305,6 +310,7 @@ def _references(
             for name, density in [("weights", False), ("density", True)]
             if density in {is_density(run.method) for run in runs}
         }
+        # By `id`, because proposals contain arrays, which have no hash.
         approximate = {id(r.proposal): r.proposal for r in runs if r.method == "approximate"}
         limits = {
             i: finest(key, scene, finest_run._replace(method="approximate", proposal=proposal))

@@ -79,7 +79,7 @@ def test_step_errors_of_a_fast_oscillator():
     """Means off by a tenth of a posterior sd are told, within a half of it; off by two nothing
     is known, and a number would mislead; and where they are right they are trusted."""
     coarse, off, sd = oscillator(10.0, 0.3, 16)
-    assert not coarse.trustworthy and "step error" in coarse.why()
+    assert not coarse.trustworthy and "discretisation error" in coarse.why()
     told = np.asarray(coarse.step_error(), float) / sd
     assert np.sqrt(np.mean(off**2)) > 0.06
     assert np.sqrt(np.mean((off - told) ** 2)) < 0.7 * np.sqrt(np.mean(off**2))

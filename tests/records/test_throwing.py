@@ -26,7 +26,7 @@ def likelihood(error=0.1, sizes=50.0, k=0.4, step_error=0.0, doubt=0.01):
         (dict(sizes=4.0), "num_particles"),
         (dict(error=0.6), "num_particles"),
         (dict(error=jnp.inf), "num_particles"),
-        (dict(k=0.9), "may never have been drawn"),
+        (dict(k=0.9), "heavy tails"),
         (dict(step_error=0.2), "num_steps"),
         (dict(step_error=jnp.nan, doubt=jnp.nan), "num_steps"),
         (dict(doubt=jnp.inf), "num_steps"),
@@ -48,7 +48,7 @@ def draws(apart=0.0, **options):
     "changed, message",
     [
         (dict(stuck=True), "never moved"),
-        (dict(num_truncated=2), "cut off"),
+        (dict(num_truncated=2), "truncated"),
         (dict(apart=3.0), "Chains disagree"),
     ],
 )
