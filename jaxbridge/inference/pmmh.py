@@ -1,8 +1,8 @@
 """Particle-marginal Metropolis–Hastings over any parameters, including those of σ.
 
 The likelihood of exact observations is a product of transition densities, and weighted proposals
-estimate it without bias (`exact.density`). A chain that accepts with the ratio of estimates, and
-stores the estimate of its state, has the exact posterior up to the discretisation error (Andrieu &
+estimate it without bias (`exact.density`). The chain accepts with the ratio of estimates and stores
+the estimate of its state. Its law is the exact posterior up to the discretisation error (Andrieu &
 Roberts 2009). Proposals of θ are normal random walks. The warm-up adapts their covariance S Sᵀ,
 
     S Sᵀ ← S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,    η_i = min(1, p i^(-2/3)),

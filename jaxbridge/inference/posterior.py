@@ -128,8 +128,8 @@ class AbstractPosterior(AbstractResult):
     def step_uncertainty(self) -> Float[Array, " p"]:
         """Standard error of `step_error`, shape (p,).
 
-        For a state-dependent σ it is at least `step_error` itself, because the estimate from half
-        as many steps may be too large by a factor of two or three.
+        For a state-dependent σ it is at least `step_error` itself. There the estimate from half as
+        many steps may be too large by a factor of two or three.
         """
         value, noise = self._step_error
         return jnp.hypot(noise, value) if self.sigma_varies else noise

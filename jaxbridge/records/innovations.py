@@ -85,7 +85,7 @@ class Innovations(NamedTuple):
         return self.log_weight(params, xi) - (xi @ xi + self.size * math.log(2 * math.pi)) / 2
 
     def start_share(self) -> Float[Array, ""]:
-        """Effective fraction of the draws of x_0 by normal noise, at the parameters of the model.
+        """Return the effective fraction of the draws of x_0 by normal noise, at `model.params`.
 
         It is 1 if the initial law is normal. Near 0 the normal law in place of the stationary law
         misses a mode or has too light tails. Then means of w over ξ are unreliable, and a sampler

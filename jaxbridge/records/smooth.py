@@ -242,11 +242,11 @@ def smooth(
     - `block_length`: number of intervals between observations that move at once, by default 10. Use
         more if observations are so close that neighbouring states are strongly correlated, and
         fewer if blocks are rarely accepted. Not with a `proposal`.
-    - `proposal`: by default paths are guided by all observations through a linear process. If
-        several ways are possible across a gap (wells, many relaxation times), pass a proposal of
-        bridges as for `sample_exact_bridges`, for instance a `Coupling`, or "auto", which tries
-        several on each gap. Then the states at observation times move, with new bridges on both
-        sides. This needs a stationary law, and noise in all observed components.
+    - `proposal`: by default paths are guided by all observations through a linear process. Pass a
+        proposal of bridges, as for `sample_exact_bridges`, if several ways are possible across a
+        gap (wells, many relaxation times). "auto" tries several proposals on each gap. Then the
+        states at observation times move, with new bridges on both sides. This needs a stationary
+        law, and noise in all observed components.
     - `num_proposals`: number of bridges of the `proposal` for each move of each gap, by default 10.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if the result is not `trustworthy`.
