@@ -179,8 +179,8 @@ def innovations(
     **Example:**
 
     ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    paths = jb.innovations(model, times, observations, observation=seen)
+    gaussian = jb.LinearGaussian(covariance=0.01)
+    paths = jb.innovations(model, times, observations, observation=gaussian)
     value, slope = jax.value_and_grad(paths.log_density)(model.params, jnp.zeros(paths.size))
     ```
     """

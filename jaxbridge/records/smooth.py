@@ -258,9 +258,9 @@ def smooth(
     **Example:**
 
     ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    made = jb.smooth(key, model, times, observations, observation=seen, num_draws=500)
-    made.mean(), made.standard_error()
+    gaussian = jb.LinearGaussian(covariance=0.01)
+    smoothed = jb.smooth(key, model, times, observations, observation=gaussian, num_draws=500)
+    smoothed.mean(), smoothed.standard_error()
     ```
     """
     check_key(key)
