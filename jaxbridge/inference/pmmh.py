@@ -148,9 +148,10 @@ class PMMHPosterior(AbstractPosterior):
     - `state`: last state; pass it as `init`, with `num_warmup=0`, to continue.
     - `guide`: diagnostics of the last guide of each record, from the warm-up; `None` without an
         `observation`. A poor guide is a fault only if the chain mixes poorly, too.
-    - `share_lost`: fraction of the paths that diverged or left the state space, shape (*chains,).
-        It is the mean over estimates and intervals, with an `observation` the fraction of all
-        particles. It is a fault if more than 5 % of the mass may be missing.
+    - `share_lost`: fraction of the paths that diverged or left the state space, mean over estimates
+        and intervals, shape (*chains,). With an `observation` it is the total number of lost
+        particles divided by `num_proposals`. It is a fault if more than 5 % of the mass may be
+        missing.
     """
 
     params: PyTree
