@@ -1,7 +1,7 @@
 """Markov kernels for the bridges given the parameters: one step for the path of each interval.
 
 The first two kernels leave the exact law of a bridge at the current θ invariant (section 2.3 of the
-paper), also if the path was drawn at another θ:
+paper). The current path may come from another θ.
 
 - `ByRenewal`, for couplings, holds a bridge until its associated diffusion hits it. The path is its
   only state.

@@ -98,8 +98,7 @@ class GibbsPosterior(AbstractPosterior):
         zero, the posterior is conditional on these placeholders; then use another proposal.
     - `num_truncated`: number of weights that `max_trials` truncated, shape (*chains, n). With many
         of them the law is not exact.
-    - `num_nonfinite`: number of paths that left the state space or became non-finite, shape
-        (*chains, n).
+    - `num_nonfinite`: number of paths that diverged or left the state space, shape (*chains, n).
     - `log_step_error`: estimated discretisation error of the log density of the completed data at
         each draw, up to a constant, shape (*chains, n). NaN at draws without an estimate.
         `step_error`, that of the posterior mean, is computed from it.

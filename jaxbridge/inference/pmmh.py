@@ -1,8 +1,8 @@
 """Particle-marginal Metropolis–Hastings over any parameters, including those of σ.
 
 The likelihood of exact observations is a product of transition densities, and weighted proposals
-estimate it without bias (`exact.density`). A chain that accepts with the ratio of estimates, and
-stores the estimate of its state, has the exact posterior up to the discretisation error (Andrieu &
+estimate it without bias (`exact.density`). The chain accepts with the ratio of estimates and stores
+the estimate of its state. Its law is the exact posterior up to the discretisation error (Andrieu &
 Roberts 2009). Proposals of θ are normal random walks. The warm-up adapts their covariance S Sᵀ,
 
     S Sᵀ ← S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,    η_i = min(1, p i^(-2/3)),
@@ -148,9 +148,10 @@ class PMMHPosterior(AbstractPosterior):
     - `state`: last state; pass it as `init`, with `num_warmup=0`, to continue.
     - `guide`: diagnostics of the last guide of each record, from the warm-up; `None` without an
         `observation`. A poor guide is a fault only if the chain mixes poorly, too.
-    - `share_lost`: share of paths that left the state space or became non-finite, shape (*chains,):
-        the mean over estimates and intervals, or over all particles. It is a fault if more than 5 %
-        of the mass may be missing with them.
+    - `share_lost`: fraction of the paths that diverged or left the state space, mean over estimates
+        and intervals, shape (*chains,). With an `observation` it is the total number of lost
+        particles divided by `num_proposals`. It is a fault if more than 5 % of the mass may be
+        missing.
     """
 
     params: PyTree

@@ -119,8 +119,8 @@ class AbstractPosterior(AbstractResult):
         """Estimated discretisation bias of the posterior means (estimate minus limit), shape (p,).
 
         To first order it is the covariance of θ and `log_step_error`. NaN if that is not available,
-        for instance with one step. Infinite if the steps of a tenth of the draws are too long for
-        the drift.
+        for instance with one step. It is also NaN, with an infinite uncertainty, if the steps are
+        too long for the drift (`log_step_error` is infinite) in more than a tenth of the draws.
         """
         return self._step_error.value
 
@@ -128,8 +128,8 @@ class AbstractPosterior(AbstractResult):
     def step_uncertainty(self) -> Float[Array, " p"]:
         """Standard error of `step_error`, shape (p,).
 
-        For a state-dependent σ it is at least `step_error` itself, because the estimate from half
-        as many steps may be too large by a factor of two or three.
+        For a state-dependent σ it is at least `step_error` itself. There the estimate from half as
+        many steps may be too large by a factor of two or three.
         """
         value, noise = self._step_error
         return jnp.hypot(noise, value) if self.sigma_varies else noise

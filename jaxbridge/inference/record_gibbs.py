@@ -6,8 +6,8 @@ The state is (θ, path). Two moves alternate:
 - the path is converted to its noise ξ (`record_paths`), and θ moves given ξ by a normal random walk
   with the target π(θ) w(θ, ξ). The path changes with θ.
 
-Hence the sampler works for parameters of σ, of the noise and of the initial law as well as for
-those of the drift, for every step size.
+Hence the unknown parameters may be those of the drift, of σ, of the noise and of the initial law,
+for every step size.
 
 The guide is linearised along a path that is likely at some θ. It may be poor at a θ far away.
 Neither the law of the path given θ nor that of θ given ξ depends on the guide, so the warm-up

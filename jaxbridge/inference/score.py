@@ -70,8 +70,8 @@ class Score(AbstractResult):
     - `num_missing`: number of intervals without a bridge. They are left out. If all are missing,
         the score is NaN and its error infinite.
     - `num_truncated`: number of weights that `max_trials` truncated.
-    - `counts`: numbers of bridges, of simulated paths, and of paths that left the state space or
-        became non-finite, in each interval.
+    - `counts`: numbers of bridges, of simulated paths, and of paths that diverged or left the state
+        space, for each interval.
     """
 
     value: PyTree
@@ -91,8 +91,8 @@ class Score(AbstractResult):
     def verdict(self) -> Verdict:
         """The faults of the score, each with a remedy.
 
-        They are: intervals without a bridge, weights that are truncated or have heavy tails, too
-        many lost paths in an interval, and a discretisation error that dominates and exceeds 0.05
+        They are: intervals without a bridge; weights that are truncated or have heavy tails; too
+        many lost paths in an interval; and a discretisation error that dominates and exceeds 0.05
         standard deviations of the score.
         """
         error = jnp.sqrt(jnp.maximum(jnp.diagonal(self.covariance), 0))

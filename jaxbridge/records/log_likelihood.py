@@ -217,9 +217,9 @@ def log_likelihood(
     **Example:**
 
     ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    made = jb.log_likelihood(key, model, times, observations, observation=seen)
-    made.value, made.standard_error
+    gaussian = jb.LinearGaussian(covariance=0.01)
+    estimate = jb.log_likelihood(key, model, times, observations, observation=gaussian)
+    estimate.value, estimate.standard_error
     ```
     """
     check_key(key)

@@ -104,11 +104,14 @@ class Smoothed(AbstractResult):
     def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Estimate the discretisation bias of `mean(fn)` to leading order, entry by entry.
 
-        With half as many steps each path is e^D times as likely (`schemes.halving`). The estimate
-        is NaN in three cases: one step, Euler steps of a σ with fewer columns than rows, and steps
-        so long that the variance of D exceeds 1 in some interval. If two steps of an interval are
-        longer than the relaxation time of the drift, it is NaN with infinite uncertainty. If the
-        scheme of a `proposal` is more accurate than `density`, the estimate is too large.
+        With half as many steps each path is e^D times as likely (`schemes.halving`). If the scheme
+        of a `proposal` is more accurate than `density`, the estimate is too large. It is NaN in
+        these cases:
+
+        - one step;
+        - Euler steps of a σ with fewer columns than rows;
+        - steps so long that the variance of D exceeds 1 in some interval;
+        - steps longer than the relaxation time of the drift. Then the uncertainty is infinite.
         """
         return self._step_errors(fn)[0]
 
@@ -239,11 +242,11 @@ def smooth(
     - `block_length`: number of intervals between observations that move at once, by default 10. Use
         more if observations are so close that neighbouring states are strongly correlated, and
         fewer if blocks are rarely accepted. Not with a `proposal`.
-    - `proposal`: by default paths are guided by all observations through a linear process. If
-        several ways are possible across a gap (wells, many relaxation times), pass a proposal of
-        bridges as for `sample_exact_bridges`, for instance a `Coupling`, or "auto", which tries
-        several on each gap. Then the states at observation times move, with new bridges on both
-        sides. This needs a stationary law, and noise in all observed components.
+    - `proposal`: by default paths are guided by all observations through a linear process. Pass a
+        proposal of bridges, as for `sample_exact_bridges`, if several ways are possible across a
+        gap (wells, many relaxation times). "auto" tries several proposals on each gap. Then the
+        states at observation times move, with new bridges on both sides. This needs a stationary
+        law, and noise in all observed components.
     - `num_proposals`: number of bridges of the `proposal` for each move of each gap, by default 10.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if the result is not `trustworthy`.
@@ -255,9 +258,9 @@ def smooth(
     **Example:**
 
     ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    made = jb.smooth(key, model, times, observations, observation=seen, num_draws=500)
-    made.mean(), made.standard_error()
+    gaussian = jb.LinearGaussian(covariance=0.01)
+    smoothed = jb.smooth(key, model, times, observations, observation=gaussian, num_draws=500)
+    smoothed.mean(), smoothed.standard_error()
     ```
     """
     check_key(key)

@@ -1,4 +1,4 @@
-"""Are the steps of a record so long that their error has no leading term?"""
+"""Check whether the steps of a record are too long for an estimate of the discretisation error."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -12,8 +12,11 @@ from .problem import RecordProblem
 def steps_are_too_long(
     problem: RecordProblem, model: Diffusion, path: Float[Array, "points d"]
 ) -> Bool[Array, ""]:
-    """Return whether, on more than 2 % of the segments of this path, two steps are longer than the
-    relaxation time of the drift at both ends. Drifts that depend on time are not examined."""
+    """Return whether steps exceed the relaxation time of the drift on over 2 % of the segments.
+
+    The relaxation times are those at both ends of a segment on this path; one of the two suffices.
+    Time-dependent drifts are not examined.
+    """
     if model.depends_on_time:
         return jnp.zeros((), bool)
     ends, durations = path[:: problem.num_steps], problem.record.durations

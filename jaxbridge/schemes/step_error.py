@@ -9,9 +9,9 @@ Both estimates use the same paths. Hence their difference has a much smaller Mon
 either of them if D is small. This error is reported as the uncertainty.
 
 The uncertainty is infinite in two cases: if few paths carry nearly all of the weights w e^D, and if
-a step is longer than the relaxation time of the drift. In both cases the steps are too long for an
-estimate. The log of a mean of few weights is too small on average, by half the relative variance to
-leading order; the estimate corrects this bias.
+a step is longer than the relaxation time of the drift at either end. In both cases the steps are
+too long for an estimate. The log of a mean of few weights is too small on average, by half the
+relative variance to leading order; the estimate corrects this bias.
 
 For a state-dependent σ e^D has heavy tails. Weights of half as many steps from the same noise do
 not. They replace w e^D if only the mean of the weights is needed (`error_of_coupled_grids`).
