@@ -1,4 +1,4 @@
-"""How long functions take."""
+"""Timing of functions."""
 
 import functools
 import time
@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 def timed(function: Callable[[], T]) -> tuple[T, float]:
-    """The result, and the seconds until it is there."""
+    """Call the function; return its result and the seconds until the result is complete."""
     begin = time.perf_counter()
     result = jax.block_until_ready(function())
     return result, time.perf_counter() - begin
@@ -20,7 +20,7 @@ def timed(function: Callable[[], T]) -> tuple[T, float]:
 
 @functools.cache
 def _seconds_compiled() -> list[float]:
-    """Its one number grows by what XLA compiles from the first call of this on."""
+    """Return a list of one number: the seconds that XLA has compiled since the first call."""
     total = [0.0]
 
     def listen(event: str, duration_secs: float, **_: Any) -> None:
@@ -32,7 +32,7 @@ def _seconds_compiled() -> list[float]:
 
 
 def timed_once_compiled(function: Callable[[], T]) -> tuple[T, float]:
-    """As `timed`, less the seconds in which XLA compiled: for what compiles in every call."""
+    """Do as `timed`, and subtract the seconds of compilation: for calls that always compile."""
     total = _seconds_compiled()
     before = total[0]
     result, seconds = timed(function)
@@ -40,14 +40,14 @@ def timed_once_compiled(function: Callable[[], T]) -> tuple[T, float]:
 
 
 def fastest(function: Callable[[], T], repeats: int = 3) -> tuple[T, float]:
-    """The shortest of some runs."""
+    """Return the result and the seconds of the fastest of `repeats` runs."""
     return min((timed(function) for _ in range(repeats)), key=lambda run: run[1])
 
 
 def in_turns(
     first: Callable[[], Any], second: Callable[[], Any], repeats: int = 9
 ) -> tuple[float, float]:
-    """The median times of two functions, run in turns, once compiled."""
+    """Return the median seconds of two functions, run in turns, compilation apart."""
     seconds = [[timed(function)[1] for function in (first, second)] for _ in range(repeats + 1)]
     medians = np.median(seconds[1:], axis=0)
     return float(medians[0]), float(medians[1])

@@ -1,8 +1,9 @@
-"""The study of section 3 continued: exact bridges, and why γ → 1 makes approximate ones exact.
+"""Simulation study of section 3, continued: exact bridges.
 
-Chains and weights for the unlikely and the very unlikely bridge, beside the paper's own
-algorithm with the start law that it prints; how much the hitting probabilities vary; and what
-an exact bridge costs as its duration grows.
+- Chains and weights for the unlikely and the very unlikely bridge, compared with the algorithm of
+  the paper and the start law that it prints.
+- The variation of hitting probabilities, which explains why γ → 1 makes approximate bridges exact.
+- The cost of an exact bridge as a function of its duration.
 """
 
 from collections.abc import Sequence
@@ -26,16 +27,16 @@ UNLIKELY: Ends = ((0.785, 0.785), (1.091, 1.091))
 VERY_UNLIKELY: Ends = ((2.0, -2.0), (3.0, -3.0))
 _GAMMA = 0.5
 _NUM_STEPS = 50
-# Of the proposals of the unlikely bridge with this γ, as the approximate study measures it.
+# Share of proposals of the unlikely bridge that meet at this γ, from the approximate study.
 _SHARE_MET = 0.811
 
 
 class ExactResult(NamedTuple):
-    """One way to exact bridges, on [0, 1], looked at in the middle.
+    """Result of one method for exact bridges on [0, 1], at time 1/2.
 
-    `samples`, shape (m, 2), equally weighted; `bias`, of the weighted or chain mean in exact
-    standard deviations, with its `error`; `effective` samples; paths simulated for each
-    iteration; `seconds` once compiled; `paper_seconds` in words.
+    `samples` have shape (m, 2) and equal weights. `bias` is that of the mean in exact standard
+    deviations, with its standard `error`. `effective` is the effective sample size, `simulated`
+    the number of paths per iteration. `seconds` exclude compilation.
     """
 
     bridge: str
@@ -53,7 +54,7 @@ class ExactResult(NamedTuple):
 
 
 class Variation(NamedTuple):
-    """std/mean of 1/π_T for one bridge and γ, from ν and from the printed start law."""
+    """Ratio std/mean of 1/π_T for one bridge and γ, from ν and from the printed start law."""
 
     bridge: str
     gamma: float
@@ -62,8 +63,7 @@ class Variation(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """Seconds per effective sample for one duration, and the share of steps that the chain
-    accepted."""
+    """Seconds per effective sample for one duration, and the acceptance rate of the chain."""
 
     duration: float
     seconds: float
@@ -71,14 +71,14 @@ class Cost(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """Seconds to draw as many random numbers as the pseudo-marginal chain did, and how many."""
+    """Number of random numbers of the pseudo-marginal chain, and the seconds to draw them."""
 
     numbers: int
     seconds: float
 
 
 def run_exact(key: Key[Array, ""], scale: float, say: Say) -> list[ExactResult]:
-    """All methods on the unlikely and the very unlikely bridge; `scale` shortens the runs."""
+    """Run all methods on the unlikely and the very unlikely bridge; `scale` shortens the runs."""
     model, coupling = study_model(), jb.Coupling(_GAMMA)
     say("fitting a start law to the very unlikely bridge")
     law = jb.fit_start_law(key, model, *VERY_UNLIKELY, 1.0, num_steps=_NUM_STEPS, coupling=coupling)
@@ -156,7 +156,7 @@ def _weights(key, model, ends: Ends, iterations, coupling):
 
 
 def _judge(middle, weights, law: jb.GaussianLaw) -> tuple[Any, Fit, Any, float]:
-    """Equally weighted samples, their fit, the error of the bias and the effective size."""
+    """Return equally weighted samples, their fit, the error of the bias and the effective size."""
     sd = np.sqrt(np.diag(np.asarray(law.covariance, float)))
     deviations = (middle - np.asarray(law.mean)) / sd
     if weights is None:
@@ -164,14 +164,14 @@ def _judge(middle, weights, law: jb.GaussianLaw) -> tuple[Any, Fit, Any, float]:
         return middle, fit, deviations.std(0) / np.sqrt(sizes), float(sizes.min())
     mean = weights @ deviations
     spread = np.sqrt(weights @ (deviations - mean) ** 2)
-    drawn = np.random.default_rng(0).choice(len(middle), size=len(middle), p=weights)
-    fit = Fit(mean, spread - 1, compare(middle[drawn], law).ks_distance)
+    indices = np.random.default_rng(0).choice(len(middle), size=len(middle), p=weights)
+    fit = Fit(mean, spread - 1, compare(middle[indices], law).ks_distance)
     error = np.sqrt(weights**2 @ (deviations - mean) ** 2)
-    return middle[drawn], fit, error, float(1 / (weights**2).sum())
+    return middle[indices], fit, error, float(1 / (weights**2).sum())
 
 
 def run_variation(key: Key[Array, ""], num_bridges: int, say: Say) -> list[Variation]:
-    """The regression of section 3.2 for the three bridges of the paper."""
+    """Estimate the regression of section 3.2 for the three bridges of the paper."""
     model, results = study_model(), []
     bridges = {case.bridge: (case.start, case.end) for case in CASES}
     for name, ends in bridges.items():
@@ -197,7 +197,7 @@ def _variation(key, model, ends: Ends, coupling, law, num_bridges) -> jb.Hitting
         num_steps=_NUM_STEPS,
         coupling=coupling,
     )
-    bound = 200_000  # no count of the study comes near it
+    bound = 200_000  # far above all counts of the study
     weighted = jb.weigh_bridges(weigh_key, model, bridges, max_trials=bound)
     return jb.hitting_variation(
         count_key, model, weighted, (5, 10, 20), start_law=law, max_trials=bound
@@ -210,8 +210,10 @@ def run_cost(
     durations: Sequence[float] = (1.0, 3.0, 10.0, 30.0, 100.0),
     say: Say = silent,
 ) -> list[Cost]:
-    """Seconds per effective bridge against the duration, at a fixed step of 0.02; each duration
-    has as many bridges as make `work` units of time, 50,000 at most."""
+    """Measure the seconds per effective bridge for each duration, at a fixed step size of 0.02.
+
+    Each duration has `work` units of time in all, and at most 50,000 bridges.
+    """
     model, costs = study_model(), []
     for duration in durations:
         say(f"cost of an exact bridge of duration {duration:g}")
@@ -232,23 +234,25 @@ def run_cost(
         timed(run)
         chain, seconds = fastest(run, repeats=2)
         acceptance = float(chain.acceptance_rate)
-        # Of a chain that moves with probability p in each step, whatever it looks at.
+        # Effective size of a chain that moves with probability p in each step: n p / (2 - p).
         effective = num_bridges * acceptance / (2 - acceptance)
         costs.append(Cost(duration, seconds / effective, acceptance))
     return costs
 
 
 def slope(costs: Sequence[Cost]) -> float:
-    """The exponent p of seconds ∝ T^p, from T = 10 on."""
+    """Fit the exponent p of seconds ∝ T^p, from T = 10 on."""
     long = np.array([(c.duration, c.seconds) for c in costs if c.duration >= 10])
     duration, seconds = np.log(long).T
     return float(np.polyfit(duration, seconds, 1)[0])
 
 
 def draw_as_many(key: Key[Array, ""], result: ExactResult) -> Floor:
-    """The time of drawing the random numbers of a pseudo-marginal chain, and of nothing else:
-    for each step of a proposal two normals, one more for dU and a uniform number for the
-    meeting; for each step of a trial the last two."""
+    """Measure the time of drawing the random numbers of a pseudo-marginal chain.
+
+    Each step of a proposal takes two normals, one more for dU, and a uniform number for the
+    meeting. Each step of a trial takes the last two.
+    """
     proposals = result.iterations / _SHARE_MET
     trials = result.simulated * result.iterations - proposals
     lanes = 8_192
@@ -264,9 +268,9 @@ def draw_as_many(key: Key[Array, ""], result: ExactResult) -> Floor:
     def run(key):
         keys = jax.random.split(key, sum(rounds))
         total = jnp.zeros(())
-        for num_normals, some in ((3, keys[: rounds[0]]), (1, keys[rounds[0] :])):
+        for num_normals, round_keys in ((3, keys[: rounds[0]]), (1, keys[rounds[0] :])):
             total, _ = lax.scan(
-                lambda total, key, k=num_normals: (draw(k, total, key), None), total, some
+                lambda total, key, k=num_normals: (draw(k, total, key), None), total, round_keys
             )
         return total
 
@@ -276,7 +280,7 @@ def draw_as_many(key: Key[Array, ""], result: ExactResult) -> Floor:
 
 
 def format_exact(results: Sequence[ExactResult]) -> str:
-    """The results as a table, in plain characters."""
+    """Return the results as a plain-text table."""
     titles = ("bridge", "method", "n", "seconds", "paper, s", "paths/n", "worth")
     rows = [
         (
@@ -296,7 +300,7 @@ def format_exact(results: Sequence[ExactResult]) -> str:
 
 
 def format_floor(first: ExactResult, floor: Floor) -> str:
-    """The time of a chain beside that of its random numbers."""
+    """Return the time of a chain relative to that of its random numbers, as text."""
     return (
         f"Drawing the {floor.numbers / 1e6:.0f} million random numbers of the first row alone "
         f"takes {floor.seconds:.2f} s:\nthe chain takes {first.seconds / floor.seconds:.1f} times "
@@ -305,7 +309,7 @@ def format_floor(first: ExactResult, floor: Floor) -> str:
 
 
 def format_variation(results: Sequence[Variation]) -> str:
-    """std/mean of 1/π_T and its mean, from ν and from the printed start law."""
+    """Return a table of std/mean and of the mean of 1/π_T, from ν and from the printed start law."""
     titles = ("bridge", "gamma", "nu: std/mean", "mean 1/pi", "printed: std/mean", "mean 1/pi")
     rows = [
         (
@@ -322,22 +326,22 @@ def format_variation(results: Sequence[Variation]) -> str:
 
 
 def format_cost(costs: Sequence[Cost]) -> str:
-    """Milliseconds per effective bridge, by duration, and how they grow."""
+    """Return a table of milliseconds per effective bridge by duration, and their growth."""
     rows = [(f"{c.duration:g}", f"{1e3 * c.seconds:.4f}", f"{c.acceptance:.1%}") for c in costs]
     text = table(("duration", "ms per effective bridge", "accepted"), rows, words=0)
     return f"{text}\nFrom T = 10 on, seconds grow as T to the power {slope(costs):.2f}."
 
 
 def draw(figures: Any, results: Sequence[ExactResult]) -> dict[str, Any]:
-    """Q-Q plots and copulas of the exact methods."""
-    drawn = {}
+    """Draw Q-Q plots and copulas of the exact methods."""
+    pictures = {}
     for bridge, by_method in groupby(results, key=lambda result: result.bridge):
         group = list(by_method)
         samples = {r.method: r.samples for r in group}
         title = f"{bridge} in time 1, at time ½: exact methods, γ = {_GAMMA:g}"
         name = "very_unlikely" if bridge == _words(VERY_UNLIKELY) else "unlikely"
-        drawn[f"exact_{name}.png"] = figures.margins_and_copula(samples, group[0].law, title)
-    return drawn
+        pictures[f"exact_{name}.png"] = figures.margins_and_copula(samples, group[0].law, title)
+    return pictures
 
 
 def _words(ends: Ends) -> str:
@@ -353,18 +357,17 @@ def _with_floor(key, quick, say) -> tuple[list[ExactResult], Floor]:
 EXACT = Study(
     "Exact bridges, gamma = 0.5, at time 1/2, N = 50 steps",
     _with_floor,
-    lambda made: f"{format_exact(made[0])}\n\n{format_floor(made[0][0], made[1])}",
+    lambda results: f"{format_exact(results[0])}\n\n{format_floor(results[0][0], results[1])}",
     """\
-"paths/n" is the number of simulated paths, "worth" that of the independent exact bridges which
-the n are worth. "as published" is the paper's pseudo-marginal chain with the start law that it
-prints, which leaves most of the bias; started from the stationary law, or from any other that is
-paid for, it is gone. The very unlikely bridge has a start law fitted by a pilot run. The paper's
-seconds are those of its authors' computer and program, given for the same bridge and number of
-iterations: only their order of magnitude can be compared.""",
-    lambda figures, made: draw(figures, made[0]),
+"paths/n" is the number of simulated paths per bridge, "worth" the effective sample size. "as
+published" is the paper's pseudo-marginal chain with the start law that it prints, which leaves most
+of the bias. The stationary law, or any other with the right weights, removes it. The very unlikely
+bridge has a start law fitted by a pilot run. The paper's seconds are from its authors' computer and
+program, for the same bridge and number of iterations: compare only their order of magnitude.""",
+    lambda figures, results: draw(figures, results[0]),
 )
 VARIATION = Study(
-    "How much hitting probabilities vary",
+    "Variation of hitting probabilities",
     lambda key, quick, say: run_variation(key, 50 if quick else 300, say),
     format_variation,
     """\
@@ -374,13 +377,12 @@ approximate bridges become exact as they become rare.""",
     lambda figures, results: {"variation.png": figures.variation(results)},
 )
 COST = Study(
-    "What duration costs",
+    "Cost of an exact bridge by duration",
     lambda key, quick, say: (
         run_cost(key, 5_000, (1.0, 10.0, 30.0), say) if quick else run_cost(key, 200_000, say=say)
     ),
     format_cost,
     """\
-"ms" are those of a run once compiled, for each of the independent bridges that its chain is worth;
-"accepted" is the share of its steps that move.""",
+"ms" are milliseconds per effective bridge, compilation apart; "accepted" is the acceptance rate.""",
     lambda figures, costs: {"cost.png": figures.cost(costs, slope(costs))},
 )

@@ -16,7 +16,7 @@ from ..plot.style import COLOURS, EXACT, MARKERS, Figure, Reals, finish
 def margins_and_copula(
     samples: Mapping[str, Float[Reals, "n 2"]], law: jb.GaussianLaw, title: str
 ) -> Figure:
-    """The figures of section 3: Q-Q plots of both margins and the copula, in one row."""
+    """Draw the figures of section 3: Q-Q plots of both margins and the copula, in one row."""
     figure = Figure(figsize=(11, 4.1), layout="constrained")
     *margins, dependence = figure.subplots(1, 3)
     for i, ax in enumerate(margins):
@@ -32,8 +32,8 @@ def margins_and_copula(
 
 
 def bridges_overview(bridges: jb.Bridges, exact: jb.GaussianBridge) -> Figure:
-    """Two-dimensional bridges: paths with time upwards, and each coordinate's bands with those
-    of the exact law dashed over them."""
+    """Draw two-dimensional bridges with time upwards, and the bands of each coordinate with those
+    of the exact law as dashed lines."""
     figure = Figure(figsize=(11, 3.8), layout="constrained")
     plot.paths_in_space(bridges.times, bridges.paths, figure.add_subplot(1, 3, 1, projection="3d"))
     for i in range(2):
@@ -46,16 +46,16 @@ def bridges_overview(bridges: jb.Bridges, exact: jb.GaussianBridge) -> Figure:
 
 
 def variation(results: Sequence[Any]) -> Figure:
-    """std/mean of 1/π_T against γ for each bridge: results of `exact.run_variation`."""
+    """Draw std/mean of 1/π_T against γ for each bridge: results of `exact.run_variation`."""
     bridges = list(dict.fromkeys(result.bridge for result in results))
     figure = Figure(figsize=(3.6 * len(bridges), 3.4), layout="constrained")
     for ax, bridge in zip(figure.subplots(1, len(bridges), squeeze=False)[0], bridges, strict=True):
         group = [result for result in results if result.bridge == bridge]
         place = np.arange(len(group))
         for i, (label, name) in enumerate([("ν", "right"), ("as printed", "published")]):
-            found = [getattr(result, name) for result in group]
-            ratio = [float(v.ratio) for v in found]
-            error = [2 * float(v.ratio_error) for v in found]
+            variations = [getattr(result, name) for result in group]
+            ratio = [float(v.ratio) for v in variations]
+            error = [2 * float(v.ratio_error) for v in variations]
             style = {"color": COLOURS[i], "marker": MARKERS[i], "capsize": 3, "markersize": 5}
             ax.errorbar(place + 0.08 * i, ratio, error, label=label, **style)
         ax.set(xticks=place, xticklabels=[f"{result.gamma:g}" for result in group], xlabel="γ")
@@ -67,7 +67,7 @@ def variation(results: Sequence[Any]) -> Figure:
 
 
 def cost(costs: Sequence[Any], slope: float) -> Figure:
-    """Seconds per effective bridge against the duration: results of `exact.run_cost`."""
+    """Draw seconds per effective bridge against the duration: results of `exact.run_cost`."""
     figure = Figure(figsize=(7.6, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     duration = np.array([c.duration for c in costs])

@@ -1,8 +1,8 @@
-"""The simulation study of section 3: approximate Ornstein–Uhlenbeck bridges beside exact ones.
+"""Simulation study of section 3: approximate Ornstein–Uhlenbeck bridges and their exact law.
 
-Three bridges on [0, 1] of the process with B = ((3/2, 1), (1, 3/2)), m = 0 and σ = I, in 50
-steps, with growing γ, by the library's default method and by the paper's own. The law at time
-1/2, where the bridge is felt most, is compared with the exact one.
+The process has B = ((3/2, 1), (1, 3/2)), m = 0 and σ = I. Three bridges on [0, 1] are simulated in
+50 steps with growing γ, by the default method of the library and by that of the paper. Their law at
+time 1/2, farthest from both end points, is compared with the exact one.
 """
 
 import itertools
@@ -23,7 +23,7 @@ Point = tuple[float, float]
 
 
 class Case(NamedTuple):
-    """A bridge of the study, by the paper's word for it, and the γ of its coupling."""
+    """Bridge of the study, named as in the paper, and the γ of its coupling."""
 
     name: str
     start: Point
@@ -32,7 +32,7 @@ class Case(NamedTuple):
 
     @property
     def bridge(self) -> str:
-        """The end points, in words."""
+        """Return the end points as text."""
         start, end = (f"({x:g}, {y:g})" for x, y in (self.start, self.end))
         return f"{start} -> {end}"
 
@@ -50,7 +50,7 @@ METHODS: dict[str, Callable[[float], jb.Coupling]] = {
 
 
 class Fit(NamedTuple):
-    """How far draws are from an exact Gaussian law, margin by margin.
+    """Deviations of draws from an exact Gaussian law, margin by margin.
 
     `mean_bias`: mean less exact mean, in exact standard deviations. `sd_bias`: ratio of the
     standard deviations less one. `ks_distance`: Kolmogorov–Smirnov distance. Shape (d,) each.
@@ -62,8 +62,8 @@ class Fit(NamedTuple):
 
 
 class Chance(NamedTuple):
-    """What n draws of the exact law itself would show: the standard errors of both biases, and
-    the distance that they exceed one time in 20."""
+    """Deviations of n exact draws by chance: the standard errors of both biases, and the 95 %
+    quantile of the Kolmogorov–Smirnov distance."""
 
     mean_error: float
     sd_error: float
@@ -71,10 +71,10 @@ class Chance(NamedTuple):
 
 
 class Result(NamedTuple):
-    """One case by one method.
+    """Result of one case by one method.
 
-    `samples`, shape (n, 2), are the bridges at time 1/2 and `law` the exact law there.
-    `acceptance` is the share of proposals that met. `seconds` are those of the run once compiled.
+    `samples`, shape (n, 2), are the bridges at time 1/2, and `law` is the exact law there.
+    `acceptance` is the share of proposals that met. `seconds` exclude compilation.
     """
 
     case: Case
@@ -87,7 +87,7 @@ class Result(NamedTuple):
 
 
 def study_model() -> jb.Diffusion:
-    """The process of section 3.2."""
+    """Return the process of section 3.2."""
     return jb.ornstein_uhlenbeck([[1.5, 1.0], [1.0, 1.5]])
 
 
@@ -97,7 +97,7 @@ def run_study(
     cases: Sequence[Case] = CASES,
     say: Say = silent,
 ) -> list[Result]:
-    """Every case by every method, in the order of the table."""
+    """Run every case by every method, in the order of the table."""
     runs = list(itertools.product(cases, METHODS))
     results = []
     for i, (case, method) in enumerate(runs):
@@ -107,9 +107,9 @@ def run_study(
 
 
 def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> Result:
-    """Simulate one case by one method, and compare.
+    """Simulate one case by one method, and compare it with its exact law.
 
-    **Raises:** `RuntimeError` where a bridge was not found or misses an end point.
+    **Raises:** `RuntimeError` if a bridge is missing or misses an end point.
     """
     model, coupling = study_model(), METHODS[method](case.gamma)
 
@@ -127,7 +127,7 @@ def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> 
             save_at=[0.0, 0.5, 1.0],
         )
 
-    # The bound is traced: with one proposal the very program of the run is compiled, hardly run.
+    # The bound is traced, so this compiles the same program and hardly runs it.
     timed(lambda: bridges(1))
     result, seconds = timed(lambda: bridges(None))
     first, middle, last = np.moveaxis(np.asarray(result.paths), 1, 0)
@@ -147,13 +147,13 @@ def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> 
 
 
 def law_half_way(start: Point, end: Point) -> jb.GaussianLaw:
-    """The exact law at time ½ of the bridge in time 1."""
+    """Return the exact law at time ½ of the bridge on [0, 1]."""
     exact = jb.gaussian_bridge(study_model(), start, end, 1.0, times=[0.5])
     return jb.GaussianLaw(exact.mean[0], exact.covariance[0])
 
 
 def compare(samples: Float[np.ndarray, "n d"], law: jb.GaussianLaw) -> Fit:
-    """Draws, margin by margin, against their exact law."""
+    """Compare draws with their exact law, margin by margin."""
     mean = np.asarray(law.mean, float)
     sd = np.sqrt(np.diag(np.asarray(law.covariance, float)))
     scores = (samples - mean) / sd
@@ -162,13 +162,13 @@ def compare(samples: Float[np.ndarray, "n d"], law: jb.GaussianLaw) -> Fit:
 
 
 def chance(num_bridges: int) -> Chance:
-    """What is due to chance with this many independent draws."""
+    """Return the deviations of this many independent exact draws."""
     n = num_bridges
     return Chance(n**-0.5, (2 * n) ** -0.5, 1.36 * n**-0.5)
 
 
 def format_table(results: Sequence[Result]) -> str:
-    """The results as a table of 119 columns, in plain characters."""
+    """Return the results as a plain-text table of 119 columns."""
     titles = ("bridge", "gamma", "method", "met", "seconds")
     titles += ("bias of mean", "bias of sd", "KS distance")
     rows = [
@@ -193,8 +193,8 @@ def format_table(results: Sequence[Result]) -> str:
 
 
 def whole_bridges(key: Key[Array, ""]) -> tuple[jb.Bridges, jb.GaussianBridge]:
-    """Bridges between unlikely points, over a time long enough to see them relax, and their
-    exact law."""
+    """Sample bridges between unlikely points, long enough to relax between them, and return them
+    with their exact law."""
     model, ends, duration = study_model(), ([0.785, 0.785], [1.091, 1.091]), 3.0
     bridges = jb.sample_bridges(
         key, model, *ends, duration, num_bridges=5_000, num_steps=150, coupling=jb.Coupling(0.9)
@@ -205,16 +205,15 @@ def whole_bridges(key: Key[Array, ""]) -> tuple[jb.Bridges, jb.GaussianBridge]:
 def draw(
     figures: Any, results: Sequence[Result], whole: tuple[jb.Bridges, jb.GaussianBridge]
 ) -> dict[str, Any]:
-    """Whole paths of the unlikely bridge; and for each case Q-Q plots of both margins and the
-    copula, all methods together."""
-    drawn = {"bridges.png": figures.bridges_overview(*whole)}
+    """Draw paths of the unlikely bridge, and Q-Q plots and the copula of each case by all methods."""
+    pictures = {"bridges.png": figures.bridges_overview(*whole)}
     for case, by_method in itertools.groupby(results, key=lambda result: result.case):
         group = list(by_method)
         title = f"{case.bridge} in time 1, at time ½,  γ = {case.gamma:g}"
         name = f"{case.name.replace(' ', '-')}_gamma_{case.gamma:g}.png"
         samples = {result.method: result.samples for result in group}
-        drawn[name] = figures.margins_and_copula(samples, group[0].law, title)
-    return drawn
+        pictures[name] = figures.margins_and_copula(samples, group[0].law, title)
+    return pictures
 
 
 APPROXIMATE = Study(
@@ -223,7 +222,7 @@ APPROXIMATE = Study(
         run_study(key, 2_000 if quick else 50_000, say=say),
         whole_bridges(key),
     ),
-    lambda made: format_table(made[0]),
+    lambda results: format_table(results[0]),
     """\
 Approximate bridges have the law of the bridge given that an associated diffusion hits it. For
 the likely bridge that changes the law by about 1 % of a standard deviation; for the unlikely
@@ -232,5 +231,5 @@ method itself, which more bridges do not remove. It shrinks as gamma -> 1, at th
 pairs that meet. "default" is Heun with the Brownian crossing; "as published" is Euler with the
 sign test in radius 0.05, which has a step error of its own and overlooks about half of the
 meetings.""",
-    lambda figures, made: draw(figures, *made),
+    lambda figures, results: draw(figures, *results),
 )

@@ -35,11 +35,11 @@ class Study(NamedTuple):
 
 
 def silent(what: str) -> None:
-    """Say nothing."""
+    """Ignore a line of progress."""
 
 
 def table(titles: Row, rows: Iterable[Row], words: int = 1) -> str:
-    """Rows under their titles, in plain characters, the first columns being `words`."""
+    """Lay out rows under titles as plain text; the first `words` columns are left-aligned."""
     lines = [titles, *_unrepeated(rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     head, *body = (
@@ -55,13 +55,13 @@ def table(titles: Row, rows: Iterable[Row], words: int = 1) -> str:
 
 
 def markdown(titles: Row, rows: Iterable[Row]) -> str:
-    """The same in Markdown."""
+    """Lay out rows under titles as a Markdown table."""
     lines = [titles, ["---"] * len(titles), *_unrepeated(rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _unrepeated(rows: Iterable[Row]) -> list[Row]:
-    """A first cell is left blank where it repeats the one above it."""
+    """Return the rows, with a blank first cell where it repeats the one above."""
     return [
         ("" if row[0] == above[0] else row[0], *row[1:]) for above, row in pairwise([[""], *rows])
     ]
