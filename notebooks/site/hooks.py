@@ -1,0 +1,194 @@
+"""Hooks of the site: generated pages, links between the repository and the site, alternative text.
+
+The pages are read in two places: in the repository, where links name files, and on the site. Pages
+therefore link files of the repository, and these hooks replace the links.
+"""
+
+import ast
+import base64
+import html
+import json
+import re
+from pathlib import Path
+
+from mkdocs.structure.files import File
+
+SITE = Path(__file__).parent
+DOCS, ROOT = SITE.parent, SITE.parents[1]
+# Files of the repository that are pages of the site.
+ROOT_PAGES = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+}
+ROOT_FILES = ("CITATION.cff", "LICENSE")
+SECTIONS = {
+    "howto": ("How-to guides", "Each page solves one task."),
+    "explanation": ("Explanation", "The mathematics behind the methods, and their limits."),
+}
+
+
+def on_config(config):
+    config.nav = [_existing(entry) for entry in config.nav]
+    config.nav = [entry for entry in config.nav if entry]
+    return config
+
+
+def _existing(entry):
+    """Drop pages of `SECTIONS` and guide.md that are not written, and sections without pages."""
+    if isinstance(entry, dict):
+        ((title, value),) = entry.items()
+        if isinstance(value, list):
+            value = [kept for kept in map(_existing, value) if kept]
+            # An index alone is no section.
+            return {title: value} if len(value) > 1 else None
+        return entry if _existing(value) else None
+    folder, _, name = entry.rpartition("/")
+    optional = folder in SECTIONS and name != "index.md" or entry == "guide.md"
+    return entry if not optional or (DOCS / entry).exists() else None
+
+
+def on_files(files, config):
+    for source, page in ROOT_PAGES.items():
+        if page != "index.md":
+            text = (ROOT / source).read_text(encoding="utf-8")
+            files.append(File.generated(config, page, content=_from_root(text)))
+    for name in ROOT_FILES:
+        files.append(File.generated(config, name, content=(ROOT / name).read_bytes()))
+    for asset in sorted((SITE / "assets").iterdir()):
+        files.append(File.generated(config, f"assets/{asset.name}", abs_src_path=str(asset)))
+    for folder in SECTIONS:
+        if pages := _pages(folder, config):
+            text = _index(folder, pages)
+            files.append(File.generated(config, f"{folder}/index.md", content=text))
+    for notebook in sorted(DOCS.glob("*.ipynb")):
+        for number, picture in enumerate(_pictures(notebook), 1):
+            path = f"gallery/{notebook.stem}-{number}.png"
+            files.append(File.generated(config, path, content=picture))
+    return files
+
+
+def _pages(folder, config):
+    """Return the pages of a folder in the order of the navigation."""
+    paths = re.findall(rf"'({folder}/\w+\.md)'", str(config.nav))
+    return [DOCS / path for path in paths if not path.endswith("/index.md")]
+
+
+def _index(folder, pages):
+    title, summary = SECTIONS[folder]
+    lines = [f"# {title}", "", summary, ""]
+    for page in pages:
+        head, *paragraphs = page.read_text(encoding="utf-8").split("\n\n")
+        prose = next((p for p in paragraphs if re.match(r"[A-Z`*]", p)), "")
+        sentence = re.split(r"(?<=[.:])\s", prose.replace("\n", " "))[0]
+        sentence = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", sentence)  # links are relative to the page
+        lines.append(f"- [{head.lstrip('# ').strip()}]({page.name}). {sentence}")
+    return "\n".join(lines) + "\n"
+
+
+def _pictures(notebook):
+    """Return the pictures of a notebook as bytes, in order."""
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    return [
+        base64.b64decode("".join(output["data"]["image/png"]))
+        for cell in cells
+        for output in cell.get("outputs", [])
+        if "image/png" in output.get("data", {})
+    ]
+
+
+def _from_root(text):
+    """Rewrite links of a file at the top level of the repository for a page at the top of the site."""
+    text = text.replace("](notebooks/", "](").replace("](CHANGELOG.md", "](changelog.md")
+    return text.replace("](CONTRIBUTING.md", "](contributing.md").replace("](README.md", "](index.md")
+
+
+def _section(name):
+    """Return the body of a section of README."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    return _from_root(re.search(rf"^## {re.escape(name)}\n(.*?)(?=^## |\Z)", text, re.M | re.S)[1])
+
+
+def on_page_markdown(markdown, page, config, files):
+    markdown = re.sub(r"<!-- README: (.*?) -->", lambda found: _section(found[1]).strip(), markdown)
+    if page.file.src_uri == "tutorials.md":
+        markdown = _gallery(markdown, page.meta["pictures"])
+    return re.sub(r"\]\(((?:\.\./)+)([\w.]+)(#[^)]*)?\)", _root_link, markdown)
+
+
+def _root_link(found):
+    up, name, anchor = found.groups()
+    if name in ROOT_PAGES:
+        name = ROOT_PAGES[name]
+        # The first page has some sections of README only.
+        anchor = "" if name == "index.md" else anchor or ""
+    elif name not in ROOT_FILES:
+        return found[0]
+    return f"]({up.removeprefix('../')}{name}{anchor or ''})"
+
+
+def _gallery(markdown, pictures):
+    """Turn a list of notebooks into cards with pictures."""
+
+    def card(found):
+        title, notebook, text = found.groups()
+        stem = notebook.removesuffix(".ipynb")
+        alternative = f"Picture of the tutorial: {title}"
+        picture = f"[![{alternative}](gallery/{stem}-{pictures[stem]}.png)]({notebook})"
+        text = text.strip().replace("\n  ", "\n    ")
+        return f"-   {picture}\n\n    **[{title}]({notebook})**\n\n    {text}\n\n"
+
+    item = r"^- \[([^\]]*)\]\((\w+\.ipynb)\): (.*(?:\n  .*)*)\n"
+    cards = re.sub(item, card, markdown, flags=re.M)
+    first, last = cards.index("-   [!["), cards.rindex("\n\n    ")
+    end = cards.find("\n\n", last + 2)
+    end = len(cards) if end < 0 else end
+    body = cards[first:end]
+    return f'{cards[:first]}<div class="grid cards" markdown>\n\n{body}\n\n</div>\n{cards[end:]}'
+
+
+def _public_names():
+    """Return the names of `jaxbridge.__all__`."""
+    tree = ast.parse((ROOT / "jaxbridge/__init__.py").read_text(encoding="utf-8"))
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and node.targets[0].id == "__all__":
+            return frozenset(ast.literal_eval(node.value))
+    raise ValueError("jaxbridge/__init__.py has no `__all__`.")
+
+
+NAMES = _public_names()
+
+
+def on_page_content(content, page, config, files):
+    if page.file.src_uri.endswith(".ipynb"):
+        content = _describe_pictures(content, page)
+    return _link_names(content)
+
+
+def _describe_pictures(content, page):
+    """Give each picture of a notebook without alternative text the title of its section."""
+    section = page.title or ""
+
+    def replace(found):
+        nonlocal section
+        if found["title"] is not None:
+            section = html.escape(re.sub(r"<[^>]*>|¶", "", found["title"]).strip(), quote=True)
+            return found[0]
+        return f'alt="Picture of the section: {section}"'
+
+    pattern = r'<h[1-4][^>]*>(?P<title>.*?)</h[1-4]>|alt="No description[^"]*"'
+    return re.sub(pattern, replace, content, flags=re.S)
+
+
+def _link_names(content):
+    """Link each public name in code style, `smooth` or `jb.smooth`, to its place in the reference."""
+    closed = {"a", "pre", "h1", "h2", "h3", "h4", "h5", "h6", "autoref"}
+    depth, parts = 0, []
+    for part in re.split(r"(<code>[^<]*</code>|</?\w+[^>]*>)", content):
+        if name := re.fullmatch(r"<code>(?:jb\.)?(\w+)(?:\([^<]*\))?</code>", part):
+            if not depth and name[1] in NAMES:
+                part = f'<autoref identifier="jaxbridge.{name[1]}" optional>{part}</autoref>'
+        elif (tag := re.match(r"<(/?)(\w+)", part)) and tag[2] in closed:
+            depth += -1 if tag[1] else 1
+        parts.append(part)
+    return "".join(parts)
