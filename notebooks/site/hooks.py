@@ -6,12 +6,14 @@ therefore link files of the repository, and these hooks replace the links.
 
 import ast
 import base64
+import hashlib
 import html
 import json
 import re
 from pathlib import Path
 
 from mkdocs.structure.files import File
+from mkdocs.utils import get_relative_url
 
 SITE = Path(__file__).parent
 DOCS, ROOT = SITE.parent, SITE.parents[1]
@@ -40,11 +42,12 @@ def _existing(entry):
         ((title, value),) = entry.items()
         if isinstance(value, list):
             value = [kept for kept in map(_existing, value) if kept]
-            # An index alone is no section.
-            return {title: value} if len(value) > 1 else None
+            return {title: value} if value else None
         return entry if _existing(value) else None
     folder, _, name = entry.rpartition("/")
-    optional = folder in SECTIONS and name != "index.md" or entry == "guide.md"
+    if folder in SECTIONS and name == "index.md":  # generated
+        return entry if (DOCS / folder).exists() else None
+    optional = folder in SECTIONS or entry == "guide.md"
     return entry if not optional or (DOCS / entry).exists() else None
 
 
@@ -162,7 +165,61 @@ NAMES = _public_names()
 def on_page_content(content, page, config, files):
     if page.file.src_uri.endswith(".ipynb"):
         content = _describe_pictures(content, page)
+        content = _link_pages(content, page, files)
+        content = _without_shared_parts(content, page)
+        _mend_contents(content, page)
     return _link_names(content)
+
+
+def on_post_build(config):
+    for name, style in STYLES.items():
+        (Path(config.site_dir) / name).write_text(style, encoding="utf-8")
+
+
+# Style sheets of notebooks, by their paths on the site.
+STYLES = {}
+
+
+def _without_shared_parts(content, page):
+    """Move the large style sheet, which all notebooks share, to a file; drop unused scripts."""
+
+    def link(found):
+        if len(found[1]) < 100_000:
+            return found[0]
+        name = f"assets/notebook-{hashlib.sha256(found[1].encode()).hexdigest()[:8]}.css"
+        STYLES[name] = found[1]
+        return f'<link rel="stylesheet" href="{get_relative_url(name, page.url)}">'
+
+    content = re.sub(r"<style[^>]*>(.*?)</style>", link, content, flags=re.S)
+    # Configurations of MathJax 2 and Mermaid, which the pages do not use.
+    unused = r'<script (?:src=""|type="text/x-mathjax-config"|type="module")>.*?</script>'
+    return re.sub(unused, "", content, flags=re.S)
+
+
+def _link_pages(content, page, files):
+    """Replace links from a notebook to files of the repository by links to pages of the site."""
+
+    def link(found):
+        name, anchor = found["name"], found["anchor"] or ""
+        target = files.get_file_from_path(ROOT_PAGES.get(name.removeprefix("../"), name))
+        if target is None:
+            return found[0]
+        return f'href="{target.url_relative_to(page.file)}{anchor}"'
+
+    return re.sub(r'href="(?P<name>[\w./]+\.(?:ipynb|md))(?P<anchor>#[^"]*)?"', link, content)
+
+
+def _mend_contents(content, page):
+    """Correct the table of contents of a notebook, in which code of headings is missing."""
+    headings = re.findall(r'<h[1-6] id="([^"]+)"[^>]*>(.*?)</h[1-6]>', content, re.S)
+
+    def flat(items):
+        for item in items:
+            yield item
+            yield from flat(item.children)
+
+    for item, (name, title) in zip(flat(page.toc), headings, strict=True):
+        item.id, item.title = name, re.sub(r"<[^>]*>|¶", "", title).strip()
 
 
 def _describe_pictures(content, page):

@@ -1,13 +1,10 @@
-// Formulas are those that arithmatex marks, and those of notebooks.
+// Dollar signs mark formulas in notebooks only. On other pages arithmatex marks them.
+const inNotebook = document.querySelector(".jupyter-wrapper") !== null;
 window.MathJax = {
   tex: {
-    inlineMath: [["\\(", "\\)"], ["$", "$"]],
-    displayMath: [["\\[", "\\]"], ["$$", "$$"]],
+    inlineMath: inNotebook ? [["\\(", "\\)"], ["$", "$"]] : [["\\(", "\\)"]],
+    displayMath: inNotebook ? [["\\[", "\\]"], ["$$", "$$"]] : [["\\[", "\\]"]],
     processEscapes: true,
     processEnvironments: true,
-  },
-  options: {
-    ignoreHtmlClass: ".*|",
-    processHtmlClass: "arithmatex|jp-RenderedMarkdown|jp-RenderedHTMLCommon",
   },
 };
