@@ -168,7 +168,7 @@ def on_page_content(content, page, config, files):
         content = _link_pages(content, page, files)
         content = _without_shared_parts(content, page)
         _mend_contents(content, page)
-    return _link_names(content)
+    return _link_names(_quote_axes(content))
 
 
 def on_post_build(config):
@@ -235,6 +235,16 @@ def _describe_pictures(content, page):
 
     pattern = r'<h[1-4][^>]*>(?P<title>.*?)</h[1-4]>|alt="No description[^"]*"'
     return re.sub(pattern, replace, content, flags=re.S)
+
+
+def _quote_axes(content):
+    """Write the axes of arrays in signatures alike: `Float[Array, ' d']` becomes "d"."""
+
+    def signature(found):
+        axes = r'<span class="s[12]">(?:&#39;|&quot;|["\']) ?([^<]*?)(?:&#39;|&quot;|["\'])</span>'
+        return re.sub(axes, r'<span class="s2">"\1"</span>', found[0])
+
+    return re.sub(r'<div class="doc-signature.*?</div>', signature, content, flags=re.S)
 
 
 def _link_names(content):
