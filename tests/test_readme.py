@@ -1,5 +1,5 @@
-"""README and the pages beside the notebooks: their code runs, each page as a program of its own; their
-tables are those of the stored run; and their links lead somewhere."""
+"""README and the pages beside the notebooks: their code runs, each page as a program of its own;
+their tables are those of the stored run; and their links lead somewhere."""
 
 import inspect
 import pathlib
@@ -15,7 +15,11 @@ ROOT = pathlib.Path(__file__).parent.parent
 NOTEBOOKS = ROOT / "notebooks"
 README, CONTRIBUTING = ROOT / "README.md", ROOT / "CONTRIBUTING.md"
 FOLDERS = [NOTEBOOKS, NOTEBOOKS / "howto", NOTEBOOKS / "explanation"]
-PAGES = [README, *(page for folder in FOLDERS for page in sorted(folder.glob("*.md"))), CONTRIBUTING]
+PAGES = [
+    README,
+    *(page for folder in FOLDERS for page in sorted(folder.glob("*.md"))),
+    CONTRIBUTING,
+]
 TEXT = {page: page.read_text(encoding="utf-8") for page in PAGES}
 # Blocks of other languages, and those marked as `py`, do not run.
 CODE = {page: re.findall(r"```python\n(.*?)```", text, re.DOTALL) for page, text in TEXT.items()}
@@ -80,8 +84,7 @@ CLAIMS = {
     "speed": lambda page: page["costs"].cheapest() is not None,
     "trust": lambda page: page["density"].trustworthy.tolist() == [True, False],
     "unknown_sigma": lambda page: (
-        covers(page["posterior"].params["sigma"], 0.5)
-        and covers(page["drift_posterior"].params, 1)
+        covers(page["posterior"].params["sigma"], 0.5) and covers(page["drift_posterior"].params, 1)
     ),
 }
 
