@@ -84,7 +84,9 @@ def _index(folder, pages):
         head, *paragraphs = page.read_text(encoding="utf-8").split("\n\n")
         prose = next((p for p in paragraphs if re.match(r"[A-Z`*]", p)), "")
         sentence = re.split(r"(?<=[.:])\s", prose.replace("\n", " "))[0]
-        sentence = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", sentence)  # links are relative to the page
+        sentence = re.sub(
+            r"\[([^\]]*)\]\([^)]*\)", r"\1", sentence
+        )  # links are relative to the page
         lines.append(f"- [{head.lstrip('# ').strip()}]({page.name}). {sentence}")
     return "\n".join(lines) + "\n"
 
@@ -101,9 +103,11 @@ def _pictures(notebook):
 
 
 def _from_root(text):
-    """Rewrite links of a file at the top level of the repository for a page at the top of the site."""
+    """Rewrite links of a file at the top level for a page at the top of the site."""
     text = text.replace("](notebooks/", "](").replace("](CHANGELOG.md", "](changelog.md")
-    return text.replace("](CONTRIBUTING.md", "](contributing.md").replace("](README.md", "](index.md")
+    return text.replace("](CONTRIBUTING.md", "](contributing.md").replace(
+        "](README.md", "](index.md"
+    )
 
 
 def _section(name):
@@ -168,7 +172,7 @@ def on_page_content(content, page, config, files):
         content = _link_pages(content, page, files)
         content = _without_shared_parts(content, page)
         _mend_contents(content, page)
-    return _link_names(_quote_axes(content))
+    return _link_names(content)
 
 
 def on_post_build(config):
@@ -237,18 +241,8 @@ def _describe_pictures(content, page):
     return re.sub(pattern, replace, content, flags=re.S)
 
 
-def _quote_axes(content):
-    """Write the axes of arrays in signatures alike: `Float[Array, ' d']` becomes "d"."""
-
-    def signature(found):
-        axes = r'<span class="s[12]">(?:&#39;|&quot;|["\']) ?([^<]*?)(?:&#39;|&quot;|["\'])</span>'
-        return re.sub(axes, r'<span class="s2">"\1"</span>', found[0])
-
-    return re.sub(r'<div class="doc-signature.*?</div>', signature, content, flags=re.S)
-
-
 def _link_names(content):
-    """Link each public name in code style, `smooth` or `jb.smooth`, to its place in the reference."""
+    """Link each public name in code style, `smooth` or `jb.smooth`, to the reference."""
     closed = {"a", "pre", "h1", "h2", "h3", "h4", "h5", "h6", "autoref"}
     depth, parts = 0, []
     for part in re.split(r"(<code>[^<]*</code>|</?\w+[^>]*>)", content):
