@@ -30,27 +30,6 @@ SECTIONS = {
 }
 
 
-def on_config(config):
-    config.nav = [_existing(entry) for entry in config.nav]
-    config.nav = [entry for entry in config.nav if entry]
-    return config
-
-
-def _existing(entry):
-    """Drop pages of `SECTIONS` and guide.md that are not written, and sections without pages."""
-    if isinstance(entry, dict):
-        ((title, value),) = entry.items()
-        if isinstance(value, list):
-            value = [kept for kept in map(_existing, value) if kept]
-            return {title: value} if value else None
-        return entry if _existing(value) else None
-    folder, _, name = entry.rpartition("/")
-    if folder in SECTIONS and name == "index.md":  # generated
-        return entry if (DOCS / folder).exists() else None
-    optional = folder in SECTIONS or entry == "guide.md"
-    return entry if not optional or (DOCS / entry).exists() else None
-
-
 def on_files(files, config):
     for source, page in ROOT_PAGES.items():
         if page != "index.md":
@@ -61,9 +40,8 @@ def on_files(files, config):
     for asset in sorted((SITE / "assets").iterdir()):
         files.append(File.generated(config, f"assets/{asset.name}", abs_src_path=str(asset)))
     for folder in SECTIONS:
-        if pages := _pages(folder, config):
-            text = _index(folder, pages)
-            files.append(File.generated(config, f"{folder}/index.md", content=text))
+        text = _index(folder, config)
+        files.append(File.generated(config, f"{folder}/index.md", content=text))
     for notebook in sorted(DOCS.glob("*.ipynb")):
         for number, picture in enumerate(_pictures(notebook), 1):
             path = f"gallery/{notebook.stem}-{number}.png"
@@ -71,24 +49,23 @@ def on_files(files, config):
     return files
 
 
-def _pages(folder, config):
-    """Return the pages of a folder in the order of the navigation."""
-    paths = re.findall(rf"'({folder}/\w+\.md)'", str(config.nav))
-    return [DOCS / path for path in paths if not path.endswith("/index.md")]
-
-
-def _index(folder, pages):
+def _index(folder, config):
+    """Return the first page of a section: its pages in the order of the navigation."""
     title, summary = SECTIONS[folder]
     lines = [f"# {title}", "", summary, ""]
-    for page in pages:
-        head, *paragraphs = page.read_text(encoding="utf-8").split("\n\n")
-        prose = next((p for p in paragraphs if re.match(r"[A-Z`*]", p)), "")
-        sentence = re.split(r"(?<=[.:])\s", prose.replace("\n", " "))[0]
-        sentence = re.sub(
-            r"\[([^\]]*)\]\([^)]*\)", r"\1", sentence
-        )  # links are relative to the page
-        lines.append(f"- [{head.lstrip('# ').strip()}]({page.name}). {sentence}")
+    for name in re.findall(rf"'{folder}/(\w+\.md)'", str(config.nav)):
+        if name != "index.md":
+            heading, sentence = _opening((DOCS / folder / name).read_text(encoding="utf-8"))
+            lines.append(f"- [{heading}]({name}). {sentence}")
     return "\n".join(lines) + "\n"
+
+
+def _opening(text):
+    """Return the title of a page and its first sentence, without links."""
+    heading, *paragraphs = text.split("\n\n")
+    prose = next((part for part in paragraphs if re.match(r"[A-Z`*]", part)), "")
+    sentence = re.split(r"(?<=[.:])\s", prose.replace("\n", " "))[0]
+    return heading.lstrip("# ").strip(), re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", sentence)
 
 
 def _pictures(notebook):
@@ -104,10 +81,10 @@ def _pictures(notebook):
 
 def _from_root(text):
     """Rewrite links of a file at the top level for a page at the top of the site."""
-    text = text.replace("](notebooks/", "](").replace("](CHANGELOG.md", "](changelog.md")
-    return text.replace("](CONTRIBUTING.md", "](contributing.md").replace(
-        "](README.md", "](index.md"
-    )
+    text = text.replace("](notebooks/", "](")
+    for source, page in ROOT_PAGES.items():
+        text = text.replace(f"]({source}", f"]({page}")
+    return text
 
 
 def _section(name):
@@ -135,23 +112,20 @@ def _root_link(found):
 
 
 def _gallery(markdown, pictures):
-    """Turn a list of notebooks into cards with pictures."""
+    """Turn the list of notebooks into cards with pictures."""
 
     def card(found):
         title, notebook, text = found.groups()
         stem = notebook.removesuffix(".ipynb")
-        alternative = f"Picture of the tutorial: {title}"
-        picture = f"[![{alternative}](gallery/{stem}-{pictures[stem]}.png)]({notebook})"
+        image = f"![Picture of the tutorial: {title}](gallery/{stem}-{pictures[stem]}.png)"
         text = text.strip().replace("\n  ", "\n    ")
-        return f"-   {picture}\n\n    **[{title}]({notebook})**\n\n    {text}\n\n"
+        return f"-   [{image}]({notebook})\n\n    **[{title}]({notebook})**\n\n    {text}\n\n"
 
-    item = r"^- \[([^\]]*)\]\((\w+\.ipynb)\): (.*(?:\n  .*)*)\n"
-    cards = re.sub(item, card, markdown, flags=re.M)
-    first, last = cards.index("-   [!["), cards.rindex("\n\n    ")
-    end = cards.find("\n\n", last + 2)
-    end = len(cards) if end < 0 else end
-    body = cards[first:end]
-    return f'{cards[:first]}<div class="grid cards" markdown>\n\n{body}\n\n</div>\n{cards[end:]}'
+    item = r"^- \[([^\]]*)\]\((\w+\.ipynb)\): (.*\n(?:  .*\n)*)"
+    before, *_ = re.split(item, markdown, maxsplit=1, flags=re.M)
+    cards = "".join(card(found) for found in re.finditer(item, markdown, re.M))
+    after = re.sub(item, "", markdown.removeprefix(before), flags=re.M)
+    return f'{before}<div class="grid cards" markdown>\n\n{cards}</div>\n{after}'
 
 
 def _public_names():
@@ -243,13 +217,13 @@ def _describe_pictures(content, page):
 
 def _link_names(content):
     """Link each public name in code style, `smooth` or `jb.smooth`, to the reference."""
-    closed = {"a", "pre", "h1", "h2", "h3", "h4", "h5", "h6", "autoref"}
+    without_links = {"a", "autoref", "pre", "h1", "h2", "h3", "h4", "h5", "h6"}
     depth, parts = 0, []
     for part in re.split(r"(<code>[^<]*</code>|</?\w+[^>]*>)", content):
         if name := re.fullmatch(r"<code>(?:jb\.)?(\w+)(?:\([^<]*\))?</code>", part):
             if not depth and name[1] in NAMES:
                 part = f'<autoref identifier="jaxbridge.{name[1]}" optional>{part}</autoref>'
-        elif (tag := re.match(r"<(/?)(\w+)", part)) and tag[2] in closed:
+        elif (tag := re.match(r"<(/?)(\w+)", part)) and tag[2] in without_links:
             depth += -1 if tag[1] else 1
         parts.append(part)
     return "".join(parts)
