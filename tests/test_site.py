@@ -16,7 +16,7 @@ ENTRIES = collections.Counter(re.findall(r"^::: (\S+)$", "\n".join(PAGES.values(
 
 
 def names_of_plot():
-    """`jaxbridge.plot.__all__`, without Matplotlib, which the module needs."""
+    """Return `jaxbridge.plot.__all__` without importing the module, which needs Matplotlib."""
     tree = ast.parse((ROOT / "jaxbridge/plot/__init__.py").read_text(encoding="utf-8"))
     (names,) = (node.value for node in tree.body if isinstance(node, ast.Assign))
     return ast.literal_eval(names)
@@ -38,7 +38,7 @@ def test_other_entries_are_those_of_verdicts():
 
 @pytest.mark.parametrize("folder", ["reference", "howto", "explanation", "."])
 def test_each_page_is_in_the_navigation(folder):
-    """A page that is not in the navigation fails the build, too, but later."""
+    """The build fails for a missing page, too. This test needs no extra."""
     navigation = (ROOT / "notebooks/site/mkdocs.yml").read_text(encoding="utf-8")
     pages = (ROOT / "notebooks" / folder).glob("*.md")
     for page in pages:
