@@ -256,7 +256,7 @@ def varying_sigma() -> Iterator[Model]:
     yield Model("multiplicative noise", model, on_line(grid, durations), (-2.0, 2.0), durations)
 
 
-def _intervals(model: Model, rng, count: int):
+def intervals_of(model: Model, rng, count: int):
     """Start, end, duration and log p of intervals: every other as likely as data, else anywhere,
     but not so unlikely that the exact numbers have no digits left."""
     size = 200
@@ -299,29 +299,36 @@ def _cases(family, name, estimate, exact) -> Iterator[Case]:
         )
 
 
-def densities(models, family, seed, count) -> Iterator[Case]:
-    """By each proposal, on a coarse and a fine grid."""
+def densities(models, family, seed, count, thorough=True) -> Iterator[Case]:
+    """By each proposal, on a coarse and a fine grid; on one of them by turns if not `thorough`."""
     rng = np.random.default_rng(seed)
-    for model in models:
-        start, end, duration, exact = _intervals(model, rng, count)
-        for name, proposal in _PROPOSALS.items():
-            for num_steps in (10, 50):
-                estimate = jb.transition_log_density(
-                    jax.random.key(rng.integers(2**31)),
-                    model.model,
-                    jnp.asarray(start[:, None], jnp.float32),
-                    jnp.asarray(end[:, None], jnp.float32),
-                    jnp.asarray(duration, jnp.float32),
-                    num_steps=num_steps,
-                    proposal=proposal,
-                )
-                yield from _cases(family, f"{model.name}, {name}, N = {num_steps}", estimate, exact)
+    for i, model in enumerate(models):
+        intervals = intervals_of(model, rng, count)
+        for j, name in enumerate(_PROPOSALS):
+            grids = (10, 50) if thorough else ((10, 50)[(i + j) % 2],)
+            for num_steps in grids:
+                yield from density_cases(family, model, intervals, name, num_steps, rng)
+
+
+def density_cases(family, model: Model, intervals, name, num_steps, rng) -> Iterator[Case]:
+    """Of one proposal, by name, on one grid."""
+    start, end, duration, exact = intervals
+    estimate = jb.transition_log_density(
+        jax.random.key(rng.integers(2**31)),
+        model.model,
+        jnp.asarray(start[:, None], jnp.float32),
+        jnp.asarray(end[:, None], jnp.float32),
+        jnp.asarray(duration, jnp.float32),
+        num_steps=num_steps,
+        proposal=_PROPOSALS[name],
+    )
+    yield from _cases(family, f"{model.name}, {name}, N = {num_steps}", estimate, exact)
 
 
 # Ornstein–Uhlenbeck processes, and images of them.
 
 
-def linear_densities(seed, count) -> Iterator[Case]:
+def linear_densities(seed, count, thorough=True) -> Iterator[Case]:
     """In two dimensions, with rotation, a full σ(x), couplings, and steps that are hopeless."""
     rng = np.random.default_rng(seed)
     processes = {
@@ -350,7 +357,7 @@ def linear_densities(seed, count) -> Iterator[Case]:
             exact += np.linalg.slogdet(np.asarray(jacobians, float))[1]
         couplings = {"coupling": jb.Coupling(0.0)} if warp is None else {}
         for kind, proposal in {**_PROPOSALS, **couplings}.items():
-            for num_steps in (10, 50):
+            for num_steps in (10, 50) if thorough else (20,):
                 estimate = jb.transition_log_density(
                     jax.random.key(rng.integers(2**31)),
                     model, start, end, duration, num_steps=num_steps, proposal=proposal,
@@ -359,7 +366,7 @@ def linear_densities(seed, count) -> Iterator[Case]:
                 yield from _cases("OU, images of it", title, estimate, exact)
 
 
-def linear_means(seed, count) -> Iterator[Case]:
+def linear_means(seed, count, thorough=True) -> Iterator[Case]:
     """Mid-points of bridges, by weights and by chains, in standard deviations."""
     rng = np.random.default_rng(seed)
     model = jb.ornstein_uhlenbeck(helpers.NON_REVERSIBLE)
@@ -373,7 +380,7 @@ def linear_means(seed, count) -> Iterator[Case]:
     mean = np.array([np.asarray(law.mean[0]) for law in laws])
     sd = np.array([np.sqrt(np.diag(np.asarray(law.covariance[0]))) for law in laws])
     for kind, proposal in {**_PROPOSALS, "coupling": jb.Coupling(0.5)}.items():
-        for num_steps in (10, 50):
+        for num_steps in (10, 50) if thorough else (20,):
             for method in ("weights", "chain"):
                 key = jax.random.key(rng.integers(2**31))
                 sample = (
@@ -417,7 +424,7 @@ def _told(family, name, result, value, exact, error, step_error, k=np.nan) -> Ca
     return Case(family, name, *numbers, bool(result.trustworthy), why)
 
 
-def linear_records(seed, count) -> Iterator[Case]:
+def linear_records(seed, count, thorough=True) -> Iterator[Case]:
     """Likelihoods and smoothed means of linear models beside Kalman's."""
     rng = np.random.default_rng(seed)
     models = {
@@ -451,7 +458,7 @@ def linear_records(seed, count) -> Iterator[Case]:
             R = np.eye(len(matrix)) * noise**2
             seen = jb.LinearGaussian(matrix=matrix, covariance=noise**2)
             law = jb.GaussianLaw(np.zeros(d), np.eye(d))
-            for num_steps in (4, 20):
+            for num_steps in (4, 20) if thorough else (20,):
                 exact = kalman(step, times, values, matrix, R, np.zeros(d), np.eye(d), num_steps)
                 key = jax.random.key(rng.integers(2**31))
                 record = dict(observation=seen, initial=law, num_steps=num_steps)
@@ -479,7 +486,7 @@ def linear_records(seed, count) -> Iterator[Case]:
                 )  # fmt: skip
 
 
-def line_records(seed, count) -> Iterator[Case]:
+def line_records(seed, count, thorough=True) -> Iterator[Case]:
     """Likelihoods of noisy records of diffusions on a line beside sums over a grid."""
     rng = np.random.default_rng(seed)
     chosen = [*constant_sigma()][:2] + [m for m in varying_sigma() if m.name == "logistic"]
@@ -511,7 +518,7 @@ def line_records(seed, count) -> Iterator[Case]:
                 exact += np.log(belief.sum())
                 belief = (belief / belief.sum()) @ P
                 x = rng.choice(len(nodes), p=P[x] / P[x].sum())
-            for num_steps in (5, 20):
+            for num_steps in (5, 20) if thorough else (20,):
                 result = jb.log_likelihood(
                     jax.random.key(rng.integers(2**31)), model.model, gap * np.arange(12.0),
                     np.array(values), observation=jb.LinearGaussian(covariance=noise**2),
@@ -524,9 +531,12 @@ def line_records(seed, count) -> Iterator[Case]:
                 )  # fmt: skip
 
 
+# Of a seed, the number of intervals or records, and whether all grids are tried.
 _FAMILIES = {
-    "constant": lambda seed, n: densities(constant_sigma(), "σ constant", seed, n),
-    "varying": lambda seed, n: densities(varying_sigma(), "σ(x), boundaries", seed, n),
+    "constant": lambda seed, n, every: densities(constant_sigma(), "σ constant", seed, n, every),
+    "varying": lambda seed, n, every: densities(
+        varying_sigma(), "σ(x), boundaries", seed, n, every
+    ),
     "linear": linear_densities,
     "means": linear_means,
     "records": linear_records,
@@ -554,11 +564,11 @@ def table(cases: list[Case]) -> str:
     return "\n".join(rows)
 
 
-def run(families, seed, count) -> list[Case]:
+def run(families, seed, count, thorough=True) -> list[Case]:
     """All cases of these families, with progress on the standard error."""
     cases, begin = [], time.perf_counter()
     for name in families:
-        cases += _FAMILIES[name](seed, count)
+        cases += _FAMILIES[name](seed, count, thorough)
         print(f"{name}: {len(cases)} cases, {time.perf_counter() - begin:.0f} s", file=sys.stderr)
     return cases
 
@@ -568,9 +578,10 @@ def main() -> None:
     parser.add_argument("families", nargs="*", help=f"of {', '.join(_FAMILIES)}; all by default")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=8, help="intervals, or records, of each model")
+    parser.add_argument("--thorough", action="store_true", help="all grids for each proposal")
     parser.add_argument("--out", type=Path, help="a JSON file for all cases")
     options = parser.parse_args()
-    cases = run(options.families or _FAMILIES, options.seed, options.count)
+    cases = run(options.families or _FAMILIES, options.seed, options.count, options.thorough)
     print(table(cases))
     for case in cases:
         if case.trusted and case.is_wrong:

@@ -3,9 +3,11 @@ package that run by default, refusals and examples among them, with its annotati
 
 import os
 import pathlib
+import platform
+import re
 import shutil
 import sys
-import tempfile
+import zlib
 from importlib import metadata
 
 from jaxtyping import config as jaxtyping_config, install_import_hook
@@ -29,13 +31,35 @@ import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
-# Modules, workers and the programs that tests start compile much the same: what one has
-# compiled, be it small, the others read from disk, for the time of one run.
+# Modules, workers, the programs that tests start, and later runs compile mostly the same programs.
+# They are kept, however small, for this release of jaxlib and this kind of processor;
+# `pytest --cache-clear` removes them.
 _TESTS = pathlib.Path(__file__).parent
+_MOST_BYTES = 4_000_000_000
 _CACHE = "JAX_COMPILATION_CACHE_DIR"
-_OWNS_CACHE = _CACHE not in os.environ
-if _OWNS_CACHE:
-    os.environ[_CACHE] = tempfile.mkdtemp()
+
+
+def _processor() -> str:
+    """Return a name of this kind of processor, on whose instructions programs depend."""
+    about = pathlib.Path("/proc/cpuinfo")
+    flags = re.search(r"^flags.*$", about.read_text(), re.M) if about.exists() else None
+    name = flags[0] if flags else platform.processor()
+    return f"{platform.machine()}-{zlib.crc32(name.encode()):08x}"
+
+
+def _programs() -> pathlib.Path:
+    """Return the folder of compiled programs, emptied if it has grown large."""
+    release = f"jaxlib-{metadata.version('jaxlib')}-{_processor()}"
+    folder = _TESTS.parent / ".pytest_cache" / "programs" / release
+    if folder.exists() and sum(file.stat().st_size for file in folder.iterdir()) > _MOST_BYTES:
+        shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+# Workers inherit the folder from the process that starts them.
+if _CACHE not in os.environ:
+    os.environ[_CACHE] = str(_programs())
 jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
@@ -49,11 +73,6 @@ def compiled_in_haste(request):
     runs is."""
     haste = "optimised" not in request.keywords
     jax.config.update("jax_disable_most_optimizations", haste)
-
-
-def pytest_unconfigure():
-    if _OWNS_CACHE:
-        shutil.rmtree(os.environ[_CACHE], ignore_errors=True)
 
 
 @pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.slow)])

@@ -307,6 +307,75 @@ def test_malformed_functions_and_models(call, monkeypatch):
         assert not faults(call, lambda i: OF_FUNCTIONS, monkeypatch, traced=True)
 
 
+# Calls that return estimates: what is malformed and taken all the same is run.
+ESTIMATES = {
+    name: CALLS[name]
+    for name in [
+        "transition_log_density",
+        "sample_weighted_bridges",
+        "sample_exact_bridges",
+        "log_likelihood",
+        "smooth",
+        "score",
+        "gibbs of a record",
+        "pmmh",
+        "maximum_likelihood",
+    ]
+}
+NUMBERS = [np.nan, np.inf, -1.0, 0.0, 1e-30, 1e19, 1e38, 1e300]
+
+
+def with_number(arguments, value):
+    """The arguments of a call, with this value in the place of one number each time."""
+    model = arguments["model"]
+    for name in ("B", "mean"):
+        number = jnp.full_like(getattr(model.params, name), value)
+        yield (
+            f"params.{name}",
+            {"model": model.with_params(model.params._replace(**{name: number}))},
+        )
+    if "end" in arguments:
+        yield "start", {"start": [value, 0.0]}
+        yield "duration", {"duration": value}
+    else:
+        yield "times", {"times": [0.0, value, 2 * value]}
+        yield "observations", {"observations": [[0.0], [value], [0.2]]}
+        yield "units", {"observations": value * np.array(RECORD["observations"])}
+    if "observation" in arguments:
+        yield "covariance", {"observation": lambda: jb.LinearGaussian(covariance=value)}
+
+
+def main_number(result):
+    """The number that was asked for."""
+    for name in ("gradient", "theta", "value"):
+        if hasattr(result, name):
+            return getattr(result, name)
+    return result.mean()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("call", ESTIMATES)
+def test_outcomes_of_malformed_numbers(call):
+    """An estimate that is not finite is not trustworthy, and what is refused is named."""
+    call, arguments = ESTIMATES[call]()
+    wrong = []
+    for value in NUMBERS:
+        for name, changed in with_number(arguments, value):
+            try:
+                made = {k: each() if callable(each) else each for k, each in changed.items()}
+                with jax.numpy_dtype_promotion("standard"):  # as optax asks for
+                    result = call(**(arguments | made))
+                finite = np.all(np.isfinite(main_number(result)))
+                if not finite and np.all(result.trustworthy):
+                    wrong.append((name, value, "not finite, and trusted"))
+            except (ValueError, TypeError) as error:
+                if "`" not in str(error):
+                    wrong.append((name, value, f"{type(error).__name__}: {error}"))
+            except Exception as error:
+                wrong.append((name, value, f"{type(error).__name__}: {error}"))
+    assert not wrong
+
+
 # Functions that a model, an observation model or a coupling holds, each in a call that evaluates
 # it, beside the name that the refusal must have.
 def drift(x, p):

@@ -22,6 +22,11 @@ from .pareto import is_reliable
 
 _NO_FAULT = "No fault was found."
 _PARAMETERS = "Some parameters of the model are not finite, so simulation is impossible."
+_NOT_FINITE = (
+    "The result or its error is not finite, and no other fault was found: a point, an observation "
+    "or a parameter exceeds the range of the floating-point numbers. Use other units, or double "
+    "precision."
+)
 _MISSING = (
     "Some bridges were not found within `max_proposals` proposals. Allow more proposals, lengthen "
     "the duration or choose a smaller `gamma`. On intervals much shorter than the relaxation time, "
@@ -41,23 +46,24 @@ _TRUNCATED = (
     "a density."
 )
 _HEAVY = (
-    "Some weights have tails so heavy (a Pareto shape k̂ above 0.7, or 0.6 where weights are very "
-    "unequal, or 1 where they are nearly equal; or fewer than 20 effective weights) that their "
-    "mean and its error cannot be trusted. Choose another proposal, more "
-    'proposals, shorter intervals, or `method="crank_nicolson"`.'
+    "Some weights have tails so heavy that their mean and its error cannot be trusted: the Pareto "
+    "shape k̂ is above 0.7 (0.6 for very unequal weights, 1 for nearly equal ones), or fewer than "
+    "20 weights are effective. Choose another proposal, more proposals, shorter intervals, or "
+    '`method="crank_nicolson"`.'
 )
 _LOST = (
-    "Many simulated paths left the state space or the finite numbers (`num_nonfinite`): 5 % if "
-    "weights are equal, fewer if not. Their mass is missing, so densities are too small and "
-    "bridges keep away from the boundary. Take more steps, or coordinates in which steps cannot "
-    "leave. Where the diffusion attains its boundary (of dX = κ(θ - X) dt + σ√X dW where "
-    "2κθ < σ²) neither is a remedy: no proposal of this package has paths that touch it."
+    "Too many simulated paths left the state space or the finite numbers (`num_nonfinite`): more "
+    "than 5 % if weights are equal, fewer otherwise. Their mass is missing, so densities are too "
+    "small and bridges avoid the boundary. Use more steps, or coordinates in which steps cannot "
+    "leave. Neither helps if the diffusion attains its boundary (such as dX = κ(θ - X) dt + "
+    "σ√X dW with 2κθ < σ²): no proposal of this package has paths that touch it."
 )
 # A larger share of missing mass is a fault.
 _MOST_MISSING = 0.05
-# Σw² n / (Σw)² where it is not known, as of the states of a chain.
+# Assumed inequality of weights, n Σw² / (Σw)², if it is unknown, as for the states of a chain.
 _INEQUALITY = 2.5
 
+# Fewest effective weights of an interval in a sum over intervals.
 _FEWEST_IN_SUM = 5
 
 
@@ -81,6 +87,16 @@ class Verdict(eqx.Module):
     def trustworthy(self) -> Bool[Array, "*I"]:
         """Return whether no fault is present, shape () or (I,)."""
         return ~reduce(jnp.logical_or, (fault.present for fault in self.faults))
+
+    def with_finite(self, *numbers: Float[Array, "*shape"]) -> "Verdict":
+        """Return the same faults, and the fault that one of the numbers is not finite though no
+        other fault is present. Their first axes are those of `trustworthy`."""
+        sound = self.trustworthy
+        finite = [
+            jnp.all(jnp.isfinite(each), axis=tuple(range(sound.ndim, each.ndim)))
+            for each in numbers
+        ]
+        return Verdict((*self.faults, Fault(sound & ~reduce(jnp.logical_and, finite), _NOT_FINITE)))
 
     def why(self) -> str:
         """Return one line for each fault that is present.
@@ -155,20 +171,27 @@ def lost_paths(
     effective: Float[Array, "*I"] | None = None,
     number: Int[Array, "*I"] | None = None,
 ) -> Fault:
-    """Return the fault of paths that left the state space or the finite numbers: the mass that may
-    be missing is beyond 5 % and beyond the standard error.
+    """Return the fault of paths that left the state space or the finite numbers.
 
-    A lost path would have had any weight. It counts with Σw²/Σw, the mean weight of a path of the
-    target, which is number/effective times the mean of the weights above zero: where weights are
-    equal a share q of lost paths is a share q of the mass, and where a few have most of it the lost
-    ones may be among them.
+    It is present if the mass that may be missing exceeds both 5 % and the relative standard error.
+    `number` is the number of positive weights.
+
+    The weight of a lost path is unknown. It is taken as Σw²/Σw, the mean weight of a path of the
+    target, which is number/effective times the mean positive weight. With equal weights, a share q
+    of lost paths is a share q of the mass. If a few weights have most of the mass, lost paths may
+    be among them.
     """
     share = num_lost / jnp.maximum(num_simulated, 1)
     if effective is None or number is None:
-        return Fault(share > _MOST_MISSING / _INEQUALITY, _LOST)
+        return lost_share(share)
     size = jnp.maximum(effective, 1)
     missing = share.astype(size.dtype) * jnp.maximum(number.astype(size.dtype) / size, 1)
     return Fault(missing > jnp.maximum(_MOST_MISSING, 1 / jnp.sqrt(size)), _LOST)
+
+
+def lost_share(share: Float[Array, "*I"]) -> Fault:
+    """Return the fault of a share of lost paths whose weights are not known to be equal."""
+    return Fault(share > _MOST_MISSING / _INEQUALITY, _LOST)
 
 
 def heavy_tails(
@@ -176,8 +199,11 @@ def heavy_tails(
     effective: Float[Array, "*I"] | float,
     number: Int[Array, "*I"] | None = None,
 ) -> Fault:
-    """Return the fault of weights whose mean a few large ones decide, by their Pareto shape, their
-    effective number and the number of those above zero."""
+    """Return the fault of weights whose mean is determined by a few large ones.
+
+    It follows from their Pareto shape, their effective sample size and the number of positive
+    weights (see `is_reliable`).
+    """
     return Fault(~is_reliable(k, effective, number), _HEAVY)
 
 

@@ -97,7 +97,8 @@ class TransitionLogDensity(AbstractResult):
         - too many lost paths;
         - a discretisation error that dominates and exceeds 0.05.
         """
-        return Verdict((*self._weight_faults, step_fault(self._step_error, self.standard_error)))
+        verdict = Verdict((*self._weight_faults, step_fault(self._step_error, self.standard_error)))
+        return verdict.with_finite(self.value, self.standard_error)
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:

@@ -104,7 +104,8 @@ class ExtrapolatedBridges(AbstractResult):
         It does not include the discretisation error: compare half of `removed(fn)` with the
         standard error.
         """
-        return Verdict((*self.fine._weight_faults, *self.coarse._weight_faults))
+        verdict = Verdict((*self.fine._weight_faults, *self.coarse._weight_faults))
+        return verdict.with_finite(self.fine.mean(), self.coarse.mean())
 
     def _combined(self, fn, fine, coarse, combine):
         # Extrapolation needs the order p only, so it also works where `step_share` is infinite.

@@ -160,7 +160,8 @@ class WeightedBridges(AbstractExactBridges):
         """
         # In standard deviations, as is the discretisation error of the mean path.
         error = 1 / jnp.sqrt(jnp.maximum(self.effective_sample_size, 1))
-        return Verdict((*self._weight_faults, step_fault(self.step_error_in_sds(), error)))
+        verdict = Verdict((*self._weight_faults, step_fault(self.step_error_in_sds(), error)))
+        return verdict.with_finite(self.mean(), self.standard_error())
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:

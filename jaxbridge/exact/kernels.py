@@ -144,7 +144,7 @@ class Chain(AbstractExactBridges):
                 ),
                 step_fault(self.step_error_in_sds(), error),
             )
-        )
+        ).with_finite(self.mean())
 
     def standard_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return the standard error of `mean(fn)`, entry by entry.

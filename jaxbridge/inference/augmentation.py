@@ -6,6 +6,7 @@ is quadratic if the drift is linear in θ. The module detects this from the prog
 in which θ does not occur.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -22,7 +23,14 @@ from ..engine.keys import split_each
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
 from ..proposals import AbstractWeightedProposal, Budget, ModifiedDiffusionBridge, as_pairs
-from ..schemes import EulerDensity, Form, log_likelihoods
+from ..schemes import (
+    MOST_TOO_LONG,
+    UNKNOWN_SHARE,
+    EulerDensity,
+    Form,
+    log_likelihoods,
+    share_in_regime,
+)
 from .blocks import Block, Use, make_blocks, target_forms, with_keys
 from .bridge_kernels import AbstractBridgeKernel, BridgeInfo, ByRenewal, ByWeights, Unweighted
 from .data import Problem
@@ -125,14 +133,20 @@ class Augmentation(eqx.Module):
         many steps make each path e^D times as likely (`halving`), so that they change log p of an
         interval by log E[e^D], to leading order E[D + ½ D²]; of that a share is the error.
         (Not E[D], for the variance of D is of the same order; nor E[e^D - 1], which is -1 however
-        far steps are out of all proportion, and would tell of no error.)"""
+        far steps are out of all proportion, and would tell of no error.) Infinite where steps are
+        too long for the drift in more than 2 % of the intervals."""
         model, form = model.prepared(), self.form
 
         def of_block(block, mine):
             halvings = block.log_halvings(model, mine, form)
-            return jnp.sum(block.step_shares(model, form) * (halvings + halvings**2 / 2))
+            share = block.step_shares(model, form)
+            in_regime = share_in_regime(share, model, block.intervals, block.num_steps)
+            error = jnp.sum(share * (halvings + halvings**2 / 2))
+            return error, jnp.sum(in_regime == UNKNOWN_SHARE)
 
-        return sum(map(of_block, self.blocks, paths), start=jnp.zeros((), paths[0].dtype))
+        errors, too_long = zip(*map(of_block, self.blocks, paths), strict=True)
+        hopeless = sum(too_long) > math.floor(MOST_TOO_LONG * self.num_intervals)
+        return jnp.where(hopeless, jnp.inf, sum(errors))
 
     def points(self, paths: Paths) -> tuple[Float[Array, "points d"], Float[Array, " points"]]:
         """All points of the paths but their ends, and the steps that begin there."""

@@ -141,9 +141,9 @@ def with_keys(
 
 def over_intervals(blocks: tuple[Block, ...], made: Sequence[Any]) -> Any:
     """What was made of each block, named tuples, for all intervals: sums, and of the effective
-    number of paths and k̂ of each interval those of all, in their order."""
+    number of paths, k̂ and the counts of each interval those of all, in their order."""
     order = jnp.argsort(jnp.concatenate([block.index for block in blocks]))
-    fields = ("effective_sample_size", "pareto_k")
+    fields = ("effective_sample_size", "pareto_k", "num_found", "num_simulated", "num_nonfinite")
     each = {f: jnp.concatenate([getattr(one, f) for one in made])[order] for f in fields}
     sums = [one._replace(**dict.fromkeys(fields, 0)) for one in made]
     return jax.tree.map(lambda *leaves: sum(leaves), *sums)._replace(**each)

@@ -1,7 +1,7 @@
 """Markov kernels for the bridges given the parameters: one step for the path of each interval.
 
 The first two kernels leave the exact law of a bridge at the current θ invariant (section 2.3 of the
-paper), also if the path was drawn at another θ:
+paper). The current path may come from another θ.
 
 - `ByRenewal`, for couplings, holds a bridge until its associated diffusion hits it. The path is its
   only state.
@@ -32,13 +32,15 @@ class BridgeInfo(NamedTuple):
     """Of one step on all intervals: whether the path of each was replaced; how many paths were
     simulated, or weighed, for it; whether no proposal was found though one was called for. Then
     the path stays, which leaves the exact law invariant, for whether one is found does not
-    depend on the path. Last, whether a weight was cut off by a bound on its trials, or the run
-    that replaces a sampler of the stationary law by one on its steps."""
+    depend on the path. Then, whether a weight was cut off by a bound on its trials, or the run
+    that replaces a sampler of the stationary law by one on its steps. Last, how many paths left the
+    state space or the finite numbers."""
 
     moved: Bool[Array, " I"]
     num_simulated: Int[Array, " I"]
     missing: Bool[Array, " I"]
     truncated: Bool[Array, " I"]
+    num_nonfinite: Int[Array, " I"]
 
 
 class AbstractBridgeKernel(eqx.Module):
@@ -75,7 +77,8 @@ class ByRenewal(AbstractBridgeKernel):
         num_steps = paths.shape[1] - 1
         law, dt = self.pairs.coupling.start_law, intervals.duration / num_steps
         cut = run_is_cut(law, model, dt, num_steps)
-        return paths, BridgeInfo(info.is_accepted, info.num_simulated, info.is_missing, cut)
+        counts = info.is_accepted, info.num_simulated, info.is_missing, cut
+        return paths, BridgeInfo(*counts, info.num_nonfinite)
 
 
 class ByWeights(AbstractBridgeKernel):
@@ -97,7 +100,9 @@ class ByWeights(AbstractBridgeKernel):
         num_simulated = old.num_simulated[:, 0] + new.num_simulated[:, 0]
         paths = jnp.where(accepted[:, None, None], new.paths[:, 0], paths)
         truncated = old.truncated[:, 0] | new.truncated[:, 0]
-        return paths, BridgeInfo(accepted, num_simulated, ~new.found[:, 0], truncated)
+        num_nonfinite = old.num_nonfinite[:, 0] + new.num_nonfinite[:, 0]
+        counts = accepted, num_simulated, ~new.found[:, 0], truncated
+        return paths, BridgeInfo(*counts, num_nonfinite)
 
 
 class Unweighted(AbstractBridgeKernel):
@@ -113,4 +118,5 @@ class Unweighted(AbstractBridgeKernel):
         proposed = propose_paths(keys, model, self.pairs, intervals, None, num_steps)
         found = proposed.num_found > 0
         paths = jnp.where(found[:, None, None], proposed.outputs.paths, paths)
-        return paths, BridgeInfo(found, proposed.num_trials, ~found, jnp.zeros_like(found))
+        counts = found, proposed.num_trials, ~found, jnp.zeros_like(found)
+        return paths, BridgeInfo(*counts, proposed.num_nonfinite)

@@ -20,7 +20,7 @@ from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
 from ..engine.progress import metered_scan
-from ..engine.verdict import Fault
+from ..engine.verdict import Fault, lost_paths
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
 from ..records import Initial, Observation, as_record_problems
@@ -98,6 +98,7 @@ class GibbsPosterior(AbstractPosterior):
         zero, the posterior is conditional on these placeholders; then use another proposal.
     - `num_truncated`: number of weights that `max_trials` truncated, shape (*chains, n). With many
         of them the law is not exact.
+    - `num_nonfinite`: number of paths that diverged or left the state space, shape (*chains, n).
     - `log_step_error`: estimated discretisation error of the log density of the completed data at
         each draw, up to a constant, shape (*chains, n). NaN at draws without an estimate.
         `step_error`, that of the posterior mean, is computed from it.
@@ -115,6 +116,7 @@ class GibbsPosterior(AbstractPosterior):
     num_simulated: Int[Array, "*chains n"]
     num_missing: Int[Array, "*chains n"]
     num_truncated: Int[Array, "*chains n"]
+    num_nonfinite: Int[Array, "*chains n"]
     log_step_error: Float[Array, "*chains n"]
     sigma_varies: bool = eqx.field(static=True)
     state: GibbsState
@@ -130,7 +132,11 @@ class GibbsPosterior(AbstractPosterior):
         # Counted in every iteration: a stand-in that no proposal has replaced.
         late = self.num_missing[..., self.num_missing.shape[-1] // 2 :]
         often = jnp.mean(self.num_truncated > 0, axis=-1) > _MOST_TRUNCATED
-        return Fault(jnp.any(jnp.min(late, axis=-1) > 0), _MISSING), Fault(jnp.any(often), _CUT_OFF)
+        return (
+            Fault(jnp.any(jnp.min(late, axis=-1) > 0), _MISSING),
+            Fault(jnp.any(often), _CUT_OFF),
+            lost_paths(jnp.sum(self.num_nonfinite), jnp.sum(self.num_simulated)),
+        )
 
 
 @public_entry
@@ -280,6 +286,7 @@ class GibbsInfo(NamedTuple):
     num_simulated: Int[Array, "*chains"]
     num_missing: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
+    num_nonfinite: Int[Array, "*chains"]
 
 
 class _Sampler(eqx.Module):

@@ -41,12 +41,21 @@ class Guide(NamedTuple):
 
 class Estimate(NamedTuple):
     """log of an unbiased estimate of the likelihood, -inf where there is none, with its variance
-    and its step error; and how many of its weights were cut off."""
+    and its step error; how many of its weights were cut off; and the share of its paths, or
+    particles, that left the state space or the finite numbers."""
 
     log_likelihood: Float[Array, ""]
     variance: Float[Array, ""]
     log_step_error: Float[Array, ""]
     num_truncated: Int[Array, ""]
+    share_lost: Float[Array, ""]
+
+
+def _share(
+    part: Int[Array, " I"], whole: Int[Array, " I"], like: Float[Array, ""]
+) -> Float[Array, " I"]:
+    """Return part / whole, zero of nothing."""
+    return part.astype(like.dtype) / jnp.maximum(whole, 1).astype(like.dtype)
 
 
 class AbstractLikelihood(eqx.Module):
@@ -124,7 +133,8 @@ class TransitionLikelihood(AbstractLikelihood):
     def estimate(self, key, model):
         model = model.prepared()
         zero = jnp.zeros((), self.like.dtype)
-        total = Estimate(zero, zero, zero, jnp.int32(0))
+        total = Estimate(zero, zero, zero, jnp.int32(0), zero)
+        num_intervals = sum(len(block.index) for block in self.blocks)
         for block_key, block in with_keys(key, self.blocks):
             arguments = (model, block.proposal, block.problem, self.num_proposals)
             made = estimate_log_density(block_key, *arguments, held=True)
@@ -133,6 +143,7 @@ class TransitionLikelihood(AbstractLikelihood):
                 jnp.sum(made.standard_error**2),
                 jnp.sum(made.step_error),
                 jnp.sum(made.num_truncated, dtype=jnp.int32),
+                jnp.sum(_share(made.num_nonfinite, made.num_simulated, zero)) / num_intervals,
             )
             total = jax.tree.map(jnp.add, total, mine)
         known = ~jnp.isnan(total.log_likelihood)
@@ -174,17 +185,16 @@ class RecordLikelihood(AbstractLikelihood):
     num_particles: int = eqx.field(static=True)
 
     def estimate(self, key, model):
-        value, variance = self._estimate(key, model, self.fine)
-        return Estimate(
-            nan_to_neg_inf(value), variance, jnp.full_like(value, jnp.nan), jnp.int32(0)
-        )
+        value, variance, lost = self._estimate(key, model, self.fine)
+        unknown = jnp.full_like(value, jnp.nan)
+        return Estimate(nan_to_neg_inf(value), variance, unknown, jnp.int32(0), lost)
 
     def log_step_error(self, key, model):
         problem = self.fine.records.stacked
         if problem.num_steps == 1:
             return jnp.full((), jnp.nan, problem.like.dtype)
         estimate = lambda grid: self._estimate(key, model, grid, skips=True)
-        log_p, variance = on_both_grids(estimate, self.fine, self.coarse)
+        log_p, variance, _ = on_both_grids(estimate, self.fine, self.coarse)
         # The mean of log p̂ is too small by half its variance.
         fine, coarse = log_p + variance / 2
         return share_of_grid(problem.density.order, problem.num_steps) * (coarse - fine)
@@ -223,11 +233,13 @@ class RecordLikelihood(AbstractLikelihood):
 
     def _estimate(
         self, key: Key[Array, ""], model: Diffusion, grid: GuidedRecords, skips: bool = False
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """log p̂ with its variance, of one filter of each record."""
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+        """log p̂ with its variance, of one filter of each record, and the mass that lost particles
+        may be missing from it."""
         made = self._filtered(key, model, grid, self.rate, 1, skips)
         variance = jax.vmap(lambda each: each.variance(self.num_particles))(made)
-        return jnp.sum(made.log_estimate), jnp.sum(variance)
+        lost = jnp.sum(made.num_nonfinite).astype(variance.dtype) / self.num_particles
+        return jnp.sum(made.log_estimate), jnp.sum(variance), lost
 
     def _filtered(
         self,

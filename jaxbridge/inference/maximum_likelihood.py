@@ -73,11 +73,11 @@ class MaximumLikelihood(AbstractResult):
     - `num_truncated`: number of weights that `max_trials` truncated.
     - `num_refused`: number of iterations without a step, because it would have left the constraint
         or led to values that are not finite.
-    - `newton`: whether Newton's method converged to a maximum. This means that the next step is
-        short compared with the standard errors or the Monte Carlo errors, that the information is
-        positive definite, and that the Monte Carlo error in every direction is at most half a
-        standard error. If false, `params` are not an estimate: use more iterations, a larger
-        learning rate or more bridges, unless the maximum is outside the constraint.
+    - `newton`: whether Newton's method converged to a maximum. Then the next step is short compared
+        with the standard errors or the Monte Carlo errors, and the information is positive
+        definite. Moreover the Monte Carlo error in every direction is at most half a standard
+        error. If false, `params` are not an estimate: use more iterations, a larger learning rate
+        or more bridges, unless the maximum is outside the constraint.
     - `fall`: decrease of the log-likelihood one standard error below and above the estimate in each
         parameter, with the others optimised to second order, shape (2, p). It is 0.5 for a
         quadratic log-likelihood. Values near or below zero show that there is no maximum inside;
@@ -114,7 +114,7 @@ class MaximumLikelihood(AbstractResult):
                 *self.score._weight_faults,
                 Fault(jnp.any(steps.present), steps.sentence),
             )
-        )
+        ).with_finite(self.theta, self.covariance)
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:

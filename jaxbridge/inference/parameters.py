@@ -200,7 +200,7 @@ def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p
         )
     if not is_traced(theta) and not np.all(np.isfinite(theta)):
         raise ValueError(
-            f"the unknown parameters must be finite; got the model's {parameters.params}."
+            f"the unknown parameters among `params` must be finite; got {parameters.params}."
         )
     if uses_argument(lambda theta: parameters.bind(theta).coordinate_values(), theta):
         raise ValueError(

@@ -1,8 +1,8 @@
 """Particle-marginal Metropolis–Hastings over any parameters, including those of σ.
 
 The likelihood of exact observations is a product of transition densities, and weighted proposals
-estimate it without bias (`exact.density`). A chain that accepts with the ratio of estimates, and
-stores the estimate of its state, has the exact posterior up to the discretisation error (Andrieu &
+estimate it without bias (`exact.density`). The chain accepts with the ratio of estimates and stores
+the estimate of its state. Its law is the exact posterior up to the discretisation error (Andrieu &
 Roberts 2009). Proposals of θ are normal random walks. The warm-up adapts their covariance S Sᵀ,
 
     S Sᵀ ← S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,    η_i = min(1, p i^(-2/3)),
@@ -33,7 +33,7 @@ from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..engine.linalg import matvec
 from ..engine.progress import metered_stages
-from ..engine.verdict import Fault
+from ..engine.verdict import Fault, lost_share
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal, Budget
@@ -148,6 +148,10 @@ class PMMHPosterior(AbstractPosterior):
     - `state`: last state; pass it as `init`, with `num_warmup=0`, to continue.
     - `guide`: diagnostics of the last guide of each record, from the warm-up; `None` without an
         `observation`. A poor guide is a fault only if the chain mixes poorly, too.
+    - `share_lost`: fraction of the paths that diverged or left the state space, mean over estimates
+        and intervals, shape (*chains,). With an `observation` it is the total number of lost
+        particles divided by `num_proposals`. It is a fault if more than 5 % of the mass may be
+        missing.
     """
 
     params: PyTree
@@ -163,6 +167,7 @@ class PMMHPosterior(AbstractPosterior):
     num_truncated: Int[Array, "*chains"]
     state: PMMHState
     guide: GuideCheck | None = None
+    share_lost: Float[Array, "*chains"] | None = None
 
     @property
     def stuck(self) -> Bool[Array, "*chains"]:
@@ -183,7 +188,7 @@ class PMMHPosterior(AbstractPosterior):
         share = self.num_truncated.astype(self.theta.dtype) / self.accepted.shape[-1]
         often = jnp.any(share > _MOST_TRUNCATED)
         in_part = ~noisy & ~jnp.all(self.variance_in_part < _MOST_VARIANCE)
-        refused = refused_moves(self.accepted)
+        refused, lost = refused_moves(self.accepted), self.share_lost
         hampered = noisy | in_part | refused.present | jnp.any(self.stuck)
         return (
             refused,
@@ -191,6 +196,7 @@ class PMMHPosterior(AbstractPosterior):
             Fault(noisy, _NOISY),
             Fault(in_part, _NOISY_IN_PART),
             Fault(often, _TRUNCATED),
+            *(() if lost is None else (lost_share(jnp.max(lost)),)),
         )
 
 
@@ -353,11 +359,13 @@ def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLi
 
 class PMMHInfo(NamedTuple):
     """Counted in one step: whether it was accepted; was refused because no estimate was to be had;
-    and how many weights of the estimate were cut off."""
+    how many weights of the estimate were cut off; and after the warm-up the share of its paths that
+    was lost."""
 
     accepted: Int[Array, "*chains"]
     num_without_estimate: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
+    share_lost: Float[Array, "*chains"]
 
 
 class _Run(NamedTuple):
@@ -440,7 +448,8 @@ class _Sampler(eqx.Module):
         without = inside & (made.log_likelihood == -jnp.inf)
         chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), moved, state)
         count = lambda which: which.astype(jnp.int32)
-        info = PMMHInfo(count(accepted), count(without), made.num_truncated)
+        lost = jnp.where(learning, 0, made.share_lost)
+        info = PMMHInfo(count(accepted), count(without), made.num_truncated, lost)
         return chain._replace(root=root), info
 
 
@@ -520,6 +529,7 @@ def _run(
             **run.chain._asdict(), num_done=run.num_done, proposals=(), guide=run.guide
         ),
         guide=None if run.guide is None else run.guide.check,
+        share_lost=run.counted.share_lost / (num_iterations * thin),
     )
 
 
@@ -531,7 +541,7 @@ def _not_begun(
     nothing, none = jnp.zeros(chains, theta.dtype), jnp.zeros(chains, jnp.int32)
     root = jnp.broadcast_to(root, (*chains, *root.shape))
     chain = _Chain(theta, nothing, nothing, nothing, root)
-    return _Run(chain, guide, jnp.int32(0), PMMHInfo(none, none, none))
+    return _Run(chain, guide, jnp.int32(0), PMMHInfo(none, none, none, nothing))
 
 
 def _going_on(state: PMMHState) -> _Run:
@@ -539,4 +549,5 @@ def _going_on(state: PMMHState) -> _Run:
         state.theta, state.log_likelihood, state.variance, state.log_step_error, state.root
     )
     none = jnp.zeros(chain.log_likelihood.shape, jnp.int32)
-    return _Run(chain, state.guide, state.num_done, PMMHInfo(none, none, none))
+    nothing = jnp.zeros_like(chain.log_likelihood)
+    return _Run(chain, state.guide, state.num_done, PMMHInfo(none, none, none, nothing))

@@ -18,14 +18,15 @@ from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.verdict import AbstractResult, Fault, Verdict
-from ..schemes import StepError, dominates, step_fault
+from ..schemes import StepError, dominates, step_fault, unknown_where
 from .parameters import Parameters, init_vectors, of_rows
 
 # Of about so many of the draws the step error is worked out: as many as tell a covariance, for it
 # takes a good part of the time of an iteration.
 _STEP_ERRORS = 256
-# Of fewer draws a covariance tells nothing.
-_FEWEST = 10
+# Of fewer draws a covariance tells nothing; nor if steps are too long for the drift in a larger
+# share of them.
+_FEWEST, _MOST_INFINITE = 10, 0.1
 # Limits of chains that agree, and of draws that are worth an error.
 _MOST_R_HAT, _FEWEST_EFFECTIVE = 1.1, 25
 _APART = (
@@ -87,7 +88,7 @@ class AbstractPosterior(AbstractResult):
                 *self._faults,
                 Fault(jnp.any(steps.present), steps.sentence),
             )
-        )
+        ).with_finite(self.theta)
 
     @property
     def _chains(self) -> Float[Array, "chains n p"]:
@@ -118,7 +119,8 @@ class AbstractPosterior(AbstractResult):
         """Estimated discretisation bias of the posterior means (estimate minus limit), shape (p,).
 
         To first order it is the covariance of θ and `log_step_error`. NaN if that is not available,
-        for instance with one step.
+        for instance with one step. It is also NaN, with an infinite uncertainty, if the steps are
+        too long for the drift (`log_step_error` is infinite) in more than a tenth of the draws.
         """
         return self._step_error.value
 
@@ -126,8 +128,8 @@ class AbstractPosterior(AbstractResult):
     def step_uncertainty(self) -> Float[Array, " p"]:
         """Standard error of `step_error`, shape (p,).
 
-        For a state-dependent σ it is at least `step_error` itself, because the estimate from half
-        as many steps may be too large by a factor of two or three.
+        For a state-dependent σ it is at least `step_error` itself. There the estimate from half as
+        many steps may be too large by a factor of two or three.
         """
         value, noise = self._step_error
         return jnp.hypot(noise, value) if self.sigma_varies else noise
@@ -167,8 +169,12 @@ class AbstractPosterior(AbstractResult):
         spread = jnp.sqrt(jnp.sum(each**2, axis=0) / jnp.minimum(count * share, count)) / jnp.sqrt(
             count
         )
-        unknown = number < _FEWEST
-        return StepError(jnp.where(unknown, jnp.nan, mean), jnp.where(unknown, jnp.nan, spread))
+        few = number < _FEWEST
+        error = StepError(jnp.where(few, jnp.nan, mean), jnp.where(few, jnp.nan, spread))
+        infinite = jnp.sum(jnp.isinf(self.log_step_error)).astype(products.dtype)
+        return unknown_where(
+            infinite > _MOST_INFINITE * (infinite + number.astype(infinite.dtype)), error
+        )
 
     def to_arviz(self) -> Any:
         """Return the draws as ArviZ's `InferenceData` (`DataTree` since its version 1).

@@ -6,8 +6,8 @@ The state is (θ, path). Two moves alternate:
 - the path is converted to its noise ξ (`record_paths`), and θ moves given ξ by a normal random walk
   with the target π(θ) w(θ, ξ). The path changes with θ.
 
-Hence the sampler works for parameters of σ, of the noise and of the initial law as well as for
-those of the drift, for every step size.
+Hence the unknown parameters may be those of the drift, of σ, of the noise and of the initial law,
+for every step size.
 
 The guide is linearised along a path that is likely at some θ. It may be poor at a θ far away.
 Neither the law of the path given θ nor that of θ given ξ depends on the guide, so the warm-up
@@ -186,7 +186,8 @@ class RecordSampler(eqx.Module):
         (state, guides), completion = guided, self.completion
         noise, log_weight = completion.noise(key, At(state.theta, guides), state.paths)
         ratio = nan_to_neg_inf(completion.coarse_log_weight(state.theta, noise)) - log_weight
-        return jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
+        ratio = jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
+        return jnp.where(completion.steps_are_too_long(state.theta, state.paths), jnp.inf, ratio)
 
 
 def sample_records(
@@ -279,7 +280,9 @@ def _sample_records(
     fields, (moved, taken, has_weight, log_ratio) = drawn(parameters, *draws)
     real = movable(records)
     ever = jnp.any(taken > 0, axis=-4)  # of all draws
-    change = relative_change(log_ratio, jnp.nanmedian(log_ratio))
+    too_long = log_ratio == jnp.inf
+    change = relative_change(log_ratio, jnp.nanmedian(jnp.where(too_long, jnp.nan, log_ratio)))
+    change = jnp.where(too_long, jnp.inf, change)
     posterior = RecordPosterior(
         **fields,
         parameters_moved=moved,

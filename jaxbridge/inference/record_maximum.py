@@ -11,8 +11,8 @@ noise and of the initial law as well as for those of the drift, for every step s
 In each iteration chains of paths move given the current θ. The paths are converted to ξ, and an
 optimiser moves θ along the mean of ∇ log w, which changes the paths with θ (Gu & Kong 1998).
 Newton's method continues from the average of the second half of the iterates (`newton`). In its
-passes the chains run with fixed θ. It estimates log L(θ + d) - log L(θ), the log of the mean of
-w(θ + d) / w(θ) given the data, by the first two cumulants of the log ratio.
+passes the chains run with fixed θ. The difference log L(θ + d) - log L(θ) is the log of the mean of
+w(θ + d) / w(θ) given the data. The first two cumulants of the log ratio estimate it.
 
 ∇² log w is a difference of ∇ log w at θ ± h e_j, because derivatives take three times as long to
 compile. h is a fraction of 1 / √D_j, with D_j the mean of -∂²_j log w. This would be the standard
@@ -90,9 +90,9 @@ class RecordMaximumLikelihood(AbstractResult):
     - `stuck`: whether a block of a path never moved in the last pass, shape (chains,).
     - `num_refused`: number of iterations without a step, because it would have left the constraint
         or led to values that are not finite.
-    - `newton`: whether Newton's method converged to a maximum. This means that the next step is
-        short compared with the standard errors or the Monte Carlo errors, and that the information
-        is positive definite by a wide margin.
+    - `newton`: whether Newton's method converged to a maximum. Then the next step is short compared
+        with the standard errors or the Monte Carlo errors. Moreover the information is positive
+        definite by a wide margin.
     - `fall`: decrease of the log-likelihood one standard error below and above the estimate in each
         parameter, with the others optimised to second order, shape (2, p). It is 0.5 for a
         quadratic log-likelihood. Values near or below zero show that there is no maximum inside;
@@ -137,7 +137,7 @@ class RecordMaximumLikelihood(AbstractResult):
                 self.guide.fault(stuck | apart | ~self.newton),
                 Fault(jnp.any(steps.present), steps.sentence),
             )
-        )
+        ).with_finite(self.theta, self.covariance)
 
     @property
     def _chains_disagree(self) -> Bool[Array, ""]:

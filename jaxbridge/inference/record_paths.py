@@ -37,6 +37,7 @@ from ..records import (
     noise_and_log_weight,
     path_and_log_weight,
     stacked,
+    steps_are_too_long,
     sweep,
 )
 from ..schemes import share_of_grid
@@ -138,6 +139,14 @@ class RecordPaths(eqx.Module):
     ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
         """The paths of ξ, and log w."""
         return _of_noise(self.fine.records, self.parameters.bind(at.theta), at.guides, noise)
+
+    def steps_are_too_long(
+        self, theta: Float[Array, " p"], paths: Float[Array, "R points d"]
+    ) -> Bool[Array, ""]:
+        """Whether steps are too long for the drift along the path of some record."""
+        model = self.parameters.bind(theta)
+        one = lambda problem, path: steps_are_too_long(problem, model, path)
+        return jnp.any(self.fine.records.each(one, paths))
 
     def coarse_log_weight(
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"]

@@ -30,6 +30,7 @@ from ..engine.verdict import (
     Fault,
     Verdict,
     heavy_tails_in_sum,
+    lost_paths,
     missing_bridges,
     truncated_weights,
 )
@@ -42,6 +43,14 @@ from .parameters import Parameters, as_parameters
 
 # Bridges of all intervals that are made at a time.
 _PATHS = 8_192
+
+
+class PathCounts(NamedTuple):
+    """Of the paths of each interval: how many became bridges, were simulated, and were lost."""
+
+    found: Int[Array, " I"]
+    simulated: Int[Array, " I"]
+    nonfinite: Int[Array, " I"]
 
 
 class Score(AbstractResult):
@@ -61,6 +70,8 @@ class Score(AbstractResult):
     - `num_missing`: number of intervals without a bridge. They are left out. If all are missing,
         the score is NaN and its error infinite.
     - `num_truncated`: number of weights that `max_trials` truncated.
+    - `counts`: numbers of bridges, of simulated paths, and of paths that diverged or left the state
+        space, for each interval.
     """
 
     value: PyTree
@@ -74,18 +85,21 @@ class Score(AbstractResult):
     step_uncertainty: Float[Array, " p"]
     num_missing: Int[Array, ""]
     num_truncated: Int[Array, ""]
+    counts: PathCounts
 
     @property
     def verdict(self) -> Verdict:
         """The faults of the score, each with a remedy.
 
-        They are: intervals without a bridge, weights that are truncated or have heavy tails, and a
-        discretisation error that dominates and exceeds 0.05 standard deviations of the score.
+        They are: intervals without a bridge; weights that are truncated or have heavy tails; too
+        many lost paths in an interval; and a discretisation error that dominates and exceeds 0.05
+        standard deviations of the score.
         """
         error = jnp.sqrt(jnp.maximum(jnp.diagonal(self.covariance), 0))
         sd = jnp.sqrt(jnp.maximum(jnp.diagonal(self.information), 0))
         steps = step_fault(StepError(self.step_error, self.step_uncertainty), error, sd)
-        return Verdict((*self._weight_faults, Fault(jnp.any(steps.present), steps.sentence)))
+        verdict = Verdict((*self._weight_faults, Fault(jnp.any(steps.present), steps.sentence)))
+        return verdict.with_finite(self.gradient, self.covariance)
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:
@@ -93,7 +107,15 @@ class Score(AbstractResult):
             missing_bridges(self.num_missing > 0),
             truncated_weights(self.num_truncated > 0),
             heavy_tails_in_sum(self.pareto_k, self.effective_sample_size),
+            self._lost,
         )
+
+    @property
+    def _lost(self) -> Fault:
+        """Return the fault of lost paths in any interval."""
+        found, simulated, nonfinite = self.counts
+        fault = lost_paths(nonfinite, simulated, self.effective_sample_size, found)
+        return Fault(jnp.any(fault.present), fault.sentence)
 
 
 @public_entry
@@ -207,13 +229,15 @@ def as_score(
         *step_error,
         num_missing,
         num_truncated,
+        PathCounts(sums.num_found, sums.num_simulated, sums.num_nonfinite),
     )
 
 
 class _Sums(NamedTuple):
     """Σ over intervals of the score, of the covariance of its error, and of the information; the
     effective number of bridges of each, and k̂; the step error of the score, with the square of
-    its uncertainty; how many weights were cut off; and by how much the log-likelihood rises from θ
+    its uncertainty; how many weights were cut off; the counts of paths in each interval; and by how
+    much the log-likelihood rises from θ
     to points around it."""
 
     gradient: Float[Array, " p"]
@@ -224,6 +248,9 @@ class _Sums(NamedTuple):
     step_error: Float[Array, " p"]
     step_variance: Float[Array, " p"]
     num_truncated: Int[Array, ""]
+    num_found: Int[Array, " I"]
+    num_simulated: Int[Array, " I"]
+    num_nonfinite: Int[Array, " I"]
     rises: Float[Array, "*shape"]
 
 
@@ -249,12 +276,15 @@ def _over_all(
 
 
 class _Bridges(NamedTuple):
-    """n weighted bridges of each interval, with the derivatives of the log density of their paths;
+    """n weighted bridges of each interval, whether each was cut off, and how many paths were
+    simulated and lost for it, with the derivatives of the log density of their paths;
     of the first m, D of `halving` with its gradient; and by how much their log density rises from θ
     to points around it."""
 
     log_weights: Float[Array, "I n"]
     truncated: Bool[Array, "I n"]
+    num_simulated: Int[Array, "I n"]
+    num_nonfinite: Int[Array, "I n"]
     gradient: Float[Array, "I n p"]
     hessian: Float[Array, "I n p p"]
     log_halving: Float[Array, "I m"]
@@ -296,7 +326,8 @@ def _draw(
     none = jnp.zeros((0, len(keys), n), theta.dtype)
     around = lax.map(log_f, points) - log_f(theta) if len(points) else none
     rises = jnp.moveaxis(around, 0, -1).reshape(len(keys), n, *offsets.shape[:-1])
-    return _Bridges(drawn.log_weights, drawn.truncated, *derivatives, *halvings, rises)
+    counts = drawn.truncated, drawn.num_simulated, drawn.num_nonfinite
+    return _Bridges(drawn.log_weights, *counts, *derivatives, *halvings, rises)
 
 
 @compiled_sooner
@@ -330,9 +361,9 @@ def _of_block(
     share = block.step_shares(model, form)
     halves = (some.gradient, some.gradient + some.slope)
     error = error_of_mean(some.log_weights, some.log_halving, share, *halves)
-    all_bridges = (*made[:4], made.rises)
+    all_bridges = (*made[:6], made.rises)
     all_bridges = (join(leaf, at_once)[:, :num_bridges] for leaf in all_bridges)
-    log_weights, truncated, g, H, rises = all_bridges
+    log_weights, truncated, num_simulated, num_nonfinite, g, H, rises = all_bridges
     weights = normalise_weights(log_weights)
     mean = jnp.sum(weights[..., None] * g, axis=1)
     deviation = g - mean[:, None]
@@ -352,6 +383,9 @@ def _of_block(
         jnp.sum(error.value, axis=0),
         jnp.sum(error.uncertainty**2, axis=0),
         jnp.sum(truncated, dtype=jnp.int32),
+        jnp.sum(log_weights > -jnp.inf, axis=1, dtype=jnp.int32),
+        jnp.sum(num_simulated, axis=1, dtype=jnp.int32),
+        jnp.sum(num_nonfinite, axis=1, dtype=jnp.int32),
         _rises(weights, rises),
     )
 

@@ -62,8 +62,8 @@ _SHORTEST = 1e-4
 class Simulated(NamedTuple):
     """ℓ̂ and its derivatives at one θ, over the intervals that have any path: its value, ∇ℓ̂, the
     covariance of that by the noise of the paths, and -∇²ℓ̂; the effective number of paths of each
-    interval, and k̂ of their weights; how many intervals have none; and the rounding error of the
-    value."""
+    interval, and k̂ of their weights; how many intervals have none; the rounding error of the
+    value; and how many paths of each interval have a weight, were simulated, and were lost."""
 
     value: Float[Array, ""]
     gradient: Float[Array, " p"]
@@ -73,6 +73,9 @@ class Simulated(NamedTuple):
     pareto_k: Float[Array, " I"]
     num_missing: Int[Array, ""]
     rounding: Float[Array, ""]
+    num_found: Int[Array, " I"]
+    num_simulated: Int[Array, " I"]
+    num_nonfinite: Int[Array, " I"]
 
 
 class Maximum(NamedTuple):
@@ -146,16 +149,17 @@ def _log_weights(
     block: Block,
     num_paths: int,
     theta: Float[Array, " p"],
-) -> tuple[Float[Array, "I n"], Bool[Array, "I n"]]:
+) -> tuple[Float[Array, "I n"], Bool[Array, "I n"], Int[Array, "I n"]]:
     """log w at θ of the paths with this noise, zero for those that were lost, or have no weight
-    beside others, for where a path nearly overflows its derivatives do; and which are not."""
+    beside others, for where a path nearly overflows its derivatives do; which are not; and how many
+    left the state space or the finite numbers."""
     keys = jax.random.split(key, (block.intervals.start.shape[0], num_paths))
     nothing = jnp.zeros(0, jnp.int32)  # no path is kept
     model = parameters.bind(theta).prepared()
     drawn = block.proposal.draw(keys, model, block.intervals, block.num_steps, nothing, True)
     largest = jnp.max(drawn.log_weights, axis=1, keepdims=True)
     found = drawn.found & (drawn.log_weights > largest + _NO_WEIGHT)
-    return jnp.where(found, drawn.log_weights, 0), found
+    return jnp.where(found, drawn.log_weights, 0), found, drawn.num_nonfinite
 
 
 def _log_densities(
@@ -187,7 +191,7 @@ def simulated_value(
     value = jnp.zeros((), theta.dtype)
     for block_key, block in with_keys(key, blocks):
         value += jnp.sum(
-            _log_densities(*_log_weights(block_key, parameters, block, num_paths, theta))
+            _log_densities(*_log_weights(block_key, parameters, block, num_paths, theta)[:2])
         )
     return value
 
@@ -233,7 +237,7 @@ def step_error_of_score(
 
         def difference(theta, key=block_key, block=block, half=half):
             values = (
-                jnp.sum(_log_densities(*_log_weights(key, parameters, each, num_paths, theta)))
+                jnp.sum(_log_densities(*_log_weights(key, parameters, each, num_paths, theta)[:2]))
                 for each in (block, half)
             )
             fine, coarse = values
@@ -249,14 +253,14 @@ def _of_block(
     key, parameters, block: Block, theta: Float[Array, " p"], num_paths: int
 ) -> Simulated:
     def log_weights(theta):
-        made, found = _log_weights(key, parameters, block, num_paths, theta)
-        return made, (made, found)
+        made, *counts = _log_weights(key, parameters, block, num_paths, theta)
+        return made, (made, *counts)
 
     def first(theta):
-        g, (made, found) = jax.jacfwd(log_weights, has_aux=True)(theta)
-        return g, (made, found, g)
+        g, made = jax.jacfwd(log_weights, has_aux=True)(theta)
+        return g, (*made, g)
 
-    H, (made, found, g) = jax.jacfwd(first, has_aux=True)(theta)
+    H, (made, found, num_nonfinite, g) = jax.jacfwd(first, has_aux=True)(theta)
 
     def total(t):
         """ℓ̂ at θ + t, with the log weights expanded to second order."""
@@ -278,6 +282,9 @@ def _of_block(
         pareto_k(jnp.where(found, made, -jnp.inf)),
         jnp.sum(~some, dtype=jnp.int32),
         4 * jnp.finfo(theta.dtype).eps * jnp.sum(jnp.abs(densities)),
+        jnp.sum(found, axis=1, dtype=jnp.int32),
+        jnp.full(len(found), num_paths, jnp.int32),
+        jnp.sum(num_nonfinite, axis=1, dtype=jnp.int32),
     )
 
 
@@ -378,7 +385,7 @@ def stochastic_ascent(
     def mean_log_likelihood(theta, key):
         value, missing = jnp.zeros((), theta.dtype), jnp.int32(0)
         for block_key, block in with_keys(key, blocks):
-            made, found = _log_weights(block_key, parameters, block, _FEW, theta)
+            made, found, _ = _log_weights(block_key, parameters, block, _FEW, theta)
             value += jnp.sum(_log_densities(made, found))
             missing += jnp.sum(~jnp.any(found, axis=1), dtype=jnp.int32)
         return value / num_intervals, missing

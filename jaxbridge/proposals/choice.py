@@ -146,7 +146,7 @@ class Choice(AbstractWeightedProposal):
         make: Callable[[AbstractSingleProposal, Bool[Array, " I"] | None], WeightedPaths],
         active: Bool[Array, " I"] | None,
     ) -> WeightedPaths:
-        """What each interval's candidate makes."""
+        """Combine the results of `make` for the candidate of each interval."""
         if len(self.used) == 1:
             return make(self.candidates[self.used[0]], active)
         made = None
@@ -159,7 +159,7 @@ class Choice(AbstractWeightedProposal):
         return made
 
     def for_all(self):
-        """The candidate that leaves the least variance, Σ 1/(effective paths), for its cost."""
+        """Return the candidate with the least variance, Σ 1/(effective paths), at its cost."""
         rates = np.asarray(_presumed_rates(self), float)
         return self.candidates[int(np.argmin(np.sum(1 / np.maximum(rates, 1e-30), axis=1)))]
 

@@ -245,7 +245,7 @@ class CoupledPairs(AbstractSingleProposal):
     def log_halving(
         self, model: Diffusion, intervals: Intervals, paths: Float[Array, "P points d"], n: int
     ) -> Float[Array, " P"]:
-        """D of the first of n paths of each interval, NaN of the others."""
+        """Return D for the first of the n paths of each interval, and NaN for the others."""
         dynamics = model.forward(intervals.start[0])
         density, _ = step_law_of(self.coupling.scheme, dynamics)
         num_some = num_looked(_LOOKED * n, dynamics.sigma_varies)

@@ -57,3 +57,4 @@ from .several import (
     linearisations as linearisations,
     stacked as stacked,
 )
+from .step_regime import steps_are_too_long as steps_are_too_long

@@ -12,11 +12,12 @@ equal without a discount, and the rate is zero. The best of several rates may be
 it must also be better than no discount in a second set of pilot runs.
 
 *Chains over parameters* use one rate for all parameters. If nearly every p̂ is too small in a
-region, the chain avoids this region and cannot detect the error. Hence the loss of a rate (the mean
-of log p̂ below that at the best rate) is computed at several parameters, which are about as likely
-as those of the chains. The chosen rate has the smallest mean loss. The log of the mean of p̂ would
-be a worse criterion for two reasons. With few pilot runs a single large estimate decides it. And
-with a rate that is too low, chains stay where it is sufficient, which seems to confirm it.
+region, the chain avoids this region and cannot detect the error. The loss of a rate is the decrease
+of the mean of log p̂ below that at the best rate. It is computed at several parameters, which are
+about as likely as those of the chains. The chosen rate has the smallest mean loss. The log of the
+mean of p̂ would be a worse criterion for two reasons. With few pilot runs a single large estimate
+decides it. And with a rate that is too low, chains stay where it is sufficient, which seems to
+confirm it.
 """
 
 from collections.abc import Callable

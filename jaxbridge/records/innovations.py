@@ -85,7 +85,7 @@ class Innovations(NamedTuple):
         return self.log_weight(params, xi) - (xi @ xi + self.size * math.log(2 * math.pi)) / 2
 
     def start_share(self) -> Float[Array, ""]:
-        """Effective fraction of the draws of x_0 by normal noise, at the parameters of the model.
+        """Return the effective fraction of the draws of x_0 by normal noise, at `model.params`.
 
         It is 1 if the initial law is normal. Near 0 the normal law in place of the stationary law
         misses a mode or has too light tails. Then means of w over ξ are unreliable, and a sampler
@@ -179,8 +179,8 @@ def innovations(
     **Example:**
 
     ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    paths = jb.innovations(model, times, observations, observation=seen)
+    gaussian = jb.LinearGaussian(covariance=0.01)
+    paths = jb.innovations(model, times, observations, observation=gaussian)
     value, slope = jax.value_and_grad(paths.log_density)(model.params, jnp.zeros(paths.size))
     ```
     """

@@ -155,7 +155,7 @@ class LogLikelihood(AbstractResult):
                 Fault(self._missing > jnp.maximum(self.standard_error, _MOST_LOST), _LOST),
                 step_fault(error, self.standard_error),
             )
-        )
+        ).with_finite(self.value)
 
     @property
     def _is_heavy(self) -> Bool[Array, ""]:
@@ -217,9 +217,9 @@ def log_likelihood(
     **Example:**
 
     ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    made = jb.log_likelihood(key, model, times, observations, observation=seen)
-    made.value, made.standard_error
+    gaussian = jb.LinearGaussian(covariance=0.01)
+    estimate = jb.log_likelihood(key, model, times, observations, observation=gaussian)
+    estimate.value, estimate.standard_error
     ```
     """
     check_key(key)

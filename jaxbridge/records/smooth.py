@@ -31,6 +31,7 @@ from ..schemes import (
     root_mean_square_in_sds,
     share_of_order,
     step_fault,
+    unknown_where,
 )
 from .guide_search import GuideCheck, Linearised, linearised
 from .guided_record import path_and_log_weight
@@ -39,6 +40,7 @@ from .observation import Observation
 from .path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep, tuned
 from .problem import RecordProblem, as_record_problem
 from .states import Draws, sample_states
+from .step_regime import steps_are_too_long
 
 # R̂ beyond which chains disagree.
 _MOST_R_HAT = 1.1
@@ -102,10 +104,14 @@ class Smoothed(AbstractResult):
     def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Estimate the discretisation bias of `mean(fn)` to leading order, entry by entry.
 
-        With half as many steps each path is e^D times as likely (`schemes.halving`). The estimate
-        is NaN in three cases: one step, Euler steps of a σ with fewer columns than rows, and steps
-        so long that the variance of D exceeds 1 in some interval. If the scheme of a `proposal` is
-        more accurate than `density`, the estimate is too large.
+        With half as many steps each path is e^D times as likely (`schemes.halving`). If the scheme
+        of a `proposal` is more accurate than `density`, the estimate is too large. It is NaN in
+        these cases:
+
+        - one step;
+        - Euler steps of a σ with fewer columns than rows;
+        - steps so long that the variance of D exceeds 1 in some interval;
+        - steps longer than the relaxation time of the drift. Then the uncertainty is infinite.
         """
         return self._step_errors(fn)[0]
 
@@ -156,7 +162,7 @@ class Smoothed(AbstractResult):
                 *guide,
                 step_fault(error, standard_error),
             )
-        )
+        ).with_finite(self.mean(), standard_error)
 
     @property
     def _chains_agree(self) -> Bool[Array, ""]:
@@ -186,6 +192,9 @@ class Smoothed(AbstractResult):
         varies = _noise_varies(problem, self.paths[0, 0])
         share = share_of_order(problem.density.order)
         each = [_change(leaf, D, share, varies) for leaf in leaves]
+        mean = jnp.mean(self.paths, axis=(0, 1))
+        too_long = steps_are_too_long(problem, problem.model, mean)
+        each = [unknown_where(too_long, error) for error in each]
         values, doubts = zip(*each, strict=True)
         return jax.tree.unflatten(treedef, values), jax.tree.unflatten(treedef, doubts)
 
@@ -233,11 +242,11 @@ def smooth(
     - `block_length`: number of intervals between observations that move at once, by default 10. Use
         more if observations are so close that neighbouring states are strongly correlated, and
         fewer if blocks are rarely accepted. Not with a `proposal`.
-    - `proposal`: by default paths are guided by all observations through a linear process. If
-        several ways are possible across a gap (wells, many relaxation times), pass a proposal of
-        bridges as for `sample_exact_bridges`, for instance a `Coupling`, or "auto", which tries
-        several on each gap. Then the states at observation times move, with new bridges on both
-        sides. This needs a stationary law, and noise in all observed components.
+    - `proposal`: by default paths are guided by all observations through a linear process. Pass a
+        proposal of bridges, as for `sample_exact_bridges`, if several ways are possible across a
+        gap (wells, many relaxation times). "auto" tries several proposals on each gap. Then the
+        states at observation times move, with new bridges on both sides. This needs a stationary
+        law, and noise in all observed components.
     - `num_proposals`: number of bridges of the `proposal` for each move of each gap, by default 10.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if the result is not `trustworthy`.
@@ -249,9 +258,9 @@ def smooth(
     **Example:**
 
     ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    made = jb.smooth(key, model, times, observations, observation=seen, num_draws=500)
-    made.mean(), made.standard_error()
+    gaussian = jb.LinearGaussian(covariance=0.01)
+    smoothed = jb.smooth(key, model, times, observations, observation=gaussian, num_draws=500)
+    smoothed.mean(), smoothed.standard_error()
     ```
     """
     check_key(key)

@@ -73,6 +73,8 @@ from .step_density import (
     most_accurate_density as most_accurate_density,
 )
 from .step_error import (
+    MOST_TOO_LONG as MOST_TOO_LONG,
+    UNKNOWN_SHARE as UNKNOWN_SHARE,
     StepError as StepError,
     dominates as dominates,
     error_of_coupled_grids as error_of_coupled_grids,
@@ -85,6 +87,7 @@ from .step_error import (
     share_of_known_order as share_of_known_order,
     share_of_order as share_of_order,
     step_fault as step_fault,
+    unknown_where as unknown_where,
     with_rounding as with_rounding,
 )
 from .step_law import (

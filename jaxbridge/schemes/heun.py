@@ -48,9 +48,12 @@ class Heun(AbstractScheme):
         return sigma.solve(x_next - x - drift * dt / 2)
 
     def frame(self, dynamics, x, driven, dt):
-        """For constant σ the noise of the step is σ (I + ½ ∇α δ) ΔW, so the gap at its end lies
-        along (I + ½ ∇α δ) u if u is taken after half the drift. The length stays that at the
-        beginning, since D_{i+1} is measured at the end: it is their product that counts."""
+        """Return the frame with u after half of the drift (constant σ only), and the gap before it.
+
+        For constant σ the noise of the step is σ (I + ½ ∇α δ) ΔW. With u after half of the drift
+        the gap at the end lies along (I + ½ ∇α δ) u. The length is that at the beginning, because
+        meeting rules use its product with the length at the end, D_{i+1}.
+        """
         now = frame(dynamics.sigma(driven), x, driven)
         if dynamics.sigma_varies:
             return now

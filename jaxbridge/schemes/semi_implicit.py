@@ -52,7 +52,7 @@ class SemiImplicit(AbstractScheme):
         return dynamics.sigma(x).solve(matvec(implicit, x_next - x) - drift * dt)
 
     def frame(self, dynamics, x, driven, dt):
-        """The root of the noise is L⁻¹σ, at x'."""
+        """Return the frame for the matrix L⁻¹σ of the noise, evaluated at x'."""
         drift, implicit = self._linearised(dynamics, x, dt)
         driven_drift, driven_implicit = self._linearised(dynamics, driven, dt)
         gone = solve(implicit, drift * dt) - solve(driven_implicit, driven_drift * dt)

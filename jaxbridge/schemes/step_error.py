@@ -9,9 +9,9 @@ Both estimates use the same paths. Hence their difference has a much smaller Mon
 either of them if D is small. This error is reported as the uncertainty.
 
 The uncertainty is infinite in two cases: if few paths carry nearly all of the weights w e^D, and if
-a step is longer than the relaxation time of the drift. In both cases the steps are too long for an
-estimate. The log of a mean of few weights is too small on average, by half the relative variance to
-leading order; the estimate corrects this bias.
+a step is longer than the relaxation time of the drift at either end. In both cases the steps are
+too long for an estimate. The log of a mean of few weights is too small on average, by half the
+relative variance to leading order; the estimate corrects this bias.
 
 For a state-dependent σ e^D has heavy tails. Weights of half as many steps from the same noise do
 not. They replace w e^D if only the mean of the weights is needed (`error_of_coupled_grids`).
@@ -205,6 +205,8 @@ def share_of_order(order: int) -> float:
 
 # Of an error of which D says nothing: figures were wrong by factors of 10,000.
 UNKNOWN_SHARE = math.inf
+# A smaller share of intervals whose steps are too long does not matter to a sum over all.
+MOST_TOO_LONG = 0.02
 _GUESS = 3.0
 
 
@@ -216,20 +218,27 @@ def guessed(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
 def share_in_regime(
     share: Float[Array, "*I"], model: Diffusion, intervals: Intervals, num_steps: int
 ) -> Float[Array, "*I"]:
-    """Return the share, infinite for intervals in which a leading term has no meaning, as two steps
-    are longer than the relaxation time at both ends; zero stays zero.
+    """Return the share, infinite for intervals in which a leading term has no meaning, as a step is
+    longer than the relaxation time at either end; zero stays zero.
 
     The mean of a step of length δ is a polynomial of δ∇α in the place of an exponential function.
     That of half as many steps is unstable where the spectral radius ρ of ∇α has 2δρ > 2. There
-    changes can have any size and either sign, and nearly none by chance.
+    changes can have any size and either sign, and nearly none by chance. One end is enough: paths
+    from a slow tail to a fast centre, or from one wall of a well to another, are wrong there.
     """
 
     def rate(x):
         return spectral_radius(jax.jacfwd(model.drift)(x))
 
     rates = jax.vmap(rate)(jnp.concatenate([intervals.start, intervals.end])).reshape(2, -1)
-    too_long = jnp.min(rates, axis=0) * intervals.duration / num_steps > _LONGEST_STEP
+    too_long = jnp.max(rates, axis=0) * intervals.duration / num_steps > _LONGEST_STEP
     return jnp.where(too_long & (share > 0), UNKNOWN_SHARE, share)
+
+
+def unknown_where(unknown: Bool[Array, ""], error: StepError) -> StepError:
+    """Return the step error, NaN with an infinite uncertainty where it is unknown."""
+    value, uncertainty = error
+    return StepError(jnp.where(unknown, jnp.nan, value), jnp.where(unknown, jnp.inf, uncertainty))
 
 
 def share_of_known_order(share: Float[Array, "*I"]) -> Float[Array, "*I"]:

@@ -206,7 +206,7 @@ def user_estimate(reference: tuple[Numbers, Numbers] | None) -> Estimate | None:
     if reference is None:
         return None
     if len(as_sequence("reference", reference, "a mean and a standard deviation")) != 2:
-        raise ValueError(f"`reference` must be a pair `(mean, sd)`; got {len(reference)} entries.")
+        raise ValueError(f"`reference` must be a pair `(mean, sd)`; got {reference}.")
     mean, sd = (np.ravel(np.asarray(as_floating("reference", part))) for part in reference)
     return Estimate(mean, np.zeros_like(mean), sd)
 

@@ -66,9 +66,9 @@ class Setting(NamedTuple):
     def seconds_for(self, target: float) -> float:
         """Return the seconds that this setting needs for a total error of `target`.
 
-        The total error is the root of the sum of two squares: the upper bound `error +
-        uncertainty` of the error that does not shrink with the number of samples, and the Monte
-        Carlo error. The result is infinite if that bound is not below `target`.
+        The squared total error is the sum of two squares. The first is the bound `error` +
+        `uncertainty` of the error that more samples do not reduce. The second is the Monte Carlo
+        error of a longer run. The result is infinite if the bound is not below `target`.
         """
         bias_bound = self.error + self.uncertainty
         # `not <` instead of `>=`: an error of NaN gives infinity, too.
@@ -168,7 +168,7 @@ class WorkPrecision(NamedTuple):
 
 
 def _fit_order(group: Sequence[Setting]) -> Order:
-    """Fit the log of the step error to the log of the step size by weighted least squares."""
+    """Fit log error against log step size by weighted least squares, for one curve."""
     # Errors within two standard errors of zero are mostly noise: their logarithms would mislead.
     significant = [s for s in group if s.step_error > 2 * s.step_uncertainty]
     if len({s.num_steps for s in significant}) < 2:

@@ -5,6 +5,7 @@ import inspect
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import jaxbridge as jb
@@ -101,3 +102,16 @@ def test_lost_paths_count_for_more_where_weights_are_unequal():
     lost = jnp.array([40, 51, 40, 6, 0])
     fault = lost_paths(lost, jnp.full(5, 1000), effective, number)
     assert fault.present.tolist() == [0, 1, 1, 0, 0]
+
+
+def test_numbers_that_are_not_finite_are_a_fault():
+    """If there is no other, for each interval."""
+    other = Verdict((Fault(jnp.array([False, True, False]), "Another."),))
+    numbers = jnp.array([[1.0, 2.0], [jnp.nan, 0.0], [0.0, jnp.inf]])
+    made = other.with_finite(numbers, jnp.zeros(3))
+    np.testing.assert_array_equal(made.trustworthy, [True, False, False])
+    another, not_finite = made.why().split("\n")
+    assert "Another." in another and "(first [2])" in not_finite and "finite" in not_finite
+    scalar = Verdict((Fault(jnp.array(False), "Another."),))
+    assert scalar.with_finite(jnp.ones((2, 3))).trustworthy
+    assert not scalar.with_finite(jnp.ones(2), numbers).trustworthy

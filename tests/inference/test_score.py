@@ -1,6 +1,7 @@
 """Fisher's identity and Louis's formula against derivatives of the closed form."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from inference_oracles import multivariate_ou, ou_transitions_log_density
@@ -61,3 +62,27 @@ def test_intervals_may_have_numbers_of_steps_of_their_own():
     error = np.sqrt(np.diagonal(one.covariance + two.covariance))
     np.testing.assert_array_less(np.abs(one.gradient - two.gradient), 5 * error + 0.1)
     assert two.effective_sample_size.shape == (7,)
+
+
+@pytest.mark.slow
+def test_lost_paths_are_told():
+    """Cox, Ingersoll and Ross's process whose paths attain zero: the mass of those that touch it is
+    missing, in scores, in maxima of likelihoods by bridges and in posteriors by either sampler."""
+    model = jb.Diffusion(
+        lambda x, p: p - x, lambda x, p: jnp.sqrt(x), domain=lambda x, p: x[0] > 0,
+        params=jnp.float32(0.1),
+    )  # fmt: skip
+    data = np.arange(3) * 1.0, np.array([0.05, 0.01, 0.02])[:, None]
+    options = {"proposal": jb.ModifiedDiffusionBridge(), "num_steps": 20}
+    key, prior = jax.random.key(0), jb.NormalPrior(0.1, 0.01)
+    made = jb.score(key, model, *data, num_bridges=400, **options)
+    assert made.counts.nonfinite.sum() > 40 and not made.trustworthy
+    allowed = lambda a: a > 0
+    chains = [
+        getattr(jb, method)(
+            key, model, *data, prior=prior, constraint=allowed, num_iterations=200, **options
+        )
+        for method in ("gibbs", "pmmh")
+    ]
+    for result in (made, *chains):
+        assert "2κθ < σ²" in result.why() and not result.trustworthy

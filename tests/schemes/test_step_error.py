@@ -8,6 +8,7 @@ from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, slow_beyond
 from test_step_density import DENSITIES, FROM, TO
 
 import jaxbridge as jb
+from jaxbridge.models.bridge_problem import Intervals
 from jaxbridge.schemes.step_error import (
     UNKNOWN_SHARE,
     StepError,
@@ -16,6 +17,7 @@ from jaxbridge.schemes.step_error import (
     error_of_log_mean,
     error_of_mean,
     relative_change,
+    share_in_regime,
     share_of_order,
     step_fault,
 )
@@ -249,6 +251,17 @@ def test_draws_that_half_as_many_steps_lose_are_missing_and_no_more():
     D = jnp.array([-jnp.inf, -1e20, -0.01, 0.0, 0.02, 3.0])
     made = relative_change(D, jnp.zeros(()))
     np.testing.assert_allclose(made, [-1, -1, np.expm1(-0.01), 0, 0.0202, 7.5], rtol=1e-5)
+
+
+def test_steps_may_be_too_long_at_one_end_only():
+    """From the centre of a law of heavy tails, where the relaxation time is 1/2, into a tail, and
+    back: the change by half as many steps was .1 where the error was .7."""
+    model = jb.Diffusion(lambda x, p: -2 * x / (1 + x**2))
+    points = jnp.array([[0.0], [40.0], [40.0], [0.0]])
+    intervals = Intervals(points, points[jnp.array([1, 0, 1, 0])], jnp.array([100.0] * 3 + [20.0]))
+    share = share_in_regime(jnp.array([1.0, 1.0, 1.0, 1.0]), model.prepared(), intervals, 50)
+    assert share.tolist() == [np.inf, np.inf, 1.0, 1.0]
+    assert share_in_regime(jnp.zeros(4), model.prepared(), intervals, 50).tolist() == 4 * [0.0]
 
 
 @pytest.mark.parametrize(

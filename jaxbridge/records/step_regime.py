@@ -1,0 +1,28 @@
+"""Check whether the steps of a record are too long for an estimate of the discretisation error."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..models.bridge_problem import Intervals
+from ..models.diffusion import Diffusion
+from ..schemes import MOST_TOO_LONG, UNKNOWN_SHARE, share_in_regime
+from .problem import RecordProblem
+
+
+def steps_are_too_long(
+    problem: RecordProblem, model: Diffusion, path: Float[Array, "points d"]
+) -> Bool[Array, ""]:
+    """Return whether steps exceed the relaxation time of the drift on over 2 % of the segments.
+
+    The relaxation times are those at both ends of a segment on this path; one of the two suffices.
+    Time-dependent drifts are not examined.
+    """
+    if model.depends_on_time:
+        return jnp.zeros((), bool)
+    ends, durations = path[:: problem.num_steps], problem.record.durations
+    intervals = Intervals(ends[:-1], ends[1:], durations)
+    share = share_in_regime(jnp.ones_like(durations), model, intervals, problem.num_steps)
+    moving = durations > 0
+    number = jnp.maximum(jnp.sum(moving), 1).astype(durations.dtype)
+    too_long = jnp.sum(moving & (share == UNKNOWN_SHARE)).astype(durations.dtype)
+    return too_long > MOST_TOO_LONG * number
