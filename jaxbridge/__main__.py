@@ -20,7 +20,7 @@ COMMAND = Command(
     part="paper",
     figures=_figures,
     keeps_programs=True,
-    next_steps="Read next: README.md, then notebooks/01_quickstart.ipynb and notebooks/guide.md.",
+    next_steps="Read next: README.md, then notebooks/01_quickstart.ipynb and notebooks/howto.",
 )
 
 main = COMMAND.run

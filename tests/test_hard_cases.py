@@ -68,7 +68,7 @@ def density_on_grid(drift, grid, start, duration):
 
 @hard(
     "start equals end; start within 1e-7 of the reversed path; met at step 0",
-    "0/0 in u = v/|v|, and in its derivative",
+    "0/0 in u = v/‖v‖, and in its derivative",
     "u is zero there, with derivative zero; index 0 counts as a meeting",
 )
 @pytest.mark.slow
