@@ -309,7 +309,7 @@ def format_floor(first: ExactResult, floor: Floor) -> str:
 
 
 def format_variation(results: Sequence[Variation]) -> str:
-    """Return a table of std/mean and of the mean of 1/π_T, from ν and from the printed start law."""
+    """Return a table of std/mean and mean of 1/π_T, from ν and from the printed start law."""
     titles = ("bridge", "gamma", "nu: std/mean", "mean 1/pi", "printed: std/mean", "mean 1/pi")
     rows = [
         (
@@ -383,6 +383,7 @@ COST = Study(
     ),
     format_cost,
     """\
-"ms" are milliseconds per effective bridge, compilation apart; "accepted" is the acceptance rate.""",
+"ms" are milliseconds per effective bridge, compilation apart. "accepted" is the share of accepted
+steps.""",
     lambda figures, costs: {"cost.png": figures.cost(costs, slope(costs))},
 )

@@ -205,7 +205,7 @@ def whole_bridges(key: Key[Array, ""]) -> tuple[jb.Bridges, jb.GaussianBridge]:
 def draw(
     figures: Any, results: Sequence[Result], whole: tuple[jb.Bridges, jb.GaussianBridge]
 ) -> dict[str, Any]:
-    """Draw paths of the unlikely bridge, and Q-Q plots and the copula of each case by all methods."""
+    """Draw paths of the unlikely bridge, and for each case Q-Q plots and the copula."""
     pictures = {"bridges.png": figures.bridges_overview(*whole)}
     for case, by_method in itertools.groupby(results, key=lambda result: result.case):
         group = list(by_method)
