@@ -97,6 +97,7 @@ def as_cases(pages):
     ]
 
 
+@pytest.mark.usefixtures("unchecked")  # annotations, as for users
 @pytest.mark.parametrize("page", as_cases(page for page, blocks in CODE.items() if blocks))
 def test_code_runs(page):
     """The blocks of a page, in order, in a namespace of their own."""
