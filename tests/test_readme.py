@@ -5,6 +5,7 @@ import inspect
 import pathlib
 import re
 
+import jax
 import numpy as np
 import pytest
 from studies.benchmark import in_markdown, load
@@ -97,12 +98,14 @@ def as_cases(pages):
     ]
 
 
+@pytest.mark.usefixtures("unchecked")  # annotations, as for users
 @pytest.mark.parametrize("page", as_cases(page for page, blocks in CODE.items() if blocks))
 def test_code_runs(page):
     """The blocks of a page, in order, in a namespace of their own."""
     variables = {}
-    for block in CODE[page]:
-        exec(compile(block, page.name, "exec"), variables)
+    with jax.numpy_dtype_promotion("standard"):  # BlackJAX mixes dtypes
+        for block in CODE[page]:
+            exec(compile(block, page.name, "exec"), variables)
     assert CLAIMS[page.stem](variables)
 
 
