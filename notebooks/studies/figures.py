@@ -89,12 +89,10 @@ def bayes(example: Example) -> dict[str, Figure]:
     return {"bayes_posterior.png": density, "bayes_trace.png": trace}
 
 
-# What was seen, what is wanted, under which condition: and the call.
-
-
+# Observation, purpose, condition, call.
 _CHOICES = (
     (
-        "seen exactly",
+        "observed exactly",
         (
             (
                 "bridges, or\ntransition densities",
@@ -114,25 +112,25 @@ _CHOICES = (
         ),
     ),
     (
-        "seen with noise,\nor in part;\nor σ does not reach\nthe whole state, or\n"
-        "coefficients depend\non time",
+        "observed with noise,\nor in part;\nor noise in some\ncoordinates only;\n"
+        "or time-dependent\ncoefficients",
         (
             ("likelihood", (("", "log_likelihood"),)),
             (
                 "paths",
                 (
-                    ("gaps short beside\njumps of wells", "smooth"),
-                    ("long gaps, wells", 'smooth(proposal="auto")'),
+                    ("short gaps", "smooth"),
+                    ("long gaps\nbetween wells", 'smooth(proposal="auto")'),
                 ),
             ),
-            ("parameters", (("σ or noise,\nknown or not", "gibbs, pmmh, maximum_likelihood"),)),
+            ("parameters", (("σ and noise known\nor unknown", "gibbs, pmmh, maximum_likelihood"),)),
         ),
     ),
 )  # fmt: skip
 
 
 def how_to_choose() -> Figure:
-    """From how the diffusion was seen to the function, as a tree from left to right."""
+    """Draw the choice of a function as a tree, from the kind of observation on the left."""
     figure = Figure(figsize=(11, 5.4), layout="constrained")
     ax = figure.subplots()
     ax.set_axis_off()
@@ -172,7 +170,7 @@ def how_to_choose() -> Figure:
         height -= 0.4
     ax.set(xlim=(-0.01, 0.93), ylim=(height + 0.5, 0.7))
     for x, title in zip(
-        columns, ("the diffusion was", "wanted", "where", "call, or proposal"), strict=True
+        columns, ("the diffusion is", "you want", "if", "call, or proposal"), strict=True
     ):
         ax.text(x, 0.75, title, fontsize="small", fontweight="bold")
     return figure
