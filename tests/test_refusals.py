@@ -405,7 +405,7 @@ WAYS = [
     OWN_RUN,
 ]
 REMEDIES = [
-    "in proportion to `log_stationary`",
+    "in proportion to exp of `log_stationary`",
     "normalised=True",
     r"fit_start_law\(..., for_density=True\)",
     '"auto"',
@@ -628,7 +628,7 @@ TUNING = [
         fit(BLIND, *POINT, for_density=True),
         "need the stationary density, with any start law",
     ),
-    ("constant", choose_pairs(for_density=True), "in proportion to `log_stationary`"),
+    ("constant", choose_pairs(for_density=True), "in proportion to exp of `log_stationary`"),
     (
         "in jit",
         traced(lambda a: fit(PAPER, a, a, 1.0)(), X),
@@ -648,7 +648,7 @@ TUNING = [
     ("no bridges", precision(num_bridges=0), "`num_bridges` must be at least 1"),
     ("intervals", precision(start=[A] * 2), "one interval"),
     ("auto", precision(proposals=["auto"]), "must be single proposals"),
-    ("constant", rough_cost(log_density=-0.4), "in proportion to `log_stationary`"),
+    ("constant", rough_cost(log_density=-0.4), "in proportion to exp of `log_stationary`"),
     ("a number", of(jb.hitting_variation)(KEY, HYPERBOLIC, 3.0), "`bridges`", TypeError),
     ("not exact", variation(approximate), "must have the exact law", TypeError),
     ("counts", variation(weighted, num_counts=(5, 5)), "two or more increasing"),

@@ -140,7 +140,7 @@ class CoupledPairs(AbstractSingleProposal):
         smoothed = needs_burn_in(law, model)  # then it gives way to one with a density (`prepared`)
         if isinstance(law, Stationary | Reversed) and not (model.normalised or smoothed):
             raise ValueError(
-                "a coupling from the stationary law gives densities in proportion to "
+                "a coupling from the stationary law gives densities in proportion to exp of "
                 "`log_stationary`, which is not declared to be normalised, so densities may be "
                 "wrong by any factor. If it is normalised for all parameters, pass "
                 "`Diffusion(..., normalised=True)`. Otherwise use a start law with a density, "

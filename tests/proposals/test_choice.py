@@ -203,7 +203,7 @@ def test_densities_are_not_mixed_where_they_have_different_constants():
     )
     assert not any(isinstance(c, jb.CoupledPairs) for c in estimate.proposal.candidates)
     mixed = mixed_choice(model, 2)
-    with pytest.raises(ValueError, match="in proportion to `log_stationary`"):
+    with pytest.raises(ValueError, match="in proportion to exp of `log_stationary`"):
         jb.transition_log_density(*arguments, num_steps=10, num_proposals=2, proposal=mixed)
 
 
