@@ -68,8 +68,8 @@ def density_on_grid(drift, grid, start, duration):
 
 @hard(
     "start equals end; start within 1e-7 of the reversed path; met at step 0",
-    "0/0 in u = v/‖v‖, and in its derivative",
-    "u is zero there, with derivative zero; index 0 counts as a meeting",
+    "0/0 in u = v/‖v‖ (v is the difference of the pair), and in its derivative",
+    "u and its derivative are zero; index 0 counts as a meeting",
 )
 @pytest.mark.slow
 @in_single
@@ -104,8 +104,9 @@ def test_pairs_that_have_met_before_they_start(precision):
 
 @hard(
     "γ = -1; γ = 1 - 1e-3; γ = 1 - 1e-6; γ = 1",
-    "√(1-γ²) of a negative number, division by 1-γ = 0; a search without end",
-    "finite for every γ < 1, and fewer meetings as it grows, within the bound; γ = 1 is refused",
+    "√(1-γ²) of a negative number, division by 1-γ = 0; an endless search",
+    "paths are finite for every γ < 1; fewer pairs meet as γ → 1, and the search stops at "
+    "`max_proposals`; γ = 1 raises an error",
 )
 @pytest.mark.slow
 @in_single
@@ -136,9 +137,9 @@ def test_gamma_at_both_ends(precision, unchecked):
 
 @hard(
     "bridges 7 standard deviations out, (5, -5) → (6, -6), and 30, (10, 10) → (-10, -10)",
-    "a search for ever; weights that under- or overflow",
-    "the right density from a fitted start law, or `met` is false within the bound; log weights "
-    "are kept as logarithms",
+    "an endless search; weights that under- or overflow",
+    "the right density from a fitted start law, or `met` is false after `max_proposals`; "
+    "weights are stored as logarithms",
 )
 @pytest.mark.slow
 @pytest.mark.optimised
@@ -187,7 +188,7 @@ def test_very_unlikely_bridges(precision):
 @hard(
     "T = 1000 in 50,000 steps",
     "sums of δ in float32 are off by several steps at the end; memory for every step",
-    "times are i δ, computed from i; only the times asked for are kept",
+    "times are i δ, computed from i; only requested times are stored",
 )
 @pytest.mark.slow
 @pytest.mark.optimised
@@ -211,8 +212,8 @@ def test_long_intervals(model):
 
 @hard(
     "T = 0.001",
-    "pairs do not meet unless the ends are close: a search for ever",
-    "`met` is false within the bound, and `throw=True` says what to do instead",
+    "pairs do not meet unless the end points are close: an endless search",
+    "`met` is false after `max_proposals`, and `throw=True` names alternatives",
 )
 @in_single
 def test_short_intervals(precision):
@@ -231,8 +232,8 @@ def test_short_intervals(precision):
 @hard(
     "stiff drift: eigenvalues 0.5 and 500 at δ = 0.02",
     "explicit steps explode",
-    "counted in `num_nonfinite` with an explicit scheme; `SemiImplicit` and, for linear drift, "
-    "`GaussianTransition` stay stable and give the right density",
+    "with an explicit scheme paths are lost and counted in `num_nonfinite`; `SemiImplicit` "
+    "and, for linear drift, `GaussianTransition` stay stable and give the right density",
 )
 @pytest.mark.slow
 @in_single
@@ -282,10 +283,11 @@ def log_wells(x, p):
 
 
 @hard(
-    "superlinear drift: a double well, dX = (X - X³) dt + dW from 8, δ = 0.05, and a quartic well "
-    "in the plane, turned",
-    "explicit steps overflow from the first on",
-    "counted in `num_nonfinite`; `SemiImplicit` gives the density of the Fokker–Planck equation",
+    "superlinear drift: a double well, dX = (X - X³) dt + dW from 8, δ = 0.05, and a rotated "
+    "quartic well in the plane",
+    "explicit steps overflow from the first step",
+    "lost paths are counted in `num_nonfinite`; `SemiImplicit` gives the density of the "
+    "Fokker–Planck equation",
 )
 @pytest.mark.slow
 @pytest.mark.parametrize("wells", [[8.0, 0.5], [[8.0, 0.5], [-0.8, -0.4]]], ids=["line", "plane"])
@@ -321,7 +323,7 @@ def test_superlinear_drift(wells, precision):
 
 @hard(
     "a metastable double well over T = 50",
-    "a pair in different wells is called unreachable",
+    "end points in different wells are reported as unreachable",
     "the share of bridges in either well half way is that of the Fokker–Planck equation",
 )
 @pytest.mark.slow
@@ -362,7 +364,7 @@ def test_metastable_double_well():
 @hard(
     "nearly singular σ: condition number 1e6, and correlation 0.9999",
     "V = σσᵀ squares the condition number, beyond float32",
-    "only σ is solved with; densities agree with the closed form",
+    "only systems with σ are solved, never with V; densities agree with the closed form",
 )
 @pytest.mark.slow
 @pytest.mark.parametrize(
@@ -393,7 +395,8 @@ def test_nearly_singular_sigma(mixing, precision):
 @hard(
     "σ(x) a rotation through full turns: repeated singular values",
     "the polar factor by singular vectors jumps, with infinite derivatives",
-    "O is σ(x')ᵀσ(x) itself, and bridges have the Ornstein–Uhlenbeck law",
+    "the rotation of the pair is σ(x')ᵀσ(x), without singular vectors; bridges have the "
+    "Ornstein–Uhlenbeck law",
 )
 @pytest.mark.slow
 @in_single
@@ -440,7 +443,7 @@ def half_plane(x, p):
 @hard(
     "log ν flat, with heavy tails, with a kink, -∞ outside, and at 10⁴ standard deviations",
     "ν underflows, ∇ν/ν is 0/0",
-    "only ∇log ν is used; a path that comes to where it is not finite is a miss",
+    "only ∇log ν is used; a path is lost where it is not finite",
 )
 @pytest.mark.parametrize(
     "log_density",
@@ -470,9 +473,8 @@ def test_unusual_stationary_densities(log_density, precision):
 
 @hard(
     "d = 1, 2, 10, 50",
-    "costs and memory of d³ matrices where none is called for",
-    "with σ = I memory grows as d; laws, and the share of pairs that meet, "
-    "are those of the closed form",
+    "matrices of d×d numbers and their O(d³) products, although σ = I needs none",
+    "with σ = I memory grows as d; laws and meeting probabilities are those of the closed form",
 )
 @pytest.mark.slow
 @pytest.mark.parametrize("d", [1, 2, 10, 50])
@@ -544,7 +546,8 @@ def check_memory(model, d, dtype):
 @hard(
     "a drift that is mostly rotation, eigenvalues 0.1 ± 20i",
     "the path turns once in 15 steps: symmetric formulas for the reversal fail",
-    "α* from log ν turns the other way; the density is that of the closed form",
+    "the reverse drift, computed from log ν, rotates in the opposite direction; the density "
+    "is that of the closed form",
 )
 @pytest.mark.slow
 @in_single
@@ -573,8 +576,8 @@ def test_rotation_dominated_drift(precision):
 @hard(
     "bridges that 100,000 trials do not hit; all proposals missed; one accepted",
     "a geometric count that never ends; division by no hits",
-    "`max_trials` bounds the work, `truncated` says where, weights stay finite; a fitted start law "
-    "hits them",
+    "`max_trials` bounds the work and sets `truncated`; weights stay finite; with a fitted "
+    "start law all bridges are hit",
 )
 @pytest.mark.slow
 def test_extreme_counts():
@@ -610,7 +613,7 @@ def test_extreme_counts():
 @hard(
     "parameters that are not finite, inside `jit`",
     "NaN paths that look like results",
-    "nothing is met, all proposals are counted in `num_nonfinite`; `throw=True` raises",
+    "no pair meets, and all proposals are counted in `num_nonfinite`; `throw=True` raises an error",
 )
 @pytest.mark.slow
 def test_parameters_that_are_not_finite():
@@ -639,9 +642,9 @@ def test_parameters_that_are_not_finite():
 
 
 @hard(
-    "the same key under `jit` and without, in other batches",
+    "the same key with and without `jit`, and in other batches",
     "other numbers",
-    "the same numbers up to rounding: each path has a key of its own",
+    "the same numbers up to rounding, because each path has its own key",
 )
 @pytest.mark.slow
 def test_the_same_key_gives_the_same_numbers():
@@ -665,7 +668,7 @@ def test_the_same_key_gives_the_same_numbers():
 @hard(
     "60,000 lanes with a full σ(x), d = 6",
     "batched LAPACK calls inside a scan deadlock XLA's thread pool on CPU",
-    "no LAPACK call in any loop: elimination and polar iterations written out",
+    "no LAPACK call in any loop; elimination and polar iterations instead",
 )
 @pytest.mark.slow
 def test_no_deadlock():
