@@ -81,7 +81,7 @@ CLAIMS = {
     "progress": lambda page: bool(page["bridges"].met.all()),
     "saving": lambda page: page["draws"].shape == (1500, 1) and page["state"].num_done == 1500,
     "several_devices": lambda page: bool(page["bridges"].met.all()),
-    "several_records": lambda page: covers(page["posterior"].params["log_noise"], -1),
+    "several_records": lambda page: max(page["values_at"], key=page["values_at"].get) == 0.0,
     "speed": lambda page: page["costs"].cheapest() is not None,
     "trust": lambda page: page["density"].trustworthy.tolist() == [True, False],
     "unknown_sigma": lambda page: (
