@@ -64,7 +64,7 @@ CLAIMS = {
         page["paths"].shape == (8, 101, 1) and page["exact"].mean.shape == (2, 2)
     ),
     "noisy_data": lambda page: (
-        page["posterior"].theta.shape == (2000, 3)
+        page["posterior"].theta.shape == (500, 3)
         and covers(page["posterior"].params["log_noise"], -1)
         and bool(page["paths"].trustworthy)
     ),
@@ -79,9 +79,9 @@ CLAIMS = {
         and page["curves"][0].mean().shape == (71, 1)
     ),
     "progress": lambda page: bool(page["bridges"].met.all()),
-    "saving": lambda page: page["draws"].shape == (1500, 3) and page["part"].state.num_done == 2500,
+    "saving": lambda page: page["draws"].shape == (1500, 1) and page["state"].num_done == 1500,
     "several_devices": lambda page: bool(page["bridges"].met.all()),
-    "several_records": lambda page: covers(page["posterior"].params["log_noise"], -1),
+    "several_records": lambda page: max(page["values_at"], key=page["values_at"].get) == 0.0,
     "speed": lambda page: page["costs"].cheapest() is not None,
     "trust": lambda page: page["density"].trustworthy.tolist() == [True, False],
     "unknown_sigma": lambda page: (

@@ -542,7 +542,7 @@ OF_A_RECORD = [
     ),
     ("a guess without noise", dict(observation=GUESSED), "`guess` must have positive variances"),
     ("fewer rows", dict(observations=VALUES[:3]), "one row per time"),
-    ("times go back", dict(times=AT[::-1]), "`times` must increase"),
+    ("times go back", dict(times=AT[::-1]), "`times` must be increasing"),
     ("a time is missing", dict(times=[0.0, NAN, 2.0, 3.0]), r"`times\[1\]` = nan\. Remove"),
     ("one time", dict(times=AT[:1], observations=VALUES[:1]), "at least two times"),
     ("infinite", dict(observations=VALUES + np.inf), r"`observations\[0, 0\]` is infinite"),

@@ -45,7 +45,7 @@ class Clock(NamedTuple):
         elapsed = np.asarray(since, float)
         steps = np.diff(elapsed)
         smallest = np.min(steps[steps > 0], initial=np.inf)
-        if _spacing(np.max(np.abs(times), initial=0), since.dtype) <= _MOST_MOVED * smallest:
+        if _spacing(float(np.max(np.abs(times), initial=0)), since.dtype) <= _MOST_MOVED * smallest:
             return times
         return np.sum(np.asarray(self.origin, float)) + elapsed
 
