@@ -148,7 +148,7 @@ def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, 
 def _has_rows(times: Numbers) -> bool:
     """Whether there are the times of several records, each of two or more."""
     several = isinstance(times, list | tuple | np.ndarray | jax.Array) and _num_axes(times) == 2
-    return several and len(times[0]) > 1  # pyright: ignore
+    return several and len(times) > 0 and len(times[0]) > 1  # pyright: ignore
 
 
 def of_each(function: Callable[..., Any], seen: list[tuple[Numbers, Numbers]]) -> list[Any]:
