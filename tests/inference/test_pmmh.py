@@ -121,7 +121,7 @@ def test_going_on_with_a_record_is_one_run():
     more = jb.pmmh(*arguments, **going_on)
     np.testing.assert_array_equal(jnp.concatenate([first.theta, more.theta], 1), whole.theta)
     assert jax.tree.all(jax.tree.map(np.array_equal, first.state.guide, more.state.guide))
-    assert np.ptp(first.state.guide.fine) > 1
+    assert np.ptp(first.state.guide.fine) > 0.5  # it follows the observations
     with pytest.raises(ValueError, match="a state of draws from other records"):
         jb.pmmh(*arguments, **{**going_on, "num_steps": 4})
 
