@@ -14,7 +14,7 @@ import jaxbridge as jb
 from jaxbridge.inference import simulated_likelihood
 from jaxbridge.inference.data import as_problem
 from jaxbridge.inference.parameters import as_parameters
-from jaxbridge.proposals.auto import guided_candidates
+from jaxbridge.proposals.auto import Budget, guided_candidates
 
 POSITIVE = lambda params: jnp.all(jnp.stack(params) > 0)
 BRIDGE = jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())
@@ -216,7 +216,7 @@ def test_a_choice_is_made_once_or_kept(unchecked):
     times, data, *_ = ou_problem()
     model, key = ou_1d(), jax.random.key(0)
     problem = as_problem(key, as_parameters(model, None), times[:5], data[:5], 5, None)
-    auto = simulated_likelihood.as_pulled("auto", model, problem.like, (None, None, None))
+    auto = simulated_likelihood.as_pulled("auto", model, problem.like, Budget())
     (block,) = simulated_likelihood.pulled_blocks(key, model, problem, auto)
     assert isinstance(block.proposal, jb.Guided | jb.ModifiedDiffusionBridge)
     candidates = guided_candidates()
