@@ -274,7 +274,7 @@ def test_transitions_of_a_double_well_at_a_temperature(proposal):
     )
     estimate = jb.transition_log_density(
         jax.random.key(0), model, [start], [end], duration,
-        num_proposals=20_000, num_steps=60, proposal=proposal,
+        num_proposals=40_000, num_steps=60, proposal=proposal,
     )  # fmt: skip
     assert abs(estimate.value - expected) < 5 * estimate.standard_error + 0.01
     assert estimate.standard_error < 0.03

