@@ -148,10 +148,10 @@ class PMMHPosterior(AbstractPosterior):
     - `state`: last state; pass it as `init`, with `num_warmup=0`, to continue.
     - `guide`: diagnostics of the last guide of each record, from the warm-up; `None` without an
         `observation`. A poor guide is a fault only if the chain mixes poorly, too.
-    - `share_lost`: fraction of the paths that diverged or left the state space, mean over estimates
-        and intervals, shape (*chains,). With an `observation` it is the total number of lost
-        particles divided by `num_proposals`. It is a fault if more than 5 % of the mass may be
-        missing.
+    - `share_lost`: fraction of the paths that diverged or left the state space, shape (*chains,):
+        the mean over intervals and over the estimates after the warm-up, weighted by their
+        acceptance probabilities. With an `observation` it is the total number of lost particles
+        divided by `num_proposals`. It is a fault if more than 5 % of the mass may be missing.
     """
 
     params: PyTree
@@ -359,12 +359,13 @@ def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLi
 
 class PMMHInfo(NamedTuple):
     """Counted in one step: whether it was accepted; was refused because no estimate was to be had;
-    how many weights of the estimate were cut off; and after the warm-up the share of its paths that
-    was lost."""
+    how many weights of the estimate were cut off. After the warm-up also the acceptance
+    probability, and the share of lost paths times this probability."""
 
     accepted: Int[Array, "*chains"]
     num_without_estimate: Int[Array, "*chains"]
     num_truncated: Int[Array, "*chains"]
+    acceptance: Float[Array, "*chains"]
     share_lost: Float[Array, "*chains"]
 
 
@@ -448,8 +449,10 @@ class _Sampler(eqx.Module):
         without = inside & (made.log_likelihood == -jnp.inf)
         chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), moved, state)
         count = lambda which: which.astype(jnp.int32)
-        lost = jnp.where(learning, 0, made.share_lost)
-        info = PMMHInfo(count(accepted), count(without), made.num_truncated, lost)
+        # Where parameters are improbable, explosions say nothing about the posterior.
+        weight = jnp.where(learning, 0, rate)
+        lost = jnp.where(weight > 0, weight * made.share_lost, 0)
+        info = PMMHInfo(count(accepted), count(without), made.num_truncated, weight, lost)
         return chain._replace(root=root), info
 
 
@@ -529,8 +532,14 @@ def _run(
             **run.chain._asdict(), num_done=run.num_done, proposals=(), guide=run.guide
         ),
         guide=None if run.guide is None else run.guide.check,
-        share_lost=run.counted.share_lost / (num_iterations * thin),
+        share_lost=_mean_share_lost(run.counted),
     )
+
+
+def _mean_share_lost(counted: PMMHInfo) -> Float[Array, "*chains"]:
+    """Return the mean share of lost paths, weighted by acceptance probabilities, or zero."""
+    weight = counted.acceptance
+    return jnp.where(weight > 0, counted.share_lost / jnp.where(weight > 0, weight, 1), 0)
 
 
 def _not_begun(
@@ -541,7 +550,7 @@ def _not_begun(
     nothing, none = jnp.zeros(chains, theta.dtype), jnp.zeros(chains, jnp.int32)
     root = jnp.broadcast_to(root, (*chains, *root.shape))
     chain = _Chain(theta, nothing, nothing, nothing, root)
-    return _Run(chain, guide, jnp.int32(0), PMMHInfo(none, none, none, nothing))
+    return _Run(chain, guide, jnp.int32(0), PMMHInfo(none, none, none, nothing, nothing))
 
 
 def _going_on(state: PMMHState) -> _Run:
@@ -550,4 +559,4 @@ def _going_on(state: PMMHState) -> _Run:
     )
     none = jnp.zeros(chain.log_likelihood.shape, jnp.int32)
     nothing = jnp.zeros_like(chain.log_likelihood)
-    return _Run(chain, state.guide, state.num_done, PMMHInfo(none, none, none, nothing))
+    return _Run(chain, state.guide, state.num_done, PMMHInfo(none, none, none, nothing, nothing))
