@@ -189,7 +189,7 @@ MODELS = [
         TypeError,
     ),
     ("another model", at([0.5], HYPERBOLIC), "made by `ornstein_uhlenbeck`", TypeError),
-    *each("times", at, [[0.5, 0.2], [-0.1, 0.2], [0.5, 1.1], [NAN]], "`times` must .*increas"),
+    *each("times", at, [[0.5, 0.2], [-0.1, 0.2], [0.5, 1.1], [NAN]], "`times` must increase"),
     ("no times", gaussian(times=[]), "`times`"),
     ("time", gaussian(times=0.5), "`times` must have shape"),
     ("duration", gaussian(duration=-1.0), "`duration` must be positive"),
@@ -205,7 +205,10 @@ MODELS = [
     ("keys", simulate(key=jax.random.split(KEY)), "`key` must be a single key"),
     *each("times", on, [1.0, [1.0]], "`times` must have shape"),
     *each(
-        "times", on, [[0.0, 0.0], [0.0, 2.0, 1.0], [1.0, 0.0], [NAN] * 2], "`times` must .*increas"
+        "times",
+        on,
+        [[0.0, 0.0], [0.0, 2.0, 1.0], [1.0, 0.0], [NAN] * 2],
+        "`times` must be increasing",
     ),
     *each("x0", lambda x: simulate(x0=x), [1.0, np.zeros((3, 2))], "`x0` must have shape"),
     ("x0 on a line", simulate(x0=[0.0]), r"at a point `x` of shape \(1,\)"),
@@ -599,7 +602,7 @@ RECORDS = [
     # Several records.
     ("one and two", several([TWO], [LINE[:2]] * 2), "got 1 and 2"),
     ("columns", several([TWO] * 2, [LINE[:2], VALUES[:2]]), r"columns.*\[1, 2\]"),
-    ("times go back", several([TWO, [0, -1.0]], [LINE[:2]] * 2), "in record 1: .*increas"),
+    ("times go back", several([TWO, [0, -1.0]], [LINE[:2]] * 2), "in record 1: .*increasing"),
     (
         "path of two",
         reads("smooth")(times=[AT] * 2, observations=[VALUES] * 2),

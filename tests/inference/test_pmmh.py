@@ -110,7 +110,7 @@ def test_going_on_is_one_run():
 def test_going_on_with_a_record_is_one_run():
     """By the guide that was found in the warm-up, and the rate at which it forgets."""
     model = jb.Diffusion(lambda x, p: p * (x - x**3), [[0.7]], params=1.0)
-    arguments = (jax.random.key(3), model, np.arange(5.0), [[1.0], [0.2], [-0.4], [-1.0], [-0.8]])
+    arguments = (jax.random.key(3), model, np.arange(5.0), [[1.0], [0.8], [0.2], [-1.0], [-0.9]])
     options = {
         "observation": jb.LinearGaussian(covariance=0.3), "initial": [0.0],
         "prior": jb.NormalPrior(1.0, 1.0), "num_chains": 2, "num_steps": 5, "num_proposals": 16,
@@ -121,7 +121,7 @@ def test_going_on_with_a_record_is_one_run():
     more = jb.pmmh(*arguments, **going_on)
     np.testing.assert_array_equal(jnp.concatenate([first.theta, more.theta], 1), whole.theta)
     assert jax.tree.all(jax.tree.map(np.array_equal, first.state.guide, more.state.guide))
-    assert np.ptp(first.state.guide.fine) > 0.5  # it follows the observations
+    assert np.ptp(first.state.guide.fine) > 1
     with pytest.raises(ValueError, match="a state of draws from other records"):
         jb.pmmh(*arguments, **{**going_on, "num_steps": 4})
 

@@ -89,7 +89,7 @@ def test_a_side_that_all_filters_miss_is_found():
     values = np.asarray(path)[:, 1:] + 0.1 * np.random.default_rng(0).normal(size=(13, 1))
     law, seen = jb.GaussianLaw([0.15, 0.0], np.diag([0.5, 0.01])), jb.LinearGaussian([[0, 1]], 0.01)
     given = {"observation": seen, "initial": law, "num_steps": 10}
-    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=400, **given)
+    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=1600, **given)
     problem = as_record_problem(model, times, values, seen, law, num_steps=10)
     guide = linearised(problem, model).guide
     run = jax.jit(lambda key, rate, P: run_filters(
@@ -97,8 +97,7 @@ def test_a_side_that_all_filters_miss_is_found():
     ).log_estimate, static_argnums=2)  # fmt: skip
     free = run(jax.random.key(3), jnp.float32(1000), 8000)
     error = np.hypot(np.std(free) / np.sqrt(8), made.standard_error)
-    assert made.forgetting > 0 and abs(made.value - np.mean(free)) < 5 * error
-    assert 5 * error < 0.4 or not made.trustworthy  # one particle may have most of the weight
+    assert made.forgetting > 0 and abs(made.value - np.mean(free)) < 5 * error < 0.4
     sure = run(jax.random.key(2), jnp.float32(0), 400)
     assert np.std(sure) < 0.2 and np.mean(sure) < np.mean(free) - 0.5
 
