@@ -4,13 +4,6 @@ from .studies.command import Command
 from .studies.exact import COST, EXACT, VARIATION
 from .studies.paper import APPROXIMATE
 
-
-def _figures():
-    from .studies import figures
-
-    return figures
-
-
 COMMAND = Command(
     program="python -m jaxbridge",
     description="Approximate and exact Ornstein-Uhlenbeck bridges: section 3 of Bladt, Finch & "
@@ -18,7 +11,7 @@ COMMAND = Command(
     parts={"approximate": (APPROXIMATE,), "exact": (EXACT, VARIATION, COST)},
     groups={"paper": ("approximate", "exact")},
     part="paper",
-    figures=_figures,
+    figures="jaxbridge.studies.figures",
     keeps_programs=True,
     next_steps="Read next: README.md, then notebooks/01_quickstart.ipynb and notebooks/howto.",
 )

@@ -4,8 +4,6 @@ import pathlib
 import re
 import tomllib
 
-import jax.numpy as jnp
-
 import jaxbridge as jb
 from jaxbridge.studies.command import Command
 from jaxbridge.studies.report import Study
@@ -32,7 +30,7 @@ def test_each_run_adds_a_line_to_a_history(tmp_path, capsys):
         lambda results: {"all.json": "1\n", "history.jsonl": "1\n"},
     )
     command = Command(
-        "nothing", "", {"it": (study,)}, {}, "it", lambda: jnp, False, "Read next: nothing."
+        "nothing", "", {"it": (study,)}, {}, "it", "math", False, "Read next: nothing."
     )
     for _ in range(2):
         command.run(["--out", str(tmp_path)])

@@ -186,7 +186,14 @@ def lost_paths(
         return lost_share(share)
     size = jnp.maximum(effective, 1)
     missing = share.astype(size.dtype) * jnp.maximum(number.astype(size.dtype) / size, 1)
-    return Fault(missing > jnp.maximum(_MOST_MISSING, 1 / jnp.sqrt(size)), _LOST)
+    return Fault(is_too_much_missing(missing, 1 / jnp.sqrt(size)), _LOST)
+
+
+def is_too_much_missing(
+    missing: Float[Array, "*I"], standard_error: Float[Array, "*I"]
+) -> Bool[Array, "*I"]:
+    """Return whether missing mass, relative to the whole, exceeds 5 % and the standard error."""
+    return missing > jnp.maximum(_MOST_MISSING, standard_error)
 
 
 def lost_share(share: Float[Array, "*I"]) -> Fault:

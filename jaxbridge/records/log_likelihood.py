@@ -28,7 +28,13 @@ from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..engine.pareto import largest_reliable_k
 from ..engine.times import as_times, check_increasing
-from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
+from ..engine.verdict import (
+    AbstractResult,
+    Fault,
+    Verdict,
+    is_too_much_missing,
+    throw_where_untrustworthy,
+)
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
 from ..schemes import (
@@ -79,8 +85,6 @@ _LOST = (
     "boundary. If the diffusion attains its boundary (for dX = κ(θ - X) dt + σ√X dW if 2κθ < σ²), "
     "no particle represents these paths."
 )
-# In units of log L.
-_MOST_LOST = 0.05
 
 
 class LogLikelihood(AbstractResult):
@@ -152,7 +156,7 @@ class LogLikelihood(AbstractResult):
                 Fault(apart, _DISAGREE),
                 Fault(heavy, _HEAVY),
                 *guide,
-                Fault(self._missing > jnp.maximum(self.standard_error, _MOST_LOST), _LOST),
+                Fault(is_too_much_missing(self._missing, self.standard_error), _LOST),
                 step_fault(error, self.standard_error),
             )
         ).with_finite(self.value)

@@ -117,7 +117,8 @@ def path_log_likelihood(
         check_increasing(known)
     elif not is_traced(steps) and not np.all(np.asarray(steps) > 0):
         raise ValueError(
-            "`times` must be finite and increase strictly: sort them and remove duplicates."
+            "`times` must be finite and increase strictly in each interval; got steps between "
+            f"{np.min(steps)} and {np.max(steps)}. Sort them and remove duplicates."
         )
     return log_likelihood_of_steps(model, steps.astype(path.dtype), path, form)
 

@@ -2,12 +2,13 @@
 
 import argparse
 import contextlib
+import importlib
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import NamedTuple, NoReturn
 
 import jax
 
@@ -24,7 +25,7 @@ class Command(NamedTuple):
     - `parts`: studies by the name that selects them.
     - `groups`: names for several parts.
     - `part`: the default, one of the names.
-    - `figures`: imports the module of figures; raises `ImportError` without matplotlib.
+    - `figures`: name of the module of figures, imported only to draw: it needs matplotlib.
     - `keeps_programs`: whether compiled programs are stored in the output folder. Not for studies
         that measure the time of compilation.
     - `next_steps`: printed at the end: further reading.
@@ -35,7 +36,7 @@ class Command(NamedTuple):
     parts: Mapping[str, Sequence[Study]]
     groups: Mapping[str, Sequence[str]]
     part: str
-    figures: Callable[[], Any]
+    figures: str
     keeps_programs: bool
     next_steps: str
 
@@ -101,7 +102,7 @@ class Command(NamedTuple):
                 path.write_text(before + text, encoding="utf-8")
             written.append(file)
         try:
-            figures = self.figures()
+            figures = importlib.import_module(self.figures)
         except ImportError as error:
             print(f"no pictures: {error}\n")
             return written

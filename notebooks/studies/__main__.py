@@ -15,12 +15,6 @@ PARTS = {
 }
 
 
-def _figures():
-    from . import figures
-
-    return figures
-
-
 COMMAND = Command(
     program="python -m studies",
     description="The accuracy that a time buys, Bayesian inference (section 4 of the paper), "
@@ -28,7 +22,7 @@ COMMAND = Command(
     parts=PARTS,
     groups={"all": tuple(PARTS)},
     part="all",
-    figures=_figures,
+    figures="studies.figures",
     keeps_programs=False,
     next_steps="Read next: costs.md, how_to_choose.md and rivals.md, made from such results.",
 )
