@@ -358,9 +358,10 @@ def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLi
 
 
 class PMMHInfo(NamedTuple):
-    """Counted in one step: whether it was accepted; was refused because no estimate was to be had;
-    how many weights of the estimate were cut off. After the warm-up also the acceptance
-    probability, and the share of lost paths times this probability."""
+    """Counts of one step: acceptance, refusal for lack of an estimate, and truncated weights.
+
+    After the warm-up also the acceptance probability, and the share of lost paths times it.
+    """
 
     accepted: Int[Array, "*chains"]
     num_without_estimate: Int[Array, "*chains"]
