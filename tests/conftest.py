@@ -30,11 +30,11 @@ import jax  # noqa: E402
 import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+_TESTS = pathlib.Path(__file__).parent
 
 # Modules, workers, the programs that tests start, and later runs compile mostly the same programs.
-# They are kept, however small, for this release of jaxlib and this kind of processor;
-# `pytest --cache-clear` removes them.
-_TESTS = pathlib.Path(__file__).parent
+# They are kept, however small, for this release of jaxlib and this kind of processor, in pytest's
+# own cache folder (`-o cache_dir=FOLDER`); `pytest --cache-clear` removes them.
 _MOST_BYTES = 4_000_000_000
 _CACHE = "JAX_COMPILATION_CACHE_DIR"
 
@@ -47,20 +47,23 @@ def _processor() -> str:
     return f"{platform.machine()}-{zlib.crc32(name.encode()):08x}"
 
 
-def _programs() -> pathlib.Path:
+def _programs(config: pytest.Config) -> pathlib.Path:
     """Return the folder of compiled programs, emptied if it has grown large."""
     release = f"jaxlib-{metadata.version('jaxlib')}-{_processor()}"
-    folder = _TESTS.parent / ".pytest_cache" / "programs" / release
+    folder = config.cache.mkdir("programs") / release
     if folder.exists() and sum(file.stat().st_size for file in folder.iterdir()) > _MOST_BYTES:
         shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
-# Workers inherit the folder from the process that starts them.
-if _CACHE not in os.environ:
-    os.environ[_CACHE] = str(_programs())
-jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
+def pytest_configure(config: pytest.Config) -> None:
+    # Workers inherit the folder from the process that starts them.
+    if _CACHE not in os.environ:
+        os.environ[_CACHE] = str(_programs(config))
+    jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
+
+
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 jax.config.update("jax_disable_most_optimizations", True)  # of what is made while collecting
