@@ -18,7 +18,15 @@ from ..engine.averages import nan_to_neg_inf
 from ..exact import estimate_log_density
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
-from ..records import Filtered, GuideCheck, guided, half_will_do, rate_for_several, run_filters
+from ..records import (
+    Filtered,
+    GuideCheck,
+    guided,
+    half_will_do,
+    rate_for_several,
+    run_filters,
+    steps_are_too_long,
+)
 from ..schemes import share_of_grid
 from .blocks import Block, with_keys
 from .parameters import Parameters
@@ -40,15 +48,27 @@ class Guide(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """log of an unbiased estimate of the likelihood, -inf where there is none, with its variance
-    and its step error; how many of its weights were cut off; and the share of its paths, or
-    particles, that left the state space or the finite numbers."""
+    """Unbiased estimate of a likelihood.
+
+    - `log_likelihood`: its log, -inf if it is zero; `variance`: variance of the log.
+    - `log_step_error`: discretisation error of the log, infinite if steps are too long to estimate
+        it.
+    - `num_truncated`: number of truncated weights.
+    - `share_lost`: share of paths, or particles, that left the state space or diverged.
+    """
 
     log_likelihood: Float[Array, ""]
     variance: Float[Array, ""]
     log_step_error: Float[Array, ""]
     num_truncated: Int[Array, ""]
     share_lost: Float[Array, ""]
+
+
+def _infinite_where_unknown(
+    error: Float[Array, " I"], uncertainty: Float[Array, " I"]
+) -> Float[Array, " I"]:
+    """Return step errors, infinite instead of NaN where steps are too long for an estimate."""
+    return jnp.where(jnp.isnan(error) & jnp.isinf(uncertainty), jnp.inf, error)
 
 
 def _share(
@@ -141,7 +161,7 @@ class TransitionLikelihood(AbstractLikelihood):
             mine = Estimate(
                 jnp.sum(made.value),
                 jnp.sum(made.standard_error**2),
-                jnp.sum(made.step_error),
+                jnp.sum(_infinite_where_unknown(made.step_error, made.step_uncertainty)),
                 jnp.sum(made.num_truncated, dtype=jnp.int32),
                 jnp.sum(_share(made.num_nonfinite, made.num_simulated, zero)) / num_intervals,
             )
@@ -197,7 +217,10 @@ class RecordLikelihood(AbstractLikelihood):
         log_p, variance, _ = on_both_grids(estimate, self.fine, self.coarse)
         # The mean of log p̂ is too small by half its variance.
         fine, coarse = log_p + variance / 2
-        return share_of_grid(problem.density.order, problem.num_steps) * (coarse - fine)
+        error = share_of_grid(problem.density.order, problem.num_steps) * (coarse - fine)
+        one = lambda problem, points: steps_are_too_long(problem, model, points)
+        too_long = self.fine.records.each(one, self.fine.points)
+        return jnp.where(jnp.any(too_long), jnp.inf, error)
 
     def near(self, key, at, theta, around):
         records, P = self.fine.records, self.num_particles
