@@ -51,7 +51,7 @@ def test_paths_beyond_the_end_of_the_shorter_one_are_nobodys():
     records = as_record_problems(
         model, times, values, **LONG.options, num_steps=4, density=jb.EulerDensity()
     )
-    points, chains = linearisations(records, model), 200
+    (points, _), chains = linearisations(records, model), 200
 
     def first(problem, points):
         start = jnp.broadcast_to(points[0][:, None], (2, chains))
