@@ -145,5 +145,10 @@ def covered_start(
     law: Cover, scalars: Scalars, point: Float[Array, " d"], h: Information
 ) -> CoveredStart:
     """The cover given what is seen at t_0, counted from the point, and h_0."""
-    laws = jax.vmap(lambda each: guided_start(each, scalars, point, h))(law.laws)
-    return CoveredStart(laws, law.log_shares + laws.log_integral)
+
+    def one(part: NormalStep):
+        tilted = guided_start(part, scalars, point, h)
+        return tilted, tilted.log_integral
+
+    laws, log_integrals = jax.vmap(one)(law.laws)
+    return CoveredStart(laws, law.log_shares + log_integrals)
