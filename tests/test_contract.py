@@ -271,12 +271,15 @@ def test_parameters_may_hold_what_is_no_array(name, monkeypatch):
     numbers are those of the process without them."""
 
     def made_by(model):
-        monkeypatch.setitem(globals(), "base_model", lambda: model)
-        made = jax.tree_util.tree_leaves_with_path(DOORS[name](numbers()))
+        monkeypatch.setitem(globals(), "base_model", lambda: model())
+        made = jax.tree_util.tree_leaves_with_path(DOORS[name](numbers(dtype=dtype)))
         own = [leaf for path, leaf in made if "network" not in jax.tree_util.keystr(path)]
         return [leaf for leaf in own if eqx.is_inexact_array(leaf)]
 
-    assert_same(made_by(silent_network()), made_by(paper_model()))
+    # Rounding, which differs, decides about moves of the chain behind a maximum.
+    dtype = "float64" if name == "maximum_likelihood" else "float32"
+    with jax.enable_x64(dtype == "float64"):
+        assert_same(made_by(silent_network), made_by(paper_model))
 
 
 @pytest.mark.parametrize(
