@@ -13,8 +13,6 @@ from importlib import metadata
 from jaxtyping import config as jaxtyping_config, install_import_hook
 from packaging.version import Version  # which pytest installs
 
-install_import_hook("jaxbridge", "beartype.beartype")
-
 # Tests compile for longer than they run, and so as `engine.compiled_sooner` does, what they write
 # themselves, too, and without the optimisation that is faulty in some releases (`engine.compiler`).
 # Programs of their own (`helpers.run_program`, the command line) are as users'.
@@ -58,6 +56,10 @@ def _programs(config: pytest.Config) -> pathlib.Path:
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # Slow tests run without the check of annotations, and so without the hook: it takes time even
+    # where nothing is checked.
+    if config.option.markexpr != "slow":
+        install_import_hook("jaxbridge", "annotations.check_annotations")
     # Workers inherit the folder from the process that starts them.
     if _CACHE not in os.environ:
         os.environ[_CACHE] = str(_programs(config))
