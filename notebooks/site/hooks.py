@@ -14,6 +14,7 @@ from pathlib import Path
 
 from mkdocs.structure.files import File
 from mkdocs.utils import get_relative_url
+from mkdocs.utils.meta import get_data
 
 SITE = Path(__file__).parent
 DOCS, ROOT = SITE.parent, SITE.parents[1]
@@ -146,6 +147,7 @@ def on_page_content(content, page, config, files):
         content = _link_pages(content, page, files)
         content = _without_shared_parts(content, page)
         _mend_contents(content, page)
+        content = _with_front_picture(content, page)
     return _link_names(content)
 
 
@@ -198,6 +200,16 @@ def _mend_contents(content, page):
 
     for item, (name, title) in zip(flat(page.toc), headings, strict=True):
         item.id, item.title = name, re.sub(r"<[^>]*>|¶", "", title).strip()
+
+
+def _with_front_picture(content, page):
+    """Begin a notebook with the picture of its card in the gallery."""
+    text = (DOCS / "tutorials.md").read_text(encoding="utf-8")
+    stem = Path(page.file.src_uri).stem
+    path = f"gallery/{stem}-{get_data(text)[1]['pictures'][stem]}.png"
+    source = get_relative_url(path, page.url)
+    picture = f'<p class="front"><img alt="Picture from this tutorial" src="{source}"></p>'
+    return content.replace("</h1>", f"</h1>{picture}", 1)
 
 
 def _describe_pictures(content, page):
