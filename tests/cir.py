@@ -19,8 +19,9 @@ def transition(params, start, duration):
     return scale, 4 * rate * level / sigma**2, start * np.exp(-rate * duration) / scale
 
 
-def log_density(params, start, end, duration):
-    """log p_T(start, end), for arrays of points and durations.
+def log_density(params, start, end, duration, killed=False):
+    """log p_T(start, end), for arrays of points and durations; `killed` for the process that ends
+    where it reaches zero (a Bessel function of the opposite order).
 
     Through the exponentially scaled Bessel function, which stays finite where the noncentrality
     is large, that is for short gaps. (Its order is too small for its own overflow to matter.)
@@ -28,7 +29,7 @@ def log_density(params, start, end, duration):
     scale, freedom, noncentrality = transition(params, start, duration)
     x, order = end / scale, freedom / 2 - 1
     root = np.sqrt(x * noncentrality)
-    bessel = np.log(special.ive(order, root))
+    bessel = np.log(special.ive(abs(order) if killed else order, root))
     gap = (np.sqrt(x) - np.sqrt(noncentrality)) ** 2 / 2
     return order / 2 * np.log(x / noncentrality) - gap + bessel - np.log(2 * scale)
 

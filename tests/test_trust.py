@@ -411,7 +411,9 @@ def cir_log_densities(coordinates, params, proposal, num_steps=100, num_proposal
         jax.random.key(3), model, data[:-1], data[1:], gaps, num_steps=num_steps,
         num_proposals=num_proposals, proposal=proposal,
     )  # fmt: skip
-    exact = cir.log_density(params, observations[:-1, 0], observations[1:, 0], gaps)
+    # The logarithm of zero is beyond all paths.
+    killed = coordinates == "logarithms"
+    exact = cir.log_density(params, observations[:-1, 0], observations[1:, 0], gaps, killed)
     return estimate, np.asarray(estimate.value, float) + added - exact
 
 
