@@ -597,6 +597,7 @@ def test_heavy_tails_are_told_and_auto_takes_another():
 
 
 @slow
+@pytest.mark.optimised
 @jax.numpy_dtype_promotion("standard")  # optax raises a float to a whole number
 def test_unknown_sigma_of_cox_ingersoll_and_ross():
     """All three parameters, by Euler's target, of first order, against the exact maximum."""
