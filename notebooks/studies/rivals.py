@@ -252,10 +252,10 @@ A package that is not installed has a row that says so.
 _SUMMARY = """\
 - **Bridges.** More paths count with jaxbridge on three of five bridges, and with a learnt score on
   two. jaxbridge needs no training. A trained score is faster.
-- **Filters.** At equal variance the other filters take from thirty times as much time to very much
-  more. particles has its first result sooner, because it compiles nothing.
-- **Posteriors.** `gibbs` is not visibly biased, and numpyro is. For an unknown σ that
-  varies, `pmmh` and numpyro are level at equal steps.
+- **Filters.** At equal variance the other filters take from some thirty times as much time to very
+  much more. particles has its first result sooner, because it compiles nothing.
+- **Posteriors.** `gibbs` is not visibly biased, and numpyro is. For an unknown, varying
+  σ, `pmmh` and numpyro are level at equal steps.
 """
 
 
@@ -307,8 +307,8 @@ between two observations, for each record:
   that of a filter on two grids, extrapolated.
 - **prey and predators**: the chemical Langevin equation of the reactions of Lotka and Volterra,
   with rates 0.5, 0.0025 and 0.3 (Golightly & Wilkinson 2008). The prey is observed 40 times, at
-  unit intervals, with noise of sd 5. The likelihood is not known. All packages use Euler steps of the same
-  length.
+  unit intervals, with noise of sd 5. The likelihood is not known. All packages use Euler steps of
+  the same length.
 
 The methods:
 
@@ -359,6 +359,7 @@ _DETAILS = """\
 - jaxbridge needs no training, and a new start or duration costs no more. A score is trained for one
   start and duration.
 - A trained score is faster, mostly several times, because "auto" makes pilot runs in each call.
+- The bridge from 3 to 4 reuses compiled programs, so its first call with jaxbridge is short.
 - The log p of the learnt score has the error of the Euler scheme, most clearly from 3 to 4.
 
 **Filters**
