@@ -24,7 +24,7 @@ in_single = pytest.mark.parametrize("precision", ["float32"], indirect=True)
 
 
 def hard(case, plain, here):
-    """Add a row to the table: the case, the failure of a plain implementation, the behaviour here."""
+    """Add a row to the table: case, failure of a plain implementation, behaviour here."""
 
     def keep(test):
         ROWS.append((case, plain, here, test.__name__))
