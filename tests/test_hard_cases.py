@@ -1,6 +1,6 @@
-"""Hard cases stay numerically stable, each against an oracle or an invariant.
+"""Hard cases are numerically stable. Each test compares with an oracle or checks an invariant.
 
-`hard` keeps what the table in notebooks/hard_cases.md says of a case beside the test that shows it.
+The decorator `hard` has the row of the test in the table of notebooks/hard_cases.md.
 """
 
 import pathlib
@@ -24,8 +24,7 @@ in_single = pytest.mark.parametrize("precision", ["float32"], indirect=True)
 
 
 def hard(case, plain, here):
-    """A row of the table: the case, what goes wrong in a plain implementation, and what happens
-    here."""
+    """Add a row to the table: case, failure of a plain implementation, behaviour here."""
 
     def keep(test):
         ROWS.append((case, plain, here, test.__name__))
@@ -187,7 +186,7 @@ def test_very_unlikely_bridges(precision):
 
 @hard(
     "T = 1000 in 50,000 steps",
-    "sums of δ in float32 are off by several steps at the end; memory for every step",
+    "sums of δ in float32 are wrong by several steps at the end; every step is stored",
     "times are i δ, computed from i; only requested times are stored",
 )
 @pytest.mark.slow
@@ -231,7 +230,7 @@ def test_short_intervals(precision):
 
 @hard(
     "stiff drift: eigenvalues 0.5 and 500 at δ = 0.02",
-    "explicit steps explode",
+    "explicit steps overflow",
     "with an explicit scheme paths are lost and counted in `num_nonfinite`; `SemiImplicit` "
     "and, for linear drift, `GaussianTransition` stay stable and give the right density",
 )
@@ -545,7 +544,7 @@ def check_memory(model, d, dtype):
 
 @hard(
     "a drift that is mostly rotation, eigenvalues 0.1 ± 20i",
-    "the path turns once in 15 steps: symmetric formulas for the reversal fail",
+    "the path turns once in 15 steps, so symmetric formulas for the reversal fail",
     "the reverse drift, computed from log ν, rotates in the opposite direction; the density "
     "is that of the closed form",
 )
@@ -643,7 +642,7 @@ def test_parameters_that_are_not_finite():
 
 @hard(
     "the same key with and without `jit`, and in other batches",
-    "other numbers",
+    "different numbers",
     "the same numbers up to rounding, because each path has its own key",
 )
 @pytest.mark.slow

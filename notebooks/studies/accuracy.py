@@ -300,8 +300,8 @@ def format_effects(costs: Sequence[EffectCost]) -> str:
 
 
 def sigma_table(sigmas: Sequence[tuple[int, float, float]]) -> Table:
-    """What a full σ(x) costs."""
-    titles = ("σ(x), d =", "ns a path and step, σ = I", "full σ(x)", "ratio")
+    """Return the table of the times per step with σ = I and with a full σ(x)."""
+    titles = ("d", "ns per path and step, σ = I", "the same, full σ(x)", "ratio")
     rows = [(f"{d}", f"{one:.0f}", f"{full:.0f}", f"{full / one:.1f}") for d, one, full in sigmas]
     return titles, rows
 

@@ -1,10 +1,12 @@
-"""How fast it is: ratios, each of two times taken in turns in one run.
+"""Benchmarks of speed. A ratio compares two times, measured in turns in one run.
 
-Against drawing the same random numbers with the same generator, which is the floor; against a
-vectorised NumPy version of the same method; against the paper's discretisation at equal
-accuracy; the package's proposals against each other; and the first call of each entry point, in
-seconds, most of which is compilation. Results are kept as JSON with the
-device, the versions and the date, and the README's table is made from that file.
+- Calls are compared with drawing the same random numbers by the same generator (the floor),
+  with a vectorised NumPy version, and with the paper's discretisation at equal accuracy.
+- The proposals of the package are compared with each other.
+- First calls are measured in seconds. Most of this time is compilation.
+
+Results are stored as JSON with the device, the versions and the date. The tables of
+`notebooks/costs.md` are made from that file.
 """
 
 import datetime
@@ -189,7 +191,7 @@ def _whole_call(key: Key[Array, ""], gamma: float, num_bridges: int) -> Ratio:
     draw = draw_floor(gamma > -1, num_proposals)
     return Ratio(
         f"`sample_bridges`, {num_bridges:,} bridges, γ = {gamma:g}",
-        f"drawing the random numbers of the {num_proposals:,} proposals that takes",
+        f"drawing the random numbers of its {num_proposals:,} proposals",
         *in_turns(sample, lambda: draw(key)),
         1.8,
     )
@@ -225,7 +227,7 @@ def _batch(key: Key[Array, ""], num_intervals: int) -> Ratio:
     seconds, reference = in_turns(sample, proposals)
     return Ratio(
         f"one bridge for each of {num_intervals:,} pairs of end points",
-        f"the price of their {expected:,.0f} expected proposals",
+        f"the time of their {expected:,.0f} expected proposals",
         seconds,
         reference * expected / each,
         3.0,
@@ -327,7 +329,7 @@ def tables(benchmark: Benchmark) -> list[Table]:
         for r in benchmark.ratios
     ]
     return [
-        (("call", "against", "takes", "ratio", "aim"), calls),
+        (("call", "compared with", "time", "ratio", "limit"), calls),
         sigma_table(benchmark.sigmas),
         crossover_table(benchmark.rates),
         first_calls_table(benchmark.first_calls),
@@ -371,12 +373,14 @@ BENCHMARK = Study(
     _run,
     in_plain_characters,
     """\
-"ratio" is that of the times of both; nanoseconds are of a path and step with sigma = I and with a
-full sigma(x). Below, thousands of effective samples per second, compile time left out, of a run of
-200,000 proposals in 50 steps (T up to 1) or 20,000 in 1,000 (from T = 5 on); fewer for couplings
-alone. The step error is of second order for all: Heun for couplings, the Itô–Taylor density for the
-others. "auto" includes its pilot runs. Last, the seconds of a first call in a process, of a second,
-and of a first that finds its programs on disk; programs compiled, and memory maps left.""",
+Calls: "ratio" is the time of the call over the time of the comparison.
+Full sigma(x): nanoseconds per path and step, with sigma = I and with a full sigma(x).
+Durations: thousands of effective samples per second, without compilation. A run has 200,000
+proposals of 50 steps (T up to 1), or 20,000 of 1,000 steps (from T = 5 on); couplings alone have
+fewer. The discretisation error is of second order for all: Heun for couplings, the Itô–Taylor
+density for the others. "auto" includes its pilot runs.
+First calls: seconds of the first call in a process, of a second call, and of a first call with
+programs on disk; programs compiled; memory maps that they keep.""",
     lambda figures, made: {"crossover.png": figures.crossover(made.rates, LONG)},
     as_files,
 )

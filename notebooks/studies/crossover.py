@@ -188,8 +188,10 @@ def _rate(
 
 
 def crossover_table(rates: Sequence[Rate]) -> Table:
-    """Thousands of effective samples per second, by proposal and duration; "auto" also as a share
-    of the best of the others, and what it took."""
+    """Return the table of effective samples per second, in thousands, by proposal and duration.
+
+    Two more rows have the share of "auto" in the best single proposal, and its selection.
+    """
     durations = list(dict.fromkeys(rate.duration for rate in rates))
     rows: list[Row] = []
     for process, of_process in groupby(rates, key=lambda rate: rate.process):
@@ -200,7 +202,9 @@ def crossover_table(rates: Sequence[Rate]) -> Table:
             rows.append((process, proposal.strip('"'), *found))
         shares = [f"{share_of_best(group, t):.2f}" for t in durations]
         rows.append((process, "auto / best", *shares))
-        rows.append((process, "auto took", *(_short(rate['"auto"', t].chosen) for t in durations)))
+        rows.append(
+            (process, "auto selected", *(_short(rate['"auto"', t].chosen) for t in durations))
+        )
     return ("process", "proposal", *(f"T = {t:g}" for t in durations)), rows
 
 

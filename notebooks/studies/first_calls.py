@@ -178,7 +178,7 @@ def run_first_calls(entries: Sequence[str] = tuple(ENTRIES), say: Say = silent) 
 
 def first_calls_table(rows: Sequence[FirstCall]) -> Table:
     """Seconds, programs and maps."""
-    titles = ("first call of", "s", "again", "programs on disk", "programs", "maps left")
+    titles = ("call", "first, s", "second, s", "first, from disk, s", "programs", "memory maps")
     return titles, [
         (
             r.what,

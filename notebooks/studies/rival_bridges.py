@@ -30,8 +30,8 @@ from .peers import NOT_INSTALLED, in_r
 
 RADIAL = 4.0  # of dX = (4/X - X) dt + dW, the norm of a process in nine dimensions
 CELL_SIGMA, CELL_HALF = 0.1, 2.0**-4
-LIBRARY = 'here, "auto"'
-LEARNT = "score, learnt"
+LIBRARY = 'jaxbridge, "auto"'
+LEARNT = "learnt score"
 
 
 class BridgeTask(NamedTuple):
@@ -408,6 +408,6 @@ def _r_rows(task: BridgeTask, num_paths: int) -> list[BridgeRow]:
             rows.append(BridgeRow(task.name, way, why=NOT_INSTALLED))
             continue
         gap = made["mean"] - 1 / np.cosh(1.0)  # the exact mean of the bridge from 1 to 1 half way
-        why = f"mean half way off by {gap:+.3f} ± {made['sd'] / np.sqrt(num_paths):.3f}"
+        why = f"error of the mean half way {gap:+.3f} ± {made['sd'] / np.sqrt(num_paths):.3f}"
         rows.append(BridgeRow(task.name, way, first=made["seconds"], again=None, why=why))
     return rows

@@ -27,7 +27,7 @@ from jaxbridge.studies.report import Say
 from .peers import where_installed
 
 NUM_STEPS = 10
-LIBRARY = "here, `log_likelihood`"
+LIBRARY = "jaxbridge, `log_likelihood`"
 _ROTATION = np.array([[1.0, 1.5], [-1.0, 0.5]])
 _RATES = 0.5, 0.0025, 0.3
 _WELL_SIGMA = 0.7
@@ -104,7 +104,7 @@ def _predation_variance(x: Any) -> Any:
 def records(quick: bool) -> list[Record]:
     """Those of the study, simulated in a hundred Euler steps a gap; quickly, the first."""
     scenes = [
-        Record("OU, one of two seen", _ou_drift, _unit_variance, True, (0.0, 0.0), 0.5, 0.1,
+        Record("OU, one of two observed", _ou_drift, _unit_variance, True, (0.0, 0.0), 0.5, 0.1,
                np.empty(50), None),
         Record("double well", _well_drift, _well_variance, True, (1.0,), 0.5, 0.1,
                np.empty(50), None),

@@ -215,12 +215,14 @@ def _library_rows(
         )
 
     if sigma is None:
-        ways: dict[str, Callable[[int], Any]] = {f"here, `gibbs`, {NUM_STEPS} steps": gibbs}
+        ways: dict[str, Callable[[int], Any]] = {f"jaxbridge, `gibbs`, {NUM_STEPS} steps": gibbs}
     else:
         logs = jb.transform(model, jnp.log, jnp.exp).model
         ways = {
-            f"here, `pmmh`, {NUM_STEPS} steps": lambda i: pmmh(i, model, values, NUM_STEPS, 30),
-            f"here, `pmmh` of log X, {4 * NUM_STEPS} steps": lambda i: pmmh(
+            f"jaxbridge, `pmmh`, {NUM_STEPS} steps": lambda i: pmmh(
+                i, model, values, NUM_STEPS, 30
+            ),
+            f"jaxbridge, `pmmh` of log X, {4 * NUM_STEPS} steps": lambda i: pmmh(
                 i, logs, np.log(values), 4 * NUM_STEPS, 60
             ),
         }

@@ -59,7 +59,7 @@ def test_table_and_figure_show_the_share_of_the_best():
     titles, (*_, shares, taken) = crossover_table(rates())
     assert titles == ("process", "proposal", "T = 0.05", "T = 20")
     assert shares == ("double well", "auto / best", "0.75", "0.80")
-    assert taken == ("double well", "auto took", "C(0)", "C(0)")
+    assert taken == ("double well", "auto selected", "C(0)", "C(0)")
     (ax,) = figures.crossover(rates(), 5.0).axes
     assert ax.get_title() == "double well" and len(ax.get_lines()) == 3
     assert len({process.name for process in processes()}) == 3
