@@ -720,6 +720,7 @@ INFERENCE = [
         r"`observations\[2\]`.*outside the state space",
     ),
     ("prior's mean", normal(jnp.zeros(3), 1.0), "`prior.mean` must be"),
+    ("prior's entries", normal({"rate": 0.0}, 1.0), "must have the structure of the parameters"),
     ("prior's shape", normal(0.0, jnp.ones((2, 2))), "`prior.variance` must be"),
     ("prior's variance", normal(0.0, -1.0), "positive"),
     ("a number", gibbs(prior=3.0), "`prior` must be", TypeError),

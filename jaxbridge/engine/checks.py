@@ -4,6 +4,7 @@ Checks need values, so they are skipped for traced arrays.
 """
 
 import datetime
+import reprlib
 from collections.abc import Sequence
 from numbers import Real
 from typing import Any
@@ -92,7 +93,9 @@ def as_real(name: str, value: Numbers) -> Array:
             "numbers instead."
         ) from error
     except (TypeError, ValueError) as error:
-        raise TypeError(f"`{name}` must be real numbers in an array; got {value!r}.") from error
+        raise TypeError(
+            f"`{name}` must be real numbers in an array; got {reprlib.repr(value)}."
+        ) from error
     if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer)):
         raise TypeError(
             f"`{name}` must be real numbers; got dtype {array.dtype}. Convert them to floats."

@@ -138,6 +138,11 @@ def _as_array(
                 )
             full.append(jnp.broadcast_to(leaf, known.shape).ravel())
         value = jnp.concatenate(full)
+    elif isinstance(value, dict):
+        raise ValueError(
+            f"`prior.{name}` must have the structure of the parameters, {structure}; got "
+            f"{jax.tree.structure(value)}. Pass an entry for each parameter, or one number for all."
+        )
     return as_floating(f"prior.{name}", value).astype(theta.dtype)
 
 

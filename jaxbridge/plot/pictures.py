@@ -79,22 +79,30 @@ def paths_in_space(
     return space
 
 
+def _numbers_or_dates(times: Reals) -> np.ndarray:
+    """Return times as floats; dates stay dates, for which matplotlib has an axis."""
+    times = np.asarray(times)
+    return times if times.dtype.kind == "M" else times.astype(float)
+
+
 def bridge_fan(
-    times: Float[Reals, " K"],
+    times: Reals,
     paths: Float[Reals, "*n K d"],
     ax: Axes | None = None,
     coordinate: int = 0,
     num_paths: int = 5,
     exact: jb.GaussianBridge | None = None,
     weights: Float[Reals, " n"] | None = None,
-    data: tuple[Float[Reals, " m"], Float[Reals, " m"]] | None = None,
+    data: tuple[Reals, Float[Reals, " m"]] | None = None,
     data_sd: Number | Float[Reals, " m"] = 0.0,
 ) -> Axes:
-    """Plot one coordinate of many bridges: median, 50 % and 90 % bands, and a few paths.
+    """Plot one coordinate of many bridges or smoothed paths.
+
+    The picture has the median, bands of 50 % and 90 %, and a few paths.
 
     **Arguments:**
 
-    - `times`: shape (K,).
+    - `times`: numbers or dates (`datetime64`), shape (K,).
     - `paths`: shape (n, K, d), as returned by `sample_bridges`, or (chains, n, K, d), as returned
         by `smooth`. Bridges that were not found (NaN) are left out.
     - `ax`: axes to draw in; by default new ones.
@@ -120,7 +128,7 @@ def bridge_fan(
     ```
     """
     ax = axes_or_new(ax)
-    times, paths = np.asarray(times, float), np.asarray(paths)
+    times, paths = _numbers_or_dates(times), np.asarray(paths)
     finite, index = finite_paths(paths.reshape(-1, *paths.shape[2:]) if paths.ndim == 4 else paths)
     values = finite[..., coordinate]
     if weights is None:
@@ -147,7 +155,7 @@ def bridge_fan(
         lines = ax.plot(times, curves, color=EXACT, linewidth=0.9, linestyle=DASHES[0])
         lines[2].set_label("exact")
     if data is not None:
-        data_times, observed = (np.asarray(part, float) for part in data)
+        data_times, observed = _numbers_or_dates(data[0]), np.asarray(data[1], float)
         # NaN hides the error bars of missing values.
         error = np.where(np.isnan(observed), np.nan, 2 * np.asarray(data_sd, float))
         style = {"fmt": ".", "color": COLOURS[1], "markersize": 5, "elinewidth": 0.9, "zorder": 3}

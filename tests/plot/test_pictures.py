@@ -5,6 +5,7 @@ import matplotlib
 matplotlib.use("Agg")
 
 import jax
+import matplotlib.dates as mdates
 import matplotlib.pyplot
 import numpy as np
 import pytest
@@ -76,6 +77,13 @@ def test_bands_of_weighted_bridges():
     np.testing.assert_allclose(median.get_ydata(), 45)
     drawn = [line.get_ydata()[0] for line in ax.lines if line is not median]
     assert all(40 <= value <= 50 for value in drawn) and len(drawn) == 2
+
+
+def test_dates_have_an_axis_of_dates():
+    dates = np.datetime64("2024-03-01") + np.arange(3).astype("timedelta64[D]")
+    values = np.random.default_rng(0).normal(size=(101, 3, 1))
+    ax = plot.bridge_fan(dates, values, data=(dates, np.array([0.1, np.nan, 0.2])))
+    np.testing.assert_array_equal(ax.get_xlim(), mdates.date2num(dates[[0, -1]]))
 
 
 def test_data_are_drawn_with_their_noise():
