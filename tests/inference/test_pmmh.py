@@ -230,6 +230,7 @@ def test_ranks_of_true_parameters_are_uniform():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 def test_the_step_error_where_sigma_varies_is_doubted():
     """σ√x (Cox, Ingersoll & Ross 1985) in raw coordinates: the posterior mean of σ by ten steps is
     .9 standard deviations off, and what half as many steps tell is more than that."""

@@ -100,6 +100,7 @@ def test_states_stay_in_the_state_space():
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 @pytest.mark.parametrize(
     "proposal",
     [jb.Coupling(0.5), jb.Guided(density=jb.ItoTaylorDensity())],
