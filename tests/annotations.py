@@ -6,10 +6,9 @@ from beartype import beartype
 
 
 def check_annotations(fn: Callable | type) -> Callable | type:
-    """Return the function or class with its annotations checked; a function inside of a function as
-    it is.
+    """Return the function or class with its annotations checked.
 
-    The latter would be decorated at each call of the outer one, which takes a third of the time of
-    tracing.
+    Nested functions are returned unchanged. Otherwise each call of the outer function would
+    decorate them again, which slows tracing.
     """
     return fn if "<locals>" in fn.__qualname__ else beartype(fn)

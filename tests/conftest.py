@@ -61,9 +61,9 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.option.markexpr != "slow":
         install_import_hook("jaxbridge", "annotations.check_annotations")
     # Workers inherit the folder from the process that starts them.
-    if _CACHE not in os.environ:
+    if _CACHE not in os.environ and config.pluginmanager.hasplugin("cacheprovider"):
         os.environ[_CACHE] = str(_programs(config))
-    jax.config.update("jax_compilation_cache_dir", os.environ[_CACHE])
+    jax.config.update("jax_compilation_cache_dir", os.environ.get(_CACHE))
 
 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -19,8 +19,8 @@ def test_shares_are_the_integrals_of_the_parts(d, x64):
     point, row, r = rng.normal(size=(3, d))
     H = 0.3 * np.eye(d) + np.outer(r, r)
     law = Cover(jnp.log(jnp.array([0.2, 0.5, 0.3])), NormalStep(*map(jnp.asarray, (means, roots))))
-    scalars = Scalars(row[None], jnp.array([0.4]), jnp.array([0.2]), jnp.array([True]))
-    scalars = jax.tree.map(jnp.asarray, scalars._replace(values=jnp.array([0.4 - row @ point])))
+    scalars = Scalars(row[None], np.array([0.4 - row @ point]), np.array([0.2]), np.array([True]))
+    scalars = jax.tree.map(jnp.asarray, scalars)
     start = covered_start(law, scalars, jnp.asarray(point), Information(*map(jnp.asarray, (r, H))))
     for log_share, share, mean, root in zip(
         start.log_shares, (0.2, 0.5, 0.3), means - point, roots, strict=True
