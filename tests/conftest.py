@@ -7,6 +7,7 @@ import platform
 import re
 import shutil
 import sys
+import time
 import zlib
 from importlib import metadata
 
@@ -23,6 +24,9 @@ _FLAGS = [
 if Version(metadata.version("jaxlib")) < Version("0.11.1"):  # later ones end at unknown flags
     _FLAGS.append("--xla_cpu_use_fusion_emitters=false")
 os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
+# Workers share the cores: threads of linear algebra that wait for each other cost up to ten times
+# the time of one. NumPy and SciPy read this when they are imported.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
@@ -69,6 +73,27 @@ def pytest_configure(config: pytest.Config) -> None:
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 jax.config.update("jax_disable_most_optimizations", True)  # of what is made while collecting
+
+
+# Processor time (s) of a test whose programs are not compiled yet: about twice what the longest
+# tests take.
+_MOST_SECONDS, _MOST_SECONDS_SLOW = 20, 900
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """Fail tests that take too much processor time, which is the same on a busy machine."""
+    start = time.process_time()
+    result = yield
+    seconds = time.process_time() - start
+    if "slow" in item.keywords:
+        most, advice = _MOST_SECONDS_SLOW, "Make it cheaper, or split it."
+    else:
+        most, advice = _MOST_SECONDS, "Make it cheaper, or mark it as `slow`."
+    if seconds > most:
+        message = f"The test took {seconds:.0f} s of processor time; at most {most} s are allowed."
+        pytest.fail(f"{message} {advice}", pytrace=False)
+    return result
 
 
 @pytest.fixture(autouse=True)

@@ -43,6 +43,7 @@ def run_program(program, deadline=240, num_devices=1, in_haste=False):
     flags = f"--xla_force_host_platform_device_count={num_devices}"
     environment = {**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags}
     environment["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(in_haste))
+    environment.pop("OPENBLAS_NUM_THREADS", None)  # which `conftest.py` sets
     subprocess.run(command, check=True, timeout=deadline, env=environment)
 
 

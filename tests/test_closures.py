@@ -175,6 +175,6 @@ def test_derivatives_in_closures_are_those_in_params(name):
     compare(name, "jit(jacfwd)")
 
 
-@pytest.mark.parametrize("nesting", slow_beyond(1, NESTINGS))
+@pytest.mark.parametrize("nesting", slow_beyond(0, NESTINGS))
 def test_under_every_nesting(nesting):
     compare("transition_log_density", nesting)

@@ -129,16 +129,8 @@ def test_random_models_are_what_they_say(random, x64):
     assert abs(jnp.trace(jax.jacfwd(flux)(x))) < 1e-5 * density(x)
 
 
-KNOWN = list(random_models.EXACT)
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        name if i == 2 else pytest.param(name, marks=pytest.mark.slow)
-        for i, name in enumerate(KNOWN)
-    ],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", random_models.EXACT)
 def test_numbers_of_random_models(name):
     made = random_models.solve(random_models.named(name))
     log_density, mean = random_models.EXACT[name]

@@ -6,8 +6,10 @@ import pathlib
 import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import zeros_of
 from studies.benchmark import in_markdown, load
 
 import jaxbridge as jb
@@ -90,16 +92,11 @@ CLAIMS = {
 }
 
 
-def as_cases(pages):
-    """The pages as parameters of a test: all but README are slow."""
-    return [
-        pytest.param(page, id=page.stem, marks=() if page is README else pytest.mark.slow)
-        for page in pages
-    ]
-
-
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")  # annotations, as for users
-@pytest.mark.parametrize("page", as_cases(page for page, blocks in CODE.items() if blocks))
+@pytest.mark.parametrize(
+    "page", [page for page, blocks in CODE.items() if blocks], ids=lambda page: page.stem
+)
 def test_code_runs(page):
     """The blocks of a page, in order, in a namespace of their own."""
     variables = {}
@@ -109,7 +106,32 @@ def test_code_runs(page):
     assert CLAIMS[page.stem](variables)
 
 
+def traced(function):
+    """Return a function that returns zeros for the numbers of `function`, which is not run."""
+    return lambda *args, **options: zeros_of(lambda: function(*args, **options))
+
+
+# Of each block of README: a condition on its variables, whatever the numbers.
+SHAPES = [
+    lambda page: page["paths"].paths.shape[-1] == 1 and page["rate"].shape == (1000,),
+    lambda page: page["bridges"].paths.shape == (1000, 101, 2),
+]
+
+
+@pytest.mark.usefixtures("unchecked")
+@pytest.mark.parametrize("block", range(len(SHAPES)))
+def test_calls_of_the_readme_are_accepted(block, monkeypatch):
+    """Its computations are traced; the slow tests run them."""
+    for name in ("simulate", "smooth", "gibbs", "sample_bridges", "transition_log_density"):
+        assert f"jb.{name}(" in TEXT[README]
+        monkeypatch.setattr(jb, name, traced(getattr(jb, name)))
+    page = {"jax": jax, "jnp": jnp, "jb": jb}
+    exec(compile(CODE[README][block], README.name, "exec"), page)
+    assert SHAPES[block](page)
+
+
 def test_every_task_has_code():
+    assert len(SHAPES) == len(CODE[README])
     assert {page.stem for page, blocks in CODE.items() if blocks} == set(CLAIMS)
     tasks = [page for page in PAGES if page.parent.name == "howto" and page.stem != "index"]
     assert len(tasks) >= 19 and all(CODE[page] for page in tasks)

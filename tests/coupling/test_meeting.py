@@ -129,6 +129,7 @@ def bias_of_heun(meeting, dt):
     return np.linalg.norm(points.mean(0) - mean) / np.sqrt(dt)
 
 
+@pytest.mark.slow
 def test_heun_sees_the_pair_after_half_its_drift():
     """What a meeting costs shrinks much faster than with the pair as it is before."""
     ours, before = (

@@ -60,6 +60,7 @@ def test_its_ellipse_is_normalised_in_more_dimensions():
     np.testing.assert_allclose(jnp.cov(draws.T), law.root @ law.root.T, atol=0.2)
 
 
+@pytest.mark.slow
 def test_one_mode_is_an_ellipse_and_two_are_kernels():
     normal = jax.random.normal(jax.random.key(0), (512, 6)) / jnp.sqrt(2)
     assert smoothed_draws(KEY, normal, jnp.zeros(6), PULLED).share == 1
@@ -75,6 +76,7 @@ def test_draws_that_are_not_finite_or_all_the_same_make_a_law():
     assert jnp.all(jnp.isfinite(law.sample(jax.random.key(0), PULLED)))
 
 
+@pytest.mark.slow
 def test_weights_have_no_tails_where_the_density_falls_off_fast():
     """Two wells with quartic walls: the effective share of weights μ/ν, under many draws of ν and
     under those of μ, which see what of it lies in the walls."""

@@ -242,6 +242,7 @@ def test_what_is_held_can_be_tangents():
     np.testing.assert_array_equal(transposed, points)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [8, 16, 32])
 def test_layers_of_a_network_are_products_of_matrices(width):
     """Written out, a layer has a term for each weight, of which the compiler makes derivatives."""

@@ -162,6 +162,7 @@ def test_chains_under_vmap_share_their_lanes(method):
         np.testing.assert_array_equal(together[i], run_kernel(kernel, keys[i], 3)[0].position)
 
 
+@pytest.mark.slow
 def test_chains_of_several_models_under_vmap():
     """Of which each has lanes of its own."""
     keys = jax.random.split(jax.random.key(1), 2)

@@ -387,7 +387,7 @@ def test_prepare_runs_outside_every_loop():
     [jb.hyperbolic, lambda _, d: jb.ornstein_uhlenbeck(jnp.eye(d, dtype=jnp.float32))],
     ids=["hyperbolic", "Ornstein-Uhlenbeck"],
 )
-@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("d", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_single_precision_serves_where_double_is_on(make, d):
     """No constant of a model is a NumPy number, which would not be promoted, or promote."""
     model, point = make(0.8, d), jnp.ones(d, jnp.float32)

@@ -497,7 +497,7 @@ def test_thousands_of_intervals_without_compiling_again():
     assert np.median(np.abs(np.asarray(estimate.value) - exact)) < 0.05
 
 
-@pytest.mark.parametrize("proposal", [jb.ModifiedDiffusionBridge(), jb.Guided()])
+@pytest.mark.parametrize("proposal", slow_beyond(1, [jb.Guided(), jb.ModifiedDiffusionBridge()]))
 def test_what_cannot_be_a_bridge_is_flagged_where_it_is_traced(unchecked, proposal):
     key = jax.random.key(0)
     options = dict(num_bridges=4, num_steps=5, proposal=proposal)
@@ -542,6 +542,7 @@ def test_explosions_are_counted_and_never_returned(start, found):
     assert (np.isfinite(weighted.mean()) == (found > 0)).all()  # of none there is no mean
 
 
+@slow
 def test_defaults_agree_in_what_they_are_exact_for():
     """Fisher's identity: the mean score of bridges is that of p_T. By default bridges and the
     likelihood of paths are of second order both; bridges of the Euler scheme are not."""
@@ -572,6 +573,7 @@ def test_defaults_agree_in_what_they_are_exact_for():
     assert abs(errors[jb.EulerDensity()][0]) > 5 * standard_error + 0.1 / 6**2
 
 
+@slow
 def test_the_default_is_the_most_accurate_that_the_model_has():
     arguments = (jax.random.key(0), BENT, jnp.array([0.3]), jnp.array([0.7]), 0.4)
     made = jb.sample_weighted_bridges(*arguments, num_bridges=3, num_steps=4, proposal=jb.Guided())

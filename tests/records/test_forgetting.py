@@ -72,6 +72,7 @@ def test_the_rate_that_loses_least_is_chosen():
     assert loses_least(jnp.zeros((3, 2))) == 0  # the least of several
 
 
+@pytest.mark.slow
 def test_nothing_is_forgotten_where_all_weights_are_equal():
     given = {"observation": SEEN, "initial": LAW, "num_steps": 4}
     made = jb.log_likelihood(jax.random.key(0), MODEL, TIMES, VALUES, **given)

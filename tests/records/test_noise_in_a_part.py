@@ -111,6 +111,7 @@ def test_the_filter_in_single_precision(case, noise):
     assert abs(made.value - chain) < 1e-3 * max(abs(chain), 1)
 
 
+@pytest.mark.slow
 def test_orders_of_the_steps(x64):
     """The expansion is of second order, Euler's scheme of first, where noise comes by the drift."""
     case, sizes = oscillator(0.1), np.array([16, 32, 64])

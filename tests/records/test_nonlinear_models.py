@@ -126,6 +126,7 @@ def options(case):
     return {"observation": case.observation, "initial": law}
 
 
+@pytest.mark.slow
 def test_a_path_that_guides_worse_is_not_taken():
     """From the filter's means, with a well on either side of a gap, to the likeliest path."""
     case, values, _ = recorded("double well")
@@ -227,20 +228,25 @@ def test_the_maximum_is_that_of_the_grid():
     np.testing.assert_array_less(np.abs(told - exact), 4.5 * error + grid)
 
 
+# Brownian motion of which nothing is seen, lost where a step leads below zero.
+POSITIVE = jb.Diffusion(lambda x, p: 0 * x, domain=lambda x, p: x[0] > 0)
+UNSEEN = (KEY, POSITIVE, np.array([0.0, 0.5, 1.0]), np.full((3, 1), np.nan))
+FROM_HALF = {"observation": jb.LinearGaussian(covariance=0.1), "initial": [0.5], "num_steps": 2}
+
+
 def test_no_path_ends_outside_of_the_state_space():
-    """Brownian motion of which nothing is seen, lost where a step leads below zero: the likelihood
-    is the probability that none of four does, by quadrature."""
-    model = jb.Diffusion(lambda x, p: 0 * x, domain=lambda x, p: x[0] > 0)
-    times, nothing = np.array([0.0, 0.5, 1.0]), np.full((3, 1), np.nan)
-    options = {"observation": jb.LinearGaussian(covariance=0.1), "initial": [0.5], "num_steps": 2}
-    arguments = (KEY, model, times, nothing)
+    """The likelihood is the probability that none of four steps leads there, by quadrature."""
     nodes = (np.arange(1500) + 0.5) * 0.004
     kernel = lambda x: np.exp(-2 * (nodes - x) ** 2) / np.sqrt(np.pi / 2)
     density = kernel(0.5)
     for _ in range(3):
         density = kernel(nodes[:, None]) @ density * 0.004
-    made = jb.log_likelihood(*arguments, **options, num_particles=2000)
+    made = jb.log_likelihood(*UNSEEN, **FROM_HALF, num_particles=2000)
     assert abs(made.value - np.log(density.sum() * 0.004)) < 5 * made.standard_error < 0.05
     assert made.num_nonfinite > 1000
-    drawn = jb.smooth(*arguments, **options, num_draws=50, num_warmup=20)
+
+
+@pytest.mark.slow
+def test_no_smoothed_path_leaves_the_state_space():
+    drawn = jb.smooth(*UNSEEN, **FROM_HALF, num_draws=50, num_warmup=20)
     assert np.all(drawn.paths > 0) and not np.any(drawn.stuck)

@@ -5,6 +5,8 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
+from helpers import slow_beyond
 from scipy import stats
 
 import jaxbridge as jb
@@ -25,17 +27,26 @@ def filters(log_density, num_particles, num_filters=500):
     return run(jax.random.key(0))
 
 
-def test_a_filter_knows_its_own_variance():
+def of_count(y, x, p):
+    return y[0] * x[0] - jnp.exp(x[0])
+
+
+def nearly_normal(y, x, p):
+    return -((y[0] - 3 * x[0]) ** 2) / 6
+
+
+@pytest.mark.parametrize(
+    "log_density, resampled", slow_beyond(1, [(of_count, True), (nearly_normal, False)])
+)
+def test_a_filter_knows_its_own_variance(log_density, resampled):
     """Resampled or not, up to what is of second order and the spread of 500."""
-    gentle = lambda y, x, p: -((y[0] - 3 * x[0]) ** 2) / 6
-    count = lambda y, x, p: y[0] * x[0] - jnp.exp(x[0])
-    for log_density, resampled in [(gentle, False), (count, True)]:
-        made = filters(log_density, 200)
-        assert np.any(made.size < 100) == resampled
-        told, seen = np.mean(made.variance(200)), np.var(made.log_estimate)
-        np.testing.assert_allclose(told, seen, rtol=5 * np.sqrt(2 / 500) + 0.05)
+    made = filters(log_density, 200)
+    assert np.any(made.size < 100) == resampled
+    told, seen = np.mean(made.variance(200)), np.var(made.log_estimate)
+    np.testing.assert_allclose(told, seen, rtol=5 * np.sqrt(2 / 500) + 0.05)
 
 
+@pytest.mark.slow
 def test_a_filter_that_lost_all_particles_knows_nothing():
     made = filters(lambda y, x, p: jnp.where(y[0] == 5, -jnp.inf, 0.0), 20, 3)
     assert np.all(made.log_estimate == -np.inf) and np.all(made.variance(20) == np.inf)

@@ -25,7 +25,6 @@ NEVER = jb.ObservationDensity(lambda y, x, p: -jnp.inf, GUESS)
 LAW = jb.GaussianLaw([0.0], [[0.5]])
 
 
-@pytest.mark.slow
 def problem_of_length(num, observation=POSITIVE):
     counts = np.resize(COUNTS, (num + 1, 1))
     return as_record_problem(
@@ -45,6 +44,7 @@ def test_a_path_of_no_weight_is_left():
     assert np.all(paths.start > 0) and np.all(paths.points[:, -1] > 0)
 
 
+@pytest.mark.slow
 def test_a_chain_that_never_moves_says_so():
     options = dict(num_draws=4, num_warmup=0, num_chains=2, num_steps=4)
     arguments = (jax.random.key(0), MODEL, TIMES, COUNTS)

@@ -51,7 +51,8 @@ def log_likelihood_of_steps(a, values):
     return value
 
 
-@pytest.mark.parametrize("seed", [2, pytest.param(0, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 0])
 @pytest.mark.parametrize("precision", [32, 64])
 def test_no_weight_is_larger_than_that_of_a_real_path(seed, precision, request):
     """log w ≤ ½|ξ|² + the largest log densities of what was seen. Sums that telescope over h break

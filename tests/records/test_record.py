@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
-from helpers import count_compilations
+from helpers import count_compilations, slow_beyond
 
 import jaxbridge as jb
 from jaxbridge.records.record import as_records, as_rows, split_records
@@ -28,16 +28,26 @@ def test_masked_values_and_rows_without_any_are_not_seen():
     assert same.log_weight(MODEL.params, xi) == value
 
 
-def test_long_gaps_are_cut_into_segments():
+def grid_of_record(times, values):
+    (record,) = as_records([(times, values)], None, 0.1)
+    return record.clock(record.grid())
+
+
+def grid_of_paths(times, values):
+    options = dict(observation=SEEN, initial=[0.0, 0.0], step_size=0.1)
+    return jb.innovations(MODEL, times, values, **options).times
+
+
+@pytest.mark.parametrize("grid_of", slow_beyond(1, [grid_of_record, grid_of_paths]))
+def test_long_gaps_are_cut_into_segments(grid_of):
     """With `step_size` no step is longer, the end of every gap is a point of the grid, and so is
     what is seen there."""
     times = np.array([0.0, 0.1, 2.1, 2.3])
-    values = np.arange(8.0).reshape(4, 2)
-    made = jb.innovations(MODEL, times, values, observation=SEEN, initial=[0.0, 0.0], step_size=0.1)
-    steps = np.diff(made.times)
+    grid = np.asarray(grid_of(times, np.arange(8.0).reshape(4, 2)))
+    steps = np.diff(grid)
     assert steps.max() < 0.1 * (1 + 1e-4) and steps.min() > 0
     assert len(steps) < 60
-    assert np.all(np.abs(times[:, None] - np.asarray(made.times)).min(1) < 1e-6)
+    assert np.all(np.abs(times[:, None] - grid).min(1) < 1e-6)
 
 
 def test_segments_begin_at_their_times():
@@ -69,12 +79,16 @@ def test_a_record_does_not_depend_on_the_zero_of_time():
     for options in ({"model": SEASONAL}, {"observation": noise}):
         with pytest.raises(ValueError, match="too far from zero for coefficients"):
             log_weight(2_460_000 + TIMES, **options)
-    with jax.enable_x64(True):
-        double = jb.seasonal_ornstein_uhlenbeck(1.5, period=0.5)
-        near, far = (log_weight(shift + TIMES, model=double) for shift in (0, 2_460_000))
-        assert abs(near - far) < 1e-6
 
 
+@pytest.mark.slow
+def test_in_double_precision_seasons_are_kept_far_from_the_zero_of_time(x64):
+    double = jb.seasonal_ornstein_uhlenbeck(1.5, period=0.5)
+    near, far = (log_weight(shift + TIMES, model=double) for shift in (0, 2_460_000))
+    assert abs(near - far) < 1e-6
+
+
+@pytest.mark.slow
 def test_times_of_paths_are_the_callers():
     """Also where single precision would round them, and where they are integers of 64 bits."""
     days = 2_460_000 + TIMES
@@ -106,6 +120,7 @@ def test_several_series_of_numbers_are_several_records():
     np.testing.assert_array_equal(both[1][:, 0], READINGS[:3, 0].astype(np.float32))
 
 
+@pytest.mark.slow
 def test_a_record_may_begin_before_its_first_time():
     later = np.concatenate([[[np.nan]], READINGS])
     expected = log_weight(1e6 + np.array([-0.5, *TIMES]), later)

@@ -20,7 +20,6 @@ LONG = plane(9)
 SHORT = LONG._replace(times=LONG.times[:6] + 1, values=-LONG.values[5::-1])
 
 
-@pytest.mark.slow
 def both():
     times, values = [LONG.times, SHORT.times], [LONG.values, SHORT.values]
     return LONG.model, times, values

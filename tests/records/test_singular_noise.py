@@ -53,7 +53,6 @@ def test_no_filter_takes_a_negative_variance():
     assert value(-0.5) == (-np.inf, 0)
 
 
-@pytest.mark.slow
 def told(values, initial=POINT):
     return jb.log_likelihood(
         KEY, MODEL, TIMES, values, observation=jb.LinearGaussian(covariance=[0.0, 0.1]),
@@ -61,6 +60,7 @@ def told(values, initial=POINT):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_state_that_is_known_and_seen_exactly():
     """What is seen of it says nothing where it agrees, and is not explained where it does not."""
     values = np.array([[np.nan, 0.2], [0.5, 0.1], [0.2, np.nan]])

@@ -131,16 +131,26 @@ def test_smoothed_paths_tell_it(num_steps):
             np.testing.assert_array_less(np.abs(told - change), allowance)
 
 
-def test_what_is_not_known_of_smoothed_paths_is_not_told():
-    """Where σ varies all of it is in doubt; of a single step nothing is known."""
-    options = {"observation": jb.LinearGaussian(covariance=0.1), "initial": [0.3], "num_draws": 6}
+def smoothed_of_steps(num_steps):
+    """Paths of a model whose σ varies."""
     varying = jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + 0.3 * jnp.sin(x))
-    record = (jax.random.key(0), varying, [0.0, 0.5], [[0.3], [0.1]])
-    made = jb.smooth(*record, **options, num_steps=2, num_warmup=0, num_chains=2)
+    return jb.smooth(
+        jax.random.key(0), varying, [0.0, 0.5], [[0.3], [0.1]], num_steps=num_steps,
+        observation=jb.LinearGaussian(covariance=0.1), initial=[0.3],
+        num_draws=6, num_warmup=0, num_chains=2,
+    )  # fmt: skip
+
+
+def test_where_sigma_varies_all_of_the_step_error_is_in_doubt():
+    made = smoothed_of_steps(2)
     told, doubt = np.abs(made.step_error()), np.asarray(made.step_uncertainty())
     assert np.isfinite(told).all() and np.all(doubt >= told) and np.max(told) > 0
-    of_one = jb.smooth(*record, **options, num_steps=1, num_warmup=0, num_chains=2)
-    assert np.isnan(of_one.step_error()).all() and np.isnan(of_one.step_uncertainty()).all()
+
+
+@pytest.mark.slow
+def test_of_smoothed_paths_of_one_step_nothing_is_known():
+    made = smoothed_of_steps(1)
+    assert np.isnan(made.step_error()).all() and np.isnan(made.step_uncertainty()).all()
 
 
 # Sums of orders 1 and 2 of steps of length 1/N.

@@ -55,7 +55,7 @@ def test_a_seasonal_process_is_kalmans(x64):
     values[4] = np.nan
     model = jb.seasonal_ornstein_uhlenbeck(RATE, 0.0, AMPLITUDE, 0.0, PERIOD, SIGMA)
     exact = seasonal_kalman(TIMES, values)
-    made = {N: told(model, values, N) for N in (4, 8, 16)}
+    made = {N: told(model, values, N) for N in (8, 16)}
     errors = {N: float(each.value) - exact for N, each in made.items()}
     assert 1.7 < loglog_slope(1 / np.array(list(errors)), np.abs(list(errors.values()))) < 2.4
     for N in (8, 16):
@@ -63,6 +63,7 @@ def test_a_seasonal_process_is_kalmans(x64):
         assert np.ptp(np.asarray(made[N].log_estimates)) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_constant_function_of_time_gives_the_very_numbers():
     values = np.sin(2 * TIMES)[:, None]
     plain = jb.Diffusion(lambda x, p: -p * x - x**3, lambda x, p: 0.5 + 0 * x, params=1.2)
