@@ -54,10 +54,13 @@ def warn_of_loop_fault() -> None:
     # Python's default filter shows this warning once for each calling line.
     warnings.warn(
         f"JAX {jax.__version__} compiles some small loops (`lax.fori_loop`, `lax.scan`) wrongly on "
-        "this CPU. Programs that jaxbridge compiles are not affected. Functions that you compile, "
-        "for example with `jax.jit`, may return wrong numbers, whether they use jaxbridge or not. "
-        "To switch the faulty optimisation off, set the environment variable "
-        "XLA_FLAGS=--xla_disable_hlo_passes=small-while-loop-hoisting before Python starts.",
+        "this CPU. The functions of jaxbridge are not affected if you call them outside of these. "
+        "Other programs may return wrong numbers, whether they use jaxbridge or not: functions "
+        "that you compile (`jax.jit`), and loops of JAX that you or another package run "
+        "(`lax.scan`, `lax.map`, the samplers of NumPyro and BlackJAX). `jax.vmap` and `jax.grad` "
+        "without these are not affected. To switch the faulty optimisation off, set the "
+        "environment variable XLA_FLAGS=--xla_disable_hlo_passes=small-while-loop-hoisting before "
+        "Python starts. See `howto/debugging.md` in the documentation.",
         RuntimeWarning,
         stacklevel=2,
     )

@@ -50,7 +50,20 @@ _UNEQUAL, _NEARLY_EQUAL = (0.2, 0.6), (0.8, 1.0)
 # A few weights far above many others hardly change the fit of k. With few effective weights, the
 # log of the mean and its error are wrong nevertheless: for 100 weights, a bound of 5 accepts twice
 # as many wrong means.
-_FEWEST_EFFECTIVE = 20
+FEWEST_EFFECTIVE = 20
+
+
+def largest_reliable_k_of(
+    k: Float[Array, "*I"],
+    effective: Float[Array, "*I"] | float | None,
+    number: Int[Array, "*I"] | None,
+) -> Float[Array, "*I"] | float:
+    """Return the bound on k̂ of weights with this effective sample size and number."""
+    if effective is None or number is None:
+        return _MOST_RELIABLE
+    share = effective / jnp.maximum(number, 1).astype(k.dtype)
+    most = jnp.where(share < _UNEQUAL[0], _UNEQUAL[1], _MOST_RELIABLE)
+    return jnp.where(share > _NEARLY_EQUAL[0], _NEARLY_EQUAL[1], most).astype(k.dtype)
 
 
 @jax.jit  # outside of other programs, one program for all operations
@@ -63,12 +76,8 @@ def is_reliable(
 
     It depends on the effective sample size and, if given, on the `number` of positive weights.
     """
-    most = _MOST_RELIABLE
-    if number is not None:
-        share = effective / jnp.maximum(number, 1).astype(k.dtype)
-        most = jnp.where(share < _UNEQUAL[0], _UNEQUAL[1], most)
-        most = jnp.where(share > _NEARLY_EQUAL[0], _NEARLY_EQUAL[1], most)
-    return (k < most) & (effective >= _FEWEST_EFFECTIVE)
+    most = largest_reliable_k_of(k, effective, number)
+    return (k < most) & (effective >= FEWEST_EFFECTIVE)
 
 
 @public_entry

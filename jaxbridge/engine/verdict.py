@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .checks import all_finite_leaves, is_traced
-from .pareto import is_reliable
+from .pareto import FEWEST_EFFECTIVE, is_reliable, largest_reliable_k_of
 
 _NO_FAULT = "No fault was found."
 _PARAMETERS = "Some parameters of the model are not finite, so simulation is impossible."
@@ -28,9 +28,12 @@ _NOT_FINITE = (
     "precision."
 )
 _MISSING = (
-    "Some bridges were not found within `max_proposals` proposals. Allow more proposals, lengthen "
-    "the duration or choose a smaller `gamma`. On intervals much shorter than the relaxation time, "
-    "pairs hardly ever meet: use `ModifiedDiffusionBridge()` or `Guided()` there."
+    "Bridges are missing: no pair met within the allowed number of proposals. Use more "
+    "`{argument}`, or a smaller `gamma`. On intervals much shorter than the relaxation time, pairs "
+    "hardly ever meet: use `ModifiedDiffusionBridge()` or `Guided()` there. If transitions are "
+    "rare, as between wells, use a start law with a density near the end point "
+    "(`fit_start_law(..., for_density=True)`). Or use `Guided(np.zeros((d, d)))` for a state of "
+    "dimension d: its paths have the drift of the model and are pulled towards the end point."
 )
 _FAILED = (
     "Some intervals have no bridges: paths left the finite numbers or the state space, or their "
@@ -45,11 +48,20 @@ _TRUNCATED = (
     "to `Diffusion`, or pass the coupling a shorter `Stationary(burn_in=...)` or a start law with "
     "a density."
 )
+_LIGHTER = (
+    'Choose another proposal, more proposals, shorter intervals, or `method="crank_nicolson"`.'
+)
 _HEAVY = (
-    "Some weights have tails so heavy that their mean and its error cannot be trusted: the Pareto "
-    "shape k̂ is above 0.7 (0.6 for very unequal weights, 1 for nearly equal ones), or fewer than "
-    "20 weights are effective. Choose another proposal, more proposals, shorter intervals, or "
-    '`method="crank_nicolson"`.'
+    "The weights have tails so heavy that their mean and its error cannot be trusted: the Pareto "
+    f"shape k̂ is above its bound. {_LIGHTER}"
+)
+_FEW = (
+    "A few weights determine the mean, so it and its error cannot be trusted: the effective sample "
+    f"size is below {FEWEST_EFFECTIVE}. {_LIGHTER}"
+)
+_HEAVY_IN_SUM = (
+    "In too many intervals the weights have heavy tails or small effective sample sizes, so their "
+    f"sum and its error cannot be trusted. {_LIGHTER}"
 )
 _LOST = (
     "Too many simulated paths left the state space or the finite numbers (`num_nonfinite`): more "
@@ -72,10 +84,20 @@ class Fault(eqx.Module):
 
     - `present`: whether the fault is present, shape (), or (I,) with one entry for each interval.
     - `sentence`: the fault and its remedy.
+    - `detail`, `values`: a format string and the numbers that it prints, each of the shape of
+        `present`. `why()` appends them to the sentence.
     """
 
     present: Bool[Array, "*I"]
     sentence: str = eqx.field(static=True)
+    detail: str = eqx.field(static=True, default="")
+    values: tuple[Array, ...] = ()
+
+    def in_any(self) -> "Fault":
+        """Return the fault of all entries together, with the numbers of its first entry."""
+        first = jnp.argmax(self.present.ravel())
+        values = tuple(value.ravel()[first] for value in self.values)
+        return Fault(jnp.any(self.present), self.sentence, self.detail, values)
 
 
 class Verdict(eqx.Module):
@@ -108,7 +130,7 @@ class Verdict(eqx.Module):
                 "`why()` returns a string, which compiled code cannot: return the result from "
                 "`jit` and call `why()` there, or use `trustworthy` inside."
             )
-        faults = [_located(fault) for fault in self.faults if np.any(fault.present)]
+        faults = [_described(fault) for fault in self.faults if np.any(fault.present)]
         return "\n".join(faults) if faults else _NO_FAULT
 
 
@@ -152,12 +174,15 @@ def throw_where_untrustworthy(result: _Result, field: str, model: PyTree) -> _Re
     return eqx.tree_at(lambda tree: getattr(tree, field), result, value)
 
 
-def missing_bridges(missing: Bool[Array, "*I"], coupled: bool = True) -> Fault:
+def missing_bridges(
+    missing: Bool[Array, "*I"], coupled: bool = True, argument: str = "max_proposals"
+) -> Fault:
     """Return the fault of missing bridges.
 
-    If `coupled`, pairs did not meet; otherwise paths failed.
+    If `coupled`, pairs did not meet within the number of proposals that `argument` sets; otherwise
+    paths failed.
     """
-    return Fault(missing, _MISSING if coupled else _FAILED)
+    return Fault(missing, _MISSING.format(argument=argument) if coupled else _FAILED)
 
 
 def truncated_weights(truncated: Bool[Array, "*I"]) -> Fault:
@@ -201,17 +226,29 @@ def lost_share(share: Float[Array, "*I"]) -> Fault:
     return Fault(share > _MOST_MISSING / _INEQUALITY, _LOST)
 
 
+@jax.jit  # outside of other programs, one program for all operations
 def heavy_tails(
     k: Float[Array, "*I"],
-    effective: Float[Array, "*I"] | float,
+    effective: Float[Array, "*I"] | None = None,
     number: Int[Array, "*I"] | None = None,
-) -> Fault:
-    """Return the fault of weights whose mean is determined by a few large ones.
+) -> tuple[Fault, ...]:
+    """Return the faults of weights whose mean is determined by a few large ones.
 
-    It follows from their Pareto shape, their effective sample size and the number of positive
-    weights (see `is_reliable`).
+    They follow from the Pareto shape, the effective sample size and the number of positive weights
+    (see `is_reliable`). Without an effective sample size, the shape alone decides.
     """
-    return Fault(~is_reliable(k, effective, number), _HEAVY)
+    most = jnp.broadcast_to(largest_reliable_k_of(k, effective, number), k.shape)
+    detail, values = "k̂ is {:.2f}, and its bound {:.2f} for these weights", (k, most)
+    if effective is None:
+        return (Fault(~(k < most), _HEAVY, detail, values),)
+    detail, values = f"{detail}; the effective sample size is {{:,.0f}}", (*values, effective)
+    if number is not None:
+        detail, values = f"{detail} of {{:,}}", (*values, number)
+    few = ~(effective >= FEWEST_EFFECTIVE)
+    return (
+        Fault(few, _FEW, detail, values),
+        Fault(~few & ~(k < most), _HEAVY, detail, values),
+    )
 
 
 def heavy_tails_in_sum(k: Float[Array, " I"], effective: Float[Array, " I"]) -> Fault:
@@ -221,15 +258,27 @@ def heavy_tails_in_sum(k: Float[Array, " I"], effective: Float[Array, " I"]) -> 
     size, while the statistical error of the sum grows as √I. Up to √I / 4 of them are therefore
     harmless, if all intervals have at least five effective weights.
     """
-    unreliable = jnp.sum(~is_reliable(k, effective))
+    unreliable, most = jnp.sum(~is_reliable(k, effective)), math.isqrt(k.size) // 4
     hopeless = jnp.any(~(effective >= _FEWEST_IN_SUM))
-    return Fault((unreliable > math.isqrt(k.size) // 4) | hopeless, _HEAVY)
+    detail = (
+        f"{{}} of {k.size} intervals have a k̂ above 0.7 or an effective sample size below "
+        f"{FEWEST_EFFECTIVE} (at most {most} may), and the smallest effective sample size is "
+        f"{{:,.1f}} (at least {_FEWEST_IN_SUM})"
+    )
+    values = unreliable, jnp.min(effective, initial=math.inf)
+    return Fault((unreliable > most) | hopeless, _HEAVY_IN_SUM, detail, values)
 
 
-def _located(fault: Fault) -> str:
-    """Return the sentence, preceded by the affected intervals if there are several."""
-    present = np.asarray(jax.device_get(fault.present))
+def _described(fault: Fault) -> str:
+    """Return the sentence with the numbers of the first affected interval.
+
+    If there are several intervals, it begins with the affected ones.
+    """
+    present, *values = map(np.asarray, jax.device_get((fault.present, *fault.values)))
+    first = tuple(np.argwhere(present)[0].tolist())
+    numbers = fault.detail.format(*(value[first].item() for value in values))
     if present.ndim == 0:
-        return fault.sentence
-    number, first = np.count_nonzero(present), np.argwhere(present)[0].tolist()
-    return f"In {number} of {present.size} (first {first}): {fault.sentence}"
+        return fault.sentence + (f" Here {numbers}." if numbers else "")
+    place, number = list(first), np.count_nonzero(present)
+    numbers = f" In {place}, {numbers}." if numbers else ""
+    return f"In {number} of {present.size} (first {place}): {fault.sentence}{numbers}"

@@ -31,7 +31,7 @@ from ..engine.verdict import (
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractProposal, AbstractWeightedProposal, Budget, as_proposal, resolve
-from ..schemes import StepError, dominates, step_fault, with_rounding
+from ..schemes import StepError, dominates, step_faults, with_rounding
 
 
 class TransitionLogDensity(AbstractResult):
@@ -97,17 +97,18 @@ class TransitionLogDensity(AbstractResult):
         - too many lost paths;
         - a discretisation error that dominates and exceeds 0.05.
         """
-        verdict = Verdict((*self._weight_faults, step_fault(self._step_error, self.standard_error)))
+        steps = step_faults(self._step_error, self.standard_error, coupled=self.proposal.coupled)
+        verdict = Verdict((*self._weight_faults, *steps))
         return verdict.with_finite(self.value, self.standard_error)
 
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:
         sizes = self.effective_sample_size, self.num_met
         return (
-            missing_bridges(self.num_met == 0, self.proposal.coupled),
+            missing_bridges(self.num_met == 0, self.proposal.coupled, "num_proposals"),
             truncated_weights(self.num_truncated > 0),
             lost_paths(self.num_nonfinite, self.num_simulated, *sizes),
-            heavy_tails(self.pareto_k, *sizes),
+            *heavy_tails(self.pareto_k, *sizes),
         )
 
     @property

@@ -22,13 +22,17 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ..engine.averages import PathFunction
 from ..engine.entry import public_entry
 from ..engine.verdict import AbstractResult, Fault, Verdict
-from ..schemes import StepError, dominates, share_of_known_order, step_fault
+from ..schemes import StepError, dominates, share_of_known_order, step_faults
 from .density import TransitionLogDensity
 from .importance import WeightedBridges
 
 _NEGATIVE = (
     "The combination of the two estimates is negative because of their noise, or one of them is "
     "zero. Take more `num_proposals`."
+)
+_REMAINING = (
+    "The discretisation error may still exceed three standard errors and 0.05: half of `removed`, "
+    "a bound on it, does. Use more `num_steps` on both grids."
 )
 
 
@@ -65,7 +69,9 @@ class ExtrapolatedLogDensity(AbstractResult):
         discretisation error replaces that of each estimate.
         """
         weights = (*self.fine._weight_faults, *self.coarse._weight_faults)
-        remaining = step_fault(self._remaining_error, self.standard_error)
+        steps = Verdict(step_faults(self._remaining_error, self.standard_error))
+        bound, detail = self._remaining_error.uncertainty, "it is {:.2g}, the standard error {:.2g}"
+        remaining = Fault(~steps.trustworthy, _REMAINING, detail, (bound, self.standard_error))
         return Verdict((*weights, Fault(~jnp.isfinite(self.value), _NEGATIVE), remaining))
 
     @property

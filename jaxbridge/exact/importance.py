@@ -58,7 +58,7 @@ from ..proposals import (
     resolve,
     usable,
 )
-from ..schemes import step_fault
+from ..schemes import step_faults
 from .exact_bridges import AbstractExactBridges
 
 
@@ -160,7 +160,8 @@ class WeightedBridges(AbstractExactBridges):
         """
         # In standard deviations, as is the discretisation error of the mean path.
         error = 1 / jnp.sqrt(jnp.maximum(self.effective_sample_size, 1))
-        verdict = Verdict((*self._weight_faults, step_fault(self.step_error_in_sds(), error)))
+        steps = step_faults(self.step_error_in_sds(), error, coupled=self.proposal.coupled)
+        verdict = Verdict((*self._weight_faults, *steps))
         return verdict.with_finite(self.mean(), self.standard_error())
 
     @property
@@ -173,7 +174,7 @@ class WeightedBridges(AbstractExactBridges):
             missing_bridges(missing, self.proposal.coupled),
             truncated_weights(jnp.any(self.truncated, axis=-1)),
             lost_paths(self.num_nonfinite, self.num_simulated, *sizes),
-            heavy_tails(self.pareto_k, *sizes),
+            *heavy_tails(self.pareto_k, *sizes),
         )
 
     def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:

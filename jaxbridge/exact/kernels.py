@@ -1,6 +1,5 @@
 """Common parts of the Markov chains on bridges: kernels, their keys, and the result `Chain`."""
 
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -32,7 +31,7 @@ from ..engine.verdict import (
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal
-from ..schemes import step_fault
+from ..schemes import step_faults
 from .exact_bridges import AbstractExactBridges
 
 # With fewer moves neither the mean of the chain nor its error is reliable.
@@ -130,7 +129,7 @@ class Chain(AbstractExactBridges):
         if self.truncated is not None:
             is_truncated = jnp.any(self.truncated, axis=-1)
         # A chain has no effective sample size of weights, so only k̂ decides.
-        heavy = () if self.pareto_k is None else (heavy_tails(self.pareto_k, math.inf),)
+        heavy = () if self.pareto_k is None else heavy_tails(self.pareto_k)
         # The number of moves bounds the effective sample size from above.
         error = 1 / jnp.sqrt(jnp.maximum(moves, 1).astype(self.paths.dtype))
         return Verdict(
@@ -142,7 +141,7 @@ class Chain(AbstractExactBridges):
                 Fault(
                     moves < min(_FEWEST_MOVES, (self.accepted.shape[-1] + 1) // 2), _TOO_FEW_MOVES
                 ),
-                step_fault(self.step_error_in_sds(), error),
+                *step_faults(self.step_error_in_sds(), error, coupled=self.proposal.coupled),
             )
         ).with_finite(self.mean())
 

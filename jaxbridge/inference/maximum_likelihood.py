@@ -24,11 +24,11 @@ from ..engine.arguments import check_choice
 from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
-from ..engine.verdict import AbstractResult, Fault, Verdict
+from ..engine.verdict import AbstractResult, Verdict
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
 from ..records import Initial, Observation, as_record_problems
-from ..schemes import StepError, dominates, step_fault
+from ..schemes import StepError, dominates, step_faults
 from .augmentation import augment
 from .data import Problem, as_problem
 from .newton import Passes, Slope, falls, is_maximum, maximum_faults, newton_passes
@@ -107,12 +107,12 @@ class MaximumLikelihood(AbstractResult):
         error that dominates and exceeds 0.05 standard errors.
         """
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
-        steps = step_fault(StepError(self.step_error, self.step_uncertainty), sd, sd)
+        steps = step_faults(StepError(self.step_error, self.step_uncertainty), sd, sd)
         return Verdict(
             (
                 *maximum_faults(self.newton, self.fall),
                 *self.score._weight_faults,
-                Fault(jnp.any(steps.present), steps.sentence),
+                *(fault.in_any() for fault in steps),
             )
         ).with_finite(self.theta, self.covariance)
 

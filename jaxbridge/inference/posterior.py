@@ -18,7 +18,7 @@ from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.verdict import AbstractResult, Fault, Verdict
-from ..schemes import StepError, dominates, step_fault, unknown_where
+from ..schemes import StepError, dominates, step_faults, unknown_where
 from .parameters import Parameters, init_vectors, of_rows
 
 # Of about so many of the draws the step error is worked out: as many as tell a covariance, for it
@@ -79,14 +79,14 @@ class AbstractPosterior(AbstractResult):
         standard deviations.
         """
         sd = jnp.std(self.theta, axis=tuple(range(self.theta.ndim - 1)))
-        steps = step_fault(self._step_error, self.standard_error, sd)
+        steps = step_faults(self._step_error, self.standard_error, sd)
         return Verdict(
             (
                 Fault(jnp.any(jnp.isinf(self.standard_error)), _STUCK),
                 Fault(~jnp.all(self.r_hat < _MOST_R_HAT), _APART),
                 Fault(~jnp.all(self.effective_sample_size >= _FEWEST_EFFECTIVE), _FEW),
                 *self._faults,
-                Fault(jnp.any(steps.present), steps.sentence),
+                *(fault.in_any() for fault in steps),
             )
         ).with_finite(self.theta)
 

@@ -44,7 +44,7 @@ from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduc
 from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..records import GuideCheck, Records, tuned
-from ..schemes import StepError, dominates, step_fault
+from ..schemes import StepError, dominates, step_faults
 from .newton import (
     Passes,
     Slope,
@@ -127,7 +127,7 @@ class RecordMaximumLikelihood(AbstractResult):
         errors.
         """
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
-        steps = step_fault(StepError(self.step_error, self.step_uncertainty), sd, sd)
+        steps = step_faults(StepError(self.step_error, self.step_uncertainty), sd, sd)
         stuck, apart = jnp.any(self.stuck), self._chains_disagree
         return Verdict(
             (
@@ -135,7 +135,7 @@ class RecordMaximumLikelihood(AbstractResult):
                 Fault(stuck, _STUCK),
                 Fault(apart, _APART),
                 self.guide.fault(stuck | apart | ~self.newton),
-                Fault(jnp.any(steps.present), steps.sentence),
+                *(fault.in_any() for fault in steps),
             )
         ).with_finite(self.theta, self.covariance)
 

@@ -36,7 +36,7 @@ from ..engine.verdict import (
 )
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
-from ..schemes import Form, StepError, error_of_mean, log_likelihoods, num_looked, step_fault
+from ..schemes import Form, StepError, error_of_mean, log_likelihoods, num_looked, step_faults
 from .blocks import Block, make_blocks, over_intervals, target_forms, with_keys
 from .data import Problem, as_problem
 from .parameters import Parameters, as_parameters
@@ -97,8 +97,8 @@ class Score(AbstractResult):
         """
         error = jnp.sqrt(jnp.maximum(jnp.diagonal(self.covariance), 0))
         sd = jnp.sqrt(jnp.maximum(jnp.diagonal(self.information), 0))
-        steps = step_fault(StepError(self.step_error, self.step_uncertainty), error, sd)
-        verdict = Verdict((*self._weight_faults, Fault(jnp.any(steps.present), steps.sentence)))
+        steps = step_faults(StepError(self.step_error, self.step_uncertainty), error, sd)
+        verdict = Verdict((*self._weight_faults, *(fault.in_any() for fault in steps)))
         return verdict.with_finite(self.gradient, self.covariance)
 
     @property
@@ -114,8 +114,7 @@ class Score(AbstractResult):
     def _lost(self) -> Fault:
         """Return the fault of lost paths in any interval."""
         found, simulated, nonfinite = self.counts
-        fault = lost_paths(nonfinite, simulated, self.effective_sample_size, found)
-        return Fault(jnp.any(fault.present), fault.sentence)
+        return lost_paths(nonfinite, simulated, self.effective_sample_size, found).in_any()
 
 
 @public_entry

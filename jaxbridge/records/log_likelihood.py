@@ -43,7 +43,7 @@ from ..schemes import (
     dominates,
     error_of_grids,
     num_coarse_grids,
-    step_fault,
+    step_faults,
 )
 from .forgetting import chosen_of, confirmed, half_will_do, rates_for, undecided
 from .guide_search import GuideCheck, linearised
@@ -75,10 +75,11 @@ _DISAGREE = (
     "possible across a gap, add observations, or use `smooth` with a `proposal`."
 )
 _HEAVY = (
-    "At some observation the weights have heavy tails (`pareto_k` above 0.8; for few particles the "
-    "limit is lower, and for fewer than 25 `pareto_k` is infinite). Particles of larger weight may "
-    "be missing. Use more `num_particles`, and check that `value` does not change."
+    "At some observation the weights have heavy tails: `pareto_k` is above its bound, 0.8 or less "
+    "for few particles, and infinite for fewer than 25. Particles of larger weight may be missing. "
+    "Use more `num_particles`, and check that `value` does not change."
 )
+_LARGEST_K = "the largest k̂ is {:.2f}, at observation {}, and the bound {:.2f}"
 _LOST = (
     "Many particles left the state space or diverged (`num_nonfinite`). The log-likelihood may be "
     "too small by more than its standard error and 0.05. Use more steps, or coordinates without a "
@@ -154,16 +155,25 @@ class LogLikelihood(AbstractResult):
             (
                 Fault(lost, _UNEXPLAINED),
                 Fault(apart, _DISAGREE),
-                Fault(heavy, _HEAVY),
+                Fault(heavy, _HEAVY, _LARGEST_K, self._largest_k),
                 *guide,
                 Fault(is_too_much_missing(self._missing, self.standard_error), _LOST),
-                step_fault(error, self.standard_error),
+                *step_faults(error, self.standard_error),
             )
         ).with_finite(self.value)
 
     @property
     def _is_heavy(self) -> Bool[Array, ""]:
-        return jnp.any(self.pareto_k > largest_reliable_k(self.num_weights) + _LARGEST_OF_MANY)
+        return jnp.any(self.pareto_k > self._most_k)
+
+    @property
+    def _most_k(self) -> float:
+        return largest_reliable_k(self.num_weights) + _LARGEST_OF_MANY
+
+    @property
+    def _largest_k(self) -> tuple[Array, ...]:
+        """Return the largest k̂, the index of its observation, and the bound."""
+        return jnp.max(self.pareto_k), jnp.argmax(self.pareto_k), jnp.asarray(self._most_k)
 
     @property
     def _missing(self) -> Float[Array, ""]:

@@ -30,7 +30,7 @@ from ..schemes import (
     log_halving_of_paths,
     root_mean_square_in_sds,
     share_of_order,
-    step_fault,
+    step_faults,
     unknown_where,
 )
 from .guide_search import GuideCheck, Linearised, linearised
@@ -160,7 +160,7 @@ class Smoothed(AbstractResult):
                 Fault(self.num_truncated > 0, _CUT_OFF),
                 Fault(apart, _APART),
                 *guide,
-                step_fault(error, standard_error),
+                *step_faults(error, standard_error),
             )
         ).with_finite(self.mean(), standard_error)
 

@@ -86,7 +86,7 @@ from .step_error import (
     share_in_regime as share_in_regime,
     share_of_known_order as share_of_known_order,
     share_of_order as share_of_order,
-    step_fault as step_fault,
+    step_faults as step_faults,
     unknown_where as unknown_where,
     with_rounding as with_rounding,
 )

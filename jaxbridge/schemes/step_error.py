@@ -18,6 +18,7 @@ not. They replace w e^D if only the mean of the weights is needed (`error_of_cou
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -39,11 +40,35 @@ _LONGEST_STEP = 1.0
 _MATTERS = 0.05
 # What rounding adds to log p is no matter below this.
 _FELT = 1e-3
-_STEPS = (
-    "The discretisation error (`step_error`, `step_uncertainty`) exceeds the standard error and "
-    "0.05 (of a log density, or of a standard deviation), or its estimate is too uncertain. Use "
-    "more `num_steps`; for stiff drift use the scheme `SemiImplicit()`; for couplings with a "
-    "state-dependent σ(x) run two grids and `extrapolate`."
+_SHORTER = "Use more `num_steps`; for stiff drift use the scheme `SemiImplicit()`."
+_TOO_LARGE = (
+    "The discretisation error (`step_error`) exceeds the standard error and 0.05 (of a log "
+    f"density, or of a standard deviation). {_SHORTER}"
+)
+_TOO_LONG = (
+    "The discretisation error is unknown, because a step is longer than the relaxation time of "
+    f"the drift. {_SHORTER}"
+)
+_TOO_LONG_OR_VARYING_SIGMA = (
+    "The discretisation error is unknown. Either a step is longer than the relaxation time of the "
+    "drift: use more `num_steps`, and for stiff drift the scheme `SemiImplicit()`. Or σ depends on "
+    "the state: then couplings have no estimate, so run two grids and `extrapolate`."
+)
+_NO_ESTIMATE = (
+    "The discretisation error is unknown (`step_error` is NaN). There is no estimate for a single "
+    "step, for fewer than ten draws, or for steps so long that half as many give a very different "
+    "law. Use more `num_steps`."
+)
+_NO_COMPARISON = (
+    "The discretisation error is unknown (`step_uncertainty` is infinite): results for half as "
+    "many steps differ too much, or too few paths carry weight. Use more `num_steps`; for a small "
+    "effective sample size use more proposals, particles or draws, too."
+)
+_TOO_UNCERTAIN = (
+    "The estimate of the discretisation error is too uncertain: `step_uncertainty` exceeds three "
+    "standard errors, and the error may exceed 0.05 (of a log density, or of a standard "
+    "deviation). Too few paths, bridges or draws determine it, or its leading order is not enough. "
+    "Use more proposals, bridges, particles or draws, or more `num_steps`."
 )
 
 
@@ -186,16 +211,38 @@ def root_mean_square_in_sds(
     return jnp.sqrt(jnp.sum(squares, axis=(-2, -1)) / number)
 
 
-def step_fault(
+@partial(jax.jit, static_argnames="coupled")  # one program where it is called outside of any
+def step_faults(
     error: StepError,
     standard_error: Inexact[Array, "..."],
     sd: Inexact[Array, "..."] | float = 1.0,
-) -> Fault:
-    """Return the fault of a step error that dominates and that matters: it, or its uncertainty, is
-    beyond 0.05 in the log of a density, or 0.05 of a standard deviation `sd`."""
+    coupled: bool = False,
+) -> tuple[Fault, ...]:
+    """Return the faults of a step error that dominates and that matters: it, or its uncertainty, is
+    beyond 0.05 in the log of a density, or 0.05 of a standard deviation `sd`.
+
+    At most one of them is present in each entry: the error is large, or unknown for one of three
+    reasons, or its estimate is too uncertain. `coupled` states that the paths are from a coupling,
+    which has no estimate for a state-dependent σ.
+    """
     size, doubt, floor = jnp.abs(error.value), error.uncertainty, _MATTERS * sd
-    matters = ~((size <= floor) & (doubt <= floor))
-    return Fault(dominates(error, standard_error) & matters, _STEPS)
+    present = dominates(error, standard_error) & ~((size <= floor) & (doubt <= floor))
+    values = jnp.broadcast_arrays(present, error.value, doubt, standard_error)[1:]
+    detail = "the estimate is {:.2g} ± {:.1g}, and the standard error {:.2g}"
+    cases = (
+        (jnp.isnan(size) & jnp.isinf(doubt), _TOO_LONG_OR_VARYING_SIGMA if coupled else _TOO_LONG),
+        (jnp.isnan(size), _NO_ESTIMATE),
+        (~jnp.isfinite(doubt), _NO_COMPARISON),
+        (size > jnp.maximum(standard_error, 2 * doubt), _TOO_LARGE),
+        (jnp.ones_like(present), _TOO_UNCERTAIN),
+    )
+    faults = []
+    for case, sentence in cases:
+        has_numbers = sentence in (_TOO_LARGE, _TOO_UNCERTAIN)
+        numbers = (detail, tuple(values)) if has_numbers else ("", ())
+        faults.append(Fault(present & case, sentence, *numbers))
+        present &= ~case
+    return tuple(faults)
 
 
 def share_of_order(order: int) -> float:

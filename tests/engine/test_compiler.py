@@ -1,5 +1,6 @@
 """What the installed compiler accepts, and what it is known to compute wrongly."""
 
+import pathlib
 import warnings
 
 import jax
@@ -22,9 +23,15 @@ def test_only_known_options_are_asked_for(name, is_known, monkeypatch):
 
 
 def test_users_are_warned_where_their_loops_are_wrong(monkeypatch):
+    """The warning names the programs, the flag, and a page that has the flag, too."""
     monkeypatch.setattr(compiler, "has_loop_fault", lambda: True)
-    with pytest.warns(RuntimeWarning, match="XLA_FLAGS=--xla_disable_hlo_passes=small-while"):
+    flag = "disable_hlo_passes=small-while-loop-hoisting"
+    with pytest.warns(RuntimeWarning, match=f"XLA_FLAGS=--xla_{flag}") as caught:
         double(jnp.ones(3))
+    text = str(caught[0].message)
+    assert all(name in text for name in ("jax.jit", "jax.vmap", "lax.scan", "NumPyro"))
+    page = pathlib.Path(__file__).parents[2] / "notebooks/howto/debugging.md"
+    assert "howto/debugging.md" in text and flag in page.read_text("utf-8")
 
 
 def test_where_nothing_is_wrong_nobody_is_warned(monkeypatch):

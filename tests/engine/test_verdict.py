@@ -16,6 +16,7 @@ from jaxbridge.engine.verdict import (
     heavy_tails,
     heavy_tails_in_sum,
     lost_paths,
+    missing_bridges,
     throw_where_untrustworthy,
 )
 
@@ -58,16 +59,52 @@ def test_throwing_says_the_first_fault():
     assert throw_where_untrustworthy(good, "value", jnp.ones(2)).value == 1
 
 
+def present(faults):
+    return (~Verdict(faults).trustworthy).tolist()
+
+
 def test_heavy_tails():
     k = jnp.array([0.2, 0.9, 0.2, jnp.nan])
-    assert heavy_tails(k, jnp.array([99.0, 99.0, 4.0, 99.0])).present.tolist() == [0, 1, 1, 1]
+    assert present(heavy_tails(k, jnp.array([99.0, 99.0, 4.0, 99.0]))) == [0, 1, 1, 1]
+    assert present(heavy_tails(k)) == [0, 1, 0, 1]
 
 
 def test_heavy_tails_beside_the_effective_share():
     """Nearly equal weights may have a larger k̂ than others, very unequal ones a smaller."""
     k, number = jnp.array([0.65, 0.65, 0.8, 0.8, 1.1]), jnp.full(5, 1000)
     size = jnp.array([190.0, 210.0, 790.0, 810.0, 990.0])
-    assert heavy_tails(k, size, number).present.tolist() == [1, 0, 1, 0, 1]
+    assert present(heavy_tails(k, size, number)) == [1, 0, 1, 0, 1]
+
+
+def test_heavy_tails_are_reported_with_their_numbers():
+    """The case, the shape, its bound and the sizes; of several intervals those of the first."""
+    shape, size, number = jnp.array(0.66), jnp.array(644.0), jnp.array(300_000)
+    why = Verdict(heavy_tails(shape, size, number)).why()
+    numbers = "k̂ is 0.66, and its bound 0.60 for these weights; the effective sample size is"
+    assert "k̂ is above its bound" in why and why.endswith(f"Here {numbers} 644 of 300,000.")
+    assert "below 20" in Verdict(heavy_tails(shape, jnp.array(3.0), number)).why()
+    assert Verdict(heavy_tails(shape, size, jnp.array(1000))).why() == "No fault was found."
+    several = Verdict(heavy_tails(jnp.array([0.2, 0.9]), jnp.array([50.0, 1644.0]))).why()
+    assert several.startswith("In 1 of 2 (first [1]): ") and "\n" not in several
+    assert several.endswith(
+        "In [1], k̂ is 0.90, and its bound 0.70 for these weights; the effective sample size is "
+        "1,644."
+    )
+
+
+def test_missing_bridges_name_the_argument_of_the_caller():
+    for argument in ("num_proposals", "max_proposals"):
+        why = Verdict((missing_bridges(jnp.array(True), True, argument),)).why()
+        assert f"`{argument}`" in why and "Guided(np.zeros((d, d)))" in why
+    failed = Verdict((missing_bridges(jnp.array(True), coupled=False),)).why()
+    assert "proposals" not in failed
+
+
+def test_fault_in_any_entry_has_the_numbers_of_the_first():
+    values = (jnp.array([[1.0, 2.0], [3.0, 4.0]]),)
+    fault = Fault(jnp.array([[False, False], [True, True]]), "Large.", "it is {:.0f}", values)
+    assert Verdict((fault.in_any(),)).why() == "Large. Here it is 3."
+    assert Verdict((fault,)).why() == "In 2 of 4 (first [1, 0]): Large. In [1, 0], it is 3."
 
 
 def test_heavy_tails_in_a_sum_are_counted():
@@ -76,7 +113,8 @@ def test_heavy_tails_in_a_sum_are_counted():
     assert not heavy_tails_in_sum(k.at[:2].set(0.9), size).present
     assert heavy_tails_in_sum(k.at[:3].set(0.9), size).present
     assert heavy_tails_in_sum(k, size.at[0].set(3.0)).present
-    assert heavy_tails_in_sum(k[:1].at[0].set(0.9), size[:1]).present
+    one = heavy_tails_in_sum(k[:1].at[0].set(0.9), size[:1])
+    assert one.present and "1 of 1 intervals" in Verdict((one,)).why()
 
 
 def test_every_result_has_a_verdict():

@@ -8,6 +8,7 @@ from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, slow_beyond
 from test_step_density import DENSITIES, FROM, TO
 
 import jaxbridge as jb
+from jaxbridge.engine.verdict import Verdict
 from jaxbridge.models.bridge_problem import Intervals
 from jaxbridge.schemes.step_error import (
     UNKNOWN_SHARE,
@@ -19,7 +20,7 @@ from jaxbridge.schemes.step_error import (
     relative_change,
     share_in_regime,
     share_of_order,
-    step_fault,
+    step_faults,
 )
 
 
@@ -160,7 +161,7 @@ def test_changes_are_those_of_weights_and_factors():
     assert error_of_log_mean(log_w, D, 0 * share).value == 0
     unknown = error_of_log_mean(log_w, D, jnp.asarray(UNKNOWN_SHARE))
     assert np.isnan(unknown.value) and unknown.uncertainty == np.inf
-    assert dominates(unknown, one) and step_fault(unknown, one).present
+    assert dominates(unknown, one) and not Verdict(step_faults(unknown, one)).trustworthy
 
 
 def test_few_paths_do_not_bias_the_log_of_a_mean():
@@ -226,25 +227,34 @@ def test_when_step_errors_dominate(value, uncertainty, standard_error, expected)
 @pytest.mark.parametrize(
     "value, uncertainty, sd, expected",
     [
-        (0.04, 0.01, 1.0, False),  # too small to matter
-        (0.04, 0.06, 1.0, True),
-        (-0.2, 0.0, 1.0, True),
-        (-0.2, 0.0, 10.0, False),  # in standard deviations
-        (0.0, np.inf, 1.0, True),
-        (np.nan, np.nan, 1.0, True),
+        (0.04, 0.01, 1.0, "No fault was found"),  # too small to matter
+        (0.04, 0.06, 1.0, "too uncertain"),
+        (-0.2, 0.0, 1.0, "(`step_error`) exceeds the standard error"),
+        (-0.2, 0.0, 10.0, "No fault was found"),  # in standard deviations
+        (0.0, np.inf, 1.0, "(`step_uncertainty` is infinite)"),
+        (np.nan, np.inf, 1.0, "longer than the relaxation time"),
+        (np.nan, np.nan, 1.0, "(`step_error` is NaN)"),
     ],
 )
 def test_faults_are_step_errors_that_matter(value, uncertainty, sd, expected):
-    """Beside no Monte Carlo error at all, as where a model is linear."""
-    fault = step_fault(
-        StepError(jnp.asarray(value), jnp.asarray(uncertainty)), jnp.asarray(0.0), sd
-    )
-    assert bool(fault.present) is expected
+    """Beside no Monte Carlo error at all, as where a model is linear. One sentence says why."""
+    error = StepError(jnp.asarray(value), jnp.asarray(uncertainty))
+    for coupled in (False, True):
+        why = Verdict(step_faults(error, jnp.asarray(0.0), sd, coupled=coupled)).why()
+        assert expected in why and "\n" not in why
+        assert ("`extrapolate`" in why) == (coupled and np.isnan(value) and np.isinf(uncertainty))
+
+
+def test_step_errors_are_reported_with_their_numbers():
+    error = StepError(jnp.array([0.01, -0.2]), jnp.array([0.0, 0.012]))
+    *_, large, uncertain = step_faults(error, jnp.asarray(0.1))
+    why = Verdict((large.in_any(), uncertain.in_any())).why()
+    assert why.endswith("Here the estimate is -0.2 ± 0.01, and the standard error 0.1.")
 
 
 def test_large_step_errors_beside_larger_noise_are_no_fault():
     error = StepError(jnp.asarray(0.2), jnp.asarray(0.01))
-    assert not step_fault(error, jnp.asarray(0.5)).present
+    assert Verdict(step_faults(error, jnp.asarray(0.5))).trustworthy
 
 
 def test_draws_that_half_as_many_steps_lose_are_missing_and_no_more():
