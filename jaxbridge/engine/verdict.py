@@ -31,9 +31,10 @@ _MISSING = (
     "Bridges are missing: no pair met within the allowed number of proposals. Use more "
     "`{argument}`, or a smaller `gamma`. On intervals much shorter than the relaxation time, pairs "
     "hardly ever meet: use `ModifiedDiffusionBridge()` or `Guided()` there. If transitions are "
-    "rare, as between wells, use a start law with a density near the end point "
-    "(`fit_start_law(..., for_density=True)`). Or use `Guided(np.zeros((d, d)))` for a state of "
-    "dimension d: its paths have the drift of the model and are pulled towards the end point."
+    "rare, as between wells, use `ModifiedDiffusionBridge()` or, for state dimension d, "
+    "`Guided(np.zeros((d, d)))`: its paths follow the model's drift and a pull towards the end "
+    "point. For densities a start law near the end point also helps "
+    "(`fit_start_law(..., for_density=True)`)."
 )
 _FAILED = (
     "Some intervals have no bridges: paths left the finite numbers or the state space, or their "

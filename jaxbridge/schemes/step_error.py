@@ -46,11 +46,11 @@ _TOO_LARGE = (
     f"density, or of a standard deviation). {_SHORTER}"
 )
 _TOO_LONG = (
-    "The discretisation error is unknown, because a step is longer than the relaxation time of "
-    f"the drift. {_SHORTER}"
+    "The discretisation error is unknown, because steps are longer than the relaxation time of "
+    f"the drift (for a posterior: in more than a tenth of the draws). {_SHORTER}"
 )
 _TOO_LONG_OR_VARYING_SIGMA = (
-    "The discretisation error is unknown. Either a step is longer than the relaxation time of the "
+    "The discretisation error is unknown. Either steps are longer than the relaxation time of the "
     "drift: use more `num_steps`, and for stiff drift the scheme `SemiImplicit()`. Or σ depends on "
     "the state: then couplings have no estimate, so run two grids and `extrapolate`."
 )

@@ -33,4 +33,4 @@ def test_posteriors_of_steps_that_are_too_long(method, record):
         num_iterations=60, **record,
     )  # fmt: skip
     assert np.all(np.isinf(posterior.step_uncertainty)) and not posterior.trustworthy
-    assert "num_steps" in posterior.why()
+    assert "num_steps" in posterior.why() and "longer than the relaxation" in posterior.why()
