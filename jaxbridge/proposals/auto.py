@@ -68,8 +68,10 @@ class Auto(AbstractProposal):
     def of(self, which):
         return self
 
-    def for_model(self, model, like):
-        candidates = tuple(candidate.for_model(model, like) for candidate in self.candidates)
+    def for_model(self, model, like, for_density=False):
+        candidates = tuple(
+            candidate.for_model(model, like, for_density) for candidate in self.candidates
+        )
         return dataclasses.replace(self, candidates=candidates)
 
     def check(self, model, intervals):
@@ -156,9 +158,9 @@ def as_proposal(
     if isinstance(proposal, str) and proposal == "auto":
         candidates = default_candidates(model, for_density)
         given = choice_between(candidates, budget, left_out=why_left_out(model, for_density))
-        return given.for_model(model, like)
+        return given.for_model(model, like, for_density)
     given = _given(Coupling() if proposal is None else proposal, budget, name)
-    return given.for_model(model, like)
+    return given.for_model(model, like, for_density)
 
 
 def _given(proposal: Any, budget: Budget, name: str = "proposal") -> AbstractProposal:

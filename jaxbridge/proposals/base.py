@@ -87,10 +87,13 @@ class AbstractProposal(eqx.Module):
         """Return the grid t_i / T, from 0 to 1, shape (N+1,)."""
 
     @abstractmethod
-    def for_model(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractProposal":
+    def for_model(
+        self, model: Diffusion, like: Float[Array, " d"], for_density: bool = False
+    ) -> "AbstractProposal":
         """Return the proposal with all defaults that depend on the model set.
 
-        `like` is a point of the right shape and dtype.
+        `like` is a point of the right shape and dtype. `for_density` states that only weights are
+        needed, and no paths.
         """
 
     @abstractmethod
@@ -200,10 +203,13 @@ class AbstractSingleProposal(AbstractWeightedProposal):
         return False
 
     @abstractmethod
-    def for_model(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractSingleProposal":
+    def for_model(
+        self, model: Diffusion, like: Float[Array, " d"], for_density: bool = False
+    ) -> "AbstractSingleProposal":
         """Return the proposal with all defaults that depend on the model set.
 
-        `like` is a point of the right shape and dtype.
+        `like` is a point of the right shape and dtype. `for_density` states that only weights are
+        needed, and no paths.
         """
 
     def of(self, which):

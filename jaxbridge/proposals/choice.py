@@ -92,8 +92,10 @@ class Choice(AbstractWeightedProposal):
         used = self.used if is_traced(chosen) else tuple(np.unique(chosen).tolist())
         return Choice(self.candidates, *told, used, self.left_out)
 
-    def for_model(self, model, like):
-        candidates = tuple(candidate.for_model(model, like) for candidate in self.candidates)
+    def for_model(self, model, like, for_density=False):
+        candidates = tuple(
+            candidate.for_model(model, like, for_density) for candidate in self.candidates
+        )
         return dataclasses.replace(self, candidates=candidates)
 
     def check(self, model, intervals):

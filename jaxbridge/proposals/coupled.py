@@ -95,7 +95,7 @@ class CoupledPairs(AbstractSingleProposal):
     def ingredients(self):
         return ingredients(self.coupling)
 
-    def for_model(self, model, like):
+    def for_model(self, model, like, for_density=False):
         return self
 
     def most_accurate(self, model, like):

@@ -26,6 +26,7 @@ weight is unbiased for half as many steps, and its ratio to the fine weight vari
 e^D of `halving`.
 """
 
+import math
 from abc import abstractmethod
 from typing import NamedTuple
 
@@ -47,6 +48,7 @@ from ..models.dynamics import Dynamics
 from ..schemes import (
     AbstractStepDensity,
     Euler,
+    EulerDensity,
     StepLaw,
     check_model,
     log_halving_of_all_steps,
@@ -107,14 +109,21 @@ class AbstractGuidedProposal(AbstractSingleProposal):
     def ingredients(self):
         return type(self.target).__name__, "", np.nan
 
-    def for_model(self, model, like):
+    def for_model(self, model, like, for_density=False):
         model.check_invertible_sigma(like)
-        return self if self.density is not None else self.most_accurate(model, like)
+        if self.density is not None:
+            return self
+        return self._with_density(
+            most_accurate_density(model.sigma_varies(like), may_bend=for_density)
+        )
 
     def most_accurate(self, model, like):
         density = most_accurate_density(model.sigma_varies(like))
         if self.density is not None and self.density.order >= density.order:
             return self
+        return self._with_density(density)
+
+    def _with_density(self, density: AbstractStepDensity):
         is_density = lambda leaf: leaf is None or isinstance(leaf, AbstractStepDensity)
         return eqx.tree_at(lambda p: p.density, self, density, is_leaf=is_density)
 
@@ -196,12 +205,14 @@ class AbstractGuidedProposal(AbstractSingleProposal):
 
 
 class _CoarseSteps(NamedTuple):
-    """The step of half as many that ends with each step, and the share c of the earlier noise."""
+    """The step of half as many in which each step lies, whether it ends with it, and the share c of
+    the earlier noise."""
 
     guide: PyTree
     dt: Float[Array, "*steps I"]
     remaining: Float[Array, "*steps I"]
     share: Float[Array, "*steps"]
+    ends: Bool[Array, "*steps"]
 
 
 class _Steps(NamedTuple):
@@ -262,10 +273,13 @@ class _Lanes:
         with_coarse: bool = False,
     ):
         start, end, _ = intervals
-        guide, dt, remaining = _grid(proposal, dynamics, intervals, proposal.remaining(num_steps))
+        fractions, coarse_points = _points(proposal, dynamics, num_steps)
+        guide, dt, remaining = _grid(proposal, dynamics, intervals, fractions)
         coarse, self._coarse_dt = None, None
         if with_coarse:
-            coarse, self._coarse_dt = _coarse_grid(proposal, dynamics, intervals, num_steps)
+            arguments = (proposal, dynamics, intervals, fractions, coarse_points)
+            coarse, self._coarse_dt = _coarse_grid(*arguments)
+        num_steps = self.num_steps = len(fractions) - 1
         self._num_draws, self._num_steps = num_draws, num_steps
         self._num_looked = num_looked(num_draws, dynamics.sigma_varies)
         self._of_lane = None if start.shape[0] == 1 else -1
@@ -274,6 +288,8 @@ class _Lanes:
         self.steps = _Steps(guide, dt[:-1], remaining[:-1], before[:-1], ends[:-1], coarse)
         self._last = _Steps(None, dt[-1], remaining[-1], before[-1], ends[-1], None)
         self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.target
+        # The end is seen exactly: the last step needs a density, so it is normal.
+        self._closing = EulerDensity() if dynamics.sigma_varies else self._density
         self._of_pairs = jax.jit(self._log_halving)  # traced once, for the loop and for its end
 
     def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
@@ -299,7 +315,7 @@ class _Lanes:
         if coarse_steps is None:  # the coarse path is of one step, its last
             return state._replace(path=path)
         coarse = lax.cond(
-            steps.ends_pair,
+            coarse_steps.ends,
             lambda: self._coarse_stepped(coarse, state.before, here, coarse_steps),
             lambda: coarse,
         )
@@ -311,8 +327,8 @@ class _Lanes:
         def one(x, xi, step):
             target = self._density.steps_from(self._dynamics, x).law(step.dt)
             law = self._proposal.step_law(step, x, target)
-            x_next = law.point(xi)
-            return x_next, self._log_densities(target, law, x_next, xi)
+            point = law.point(xi)
+            return target.bent(point), self._log_densities(target, law, point, xi)
 
         made = over_lanes(-1, -1, self._of_lane)(one)(path.x, xi, step)
         return self._weighted(path, *made)
@@ -370,7 +386,7 @@ class _Lanes:
             end, dt = last
             inside = all_finite(self._dynamics.drift(end))
             inside &= jnp.isfinite(self._dynamics.sigma(end).log_abs_det())
-            log_density = self._density.steps_from(self._dynamics, x).law(dt).log_density(end)
+            log_density = self._closing.steps_from(self._dynamics, x).law(dt).log_density(end)
             return jnp.where(inside, log_density, jnp.nan)
 
         last = self._of_each((self.end, dt), num_draws)
@@ -555,6 +571,7 @@ def _simulate(
     only_weights = stored is not None and stored.shape[0] == 0
     with_coarse = only_weights and dynamics.sigma_varies and num_steps > 1
     lanes = _Lanes(proposal, dynamics, intervals, num_steps, num_draws, with_coarse)
+    num_steps = lanes.num_steps
     state, end = lanes.begin(), lanes.spread(lanes.end)
     path = state.x[None][:0]
     store = slots = None
@@ -611,22 +628,50 @@ def _grid(
     return guide(dynamics, start, end, dt), dt, remaining
 
 
+def _points(
+    proposal: AbstractGuidedProposal, dynamics: Dynamics, num_steps: int
+) -> tuple[Float[np.ndarray, " points"], list[int]]:
+    """Return the fractions of the time that remains, and which of them are points of the grid of
+    half as many steps.
+
+    The last step has a normal density, of first order where σ varies. For a target of second order
+    it is split into steps of ½, ¼, ..., the last of which is about T / N².
+    """
+    fractions = proposal.remaining(num_steps)
+    coarse = [*range(0, num_steps, 2)]
+    if not (dynamics.sigma_varies and proposal.target.order > 1):
+        return fractions, [*coarse, num_steps]
+    num_splits = math.ceil(math.log2(num_steps)) if num_steps > 1 else 0
+    splits = fractions[-2] * 0.5 ** np.arange(1, num_splits + 1)
+    # The coarse grid splits its last step down to four times the length.
+    shared = range(num_steps - 1, num_steps - 1 + max(num_splits - 1, 0))
+    coarse = sorted({*coarse, *shared})
+    return np.concatenate([fractions[:-1], splits, [0.0]]), [*coarse, num_steps + num_splits]
+
+
 def _coarse_grid(
-    proposal: AbstractGuidedProposal, dynamics: Dynamics, intervals: Intervals, num_steps: int
+    proposal: AbstractGuidedProposal,
+    dynamics: Dynamics,
+    intervals: Intervals,
+    fractions: Float[np.ndarray, " points"],
+    points: list[int],
 ) -> tuple[_CoarseSteps | None, Float[Array, " I"]]:
     """Return the steps of half as many, each once for the two that it replaces (`None` if there is
     only the last), and the length of the last."""
-    fractions = proposal.remaining(num_steps)
-    points = np.append(np.arange(0, num_steps, 2), num_steps)
     guide, dt, remaining = _grid(proposal, dynamics, intervals, fractions[points])
     num_inner = len(points) - 2
     if num_inner == 0:
         return None, dt[-1]
-    before, middle, after = (fractions[i : i + 2 * num_inner : 2] for i in range(3))
-    share = np.sqrt((before - middle) * after / ((before - after) * middle))
-    steps = _CoarseSteps(guide, dt[:-1], remaining[:-1], jnp.asarray(share, dt.dtype))
-    which = np.minimum(np.arange(num_steps - 1) // 2, num_inner - 1)
-    return jax.tree.map(lambda leaf: leaf[which], steps), dt[-1]
+    first, last = np.array(points[:-2]), np.array(points[1:-1])
+    before, middle, after = fractions[first], fractions[first + 1], fractions[last]
+    is_pair = last - first == 2
+    share = np.sqrt((before - middle) * after / ((before - after) * middle)) * is_pair
+    number = np.arange(len(fractions) - 2)
+    which = np.minimum(np.searchsorted(last, number + 1), num_inner - 1)
+    ends = np.isin(number + 1, last)
+    steps = (guide, dt[:-1], remaining[:-1], jnp.asarray(share, dt.dtype))
+    steps = jax.tree.map(lambda leaf: leaf[which], steps)
+    return _CoarseSteps(*steps, jnp.asarray(ends)), dt[-1]
 
 
 def deterministic_path(

@@ -153,15 +153,16 @@ class ItoTaylorDensity(AbstractStepDensity):
     order: ClassVar[int] = 2
 
     def steps_from(self, dynamics, x):
-        if dynamics.sigma_varies:
-            raise ValueError(
-                "`ItoTaylorDensity` is for constant σ, but σ of this model depends on the state: "
-                "use `EulerDensity()`, or `HypoellipticDensity()` for a σ with fewer columns than "
-                "rows."
-            )
         sigma, d = dynamics.sigma(x), x.shape[0]
+        if dynamics.sigma_varies and not sigma.invertible:
+            raise ValueError(
+                "`ItoTaylorDensity` is for constant or invertible σ, but σ of this model depends on "
+                "the state and has fewer columns than rows: use `HypoellipticDensity()`."
+            )
         if not sigma.invertible:
             return _degenerate_ito_taylor(dynamics, x)
+        if dynamics.sigma_varies:
+            return _bent_ito_taylor(dynamics, x)
         along = [_along(dynamics.drift, x, column) for column in columns_of(sigma, x)]
         slopes, bends = zip(*along, strict=True)
         # What is made of them would else compute them anew for each of its numbers.
@@ -242,9 +243,12 @@ def check_step_density(density: AbstractStepDensity | None) -> AbstractStepDensi
     return density
 
 
-def most_accurate_density(sigma_varies: bool, invertible: bool = True) -> AbstractStepDensity:
-    """That which the model has."""
-    if not sigma_varies:
+def most_accurate_density(
+    sigma_varies: bool, invertible: bool = True, may_bend: bool = False
+) -> AbstractStepDensity:
+    """Return the most accurate step density of a model; `may_bend` if its steps need not be
+    normal."""
+    if not sigma_varies or (invertible and may_bend):
         return ItoTaylorDensity()
     return EulerDensity() if invertible else HypoellipticDensity()
 
@@ -287,6 +291,48 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
     def decay(dt):
         F = jax.jacfwd(dynamics.drift)(x)
         return jnp.eye(x.shape[0], dtype=x.dtype) + dt * F + dt**2 / 2 * matmul(F, F)
+
+    return StepsFrom(law, decay)
+
+
+def _bent_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
+    """Return the steps of weak order 2 for an invertible σ(x) (Kloeden & Platen, section 14.2).
+
+    With the triangular root of V, its columns b^j and L^j = b^j·∇,
+
+        x' = x + αδ + ½δ² L⁰α + √δ [b + ½δ (L⁰b + L^jα)] ξ
+             + ½δ Σ L^j b^l (ξ_j ξ_l - 1{j=l}) + ½δ Σ_{j<l} (L^j b^l - L^l b^j) V_jl.
+
+    The V_jl ~ N(0, 1) are independent of ξ. Their part is normal, and the terms without it are
+    functions of ξ of at least its order. So it is added to the covariance of the normal part.
+    """
+    d = x.shape[0]
+    coefficients = lambda y: (dynamics.drift(y), dynamics.sigma(y).root().as_matrix(d, x.dtype))
+    sigma = dynamics.sigma(x).root()
+    alpha, b = coefficients(x)
+    first, second = zip(*[_along(coefficients, x, column) for column in b.T], strict=True)
+    drift_of_drift, drift_of_b = jax.jvp(coefficients, (x,), (alpha,))[1]
+    half_laplacian = jax.tree.map(lambda *terms: sum_first_axis(jnp.stack(terms)) / 2, *second)
+    bend = drift_of_drift + half_laplacian[0]
+    change = drift_of_b + half_laplacian[1]
+    slopes = jnp.stack([slope for slope, _ in first], axis=1)
+    G = jnp.stack([turn for _, turn in first], axis=1)  # G[:, j, l] = L^j b^l
+    pairs = [(j, k) for j in range(d) for k in range(j + 1, d)]
+    twists = [sigma.solve(G[:, j, k] - G[:, k, j]) for j, k in pairs]
+    extra = sum_first_axis(jnp.stack([t[:, None] * t for t in twists])) if pairs else None
+    identity = jnp.eye(d, dtype=x.dtype)
+
+    def law(dt):
+        linear = slopes + _bounded(change, b, dt)
+        A = jnp.stack([sigma.solve(column) for column in linear.T], axis=1)
+        root = identity + dt / 2 * A
+        S = matmul(root, root.T)
+        S = S if extra is None else S + dt / 4 * extra
+        return StepLaw(x + dt * alpha + dt**2 / 2 * bend, sigma, S, dt, G)
+
+    def decay(dt):
+        A = jnp.stack([sigma.solve(slope) for slope in slopes.T], axis=1)
+        return identity + dt * A + dt**2 / 2 * matmul(A, A)
 
     return StepsFrom(law, decay)
 

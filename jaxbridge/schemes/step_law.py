@@ -32,12 +32,15 @@ class StepLaw(NamedTuple):
     - `sigma`: σ at the point.
     - `covariance`: S in noise coordinates, shape (d, d), or a scalar for a multiple of I.
     - `dt`: δ.
+    - `curvature`: G of the quadratic part of a step that is not normal (`bent`), shape (d, d, d);
+        `None` for a normal law.
     """
 
     mean: Float[Array, "d *lanes"]
     sigma: AbstractSigma
     covariance: Float[Array, "..."]
     dt: Float[Array, "*lanes"]
+    curvature: Float[Array, "d d d"] | None = None
 
     @property
     def matrix(self) -> Float[Array, "d d"]:
@@ -63,6 +66,19 @@ class StepLaw(NamedTuple):
         S = self.covariance
         noise = jnp.sqrt(S) * xi if S.ndim == 0 else matvec(cholesky(S), xi)
         return self.mean + jnp.sqrt(self.dt) * self.sigma.mv(noise)
+
+    def bent(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Return the end of the step whose normal part ends in `point`,
+
+            x' = point + ½ δ Σ_jl G_jl (ξ_j ξ_l - 1{j=l}).
+
+        Here ξ is the noise of `point`. The density of ξ, not of x', is the law of the step.
+        """
+        if self.curvature is None:
+            return point
+        xi = self.noise(point)
+        square = xi[:, None] * xi - jnp.eye(xi.shape[0], dtype=xi.dtype)
+        return point + self.dt / 2 * jnp.sum(self.curvature * square[None], axis=(1, 2))
 
     def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return ξ, the normalised noise of the step to `point`: the inverse of `point`."""
