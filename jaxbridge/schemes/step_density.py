@@ -296,42 +296,48 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
 
 
 def _bent_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
-    """Return the steps of weak order 2 for an invertible σ(x) (Kloeden & Platen, section 14.2).
+    """Return the steps of weak order 2 for an invertible σ(x), from V and its derivatives alone.
 
-    With the triangular root of V, its columns b^j and L^j = b^j·∇,
+    With a root b of V, L⁰ = α·∇ + ½ Σ V_ik ∂_i ∂_k, and A = b⁻¹ ∇α b, let
 
-        x' = x + αδ + ½δ² L⁰α + √δ [b + ½δ (L⁰b + L^jα)] ξ
-             + ½δ Σ L^j b^l (ξ_j ξ_l - 1{j=l}) + ½δ Σ_{j<l} (L^j b^l - L^l b^j) V_jl.
+        W_jlm = (b⁻¹ ∂V[b_j] b⁻ᵀ)_lm,    Q_jlm = (W_jlm + W_ljm + W_mjl) / 6.
 
-    The V_jl ~ N(0, 1) are independent of ξ. Their part is normal, and the terms without it are
-    functions of ξ of at least its order. So it is added to the covariance of the normal part.
+    The step is x' = μ + √δ b [n + ½ √δ Σ Q_·jl (ξ_j ξ_l - 1{j=l})] with n = S^{1/2} ξ and
+
+        μ = x + αδ + ½δ² L⁰α,    S = I + ½δ M + O(δ²),    M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ Q_·jl Q_·jl.
+
+    Its moments are those of the diffusion up to O(δ³): the third ones, ½δ² (V∇_a V_bc + ...), are
+    those of Q; the variance of the quadratic part is taken from S. That makes weak order 2 (Kloeden
+    & Platen, section 14.5). Any root of V has the same law.
     """
     d = x.shape[0]
-    coefficients = lambda y: (dynamics.drift(y), dynamics.sigma(y).root().as_matrix(d, x.dtype))
     sigma = dynamics.sigma(x).root()
-    alpha, b = coefficients(x)
-    first, second = zip(*[_along(coefficients, x, column) for column in b.T], strict=True)
-    drift_of_drift, drift_of_b = jax.jvp(coefficients, (x,), (alpha,))[1]
-    half_laplacian = jax.tree.map(lambda *terms: sum_first_axis(jnp.stack(terms)) / 2, *second)
-    bend = drift_of_drift + half_laplacian[0]
-    change = drift_of_b + half_laplacian[1]
-    slopes = jnp.stack([slope for slope, _ in first], axis=1)
-    G = jnp.stack([turn for _, turn in first], axis=1)  # G[:, j, l] = L^j b^l
-    pairs = [(j, k) for j in range(d) for k in range(j + 1, d)]
-    twists = [sigma.solve(G[:, j, k] - G[:, k, j]) for j, k in pairs]
-    extra = sum_first_axis(jnp.stack([t[:, None] * t for t in twists])) if pairs else None
+
+    def coefficients(y):
+        matrix = dynamics.sigma(y).as_matrix(d, y.dtype)
+        return dynamics.drift(y), matmul(matrix, matrix.T)
+
+    columns = jax.vmap(sigma.solve, in_axes=1, out_axes=1)  # b⁻¹ X
+    scaled = lambda matrix: columns(columns(matrix).T)  # b⁻¹ X b⁻ᵀ of a symmetric X
+    b = sigma.as_matrix(d, x.dtype)
+    alpha = dynamics.drift(x)
+    (slopes, turns), (bends, changes) = jax.vmap(lambda v: _along(coefficients, x, v))(b.T)
+    drift_of_drift, drift_of_V = jax.jvp(coefficients, (x,), (alpha,))[1]
+    bend = drift_of_drift + sum_first_axis(bends) / 2
+    W = jax.vmap(scaled)(turns)
+    Q = (W + jnp.moveaxis(W, 0, 1) + jnp.moveaxis(W, 0, 2)) / 6
+    A = columns(slopes.T)
+    change = scaled(drift_of_V + sum_first_axis(changes) / 2)
+    Q_rows = Q.reshape(d, -1)
+    M = change + A + A.T - matmul(Q_rows, Q_rows.T)
     identity = jnp.eye(d, dtype=x.dtype)
+    G = jax.vmap(sigma.mv, in_axes=1, out_axes=1)(Q_rows).reshape(d, d, d)
 
     def law(dt):
-        linear = slopes + _bounded(change, b, dt)
-        A = jnp.stack([sigma.solve(column) for column in linear.T], axis=1)
-        root = identity + dt / 2 * A
-        S = matmul(root, root.T)
-        S = S if extra is None else S + dt / 4 * extra
-        return StepLaw(x + dt * alpha + dt**2 / 2 * bend, sigma, S, dt, G)
+        root = identity + dt / 4 * M  # whose square is never indefinite
+        return StepLaw(x + dt * alpha + dt**2 / 2 * bend, sigma, matmul(root, root), dt, G)
 
     def decay(dt):
-        A = jnp.stack([sigma.solve(slope) for slope in slopes.T], axis=1)
         return identity + dt * A + dt**2 / 2 * matmul(A, A)
 
     return StepsFrom(law, decay)
