@@ -30,6 +30,7 @@ from ..engine.linalg import (
     cholesky,
     log_abs_det,
     lower_factor,
+    matmul,
     matvec,
     solve,
     solve_lower,
@@ -239,6 +240,14 @@ def columns_of(sigma: AbstractSigma, x: Float[Array, " d"]) -> list[Float[Array,
     num_columns = sigma.as_matrix(x.shape[0], x.dtype).shape[1]
     # By products with unit vectors, so that diagonals stay cheap.
     return [sigma.mv(jnp.asarray(unit, x.dtype)) for unit in np.eye(num_columns)]
+
+
+def covariance_of(sigma: AbstractSigma, x: Float[Array, " d"]) -> Float[Array, "d d"]:
+    """Return V = σσᵀ at x."""
+    if isinstance(sigma, Diagonal):
+        return jnp.diag(sigma.diagonal**2)
+    matrix = sigma.as_matrix(x.shape[0], x.dtype)
+    return matmul(matrix, matrix.T)
 
 
 def root_of(V: Float[Array, "d d"]) -> Triangular:

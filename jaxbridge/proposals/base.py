@@ -246,7 +246,9 @@ class AbstractSingleProposal(AbstractWeightedProposal):
         """Return the names of scheme (or target step density) and meeting rule, and γ."""
 
     @abstractmethod
-    def most_accurate(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractSingleProposal":
+    def most_accurate(
+        self, model: Diffusion, like: Float[Array, " d"], for_density: bool = False
+    ) -> "AbstractSingleProposal":
         """Return the proposal with the most accurate scheme or target for this model."""
 
     @abstractmethod

@@ -98,7 +98,7 @@ class CoupledPairs(AbstractSingleProposal):
     def for_model(self, model, like, for_density=False):
         return self
 
-    def most_accurate(self, model, like):
+    def most_accurate(self, model, like, for_density=False):
         return eqx.tree_at(lambda p: p.coupling, self, most_accurate(self.coupling))
 
     def for_pilot(self):

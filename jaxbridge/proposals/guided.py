@@ -103,6 +103,11 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return self.density
 
     @property
+    def target_cost(self) -> float:
+        """Seconds of a step of the target relative to a normal one, measured for d ≤ 3."""
+        return 1.0 if self.target.is_normal else 2.5
+
+    @property
     def efficiency_bound(self):
         return 1.0
 
@@ -111,14 +116,13 @@ class AbstractGuidedProposal(AbstractSingleProposal):
 
     def for_model(self, model, like, for_density=False):
         model.check_invertible_sigma(like)
-        if self.density is not None:
+        # One that is not normal was selected for a density, and serves nothing else.
+        if self.density is not None and (for_density or self.density.is_normal):
             return self
-        return self._with_density(
-            most_accurate_density(model.sigma_varies(like), may_bend=for_density)
-        )
+        return self._with_density(most_accurate_density(model.sigma_varies(like), True, for_density))
 
-    def most_accurate(self, model, like):
-        density = most_accurate_density(model.sigma_varies(like))
+    def most_accurate(self, model, like, for_density=False):
+        density = most_accurate_density(model.sigma_varies(like), True, for_density)
         if self.density is not None and self.density.order >= density.order:
             return self
         return self._with_density(density)
@@ -288,8 +292,8 @@ class _Lanes:
         self.steps = _Steps(guide, dt[:-1], remaining[:-1], before[:-1], ends[:-1], coarse)
         self._last = _Steps(None, dt[-1], remaining[-1], before[-1], ends[-1], None)
         self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.target
-        # The end is seen exactly: the last step needs a density, so it is normal.
-        self._closing = EulerDensity() if dynamics.sigma_varies else self._density
+        # The end is observed exactly, so the last step needs a density of x'.
+        self._closing = self._density if self._density.is_normal else EulerDensity()
         self._of_pairs = jax.jit(self._log_halving)  # traced once, for the loop and for its end
 
     def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
@@ -634,12 +638,12 @@ def _points(
     """Return the fractions of the time that remains, and which of them are points of the grid of
     half as many steps.
 
-    The last step has a normal density, of first order where σ varies. For a target of second order
-    it is split into steps of ½, ¼, ..., the last of which is about T / N².
+    The last step needs a normal law. If the others are not normal, it is of lower order, and is
+    split into steps of ½, ¼, ..., 2^-k of its length, the last of which is about T / N².
     """
     fractions = proposal.remaining(num_steps)
     coarse = [*range(0, num_steps, 2)]
-    if not (dynamics.sigma_varies and proposal.target.order > 1):
+    if proposal.target.is_normal:
         return fractions, [*coarse, num_steps]
     num_splits = math.ceil(math.log2(num_steps)) if num_steps > 1 else 0
     splits = fractions[-2] * 0.5 ** np.arange(1, num_splits + 1)

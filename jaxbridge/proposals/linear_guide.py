@@ -32,7 +32,7 @@ from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.lanes import over_points
 from ..engine.linalg import inverse, matmul, matvec
 from ..models.dynamics import Dynamics
-from ..models.sigma import AbstractSigma, root_of
+from ..models.sigma import covariance_of, root_of
 from ..schemes import AbstractStepDensity, StepLaw, check_step_density
 from .guided import AbstractGuidedProposal, check_refinement, deterministic_path
 
@@ -77,7 +77,8 @@ class Guided(AbstractGuidedProposal):
             is replaced by a straight line;
         - a matrix F of shape (d, d), with α̃ = α(b) and σ̃ = σ(b).
     - `density`: step density of the target. The default is the most accurate one:
-        `ItoTaylorDensity()` for constant σ, `EulerDensity()` for a state-dependent σ.
+        `ItoTaylorDensity()` for constant σ. For a state-dependent σ it is `EulerDensity()` for
+        paths, and steps of weak order 2 for `transition_log_density` and `pmmh`.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ], between 1 (equal steps) and 4. Above 1 the steps
         shrink towards the end, which helps if σ varies much along the path.
 
@@ -128,7 +129,7 @@ class Guided(AbstractGuidedProposal):
         return f"Guided({self.linearisation})"
 
     def relative_seconds(self, model, intervals):
-        return jnp.full_like(intervals.duration, 1.3)
+        return jnp.full_like(intervals.duration, 1.3 * self.target_cost)
 
     def guide(self, dynamics, start, end, dt):
         d = end.shape[0]
@@ -197,12 +198,5 @@ class Guided(AbstractGuidedProposal):
     def _linear(self, dynamics: Dynamics, x: Float[Array, " d"], end: Float[Array, " d"]):
         """F, the linear drift at b, and Ṽ, when the diffusion is linearised at x."""
         F = jax.jacfwd(dynamics.drift)(x) if self._matrix is None else self._matrix.astype(x.dtype)
-        sigma = dynamics.sigma(x)
-        V = _congruence_of_root(sigma, x)
+        V = covariance_of(dynamics.sigma(x), x)
         return F, dynamics.drift(x) + matvec(F, end - x), V
-
-
-def _congruence_of_root(sigma: AbstractSigma, x: Float[Array, " d"]) -> Float[Array, "d d"]:
-    """V = σ σᵀ."""
-    matrix = sigma.as_matrix(x.shape[0], x.dtype)
-    return matmul(matrix, matrix.T)

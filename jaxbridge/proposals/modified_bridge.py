@@ -19,7 +19,8 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
     **Arguments:**
 
     - `density`: step density of the target. The default is the most accurate one:
-        `ItoTaylorDensity()` for constant σ, `EulerDensity()` for a state-dependent σ.
+        `ItoTaylorDensity()` for constant σ. For a state-dependent σ it is `EulerDensity()` for
+        paths, and steps of weak order 2 for `transition_log_density` and `pmmh`.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ], between 1 (equal steps) and 4. Above 1 the steps
         shrink towards the end, which helps if σ varies much along the path.
 
@@ -42,7 +43,7 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
         return "ModifiedDiffusionBridge"
 
     def relative_seconds(self, model, intervals):
-        return jnp.full_like(intervals.duration, 1.0)
+        return jnp.full_like(intervals.duration, self.target_cost)
 
     def guide(self, dynamics, start, end, dt):
         return None

@@ -25,7 +25,8 @@ class ResidualBridge(AbstractGuidedProposal):
     **Arguments:**
 
     - `density`: step density of the target. The default is the most accurate one:
-        `ItoTaylorDensity()` for constant σ, `EulerDensity()` for a state-dependent σ.
+        `ItoTaylorDensity()` for constant σ. For a state-dependent σ it is `EulerDensity()` for
+        paths, and steps of weak order 2 for `transition_log_density` and `pmmh`.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ], between 1 (equal steps) and 4. Above 1 the steps
         shrink towards the end, which helps if σ varies much along the path.
 
@@ -48,7 +49,7 @@ class ResidualBridge(AbstractGuidedProposal):
         return "ResidualBridge"
 
     def relative_seconds(self, model, intervals):
-        return jnp.full_like(intervals.duration, 1.3)
+        return jnp.full_like(intervals.duration, 1.3 * self.target_cost)
 
     def guide(self, dynamics, start, end, dt):
         xi, xi_end = deterministic_path(self.target, dynamics, start, dt)

@@ -69,6 +69,7 @@ from .step_density import (
     EulerDensity as EulerDensity,
     HypoellipticDensity as HypoellipticDensity,
     ItoTaylorDensity as ItoTaylorDensity,
+    QuadraticDensity as QuadraticDensity,
     check_step_density as check_step_density,
     most_accurate_density as most_accurate_density,
 )

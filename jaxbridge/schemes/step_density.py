@@ -50,7 +50,7 @@ from jaxtyping import Array, Float
 from ..engine.lanes import compute_once
 from ..engine.linalg import matmul, semidefinite_factor, sum_first_axis
 from ..models.dynamics import Dynamics
-from ..models.sigma import columns_of
+from ..models.sigma import columns_of, covariance_of
 from .step_law import DegenerateLaw, StepLaw, root_of_length
 
 
@@ -81,10 +81,14 @@ class StepsFrom(NamedTuple):
 class AbstractStepDensity(eqx.Module):
     """Base class of step densities: the normal law of one step of a target chain.
 
-    The class attribute `order` is p in the error O(δ^p) along a path, in the mean over paths.
+    Class attributes:
+
+    - `order`: p in the error O(δ^p) along a path, in the mean over paths.
+    - `is_normal`: whether a step is normal, or else a map of normal noise (`StepLaw.bent`).
     """
 
     order: ClassVar[int]
+    is_normal: ClassVar[bool] = True
 
     @abstractmethod
     def steps_from(self, dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
@@ -153,16 +157,15 @@ class ItoTaylorDensity(AbstractStepDensity):
     order: ClassVar[int] = 2
 
     def steps_from(self, dynamics, x):
-        sigma, d = dynamics.sigma(x), x.shape[0]
-        if dynamics.sigma_varies and not sigma.invertible:
+        if dynamics.sigma_varies:
             raise ValueError(
-                "`ItoTaylorDensity` is for constant or invertible σ, but σ of this model depends on "
-                "the state and has fewer columns than rows: use `HypoellipticDensity()`."
+                "`ItoTaylorDensity` is for constant σ, but σ of this model depends on the state: "
+                "use `EulerDensity()`, or `HypoellipticDensity()` for a σ with fewer columns than "
+                "rows."
             )
+        sigma, d = dynamics.sigma(x), x.shape[0]
         if not sigma.invertible:
             return _degenerate_ito_taylor(dynamics, x)
-        if dynamics.sigma_varies:
-            return _bent_ito_taylor(dynamics, x)
         along = [_along(dynamics.drift, x, column) for column in columns_of(sigma, x)]
         slopes, bends = zip(*along, strict=True)
         # What is made of them would else compute them anew for each of its numbers.
@@ -225,6 +228,72 @@ class HypoellipticDensity(AbstractStepDensity):
         return _linear_ito_taylor(F, V, dt)
 
 
+class QuadraticDensity(AbstractStepDensity):
+    """Law of steps of weak order 2 for an invertible, state-dependent σ(x).
+
+    A step is quadratic in normal noise, so it has no normal law; the noise has. Let b be a root of
+    V = σσᵀ, L⁰ = α·∇ + ½ Σ V_ik ∂_i ∂_k, A = b⁻¹ ∇α b, and
+
+        W_jlm = (b⁻¹ ∂V[b_j] b⁻ᵀ)_lm,    Q_jlm = (W_jlm + W_ljm + W_mjl) / 6.
+
+    The step is x' = μ + √δ b [n + ½ √δ Σ_jl Q_·jl (n_j n_l - S_jl)] with n ~ N(0, S) and
+
+        μ = x + αδ + ½δ² L⁰α,    S = (I + ¼δ M)²,    M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ_jl Q_·jl Q_·jl.
+
+    Its first three moments are those of the diffusion up to O(δ³):
+
+    - the mean is μ;
+    - the third cumulant is δ² times 3 Q in noise coordinates, which is ½ (V∇V + ...), the sum over
+        the three choices of the coordinate that is differentiated;
+    - the quadratic part adds ½δ² Σ_jl Q_·jl Q_·jl to the covariance, which M subtracts.
+
+    That is weak order 2 (Kloeden & Platen 1992, section 14.5). Only V enters: all roots of V give
+    the same law. S is a square, hence never indefinite. The density of n is a density for the
+    weights of paths. An exactly observed end needs the density of x' itself, so there the step must
+    be another one.
+    """
+
+    order: ClassVar[int] = 2
+    is_normal: ClassVar[bool] = False
+
+    def steps_from(self, dynamics, x):
+        d, sigma = x.shape[0], dynamics.sigma(x).root()
+
+        def coefficients(y):
+            return dynamics.drift(y), covariance_of(dynamics.sigma(y), y)
+
+        columns = jax.vmap(sigma.solve, in_axes=1, out_axes=1)  # b⁻¹ X
+
+        def in_noise_coordinates(symmetric):
+            return columns(columns(symmetric).T)  # b⁻¹ X b⁻ᵀ
+
+        roots = sigma.as_matrix(d, x.dtype).T
+        slopes, curvatures = jax.vmap(lambda column: _along(coefficients, x, column))(roots)
+        drift, (A, turns), (bends, changes) = dynamics.drift(x), slopes, curvatures
+        W, beta = jax.vmap(in_noise_coordinates)(turns), sigma.solve(drift)
+        Q = (W + jnp.moveaxis(W, 0, 1) + jnp.moveaxis(W, 0, 2)) / 6
+        rows = Q.reshape(d, -1)
+        # α = b β, so that ∇f α is the sum of β_k ∇f b_k.
+        bend = sum_first_axis(beta[:, None] * A + bends / 2)
+        change = sum_first_axis(beta[:, None, None] * W)
+        change += in_noise_coordinates(sum_first_axis(changes)) / 2
+        A = columns(A.T)
+        M = change + A + A.T - matmul(rows, rows.T)
+        identity = jnp.eye(d, dtype=x.dtype)
+
+        def law(dt):
+            root = identity + dt / 4 * M
+            return StepLaw(x + dt * drift + dt**2 / 2 * bend, sigma, matmul(root, root), dt, Q)
+
+        def decay(dt):
+            return identity + dt * A + dt**2 / 2 * matmul(A, A)
+
+        return StepsFrom(law, decay)
+
+    def linear_step(self, F, V, dt):
+        return _linear_ito_taylor(F, V, dt)
+
+
 def _linear_ito_taylor(F, V, dt) -> LinearStep:
     identity = jnp.eye(F.shape[0], dtype=F.dtype)
     integral = dt * identity + dt**2 / 2 * F
@@ -244,13 +313,17 @@ def check_step_density(density: AbstractStepDensity | None) -> AbstractStepDensi
 
 
 def most_accurate_density(
-    sigma_varies: bool, invertible: bool = True, may_bend: bool = False
+    sigma_varies: bool, invertible: bool = True, for_weights: bool = False
 ) -> AbstractStepDensity:
-    """Return the most accurate step density of a model; `may_bend` if its steps need not be
-    normal."""
-    if not sigma_varies or (invertible and may_bend):
+    """Return the most accurate step density of a model.
+
+    `for_weights` states that only weights are needed. Then the steps need not be normal.
+    """
+    if not sigma_varies:
         return ItoTaylorDensity()
-    return EulerDensity() if invertible else HypoellipticDensity()
+    if invertible:
+        return QuadraticDensity() if for_weights else EulerDensity()
+    return HypoellipticDensity()
 
 
 def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
@@ -291,54 +364,6 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
     def decay(dt):
         F = jax.jacfwd(dynamics.drift)(x)
         return jnp.eye(x.shape[0], dtype=x.dtype) + dt * F + dt**2 / 2 * matmul(F, F)
-
-    return StepsFrom(law, decay)
-
-
-def _bent_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
-    """Return the steps of weak order 2 for an invertible σ(x), from V and its derivatives alone.
-
-    With a root b of V, L⁰ = α·∇ + ½ Σ V_ik ∂_i ∂_k, and A = b⁻¹ ∇α b, let
-
-        W_jlm = (b⁻¹ ∂V[b_j] b⁻ᵀ)_lm,    Q_jlm = (W_jlm + W_ljm + W_mjl) / 6.
-
-    The step is x' = μ + √δ b [n + ½ √δ Σ Q_·jl (ξ_j ξ_l - 1{j=l})] with n = S^{1/2} ξ and
-
-        μ = x + αδ + ½δ² L⁰α,    S = I + ½δ M + O(δ²),    M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ Q_·jl Q_·jl.
-
-    Its moments are those of the diffusion up to O(δ³): the third ones, ½δ² (V∇_a V_bc + ...), are
-    those of Q; the variance of the quadratic part is taken from S. That makes weak order 2 (Kloeden
-    & Platen, section 14.5). Any root of V has the same law.
-    """
-    d = x.shape[0]
-    sigma = dynamics.sigma(x).root()
-
-    def coefficients(y):
-        matrix = dynamics.sigma(y).as_matrix(d, y.dtype)
-        return dynamics.drift(y), matmul(matrix, matrix.T)
-
-    columns = jax.vmap(sigma.solve, in_axes=1, out_axes=1)  # b⁻¹ X
-    scaled = lambda matrix: columns(columns(matrix).T)  # b⁻¹ X b⁻ᵀ of a symmetric X
-    b = sigma.as_matrix(d, x.dtype)
-    alpha = dynamics.drift(x)
-    (slopes, turns), (bends, changes) = jax.vmap(lambda v: _along(coefficients, x, v))(b.T)
-    drift_of_drift, drift_of_V = jax.jvp(coefficients, (x,), (alpha,))[1]
-    bend = drift_of_drift + sum_first_axis(bends) / 2
-    W = jax.vmap(scaled)(turns)
-    Q = (W + jnp.moveaxis(W, 0, 1) + jnp.moveaxis(W, 0, 2)) / 6
-    A = columns(slopes.T)
-    change = scaled(drift_of_V + sum_first_axis(changes) / 2)
-    Q_rows = Q.reshape(d, -1)
-    M = change + A + A.T - matmul(Q_rows, Q_rows.T)
-    identity = jnp.eye(d, dtype=x.dtype)
-    G = jax.vmap(sigma.mv, in_axes=1, out_axes=1)(Q_rows).reshape(d, d, d)
-
-    def law(dt):
-        root = identity + dt / 4 * M  # whose square is never indefinite
-        return StepLaw(x + dt * alpha + dt**2 / 2 * bend, sigma, matmul(root, root), dt, G)
-
-    def decay(dt):
-        return identity + dt * A + dt**2 / 2 * matmul(A, A)
 
     return StepsFrom(law, decay)
 

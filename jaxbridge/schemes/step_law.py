@@ -32,7 +32,7 @@ class StepLaw(NamedTuple):
     - `sigma`: σ at the point.
     - `covariance`: S in noise coordinates, shape (d, d), or a scalar for a multiple of I.
     - `dt`: δ.
-    - `curvature`: G of the quadratic part of a step that is not normal (`bent`), shape (d, d, d);
+    - `curvature`: Q of the quadratic part of a step that is not normal (`bent`), shape (d, d, d);
         `None` for a normal law.
     """
 
@@ -70,15 +70,14 @@ class StepLaw(NamedTuple):
     def bent(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return the end of the step whose normal part ends in `point`,
 
-            x' = point + ½ δ Σ_jl G_jl (ξ_j ξ_l - 1{j=l}).
-
-        Here ξ is the noise of `point`. The density of ξ, not of x', is the law of the step.
+            x' = point + ½ δ σ Σ_jl Q_·jl (n_j n_l - S_jl),    point = μ + √δ σ n.
         """
         if self.curvature is None:
             return point
-        xi = self.noise(point)
-        square = xi[:, None] * xi - jnp.eye(xi.shape[0], dtype=xi.dtype)
-        return point + self.dt / 2 * jnp.sum(self.curvature * square[None], axis=(1, 2))
+        n = self._scaled(point)
+        square = (n[:, None] * n - self.covariance).reshape(-1)
+        rows = self.curvature.reshape(n.shape[0], -1)
+        return point + self.dt / 2 * self.sigma.mv(matvec(rows, square))
 
     def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return ξ, the normalised noise of the step to `point`: the inverse of `point`."""

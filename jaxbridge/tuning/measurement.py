@@ -251,7 +251,8 @@ def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
     discretisation error.
     """
     # The limit does not depend on the scheme, so the most accurate one serves for all settings.
-    best = run.proposal.most_accurate(*scene.interval("float64")[:2])
+    model, like, *_ = scene.interval("float64")
+    best = run.proposal.most_accurate(model, like, is_density(run.method))
     limit = run._replace(proposal=best)
     half = limit._replace(num_steps=max(run.num_steps // 2, 1))
     fine = _estimate(scene, run.method, limit.result(key, scene))

@@ -160,7 +160,8 @@ def work_precision(
     for name, count in [("num_bridges", num_bridges), ("repeats", repeats)]:
         check_count(name, count)
     _check_settings(steps, methods, dtypes, target)
-    candidates = _candidates(proposals, model, problem.like)
+    of_paths = _candidates(proposals, model, problem.like, False)
+    of_densities = _candidates(proposals, model, problem.like, True)
     if save_at is None:
         save_at = [float(problem.intervals.duration[0]) / 2]
         if any(n % 2 for n in steps):
@@ -172,19 +173,19 @@ def work_precision(
     if len(grids) > len(steps) and any(n % 2 for n in steps):
         raise ValueError(f"`num_steps` must be even for extrapolation; got {tuple(steps)}.")
     # Raise if a time of `save_at` is missing on some grid.
-    for candidate, n in itertools.product(candidates, grids):
+    for candidate, n in itertools.product(of_paths, grids):
         problem.keep(save_at, duration, candidate.fractions(n))
-    runs = _runs(methods, candidates, dtypes, steps, num_bridges)
+    runs = _runs(methods, of_paths, of_densities, dtypes, steps, num_bridges)
     _check_references(runs, fn, reference, log_density)
     if any(is_density(method) for method in methods):
-        for candidate in candidates:
+        for candidate in of_densities:
             candidate.check_for_density(model)
     finest_steps, num_reference = reference_steps, reference_bridges
     finest_steps = 4 * max(steps) if finest_steps is None else finest_steps
     num_reference = 4 * num_bridges if num_reference is None else num_reference
     finest_run = Run(
         "weights",
-        candidates[0],
+        of_paths[0],
         "float64",
         check_count("reference_steps", finest_steps),
         check_count("reference_bridges", num_reference),
@@ -220,7 +221,8 @@ def work_precision(
 
 def _runs(
     methods: Sequence[str],
-    candidates: Sequence[AbstractProposal],
+    of_paths: Sequence[AbstractProposal],
+    of_densities: Sequence[AbstractProposal],
     dtypes: Sequence[str],
     steps: Sequence[int],
     num_bridges: int,
@@ -228,7 +230,8 @@ def _runs(
     """Return all settings, without the pairs of a method and a proposal that do not fit."""
     runs = [
         Run(method, candidate, dtype, n, num_bridges)
-        for method, candidate in itertools.product(methods, candidates)
+        for method in methods
+        for candidate in (of_densities if is_density(method) else of_paths)
         if method not in (_FOR_GUIDED if candidate.coupled else _FOR_COUPLINGS)
         for dtype, n in itertools.product(dtypes, steps)
     ]
@@ -271,14 +274,17 @@ def _check_settings(
 
 
 def _candidates(
-    proposals: Sequence[Any] | None, model: Diffusion, like: Float[Array, " d"]
+    proposals: Sequence[Any] | None, model: Diffusion, like: Float[Array, " d"], for_density: bool
 ) -> list[AbstractProposal]:
     if proposals is None:
         proposals = [Coupling(scheme=Heun()), Coupling(scheme=Euler())]
         if is_linear(model.forward(like), like):
             proposals.append(Coupling(scheme=GaussianTransition()))
     proposals = as_sequence("proposals", proposals, "proposals")
-    candidates = [as_proposal(proposal, model, like, name="proposals") for proposal in proposals]
+    candidates = [
+        as_proposal(proposal, model, like, name="proposals", for_density=for_density)
+        for proposal in proposals
+    ]
     if any(len(candidate.singles) > 1 for candidate in candidates):
         raise ValueError(
             '`proposals` must be single proposals; "auto" and a result of `choose_proposal` stand '

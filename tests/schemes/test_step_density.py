@@ -12,6 +12,7 @@ from scipy.stats import multivariate_normal
 
 import jaxbridge as jb
 from jaxbridge.models.linear import linear_transition
+from jaxbridge.schemes import QuadraticDensity
 
 DENSITIES = {"euler": jb.EulerDensity(), "ito_taylor": jb.ItoTaylorDensity()}
 J = np.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -369,3 +370,73 @@ def test_noise_that_would_turn_round_within_a_step():
         assert np.all(np.isfinite(jax.jacfwd(root, 1)(x, jnp.float32(0.0))))
     at_rest = jnp.array([0.0, 1.0])  # where there is no noise
     assert np.all(np.isfinite(jax.jacfwd(root)(at_rest, jnp.float32(0.1))))
+
+
+def curved(d):
+    """Drift and σ whose columns do not commute, and which no coordinates make constant."""
+
+    def drift(x, p):
+        return jnp.sin(x[::-1]) - x + 0.3 * x**2
+
+    def sigma(x, p):
+        turned = 0.3 * jnp.cos(jnp.arange(d, dtype=x.dtype)[:, None] + x)
+        return turned + (1 + 0.4 * jnp.sin(x[::-1])) * jnp.eye(d)
+
+    return drift, sigma
+
+
+def generator(model, g):
+    """L g = α·∇g + ½ tr(V ∇²g)."""
+
+    def of(x):
+        dynamics = model.forward(x)
+        matrix = dynamics.sigma(x).as_matrix(len(x), x.dtype)
+        return dynamics.drift(x) @ jax.grad(g)(x) + jnp.vdot(matrix @ matrix.T, jax.hessian(g)(x)) / 2
+
+    return of
+
+
+@pytest.mark.parametrize("d", slow_beyond(2, [1, 2, 3]))
+def test_quadratic_steps_are_of_weak_order_2(d, x64):
+    """E g(x') = g + δLg + ½δ²L²g + O(δ³) for cubic and exponential g, by quadrature over the
+    noise: an oracle that has no square root and no expansion of the step in it."""
+    model, x = jb.Diffusion(*curved(d)), jnp.array([0.3, -0.4, 0.6])[:d]
+    rng = np.random.default_rng(d)
+    directions = jnp.asarray(rng.normal(size=(4, d)))
+    tests = [
+        *(lambda y, a=a: (a @ (y - 0.2)) ** 3 for a in directions[:2]),
+        *(lambda y, a=a: jnp.exp(a @ y / 2) for a in directions[2:]),
+        lambda y: y[0] * y[-1] * jnp.sum(y),
+    ]
+    nodes, weights = np.polynomial.hermite_e.hermegauss(9)
+    xi = np.stack([g.ravel() for g in np.meshgrid(*d * [nodes])], axis=-1)
+    probability = np.prod(np.stack(np.meshgrid(*d * [weights / weights.sum()])), axis=0).ravel()
+    steps = QuadraticDensity().steps_from(model.forward(x), x)
+    sizes, errors = np.array([0.02, 0.01, 0.005]), []
+    for dt in sizes:
+        law = steps.law(jnp.asarray(dt))
+        ends = jax.vmap(lambda noise, law=law: law.bent(law.point(noise)))(jnp.asarray(xi))
+        first = [generator(model, g) for g in tests]
+        second = [generator(model, Lg) for Lg in first]
+        expected = [
+            g(x) + dt * Lg(x) + dt**2 / 2 * LLg(x)
+            for g, Lg, LLg in zip(tests, first, second, strict=True)
+        ]
+        errors.append([probability @ jax.vmap(g)(ends) - e for g, e in zip(tests, expected, strict=True)])
+    slopes = [loglog_slope(sizes, np.abs(column)) for column in np.transpose(errors)]
+    assert min(slopes) > 2.8, slopes
+
+
+def test_quadratic_steps_depend_on_the_covariance_only(x64):
+    """Another root of V, which turns with the state, gives the same law."""
+    (drift, sigma), x = curved(2), jnp.array([0.3, -0.4])
+
+    def turned(y, p):
+        c, s = jnp.cos(3 * y[0]), jnp.sin(3 * y[0])
+        return sigma(y, p) @ jnp.array([[c, -s], [s, c]])
+
+    ours, theirs = (
+        step_law(QuadraticDensity(), jb.Diffusion(drift, root), x, 0.1) for root in (sigma, turned)
+    )
+    for name in ("mean", "covariance", "curvature"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), atol=1e-12)
