@@ -119,7 +119,9 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         # One that is not normal was selected for a density, and serves nothing else.
         if self.density is not None and (for_density or self.density.is_normal):
             return self
-        return self._with_density(most_accurate_density(model.sigma_varies(like), True, for_density))
+        return self._with_density(
+            most_accurate_density(model.sigma_varies(like), True, for_density)
+        )
 
     def most_accurate(self, model, like, for_density=False):
         density = most_accurate_density(model.sigma_varies(like), True, for_density)

@@ -70,7 +70,7 @@ class StepLaw(NamedTuple):
     def bent(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return the end of the step whose normal part ends in `point`,
 
-            x' = point + ½ δ σ Σ_jl Q_·jl (n_j n_l - S_jl),    point = μ + √δ σ n.
+        x' = point + ½ δ σ Σ_jl Q_·jl (n_j n_l - S_jl),    point = μ + √δ σ n.
         """
         if self.curvature is None:
             return point

@@ -391,7 +391,9 @@ def generator(model, g):
     def of(x):
         dynamics = model.forward(x)
         matrix = dynamics.sigma(x).as_matrix(len(x), x.dtype)
-        return dynamics.drift(x) @ jax.grad(g)(x) + jnp.vdot(matrix @ matrix.T, jax.hessian(g)(x)) / 2
+        return (
+            dynamics.drift(x) @ jax.grad(g)(x) + jnp.vdot(matrix @ matrix.T, jax.hessian(g)(x)) / 2
+        )
 
     return of
 
@@ -422,7 +424,9 @@ def test_quadratic_steps_are_of_weak_order_2(d, x64):
             g(x) + dt * Lg(x) + dt**2 / 2 * LLg(x)
             for g, Lg, LLg in zip(tests, first, second, strict=True)
         ]
-        errors.append([probability @ jax.vmap(g)(ends) - e for g, e in zip(tests, expected, strict=True)])
+        errors.append(
+            [probability @ jax.vmap(g)(ends) - e for g, e in zip(tests, expected, strict=True)]
+        )
     slopes = [loglog_slope(sizes, np.abs(column)) for column in np.transpose(errors)]
     assert min(slopes) > 2.8, slopes
 
