@@ -11,6 +11,11 @@ with p(y| x) the density of the observation at the end of the step. Hence log w 
 at most ½|ζ|² plus the maximum log density of the observations. Rounding errors cannot exceed this
 bound.
 
+A target's step may be quadratic in its noise (`QuadraticDensity`). Its normal part leads to a point
+u, and the step to x' = u + O(δ). The noise is guided as above, with the observation of u. The
+weight takes the factor g(y| x') / g(y| u) in addition. An exact observation has no such factor: the
+step to it is the normal part alone.
+
 The weight also equals ∫ p(x'| x) g(y| x') h_{i+1}(x') dx' / h_i(x) times h_i(x) / h_{i+1}(x'),
 whose product over a path telescopes. The code must not sum this form. Explicit steps that are far
 too long for the drift (δ |∇drift| above 2) may lead to log h = -1e30. Differences of such numbers
@@ -44,13 +49,19 @@ class Guide(NamedTuple):
 
 
 class GuidedLaw(NamedTuple):
-    """The law of a guided step, the log density of what is seen at its end given its beginning, and
-    what was seen on the way."""
+    """Law of a guided step.
+
+    - `origin`: ξ', from which points of `tilted` count.
+    - `log_seen`: log density of the observation at its end, given its beginning.
+    - `seen`: factors of the conditioning on that observation.
+    - `quadratic`: the target's step and the observation, if the step is not normal.
+    """
 
     origin: Float[Array, " d"]
     tilted: Tilted
     log_seen: Float[Array, ""]
     seen: list[Seen]
+    quadratic: tuple[StepLaw, Scalars | None] | None = None
 
     @property
     def log_integral(self) -> Float[Array, ""]:
@@ -64,7 +75,16 @@ class GuidedLaw(NamedTuple):
         # Point and weight would else compute it twice.
         pulled = compute_once(self.tilted.pulled(zeta))
         point = self.origin + self.tilted.point(pulled)
-        return point, self.log_seen + self.tilted.log_ratio(zeta, pulled)
+        log_weight = self.log_seen + self.tilted.log_ratio(zeta, pulled)
+        if self.quadratic is None:
+            return point, log_weight
+        law, scalars = self.quadratic
+        bent = law.bent(point)
+        if scalars is not None:
+            is_exact = jnp.any(scalars.seen & (scalars.variances == 0))
+            bent = jnp.where(is_exact, point, bent)
+            log_weight += _log_change(scalars, point - self.origin, bent - self.origin)
+        return bent, log_weight
 
     def noise_and_log_weight(
         self,
@@ -78,6 +98,18 @@ class GuidedLaw(NamedTuple):
         pulled = coordinates(displacement, self.seen, hidden[: len(self.seen)])
         zeta = self.tilted.noise(pulled)
         return zeta, self.log_seen + self.tilted.log_ratio(zeta, pulled)
+
+
+def _log_change(
+    scalars: Scalars, u: Float[Array, " d"], x: Float[Array, " d"]
+) -> Float[Array, ""]:
+    """Return log g(y| x) - log g(y| u) for scalar observations, counted from ξ' like the points."""
+    log_change = jnp.zeros((), u.dtype)
+    for row, value, variance, is_seen in zip(*scalars, strict=True):
+        noisy = is_seen & (variance > 0)
+        squares = (value - dot(row, u)) ** 2 - (value - dot(row, x)) ** 2
+        log_change += jnp.where(noisy, squares / jnp.where(noisy, 2 * variance, 1), 0)
+    return log_change
 
 
 def relative(scalars: Scalars, point: Float[Array, " d"]) -> Scalars:
@@ -122,4 +154,6 @@ def guided_law(law: StepLaw | DegenerateLaw, guide: Guide, scalars: Scalars | No
     log_seen, seen = jnp.zeros((), law.mean.dtype), []
     if scalars is not None:
         step, log_seen, seen = given(step, scalars)
-    return GuidedLaw(guide.next_point, tilted(step, guide.next_h), log_seen, seen)
+    bends = isinstance(law, StepLaw) and law.curvature is not None
+    quadratic = (law, scalars) if bends else None
+    return GuidedLaw(guide.next_point, tilted(step, guide.next_h), log_seen, seen, quadratic)

@@ -194,6 +194,7 @@ def innovations(
         step_size=step_size,
         initial_time=initial_time,
         density=density,
+        for_weights=True,
     )
     points, _, check = linearised(problem, model)
     if not is_traced(check) and not check.is_usable:

@@ -66,9 +66,11 @@ def as_record_problem(
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
     any_constant: bool = False,
+    for_weights: bool = False,
 ) -> RecordProblem:
     """What the arguments that all who read one record share say. The constant of ν may be unknown
-    where only paths at fixed parameters are asked for, `any_constant`.
+    where only paths at fixed parameters are asked for, `any_constant`. `for_weights` states that
+    the noise of a given path is never needed (`most_accurate_density`).
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
     """
@@ -79,7 +81,7 @@ def as_record_problem(
             "each record, because records are independent given the parameters."
         )
     (record,) = as_records(seen, num_steps, step_size, initial_time)
-    return problem_of(model, record, observation, initial, density, any_constant)
+    return problem_of(model, record, observation, initial, density, any_constant, for_weights)
 
 
 def problem_of(
@@ -89,6 +91,7 @@ def problem_of(
     initial: Initial,
     density: AbstractStepDensity | None = None,
     any_constant: bool = False,
+    for_weights: bool = False,
 ) -> RecordProblem:
     """What is asked of a record.
 
@@ -122,7 +125,8 @@ def problem_of(
     check_clock(model, observation, record)
     density = check_step_density(density)
     if density is None:
-        density = most_accurate_density(model.sigma_varies(like), model.sigma_is_invertible(like))
+        about_sigma = model.sigma_varies(like), model.sigma_is_invertible(like)
+        density = most_accurate_density(*about_sigma, for_weights)
     return RecordProblem(model, record, observation, initial, density, dim)
 
 

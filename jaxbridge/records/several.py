@@ -77,14 +77,17 @@ def as_record_problems(
     step_size: float | None = None,
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
+    for_weights: bool = False,
 ) -> Records:
-    """What the arguments that all who read one record, or several, share say.
+    """What the arguments that all who read one record, or several, share say (`for_weights` as in
+    `as_record_problem`).
 
     **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
     """
     seen = split_records(times, observations)
     records = as_records(seen, num_steps, step_size, initial_time)
-    problem = problem_of(model, records[0], observation, initial, density)
+    law = density, False, for_weights
+    problem = problem_of(model, records[0], observation, initial, *law)
     for record in records[1:]:
         check_domain(model, observation, record)
         check_clock(model, observation, record)
