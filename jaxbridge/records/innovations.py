@@ -169,7 +169,8 @@ def innovations(
         default 10, or the maximum step size.
     - `initial_time`: time of `initial`, if it is before the first of `times`.
     - `density`: step density. By default `ItoTaylorDensity()` for constant σ. For a state-dependent
-        σ it is `EulerDensity()`, or `HypoellipticDensity()` if σ has fewer columns than rows.
+        σ the steps are of weak order 2 and quadratic in the noise, or `HypoellipticDensity()` if σ
+        has fewer columns than rows.
 
     **Returns:** `Innovations`, differentiable in parameters and noise. Its `why()` reports faults
     of the guide. There is a warning if the likelihood at ξ = 0 is zero.

@@ -19,7 +19,8 @@ MIDDLE = jb.gaussian_bridge(OU, [0.3], [1.0], DURATION, [0.5])
 
 
 def density(key, num_steps, num_proposals=100_000, proposal=None):
-    proposal = jb.ModifiedDiffusionBridge() if proposal is None else proposal
+    """By the Euler scheme, whose error is of first order."""
+    proposal = jb.ModifiedDiffusionBridge(jb.EulerDensity()) if proposal is None else proposal
     return jb.transition_log_density(
         key,
         STRETCHED.model,
