@@ -100,9 +100,7 @@ class GuidedLaw(NamedTuple):
         return zeta, self.log_seen + self.tilted.log_ratio(zeta, pulled)
 
 
-def _log_change(
-    scalars: Scalars, u: Float[Array, " d"], x: Float[Array, " d"]
-) -> Float[Array, ""]:
+def _log_change(scalars: Scalars, u: Float[Array, " d"], x: Float[Array, " d"]) -> Float[Array, ""]:
     """Return log g(y| x) - log g(y| u) for scalar observations, counted from ξ' like the points."""
     log_change = jnp.zeros((), u.dtype)
     for row, value, variance, is_seen in zip(*scalars, strict=True):
