@@ -11,8 +11,14 @@ target over its density under the proposal,
     w = p_{N-1}(b| x_{N-1}) Π_{i<N-1} p_i(x_{i+1}| x_i) / q_i(x_{i+1}| x_i).
 
 Hence E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b], exactly for the target chain. For the diffusion the
-discretisation error of the target remains: O(δ), or O(δ²) with `ItoTaylorDensity`. Guided proposals
-need no stationary law.
+discretisation error of the target remains: O(δ), or O(δ²) with `ItoTaylorDensity` and
+`QuadraticDensity`. Guided proposals need no stationary law.
+
+*Steps that are not normal.* If only weights are needed, the target of a state-dependent σ has steps
+of weak order 2, which are maps of normal noise (`QuadraticDensity`). Then p_i and q_i are the laws
+of the normal part of a step, and x_{i+1} is a function of that part (`StepLaw.bent`). The weight is
+a ratio of densities of the noise, so this function needs no inverse. The end b needs a density of
+x_N itself. There the last step is split, and its last part is an Euler step of about T/N².
 
 *Discretisation error.* A path is a function of the noise ξ_i of its steps. Half as many steps with
 other noise give another path. For a state-dependent σ, and if only weights are needed, the error is
@@ -279,7 +285,7 @@ class _Lanes:
         with_coarse: bool = False,
     ):
         start, end, _ = intervals
-        fractions, coarse_points = _points(proposal, dynamics, num_steps)
+        fractions, coarse_points = _points(proposal, num_steps)
         guide, dt, remaining = _grid(proposal, dynamics, intervals, fractions)
         coarse, self._coarse_dt = None, None
         if with_coarse:
@@ -635,7 +641,7 @@ def _grid(
 
 
 def _points(
-    proposal: AbstractGuidedProposal, dynamics: Dynamics, num_steps: int
+    proposal: AbstractGuidedProposal, num_steps: int
 ) -> tuple[Float[np.ndarray, " points"], list[int]]:
     """Return the fractions of the time that remains, and which of them are points of the grid of
     half as many steps.
@@ -675,9 +681,9 @@ def _coarse_grid(
     number = np.arange(len(fractions) - 2)
     which = np.minimum(np.searchsorted(last, number + 1), num_inner - 1)
     ends = np.isin(number + 1, last)
-    steps = (guide, dt[:-1], remaining[:-1], jnp.asarray(share, dt.dtype))
-    steps = jax.tree.map(lambda leaf: leaf[which], steps)
-    return _CoarseSteps(*steps, jnp.asarray(ends)), dt[-1]
+    each = (guide, dt[:-1], remaining[:-1], jnp.asarray(share, dt.dtype))
+    guide, dt_inner, remaining, share = jax.tree.map(lambda leaf: leaf[which], each)
+    return _CoarseSteps(guide, dt_inner, remaining, share, jnp.asarray(ends)), dt[-1]
 
 
 def deterministic_path(

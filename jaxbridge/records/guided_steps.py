@@ -152,6 +152,7 @@ def guided_law(law: StepLaw | DegenerateLaw, guide: Guide, scalars: Scalars | No
     log_seen, seen = jnp.zeros((), law.mean.dtype), []
     if scalars is not None:
         step, log_seen, seen = given(step, scalars)
-    bends = isinstance(law, StepLaw) and law.curvature is not None
-    quadratic = (law, scalars) if bends else None
+    quadratic = None
+    if isinstance(law, StepLaw) and law.curvature is not None:
+        quadratic = law, scalars
     return GuidedLaw(guide.next_point, tilted(step, guide.next_h), log_seen, seen, quadratic)

@@ -215,7 +215,7 @@ def test_paths_that_leave_the_state_space_are_misses_and_counted():
         1.0,
         num_proposals=2000,
         num_steps=20,
-        proposal=jb.ModifiedDiffusionBridge(),
+        proposal=jb.ModifiedDiffusionBridge(jb.EulerDensity()),
     )
     assert guided.num_nonfinite > 10 and np.isfinite(guided.value)
 
