@@ -71,7 +71,9 @@ CLAIMS = {
         and bool(page["paths"].trustworthy)
     ),
     "nuts": lambda page: (
-        covers(page["draws"]["log_noise"], -1) and page["smoothed"].shape == (500, 39, 1)
+        covers(np.log(page["draws"]["sigma_1"]), np.log(0.7))
+        and covers(page["logs"]["sigma"], 0)
+        and page["smoothed"].shape == (1200, 39, 1)
     ),
     "pandas_and_dates": lambda page: (
         list(page["times"]) == [0, 1, 3, 4, 8, 9] and str(page["grid"][-1])[:10] == "2024-03-10"
@@ -81,6 +83,10 @@ CLAIMS = {
         and page["curves"][0].mean().shape == (71, 1)
     ),
     "progress": lambda page: bool(page["bridges"].met.all()),
+    "rare_transitions": lambda page: all(
+        abs(page["densities"][name].value + 3.018) < 0.3 for name in ("drift and pull", "coupling")
+    )
+    and abs(page["mean"] - 2) < 5 * page["error"] < 2,
     "saving": lambda page: page["draws"].shape == (1500, 1) and page["state"].num_done == 1500,
     "several_devices": lambda page: bool(page["bridges"].met.all()),
     "several_records": lambda page: max(page["values_at"], key=page["values_at"].get) == 0.0,

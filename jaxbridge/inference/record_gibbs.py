@@ -91,7 +91,8 @@ class RecordPosterior(AbstractPosterior):
 
     - `params`: all parameters of the model, each with leading axes (*chains, n).
     - `theta`: the unknown parameters as vectors, shape (*chains, n, p).
-    - `names`: names of the entries of θ.
+    - `names`: names of the entries of θ, for instance "alpha" or "B[0,1]". The keys of a dictionary
+        are in alphabetical order.
     - `parameters_moved`: whether θ moved, shape (*chains, n).
     - `blocks_moved`: fraction of the blocks of the path that moved, shape (*chains, n).
     - `stuck`: whether some block never moved, shape (*chains). Then the draws do not represent the
