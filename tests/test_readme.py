@@ -83,10 +83,13 @@ CLAIMS = {
         and page["curves"][0].mean().shape == (71, 1)
     ),
     "progress": lambda page: bool(page["bridges"].met.all()),
-    "rare_transitions": lambda page: all(
-        abs(page["densities"][name].value + 3.018) < 0.3 for name in ("drift and pull", "coupling")
-    )
-    and abs(page["mean"] - 2) < 5 * page["error"] < 2,
+    "rare_transitions": lambda page: (
+        all(
+            abs(page["densities"][name].value + 3.018) < 0.3
+            for name in ("drift and pull", "coupling")
+        )
+        and abs(page["mean"] - 2) < 5 * page["error"] < 2
+    ),
     "saving": lambda page: page["draws"].shape == (1500, 1) and page["state"].num_done == 1500,
     "several_devices": lambda page: bool(page["bridges"].met.all()),
     "several_records": lambda page: max(page["values_at"], key=page["values_at"].get) == 0.0,
