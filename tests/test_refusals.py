@@ -493,6 +493,8 @@ EXACT = [
     # Diagnostics.
     ("draws", of(jb.effective_sample_size)("many"), "`draws`", TypeError),
     ("few draws", of(jb.effective_sample_size)([1.0, 2.0]), "at least 4"),
+    ("one chain", of(jb.effective_sample_size)(np.ones(9), chains=True), "(chains, n, ...)"),
+    ("chains", of(jb.effective_sample_size)(np.ones((2, 9)), chains=2), "`True`", TypeError),
     ("draws", of(jb.potential_scale_reduction)("many"), "`", TypeError),
     ("few draws", of(jb.potential_scale_reduction)(np.ones((4, 3, 2))), "at least 4 draws"),
 ]

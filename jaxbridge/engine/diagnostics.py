@@ -1,6 +1,7 @@
 """Diagnostics of Markov chains: effective sample sizes and potential scale reduction."""
 
 import math
+import reprlib
 
 import jax
 import jax.numpy as jnp
@@ -11,12 +12,16 @@ from .entry import public_entry
 
 
 @public_entry
-def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
-    """Estimate the effective sample size of one chain, n / (1 + 2 Σ_t ρ_t).
+def effective_sample_size(draws: Numbers, *, chains: bool = False) -> Float[Array, "..."]:
+    """Estimate the effective sample size of one chain, n / (1 + 2 Σ_t ρ_t), or of several.
 
     The sum runs over the initial sequence of lags whose adjacent pairs of autocorrelations ρ_t have
     positive sums, and these sums are made non-increasing (Geyer 1992). The result is NaN where a
     draw is NaN, and 1 for a constant chain.
+
+    With `chains=True` the result is that of all chains together. Correlations are then relative to
+    the variance of all draws (Vehtari et al. 2021), so chains that disagree have a small effective
+    sample size. Neither a sum over the chains nor one long chain of all draws shows this.
 
     **Example:**
 
@@ -25,12 +30,20 @@ def effective_sample_size(draws: Numbers) -> Float[Array, "..."]:
     jb.effective_sample_size(draws)  # shape (2,)
     ```
 
-    **Arguments:** `draws`: one chain of at least 4 draws, shape (n, ...).
+    **Arguments:**
+
+    - `draws`: one chain of at least 4 draws, shape (n, ...), or several, shape (chains, n, ...).
+    - `chains`: whether the first axis is that of several chains, as in `potential_scale_reduction`.
 
     **Returns:** effective sample sizes, shape (...).
 
-    **Raises:** `ValueError` for fewer than 4 draws.
+    **Raises:** `ValueError` for fewer than 4 draws in a chain, `TypeError` unless `chains` is true
+    or false.
     """
+    if not isinstance(chains, bool):
+        raise TypeError(f"`chains` must be `True` or `False`; got {reprlib.repr(chains)}.")
+    if chains:
+        return effective_size_of_chains(_as_chains(draws))
     draws = as_floating("draws", draws)
     if draws.ndim == 0 or draws.shape[0] < 4:
         raise ValueError(
@@ -115,13 +128,21 @@ def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
 
     **Raises:** `ValueError` for fewer than 4 draws in each chain.
     """
+    return _potential_scale_reduction(_as_chains(draws))
+
+
+def _as_chains(draws: Numbers) -> Float[Array, "chains n ..."]:
+    """Convert draws of several chains to floating point numbers.
+
+    **Raises:** `ValueError` for fewer than 4 draws in each chain.
+    """
     draws = as_floating("draws", draws)
-    if draws.ndim < 2 or draws.shape[1] < 4:
+    if draws.ndim < 2 or draws.shape[0] < 1 or draws.shape[1] < 4:
         raise ValueError(
             "`draws` must be chains of at least 4 draws each, shape (chains, n, ...); got shape "
             f"{draws.shape}."
         )
-    return _potential_scale_reduction(draws)
+    return draws
 
 
 @jax.jit

@@ -31,18 +31,21 @@ SCORES = ndtri(LEVELS)  # the same quantiles of N(0, 1)
 
 
 def paths_in_space(
-    times: Float[Reals, " K"],
+    times: Float[Reals, " K"] | None,
     paths: Float[Reals, "n K 2"],
     ax: Axes | None = None,
     num_paths: int = 3,
 ) -> Axes:
-    """Plot a few two-dimensional bridges in space, with time upwards (the paper's first figure).
+    """Plot a few two-dimensional bridges in the plane, or in space with time upwards.
+
+    With `times` the picture has three axes: both coordinates, and time upwards (the paper's first
+    figure). With `times=None` it has the two coordinates only. Dots mark both end points.
 
     **Arguments:**
 
     - `times`, `paths`: shapes (K,) and (n, K, 2), as returned by `sample_bridges`. Bridges that
         were not found (NaN) are left out.
-    - `ax`: axes created with `projection="3d"`; by default new ones.
+    - `ax`: axes; by default new ones. With `times` they need `projection="3d"`.
     - `num_paths`: number of paths to draw, the first ones.
 
     **Returns:** the axes.
@@ -54,29 +57,45 @@ def paths_in_space(
 
     ```python
     plot.paths_in_space(bridges.times, bridges.paths)
+    plot.paths_in_space(None, bridges.paths)  # in the plane
     ```
     """
+    paths, _ = finite_paths(paths)
+    if paths.shape[-1] != 2:
+        raise ValueError(f"`paths` must have two coordinates; got shape {paths.shape}.")
+    if times is None:
+        return _draw_paths(axes_or_new(ax), paths, num_paths)
     space = axes_or_new(ax, projection="3d")
     if not isinstance(space, Axes3D):
         raise TypeError(
             '`ax` must be made with `projection="3d"`; got two-dimensional axes. Use '
-            '`plt.subplots(subplot_kw={"projection": "3d"})`.'
+            '`plt.subplots(subplot_kw={"projection": "3d"})`, or `times=None` for a picture in the '
+            "plane."
         )
-    times, (paths, _) = np.asarray(times, float), finite_paths(paths)
-    if paths.shape[-1] != 2:
-        raise ValueError(f"`paths` must have two coordinates; got shape {paths.shape}.")
-    for i, path in enumerate(paths[:num_paths]):
-        space.plot(*path.T, times, color=COLOURS[i % len(COLOURS)], linewidth=0.9)
-    # All bridges share both end points, so one path suffices.
-    for end in (0, -1):
-        space.plot(*paths[:1, end].T, times[end], "o", color=EXACT, markersize=4)
-    space.set(xlabel="$Z^{(1)}$", ylabel="$Z^{(2)}$")
+    upwards = np.broadcast_to(np.asarray(times, float)[:, None], (*paths.shape[:2], 1))
+    _draw_paths(space, np.concatenate([paths, upwards], axis=-1), num_paths)
     space.set_title("time upwards", fontsize="small")
     space.tick_params(labelsize="x-small", pad=0)
     space.locator_params(nbins=4)
     space.set_box_aspect((1, 1, 1.6))
     space.view_init(elev=15, azim=-55)
     return space
+
+
+def _draw_paths(ax: Axes, paths: Float[Reals, "n K axes"], num_paths: int) -> Axes:
+    """Draw the first paths with their end points, and label both coordinates."""
+    for i, path in enumerate(paths[:num_paths]):
+        ax.plot(*path.T, color=COLOURS[i % len(COLOURS)], linewidth=0.9)
+    # All bridges share both end points, so one path suffices.
+    for end in (0, -1):
+        ax.plot(*paths[:1, end].T, "o", color=EXACT, markersize=4)
+    ax.set(xlabel=_label(0, 2), ylabel=_label(1, 2))
+    return ax
+
+
+def _label(coordinate: int, d: int, time: str = "") -> str:
+    """Return the label of a coordinate of the state, without an index if there is only one."""
+    return f"$X^{{({coordinate + 1})}}{time}$" if d > 1 else f"$X{time}$"
 
 
 def _numbers_or_dates(times: Reals) -> np.ndarray:
@@ -95,6 +114,7 @@ def bridge_fan(
     weights: Float[Reals, " n"] | None = None,
     data: tuple[Reals, Float[Reals, " m"]] | None = None,
     data_sd: Number | Float[Reals, " m"] = 0.0,
+    truth: tuple[Reals, Float[Reals, " m"]] | None = None,
 ) -> Axes:
     """Plot one coordinate of many bridges or smoothed paths.
 
@@ -116,6 +136,8 @@ def bridge_fan(
         values.
     - `data_sd`: standard deviation of the observation noise. Error bars extend two standard
         deviations to either side.
+    - `truth`: pair of times and values of this coordinate on the true path, if it is known. It is
+        drawn as a line.
 
     **Returns:** the axes.
 
@@ -162,7 +184,11 @@ def bridge_fan(
         ax.errorbar(
             data_times, observed, error if np.any(error > 0) else None, label="observed", **style
         )
-    ax.set(xlabel="time", ylabel=f"$Z^{{({coordinate + 1})}}_t$", xlim=(times[0], times[-1]))
+    if truth is not None:
+        style = {"color": COLOURS[2], "linewidth": 1.2, "zorder": 3}
+        ax.plot(_numbers_or_dates(truth[0]), np.asarray(truth[1], float), label="truth", **style)
+    label = _label(coordinate, paths.shape[-1], "_t")
+    ax.set(xlabel="time", ylabel=label, xlim=(times[0], times[-1]))
     return finish(ax)
 
 

@@ -51,7 +51,8 @@ def test_chains_that_disagree_are_worth_few_draws():
     for i in range(1, 2000):
         draws[:, i] = 0.7 * draws[:, i - 1] + noise[:, i]
     together = jnp.asarray(draws, jnp.float32)
-    made = effective_size_of_chains(together)
+    made = jb.effective_sample_size(together, chains=True)
+    np.testing.assert_array_equal(made, effective_size_of_chains(together))
     np.testing.assert_allclose(made, 8000 * 0.3 / 1.7, rtol=0.15)
     other = blackjax.diagnostics.effective_sample_size(together)
     np.testing.assert_allclose(made, other, rtol=0.05)

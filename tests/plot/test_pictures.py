@@ -58,6 +58,25 @@ def test_paths_in_space_go_up_from_start_to_end():
     np.testing.assert_array_equal(lines[3], [[*paths[1, -1], 2.0]])
 
 
+def test_paths_in_the_plane_have_no_time():
+    paths = np.random.default_rng(0).normal(size=(4, 5, 2))
+    ax = plot.paths_in_space(None, paths, num_paths=2)
+    lines = [np.stack(line.get_data(), -1) for line in ax.lines]
+    for line, path in zip(lines, [*paths[:2], paths[0, :1], paths[0, -1:]], strict=True):
+        np.testing.assert_array_equal(line, path)
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$X^{(1)}$", "$X^{(2)}$")
+
+
+def test_true_paths_are_lines_and_axes_are_those_of_the_state():
+    times, values = np.linspace(0, 1, 3), np.random.default_rng(0).normal(size=(101, 3, 2))
+    truth = np.linspace(0, 1, 5), np.arange(5.0)
+    ax = plot.bridge_fan(times, values[..., :1], num_paths=0, truth=truth)
+    (line,) = (line for line in ax.lines if line.get_label() == "truth")
+    np.testing.assert_array_equal(line.get_data(), truth)
+    assert ax.get_ylabel() == "$X_t$"
+    assert plot.bridge_fan(times, values, coordinate=1).get_ylabel() == "$X^{(2)}_t$"
+
+
 def test_bands_are_quantiles_of_the_bridges_that_were_found():
     times, values = np.linspace(0, 1, 3), np.random.default_rng(0).normal(size=(101, 3, 2))
     values[5] = np.nan
@@ -137,7 +156,7 @@ def test_figures_render(tmp_path):
     for coordinate, ax in enumerate(overview.axes[1:]):
         median = next(line for line in ax.lines if line.get_label() == "exact").get_ydata()
         np.testing.assert_allclose(median[[0, -1]], [0.0, 1.0], atol=1e-5)
-        assert ax.get_ylabel() == f"$Z^{{({coordinate + 1})}}_t$"
+        assert ax.get_ylabel() == f"$X^{{({coordinate + 1})}}_t$"
     law = jb.GaussianLaw(exact.mean[25], exact.covariance[25])
     panels = study_figures.margins_and_copula(
         {"bridges": np.asarray(bridges.paths[:, 25])}, law, "title"
