@@ -98,6 +98,10 @@ CLAIMS = {
     "unknown_sigma": lambda page: (
         covers(page["posterior"].params["sigma"], 0.5) and covers(page["drift_posterior"].params, 1)
     ),
+    "write_a_proposal": lambda page: all(
+        abs(density.value + 4.126) < 5 * density.standard_error < 0.5
+        for density in page["densities"].values()
+    ),
 }
 
 
@@ -143,7 +147,7 @@ def test_every_task_has_code():
     assert len(SHAPES) == len(CODE[README])
     assert {page.stem for page, blocks in CODE.items() if blocks} == set(CLAIMS)
     tasks = [page for page in PAGES if page.parent.name == "howto" and page.stem != "index"]
-    assert len(tasks) >= 19 and all(CODE[page] for page in tasks)
+    assert len(tasks) >= 21 and all(CODE[page] for page in tasks)
 
 
 def test_readme_is_short_and_names_the_two_commands():
