@@ -40,7 +40,8 @@ _LONGEST_STEP = 1.0
 _MATTERS = 0.05
 # What rounding adds to log p is no matter below this.
 _FELT = 1e-3
-_SHORTER = "Use more `num_steps`; for stiff drift use the scheme `SemiImplicit()`."
+_SHORTER = "Use more steps (`num_steps`, or a smaller `step_size`)."
+_FOR_COUPLINGS = " For stiff drift use the scheme `SemiImplicit()` of the coupling."
 _TOO_LARGE = (
     "The discretisation error (`step_error`) exceeds the standard error and 0.05 (of a log "
     f"density, or of a standard deviation). {_SHORTER}"
@@ -51,18 +52,19 @@ _TOO_LONG = (
 )
 _TOO_LONG_OR_VARYING_SIGMA = (
     "The discretisation error is unknown. Either steps are longer than the relaxation time of the "
-    "drift: use more `num_steps`, and for stiff drift the scheme `SemiImplicit()`. Or σ depends on "
-    "the state: then couplings have no estimate, so run two grids and `extrapolate`."
+    "drift: use more `num_steps`, and for stiff drift the scheme `SemiImplicit()` of the coupling. "
+    "Or σ depends on the state: then couplings have no estimate, so run two grids and "
+    "`extrapolate`."
 )
 _NO_ESTIMATE = (
     "The discretisation error is unknown (`step_error` is NaN). There is no estimate for a single "
     "step, for fewer than ten draws, or for steps so long that half as many give a very different "
-    "law. Use more `num_steps`."
+    f"law. {_SHORTER}"
 )
 _NO_COMPARISON = (
     "The discretisation error is unknown (`step_uncertainty` is infinite): results for half as "
-    "many steps differ too much, or too few paths carry weight. Use more `num_steps`; for a small "
-    "effective sample size use more proposals, particles or draws, too."
+    f"many steps differ too much, or too few paths carry weight. {_SHORTER} For a small effective "
+    "sample size use more proposals, particles or draws, too."
 )
 _TOO_UNCERTAIN = (
     "The estimate of the discretisation error is too uncertain: `step_uncertainty` exceeds three "
@@ -229,16 +231,17 @@ def step_faults(
     present = dominates(error, standard_error) & ~((size <= floor) & (doubt <= floor))
     values = jnp.broadcast_arrays(present, error.value, doubt, standard_error)[1:]
     detail = "the estimate is {:.2g} ± {:.1g}, and the standard error {:.2g}"
+    too_large = _TOO_LARGE + _FOR_COUPLINGS if coupled else _TOO_LARGE
     cases = (
         (jnp.isnan(size) & jnp.isinf(doubt), _TOO_LONG_OR_VARYING_SIGMA if coupled else _TOO_LONG),
         (jnp.isnan(size), _NO_ESTIMATE),
         (~jnp.isfinite(doubt), _NO_COMPARISON),
-        (size > jnp.maximum(standard_error, 2 * doubt), _TOO_LARGE),
+        (size > jnp.maximum(standard_error, 2 * doubt), too_large),
         (jnp.ones_like(present), _TOO_UNCERTAIN),
     )
     faults = []
     for case, sentence in cases:
-        has_numbers = sentence in (_TOO_LARGE, _TOO_UNCERTAIN)
+        has_numbers = sentence in (too_large, _TOO_UNCERTAIN)
         numbers = (detail, tuple(values)) if has_numbers else ("", ())
         faults.append(Fault(present & case, sentence, *numbers))
         present &= ~case

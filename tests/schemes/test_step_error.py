@@ -242,6 +242,8 @@ def test_faults_are_step_errors_that_matter(value, uncertainty, sd, expected):
     for coupled in (False, True):
         why = Verdict(step_faults(error, jnp.asarray(0.0), sd, coupled=coupled)).why()
         assert expected in why and "\n" not in why
+        has_scheme = coupled and ("exceeds the standard" in expected or "longer" in expected)
+        assert ("SemiImplicit" in why) == has_scheme
         assert ("`extrapolate`" in why) == (coupled and np.isnan(value) and np.isinf(uncertainty))
 
 
