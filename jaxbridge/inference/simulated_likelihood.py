@@ -103,7 +103,7 @@ def as_pulled(
     """
     if isinstance(proposal, str) and proposal == "auto":
         proposal = choice_between(guided_candidates(), budget, left_out=_NO_DERIVATIVE)
-    given = as_proposal(proposal, model, like, budget)
+    given = as_proposal(proposal, model, like, budget, for_density=True)
     if given.coupled:
         raise ValueError(
             f"{_NO_DERIVATIVE}. Use a guided proposal, such as `Guided()` or "
@@ -118,7 +118,7 @@ def pulled_blocks(
     """The blocks with one proposal each, for derivatives of a choice between several run each for
     all intervals: that which leaves the least variance in all at this model, or, where the user has
     chosen interval by interval, a block for each."""
-    blocks = make_blocks(key, model, problem, proposal, Budget(), "weights")
+    blocks = make_blocks(key, model, problem, proposal, Budget(), "density")
     if proposal.is_open:
         return tuple(_decided(block) for block in blocks)
     return tuple(single for block in blocks for single in _split(block))

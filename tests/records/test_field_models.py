@@ -128,7 +128,9 @@ def bootstrap_filter(key, values, num_particles):
 
 @pytest.mark.slow
 def test_the_likelihood_of_populations_is_that_of_a_bootstrap_filter():
+    """Of the same Euler steps."""
     (model, times, observations), options = populations()
+    options = options | {"density": jb.EulerDensity()}
     made = jb.log_likelihood(
         jax.random.key(0), model, times, observations, num_particles=100, **options
     )
