@@ -237,7 +237,7 @@ def test_exploding_proposals_are_rejected_and_counted():
 def test_throw():
     arguments = (jax.random.key(0), paper_model(), [9.0, 9.0], [-9.0, -9.0], 0.01)
     settings = dict(num_steps=5, max_proposals=10, throw=True)
-    with pytest.raises(RuntimeError, match="no pair met.* Use more `max_proposals`"):
+    with pytest.raises(RuntimeError, match=r"no pair met.* Use more `max_proposals`"):
         jax.block_until_ready(jb.sample_bridges(*arguments, **settings))
 
 
