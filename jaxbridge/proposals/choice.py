@@ -1,7 +1,7 @@
 """A separate proposal for each interval: the result of "auto" and of `choose_proposal`.
 
-The module has the criterion of the choice, too: effective samples per second, with penalties for
-discretisation errors and for heavy tails.
+The module also defines the criterion of the choice: effective samples per second, reduced for
+discretisation errors and for heavy tails (`pilots` explains the formulas).
 """
 
 import dataclasses
@@ -21,15 +21,16 @@ from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from .base import AbstractSingleProposal, AbstractWeightedProposal, WeightedPaths
 
-# W, in units of a modified diffusion bridge's paths.
+# W of `pilots`, in paths of the cheapest candidate.
 _WORK = 10_000
-# What weights of heavy tails are worth beside others.
-_HEAVY = 1e-6
-# Above this share of effective paths, as foreseen for a larger sample, no tail is of account.
+# Factor on the rate of heavy-tailed weights: they rank last, but remain ordered among themselves.
+_HEAVY_TAIL_FACTOR = 1e-6
+# Above this extrapolated share of effective paths the weights are nearly equal. Then their tail
+# does not matter, and k̂ of a small pilot run is mostly noise.
 _NEARLY_EQUAL = 0.9
-# Each candidate in use is compiled, in pilot runs and runs: one that is worth less than this share
-# of the work on all intervals is left out.
-_SPARED = 0.05
+# Each candidate in use costs a compilation, in pilot runs and in runs. A candidate is omitted if
+# this increases the total work by at most this share.
+_TOLERATED_LOSS = 0.05
 
 
 class Choice(AbstractWeightedProposal):
@@ -78,7 +79,9 @@ class Choice(AbstractWeightedProposal):
         return None
 
     def describe(self):
-        return "a choice between " + ", ".join(each.describe() for each in self.candidates)
+        return "a choice between " + ", ".join(
+            candidate.describe() for candidate in self.candidates
+        )
 
     def fractions(self, num_steps):
         return self.candidates[0].fractions(num_steps)
@@ -88,9 +91,9 @@ class Choice(AbstractWeightedProposal):
             index_without_compiling(leaf, (..., which))
             for leaf in (self.seconds, self.efficiency, self.step_error, self.pareto_k, self.chosen)
         )
-        told = (seconds, efficiency, step_error, shape, chosen)
+        results = (seconds, efficiency, step_error, shape, chosen)
         used = self.used if is_traced(chosen) else tuple(np.unique(chosen).tolist())
-        return Choice(self.candidates, *told, used, self.left_out)
+        return Choice(self.candidates, *results, used, self.left_out)
 
     def for_model(self, model, like, for_density=False):
         candidates = tuple(
@@ -103,8 +106,8 @@ class Choice(AbstractWeightedProposal):
             candidate.check(model, intervals)
         if self.chosen.shape != intervals.duration.shape:
             raise ValueError(
-                f"this choice is one for {self.chosen.shape[0]} intervals, but there are "
-                f"{len(intervals.duration)}: call `choose_proposal` with the same intervals."
+                f"this result of `choose_proposal` is for {self.chosen.shape[0]} intervals; got "
+                f"{len(intervals.duration)} intervals: call `choose_proposal` with these."
             )
 
     def check_prepared(self, model):
@@ -115,7 +118,9 @@ class Choice(AbstractWeightedProposal):
         return self
 
     def step_share(self, model, intervals):
-        shares = jnp.stack([each.step_share(model, intervals) for each in self.candidates])
+        shares = jnp.stack(
+            [candidate.step_share(model, intervals) for candidate in self.candidates]
+        )
         return jnp.take_along_axis(shares, self.chosen[None], axis=0)[0]
 
     def draw(
@@ -131,43 +136,46 @@ class Choice(AbstractWeightedProposal):
     ):
         draws = (keys, num_steps, stored, misses_count, active, progress_meter)
         if len(self.used) == 1:
-            return _draw_each((self, model, intervals), *draws)
+            return _draw_by_candidate((self, model, intervals), *draws)
         if self.coupled:
             fixed = nondifferentiable_choice((model, intervals))
-            return _draw_each((self, *fixed), *draws)
-        return _draw_pulled((self, model, intervals), *draws)
+            return _draw_by_candidate((self, *fixed), *draws)
+        return _draw_guided((self, model, intervals), *draws)
 
     def reweigh(self, keys, model, intervals, paths, active=None):
         def reweigh(candidate, active):
             return candidate.reweigh(keys, model, intervals, paths, active)
 
-        return self.of_each(reweigh, active)
+        return self.by_candidate(reweigh, active)
 
-    def of_each(
+    def by_candidate(
         self,
-        make: Callable[[AbstractSingleProposal, Bool[Array, " I"] | None], WeightedPaths],
+        evaluate: Callable[[AbstractSingleProposal, Bool[Array, " I"] | None], WeightedPaths],
         active: Bool[Array, " I"] | None,
     ) -> WeightedPaths:
-        """Combine the results of `make` for the candidate of each interval."""
+        """Return the results of `evaluate` for the candidate of each interval, as one batch."""
         if len(self.used) == 1:
-            return make(self.candidates[self.used[0]], active)
-        made = None
+            return evaluate(self.candidates[self.used[0]], active)
+        paths = None
         for i in self.used:
-            mine = self.chosen == i
-            mine = mine if active is None else mine & active
-            part = make(self.candidates[i], mine)
-            made = part if made is None else jax.tree.map(_pick(mine), part, made)
-        assert made is not None
-        return made
+            mask = self.chosen == i
+            mask = mask if active is None else mask & active
+            part = evaluate(self.candidates[i], mask)
+            paths = part if paths is None else jax.tree.map(_select(mask), part, paths)
+        assert paths is not None
+        return paths
 
     def for_all(self):
-        """Return the candidate with the least variance, Σ 1/(effective paths), at its cost."""
+        """Return the candidate with the least variance for equal work, summed over intervals.
+
+        The variance of an interval is 1 / (effective samples per second).
+        """
         rates = np.asarray(_presumed_rates(self), float)
         return self.candidates[int(np.argmin(np.sum(1 / np.maximum(rates, 1e-30), axis=1)))]
 
     def split(self):
-        mine = [(np.flatnonzero(np.asarray(self.chosen) == i), i) for i in self.used]
-        return [(which, self.candidates[i]) for which, i in mine if which.size > 0]
+        members = [(np.flatnonzero(np.asarray(self.chosen) == i), i) for i in self.used]
+        return [(which, self.candidates[i]) for which, i in members if which.size > 0]
 
     def __str__(self) -> str:
         reason = [f"couplings left out: {self.left_out}"] if self.left_out else []
@@ -183,22 +191,22 @@ class Choice(AbstractWeightedProposal):
         row = "{:<44}  {:>18}  {:>10}  {:>5}  {:>14}  {:>6}  {}"
         lines = [row.format(*head, "chosen for")]
         for i, candidate in enumerate(self.candidates):
-            known = ~np.isnan(efficiency[i])
-            seen = 4 * ["-"]
-            if known.any():
-                seen = [
-                    f"{np.median(efficiency[i, known]):.3g}",
-                    f"{np.median(np.abs(step_error[i, known])):.3g}",
+            piloted = ~np.isnan(efficiency[i])
+            cells = 4 * ["-"]
+            if piloted.any():
+                cells = [
+                    f"{np.median(efficiency[i, piloted]):.3g}",
+                    f"{np.median(np.abs(step_error[i, piloted])):.3g}",
                     "-" if np.isnan(shape[i]).all() else f"{np.nanmedian(shape[i]):.2f}",
-                    f"{np.median(rates[i, known] / best[known]):.2f}",
+                    f"{np.median(rates[i, piloted] / best[piloted]):.2f}",
                 ]
             cost = f"{np.median(seconds[i] / seconds[0]):.2f}"
             count = f"{np.sum(chosen == i)} of {len(chosen)}"
-            lines.append(row.format(candidate.describe(), *seen[:3], cost, seen[3], count))
+            lines.append(row.format(candidate.describe(), *cells[:3], cost, cells[3], count))
         return "\n".join([*lines, *reason])
 
 
-def _draw_each(
+def _draw_by_candidate(
     inputs: tuple[Choice, Diffusion, Intervals],
     keys: Key[Array, "I n"],
     num_steps: int,
@@ -207,129 +215,151 @@ def _draw_each(
     active: Bool[Array, " I"] | None,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> WeightedPaths:
-    """Each interval by its candidate, which is run for no other."""
+    """Draw the paths of each interval by its candidate; candidates skip other intervals."""
     choice, model, intervals = inputs
 
     def draw(candidate, active):
         arguments = (keys, model, intervals, num_steps, stored, misses_count, active)
         return candidate.draw(*arguments, progress_meter)
 
-    return choice.of_each(draw, active)
+    return choice.by_candidate(draw, active)
 
 
 @eqx.filter_custom_jvp
-def _draw_pulled(inputs: tuple[Choice, Diffusion, Intervals], *draws) -> WeightedPaths:
-    """`_draw_each` between proposals that are pulled to the end point, with derivatives."""
-    return _draw_each(inputs, *draws)
+def _draw_guided(inputs: tuple[Choice, Diffusion, Intervals], *draws) -> WeightedPaths:
+    """Draw like `_draw_by_candidate`, for guided proposals only, with derivatives."""
+    return _draw_by_candidate(inputs, *draws)
 
 
-@_draw_pulled.def_jvp
-def _draw_pulled_tangents(primals, tangents):
-    """Running a candidate for a few intervals only takes a loop of unknown length, which has no
-    reverse mode, so derivatives run each for all. In the place of an interval that is another's
-    stands one of its own: a masked 0 · ∞ from where a proposal does not serve would be NaN."""
+@_draw_guided.def_jvp
+def _draw_guided_tangents(primals, tangents):
+    """Return paths and log weights with their tangents, in a form that has a reverse mode.
+
+    Drawing on selected intervals needs a loop of unknown length, which has no reverse mode. Hence
+    derivatives run each candidate on all intervals and mask the results.
+    """
     inputs, keys, num_steps, stored, misses_count, active, _ = primals
-    drawn = _draw_pulled(*primals)
+    drawn = _draw_guided(*primals)
 
-    def again(inputs):
+    def redraw(inputs):
         choice, model, intervals = inputs
         total = None
         for i in choice.used:
-            mine = choice.chosen == i
-            mine = mine if active is None else mine & active
-            stand_in = jnp.where(mine, jnp.arange(len(mine)), jnp.argmax(mine))
-            each = jax.tree.map(lambda leaf, at=stand_in: leaf[at], intervals)
-            arguments = (keys[stand_in], model, each, num_steps, stored, misses_count)
-            made = choice.candidates[i].draw(*arguments)
-            masked = [
-                jnp.where(mine.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
-                for leaf in (made.paths, made.log_weights)
+            mask = choice.chosen == i
+            mask = mask if active is None else mask & active
+            # Intervals of other candidates are replaced by one of this candidate. Elsewhere its
+            # results may be infinite, and a masked 0 · ∞ would make the derivative NaN.
+            stand_in = jnp.where(mask, jnp.arange(len(mask)), jnp.argmax(mask))
+            block = jax.tree.map(lambda leaf, at=stand_in: leaf[at], intervals)
+            arguments = (keys[stand_in], model, block, num_steps, stored, misses_count)
+            weighted = choice.candidates[i].draw(*arguments)
+            parts = [
+                jnp.where(mask.reshape(-1, *[1] * (leaf.ndim - 1)), leaf, 0)
+                for leaf in (weighted.paths, weighted.log_weights)
             ]
-            total = masked if total is None else [a + b for a, b in zip(total, masked, strict=True)]
+            total = parts if total is None else [a + b for a, b in zip(total, parts, strict=True)]
         assert total is not None
         return tuple(total)
 
-    _, (paths, log_weights) = eqx.filter_jvp(again, (inputs,), (tangents[0],))
+    _, (paths, log_weights) = eqx.filter_jvp(redraw, (inputs,), (tangents[0],))
     return drawn, WeightedPaths(paths, log_weights, *6 * [None])  # pyright: ignore
 
 
-def _pick(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
+def _select(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
     return lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
 def best_at_worst(choice: Choice, num: int) -> Choice:
-    """One way for each of the groups of `num` intervals that follow each other: that which is best
-    where it is worst. For chains in which end points move, whose pilot runs were from several."""
+    """Return one candidate for each group of `num` successive intervals, by its worst rate.
+
+    Chains with moving end points use it: a group has the pilot runs of several end points of one
+    interval. The result has one interval per group.
+    """
     worst = jnp.min(_presumed_rates(choice).reshape(len(choice.candidates), -1, num), axis=2)
     chosen = jnp.repeat(best_of_few(worst), num)
-    told = (choice.seconds, choice.efficiency, choice.step_error, choice.pareto_k)
-    whole = Choice(choice.candidates, *told, chosen, choice.used, choice.left_out)
-    return whole.of(np.arange(0, len(chosen), num))
+    results = (choice.seconds, choice.efficiency, choice.step_error, choice.pareto_k)
+    repeated = Choice(choice.candidates, *results, chosen, choice.used, choice.left_out)
+    return repeated.of(np.arange(0, len(chosen), num))
 
 
 def worth_a_pilot(potential: Float[Array, " I"], best: Float[Array, " I"]) -> Bool[Array, " I"]:
-    """On which intervals to try what could at most have this rate; on none where that would hardly
-    gain anything over all of them."""
+    """Return the mask of the intervals on which a candidate with these maximal rates needs a pilot.
+
+    The mask is empty if the candidate cannot reduce the work on all intervals by more than a small
+    share.
+    """
     gain = _loss(best, jnp.maximum(best, potential))
-    return (potential > best) & (gain > 1 + _SPARED)
+    return (potential > best) & (gain > 1 + _TOLERATED_LOSS)
 
 
 def best_of_few(rates: Float[Array, "C I"]) -> Int[Array, " I"]:
-    """The best candidate of each interval, among as few as hardly lose anything together: one after
-    the other is left out that the others replace best, of equals the last."""
+    """Return the best candidate of each interval, from a small set of candidates.
+
+    Starting from all candidates, the one with the smallest loss is removed, the last one of equals.
+    This repeats while the loss of the remaining set is tolerable.
+    """
     rates = jnp.where(jnp.isnan(rates), 0, rates)
     best, num = jnp.max(rates, axis=0), len(rates)
 
-    def loss(kept: Bool[Array, " C"]) -> Float[Array, ""]:
-        return _loss(jnp.max(jnp.where(kept[:, None], rates, 0), axis=0), best)
+    def loss(remaining: Bool[Array, " C"]) -> Float[Array, ""]:
+        return _loss(jnp.max(jnp.where(remaining[:, None], rates, 0), axis=0), best)
 
-    def leave_out(_, kept: Bool[Array, " C"]) -> Bool[Array, " C"]:
-        without = kept & ~jnp.eye(num, dtype=bool)
-        losses = jnp.where(kept, jax.vmap(loss)(without), jnp.inf)
-        least = num - 1 - jnp.argmin(losses[::-1])
-        return jnp.where(losses[least] <= 1 + _SPARED, without[least], kept)
+    def leave_out(_, remaining: Bool[Array, " C"]) -> Bool[Array, " C"]:
+        without = remaining & ~jnp.eye(num, dtype=bool)
+        losses = jnp.where(remaining, jax.vmap(loss)(without), jnp.inf)
+        cheapest = num - 1 - jnp.argmin(losses[::-1])
+        return jnp.where(losses[cheapest] <= 1 + _TOLERATED_LOSS, without[cheapest], remaining)
 
-    kept = lax.fori_loop(0, num - 1, leave_out, jnp.ones(num, bool))
-    return jnp.argmax(jnp.where(kept[:, None], rates, -1), axis=0).astype(jnp.int32)
+    remaining = lax.fori_loop(0, num - 1, leave_out, jnp.ones(num, bool))
+    return jnp.argmax(jnp.where(remaining[:, None], rates, -1), axis=0).astype(jnp.int32)
 
 
 def _loss(rates: Float[Array, " I"], best: Float[Array, " I"]) -> Float[Array, ""]:
-    """How many times as much work these rates take as the best: on an interval, in the mean; or on
-    all together, where hard ones count for more."""
-    some, rates = best > 0, jnp.maximum(rates, _least(rates))
-    each = jnp.mean(jnp.where(some, best / rates, 1))
-    work = jnp.sum(jnp.where(some, 1 / rates, 0))
-    least = jnp.sum(jnp.where(some, 1 / jnp.where(some, best, 1), 0))
-    return jnp.maximum(each, work / jnp.where(least > 0, least, 1))
+    """Return the work at these rates relative to that at the best rates, at least 1.
+
+    It is the larger of two values: the mean of the ratios over intervals, and the ratio of the sums
+    over intervals. Difficult intervals dominate the sums.
+    """
+    attainable, rates = best > 0, jnp.maximum(rates, _least(rates))
+    mean_ratio = jnp.mean(jnp.where(attainable, best / rates, 1))
+    work = jnp.sum(jnp.where(attainable, 1 / rates, 0))
+    least = jnp.sum(jnp.where(attainable, 1 / jnp.where(attainable, best, 1), 0))
+    return jnp.maximum(mean_ratio, work / jnp.where(least > 0, least, 1))
 
 
 def _presumed_rates(choice: Choice) -> Float[Array, "C I"]:
-    """Those of pilot runs; where a candidate had none no more than the best that had, and nothing
-    of a candidate that had none at all."""
+    """Return the rates of pilot runs, with presumed rates of intervals without a pilot run.
+
+    A candidate without a pilot run on an interval has the rate of its efficiency bound there, but
+    at most the best measured rate. A candidate without any pilot run has rate zero.
+    """
     rates = value_rates(choice.efficiency, choice.seconds, choice.step_error, choice.pareto_k)
-    known = ~jnp.isnan(rates)
-    bounds = jnp.array([each.efficiency_bound for each in choice.candidates], rates.dtype)
-    best = jnp.max(jnp.where(known, rates, 0), axis=0)
-    tried = jnp.any(known, axis=1, keepdims=True)
-    presumed = jnp.where(tried, jnp.minimum(bounds[:, None] / choice.seconds, best), 0)
-    return jnp.where(known, rates, presumed)
+    measured = ~jnp.isnan(rates)
+    bounds = jnp.array([candidate.efficiency_bound for candidate in choice.candidates], rates.dtype)
+    best = jnp.max(jnp.where(measured, rates, 0), axis=0)
+    has_pilot = jnp.any(measured, axis=1, keepdims=True)
+    presumed = jnp.where(has_pilot, jnp.minimum(bounds[:, None] / choice.seconds, best), 0)
+    return jnp.where(measured, rates, presumed)
 
 
 def _least(rates: Float[Array, " I"]) -> float:
     return float(jnp.finfo(rates.dtype).tiny)
 
 
-@jax.jit  # one program where it is called outside of any
+@jax.jit  # outside of `jit` this is one program instead of one per operation
 def value_rates(
     efficiency: Float[Array, "*C I"],
     seconds: Float[Array, "*C I"],
     step_error: Float[Array, "*C I"],
     shape: Float[Array, "*C I"],
 ) -> Float[Array, "*C I"]:
-    """Effective samples per second after the deductions for step errors and heavy tails. (Of
-    weights that are nearly equal k̂ of a small pilot run is a matter of chance.)"""
+    """Return effective samples per second, reduced for discretisation errors and heavy tails.
+
+    The formula is in the docstring of `pilots`. `shape` is k̂.
+    """
     cheapest = jnp.min(seconds, axis=0) if seconds.ndim == 2 else 1.0
     rate = efficiency / seconds
+    # W is `_WORK * cheapest` seconds.
     rate /= 1 + _WORK * cheapest * rate * step_error**2
     light = is_reliable(shape) | jnp.isnan(shape) | (efficiency > _NEARLY_EQUAL)
-    return rate * jnp.where(light, 1, _HEAVY)
+    return rate * jnp.where(light, 1, _HEAVY_TAIL_FACTOR)
