@@ -239,7 +239,7 @@ def _draw_guided_tangents(primals, tangents):
     derivatives run each candidate on all intervals and mask the results.
     """
     inputs, keys, num_steps, stored, misses_count, active, _ = primals
-    drawn = _draw_guided(*primals)
+    primal_out = _draw_guided(*primals)
 
     def redraw(inputs):
         choice, model, intervals = inputs
@@ -262,7 +262,7 @@ def _draw_guided_tangents(primals, tangents):
         return tuple(total)
 
     _, (paths, log_weights) = eqx.filter_jvp(redraw, (inputs,), (tangents[0],))
-    return drawn, WeightedPaths(paths, log_weights, *6 * [None])  # pyright: ignore
+    return primal_out, WeightedPaths(paths, log_weights, *6 * [None])  # pyright: ignore
 
 
 def _select(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
