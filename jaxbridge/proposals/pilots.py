@@ -55,21 +55,26 @@ from ..schemes import guessed
 from .base import AbstractSingleProposal
 from .choice import Choice, best_of_few, value_rates, worth_a_pilot
 
-# A pilot run draws about so many paths of each candidate in all, and so many of each interval.
+# Paths of a candidate's pilot run: in all, and the range per interval.
 _PILOT_PATHS = 4_096
 _PILOT_RANGE = (32, 512)
-# Of fewer paths k̂ is a matter of chance: of many intervals some would seem to have heavy tails.
+# With fewer paths k̂ is mostly noise: among many intervals some would seem to have heavy tails.
 _FEWEST_FOR_TAIL = 128
-# With fewer effective paths a rate is a matter of chance, and a coupling's pilot run is repeated
-# up to so often.
+# With fewer effective paths a rate is mostly noise. Then the pilot run of a coupling is repeated,
+# at most this number of times.
 _FEWEST_EFFECTIVE, _MOST_REPEATS = 5, 16
-# The rule for seconds may be wrong by this factor.
-_CONTENDS = 3.0
+# The rule for seconds may be wrong by this factor. Only candidates that are within it of the best
+# rate are timed.
+_RULE_ACCURACY = 3.0
 
 
-class _Seen(NamedTuple):
-    """What a pilot run shows: the first three as the fields of a `Choice`, the paths that were
-    simulated, and the logs of the sums of weights and of their squares."""
+class _PilotResult(NamedTuple):
+    """Results of a pilot run, for each interval.
+
+    - `efficiency`, `step_error`, `pareto_k`: as in `Choice`; NaN for inactive intervals.
+    - `num_simulated`: number of simulated paths.
+    - `log_sum`, `log_squares`: logs of the sums of the weights and of their squares.
+    """
 
     efficiency: Float[Array, " I"]
     step_error: Float[Array, " I"]
@@ -79,17 +84,23 @@ class _Seen(NamedTuple):
     log_squares: Float[Array, " I"]
 
 
-def _rate(seen: _Seen, seconds: Float[Array, "..."]) -> Float[Array, "..."]:
-    return value_rates(seen.efficiency, seconds, seen.step_error, seen.pareto_k)
+def _rate(result: _PilotResult, seconds: Float[Array, "..."]) -> Float[Array, "..."]:
+    return value_rates(result.efficiency, seconds, result.step_error, result.pareto_k)
 
 
 class _Pilot(NamedTuple):
-    """A candidate, prepared; its pilot run with a key on active intervals, if there was one, and
-    what that gave; and the seconds per path that it should take."""
+    """Candidate with its pilot run.
+
+    - `candidate`: the candidate, prepared if a pilot run is useful on any interval.
+    - `run`: function of a key and a mask of intervals that runs the pilot; `None` if it is useless.
+    - `seen`: results of the pilot run; NaN without one.
+    - `active`: mask of the intervals of the pilot run.
+    - `seconds`: seconds per path by the rule.
+    """
 
     candidate: AbstractSingleProposal
-    run: Callable[[Key[Array, ""], Bool[Array, " I"]], _Seen] | None
-    seen: _Seen
+    run: Callable[[Key[Array, ""], Bool[Array, " I"]], _PilotResult] | None
+    seen: _PilotResult
     active: Bool[Array, " I"]
     seconds: Float[Array, " I"]
 
@@ -103,10 +114,15 @@ def run_pilots(
     num_pilot: int | None,
     timed: bool,
 ) -> Choice:
-    """The choice, from pilot runs of the candidates that could win."""
+    """Return the choice, from pilot runs of the candidates that could be the best.
+
+    `num_pilot` is the number of paths per interval, by default chosen by the number of intervals.
+    `timed` states that seconds are measured, where this could change the choice.
+    """
     num_intervals = len(intervals.duration)
-    enough = int(np.clip(_PILOT_PATHS // num_intervals, *_PILOT_RANGE))
-    num_paths = enough if num_pilot is None else num_pilot
+    default_num = int(np.clip(_PILOT_PATHS // num_intervals, *_PILOT_RANGE))
+    num_paths = default_num if num_pilot is None else num_pilot
+    # Each candidate is compared with the best before it, so cheap candidates should come first.
     best = jnp.asarray(np.zeros(num_intervals, intervals.start.dtype))
     pilots = []
     for i, candidate in enumerate(candidates):
@@ -114,35 +130,35 @@ def run_pilots(
         pilots.append(
             _run_pilot(key, purpose, model, candidate, intervals, num_steps, num_paths, best)
         )
-        best = _better(best, pilots[-1].seen, pilots[-1].seconds)
-    seconds = _measured(key, pilots, best) if timed else [pilot.seconds for pilot in pilots]
+        best = _update_best(best, pilots[-1].seen, pilots[-1].seconds)
+    seconds = _measure_seconds(key, pilots, best) if timed else [pilot.seconds for pilot in pilots]
     if not is_traced(best):
-        pilots = _repeated(key, pilots)
-    seen, seconds, chosen = _compared([pilot.seen for pilot in pilots], seconds)
+        pilots = _repeat_poor(key, pilots)
+    results, seconds, chosen = _compare([pilot.seen for pilot in pilots], seconds)
     used = range(len(candidates)) if is_traced(chosen) else np.unique(chosen).tolist()
     return Choice(
         tuple(pilot.candidate for pilot in pilots),
         seconds,
-        seen.efficiency,
-        seen.step_error,
-        seen.pareto_k,
+        results.efficiency,
+        results.step_error,
+        results.pareto_k,
         chosen,
         tuple(used),
     )
 
 
 @compiled_sooner
-def _better(best: Float[Array, " I"], seen: _Seen, seconds: Float[Array, " I"]):
-    """The best rate of each interval so far."""
-    return jnp.fmax(best, _rate(seen, seconds))
+def _update_best(best: Float[Array, " I"], result: _PilotResult, seconds: Float[Array, " I"]):
+    """Return the best rate of each interval, updated by the results of one more candidate."""
+    return jnp.fmax(best, _rate(result, seconds))
 
 
 @compiled_sooner
-def _compared(seen: list[_Seen], seconds: list[Float[Array, " I"]]):
-    """What was seen of all candidates, their seconds, and which is best in each interval."""
-    stacked: _Seen = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen)
-    of_all = jnp.stack(seconds)
-    return stacked, of_all, best_of_few(_rate(stacked, of_all))
+def _compare(results: list[_PilotResult], seconds: list[Float[Array, " I"]]):
+    """Return results and seconds of all candidates, stacked, and the best one of each interval."""
+    stacked: _PilotResult = jax.tree.map(lambda *leaves: jnp.stack(leaves), *results)
+    all_seconds = jnp.stack(seconds)
+    return stacked, all_seconds, best_of_few(_rate(stacked, all_seconds))
 
 
 def _run_pilot(
@@ -155,32 +171,37 @@ def _run_pilot(
     num_pilot: int,
     best: Float[Array, " I"],
 ) -> _Pilot:
-    """The pilot run of one candidate, on the intervals where it could beat the best so far."""
+    """Run the pilot of one candidate on the intervals where its rate could exceed `best`."""
 
-    def look_at(candidate):
+    def estimate_need(candidate):
         seconds, active = _worth(candidate, model, intervals, best)
         return seconds, active, is_traced(active) or bool(np.any(np.asarray(active)))
 
-    seconds, active, called_for = look_at(candidate)
-    if called_for:
+    seconds, active, is_needed = estimate_need(candidate)
+    if is_needed:
+        # The preparation may change the seconds: measuring a burn-in makes each trial longer.
         candidate = candidate.prepared(key, model, intervals, num_steps)
-        seconds, active, called_for = look_at(candidate)
-    if not called_for:
-        nothing: Any = np.full(len(best), np.nan, best.dtype)
-        none: Any = np.zeros(len(best), np.int32)
-        seen = _Seen(nothing, nothing, nothing, none, nothing, nothing)
-        return _Pilot(candidate, None, seen, active, seconds)
+        seconds, active, is_needed = estimate_need(candidate)
+    if not is_needed:
+        nans: Any = np.full(len(best), np.nan, best.dtype)
+        zeros: Any = np.zeros(len(best), np.int32)
+        result = _PilotResult(nans, nans, nans, zeros, nans, nans)
+        return _Pilot(candidate, None, result, active, seconds)
     arguments = (purpose, model, candidate, intervals, num_steps, num_pilot)
-    run = functools.partial(_look, *arguments)
+    run = functools.partial(_draw_pilot, *arguments)
     return _Pilot(candidate, run, run(key, active), active, seconds)
 
 
-def _repeated(key: Key[Array, ""], pilots: list[_Pilot]) -> list[_Pilot]:
-    """Return the pilots, with what repeated runs show of couplings that hardly met in theirs, on
-    the intervals where no candidate has enough effective paths of light tails."""
+def _repeat_poor(key: Key[Array, ""], pilots: list[_Pilot]) -> list[_Pilot]:
+    """Return the pilots, with repeated runs of couplings that had few effective paths.
+
+    Runs are repeated on the intervals where no candidate has enough effective paths with light
+    tails.
+    """
     sizes = [_size(pilot.seen.efficiency, pilot.seen.num_simulated) for pilot in pilots]
     shapes = [np.asarray(pilot.seen.pareto_k) for pilot in pilots]
-    light = [~(shape >= largest_reliable_k(10**9)) for shape in shapes]  # NaN is of too few to tell
+    # NaN counts as a light tail: there were too few paths for k̂.
+    light = [~(shape >= largest_reliable_k(10**9)) for shape in shapes]
     best = np.max([np.where(ok, size, 0) for size, ok in zip(sizes, light, strict=True)], axis=0)
     poor = best < _FEWEST_EFFECTIVE
     return [
@@ -190,32 +211,38 @@ def _repeated(key: Key[Array, ""], pilots: list[_Pilot]) -> list[_Pilot]:
 
 
 def _repeat(key: Key[Array, ""], pilot: _Pilot, active: Bool[np.ndarray, " I"]) -> _Pilot:
-    """Return the pilot of a coupling, with the efficiency of all its runs where that is known."""
+    """Repeat the pilot run of a coupling; return the pilot with the efficiency of all its runs.
+
+    Intervals with too few effective paths after the last run keep their results. Other proposals
+    are returned unchanged.
+    """
     if pilot.run is None or pilot.candidate.by_coupling is None:
         return pilot
     efficiency, step_error, shape, count, log_sum, log_squares = map(np.array, pilot.seen)
     for number in range(1, _MOST_REPEATS + 1):
         if not active.any():
             break
-        seen = pilot.run(jax.random.fold_in(key, number), jnp.asarray(active))
-        _, error, _, more, more_sum, more_squares = map(np.asarray, seen)
+        result = pilot.run(jax.random.fold_in(key, number), jnp.asarray(active))
+        _, error, _, more, more_sum, more_squares = map(np.asarray, result)
         log_sum[active] = np.logaddexp(log_sum, more_sum)[active]
         log_squares[active] = np.logaddexp(log_squares, more_squares)[active]
         count[active] += more[active]
-        some = log_sum > -np.inf
-        size = np.exp(2 * np.where(some, log_sum, 0) - np.where(some, log_squares, np.inf))
-        found = active & (size >= _FEWEST_EFFECTIVE)
-        efficiency[found] = (size / np.maximum(count, 1))[found]
-        shape[found], step_error[found] = np.nan, error[found]
+        # (Σ w)² / Σ w², zero if all weights are zero.
+        is_hit = log_sum > -np.inf
+        size = np.exp(2 * np.where(is_hit, log_sum, 0) - np.where(is_hit, log_squares, np.inf))
+        is_enough = active & (size >= _FEWEST_EFFECTIVE)
+        efficiency[is_enough] = (size / np.maximum(count, 1))[is_enough]
+        shape[is_enough], step_error[is_enough] = np.nan, error[is_enough]
+        # Twice the minimum, so that the estimate is not selected for being just large enough.
         active = active & (size < 2 * _FEWEST_EFFECTIVE)
     values = {"efficiency": efficiency, "step_error": step_error, "pareto_k": shape}
     values = {name: jnp.asarray(value, efficiency.dtype) for name, value in values.items()}
-    # The paths of the first run go with its seconds.
+    # `num_simulated` remains that of the first run, because only that run is timed.
     return pilot._replace(seen=pilot.seen._replace(**values))
 
 
 def _size(efficiency: Float[Array, " I"], num_simulated: Int[Array, " I"]) -> Float[Any, " I"]:
-    """Return the effective paths of a pilot run, zero where there was none."""
+    """Return the number of effective paths of a pilot run, zero for intervals without one."""
     return np.nan_to_num(np.asarray(efficiency, float)) * np.asarray(num_simulated, float)
 
 
@@ -226,13 +253,13 @@ def _worth(
     intervals: Intervals,
     best: Float[Array, " I"],
 ) -> tuple[Float[Array, " I"], Bool[Array, " I"]]:
-    """Seconds per path, and on which intervals to try it."""
+    """Return the seconds per path, and the mask of the intervals that need a pilot run."""
     seconds = candidate.relative_seconds(model, intervals)
     return seconds, worth_a_pilot(candidate.efficiency_bound / seconds, best)
 
 
 @compiled_sooner
-def _look(
+def _draw_pilot(
     purpose: str,
     model: Diffusion,
     candidate: AbstractSingleProposal,
@@ -241,38 +268,38 @@ def _look(
     num_pilot: int,
     key: Key[Array, ""],
     active: Bool[Array, " I"],
-) -> _Seen:
-    """What a pilot run shows of each active interval, NaN of the others."""
+) -> _PilotResult:
+    """Draw paths and return the results for active intervals, NaN for the others."""
     candidate = candidate.for_pilot()
     keys = jax.random.split(key_for(purpose, key), (len(intervals.duration), num_pilot))
-    nothing = jnp.zeros(0, jnp.int32)  # no path is kept
+    no_points = jnp.zeros(0, jnp.int32)  # paths are not stored
     model = model.prepared()
-    drawn = candidate.draw(keys, model, intervals, num_steps, nothing, True, active)
+    drawn = candidate.draw(keys, model, intervals, num_steps, no_points, True, active)
     num_simulated = jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32)
-    # What takes too long to hit would have a weight beyond those that are seen.
+    # A truncated weight is only a lower bound of a large weight, and would bias the comparison.
     log_weights = jnp.where(drawn.truncated, -jnp.inf, drawn.log_weights)
     size = _extrapolated_size(log_weights)
     efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
     share = guessed(candidate.step_share(model, intervals))
     varies = model.sigma_varies(intervals.start[0])
     error = drawn.step_error(share, num_steps, varies)
-    seen_error = jnp.maximum(jnp.abs(error.value) - 2 * error.uncertainty, 0)
-    seen_error = jnp.where(jnp.isnan(seen_error), 0, seen_error)  # nothing is known of one step
+    error_size = jnp.maximum(jnp.abs(error.value) - 2 * error.uncertainty, 0)
+    error_size = jnp.where(jnp.isnan(error_size), 0, error_size)  # unknown for N = 1
     shape = jnp.full_like(efficiency, jnp.nan)
     if num_pilot >= _FEWEST_FOR_TAIL:
         shape = pareto_k(drawn.log_weights)
-    told = (efficiency, seen_error, shape)
-    efficiency, seen_error, shape = (jnp.where(active, value, jnp.nan) for value in told)
+    values = (efficiency, error_size, shape)
+    efficiency, error_size, shape = (jnp.where(active, leaf, jnp.nan) for leaf in values)
     sums = (logsumexp(power * log_weights, axis=1) for power in (1, 2))
-    return _Seen(efficiency, seen_error, shape, num_simulated, *sums)
+    return _PilotResult(efficiency, error_size, shape, num_simulated, *sums)
 
 
 def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
-    """Effective samples of n paths, as they would be in a sample 64 times as large.
+    """Return the effective sample size times n / (64 n), extrapolated to a sample of 64 n paths.
 
-    Where weights have heavy tails the effective share falls with the sample, about as a power
-    of its size, since the largest weights are yet to come: a small sample looks too good. The
-    power is seen between eighths of the sample and the whole.
+    With heavy-tailed weights the effective share falls about as a power of the sample size, because
+    small samples lack the largest weights. The power is estimated from the effective shares of
+    eighths of the sample and of the complete sample.
     """
     num_intervals, n = log_weights.shape
     eighth = max(n // 8, 1)
@@ -280,17 +307,21 @@ def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
     parts = log_weights[:, : n // eighth * eighth].reshape(num_intervals, -1, eighth)
     share_of_part = jnp.mean(effective_size(normalise_weights(parts)), axis=1) / eighth
     fall = jnp.minimum(share / jnp.where(share_of_part > 0, share_of_part, 1), 1)
-    return n * share * fall**2
+    return n * share * fall**2  # from n to 64 n is twice the step from n / 8 to n
 
 
-def _measured(
+def _measure_seconds(
     key: Key[Array, ""], pilots: list[_Pilot], best: Float[Array, " I"]
 ) -> list[Float[Array, " I"]]:
-    """Seconds per path by the clock, where that could change the choice; else by rule."""
+    """Return the seconds per path of each candidate, measured where this could change the choice.
+
+    If fewer than two candidates could be the best, nothing is timed and the rule is returned. Other
+    candidates have the seconds of the rule times the median ratio of measurement and rule.
+    """
 
     def contends(pilot: _Pilot) -> bool:
         rate = _rate(pilot.seen, pilot.seconds)
-        return pilot.run is not None and bool(np.any(rate * _CONTENDS > best))
+        return pilot.run is not None and bool(np.any(rate * _RULE_ACCURACY > best))
 
     contenders = [pilot for pilot in pilots if contends(pilot)]
     if len(contenders) < 2:
@@ -299,11 +330,12 @@ def _measured(
     for pilot in contenders:
         assert pilot.run is not None
         run = functools.partial(pilot.run, key, pilot.active)
-        took = min(_seconds_of(run) for _ in range(3))
+        measured = min(_seconds_of(run) for _ in range(3))
         expected = pilot.seconds * pilot.seen.num_simulated.astype(pilot.seconds.dtype)
-        factors[id(pilot)] = took / float(jnp.sum(expected))
-    others = float(np.median(list(factors.values())))
-    return [pilot.seconds * factors.get(id(pilot), others) for pilot in pilots]
+        # The rule is in seconds of a modified diffusion bridge, so only ratios of factors matter.
+        factors[id(pilot)] = measured / float(jnp.sum(expected))
+    typical = float(np.median(list(factors.values())))
+    return [pilot.seconds * factors.get(id(pilot), typical) for pilot in pilots]
 
 
 def _seconds_of(run: Callable[[], Any]) -> float:
