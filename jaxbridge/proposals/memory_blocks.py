@@ -1,4 +1,7 @@
-"""Evaluation of weighted paths in blocks that fit in memory, over devices, for active intervals."""
+"""Evaluation of weighted paths in blocks that fit in memory, over devices, for active intervals.
+
+All proposals use it for their draws. It is separate because it depends on shapes only.
+"""
 
 import math
 from collections.abc import Callable
@@ -17,11 +20,15 @@ Block = Callable[[Key[Array, "I n"], Intervals, Bool[Array, " I"] | None], Weigh
 
 
 def block_over_devices(function: Block) -> Block:
-    """`function` with its draws split over devices: interval by interval, which each then has its
-    own work done on one device only, or across all of them where that balances better."""
+    """Return `function` with its draws split over devices.
+
+    Either each device takes some of the intervals, or some of the draws of each interval. The
+    function selects the split with the smaller number of rows per device.
+    """
 
     def split(keys, intervals, active):
         num_intervals, num_draws = keys.shape
+        # With whole intervals on one device, work for an interval is not repeated on others.
         if lanes_per_device(num_intervals) * num_draws <= num_intervals * lanes_per_device(
             num_draws
         ):
@@ -39,9 +46,10 @@ def in_blocks(
     active: Bool[Array, " I"] | None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> WeightedPaths:
-    """`function`, row by row of its arguments, on blocks of at most `most_rows` rows.
+    """Return `function` of all keys and intervals, computed in blocks of at most `most_rows` rows.
 
-    Active intervals come first, and blocks without any are not run.
+    A row is one draw of one interval. Active intervals are sorted to the front, and blocks without
+    any are skipped.
     """
     num_intervals, num_draws = keys.shape
     unit = _VECTOR if num_draws >= _WORTH_FILLING else 1
@@ -54,7 +62,7 @@ def in_blocks(
     order = jnp.arange(num_intervals)
     num_active = jnp.int32(num_intervals)
     if active is not None:
-        order = jnp.argsort(~active, stable=True)
+        order = jnp.argsort(~active, stable=True)  # active intervals first
         num_active = jnp.sum(active, dtype=jnp.int32)
 
     def one_block(row, column):
@@ -70,30 +78,28 @@ def in_blocks(
         return one_block(i // num_columns, i % num_columns)
 
     if active is None:
-        _, made = metered_scan(
+        _, paths = metered_scan(
             lambda _, i: (None, numbered_block(i)), None, jnp.arange(num_blocks), progress_meter
         )
     else:
-        numbered_block = jax.jit(numbered_block)  # for its shapes and in the loop traced once
+        numbered_block = jax.jit(numbered_block)  # traced once, for shapes and for the loop
         shapes = jax.eval_shape(numbered_block, jnp.int32(0))
-        nothing = jax.tree.map(
-            lambda leaf: jnp.zeros((num_blocks, *leaf.shape), leaf.dtype), shapes
-        )
+        zeros = jax.tree.map(lambda leaf: jnp.zeros((num_blocks, *leaf.shape), leaf.dtype), shapes)
 
-        def going_on(state):
+        def has_next(state):
             i, _ = state
             return (i < num_blocks) & (rows[i // num_columns, 0] < num_active)
 
         def next_block(state):
-            i, made = state
+            i, paths = state
             block = numbered_block(i)
-            return i + 1, jax.tree.map(lambda all, one: all.at[i].set(one), made, block)
+            return i + 1, jax.tree.map(lambda all, one: all.at[i].set(one), paths, block)
 
         def progress(state):
             return state[0].astype(jnp.float32) / num_blocks
 
-        init = (jnp.int32(0), nothing)
-        _, made = metered_while_loop(going_on, next_block, init, progress, progress_meter)
+        init = (jnp.int32(0), zeros)
+        _, paths = metered_while_loop(has_next, next_block, init, progress, progress_meter)
 
     def join(leaf):
         leaf = leaf.reshape(num_rows, num_columns, *leaf.shape[1:])
@@ -101,37 +107,40 @@ def in_blocks(
         leaf = leaf[:num_intervals, :num_draws]
         return leaf if active is None else leaf[jnp.argsort(order)]
 
-    made = jax.tree.map(join, made)
-    return made if active is None else masked(made, active)
+    paths = jax.tree.map(join, paths)
+    return paths if active is None else masked(paths, active)
 
 
-def masked(made: WeightedPaths, active: Bool[Array, " I"]) -> WeightedPaths:
-    """Nothing for the intervals that are not active."""
+def masked(weighted: WeightedPaths, active: Bool[Array, " I"]) -> WeightedPaths:
+    """Return the paths, marked as not found in intervals that are not active."""
 
-    def keep(leaf, otherwise):
+    def mask_leaf(leaf, fill):
         mask = active.reshape(-1, *[1] * (leaf.ndim - 1))
-        return jnp.where(mask, leaf, otherwise)
+        return jnp.where(mask, leaf, fill)
 
     return WeightedPaths(
-        keep(made.paths, jnp.nan),
-        keep(made.log_weights, -jnp.inf),
-        keep(made.found, False),
-        keep(made.truncated, False),
-        keep(made.num_simulated, 0),
-        keep(made.num_nonfinite, 0),
-        keep(made.log_halving, jnp.nan),
-        keep(made.log_coarse, jnp.nan),
+        mask_leaf(weighted.paths, jnp.nan),
+        mask_leaf(weighted.log_weights, -jnp.inf),
+        mask_leaf(weighted.found, False),
+        mask_leaf(weighted.truncated, False),
+        mask_leaf(weighted.num_simulated, 0),
+        mask_leaf(weighted.num_nonfinite, 0),
+        mask_leaf(weighted.log_halving, jnp.nan),
+        mask_leaf(weighted.log_coarse, jnp.nan),
     )
 
 
-# XLA's loops on CPU may be twice as fast where lanes fill whole vectors, of so many numbers. Few
-# lanes are not worth a copy.
+# On CPU, loops of XLA may be twice as fast if lanes fill complete vectors of this many numbers. For
+# fewer lanes than the second number the copies cost more than this gains.
 _VECTOR, _WORTH_FILLING = 16, 256
 
 
 def _even_blocks(size: int, most: int, unit: int) -> Int[Array, "blocks length"]:
-    """0, ..., size - 1 in blocks of one length, a multiple of `unit`, the last of them repeated to
-    fill up."""
+    """Return the indices 0, ..., size - 1 in blocks of equal length, at most about `most`.
+
+    The length is rounded up to a multiple of `unit`. The last index is repeated to fill the last
+    block.
+    """
     num_blocks = -(-size // max(most, 1))
     length = -(-size // num_blocks)
     length = -(-length // unit) * unit

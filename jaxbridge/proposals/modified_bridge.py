@@ -46,7 +46,7 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
         return jnp.full_like(intervals.duration, self.target_cost)
 
     def guide(self, dynamics, start, end, dt):
-        return None
+        return None  # a step depends on its own point only
 
     def step_law(self, step, x, target):
         return bridge_law(step, target, x + (step.end - x) * (step.dt / step.remaining))

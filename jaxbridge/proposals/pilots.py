@@ -122,7 +122,7 @@ def run_pilots(
     num_intervals = len(intervals.duration)
     default_num = int(np.clip(_PILOT_PATHS // num_intervals, *_PILOT_RANGE))
     num_paths = default_num if num_pilot is None else num_pilot
-    # Each candidate is compared with the best before it, so cheap candidates should come first.
+    # A candidate has pilot runs only where it could exceed the best of the candidates before it.
     best = jnp.asarray(np.zeros(num_intervals, intervals.start.dtype))
     pilots = []
     for i, candidate in enumerate(candidates):
@@ -179,7 +179,7 @@ def _run_pilot(
 
     seconds, active, is_needed = estimate_need(candidate)
     if is_needed:
-        # The preparation may change the seconds: measuring a burn-in makes each trial longer.
+        # The preparation may change the seconds: with a burn-in each trial takes longer.
         candidate = candidate.prepared(key, model, intervals, num_steps)
         seconds, active, is_needed = estimate_need(candidate)
     if not is_needed:
@@ -233,7 +233,7 @@ def _repeat(key: Key[Array, ""], pilot: _Pilot, active: Bool[np.ndarray, " I"]) 
         is_enough = active & (size >= _FEWEST_EFFECTIVE)
         efficiency[is_enough] = (size / np.maximum(count, 1))[is_enough]
         shape[is_enough], step_error[is_enough] = np.nan, error[is_enough]
-        # Twice the minimum, so that the estimate is not selected for being just large enough.
+        # Runs continue up to twice the minimum, where the estimate is more reliable.
         active = active & (size < 2 * _FEWEST_EFFECTIVE)
     values = {"efficiency": efficiency, "step_error": step_error, "pareto_k": shape}
     values = {name: jnp.asarray(value, efficiency.dtype) for name, value in values.items()}
@@ -274,20 +274,20 @@ def _draw_pilot(
     keys = jax.random.split(key_for(purpose, key), (len(intervals.duration), num_pilot))
     no_points = jnp.zeros(0, jnp.int32)  # paths are not stored
     model = model.prepared()
-    drawn = candidate.draw(keys, model, intervals, num_steps, no_points, True, active)
-    num_simulated = jnp.sum(drawn.num_simulated, axis=1, dtype=jnp.int32)
-    # A truncated weight is only a lower bound of a large weight, and would bias the comparison.
-    log_weights = jnp.where(drawn.truncated, -jnp.inf, drawn.log_weights)
+    paths = candidate.draw(keys, model, intervals, num_steps, no_points, True, active)
+    num_simulated = jnp.sum(paths.num_simulated, axis=1, dtype=jnp.int32)
+    # The true weight of a truncated path exceeds the others; its value is unknown, so it is omitted.
+    log_weights = jnp.where(paths.truncated, -jnp.inf, paths.log_weights)
     size = _extrapolated_size(log_weights)
     efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
     share = guessed(candidate.step_share(model, intervals))
     varies = model.sigma_varies(intervals.start[0])
-    error = drawn.step_error(share, num_steps, varies)
+    error = paths.step_error(share, num_steps, varies)
     error_size = jnp.maximum(jnp.abs(error.value) - 2 * error.uncertainty, 0)
     error_size = jnp.where(jnp.isnan(error_size), 0, error_size)  # unknown for N = 1
     shape = jnp.full_like(efficiency, jnp.nan)
     if num_pilot >= _FEWEST_FOR_TAIL:
-        shape = pareto_k(drawn.log_weights)
+        shape = pareto_k(paths.log_weights)
     values = (efficiency, error_size, shape)
     efficiency, error_size, shape = (jnp.where(active, leaf, jnp.nan) for leaf in values)
     sums = (logsumexp(power * log_weights, axis=1) for power in (1, 2))
@@ -295,7 +295,7 @@ def _draw_pilot(
 
 
 def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
-    """Return the effective sample size times n / (64 n), extrapolated to a sample of 64 n paths.
+    """Return n times the effective share that a sample of 64 n paths would have, by extrapolation.
 
     With heavy-tailed weights the effective share falls about as a power of the sample size, because
     small samples lack the largest weights. The power is estimated from the effective shares of
@@ -307,7 +307,7 @@ def _extrapolated_size(log_weights: Float[Array, "I n"]) -> Float[Array, " I"]:
     parts = log_weights[:, : n // eighth * eighth].reshape(num_intervals, -1, eighth)
     share_of_part = jnp.mean(effective_size(normalise_weights(parts)), axis=1) / eighth
     fall = jnp.minimum(share / jnp.where(share_of_part > 0, share_of_part, 1), 1)
-    return n * share * fall**2  # from n to 64 n is twice the step from n / 8 to n
+    return n * share * fall**2  # 64 = 8²: two more factors of eight
 
 
 def _measure_seconds(
@@ -332,7 +332,7 @@ def _measure_seconds(
         run = functools.partial(pilot.run, key, pilot.active)
         measured = min(_seconds_of(run) for _ in range(3))
         expected = pilot.seconds * pilot.seen.num_simulated.astype(pilot.seconds.dtype)
-        # The rule is in seconds of a modified diffusion bridge, so only ratios of factors matter.
+        # Seconds per unit of the rule, which is a path of a modified diffusion bridge.
         factors[id(pilot)] = measured / float(jnp.sum(expected))
     typical = float(np.median(list(factors.values())))
     return [pilot.seconds * factors.get(id(pilot), typical) for pilot in pilots]

@@ -53,9 +53,10 @@ class ResidualBridge(AbstractGuidedProposal):
 
     def guide(self, dynamics, start, end, dt):
         xi, xi_end = deterministic_path(self.target, dynamics, start, dt)
-        moved = jnp.concatenate([xi[1:], xi_end[None]]) - xi
-        return moved[:-1], (xi + end - xi_end)[:-1]
+        displacement = jnp.concatenate([xi[1:], xi_end[None]]) - xi
+        return displacement[:-1], (xi + end - xi_end)[:-1]
 
     def step_law(self, step, x, target):
-        moved, aim = step.guide
-        return bridge_law(step, target, x + moved + (aim - x) * (step.dt / step.remaining))
+        displacement, aim = step.guide
+        # The residual x - ξ is pulled to its end b - ξ_N; `aim` is ξ_i + b - ξ_N.
+        return bridge_law(step, target, x + displacement + (aim - x) * (step.dt / step.remaining))
