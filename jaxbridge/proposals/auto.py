@@ -33,13 +33,17 @@ from .linear_guide import Guided
 from .modified_bridge import ModifiedDiffusionBridge
 from .pilots import run_pilots
 
-# Bounds the tries for one bridge, unless the user says otherwise.
+# Default bound on the attempts for one bridge.
 _MAX_PROPOSALS = 10_000
 
 
 class Auto(AbstractProposal):
-    """A choice to be made: between these, by pilot runs of so many paths, or the default.
-    `left_out` says why there are no couplings among them, where that is not the user's doing."""
+    """Open choice between candidates, to be decided by pilot runs.
+
+    - `candidates`: tuple of C proposals.
+    - `num_pilot`: paths per interval of a pilot run; `None` for the default.
+    - `left_out`: the reason why "auto" omits couplings; empty if it does not.
+    """
 
     candidates: tuple[AbstractSingleProposal, ...]
     num_pilot: int | None = eqx.field(static=True, default=None)
@@ -60,7 +64,7 @@ class Auto(AbstractProposal):
     def describe(self):
         names = ", ".join(candidate.describe() for candidate in self.candidates)
         reason = f"\ncouplings left out: {self.left_out}" if self.left_out else ""
-        return f"a choice to be made between {names}{reason}"
+        return f"an open choice between {names}{reason}"
 
     def fractions(self, num_steps):
         return self.candidates[0].fractions(num_steps)
@@ -80,8 +84,8 @@ class Auto(AbstractProposal):
 
     def check_prepared(self, model):
         raise ValueError(
-            'a kernel makes no pilot run, so `proposal="auto"` is not possible: call '
-            "`choose_proposal` before, and pass its result."
+            'a kernel makes no pilot run, so `proposal="auto"` is not possible here: call '
+            "`choose_proposal` first, and pass its result as `proposal`."
         )
 
     def prepared(self, key, model, intervals, num_steps):
@@ -95,8 +99,12 @@ class Auto(AbstractProposal):
         num_steps: int,
         timed: bool = False,
     ) -> Choice:
-        """The choice, by the rule for seconds or by the clock. What is chosen has no derivative in
-        the model, but that of which it is chosen may have one, unless it may be a coupling."""
+        """Return the choice for these intervals.
+
+        Seconds per path follow a rule; if `timed`, they are measured. The choice itself has no
+        derivatives. Paths and weights of the chosen proposal may have derivatives in the model,
+        except if a candidate is a coupling.
+        """
         if self.coupled:
             model, intervals = nondifferentiable_choice((model, intervals))
         else:
@@ -116,30 +124,36 @@ def resolve(
     intervals: Intervals,
     num_steps: int,
 ) -> AbstractProposal:
-    """The proposal, with a choice made before compiling where that can be, so that only what was
-    chosen is compiled."""
+    """Return the proposal, with an open choice decided if its arguments are not traced.
+
+    Then only the chosen candidates are compiled.
+    """
     if not isinstance(proposal, Auto):
         return proposal
     if not proposal.coupled:
-        model, intervals = without_derivatives((model, intervals))  # known under `grad`
+        model, intervals = without_derivatives((model, intervals))  # concrete under `grad`
     if is_traced(key, model, proposal, intervals):
         return proposal
     return proposal.choose(key, model, intervals, num_steps)
 
 
 class Budget(NamedTuple):
-    """What the user said of the work for a coupling's pairs: N hitting counts, and bounds on the
-    tries for a pair and on the trials for its counts."""
+    """Arguments that bound the work of a coupling; `None` for the default.
+
+    - `num_counts`: N, the number of hitting counts per path.
+    - `max_proposals`: maximum of attempts for a pair that meets.
+    - `max_trials`: maximum of trials for the counts of one path.
+    """
 
     num_counts: int | None = None
     max_proposals: int | None = None
     max_trials: int | None = None
 
     def refuse(self, reason: str) -> None:
-        """Raise `ValueError`, which says what they are for, where any of these is given."""
-        given = [f"`{name}`" for name, value in self._asdict().items() if value is not None]
-        if given:
-            raise ValueError(f"{' and '.join(given)}: {reason}. Leave this out.")
+        """Raise `ValueError` with this reason if any of the arguments is given."""
+        names = [f"`{name}`" for name, value in self._asdict().items() if value is not None]
+        if names:
+            raise ValueError(f"{' and '.join(names)}: {reason}. Omit this argument.")
 
 
 _NO_BUDGET = Budget()
@@ -153,17 +167,25 @@ def as_proposal(
     for_density: bool = False,
     name: str = "proposal",
 ) -> AbstractProposal:
-    """What the user gave as `proposal`, for points like this one; `for_density` if the size of its
-    weights matters, and not only their proportion."""
+    """Return the argument `proposal` as a proposal with all defaults of this model set.
+
+    `None` stands for `Coupling()`. `like` is a point of the right shape and dtype. `for_density`
+    states that the weights estimate densities, so a constant factor matters. `name` is the argument
+    in messages.
+
+    **Raises:** `TypeError` for anything but a coupling, a proposal or "auto". `ValueError` for a
+    budget if the proposal has no use for one.
+    """
     if isinstance(proposal, str) and proposal == "auto":
         candidates = default_candidates(model, for_density)
-        given = choice_between(candidates, budget, left_out=why_left_out(model, for_density))
-        return given.for_model(model, like, for_density)
-    given = _given(Coupling() if proposal is None else proposal, budget, name)
-    return given.for_model(model, like, for_density)
+        converted = choice_between(candidates, budget, left_out=why_left_out(model, for_density))
+        return converted.for_model(model, like, for_density)
+    converted = _convert(Coupling() if proposal is None else proposal, budget, name)
+    return converted.for_model(model, like, for_density)
 
 
-def _given(proposal: Any, budget: Budget, name: str = "proposal") -> AbstractProposal:
+def _convert(proposal: Any, budget: Budget, name: str = "proposal") -> AbstractProposal:
+    """Return a coupling as `CoupledPairs` with this budget, and a proposal unchanged."""
     if isinstance(proposal, AbstractProposal):
         if any(value is not None for value in budget):
             raise ValueError(
@@ -191,22 +213,29 @@ def choice_between(
     num_pilot: int | None = None,
     left_out: str = "",
 ) -> Auto:
-    """A choice between these, yet to be made; the budget is for couplings among them.
+    """Return an open choice between these candidates, with the budget for couplings among them.
 
-    **Raises:** `ValueError` for a budget where there are none, which `left_out` explains.
+    **Raises:** `ValueError` for no candidates, for candidates on different grids, for a candidate
+    that is itself a choice, and for a budget without couplings. `left_out` is the reason in the
+    last message.
     """
     if len(candidates) == 0:
         raise ValueError("`candidates` must contain at least one proposal; got none.")
-    if not any(isinstance(each, AbstractCoupling) for each in candidates):
-        budget.refuse(f'for couplings, which `proposal="auto"` leaves out here: {left_out}')
+    if not any(isinstance(candidate, AbstractCoupling) for candidate in candidates):
+        budget.refuse(f'for couplings, which `proposal="auto"` omits here, because {left_out}')
     proposals = tuple(
-        _given(each, budget if isinstance(each, AbstractCoupling) else _NO_BUDGET, "candidates")
-        for each in candidates
+        _convert(
+            candidate,
+            budget if isinstance(candidate, AbstractCoupling) else _NO_BUDGET,
+            "candidates",
+        )
+        for candidate in candidates
     )
     if not all(isinstance(proposal, AbstractSingleProposal) for proposal in proposals):
         raise ValueError(
             "`candidates` must be single proposals; got a result of `choose_proposal`."
         )
+    # Any number of steps shows whether the grids differ.
     grids = {tuple(proposal.fractions(8)) for proposal in proposals}
     if len(grids) > 1:
         raise ValueError("`candidates` must be on one grid: use the same `refinement` for all.")
@@ -214,19 +243,22 @@ def choice_between(
 
 
 def guided_candidates() -> list[AbstractSingleProposal]:
-    """With the same order of step error as couplings, where that is to be had."""
+    """Return the guided candidates of "auto", with the most accurate target of each model."""
     return [ModifiedDiffusionBridge(), Guided("end"), Guided("path")]
 
 
 def default_candidates(model: Diffusion, for_density: bool = False) -> list[Any]:
-    """Couplings only where the time reversal is known; and for a density, where ν is."""
+    """Return the candidates of "auto", with couplings if the model is suitable.
+
+    Couplings need a time reversal. For a density they also need a normalised ν.
+    """
     coupled = model.has_reversal and (model.normalised or not for_density)
     couplings = [Coupling(0.0), Coupling(0.5)] if coupled else []
     return [*guided_candidates(), *couplings]
 
 
 def why_left_out(model: Diffusion, for_density: bool) -> str:
-    """Why there are no couplings among `default_candidates`; empty where there are."""
+    """Return the reason why `default_candidates` has no couplings; empty if it has them."""
     if not model.has_reversal:
         return (
             "the model has no time reversal (give `Diffusion` a `log_stationary`, a "

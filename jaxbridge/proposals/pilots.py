@@ -276,7 +276,7 @@ def _draw_pilot(
     model = model.prepared()
     paths = candidate.draw(keys, model, intervals, num_steps, no_points, True, active)
     num_simulated = jnp.sum(paths.num_simulated, axis=1, dtype=jnp.int32)
-    # The true weight of a truncated path exceeds the others; its value is unknown, so it is omitted.
+    # The true weight of a truncated path exceeds the others. It is unknown, so it is omitted.
     log_weights = jnp.where(paths.truncated, -jnp.inf, paths.log_weights)
     size = _extrapolated_size(log_weights)
     efficiency = size / jnp.maximum(num_simulated, 1).astype(size.dtype)
