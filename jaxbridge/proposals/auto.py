@@ -243,7 +243,10 @@ def choice_between(
 
 
 def guided_candidates() -> list[AbstractSingleProposal]:
-    """Return the guided candidates of "auto", with the most accurate target of each model."""
+    """Return the guided candidates of "auto".
+
+    Their default targets have the same order of discretisation error as couplings, if possible.
+    """
     return [ModifiedDiffusionBridge(), Guided("end"), Guided("path")]
 
 

@@ -4,8 +4,8 @@ The weight of a pair is
 
     w = 1{met} · ν(b)/ν(x_0) · μ(x_0) · (mean of N hitting counts),
 
-where x_0 is the reversed path at time 0 and μ the start law of the associated diffusion.
-`start_laws` has the derivation.
+where x_0 is the reversed path at time 0, μ is the start law of the associated diffusion, and 1{met}
+is 1 if the pair met. `start_laws` has the derivation.
 """
 
 import equinox as eqx
@@ -41,15 +41,16 @@ from ..schemes import check_model, log_halving_of_paths, num_looked, step_law_of
 from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
 from .memory_blocks import in_blocks
 
-# Whole paths are kept only until they are weighed: at most this many bytes of them at a time.
+# Weights need complete paths. A block has at most this many bytes of them.
 _BLOCK_BYTES = 2**28
 
-# Seconds per simulated path beside those of a modified diffusion bridge.
+# Seconds per simulated path, relative to a modified diffusion bridge (measured).
 _SECONDS = 3.5
-# Hits that take longer than this are not worth waiting for in a pilot run.
+# Maximum of trials per hitting count in a pilot run. Slower hits make the proposal useless anyway.
 _PILOT_TRIALS = 64
 
-# A path costs so many others that D of more of them may be looked at than where it costs one.
+# A path with its counts costs much more than D. Hence D is evaluated for this many times more
+# paths than for guided proposals.
 _LOOKED = 4
 
 
@@ -87,8 +88,8 @@ class CoupledPairs(AbstractSingleProposal):
     def relative_seconds(self, model, intervals):
         seconds, law = jnp.full_like(intervals.duration, _SECONDS), self.coupling.start_law
         if isinstance(law, Stationary) and not model.has_sampler and law.burn_in is not None:
-            # A run for the start of each trial, in steps that cost half as much; and of the
-            # simulated paths at least half are trials.
+            # Each trial starts with a run of the burn-in, in steps that cost half as much. At least
+            # half of the simulated paths are trials: 1/2 · 1/2 = 1/4.
             seconds *= 1 + law.burn_in.astype(seconds.dtype) / intervals.duration / 4
         return seconds
 
@@ -137,8 +138,9 @@ class CoupledPairs(AbstractSingleProposal):
                 "`ModifiedDiffusionBridge()` or `Guided()`."
             )
         law = self.coupling.start_law
-        smoothed = needs_burn_in(law, model)  # then it gives way to one with a density (`prepared`)
-        if isinstance(law, Stationary | Reversed) and not (model.normalised or smoothed):
+        # A law that needs a burn-in is replaced by one with a density (`prepared`).
+        replaced = needs_burn_in(law, model)
+        if isinstance(law, Stationary | Reversed) and not (model.normalised or replaced):
             raise ValueError(
                 "a coupling from the stationary law gives densities in proportion to exp of "
                 "`log_stationary`, which is not declared to be normalised, so densities may be "
@@ -188,19 +190,19 @@ class CoupledPairs(AbstractSingleProposal):
             search = Search(1, max_proposals, num_lanes)
             proposed = find_bridges(propose_keys, inputs, active, num_steps, None, search)
             paths, reverse_start, _ = proposed.outputs
-            found = proposed.num_found > 0
+            is_found = proposed.num_found > 0
             counts = self._counts(
-                count_keys, model, intervals, paths, found, self.num_counts, progress_meter
+                count_keys, model, intervals, paths, is_found, self.num_counts, progress_meter
             )
             law = self.coupling.start_law
             log_weights = pair_log_weights(law, model, intervals.end, reverse_start, counts.mean)
-            log_weights, unusable = usable(log_weights, found)
+            log_weights, unusable = usable(log_weights, is_found)
             log_halving = self.log_halving(model, intervals, paths, num_draws)
-            kept = paths if stored is None else paths[:, stored]
-            made = WeightedPaths(
-                jnp.where(found[:, None, None], kept, jnp.nan),
+            stored_paths = paths if stored is None else paths[:, stored]
+            weighted = WeightedPaths(
+                jnp.where(is_found[:, None, None], stored_paths, jnp.nan),
                 log_weights,
-                found,
+                is_found,
                 counts.truncated | unusable,
                 proposed.num_trials + counts.num_trials,
                 proposed.num_nonfinite + counts.num_nonfinite,
@@ -208,7 +210,7 @@ class CoupledPairs(AbstractSingleProposal):
                 jnp.full_like(log_weights, jnp.nan),
             )
             return jax.tree.map(
-                lambda leaf: leaf.reshape(num_intervals, num_draws, *leaf.shape[1:]), made
+                lambda leaf: leaf.reshape(num_intervals, num_draws, *leaf.shape[1:]), weighted
             )
 
         d, itemsize = intervals.start.shape[1], intervals.start.dtype.itemsize
@@ -216,48 +218,51 @@ class CoupledPairs(AbstractSingleProposal):
         return in_blocks(block, keys, intervals, most_rows, active)
 
     def reweigh(self, keys, model, intervals, paths, active=None):
-        # Under the target the counts of a path are size-biased, and x_0 is where a trial that
-        # hit had started: N + 1 counts, less one trial.
+        # Under the target law, given the path, x_0 is the start of a trial that hit, and the counts
+        # are size-biased. This equals N + 1 counts with one trial less in their sum.
         self, model, intervals, paths = nondifferentiable((self, model, intervals, paths))
-        found = jnp.all(jnp.isfinite(paths), axis=(1, 2))
+        is_found = jnp.all(jnp.isfinite(paths), axis=(1, 2))
         if active is not None:
-            found &= active
-        counts = self._counts(keys, model, intervals, paths, found, self.num_counts + 1)
+            is_found &= active
+        counts = self._counts(keys, model, intervals, paths, is_found, self.num_counts + 1)
         num_hits = jnp.sum(counts.counts > 0, axis=1, dtype=jnp.int32)
         one_less = jnp.maximum(counts.num_trials - 1, 1).astype(paths.dtype)
         mean = one_less / jnp.maximum(num_hits - 1, 1).astype(paths.dtype)
-        # Where nothing hit, x_0 is unknown; any point serves for a weight that is flagged.
+        # Without a hit x_0 is unknown. The weight is marked as truncated, so any point will do.
         start = jnp.where((num_hits > 0)[:, None], counts.start, intervals.start)
         log_weights = pair_log_weights(self.coupling.start_law, model, intervals.end, start, mean)
-        log_weights, unusable = usable(log_weights, found)
-        made = WeightedPaths(
-            jnp.where(found[:, None, None], paths, jnp.nan),
+        log_weights, unusable = usable(log_weights, is_found)
+        weighted = WeightedPaths(
+            jnp.where(is_found[:, None, None], paths, jnp.nan),
             log_weights,
-            found,
+            is_found,
             counts.truncated | unusable,
             counts.num_trials,
             counts.num_nonfinite,
             self.log_halving(model, intervals, paths, 1),
             jnp.full_like(log_weights, jnp.nan),
         )
-        return jax.tree.map(lambda leaf: leaf[:, None], made)
+        return jax.tree.map(lambda leaf: leaf[:, None], weighted)
 
     def log_halving(
         self, model: Diffusion, intervals: Intervals, paths: Float[Array, "P points d"], n: int
     ) -> Float[Array, " P"]:
-        """Return D for the first of the n paths of each interval, and NaN for the others."""
+        """Return D of `halving` for the first of the n paths of each interval, NaN for others."""
         dynamics = model.forward(intervals.start[0])
         density, _ = step_law_of(self.coupling.scheme, dynamics)
-        num_some = num_looked(_LOOKED * n, dynamics.sigma_varies)
-        some = jnp.arange(len(paths)).reshape(-1, n)[:, :num_some].reshape(-1)
+        num_evaluated = num_looked(_LOOKED * n, dynamics.sigma_varies)
+        evaluated = jnp.arange(len(paths)).reshape(-1, n)[:, :num_evaluated].reshape(-1)
         num_steps = paths.shape[1] - 1
-        dt = jnp.broadcast_to(intervals.duration[some] / num_steps, (num_steps, len(some)))
-        log_halving = log_halving_of_paths(density, dynamics, dt, paths[some])
-        return jnp.full(len(paths), jnp.nan, paths.dtype).at[some].set(log_halving)
+        dt = jnp.broadcast_to(
+            intervals.duration[evaluated] / num_steps, (num_steps, len(evaluated))
+        )
+        log_halving = log_halving_of_paths(density, dynamics, dt, paths[evaluated])
+        return jnp.full(len(paths), jnp.nan, paths.dtype).at[evaluated].set(log_halving)
 
     def _counts(
         self, keys, model, intervals, paths, found, num_counts, progress_meter=None
     ) -> HittingCounts:
+        """Count trials until `num_counts` hits of each path that was found."""
         num_lanes = default_lanes(paths, num_counts)
         search = Search(num_counts, self.max_trials, num_lanes, progress_meter)
         return count_hits(keys, model, self.coupling, paths, intervals.duration, found, search)
@@ -270,7 +275,10 @@ def pair_log_weights(
     reverse_start: Float[Array, "P d"],
     mean_count: Float[Array, " P"],
 ) -> Float[Array, " P"]:
-    """log [ν(b)/ν(x_0) · μ(x_0) · ρ̂]; without ν(b), a constant, where the model has no ν."""
+    """Return log [ν(b)/ν(x_0) · μ(x_0) · ρ̂], with ρ̂ the mean of the hitting counts.
+
+    If the model has no ν, the result omits ν(b), which is constant for each interval.
+    """
     log_weights = over_points(lambda x: log_ratio(law, model, x))(reverse_start)
     log_weights += jnp.log(mean_count)
     if model.has_density:
@@ -281,13 +289,17 @@ def pair_log_weights(
 def usable(
     log_weights: Float[Array, "*rows"], found: Bool[Array, "*rows"]
 ) -> tuple[Float[Array, "*rows"], Bool[Array, "*rows"]]:
-    """Weights of which none spoils the others, and where one would have."""
-    number = log_weights < jnp.inf  # false for NaN, as densities of start laws may give
-    return jnp.where(found & number, log_weights, -jnp.inf), found & ~number
+    """Return log weights without NaN and +inf, and the mask of the paths that had one.
+
+    These weights become -inf, as do those of paths that were not found. Otherwise one such weight
+    would make every weighted mean NaN.
+    """
+    is_number = log_weights < jnp.inf  # false for NaN, which densities of start laws may return
+    return jnp.where(found & is_number, log_weights, -jnp.inf), found & ~is_number
 
 
 def check_density(law: AnyStartLaw, model: Diffusion) -> None:
-    """Raise `ValueError` where a start law has a density but the model's ν is not known."""
+    """Raise `ValueError` if the start law has a density but the model has no ν."""
     if not isinstance(law, Stationary | Reversed) and not model.has_density:
         raise ValueError(
             "the weights of a start law other than `Stationary()` need the stationary density: "
@@ -300,7 +312,10 @@ def as_pairs(
     method: str = "renewal",
     instead: str = 'method="pseudo_marginal"',
 ) -> CoupledPairs:
-    """The proposal, which must be a coupling's for this method."""
+    """Return the proposal, or raise `TypeError` if it is not a coupling.
+
+    `method` and `instead` are the argument and the alternative that the message names.
+    """
     if not isinstance(proposal, CoupledPairs):
         raise TypeError(
             f"{method} is for couplings: pass a `Coupling` as `proposal`, or use {instead}."
