@@ -2,10 +2,10 @@
 
 The weight of a pair is
 
-    w = 1{met} · ν(b)/ν(x_0) · μ(x_0) · (mean of N hitting counts),
+    w = 1{met} · ν(b)/ν(x_0) · μ(x_0) · (mean of N hitting counts).
 
-where x_0 is the reversed path at time 0, μ is the start law of the associated diffusion, and 1{met}
-is 1 if the pair met. `start_laws` has the derivation.
+Here x_0 is the reversed path at time 0, and μ is the start law of the associated diffusion. The
+factor 1{met} is 1 if the pair met, otherwise 0. `start_laws` has the derivation.
 """
 
 import equinox as eqx
@@ -46,7 +46,7 @@ _BLOCK_BYTES = 2**28
 
 # Seconds per simulated path, relative to a modified diffusion bridge (measured).
 _SECONDS = 3.5
-# Maximum of trials per hitting count in a pilot run. Slower hits make the proposal useless anyway.
+# Maximum of trials per hitting count in a pilot run. Slower hits are not worth their time.
 _PILOT_TRIALS = 64
 
 # A path with its counts costs much more than D. Hence D is evaluated for this many times more
@@ -250,22 +250,20 @@ class CoupledPairs(AbstractSingleProposal):
         """Return D of `halving` for the first of the n paths of each interval, NaN for others."""
         dynamics = model.forward(intervals.start[0])
         density, _ = step_law_of(self.coupling.scheme, dynamics)
-        num_evaluated = num_looked(_LOOKED * n, dynamics.sigma_varies)
-        evaluated = jnp.arange(len(paths)).reshape(-1, n)[:, :num_evaluated].reshape(-1)
+        num_rows = num_looked(_LOOKED * n, dynamics.sigma_varies)
+        rows = jnp.arange(len(paths)).reshape(-1, n)[:, :num_rows].reshape(-1)
         num_steps = paths.shape[1] - 1
-        dt = jnp.broadcast_to(
-            intervals.duration[evaluated] / num_steps, (num_steps, len(evaluated))
-        )
-        log_halving = log_halving_of_paths(density, dynamics, dt, paths[evaluated])
-        return jnp.full(len(paths), jnp.nan, paths.dtype).at[evaluated].set(log_halving)
+        dt = jnp.broadcast_to(intervals.duration[rows] / num_steps, (num_steps, len(rows)))
+        log_halving = log_halving_of_paths(density, dynamics, dt, paths[rows])
+        return jnp.full(len(paths), jnp.nan, paths.dtype).at[rows].set(log_halving)
 
     def _counts(
-        self, keys, model, intervals, paths, found, num_counts, progress_meter=None
+        self, keys, model, intervals, paths, is_found, num_counts, progress_meter=None
     ) -> HittingCounts:
         """Count trials until `num_counts` hits of each path that was found."""
         num_lanes = default_lanes(paths, num_counts)
         search = Search(num_counts, self.max_trials, num_lanes, progress_meter)
-        return count_hits(keys, model, self.coupling, paths, intervals.duration, found, search)
+        return count_hits(keys, model, self.coupling, paths, intervals.duration, is_found, search)
 
 
 def pair_log_weights(
@@ -287,7 +285,7 @@ def pair_log_weights(
 
 
 def usable(
-    log_weights: Float[Array, "*rows"], found: Bool[Array, "*rows"]
+    log_weights: Float[Array, "*rows"], is_found: Bool[Array, "*rows"]
 ) -> tuple[Float[Array, "*rows"], Bool[Array, "*rows"]]:
     """Return log weights without NaN and +inf, and the mask of the paths that had one.
 
@@ -295,7 +293,7 @@ def usable(
     would make every weighted mean NaN.
     """
     is_number = log_weights < jnp.inf  # false for NaN, which densities of start laws may return
-    return jnp.where(found & is_number, log_weights, -jnp.inf), found & ~is_number
+    return jnp.where(is_found & is_number, log_weights, -jnp.inf), is_found & ~is_number
 
 
 def check_density(law: AnyStartLaw, model: Diffusion) -> None:

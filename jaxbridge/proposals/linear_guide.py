@@ -2,13 +2,13 @@
 
 The law q_i of a step (`guided`) follows from an h-function: h_{i+1}(x) approximates the transition
 density from x at t_{i+1} to b. Let log h be quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h. The
-step of the target, tilted by h, is
+step of the target, tilted by h, has the law
 
-    q_i = N(μ_i + δ L C Lᵀ r̃, δ L C Lᵀ),    C = S (I + δ Lᵀ H̃ L S)⁻¹,    L Lᵀ = V(x_i)
+    q_i = N(μ_i + δ L C Lᵀ r̃, δ L C Lᵀ),    C = S (I + δ Lᵀ H̃ L S)⁻¹,    L Lᵀ = V(x_i).
 
-(r̃ and H̃ as in Schauer, van der Meulen & van Zanten 2017; the discrete form as in Whitaker,
-Golightly, Boys & Sherlock 2017). With the true density for h this is Doob's h-transform, and w is
-constant.
+The definitions of r̃ and H̃ are those of Schauer, van der Meulen & van Zanten (2017). The discrete
+form is that of Whitaker, Golightly, Boys & Sherlock (2017). If h is the true density, this is
+Doob's h-transform, and w is constant.
 
 The linear process has its own Ṽ = L̃ L̃ᵀ. If V(x) is larger than Ṽ, the h-function guides too
 strongly; if V(x) is smaller, too weakly. Both give weights with heavy tails. The mean V̄ = L̄ L̄ᵀ of
@@ -36,20 +36,28 @@ from ..models.sigma import covariance_of, root_of
 from ..schemes import AbstractStepDensity, StepLaw, check_step_density
 from .guided import AbstractGuidedProposal, check_refinement, deterministic_path
 
-# δ |F| of a step that has nothing in common with the diffusion: where long steps threw ξ far out.
-_FAR_OUT = 10.0
+# Above this δ |F| a step is unlike the diffusion: long steps have made the path ξ diverge.
+_DIVERGED = 10.0
 
 
-class _GaussianGuess(NamedTuple):
-    """log h(x) = ρᵀ(x - b) - ½ (x - b)ᵀ H (x - b) + constant."""
+class _StateGuide(NamedTuple):
+    """Quadratic log h(x) = ρᵀ(x - b) - ½ (x - b)ᵀ H (x - b) + constant, in state coordinates.
+
+    - `shift`: ρ.
+    - `precision`: H.
+    """
 
     shift: Float[Array, " d"]
     precision: Float[Array, "d d"]
 
 
-class _NoiseGuess(NamedTuple):
-    """The same in the coordinates of the noise: L̃ᵀρ and L̃ᵀH L̃, and Ṽ = L̃ L̃ᵀ's root L̃, which where σ
-    is constant is that of every point."""
+class _NoiseGuide(NamedTuple):
+    """Quadratic log h in noise coordinates.
+
+    - `shift`: L̃ᵀρ.
+    - `precision`: L̃ᵀH L̃.
+    - `root`: L̃ with Ṽ = L̃ L̃ᵀ; `None` for constant σ, where all points have the same root.
+    """
 
     shift: Float[Array, "d *lanes"]
     precision: Float[Array, "d d *lanes"]
@@ -141,62 +149,64 @@ class Guided(AbstractGuidedProposal):
         points = end[None]
         if self._along == "path":
             xi, xi_end = deterministic_path(self.target, dynamics, start, dt)
-            done = jnp.concatenate([jnp.zeros_like(dt[:1]), jnp.cumsum(dt)[:-1]]) / jnp.sum(dt)
-            points = xi + done[:, None] * (end - xi_end)
-            straight = start + done[:, None] * (end - start)
+            elapsed = jnp.concatenate([jnp.zeros_like(dt[:1]), jnp.cumsum(dt)[:-1]]) / jnp.sum(dt)
+            points = xi + elapsed[:, None] * (end - xi_end)
+            # If the deterministic path diverges, a straight line replaces it.
+            straight = start + elapsed[:, None] * (end - start)
             rates = over_points(jax.jacfwd(dynamics.drift))(lax.stop_gradient(points))
-            near = dt * jnp.max(jnp.abs(rates), axis=(1, 2)) < _FAR_OUT
-            points = jnp.where(near[:, None], points, straight)
+            is_near = dt * jnp.max(jnp.abs(rates), axis=(1, 2)) < _DIVERGED
+            points = jnp.where(is_near[:, None], points, straight)
         coefficients = over_points(lambda x: self._linear(dynamics, x, end))(points)
 
-        def back(guess: _GaussianGuess, inputs) -> tuple[_GaussianGuess, _GaussianGuess]:
-            """h_i from h_{i+1}, by one step of the linear process."""
+        def step_back(h: _StateGuide, inputs) -> tuple[_StateGuide, _StateGuide]:
+            """Return h_i and h_{i+1} from h_{i+1}, by one step of the linear process."""
             (F, drift, V), dt = inputs
-            shift, H = guess
+            shift, H = h
             step = self.target.linear_step(F, V, dt)
+            # (H⁻¹ + covariance)⁻¹ in a form that allows a singular H.
             gain = inverse(jnp.eye(d, dtype=end.dtype) + matmul(H, step.covariance))
             shift = shift - matvec(H, matvec(step.integral, drift))
             shift = matvec(step.decay.T, matvec(gain, shift))
             H = matmul(step.decay.T, matmul(matmul(gain, H), step.decay))
-            return _GaussianGuess(shift, (H + H.T) / 2), guess
+            return _StateGuide(shift, (H + H.T) / 2), h  # H stays symmetric under rounding
 
         F, drift, V = jax.tree.map(lambda leaf: leaf[-1], coefficients)
         step = self.target.linear_step(F, V, dt[-1])
-        pull = matmul(step.decay.T, inverse(step.covariance))  # from t_{N-1} to b itself
-        last = _GaussianGuess(-matvec(pull, matvec(step.integral, drift)), matmul(pull, step.decay))
+        pull = matmul(step.decay.T, inverse(step.covariance))  # from t_{N-1} to b
+        last = _StateGuide(-matvec(pull, matvec(step.integral, drift)), matmul(pull, step.decay))
         num_steps = dt.shape[0]
-        each = jax.tree.map(
+        per_step = jax.tree.map(
             lambda leaf: jnp.broadcast_to(leaf, (num_steps, *leaf.shape[1:]))[:-1], coefficients
         )
-        _, (shift, H) = lax.scan(back, last, (each, dt[:-1]), reverse=True)
+        _, (shift, H) = lax.scan(step_back, last, (per_step, dt[:-1]), reverse=True)
         roots = over_points(lambda x: dynamics.sigma(x).root().as_matrix(d, x.dtype))(points)
         roots = jnp.broadcast_to(roots, (num_steps, d, d))[:-1]
         pull_back = jnp.swapaxes(roots, 1, 2)
         shift = jax.vmap(matvec)(pull_back, shift)
         H = jax.vmap(matmul)(jax.vmap(matmul)(pull_back, H), roots)
-        return _NoiseGuess(shift, H, roots if dynamics.sigma_varies else None)
+        return _NoiseGuide(shift, H, roots if dynamics.sigma_varies else None)
 
     def step_law(self, step, x, target):
-        shift, H, L_guess = step.guide
+        shift, H, L_guide = step.guide
         L, S, gap = target.sigma.root(), target.matrix, target.mean - step.end
-        if L_guess is None:
+        if L_guide is None:  # L̃ = L: no scaling
             K, r = H, shift - matvec(H, L.solve(gap))  # Lᵀ H̃ L and Lᵀ r̃
         else:
-            here = L.as_matrix(len(x), x.dtype)
-            scale = root_of((matmul(here, here.T) + matmul(L_guess, L_guess.T)) / 2)  # L̄
-            from_guess, from_here = (
+            root_here = L.as_matrix(len(x), x.dtype)
+            scale = root_of((matmul(root_here, root_here.T) + matmul(L_guide, L_guide.T)) / 2)  # L̄
+            from_guide, from_here = (
                 jnp.stack([scale.solve(root[:, j]) for j in range(len(x))], axis=1)
-                for root in (L_guess, here)
+                for root in (L_guide, root_here)
             )
             K = matmul(from_here.T, matmul(H, from_here))
-            r = matvec(from_guess.T, shift) - matvec(H, scale.solve(gap))
+            r = matvec(from_guide.T, shift) - matvec(H, scale.solve(gap))
             r = matvec(from_here.T, r)
         C = matmul(S, inverse(jnp.eye(len(x), dtype=x.dtype) + step.dt * matmul(K, S)))
         mean = target.mean + step.dt * L.mv(matvec(C, r))
         return StepLaw(mean, L, (C + C.T) / 2, step.dt)
 
     def _linear(self, dynamics: Dynamics, x: Float[Array, " d"], end: Float[Array, " d"]):
-        """F, the linear drift at b, and Ṽ, when the diffusion is linearised at x."""
+        """Return F, the linear drift at b, and Ṽ, for the diffusion linearised at x."""
         F = jax.jacfwd(dynamics.drift)(x) if self._matrix is None else self._matrix.astype(x.dtype)
         V = covariance_of(dynamics.sigma(x), x)
         return F, dynamics.drift(x) + matvec(F, end - x), V
