@@ -66,7 +66,7 @@ from ..schemes import (
 from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
 from .memory_blocks import block_over_devices, in_blocks, masked
 
-# Of the duration: shorter steps are lost in the rounding of points.
+# Share of the duration. Shorter steps change points by less than their rounding errors.
 _SHORTEST_STEP = 1e-10
 
 
@@ -105,7 +105,7 @@ class AbstractGuidedProposal(AbstractSingleProposal):
 
     @property
     def target(self) -> AbstractStepDensity:
-        assert self.density is not None  # decided by `for_model`
+        assert self.density is not None  # set by `for_model`
         return self.density
 
     @property
@@ -122,7 +122,7 @@ class AbstractGuidedProposal(AbstractSingleProposal):
 
     def for_model(self, model, like, for_density=False):
         model.check_invertible_sigma(like)
-        # One that is not normal was selected for a density, and serves nothing else.
+        # A density that is not normal was selected for weights and is unusable for paths.
         if self.density is not None and (for_density or self.density.is_normal):
             return self
         return self._with_density(
@@ -212,13 +212,17 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         _, log_weights, log_halving = noise_of(self, dynamics, intervals, paths)
         unknown = jnp.full_like(log_halving, jnp.nan)
         logs = (leaf[:, None] for leaf in (log_weights, log_halving, unknown))
-        made = _weighted(paths[:, None], *logs)
-        return made if active is None else masked(made, active)
+        weighted = _as_weighted_paths(paths[:, None], *logs)
+        return weighted if active is None else masked(weighted, active)
 
 
 class _CoarseSteps(NamedTuple):
-    """The step of half as many in which each step lies, whether it ends with it, and the share c of
-    the earlier noise."""
+    """Coarse steps, one entry per fine step: each entry belongs to the coarse step around it.
+
+    - `guide`, `dt`, `remaining`: the fields of `Step` for the coarse step.
+    - `share`: c, the coefficient of the earlier noise ξ_i (module docstring).
+    - `ends`: whether the coarse step ends with this fine step.
+    """
 
     guide: PyTree
     dt: Float[Array, "*steps I"]
@@ -228,8 +232,13 @@ class _CoarseSteps(NamedTuple):
 
 
 class _Steps(NamedTuple):
-    """What changes from step to step, for a scan: the fields of `Step`; the length of the step
-    before, and whether the two are a pair; and the coarse step of both, if there are any."""
+    """Inputs of a scan over steps.
+
+    - `guide`, `dt`, `remaining`: the fields of `Step`.
+    - `before`: the length of the previous step.
+    - `ends_pair`: whether the previous step and this one are a pair of `halving`.
+    - `coarse`: the coarse steps; `None` if none are simulated.
+    """
 
     guide: PyTree
     dt: Float[Array, "*steps I"]
@@ -239,13 +248,12 @@ class _Steps(NamedTuple):
     coarse: _CoarseSteps | None
 
 
-class _Weighted(NamedTuple):
-    """The point where a path is, and its log densities so far under the target and under the
-    proposal.
+class _PathWeights(NamedTuple):
+    """Current points of paths, with their log densities so far under target and proposal.
 
-    The two are summed apart because XLA's CPU compiler (JAX 0.10.2) does not vectorise a sum in
-    place that reads a slice of the loop's inputs, as the noise is, and the target's takes most of
-    the work.
+    The two densities have separate sums for speed. XLA's CPU compiler (JAX 0.10.2) does not
+    vectorise an in-place sum that reads a slice of the loop's inputs. The density of the proposal
+    reads the noise, which is such a slice. The density of the target takes most of the work.
     """
 
     x: Float[Array, "d *lanes"]
@@ -257,23 +265,32 @@ class _Weighted(NamedTuple):
         return self.log_target - self.log_proposal
 
 
-class _State(NamedTuple):
-    """Paths, and for some of them what their step error is estimated from: the point before and D
-    of `halving` so far; or the noise before and the coarse path so far."""
+class _LaneState(NamedTuple):
+    """State of all lanes.
 
-    path: _Weighted
+    The first paths of each interval have a second part, for the estimate of discretisation errors.
+
+    - `path`: the paths.
+    - `before`: the previous point, or the previous noise if there are coarse paths.
+    - `log_halving`: D of `halving` so far.
+    - `coarse`: coarse paths so far; `None` if none are simulated.
+    """
+
+    path: _PathWeights
     before: Float[Array, "d *looked"]
     log_halving: Float[Array, "*looked"]
-    coarse: _Weighted | None
+    coarse: _PathWeights | None
 
     @property
     def x(self) -> Float[Array, "d *lanes"]:
         return self.path.x
 
 
-class _Lanes:
-    """The steps of a proposal for n paths of each of I intervals, side by side: I n lanes. What
-    belongs to a single interval is worked out once and shared by its paths."""
+class _GuidedLanes:
+    """Steps of a proposal in I n lanes, for n paths of each of I intervals.
+
+    Quantities of an interval are computed once and shared by its paths.
+    """
 
     def __init__(
         self,
@@ -285,7 +302,7 @@ class _Lanes:
         with_coarse: bool = False,
     ):
         start, end, _ = intervals
-        fractions, coarse_points = _points(proposal, num_steps)
+        fractions, coarse_points = _fractions(proposal, num_steps)
         guide, dt, remaining = _grid(proposal, dynamics, intervals, fractions)
         coarse, self._coarse_dt = None, None
         if with_coarse:
@@ -293,8 +310,9 @@ class _Lanes:
             coarse, self._coarse_dt = _coarse_grid(*arguments)
         num_steps = self.num_steps = len(fractions) - 1
         self._num_draws, self._num_steps = num_draws, num_steps
-        self._num_looked = num_looked(num_draws, dynamics.sigma_varies)
-        self._of_lane = None if start.shape[0] == 1 else -1
+        self._num_evaluated = num_looked(num_draws, dynamics.sigma_varies)
+        # A single interval needs no axis of lanes, because all lanes share its values.
+        self._lane_axis = None if start.shape[0] == 1 else -1
         self.start, self.end = start.T, end.T
         before, ends = jnp.roll(dt, 1, axis=0), jnp.arange(num_steps) % 2 == 1
         self.steps = _Steps(guide, dt[:-1], remaining[:-1], before[:-1], ends[:-1], coarse)
@@ -302,39 +320,44 @@ class _Lanes:
         self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.target
         # The end is observed exactly, so the last step needs a density of x'.
         self._closing = self._density if self._density.is_normal else EulerDensity()
-        self._of_pairs = jax.jit(self._log_halving)  # traced once, for the loop and for its end
+        self._jitted_log_halving = jax.jit(
+            self._log_halving
+        )  # traced once, for the loop and the last step
 
     def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
-        """What belongs to an interval, for each of its lanes."""
+        """Repeat the values of each interval for all its lanes."""
         return jnp.repeat(leaf, self._num_draws, axis=-1)
 
-    def begin(self) -> _State:
-        """Paths at their start, with weight one."""
+    def begin(self) -> _LaneState:
+        """Return the state at the start of the paths, with weight one."""
         start = self.spread(self.start)
-        some, zero = self._looked(start), jnp.zeros_like(start[0])
-        none = jnp.zeros_like(some[0])
-        coarse = None if self._coarse_dt is None else _Weighted(some, none, none)
-        return _State(_Weighted(start, zero, zero), some, none, coarse)
+        evaluated, zero = self._evaluated(start), jnp.zeros_like(start[0])
+        zeros = jnp.zeros_like(evaluated[0])
+        coarse = None if self._coarse_dt is None else _PathWeights(evaluated, zeros, zeros)
+        return _LaneState(_PathWeights(start, zero, zero), evaluated, zeros, coarse)
 
-    def advance(self, state: _State, xi: Float[Array, "d lanes"], steps: _Steps) -> _State:
-        """One step with the noise ξ, and the densities with their factors."""
-        step = self._of_each(self._step(steps), self._num_draws)
-        path = self._stepped(state.path, xi, step)
+    def advance(self, state: _LaneState, xi: Float[Array, "d lanes"], steps: _Steps) -> _LaneState:
+        """Return the state after a step with the noise ξ."""
+        step = self._per_lane(self._step(steps), self._num_draws)
+        path = self._take_step(state.path, xi, step)
         if state.coarse is None:
-            return self._moved(state, path, steps)
-        here = self._looked(xi)
+            return self._update_halving(state, path, steps)
+        here = self._evaluated(xi)
         coarse, coarse_steps = state.coarse, steps.coarse
-        if coarse_steps is None:  # the coarse path is of one step, its last
+        if coarse_steps is None:  # the coarse path has one step only, which `finish` takes
             return state._replace(path=path)
         coarse = lax.cond(
             coarse_steps.ends,
-            lambda: self._coarse_stepped(coarse, state.before, here, coarse_steps),
+            # The noise of both fine steps is available at the end of the pair.
+            lambda: self._take_coarse_step(coarse, state.before, here, coarse_steps),
             lambda: coarse,
         )
-        return _State(path, here, state.log_halving, coarse)
+        return _LaneState(path, here, state.log_halving, coarse)
 
-    def _stepped(self, path: _Weighted, xi: Float[Array, "d lanes"], step: Step) -> _Weighted:
-        """Return paths after a step with this noise."""
+    def _take_step(
+        self, path: _PathWeights, xi: Float[Array, "d lanes"], step: Step
+    ) -> _PathWeights:
+        """Return the paths after a step with this noise."""
 
         def one(x, xi, step):
             target = self._density.steps_from(self._dynamics, x).law(step.dt)
@@ -342,31 +365,35 @@ class _Lanes:
             point = law.point(xi)
             return target.bent(point), self._log_densities(target, law, point, xi)
 
-        made = over_lanes(-1, -1, self._of_lane)(one)(path.x, xi, step)
-        return self._weighted(path, *made)
+        results = over_lanes(-1, -1, self._lane_axis)(one)(path.x, xi, step)
+        return self._add_factors(path, *results)
 
-    def _coarse_stepped(
+    def _take_coarse_step(
         self,
-        coarse: _Weighted,
+        coarse: _PathWeights,
         before: Float[Array, "d looked"],
         xi: Float[Array, "d looked"],
         steps: _CoarseSteps,
-    ) -> _Weighted:
-        """Return the coarse paths after a step with the noise of two fine ones."""
+    ) -> _PathWeights:
+        """Return the coarse paths after a step with the noise of two fine steps.
+
+        It has no derivatives, because only the estimated discretisation error depends on it.
+        """
         xi = steps.share * before + jnp.sqrt(1 - steps.share**2) * xi
         step = Step(steps.guide, steps.dt, steps.remaining, self.end)
-        stepped = self._stepped(coarse, xi, self._of_each(step, self._num_looked))
+        stepped = self._take_step(coarse, xi, self._per_lane(step, self._num_evaluated))
         return lax.stop_gradient(stepped)
 
     @staticmethod
-    def _weighted(path: _Weighted, x_next, log_densities) -> _Weighted:
+    def _add_factors(path: _PathWeights, x_next, log_densities) -> _PathWeights:
+        """Move the paths to the next points; add the log densities of the step."""
         target, proposal = log_densities
-        return _Weighted(x_next, path.log_target + target, path.log_proposal + proposal)
+        return _PathWeights(x_next, path.log_target + target, path.log_proposal + proposal)
 
     def retrace(
-        self, state: _State, x_next: Float[Array, "d lanes"], steps: _Steps
-    ) -> tuple[_State, Float[Array, "d lanes"]]:
-        """The step to these points, and the noise ξ that it takes."""
+        self, state: _LaneState, x_next: Float[Array, "d lanes"], steps: _Steps
+    ) -> tuple[_LaneState, Float[Array, "d lanes"]]:
+        """Return the state after a step to these points, and the noise ξ of the step."""
 
         def one(x, x_next, step):
             target = self._density.steps_from(self._dynamics, x).law(step.dt)
@@ -374,77 +401,88 @@ class _Lanes:
             xi = law.noise(x_next)
             return xi, self._log_densities(target, law, x_next, xi)
 
-        step = self._of_each(self._step(steps), self._num_draws)
-        xi, log_densities = over_lanes(-1, -1, self._of_lane)(one)(state.x, x_next, step)
-        return self._moved(state, self._weighted(state.path, x_next, log_densities), steps), xi
+        step = self._per_lane(self._step(steps), self._num_draws)
+        xi, log_densities = over_lanes(-1, -1, self._lane_axis)(one)(state.x, x_next, step)
+        return self._update_halving(
+            state, self._add_factors(state.path, x_next, log_densities), steps
+        ), xi
 
-    def finish(self, state: _State) -> tuple[Float[Array, " lanes"], Float[Array, "I m"]]:
-        """The log weights with that of the last step, to b; and of the paths that are looked at
-        D, or the log weights of their coarse paths."""
-        path = self._finished(state.path, self._last.dt, self._num_draws)
+    def finish(self, state: _LaneState) -> tuple[Float[Array, " lanes"], Float[Array, "I m"]]:
+        """Return log weights after the last step, which ends in b, and values for step errors.
+
+        These values are D, or the log weights of the coarse paths, for the first m paths of each
+        interval.
+        """
+        path = self._take_last_step(state.path, self._last.dt, self._num_draws)
         if state.coarse is None or self._coarse_dt is None:
-            state = self._moved(state, path, self._last)
+            state = self._update_halving(state, path, self._last)
             half = log_halving_of_all_steps(state.log_halving, self._num_steps)
         else:
-            coarse = self._finished(state.coarse, self._coarse_dt, self._num_looked).log_weight
+            coarse = self._take_last_step(
+                state.coarse, self._coarse_dt, self._num_evaluated
+            ).log_weight
             half = lax.stop_gradient(jnp.where(jnp.isfinite(coarse), coarse, -jnp.inf))
-        return path.log_weight, half.reshape(-1, self._num_looked)
+        return path.log_weight, half.reshape(-1, self._num_evaluated)
 
-    def _finished(self, path: _Weighted, dt: Float[Array, " I"], num_draws: int) -> _Weighted:
-        """Return paths of so many lanes an interval after their last step, to b."""
+    def _take_last_step(
+        self, path: _PathWeights, dt: Float[Array, " I"], num_draws: int
+    ) -> _PathWeights:
+        """Return the paths, `num_draws` per interval, after their last step, which ends in b."""
 
         def one(x, last):
-            # Steps may lead out of the state space, where no bridge ends.
+            # An end point outside of the state space makes the weight NaN, so no path is found.
             end, dt = last
             inside = all_finite(self._dynamics.drift(end))
             inside &= jnp.isfinite(self._dynamics.sigma(end).log_abs_det())
             log_density = self._closing.steps_from(self._dynamics, x).law(dt).log_density(end)
             return jnp.where(inside, log_density, jnp.nan)
 
-        last = self._of_each((self.end, dt), num_draws)
-        log_density = over_lanes(-1, self._of_lane)(one)(path.x, last)
+        last = self._per_lane((self.end, dt), num_draws)
+        log_density = over_lanes(-1, self._lane_axis)(one)(path.x, last)
         end = jnp.repeat(self.end, num_draws, axis=-1)
-        return self._weighted(path, end, (log_density, jnp.zeros_like(log_density)))
+        return self._add_factors(path, end, (log_density, jnp.zeros_like(log_density)))
 
     def _step(self, steps: _Steps) -> Step:
         return Step(steps.guide, steps.dt, steps.remaining, self.end)
 
-    def _of_each(self, of_intervals: PyTree, num_draws: int) -> PyTree:
-        """For each of so many lanes an interval; without an axis for a single interval, which all
-        lanes share."""
-        if self._of_lane is None:
+    def _per_lane(self, of_intervals: PyTree, num_draws: int) -> PyTree:
+        """Repeat values of intervals for `num_draws` lanes each.
+
+        For a single interval, return values without an axis of lanes.
+        """
+        if self._lane_axis is None:
             return jax.tree.map(lambda leaf: leaf[..., 0], of_intervals)
         return jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=-1), of_intervals)
 
-    def _looked(self, leaf: Float[Array, "*shape lanes"]) -> Float[Array, "*shape looked"]:
-        """The first paths of each interval, of which D is worked out."""
-        leaf = leaf.reshape(*leaf.shape[:-1], -1, self._num_draws)[..., : self._num_looked]
+    def _evaluated(self, leaf: Float[Array, "*shape lanes"]) -> Float[Array, "*shape looked"]:
+        """Return the first paths of each interval, for which D is computed."""
+        leaf = leaf.reshape(*leaf.shape[:-1], -1, self._num_draws)[..., : self._num_evaluated]
         return leaf.reshape(*leaf.shape[:-2], -1)
 
     @staticmethod
     def _log_densities(target: StepLaw, law: StepLaw, point, xi):
         return target.log_relative(point), law.log_relative_of_noise(xi)
 
-    def _moved(self, state: _State, path: _Weighted, steps: _Steps) -> _State:
-        """The state with these paths, which are one step on, and their D."""
-        here, there = self._looked(state.x), self._looked(path.x)
+    def _update_halving(self, state: _LaneState, path: _PathWeights, steps: _Steps) -> _LaneState:
+        """Return the state with these paths, one step further, and with D updated."""
+        x, x_next = self._evaluated(state.x), self._evaluated(path.x)
         change = lax.cond(
             steps.ends_pair,
-            lambda: self._of_pairs(state.before, here, there, steps.before, steps.dt),
+            lambda: self._jitted_log_halving(state.before, x, x_next, steps.before, steps.dt),
             lambda: jnp.zeros_like(state.log_halving),
         )
-        return _State(path, here, state.log_halving + lax.stop_gradient(change), None)
+        return _LaneState(path, x, state.log_halving + lax.stop_gradient(change), None)
 
     def _log_halving(self, before, x, x_next, *both):
-        """The part of D of pairs of steps, of the paths that are looked at."""
+        """Return the summand of D of one pair of steps, for the first paths of each interval."""
 
         def one(before, x, x_next, *both):
             points = (before, x, x_next)
             return log_halving_of_pair(self._density, self._dynamics, points, both)
 
-        both = self._of_each(both, self._num_looked)
-        each = (-1, -1, -1, self._of_lane, self._of_lane)
-        return over_lanes(*each)(one)(before, x, x_next, *both)
+        both = self._per_lane(both, self._num_evaluated)
+        axes = (-1, -1, -1, self._lane_axis, self._lane_axis)
+        return over_lanes(*axes)(one)(before, x, x_next, *both)
 
 
 def noise_of(
@@ -453,18 +491,22 @@ def noise_of(
     intervals: Intervals,
     paths: Float[Array, "I points d"],
 ) -> tuple[Float[Array, "I steps d"], Float[Array, " I"], Float[Array, " I"]]:
-    """The noise ξ_0, ..., ξ_{N-2} from which the proposal makes these paths, one for each
-    interval, their log weights, and D."""
-    lanes = _Lanes(proposal, dynamics, intervals, paths.shape[1] - 1)
+    """Return the noise of given paths, one per interval, with their log weights and D.
 
-    def each(state, inputs):
+    The noise ξ_0, ..., ξ_{N-2} generates these paths by steps of the proposal.
+    """
+    lanes = _GuidedLanes(proposal, dynamics, intervals, paths.shape[1] - 1)
+
+    def step(state, inputs):
         x_next, steps = join_rows(inputs)
         state, xi = lanes.retrace(join_rows(state), x_next, steps)
         return split_rows(state), split_rows(xi)
 
     inputs = split_rows((jnp.moveaxis(paths, 0, -1)[1:-1], lanes.steps), axis=1)
-    state, xi = lax.scan(each, split_rows(lanes.begin()), inputs)
-    return jnp.moveaxis(join_rows(xi, axis=1), -1, 0), *_flat(lanes.finish(join_rows(state)))
+    state, xi = lax.scan(step, split_rows(lanes.begin()), inputs)
+    return jnp.moveaxis(join_rows(xi, axis=1), -1, 0), *_drop_draw_axis(
+        lanes.finish(join_rows(state))
+    )
 
 
 def path_of(
@@ -473,49 +515,53 @@ def path_of(
     intervals: Intervals,
     xi: Float[Array, "I steps d"],
 ) -> tuple[Float[Array, "I points d"], Float[Array, " I"], Float[Array, " I"]]:
-    """The paths that the proposal makes from this noise, their log weights, and D: the inverse of
-    `noise_of`."""
-    lanes = _Lanes(proposal, dynamics, intervals, xi.shape[1] + 1)
+    """Return the paths that this noise generates, with their log weights and D.
 
-    def each(state, inputs):
+    It is the inverse of `noise_of`. The target must have normal steps.
+    """
+    lanes = _GuidedLanes(proposal, dynamics, intervals, xi.shape[1] + 1)
+
+    def step(state, inputs):
         state = lanes.advance(join_rows(state), *join_rows(inputs))
         return split_rows(state), split_rows(state.x)
 
     inputs = split_rows((jnp.moveaxis(xi, 0, -1), lanes.steps), axis=1)
-    state, path = lax.scan(each, split_rows(lanes.begin()), inputs)
+    state, path = lax.scan(step, split_rows(lanes.begin()), inputs)
     path = jnp.concatenate([lanes.start[None], join_rows(path, axis=1), lanes.end[None]])
-    return jnp.moveaxis(path, -1, 0), *_flat(lanes.finish(join_rows(state)))
+    return jnp.moveaxis(path, -1, 0), *_drop_draw_axis(lanes.finish(join_rows(state)))
 
 
-def _flat(finished: tuple[Array, Array]) -> tuple[Float[Array, " I"], Float[Array, " I"]]:
-    """Of one path for each interval."""
+def _drop_draw_axis(finished: tuple[Array, Array]) -> tuple[Float[Array, " I"], Float[Array, " I"]]:
+    """Return the log weights and D of one path per interval, without the axis of draws."""
     log_weights, log_halving = finished
     return log_weights, log_halving[:, 0]
 
 
-def _weighted(
+def _as_weighted_paths(
     paths: Float[Array, "I n K d"],
     log_weights: Float[Array, "I n"],
     log_halving: Float[Array, "I n"],
     log_coarse: Float[Array, "I n"],
 ) -> WeightedPaths:
-    """One simulated path each; those that left the finite numbers are not found."""
-    found = jnp.isfinite(log_weights)
+    """Return guided paths as `WeightedPaths`; paths with a non-finite weight are not found."""
+    is_finite = jnp.isfinite(log_weights)
     return WeightedPaths(
-        jnp.where(found[..., None, None], paths, jnp.nan),
-        jnp.where(found, log_weights, -jnp.inf),
-        found,
-        jnp.zeros_like(found),
-        jnp.ones(found.shape, jnp.int32),
-        (~found).astype(jnp.int32),
+        jnp.where(is_finite[..., None, None], paths, jnp.nan),
+        jnp.where(is_finite, log_weights, -jnp.inf),
+        is_finite,
+        jnp.zeros_like(is_finite),
+        jnp.ones(is_finite.shape, jnp.int32),
+        (~is_finite).astype(jnp.int32),
         log_halving,
         log_coarse,
     )
 
 
-class _Drawn(NamedTuple):
-    """Paths, their log weights, and what their step error is estimated from (`WeightedPaths`),
-    which has no derivatives."""
+class _Draws(NamedTuple):
+    """Paths with log weights.
+
+    `log_halving` and `log_coarse` are those of `WeightedPaths`; they have no derivatives.
+    """
 
     paths: Float[Array, "I n K d"]
     log_weights: Float[Array, "I n"]
@@ -524,7 +570,7 @@ class _Drawn(NamedTuple):
 
 
 class _Inputs(NamedTuple):
-    """Everything that paths and weights may be differentiated with respect to."""
+    """Inputs in which paths and weights have derivatives."""
 
     proposal: AbstractGuidedProposal
     model: Diffusion
@@ -540,31 +586,33 @@ def _draw_block(
     intervals: Intervals,
     active: Bool[Array, " I"] | None,
 ) -> WeightedPaths:
-    return _weighted(*_draw(_Inputs(proposal, model, intervals), keys, stored, num_steps))
+    """Draw one weighted path per key. All intervals are drawn, as `active` is ignored."""
+    return _as_weighted_paths(*_draw(_Inputs(proposal, model, intervals), keys, stored, num_steps))
 
 
 @eqx.filter_custom_jvp
 def _draw(
     inputs: _Inputs, keys: Key[Array, "I n"], stored: Int[Array, " K"] | None, num_steps: int
-) -> _Drawn:
-    """One path for each key, and its log weights."""
+) -> _Draws:
+    """Draw one path per key, with its log weight."""
     return _simulate(inputs, keys, stored, num_steps, None)
 
 
 @_draw.def_jvp
 def _draw_tangents(primals, tangents):
-    """Paths that left the finite numbers have no derivatives. They are run without noise here, for
-    in reverse mode a masked 0 · ∞ would be NaN."""
+    """Return the draws with their tangents; paths with non-finite weights have tangent zero."""
     inputs, keys, stored, num_steps = primals
-    drawn = _draw(inputs, keys, stored, num_steps)
-    found = jnp.isfinite(drawn.log_weights)
+    draws = _draw(inputs, keys, stored, num_steps)
+    is_finite = jnp.isfinite(draws.log_weights)
 
-    def again(inputs):
-        paths, log_weights, *_ = _simulate(inputs, keys, stored, num_steps, found)
-        return jnp.where(found[..., None, None], paths, 0), jnp.where(found, log_weights, 0)
+    def redraw(inputs):
+        # Non-finite paths are simulated without noise, because in reverse mode a masked 0 · ∞ would
+        # be NaN.
+        paths, log_weights, *_ = _simulate(inputs, keys, stored, num_steps, is_finite)
+        return jnp.where(is_finite[..., None, None], paths, 0), jnp.where(is_finite, log_weights, 0)
 
-    _, along = eqx.filter_jvp(again, (inputs,), (tangents[0],))
-    return drawn, _Drawn(*along, *map(jnp.zeros_like, drawn[2:]))
+    _, along = eqx.filter_jvp(redraw, (inputs,), (tangents[0],))
+    return draws, _Draws(*along, *map(jnp.zeros_like, draws[2:]))
 
 
 def _simulate(
@@ -573,22 +621,26 @@ def _simulate(
     stored: Int[Array, " K"] | None,
     num_steps: int,
     noisy: Bool[Array, "I n"] | None,
-) -> _Drawn:
-    """Paths and their log weights; without noise where `noisy` is given and false."""
+) -> _Draws:
+    """Simulate one path per key, with its log weight; without noise where `noisy` is false.
+
+    `noisy` is `None` if all paths have noise.
+    """
     proposal, model, intervals = inputs
     dynamics = model.forward(intervals.start[0])
     (num_intervals, num_draws), (_, d) = keys.shape, intervals.start.shape
     dtype = intervals.start.dtype
-    # Half as many steps from the same noise are other paths, of no use where paths are wanted.
+    # Coarse paths differ from the fine ones, so they estimate the error of weights only.
     only_weights = stored is not None and stored.shape[0] == 0
     with_coarse = only_weights and dynamics.sigma_varies and num_steps > 1
-    lanes = _Lanes(proposal, dynamics, intervals, num_steps, num_draws, with_coarse)
+    lanes = _GuidedLanes(proposal, dynamics, intervals, num_steps, num_draws, with_coarse)
     num_steps = lanes.num_steps
     state, end = lanes.begin(), lanes.spread(lanes.end)
     path = state.x[None][:0]
     store = slots = None
     if stored is not None:
-        # Row K is for waste; rows of the first and the last step are filled by hand.
+        # Row K receives all points that are not stored. The rows of the first and the last point
+        # are filled separately, because the scan covers the points between.
         rows = jnp.broadcast_to(state.x, (stored.shape[0] + 1, *state.x.shape))
         slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(len(stored)))
         store = Store(slots[1:-1], rows)
@@ -612,17 +664,17 @@ def _simulate(
         )
     elif store is not None:
         path = store.rows
-    log_weights, some = lanes.finish(state)
+    log_weights, evaluated = lanes.finish(state)
     log_weights = log_weights.reshape(keys.shape)
     unknown = jnp.full(keys.shape, jnp.nan, dtype)
-    half = unknown.at[:, : some.shape[1]].set(some)
+    half = unknown.at[:, : evaluated.shape[1]].set(evaluated)
     halves = (unknown, half) if with_coarse else (half, unknown)
     if slots is None:
         path = jnp.concatenate([start[None], path, end[None]])
     else:
         path = path.at[slots[-1]].set(end)[:-1]
     path = path.reshape(-1, d, num_intervals, num_draws)
-    return _Drawn(jnp.moveaxis(path, (2, 3), (0, 1)), log_weights, *halves)
+    return _Draws(jnp.moveaxis(path, (2, 3), (0, 1)), log_weights, *halves)
 
 
 def _grid(
@@ -631,8 +683,7 @@ def _grid(
     intervals: Intervals,
     fractions: Float[np.ndarray, " points"],
 ) -> tuple[PyTree, Float[Array, "N I"], Float[Array, "N I"]]:
-    """Return the guide, the lengths of steps, and the time that remains at each, on the grid of
-    these fractions of the time that remains."""
+    """Return the guide, δ_i and T - t_i on a grid, which is given by (T - t_i) / T."""
     start, end, duration = intervals
     dt = jnp.asarray(-np.diff(fractions), start.dtype)[:, None] * duration
     remaining = jnp.asarray(fractions[:-1], start.dtype)[:, None] * duration
@@ -640,14 +691,14 @@ def _grid(
     return guide(dynamics, start, end, dt), dt, remaining
 
 
-def _points(
+def _fractions(
     proposal: AbstractGuidedProposal, num_steps: int
 ) -> tuple[Float[np.ndarray, " points"], list[int]]:
-    """Return the fractions of the time that remains, and which of them are points of the grid of
-    half as many steps.
+    """Return (T - t_i) / T of the grid, and the indices of the points of the coarse grid.
 
-    The last step needs a normal law. If the others are not normal, it is of lower order, and is
-    split into steps of ½, ¼, ..., 2^-k of its length, the last of which is about T / N².
+    The coarse grid has half as many steps. The last step needs a normal law. If other steps are not
+    normal, the last one has a lower order. Hence it is split into steps of ½, ¼, ..., 2^-k of its
+    length, and the last of these is about T / N².
     """
     fractions = proposal.remaining(num_steps)
     coarse = [*range(0, num_steps, 2)]
@@ -655,7 +706,7 @@ def _points(
         return fractions, [*coarse, num_steps]
     num_splits = math.ceil(math.log2(num_steps)) if num_steps > 1 else 0
     splits = fractions[-2] * 0.5 ** np.arange(1, num_splits + 1)
-    # The coarse grid splits its last step down to four times the length.
+    # The last step of the coarse grid is about T / (N/2)², four times as long.
     shared = range(num_steps - 1, num_steps - 1 + max(num_splits - 1, 0))
     coarse = sorted({*coarse, *shared})
     return np.concatenate([fractions[:-1], splits, [0.0]]), [*coarse, num_steps + num_splits]
@@ -668,8 +719,10 @@ def _coarse_grid(
     fractions: Float[np.ndarray, " points"],
     points: list[int],
 ) -> tuple[_CoarseSteps | None, Float[Array, " I"]]:
-    """Return the steps of half as many, each once for the two that it replaces (`None` if there is
-    only the last), and the length of the last."""
+    """Return the coarse steps, one entry per fine step, and the length of the last coarse step.
+
+    The coarse steps are `None` if there is only the last one.
+    """
     guide, dt, remaining = _grid(proposal, dynamics, intervals, fractions[points])
     num_inner = len(points) - 2
     if num_inner == 0:
@@ -677,12 +730,13 @@ def _coarse_grid(
     first, last = np.array(points[:-2]), np.array(points[1:-1])
     before, middle, after = fractions[first], fractions[first + 1], fractions[last]
     is_pair = last - first == 2
+    # A coarse step that equals one fine step has the same noise: c = 0.
     share = np.sqrt((before - middle) * after / ((before - after) * middle)) * is_pair
-    number = np.arange(len(fractions) - 2)
-    which = np.minimum(np.searchsorted(last, number + 1), num_inner - 1)
-    ends = np.isin(number + 1, last)
-    each = (guide, dt[:-1], remaining[:-1], jnp.asarray(share, dt.dtype))
-    guide, dt_inner, remaining, share = jax.tree.map(lambda leaf: leaf[which], each)
+    numbers = np.arange(len(fractions) - 2)
+    owner = np.minimum(np.searchsorted(last, numbers + 1), num_inner - 1)
+    ends = np.isin(numbers + 1, last)
+    coarse_steps = (guide, dt[:-1], remaining[:-1], jnp.asarray(share, dt.dtype))
+    guide, dt_inner, remaining, share = jax.tree.map(lambda leaf: leaf[owner], coarse_steps)
     return _CoarseSteps(guide, dt_inner, remaining, share, jnp.asarray(ends)), dt[-1]
 
 
@@ -692,7 +746,7 @@ def deterministic_path(
     start: Float[Array, " d"],
     dt: Float[Array, " N"],
 ) -> tuple[Float[Array, "N d"], Float[Array, " d"]]:
-    """ξ_0, ..., ξ_{N-1} and ξ_N of the target's steps from the start, without noise."""
+    """Return ξ_0, ..., ξ_{N-1}, shape (N, d), and ξ_N of the target's steps without noise."""
 
     def step(xi, dt):
         return density.steps_from(dynamics, xi).law(dt).mean, xi
@@ -702,12 +756,13 @@ def deterministic_path(
 
 
 def bridge_law(step: Step, target: StepLaw, mean: Float[Array, " d"]) -> StepLaw:
-    """With this mean and the covariance V δ (T - t_{i+1})/(T - t_i)."""
+    """Return the law with this mean and the covariance V δ (T - t_{i+1}) / (T - t_i)."""
     shrunk = (step.remaining - step.dt) / step.remaining
     return target._replace(mean=mean, covariance=shrunk)
 
 
 def check_refinement(refinement: float) -> float:
+    """Return `refinement` as a float; raise for anything but a number between 1 and 4."""
     if isinstance(refinement, bool) or not isinstance(refinement, int | float):
         raise TypeError(
             f"`refinement` must be a Python number, because it is static under `jit`; got "
@@ -719,11 +774,10 @@ def check_refinement(refinement: float) -> float:
 
 
 def as_guided(proposal: AbstractProposal) -> AbstractGuidedProposal:
-    """The proposal itself, if it makes paths from normal noise."""
+    """Return the proposal, or raise `TypeError` if it is not a guided proposal."""
     if not isinstance(proposal, AbstractGuidedProposal):
         raise TypeError(
-            "Crank–Nicolson moves need a `proposal` that makes paths from normal noise: pass "
-            "`ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()`; got "
-            f"{proposal.describe()}."
+            f"Crank–Nicolson moves need a guided proposal; got {proposal.describe()}: pass "
+            "`ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()` as `proposal`."
         )
     return proposal

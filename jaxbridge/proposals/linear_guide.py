@@ -4,8 +4,9 @@ The law q_i of a step (`guided`) follows from an h-function: h_{i+1}(x) approxim
 density from x at t_{i+1} to b. Let log h be quadratic, with r̃ = ∇log h(μ_i) and H̃ = -∇²log h. The
 step of the target, tilted by h, has the law
 
-    q_i = N(μ_i + δ L C Lᵀ r̃, δ L C Lᵀ),    C = S (I + δ Lᵀ H̃ L S)⁻¹,    L Lᵀ = V(x_i).
+    q_i = N(μ_i + δ L C Lᵀ r̃, δ L C Lᵀ).
 
+Here C = S (I + δ Lᵀ H̃ L S)⁻¹ and L Lᵀ = V(x_i).
 The definitions of r̃ and H̃ are those of Schauer, van der Meulen & van Zanten (2017). The discrete
 form is that of Whitaker, Golightly, Boys & Sherlock (2017). If h is the true density, this is
 Doob's h-transform, and w is constant.
@@ -163,7 +164,7 @@ class Guided(AbstractGuidedProposal):
             (F, drift, V), dt = inputs
             shift, H = h
             step = self.target.linear_step(F, V, dt)
-            # (H⁻¹ + covariance)⁻¹ in a form that allows a singular H.
+            # `gain` H = (H⁻¹ + covariance)⁻¹, in a form that allows a singular H.
             gain = inverse(jnp.eye(d, dtype=end.dtype) + matmul(H, step.covariance))
             shift = shift - matvec(H, matvec(step.integral, drift))
             shift = matvec(step.decay.T, matvec(gain, shift))
