@@ -385,7 +385,7 @@ PROPOSALS = [
     ("another choice", exact(proposal=choice(3, BRIDGE)), "is for 3 intervals; got 1 intervals"),
     ("choice of choices", choose(candidates=[choice(1, BRIDGE)]), "single proposals"),
     ("renewal", exact(proposal="auto", method="renewal"), "renewal is for couplings", TypeError),
-    ("noise", by_noise(proposal="auto"), "paths from normal noise", TypeError),
+    ("noise", by_noise(proposal="auto"), "need a guided proposal", TypeError),
     ("one pilot run", choose(num_pilot=1), "`num_pilot` must be at least 2"),
 ]
 
@@ -471,7 +471,7 @@ EXACT = [
     ("another grid", of(renewal.init)(jnp.zeros((5, 2)), KEY), r"shape \(21, 2\), or `None`"),
     ("no sampler", kernel(NO_SAMPLER, A, B, 1.0), r"Stationary\(burn_in"),
     ("long step", crank_nicolson(step_size=1.5), r"`step_size` must be a number in \(0, 1\]"),
-    ("no noise", crank_nicolson(proposal=PAIRS), "paths from normal noise", TypeError),
+    ("no noise", crank_nicolson(proposal=PAIRS), "need a guided proposal", TypeError),
     # Densities.
     ("no ν", log_density(KEY, BLIND, *POINT), "log_stationary"),
     ("word", log_density(KEY, OU, *POINT, proposal="coupling"), "`proposal` must be", TypeError),

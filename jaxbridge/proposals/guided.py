@@ -320,9 +320,8 @@ class _GuidedLanes:
         self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.target
         # The end is observed exactly, so the last step needs a density of x'.
         self._closing = self._density if self._density.is_normal else EulerDensity()
-        self._jitted_log_halving = jax.jit(
-            self._log_halving
-        )  # traced once, for the loop and the last step
+        # Traced once, for the loop and for the last step.
+        self._jitted_log_halving = jax.jit(self._log_halving)
 
     def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
         """Repeat the values of each interval for all its lanes."""
@@ -465,13 +464,13 @@ class _GuidedLanes:
 
     def _update_halving(self, state: _LaneState, path: _PathWeights, steps: _Steps) -> _LaneState:
         """Return the state with these paths, one step further, and with D updated."""
-        x, x_next = self._evaluated(state.x), self._evaluated(path.x)
+        from_x, to_x = self._evaluated(state.x), self._evaluated(path.x)
         change = lax.cond(
             steps.ends_pair,
-            lambda: self._jitted_log_halving(state.before, x, x_next, steps.before, steps.dt),
+            lambda: self._jitted_log_halving(state.before, from_x, to_x, steps.before, steps.dt),
             lambda: jnp.zeros_like(state.log_halving),
         )
-        return _LaneState(path, x, state.log_halving + lax.stop_gradient(change), None)
+        return _LaneState(path, from_x, state.log_halving + lax.stop_gradient(change), None)
 
     def _log_halving(self, before, x, x_next, *both):
         """Return the summand of D of one pair of steps, for the first paths of each interval."""
@@ -586,7 +585,7 @@ def _draw_block(
     intervals: Intervals,
     active: Bool[Array, " I"] | None,
 ) -> WeightedPaths:
-    """Draw one weighted path per key. All intervals are drawn, as `active` is ignored."""
+    """Draw one weighted path per key, on all intervals; `in_blocks` masks inactive ones."""
     return _as_weighted_paths(*_draw(_Inputs(proposal, model, intervals), keys, stored, num_steps))
 
 
@@ -777,7 +776,7 @@ def as_guided(proposal: AbstractProposal) -> AbstractGuidedProposal:
     """Return the proposal, or raise `TypeError` if it is not a guided proposal."""
     if not isinstance(proposal, AbstractGuidedProposal):
         raise TypeError(
-            f"Crank–Nicolson moves need a guided proposal; got {proposal.describe()}: pass "
-            "`ModifiedDiffusionBridge()`, `ResidualBridge()` or `Guided()` as `proposal`."
+            "Crank–Nicolson moves need a guided proposal: pass `ModifiedDiffusionBridge()`, "
+            f"`ResidualBridge()` or `Guided()` as `proposal`; got {proposal.describe()}."
         )
     return proposal
