@@ -3,12 +3,12 @@
 Grids with step sizes 1, 2 and 4 times as large give the estimates L_0, L_1 and L_2. (The first step
 of a coarser grid is shorter if N is not divisible.) To leading order, the error of one step of k
 times the size is C k^{p+1}. Hence the error of a grid is C S, with S the sum of k^{p+1} over its
-steps. With c_1 = L_1 - L_0 and c_2 = L_2 - L_1 it follows
+steps. The changes c_1 = L_1 - L_0 and c_2 = L_2 - L_1 satisfy
 
     error of L_0 = s c_1,        s = S_0 / (S_1 - S_0),
     c_2 = m c_1,                 m = (S_2 - S_1) / (S_1 - S_0).
 
-For N a power of two these are s = (2^p - 1)⁻¹ and m = 2^p. The difference c_2 - m c_1 measures the
+If N is a power of two, then s = (2^p - 1)⁻¹ and m = 2^p. The difference c_2 - m c_1 measures the
 terms of higher order that s c_1 omits. Suppose that changes continue to shrink from grid to grid by
 the ratio ρ = c_2 / c_1. Then the omitted part is
 
@@ -25,24 +25,24 @@ from jaxtyping import Array, Float
 
 from .step_error import StepError
 
-# Of what is told, where the grids agree.
-_DOUBTED = 0.25
+# Least uncertainty, as a share of the estimated error, even if the three grids agree.
+_LEAST_UNCERTAINTY = 0.25
 
 
 def steps_of_grid(num_steps: int, level: int) -> list[int]:
-    """Of how many of N steps each step of the grid of this level is made, 2^level but the first."""
+    """Return the steps of a coarser grid in units of fine steps: 2^level, the first one shorter."""
     longest = 2**level
     first = num_steps % longest
     return [first] * (first > 0) + [longest] * (num_steps // longest)
 
 
 def num_coarse_grids(num_steps: int) -> int:
-    """How many coarser grids, of two at most, are each of fewer steps than the last."""
+    """Return the number of coarser grids, at most two, each with fewer steps than the one before."""
     return min(num_steps - 1, 2)
 
 
 def share_of_grid(order: int, num_steps: int) -> float:
-    """s: the step error as a share of what the grid of half as many steps changes."""
+    """Return s, the discretisation error relative to the change on a grid of half as many steps."""
     fine, coarse, _ = _sums(order, num_steps)
     return fine / (coarse - fine)
 
@@ -53,39 +53,45 @@ def error_of_grids(
     order: int,
     num_steps: int,
 ) -> StepError:
-    """The step error of the first of the values of grids that are coarser and coarser, with Monte
-    Carlo errors of their own; NaN if there is only one."""
+    """Return the step error of `values[0]`, from values on successively coarser grids.
+
+    `errors` are the Monte Carlo standard errors of the values. For N = 1 there are no coarser
+    grids, and the result is NaN.
+    """
     if num_steps == 1:
         return StepError(*2 * [jnp.full_like(values[0], jnp.nan)])
     share = share_of_grid(order, num_steps)
     change, noise = values[1] - values[0], jnp.hypot(errors[0], errors[1])
-    told = share * change
+    estimate = share * change
     if num_coarse_grids(num_steps) < 2:
-        return StepError(told, _finite(jnp.hypot(share * noise, told)))
+        return StepError(estimate, _finite(jnp.hypot(share * noise, estimate)))
     fine, coarse, coarser = _sums(order, num_steps)
     ratio = (coarser - coarse) / (coarse - fine)
     next_change = values[2] - values[1]
-    # Of both what is beyond Monte Carlo error: it counts once, by itself.
+    # Only the part beyond Monte Carlo error counts as discrepancy, because `noise` has that error.
     factors = np.array([ratio, 1 + ratio, 1]).astype(values.dtype)
-    both = jnp.sqrt(jnp.sum((factors * errors) ** 2))
-    off = jnp.maximum(jnp.abs(next_change - ratio * change) - both, 0)
-    further = next_change * jnp.sign(change) - jnp.abs(change)
-    further += 2 * jnp.hypot(noise, jnp.hypot(errors[1], errors[2]))
+    noise_level = jnp.sqrt(jnp.sum((factors * errors) ** 2))
+    excess = jnp.maximum(jnp.abs(next_change - ratio * change) - noise_level, 0)
+    # |c_1| (ρ - 1), with two Monte Carlo errors added.
+    growth = next_change * jnp.sign(change) - jnp.abs(change)
+    growth += 2 * jnp.hypot(noise, jnp.hypot(errors[1], errors[2]))
     size = jnp.abs(change)
-    # ρ - 1, which is not to count for more than m: that is no reason for less doubt.
-    shrinking = jnp.minimum(further, ratio * size)
-    left_out = jnp.where(size > 0, off * size / jnp.where(shrinking > 0, shrinking, 1), off / ratio)
-    left_out = jnp.where((shrinking > 0) | (size == 0), share * left_out, jnp.inf)
-    doubt = jnp.hypot(share * noise, jnp.hypot(left_out, _DOUBTED * told))
-    return StepError(told, _finite(doubt))
+    # ρ - 1 counts as at most m. A larger ratio is no reason for a smaller uncertainty.
+    shrinking = jnp.minimum(growth, ratio * size)
+    omitted = jnp.where(
+        size > 0, excess * size / jnp.where(shrinking > 0, shrinking, 1), excess / ratio
+    )
+    omitted = jnp.where((shrinking > 0) | (size == 0), share * omitted, jnp.inf)
+    uncertainty = jnp.hypot(share * noise, jnp.hypot(omitted, _LEAST_UNCERTAINTY * estimate))
+    return StepError(estimate, _finite(uncertainty))
 
 
-def _finite(doubt: Float[Array, ""]) -> Float[Array, ""]:
-    """Infinite where a grid has no value."""
-    return jnp.where(jnp.isnan(doubt), jnp.inf, doubt)
+def _finite(uncertainty: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the uncertainty, infinite if it is NaN because a grid has no value."""
+    return jnp.where(jnp.isnan(uncertainty), jnp.inf, uncertainty)
 
 
 def _sums(order: int, num_steps: int) -> list[float]:
-    """S of the three grids."""
+    """Return S of the three grids."""
     grids = [steps_of_grid(num_steps, level) for level in range(3)]
     return [float(sum(k ** (order + 1) for k in grid)) for grid in grids]
