@@ -330,7 +330,7 @@ class _GuidedLanes:
     def begin(self) -> _LaneState:
         """Return the state at the start of the paths, with weight one."""
         start = self.spread(self.start)
-        evaluated, zero = self._evaluated(start), jnp.zeros_like(start[0])
+        evaluated, zero = self._select_evaluated(start), jnp.zeros_like(start[0])
         zeros = jnp.zeros_like(evaluated[0])
         coarse = None if self._coarse_dt is None else _PathWeights(evaluated, zeros, zeros)
         return _LaneState(_PathWeights(start, zero, zero), evaluated, zeros, coarse)
@@ -341,7 +341,7 @@ class _GuidedLanes:
         path = self._take_step(state.path, xi, step)
         if state.coarse is None:
             return self._update_halving(state, path, steps)
-        here = self._evaluated(xi)
+        here = self._select_evaluated(xi)
         coarse, coarse_steps = state.coarse, steps.coarse
         if coarse_steps is None:  # the coarse path has one step only, which `finish` takes
             return state._replace(path=path)
@@ -453,7 +453,9 @@ class _GuidedLanes:
             return jax.tree.map(lambda leaf: leaf[..., 0], of_intervals)
         return jax.tree.map(lambda leaf: jnp.repeat(leaf, num_draws, axis=-1), of_intervals)
 
-    def _evaluated(self, leaf: Float[Array, "*shape lanes"]) -> Float[Array, "*shape looked"]:
+    def _select_evaluated(
+        self, leaf: Float[Array, "*shape lanes"]
+    ) -> Float[Array, "*shape looked"]:
         """Return the first paths of each interval, for which D is computed."""
         leaf = leaf.reshape(*leaf.shape[:-1], -1, self._num_draws)[..., : self._num_evaluated]
         return leaf.reshape(*leaf.shape[:-2], -1)
@@ -464,7 +466,7 @@ class _GuidedLanes:
 
     def _update_halving(self, state: _LaneState, path: _PathWeights, steps: _Steps) -> _LaneState:
         """Return the state with these paths, one step further, and with D updated."""
-        from_x, to_x = self._evaluated(state.x), self._evaluated(path.x)
+        from_x, to_x = self._select_evaluated(state.x), self._select_evaluated(path.x)
         change = lax.cond(
             steps.ends_pair,
             lambda: self._jitted_log_halving(state.before, from_x, to_x, steps.before, steps.dt),

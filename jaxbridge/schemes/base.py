@@ -82,14 +82,14 @@ def fitted_in_lanes(
     like: Float[Array, " d"],
     dt: Float[Array, " lanes"],
 ) -> AbstractScheme:
-    """The scheme of each lane: arrays get a trailing axis."""
+    """Return the fitted scheme of all lanes, whose arrays have lanes in the last axis."""
     return jax.vmap(lambda dt: scheme.fitted(dynamics, like, dt), out_axes=-1)(dt)
 
 
 def steps_in_lanes(
     scheme: AbstractScheme, dynamics: Dynamics, like: Float[Array, " d"], dt: Float[Array, " lanes"]
 ) -> Callable[[Float[Array, "d lanes"], Float[Array, "d lanes"]], Float[Array, "d lanes"]]:
-    """The step of all lanes, a function of their points and N(0, I) noise."""
+    """Return the step of all lanes, as a function of their points and N(0, I) noise."""
     fitted, root_dt = fitted_in_lanes(scheme, dynamics, like, dt), jnp.sqrt(dt)
 
     @over_lanes(-1, -1, -1, -1, -1)

@@ -3,7 +3,7 @@
 Grids with step sizes 1, 2 and 4 times as large give the estimates L_0, L_1 and L_2. (The first step
 of a coarser grid is shorter if N is not divisible.) To leading order, the error of one step of k
 times the size is C k^{p+1}. Hence the error of a grid is C S, with S the sum of k^{p+1} over its
-steps. The changes c_1 = L_1 - L_0 and c_2 = L_2 - L_1 satisfy
+steps. Let c_1 = L_1 - L_0 and c_2 = L_2 - L_1. Then
 
     error of L_0 = s c_1,        s = S_0 / (S_1 - S_0),
     c_2 = m c_1,                 m = (S_2 - S_1) / (S_1 - S_0).
@@ -37,7 +37,7 @@ def steps_of_grid(num_steps: int, level: int) -> list[int]:
 
 
 def num_coarse_grids(num_steps: int) -> int:
-    """Return the number of coarser grids, at most two, each with fewer steps than the one before."""
+    """Return the number of coarser grids with fewer and fewer steps, at most two."""
     return min(num_steps - 1, 2)
 
 

@@ -1,4 +1,7 @@
-"""Checks that the model, the end points and the scheme fit together."""
+"""Checks that the model, the end points and the scheme fit together.
+
+They evaluate the model at the end points before any simulation, so errors appear early.
+"""
 
 import jax
 import numpy as np
@@ -13,9 +16,10 @@ from .milstein import Milstein
 
 
 def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) -> None:
-    """Raise `ValueError` where the model does not fit the end points, or the scheme the model.
+    """Raise `ValueError` if the model does not fit the end points, or the scheme the model.
 
-    Shapes are checked wherever the model's functions are traced, so here only values are.
+    Only values are checked, and traced values are skipped. Shapes are checked when the model's
+    functions are traced.
     """
     model.check_invertible_sigma(index_without_compiling(intervals.start, 0))
     if is_traced(model, intervals.start, intervals.end):
@@ -26,6 +30,7 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
             return
         drift, sigma, slopes = jax.device_get(coefficients)
         for value in (drift, sigma):
+            # The end points themselves are finite, so NaN is due to the parameters or the state space.
             bad = ~np.all(np.isfinite(value).reshape(len(value), -1), axis=1)
             if bad.any() and not all_finite_leaves(model.params):
                 raise ValueError(f"the `params` of the model must be finite; got {model.params}.")
@@ -34,6 +39,7 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
                     f"drift or σ of the model is not finite at `{name}` = {points[bad.argmax()]}: "
                     "pass a point inside the state space."
                 )
+        # The point where σ is closest to singular.
         worst = np.linalg.cond(sigma).argmax()
         check_invertible(f"diffusion` at `{name}", sigma[worst])
         if slopes is None:
@@ -41,14 +47,17 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
         other_coordinates = 1 - np.eye(points.shape[1])[:, None, :]
         if np.any(slopes * other_coordinates != 0):
             raise ValueError(
-                "`Milstein` needs diagonal noise in which σ_i depends on x_i alone; here σ_i "
-                "depends on other coordinates, too. Use `Heun` or `Euler`."
+                "`Milstein` needs diagonal noise in which σ_i depends on x_i alone; this σ_i "
+                "depends on other coordinates: use `Heun` or `Euler`."
             )
 
 
 @compiled_sooner
 def _coefficients(model: Diffusion, points: Float[Array, "n d"], with_slopes: bool):
-    """α and σ at the points, a constant σ only once; ∂σ where it is asked for and varies."""
+    """Return α, σ and ∂σ at the points.
+
+    A constant σ has one row only. ∂σ is `None` for a constant σ, or without `with_slopes`.
+    """
     varies = model.sigma_varies(points[0])
     sigma = jax.vmap(model.diffusion)(points if varies else points[:1])
     slopes = jax.vmap(jax.jacfwd(model.diffusion))(points) if varies and with_slopes else None

@@ -48,10 +48,12 @@ class GaussianTransition(AbstractScheme):
             )
         sigma = dynamics.sigma(like).as_matrix(like.shape[0], like.dtype)
         moments = linear_transition(jax.jacfwd(dynamics.drift)(like), matmul(sigma, sigma.T), dt)
+        # Γ_δ / δ in noise coordinates, whose Cholesky factor L tends to I as δ → 0.
         whitened = solve(sigma, solve(sigma, moments.covariance / dt).T)
         root = matmul(sigma, cholesky(whitened))
         return _FittedTransition(moments.integral, Constant(root, inverse(root)))
 
+    # Without `fitted`, each call computes the matrices again.
     def step(self, dynamics, x, dt, dw):
         return self.fitted(dynamics, x, dt).step(dynamics, x, dt, dw)
 
@@ -63,7 +65,11 @@ class GaussianTransition(AbstractScheme):
 
 
 class _FittedTransition(AbstractScheme):
-    """The same for one equation and one step size."""
+    """`GaussianTransition` of one equation with one step size.
+
+    - `integral`: M_δ, shape (d, d).
+    - `root`: R.
+    """
 
     integral: Float[Array, "d d"]
     root: Constant

@@ -37,7 +37,7 @@ class Heun(AbstractScheme):
 
     def step(self, dynamics, x, dt, dw):
         drift, sigma = self._stratonovich_drift(dynamics, x), dynamics.sigma(x)
-        # Computed before the drift there is, which would else compute it anew for each part.
+        # Otherwise XLA may compute the predictor again for each component of the drift at it.
         predicted = compute_once(x + drift * dt + sigma.mv(dw))
         drift = (drift + self._stratonovich_drift(dynamics, predicted)) / 2
         return x + drift * dt + sigma.average(dynamics.sigma(predicted)).mv(dw)
@@ -61,6 +61,7 @@ class Heun(AbstractScheme):
         return now._replace(u=half.u)
 
     def _stratonovich_drift(self, dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Return α_S at x; it equals α for constant σ."""
         drift = dynamics.drift(x)
         corrected = decisions.stratonovich(self.stratonovich, dynamics.sigma_varies).simulated
         return drift - ito_correction(dynamics, x) if corrected else drift

@@ -39,7 +39,7 @@ class HeunOrEuler(AbstractScheme):
 
 
 def scheme_for(scheme: AbstractScheme, dynamics: Dynamics) -> AbstractScheme:
-    """The scheme itself, or the one that `HeunOrEuler` is for this equation."""
+    """Return the scheme, or the one that `HeunOrEuler` selects for this equation."""
     if not isinstance(scheme, HeunOrEuler):
         return scheme
     return Heun() if decisions.corrector(dynamics.sigma_varies).simulated else Euler()

@@ -56,9 +56,10 @@ class Milstein(AbstractScheme):
         slope = self._slope(dynamics, x)
         increment = euler + slope * dt / 2  # = ΔW + ½ ∂σ ΔW²
         discriminant = 1 + 2 * slope * increment
-        # At the fold ΔW = -1/∂σ, and no increment explains a step past it.
+        # The step has its extremum at ΔW = -1/∂σ; steps beyond it have no solution.
         past = discriminant <= 0
         increment = jnp.where(past, -0.5 / jnp.where(past, slope, 1), increment)
+        # This form of the solution has no division by ∂σ, which may be zero.
         return 2 * increment / (1 + _root(discriminant))
 
     def frame(self, dynamics, x, driven, dt):
@@ -66,7 +67,7 @@ class Milstein(AbstractScheme):
 
     @staticmethod
     def _slope(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, " d"]:
-        """∂_iσ_i(x)."""
+        """Return ∂_iσ_i(x), shape (d,)."""
 
         def diagonal(y):
             sigma = dynamics.sigma(y)
@@ -79,10 +80,14 @@ class Milstein(AbstractScheme):
                 "return the diagonal of σ, shape (d,), or use `Heun` or `Euler`."
             )
 
+        # σ_i depends on x_i alone, so one derivative along (1, ..., 1) gives all ∂_iσ_i.
         return jax.jvp(diagonal, (x,), (jnp.ones_like(x),))[1]
 
 
 def _root(x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-    """√x, zero below zero; within rounding of zero a chord, whose slope is finite."""
+    """Return √x, zero for negative x.
+
+    Near zero (within rounding) a straight line replaces it, so that the derivative is finite.
+    """
     eps = jnp.finfo(x.dtype).eps
     return jnp.where(x > eps, jnp.sqrt(jnp.maximum(x, eps)), jnp.maximum(x, 0) / eps**0.5)

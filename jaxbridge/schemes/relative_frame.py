@@ -1,4 +1,7 @@
-"""Relative position of a coupled pair in noise coordinates (section 2.1 of the paper)."""
+"""Relative position of a coupled pair in noise coordinates (section 2.1 of the paper).
+
+All schemes and couplings share these functions.
+"""
 
 from typing import NamedTuple
 
@@ -27,20 +30,20 @@ class Frame(NamedTuple):
 
 
 def frame(sigma: AbstractSigma, x: Float[Array, " d"], driven: Float[Array, " d"]) -> Frame:
-    """u and |v| of section 2.1, for `sigma` = σ(x') and `driven` = x'."""
+    """Return the frame with u and |v| of section 2.1, for `sigma` = σ(x') and `driven` = x'."""
     return frame_of(sigma, x - driven)
 
 
 def frame_of(sigma: AbstractSigma, difference: Float[Array, " d"]) -> Frame:
-    """The frame of a difference of two states."""
+    """Return the frame of a difference of two states, x - x'."""
     v = sigma.solve(difference)
-    gap = safe_norm(v)
+    gap = safe_norm(v)  # with a finite derivative at zero
     return Frame(sigma, v / jnp.where(gap > 0, gap, 1), gap)
 
 
 def frame_after_drift(
     dynamics: Dynamics, x: Float[Array, " d"], driven: Float[Array, " d"], dt: Float[Array, ""]
 ) -> Frame:
-    """The gap when each has gone α δ."""
+    """Return the frame after both points have moved by their drift, α δ."""
     drift = dynamics.drift(x) - dynamics.drift(driven)
     return frame_of(dynamics.sigma(driven), x - driven + drift * dt)

@@ -55,14 +55,15 @@ class SemiImplicit(AbstractScheme):
         """Return the frame for the matrix L⁻¹σ of the noise, evaluated at x'."""
         drift, implicit = self._linearised(dynamics, x, dt)
         driven_drift, driven_implicit = self._linearised(dynamics, driven, dt)
-        gone = solve(implicit, drift * dt) - solve(driven_implicit, driven_drift * dt)
+        drift_difference = solve(implicit, drift * dt) - solve(driven_implicit, driven_drift * dt)
         d, sigma = x.shape[0], dynamics.sigma(driven)
         units = [jnp.asarray(unit, x.dtype) for unit in np.eye(d)]
+        # The inverse of L⁻¹σ is σ⁻¹L, which needs no further linear system.
         whiten = jnp.stack([sigma.solve(matvec(driven_implicit, unit)) for unit in units], axis=1)
         root = solve(driven_implicit, sigma.as_matrix(d, x.dtype))
-        return frame_of(Constant(root, whiten), x - driven + gone)
+        return frame_of(Constant(root, whiten), x - driven + drift_difference)
 
     def _linearised(self, dynamics: Dynamics, x: Float[Array, " d"], dt: Float[Array, ""]):
-        """α and L at x."""
+        """Return α and L at x."""
         slope = jax.jacfwd(dynamics.drift)(x)
         return dynamics.drift(x), jnp.eye(x.shape[0], dtype=x.dtype) - slope * dt / 2
