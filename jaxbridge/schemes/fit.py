@@ -30,7 +30,7 @@ def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) 
             return
         drift, sigma, slopes = jax.device_get(coefficients)
         for value in (drift, sigma):
-            # The end points themselves are finite, so NaN is due to the parameters or the state space.
+            # The reason is either the parameters, or a point outside of the state space.
             bad = ~np.all(np.isfinite(value).reshape(len(value), -1), axis=1)
             if bad.any() and not all_finite_leaves(model.params):
                 raise ValueError(f"the `params` of the model must be finite; got {model.params}.")

@@ -95,8 +95,8 @@ def path_log_likelihood(
     check_diffusion(model)
     if form is not None:
         check_choice("form", form, get_args(Form))
-    known, path = as_times("times", times), as_floating("path", path)
-    times, steps = known
+    grid, path = as_times("times", times), as_floating("path", path)
+    times, steps = grid
     if path.ndim < 2 or path.shape[-2] < 2:
         raise ValueError(
             "`path` must have shape (..., K, d) with at least two points, K >= 2; got shape "
@@ -114,7 +114,7 @@ def path_log_likelihood(
             f"paths of shape {path.shape}."
         )
     if times.ndim == 1:
-        check_increasing(known)
+        check_increasing(grid)
     elif not is_traced(steps) and not np.all(np.asarray(steps) > 0):
         raise ValueError(
             "`times` must be finite and increase strictly in each interval; got steps between "
@@ -129,8 +129,7 @@ def log_likelihood_of_steps(
     path: Float[Array, "*batch points d"],
     form: Form | None,
 ) -> Float[Array, "*batch"]:
-    """`path_log_likelihood`, given the steps of the grid: one for all paths, or one for each
-    interval."""
+    """Return `path_log_likelihood` for given step sizes, of one grid or of one grid per interval."""
     batch, (num_points, d) = path.shape[:-2], path.shape[-2:]
     if steps.ndim == 2:
         steps = steps.reshape(len(steps), *[1] * (len(batch) - 1), num_points - 1)
@@ -143,7 +142,7 @@ def log_likelihood_of_steps(
 
 @eqx.filter_custom_jvp
 def known_sigma(sigma: Array) -> Array:
-    """σ, of which no derivative may be taken."""
+    """Return σ unchanged, and raise `TypeError` if a derivative in it is taken."""
     return sigma
 
 
@@ -162,7 +161,7 @@ def log_likelihoods(
     paths: Float[Array, "P points d"],
     form: Form | None,
 ) -> Float[Array, " P"]:
-    """Those of P paths, with steps δ in the columns of `steps`."""
+    """Return the log-likelihoods of P paths, with the step sizes in the columns of `steps`."""
     like = paths[0, 0]
     model = model.prepared()
     model.check_invertible_sigma(like)
@@ -174,6 +173,7 @@ def log_likelihoods(
     d, num_points, num_paths = points.shape
     lanes = points.reshape(d, -1)
 
+    # Columns of `lanes` are ordered by point, then by path; so are those of the steps.
     def of_steps(leaf, shift):
         leaf = leaf.reshape(*leaf.shape[:-1], num_points, num_paths)
         leaf = lax.slice_in_dim(leaf, shift, num_points - 1 + shift, axis=-2)
@@ -195,8 +195,11 @@ _compiled = compiled(log_likelihoods)
 
 
 def _ito(model: Diffusion, dynamics: Dynamics, steps, points) -> Float[Array, " P"]:
+    """Return the form "ito", with A = ½ log ν."""
+
     def integrand(x):
-        """½ [div α + αᵀ V⁻¹ α]."""
+        """Return ½ [div α + αᵀ V⁻¹ α]."""
+        # One linearisation serves all directions of the divergence.
         alpha, slope = jax.linearize(dynamics.drift, x)
         directions = [jnp.asarray(direction, x.dtype) for direction in np.eye(x.shape[0])]
         divergence = sum_first_axis(jnp.stack([slope(e)[i] for i, e in enumerate(directions)]))
@@ -211,25 +214,26 @@ def _ito(model: Diffusion, dynamics: Dynamics, steps, points) -> Float[Array, " 
 
 
 def _girsanov(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
-    """αᵀ V⁻¹ Δx - ½ αᵀ V⁻¹ α δ."""
+    """Return αᵀ V⁻¹ Δx - ½ αᵀ V⁻¹ α δ."""
     sigma = dynamics.sigma(x).root()
     beta = sigma.solve(dynamics.drift(x))
     return dot(beta, sigma.solve(x_next - x) - dt / 2 * beta)
 
 
 def _trapezoid(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
-    """½ (β + β') · Δw - ¼ (|β|² + |β'|²) δ - ½ div β' δ."""
+    """Return ½ (β + β') · Δw - ¼ (|β|² + |β'|²) δ - ½ div β' δ."""
     sigma = dynamics.sigma(x)
     before, (after, slope) = dynamics.drift(x), jax.linearize(dynamics.drift, x_next)
     before, after, dw = (sigma.solve(vector) for vector in (before, after, x_next - x))
     units = [jnp.asarray(unit, x.dtype) for unit in np.eye(x.shape[0])]
+    # For constant σ, div β in noise coordinates equals div α.
     divergence = sum_first_axis(jnp.stack([slope(unit)[i] for i, unit in enumerate(units)]))
     squares = dot(before, before) + dot(after, after)
     return dot(before + after, dw) / 2 - dt / 4 * squares - dt / 2 * divergence
 
 
 def _ito_taylor(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
-    """log of the density of the step, relative to N(x'; x, V δ)."""
+    """Return the log density of the Itô–Taylor step relative to N(x'; x, V δ)."""
     law = ItoTaylorDensity().steps_from(dynamics, x).law(dt)
     dw = dynamics.sigma(x).solve(x_next - x)
     driftless = (x.shape[0] - dot(dw, dw) / dt) / 2  # `log_relative` of N(x, V δ)
@@ -237,14 +241,14 @@ def _ito_taylor(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
 
 
 def _driftless(dynamics: Dynamics, x, x_next, dt) -> Float[Array, ""]:
-    """log N(x'; x, V(x) δ)."""
+    """Return log N(x'; x, V(x) δ)."""
     sigma, d = dynamics.sigma(x).root(), x.shape[0]
     dw = sigma.solve(x_next - x)
     return -dot(dw, dw) / (2 * dt) - sigma.log_abs_det() - d / 2 * jnp.log(2 * math.pi * dt)
 
 
 def forms_of(model: Diffusion, like: Float[Array, " d"]) -> tuple[Form, ...]:
-    """The forms relative to the law of σW that the model has, the most accurate first."""
+    """Return the valid forms relative to the law of σW, the most accurate one first."""
     if model.sigma_varies(like):
         return ("girsanov",)
     forms: tuple[Form, ...] = ("ito_taylor", "girsanov")
@@ -254,23 +258,27 @@ def forms_of(model: Diffusion, like: Float[Array, " d"]) -> tuple[Form, ...]:
 
 
 def density_of_form(form: Form) -> AbstractStepDensity:
-    """The density of steps that the form is, or comes nearest to."""
+    """Return the step density that equals the form, or is nearest to it."""
     return EulerDensity() if form in ("girsanov", "euler") else ItoTaylorDensity()
 
 
 def forms_of_targets(
     targets: Iterable[AbstractStepDensity | None], model: Diffusion, like: Float[Array, " d"]
 ) -> tuple[Form, ...]:
-    """The forms that go with bridges of these targets, `None` for the diffusion itself, the most
-    accurate first: weights that are exact for the Euler scheme call for its own likelihood, for
-    otherwise paths and parameters would belong to two laws."""
+    """Return the forms for bridges with these targets, the most accurate one first.
+
+    A target is `None` for the diffusion itself. Bridges of the Euler chain need the likelihood of
+    that chain. With another one, paths and parameters would have no common law.
+    """
     if any(target is not None and target.order == 1 for target in targets):
         return ("girsanov",)
     forms = forms_of(model, like)
+    # "girsanov" is last; it is of lower order than the targets, so it is omitted.
     return forms if forms == ("girsanov",) else forms[:-1]
 
 
 def _form(model: Diffusion, like: Float[Array, " d"], form: Form | None) -> Form:
+    """Return the form, by default the most accurate one; raise if the model does not have it."""
     forms = forms_of(model, like)
     if form is None:
         return forms[0]

@@ -1,4 +1,4 @@
-"""Normal law of one step from x of length δ: the factors of the weight of a path.
+"""Normal laws of one step from x of length δ: the factors of the weight of a path.
 
 The target of a weighted path is a Markov chain on its grid, with normal steps
 
@@ -18,7 +18,7 @@ with S = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ ≥ ¼ I for every step size. Its er
 
 *Hypoelliptic models*, with fewer columns than rows in σ. Noise enters only some coordinates, and
 the drift carries it to the others. An Euler step has no noise in the others. The expansion above
-holds in state coordinates: with F = ∇α its noise is
+holds in state coordinates. With F = ∇α its noise is
 
     ∫_0^δ [I + (δ-s) F] σ dW_s = √δ (σ + ½δ Fσ) ζ_1 + δ^{3/2} / √12 Fσ ζ_2,    ζ ~ N(0, I).
 
@@ -168,7 +168,7 @@ class ItoTaylorDensity(AbstractStepDensity):
             return _degenerate_ito_taylor(dynamics, x)
         along = [_along(dynamics.drift, x, column) for column in columns_of(sigma, x)]
         slopes, bends = zip(*along, strict=True)
-        # What is made of them would else compute them anew for each of its numbers.
+        # Otherwise XLA may compute these derivatives again for each number that depends on them.
         drift, slopes, bends = compute_once((dynamics.drift(x), slopes, bends))
         beta = sigma.solve(drift)
         # σ (Aβ + ½ Δβ), and A with columns σ⁻¹ (∇α σ_k).
@@ -231,8 +231,8 @@ class HypoellipticDensity(AbstractStepDensity):
 class QuadraticDensity(AbstractStepDensity):
     """Law of steps of weak order 2 for an invertible, state-dependent σ(x).
 
-    A step is quadratic in normal noise, so it has no normal law; the noise has. Let b be a root of
-    V = σσᵀ, L⁰ = α·∇ + ½ Σ V_ik ∂_i ∂_k, A = b⁻¹ ∇α b, and
+    A step is a quadratic function of normal noise, so its law is not normal. Let b be a root of
+    V = σσᵀ, L⁰ = α·∇ + ½ Σ V_ik ∂_i ∂_k and A = b⁻¹ ∇α b. Let further
 
         W_jlm = (b⁻¹ ∂V[b_j] b⁻ᵀ)_lm,    Q_jlm = (W_jlm + W_ljm + W_mjl) / 6.
 
@@ -240,17 +240,16 @@ class QuadraticDensity(AbstractStepDensity):
 
         μ = x + αδ + ½δ² L⁰α,    S = (I + ¼δ M)²,    M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ_jl Q_·jl Q_·jl.
 
-    Its first three moments are those of the diffusion up to O(δ³):
+    Its first three moments equal those of the diffusion up to O(δ³):
 
     - the mean is μ;
-    - the third cumulant is δ² times 3 Q in noise coordinates, which is ½ (V∇V + ...), the sum over
-        the three choices of the coordinate that is differentiated;
+    - the third cumulant is 3 δ² Q in noise coordinates. This is ½ (V∇V + ...), a sum over the three
+        choices of the differentiated coordinate;
     - the quadratic part adds ½δ² Σ_jl Q_·jl Q_·jl to the covariance, which M subtracts.
 
-    That is weak order 2 (Kloeden & Platen 1992, section 14.5). Only V enters: all roots of V give
-    the same law. S is a square, hence never indefinite. The density of n is a density for the
-    weights of paths. An exactly observed end needs the density of x' itself, so there the step must
-    be another one.
+    This gives weak order 2 (Kloeden & Platen 1992, section 14.5). All roots of V give the same law.
+    S is a square, hence never indefinite. Weights of paths use the density of n. An exactly observed
+    end needs the density of x' itself, so the last step must have another law.
     """
 
     order: ClassVar[int] = 2
@@ -273,7 +272,7 @@ class QuadraticDensity(AbstractStepDensity):
         W, beta = jax.vmap(in_noise_coordinates)(turns), sigma.solve(drift)
         Q = (W + jnp.moveaxis(W, 0, 1) + jnp.moveaxis(W, 0, 2)) / 6
         rows = Q.reshape(d, -1)
-        # α = b β, so that ∇f α is the sum of β_k ∇f b_k.
+        # L⁰f = Σ_k [β_k ∂f[b_k] + ½ ∂²f[b_k, b_k]], because α = b β.
         bend = sum_first_axis(beta[:, None] * A + bends / 2)
         change = sum_first_axis(beta[:, None, None] * W)
         change += in_noise_coordinates(sum_first_axis(changes)) / 2
@@ -282,7 +281,7 @@ class QuadraticDensity(AbstractStepDensity):
         identity = jnp.eye(d, dtype=x.dtype)
 
         def law(dt):
-            root = identity + dt / 4 * M
+            root = identity + dt / 4 * M  # S = (I + ¼δ M)²
             return StepLaw(x + dt * drift + dt**2 / 2 * bend, sigma, matmul(root, root), dt, Q)
 
         def decay(dt):
@@ -295,6 +294,7 @@ class QuadraticDensity(AbstractStepDensity):
 
 
 def _linear_ito_taylor(F, V, dt) -> LinearStep:
+    """Return the step of the Itô–Taylor expansion for a linear drift."""
     identity = jnp.eye(F.shape[0], dtype=F.dtype)
     integral = dt * identity + dt**2 / 2 * F
     flow = matmul(F, V)
@@ -303,7 +303,10 @@ def _linear_ito_taylor(F, V, dt) -> LinearStep:
 
 
 def check_step_density(density: AbstractStepDensity | None) -> AbstractStepDensity | None:
-    """What the user gave as `density`; `None` leaves it to the model."""
+    """Return the argument `density`; raise `TypeError` if it is no step density.
+
+    `None` stands for the default of the model.
+    """
     if not (density is None or isinstance(density, AbstractStepDensity)):
         raise TypeError(
             "`density` must be `EulerDensity()`, `ItoTaylorDensity()` or `HypoellipticDensity()`; "
@@ -327,7 +330,7 @@ def most_accurate_density(
 
 
 def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
-    """Euler's steps where σ has no inverse."""
+    """Return Euler steps for a σ without inverse."""
     drift, sigma = dynamics.drift(x), _matrix(dynamics, x)
 
     def law(dt):
@@ -341,24 +344,25 @@ def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
 
 
 def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
-    """Those of Itô's and Taylor's expansion, but for ∇σ σ."""
+    """Return Itô–Taylor steps for a σ without inverse, without the terms Σ ∇σ_k σ_j."""
     sigma, drift = dynamics.sigma(x), dynamics.drift(x)
     columns = columns_of(sigma, x)
     slopes, bends = zip(*[_along(dynamics.drift, x, column) for column in columns], strict=True)
     # Fα + ½ Σ_k ∂²α(σ_k, σ_k), and Fσ.
     bent = jax.jvp(dynamics.drift, (x,), (drift,))[1] + sum_first_axis(jnp.stack(bends)) / 2
-    direct, early = jnp.stack(columns, axis=1), jnp.stack(slopes, axis=1)
-    late = None  # ∇σ α
+    sigma_columns, drift_slope = jnp.stack(columns, axis=1), jnp.stack(slopes, axis=1)
+    sigma_slope = None  # l = ∇σ α, zero for constant σ
     if dynamics.sigma_varies:
-        late = jax.jvp(lambda y: _matrix(dynamics, y), (x,), (drift,))[1]
+        sigma_slope = jax.jvp(lambda y: _matrix(dynamics, y), (x,), (drift,))[1]
 
     def law(dt):
-        length, both, apart = root_of_length(dt), early, early
-        if late is not None:
-            bounded = _bounded(late, direct, dt)
-            both, apart = early + bounded, early - bounded
-        spread = [direct + dt / 2 * both, dt * np.sqrt(1 / 12).astype(x.dtype) * apart]
-        root = semidefinite_factor(length * jnp.concatenate(spread, axis=1))
+        # Coefficients of ζ_1 and ζ_2: Fσ + l and Fσ - l.
+        root_dt, total, difference = root_of_length(dt), drift_slope, drift_slope
+        if sigma_slope is not None:
+            bounded = _bounded(sigma_slope, sigma_columns, dt)
+            total, difference = drift_slope + bounded, drift_slope - bounded
+        spread = [sigma_columns + dt / 2 * total, dt * np.sqrt(1 / 12).astype(x.dtype) * difference]
+        root = semidefinite_factor(root_dt * jnp.concatenate(spread, axis=1))
         return DegenerateLaw(x + dt * drift + dt**2 / 2 * bent, root, dt)
 
     def decay(dt):
@@ -369,21 +373,26 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
 
 
 def _matrix(dynamics: Dynamics, x: Float[Array, " d"]) -> Float[Array, "d m"]:
+    """Return σ(x) as a matrix, shape (d, m)."""
     return dynamics.sigma(x).as_matrix(x.shape[0], x.dtype)
 
 
 def _bounded(
     slopes: Float[Array, "d m"], columns: Float[Array, "d m"], dt: Float[Array, ""]
 ) -> Float[Array, "d m"]:
-    """Slopes by which no column changes in a step of length δ by more than it is."""
+    """Return l_k / √(1 + δ² |l_k|² / |σ_k|²) for all columns k of `slopes` and `columns`.
+
+    A step of length δ then changes no column by more than its own length. Slopes of zero columns
+    become zero.
+    """
     square = jnp.sum(columns**2, axis=0)
-    some = square > 0
-    change = dt**2 * jnp.sum(slopes**2, axis=0) / jnp.where(some, square, 1)
-    return slopes * jnp.where(some, 1 / jnp.sqrt(1 + change), 0)
+    is_nonzero = square > 0
+    change = dt**2 * jnp.sum(slopes**2, axis=0) / jnp.where(is_nonzero, square, 1)
+    return slopes * jnp.where(is_nonzero, 1 / jnp.sqrt(1 + change), 0)
 
 
 def _along(field, x: Float[Array, " d"], direction: Float[Array, " d"]):
-    """∂f[v] and ∂²f[v, v]."""
+    """Return the directional derivatives ∂f[v] and ∂²f[v, v] of a function f at x."""
 
     def first(y):
         return jax.jvp(field, (y,), (direction,))[1]

@@ -58,6 +58,7 @@ class StepLaw(NamedTuple):
     def solve(self, displacement: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return Λ⁻¹ times the displacement; zero for δ = 0."""
         moving = self.dt > 0
+        # The replaced length avoids 0 / 0, which would make derivatives NaN.
         safe = self._replace(dt=jnp.where(moving, self.dt, 1))
         return jnp.where(moving, safe.noise(safe.mean + displacement), 0)
 
@@ -136,9 +137,11 @@ class StepLaw(NamedTuple):
         return self.log_relative(point) - point.shape[0] / 2 - scale
 
     def _scaled(self, point):
+        """Return n of the step to `point` = μ + √δ σ n."""
         return self.sigma.solve(point - self.mean) / jnp.sqrt(self.dt)
 
     def _log_det(self):
+        """Return log det S."""
         if self.covariance.ndim == 0:
             return self.mean.shape[0] * jnp.log(self.covariance)
         return quadratic_form(self.covariance, jnp.zeros_like(self.mean))[1]
@@ -159,6 +162,7 @@ class DegenerateLaw(NamedTuple):
 
     @property
     def _moves(self):
+        """Mask of the coordinates with noise."""
         return jnp.diagonal(self.root) > 0
 
     def solve(self, displacement: Float[Array, " d"]) -> Float[Array, " d"]:
@@ -193,18 +197,23 @@ class DegenerateLaw(NamedTuple):
         Started in x, the linear step would have the law `self`.
         """
         mean = self.mean + self.carried(decay, first.mean - x)
+        # Λ Λᵀ of both steps is the sum of two squares, hence the square of the joined matrix.
         both = jnp.concatenate([matmul(decay, first.root), self.root], axis=1)
         return DegenerateLaw(mean, semidefinite_factor(both), first.dt + self.dt)
 
 
 def solve_root(root: Float[Array, "d d"], displacement: Float[Array, " d"]) -> Float[Array, " d"]:
-    """Λ⁻¹ of a lower triangular Λ, and zero along what Λ does not move."""
+    """Return Λ⁻¹ times the displacement for a lower triangular Λ.
+
+    Coordinates with a zero on the diagonal of Λ have no noise; their result is zero.
+    """
     still = jnp.diagonal(root) == 0
+    # Ones on the diagonal keep the triangular system solvable.
     safe = root + jnp.diag(jnp.where(still, 1, 0).astype(root.dtype))
     return jnp.where(still, 0, solve_lower(safe, displacement))
 
 
 def root_of_length(dt: Float[Array, ""]) -> Float[Array, ""]:
-    """√δ, whose derivative at zero is taken to be zero: a step of no length stays one."""
+    """Return √δ, with derivative zero instead of infinity at δ = 0."""
     moving = dt > 0
     return jnp.where(moving, jnp.sqrt(jnp.where(moving, dt, 1)), 0)
