@@ -129,7 +129,7 @@ def log_likelihood_of_steps(
     path: Float[Array, "*batch points d"],
     form: Form | None,
 ) -> Float[Array, "*batch"]:
-    """Return `path_log_likelihood` for given step sizes, of one grid or of one grid per interval."""
+    """Return `path_log_likelihood` for given step sizes, of one grid or one grid per interval."""
     batch, (num_points, d) = path.shape[:-2], path.shape[-2:]
     if steps.ndim == 2:
         steps = steps.reshape(len(steps), *[1] * (len(batch) - 1), num_points - 1)

@@ -12,9 +12,9 @@ chain, which is finite for every model. Its distance from p_T is the discretisat
 *Constant σ.* In noise coordinates, let β = σ⁻¹α and A = ∇β. The first terms of the Itô–Taylor
 expansion (Kloeden & Platen 1992, section 14.2) are normal as well. `ItoTaylorDensity` is the law of
 
-    x + βδ + ½δ² (Aβ + ½Δβ) + ∫_0^δ [I + (δ-s) A] dW_s,
+    x + βδ + ½δ² (Aβ + ½Δβ) + ∫_0^δ [I + (δ-s) A] dW_s.
 
-with S = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ ≥ ¼ I for every step size. Its error is O(δ²).
+Its covariance S = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ is at least ¼ I for every step size. Its error is O(δ²).
 
 *Hypoelliptic models*, with fewer columns than rows in σ. Noise enters only some coordinates, and
 the drift carries it to the others. An Euler step has no noise in the others. The expansion above
@@ -236,9 +236,12 @@ class QuadraticDensity(AbstractStepDensity):
 
         W_jlm = (b⁻¹ ∂V[b_j] b⁻ᵀ)_lm,    Q_jlm = (W_jlm + W_ljm + W_mjl) / 6.
 
-    The step is x' = μ + √δ b [n + ½ √δ Σ_jl Q_·jl (n_j n_l - S_jl)] with n ~ N(0, S) and
+    The step is x' = μ + √δ b [n + ½ √δ Σ_jl Q_·jl (n_j n_l - S_jl)] with n ~ N(0, S). The mean and
+    the covariance are
 
-        μ = x + αδ + ½δ² L⁰α,    S = (I + ¼δ M)²,    M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ_jl Q_·jl Q_·jl.
+        μ = x + αδ + ½δ² L⁰α,    S = (I + ¼δ M)².
+
+    Here M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ_jl Q_·jl Q_·jl.
 
     Its first three moments equal those of the diffusion up to O(δ³):
 
@@ -248,8 +251,8 @@ class QuadraticDensity(AbstractStepDensity):
     - the quadratic part adds ½δ² Σ_jl Q_·jl Q_·jl to the covariance, which M subtracts.
 
     This gives weak order 2 (Kloeden & Platen 1992, section 14.5). All roots of V give the same law.
-    S is a square, hence never indefinite. Weights of paths use the density of n. An exactly observed
-    end needs the density of x' itself, so the last step must have another law.
+    S is a square, hence never indefinite. Weights of paths use the density of n. An exactly
+    observed end needs the density of x' itself, so the last step must have another law.
     """
 
     order: ClassVar[int] = 2
@@ -350,7 +353,7 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
     slopes, bends = zip(*[_along(dynamics.drift, x, column) for column in columns], strict=True)
     # Fα + ½ Σ_k ∂²α(σ_k, σ_k), and Fσ.
     bent = jax.jvp(dynamics.drift, (x,), (drift,))[1] + sum_first_axis(jnp.stack(bends)) / 2
-    sigma_columns, drift_slope = jnp.stack(columns, axis=1), jnp.stack(slopes, axis=1)
+    diffusion, drift_slope = jnp.stack(columns, axis=1), jnp.stack(slopes, axis=1)
     sigma_slope = None  # l = ∇σ α, zero for constant σ
     if dynamics.sigma_varies:
         sigma_slope = jax.jvp(lambda y: _matrix(dynamics, y), (x,), (drift,))[1]
@@ -359,9 +362,9 @@ def _degenerate_ito_taylor(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFr
         # Coefficients of ζ_1 and ζ_2: Fσ + l and Fσ - l.
         root_dt, total, difference = root_of_length(dt), drift_slope, drift_slope
         if sigma_slope is not None:
-            bounded = _bounded(sigma_slope, sigma_columns, dt)
+            bounded = _bounded(sigma_slope, diffusion, dt)
             total, difference = drift_slope + bounded, drift_slope - bounded
-        spread = [sigma_columns + dt / 2 * total, dt * np.sqrt(1 / 12).astype(x.dtype) * difference]
+        spread = [diffusion + dt / 2 * total, dt * np.sqrt(1 / 12).astype(x.dtype) * difference]
         root = semidefinite_factor(root_dt * jnp.concatenate(spread, axis=1))
         return DegenerateLaw(x + dt * drift + dt**2 / 2 * bent, root, dt)
 
