@@ -53,8 +53,13 @@ class WeightedPaths(NamedTuple):
     def step_error(
         self, share: Float[Array, " I"], num_steps: int, sigma_varies: bool, held: bool = False
     ) -> StepError:
-        """Return the step error of the log of the mean of the weights; for paths of which nothing
-        is stored."""
+        """Return the step error of log p̂, with p̂ the mean of the weights.
+
+        For a state-dependent σ it needs `log_coarse`, which is only available if no points of the
+        paths are stored. `share` is the result of `step_share`. `held` states that a pseudo-marginal
+        chain keeps these weights, so that their law is tilted by p̂.
+        """
+        # For constant σ, D varies little, so e^D compares the grids more precisely than coarse paths.
         if not sigma_varies:
             return error_of_log_mean(self.log_weights, self.log_halving, share, held)
         return error_of_coupled_grids(self.log_weights, self.log_coarse, share, num_steps, held)

@@ -140,13 +140,13 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return eqx.tree_at(lambda p: p.density, self, density, is_leaf=is_density)
 
     def for_pilot(self):
-        return self
+        return self  # the work per path is fixed, so it needs no tighter bound
 
     def check_size(self, model):
         pass
 
     def must_measure(self, model):
-        return False
+        return False  # `guide` needs no simulation
 
     @abstractmethod
     def guide(
@@ -314,6 +314,7 @@ class _GuidedLanes:
         # A single interval needs no axis of lanes, because all lanes share its values.
         self._lane_axis = None if start.shape[0] == 1 else -1
         self.start, self.end = start.T, end.T
+        # Pairs of `halving` are the steps (0, 1), (2, 3), ...
         before, ends = jnp.roll(dt, 1, axis=0), jnp.arange(num_steps) % 2 == 1
         self.steps = _Steps(guide, dt[:-1], remaining[:-1], before[:-1], ends[:-1], coarse)
         self._last = _Steps(None, dt[-1], remaining[-1], before[-1], ends[-1], None)
@@ -637,7 +638,7 @@ def _simulate(
     lanes = _GuidedLanes(proposal, dynamics, intervals, num_steps, num_draws, with_coarse)
     num_steps = lanes.num_steps
     state, end = lanes.begin(), lanes.spread(lanes.end)
-    path = state.x[None][:0]
+    path = state.x[None][:0]  # no points between the ends if N = 1
     store = slots = None
     if stored is not None:
         # Row K receives all points that are not stored. The rows of the first and the last point

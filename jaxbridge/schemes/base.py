@@ -90,6 +90,7 @@ def steps_in_lanes(
     scheme: AbstractScheme, dynamics: Dynamics, like: Float[Array, " d"], dt: Float[Array, " lanes"]
 ) -> Callable[[Float[Array, "d lanes"], Float[Array, "d lanes"]], Float[Array, "d lanes"]]:
     """Return the step of all lanes, as a function of their points and N(0, I) noise."""
+    # Values that depend on δ only are computed once, outside of the step.
     fitted, root_dt = fitted_in_lanes(scheme, dynamics, like, dt), jnp.sqrt(dt)
 
     @over_lanes(-1, -1, -1, -1, -1)

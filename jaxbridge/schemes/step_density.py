@@ -236,12 +236,10 @@ class QuadraticDensity(AbstractStepDensity):
 
         W_jlm = (b⁻¹ ∂V[b_j] b⁻ᵀ)_lm,    Q_jlm = (W_jlm + W_ljm + W_mjl) / 6.
 
-    The step is x' = μ + √δ b [n + ½ √δ Σ_jl Q_·jl (n_j n_l - S_jl)] with n ~ N(0, S). The mean and
-    the covariance are
+    The step is x' = μ + √δ b [n + ½ √δ Σ_jl Q_·jl (n_j n_l - S_jl)] with n ~ N(0, S) and
+    μ = x + αδ + ½δ² L⁰α. The covariance of n is
 
-        μ = x + αδ + ½δ² L⁰α,    S = (I + ¼δ M)².
-
-    Here M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ_jl Q_·jl Q_·jl.
+        S = (I + ¼δ M)²,    M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ_jl Q_·jl Q_·jl.
 
     Its first three moments equal those of the diffusion up to O(δ³):
 

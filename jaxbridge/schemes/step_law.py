@@ -96,6 +96,7 @@ class StepLaw(NamedTuple):
             square, log_det = dot(scaled, scaled) / self.covariance, self._log_det()
         else:
             square, log_det = quadratic_form(self.covariance, scaled)
+        # E|ξ|² = d, so the terms of a sum along a path have means near zero.
         return (scaled.shape[0] - square - log_det) / 2
 
     def log_relative_of_noise(self, xi: Float[Array, " d"]) -> Float[Array, ""]:
