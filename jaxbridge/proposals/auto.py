@@ -256,7 +256,7 @@ def default_candidates(model: Diffusion, for_density: bool = False) -> list[Any]
     Couplings need a time reversal. For a density they also need a normalised ν.
     """
     coupled = model.has_reversal and (model.normalised or not for_density)
-    # Guided candidates come first, because couplings have pilot runs only where they could be better.
+    # Guided candidates come first: couplings then have pilot runs only where they could be better.
     couplings = [Coupling(0.0), Coupling(0.5)] if coupled else []
     return [*guided_candidates(), *couplings]
 

@@ -56,10 +56,10 @@ class WeightedPaths(NamedTuple):
         """Return the step error of log p̂, with p̂ the mean of the weights.
 
         For a state-dependent σ it needs `log_coarse`, which is only available if no points of the
-        paths are stored. `share` is the result of `step_share`. `held` states that a pseudo-marginal
-        chain keeps these weights, so that their law is tilted by p̂.
+        paths are stored. `share` is the result of `step_share`. `held` states that a
+        pseudo-marginal chain keeps these weights, so that their law is tilted by p̂.
         """
-        # For constant σ, D varies little, so e^D compares the grids more precisely than coarse paths.
+        # For constant σ, D varies little, so e^D compares the two grids more precisely.
         if not sigma_varies:
             return error_of_log_mean(self.log_weights, self.log_halving, share, held)
         return error_of_coupled_grids(self.log_weights, self.log_coarse, share, num_steps, held)

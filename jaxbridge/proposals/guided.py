@@ -278,7 +278,7 @@ class _LaneState(NamedTuple):
 
     path: _PathWeights
     before: Float[Array, "d *looked"]
-    log_halving: Float[Array, "*looked"]
+    log_halving: Float[Array, "*evaluated"]
     coarse: _PathWeights | None
 
     @property
@@ -338,7 +338,7 @@ class _GuidedLanes:
 
     def advance(self, state: _LaneState, xi: Float[Array, "d lanes"], steps: _Steps) -> _LaneState:
         """Return the state after a step with the noise ξ."""
-        step = self._per_lane(self._step(steps), self._num_draws)
+        step = self._per_lane(self._as_step(steps), self._num_draws)
         path = self._take_step(state.path, xi, step)
         if state.coarse is None:
             return self._update_halving(state, path, steps)
@@ -359,20 +359,20 @@ class _GuidedLanes:
     ) -> _PathWeights:
         """Return the paths after a step with this noise."""
 
-        def one(x, xi, step):
+        def step_at_point(x, xi, step):
             target = self._density.steps_from(self._dynamics, x).law(step.dt)
             law = self._proposal.step_law(step, x, target)
             point = law.point(xi)
             return target.bent(point), self._log_densities(target, law, point, xi)
 
-        results = over_lanes(-1, -1, self._lane_axis)(one)(path.x, xi, step)
+        results = over_lanes(-1, -1, self._lane_axis)(step_at_point)(path.x, xi, step)
         return self._add_factors(path, *results)
 
     def _take_coarse_step(
         self,
         coarse: _PathWeights,
-        before: Float[Array, "d looked"],
-        xi: Float[Array, "d looked"],
+        before: Float[Array, "d evaluated"],
+        xi: Float[Array, "d evaluated"],
         steps: _CoarseSteps,
     ) -> _PathWeights:
         """Return the coarse paths after a step with the noise of two fine steps.
@@ -395,14 +395,16 @@ class _GuidedLanes:
     ) -> tuple[_LaneState, Float[Array, "d lanes"]]:
         """Return the state after a step to these points, and the noise ξ of the step."""
 
-        def one(x, x_next, step):
+        def noise_at_point(x, x_next, step):
             target = self._density.steps_from(self._dynamics, x).law(step.dt)
             law = self._proposal.step_law(step, x, target)
             xi = law.noise(x_next)
             return xi, self._log_densities(target, law, x_next, xi)
 
-        step = self._per_lane(self._step(steps), self._num_draws)
-        xi, log_densities = over_lanes(-1, -1, self._lane_axis)(one)(state.x, x_next, step)
+        step = self._per_lane(self._as_step(steps), self._num_draws)
+        xi, log_densities = over_lanes(-1, -1, self._lane_axis)(noise_at_point)(
+            state.x, x_next, step
+        )
         return self._update_halving(
             state, self._add_factors(state.path, x_next, log_densities), steps
         ), xi
@@ -429,7 +431,7 @@ class _GuidedLanes:
     ) -> _PathWeights:
         """Return the paths, `num_draws` per interval, after their last step, which ends in b."""
 
-        def one(x, last):
+        def log_density_at_point(x, last):
             # An end point outside of the state space makes the weight NaN, so no path is found.
             end, dt = last
             inside = all_finite(self._dynamics.drift(end))
@@ -438,11 +440,11 @@ class _GuidedLanes:
             return jnp.where(inside, log_density, jnp.nan)
 
         last = self._per_lane((self.end, dt), num_draws)
-        log_density = over_lanes(-1, self._lane_axis)(one)(path.x, last)
+        log_density = over_lanes(-1, self._lane_axis)(log_density_at_point)(path.x, last)
         end = jnp.repeat(self.end, num_draws, axis=-1)
         return self._add_factors(path, end, (log_density, jnp.zeros_like(log_density)))
 
-    def _step(self, steps: _Steps) -> Step:
+    def _as_step(self, steps: _Steps) -> Step:
         return Step(steps.guide, steps.dt, steps.remaining, self.end)
 
     def _per_lane(self, of_intervals: PyTree, num_draws: int) -> PyTree:
@@ -456,7 +458,7 @@ class _GuidedLanes:
 
     def _select_evaluated(
         self, leaf: Float[Array, "*shape lanes"]
-    ) -> Float[Array, "*shape looked"]:
+    ) -> Float[Array, "*shape evaluated"]:
         """Return the first paths of each interval, for which D is computed."""
         leaf = leaf.reshape(*leaf.shape[:-1], -1, self._num_draws)[..., : self._num_evaluated]
         return leaf.reshape(*leaf.shape[:-2], -1)
@@ -478,13 +480,13 @@ class _GuidedLanes:
     def _log_halving(self, before, x, x_next, *both):
         """Return the summand of D of one pair of steps, for the first paths of each interval."""
 
-        def one(before, x, x_next, *both):
+        def at_points(before, x, x_next, *both):
             points = (before, x, x_next)
             return log_halving_of_pair(self._density, self._dynamics, points, both)
 
         both = self._per_lane(both, self._num_evaluated)
         axes = (-1, -1, -1, self._lane_axis, self._lane_axis)
-        return over_lanes(*axes)(one)(before, x, x_next, *both)
+        return over_lanes(*axes)(at_points)(before, x, x_next, *both)
 
 
 def noise_of(
@@ -613,8 +615,8 @@ def _draw_tangents(primals, tangents):
         paths, log_weights, *_ = _simulate(inputs, keys, stored, num_steps, is_finite)
         return jnp.where(is_finite[..., None, None], paths, 0), jnp.where(is_finite, log_weights, 0)
 
-    _, along = eqx.filter_jvp(redraw, (inputs,), (tangents[0],))
-    return draws, _Draws(*along, *map(jnp.zeros_like, draws[2:]))
+    _, tangents_out = eqx.filter_jvp(redraw, (inputs,), (tangents[0],))
+    return draws, _Draws(*tangents_out, *map(jnp.zeros_like, draws[2:]))
 
 
 def _simulate(
