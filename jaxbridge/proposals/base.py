@@ -127,7 +127,7 @@ class AbstractProposal(eqx.Module):
     def prepared(
         self, key: Key[Array, ""], model: Diffusion, intervals: Intervals, num_steps: int
     ) -> "AbstractWeightedProposal":
-        """Return the proposal with all quantities measured that these intervals need."""
+        """Measure the quantities that these intervals need; return the proposal with them."""
 
 
 class AbstractWeightedProposal(AbstractProposal):
@@ -150,7 +150,7 @@ class AbstractWeightedProposal(AbstractProposal):
 
     @abstractmethod
     def step_share(self, model: Diffusion, intervals: Intervals) -> Float[Array, " I"]:
-        """Return the factor from the change by half as many steps to the discretisation error.
+        """Return the ratio of the discretisation error to the change by half as many steps.
 
         See `schemes.step_error`; shape (I,).
         """
@@ -264,7 +264,7 @@ class AbstractSingleProposal(AbstractWeightedProposal):
     def prepared(
         self, key: Key[Array, ""], model: Diffusion, intervals: Intervals, num_steps: int
     ) -> "AbstractSingleProposal":
-        """Return the proposal with all quantities measured that these intervals need."""
+        """Measure the quantities that these intervals need; return the proposal with them."""
 
     @abstractmethod
     def must_measure(self, model: Diffusion) -> bool:

@@ -14,7 +14,7 @@ expansion (Kloeden & Platen 1992, section 14.2) are normal as well. `ItoTaylorDe
 
     x + βδ + ½δ² (Aβ + ½Δβ) + ∫_0^δ [I + (δ-s) A] dW_s.
 
-Its covariance S = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ is at least ¼ I for every step size. Its error is O(δ²).
+Here S = I + ½δ(A + Aᵀ) + ⅓δ² AAᵀ, which is at least ¼ I for every step size. The error is O(δ²).
 
 *Hypoelliptic models*, with fewer columns than rows in σ. Noise enters only some coordinates, and
 the drift carries it to the others. An Euler step has no noise in the others. The expansion above
