@@ -382,7 +382,7 @@ PROPOSALS = [
     ("duration is traced", traced(choose_in_jit, 1.0), "measures run times", TypeError),
     ("none", choose(candidates=[]), "at least one proposal"),
     ("two grids", choose(candidates=[GUIDED, refined]), "on one grid"),
-    ("another choice", exact(proposal=choice(3, BRIDGE)), "is for 3 intervals; got 1 intervals"),
+    ("another choice", exact(proposal=choice(3, BRIDGE)), "for 3 intervals, but the problem has 1"),
     ("choice of choices", choose(candidates=[choice(1, BRIDGE)]), "single proposals"),
     ("renewal", exact(proposal="auto", method="renewal"), "renewal is for couplings", TypeError),
     ("noise", by_noise(proposal="auto"), "need a guided proposal", TypeError),

@@ -106,8 +106,9 @@ class Choice(AbstractWeightedProposal):
             candidate.check(model, intervals)
         if self.chosen.shape != intervals.duration.shape:
             raise ValueError(
-                f"this result of `choose_proposal` is for {self.chosen.shape[0]} intervals; got "
-                f"{len(intervals.duration)} intervals: call `choose_proposal` with these."
+                f"this result of `choose_proposal` is for {self.chosen.shape[0]} intervals, but the "
+                f"problem has {len(intervals.duration)}: call `choose_proposal` with the same "
+                "intervals."
             )
 
     def check_prepared(self, model):

@@ -94,7 +94,7 @@ def test_going_on_is_one_run():
     assert more.state.num_done == 20
     (before,), (after,) = first.state.proposals, more.state.proposals
     assert after is before and before.chosen.shape == (5,)
-    with pytest.raises(ValueError, match="is for 5 intervals; got 2 intervals"):
+    with pytest.raises(ValueError, match="is for 5 intervals, but the problem has 2"):
         jb.pmmh(
             arguments[0],
             arguments[1],
