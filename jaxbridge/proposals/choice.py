@@ -106,8 +106,8 @@ class Choice(AbstractWeightedProposal):
             candidate.check(model, intervals)
         if self.chosen.shape != intervals.duration.shape:
             raise ValueError(
-                f"this result of `choose_proposal` is for {self.chosen.shape[0]} intervals, but the "
-                f"problem has {len(intervals.duration)}: call `choose_proposal` with the same "
+                f"this result of `choose_proposal` is for {self.chosen.shape[0]} intervals, but "
+                f"the problem has {len(intervals.duration)}: call `choose_proposal` with the same "
                 "intervals."
             )
 
