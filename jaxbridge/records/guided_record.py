@@ -1,4 +1,7 @@
-"""Guide of a whole record: the quantities of all guided steps, computed before the simulation."""
+"""Guide of a whole record: the quantities of all guided steps, computed before the simulation.
+
+The module also simulates guided paths with their weights, and recovers the noise of a path.
+"""
 
 import functools
 from collections.abc import Callable
@@ -33,13 +36,14 @@ from .tilted_step import NormalStep
 
 
 class Guidance(NamedTuple):
-    """What guides paths at some parameters.
+    """Quantities that guide the paths of a record, at given parameters.
 
-    - `initial`: the normal law of X(t_0); `start`: the guided one.
-    - `linear`: the steps of the linear process, and `steps`: the guides of all steps, leading axes
-        (K, N).
-    - `first`, `scalars`: what is seen of X(t_0), and at the ends of the segments, leading axis K,
-        counted from ξ.
+    - `initial`: normal law of X(t_0).
+    - `start`: guided law of X(t_0).
+    - `linear`: steps of the linear process, leading axes (K, N).
+    - `steps`: guides of all steps, leading axes (K, N).
+    - `first`: scalar observations of X(t_0), relative to ξ.
+    - `scalars`: scalar observations at the ends of segments, relative to ξ, leading axis K.
     """
 
     initial: NormalStep
@@ -56,25 +60,28 @@ def guided(
     points: Float[Array, "points d"],
     rate: Float[Array, ""] | None = None,
 ) -> Guidance:
-    """Linearised along these points; `rate` is that at which it forgets, if it does."""
+    """Return the guide that is linearised along these points.
+
+    `rate` is the discount rate (`forgetting`), by default none.
+    """
     dynamics_at, record = model.forward_at(problem.like), problem.record.steps()
     initial = initial_law(problem.initial, model, problem.like)
     K, N = problem.num_segments, problem.num_steps
     of_segments = lambda leaf: leaf.reshape(K, N, *leaf.shape[1:])
-    here, there = of_segments(points[:-1]), of_segments(points[1:])
+    here, next_here = of_segments(points[:-1]), of_segments(points[1:])
 
     def linear(point, next_point, step):
         dynamics = dynamics_at(step.time)
         return linear_step(problem.density, dynamics, point, next_point, step.dt)
 
-    steps = jax.vmap(over_points(linear))(here, there, record)
+    steps = jax.vmap(over_points(linear))(here, next_here, record)
     scalars = jax.vmap(relative)(problem.scalars(model), points[::N])
-    first, rest = split_first(scalars)
-    return _with_h(initial, steps, first, rest, (here, there, record), rate)
+    first, later = split_first(scalars)
+    return _with_h(initial, steps, first, later, (here, next_here, record), rate)
 
 
 def forgetful(guide: Guidance, rate: Float[Array, ""]) -> Guidance:
-    """The same, which forgets at this rate (`forgetting`)."""
+    """Return the same guide with this discount rate (`forgetting`)."""
     steps = guide.steps
     path = steps.point, steps.next_point, steps.step
     return _with_h(guide.initial, guide.linear, guide.first, guide.scalars, path, rate)
@@ -88,11 +95,12 @@ def _with_h(
     path: tuple[Float[Array, "K N d"], Float[Array, "K N d"], Steps],
     rate: Float[Array, ""] | None,
 ) -> Guidance:
-    """A linear process along a path, and what is seen of it, with what follows of them."""
-    here, there, steps = path
-    kept = None if rate is None else jnp.exp(-rate * steps.dt)
-    h = information_filter(linear, scalars, kept=kept)
-    guides = Guide(here, h, there, following(h), steps)
+    """Return the guide for a linear process along a path and for scalar observations."""
+    here, next_here, steps = path
+    # h_{i+1} to the power exp(-γ δ) enters step i.
+    power = None if rate is None else jnp.exp(-rate * steps.dt)
+    h = information_filter(linear, scalars, kept=power)
+    guides = Guide(here, h, next_here, following(h), steps)
     h_first = jax.tree.map(lambda leaf: leaf[0, 0], h)
     start = guided_start(initial, first, here[0, 0], h_first)
     return Guidance(initial, start, linear, guides, first, scalars)
@@ -101,7 +109,10 @@ def _with_h(
 def path_and_log_weight(
     problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
-    """The path that this noise makes, and its log weight: `noise[0]` makes x_0."""
+    """Return the path of this noise, and its log weight.
+
+    `noise[0]` determines x_0, and `noise[i]` step i.
+    """
     density, dynamics_at = problem.density, model.forward_at(problem.like)
     start, log_start = guide.start.point_and_log_weight(noise[0])
     steps = flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
@@ -117,10 +128,10 @@ def path_and_log_weight(
 
 
 def _of_each_step(of_step: Callable, *steps: PyTree) -> PyTree:
-    """`of_step` of all steps, which are the first axes of arrays, side by side."""
+    """Evaluate `of_step` for all steps in lanes. Steps are the first axis of all arrays."""
     last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), steps)
-    each = over_lanes(*[-1] * len(steps))(of_step)(*last)
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), each)
+    results = over_lanes(*[-1] * len(steps))(of_step)(*last)
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), results)
 
 
 def noise_and_log_weight(
@@ -130,21 +141,24 @@ def noise_and_log_weight(
     guide: Guidance,
     path: Float[Array, "points d"],
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
-    """The inverse of `path_and_log_weight`: noise that makes this path, where none moves it drawn
-    afresh."""
+    """Return noise that leads to this path, and the log weight of the path.
+
+    This is the inverse of `path_and_log_weight`. Components of the noise that do not move the path
+    are drawn afresh.
+    """
     density, dynamics_at = problem.density, model.forward_at(problem.like)
     scalars = at_every_step(guide.scalars, problem.num_steps)
     hidden = jax.random.normal(key, (len(path), scalars.values.shape[1]), path.dtype)
     solve = functools.partial(solve_root, guide.initial.root)
     first, log_start = guide.start.noise_and_log_weight(path[0], solve, hidden[0])
-    # What the law of x_0 does not leave to noise is not moved by it, either.
+    # The noise of exactly known components of x_0 has no effect, so it is drawn afresh.
     still = jnp.diagonal(guide.initial.root) == 0
     fresh = jax.random.normal(jax.random.fold_in(key, 1), first.shape, path.dtype)
 
     def of_step(x, x_next, step, scalars, hidden):
         law = target_law(density, dynamics_at, x, step.step)
-        made = guided_law(law, step, scalars)
-        return made.noise_and_log_weight(x_next, law.solve, hidden)
+        step_law = guided_law(law, step, scalars)
+        return step_law.noise_and_log_weight(x_next, law.solve, hidden)
 
     steps = path[:-1], path[1:], flat(guide.steps), scalars, hidden[1:]
     zeta, log_weights = _of_each_step(of_step, *steps)
@@ -156,18 +170,23 @@ def noise_and_log_weight(
 def corrections(
     problem: RecordProblem, model: Diffusion, guide: Guidance, path: Float[Array, "points d"]
 ) -> Float[Array, ""]:
-    """What the log weight of a path takes where observations are not of their guess, and the
-    initial law is not normal."""
-    each = over_points(correction(problem, model))
-    at_observations = each(problem.rows, path[:: problem.num_steps])
+    """Return the terms of the log weight of a path for a general observation model and initial law.
+
+    They are zero for a `LinearGaussian` and a normal initial law.
+    """
+    of_points = over_points(correction(problem, model))
+    at_observations = of_points(problem.rows, path[:: problem.num_steps])
     return jnp.sum(at_observations) + log_ratio(problem.initial, model, guide.initial, path[0])
 
 
 def correction(
     problem: RecordProblem, model: Diffusion
 ) -> Callable[[Row, Float[Array, " d"]], Float[Array, ""]]:
-    """What the log weight takes where an observation is not of its guess, a function of it and of
-    the state; NaN outside the state space, for of the last state no drift is asked."""
+    """Return a function of an observation and a state, with the log weight's term for a general model.
+
+    The term is log g minus the log density of the guess. It is NaN outside the state space, because
+    no step from the last state would detect that.
+    """
     inside = model.state_space()
 
     def of(row, x):

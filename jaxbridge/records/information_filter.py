@@ -35,7 +35,7 @@ from .tilted_step import Information, root_after, seen_of, tilt_factor
 
 
 class _Mean(NamedTuple):
-    """E u + f, the mean of a step given what is seen at its end; and Λ."""
+    """Mean E u + f of a step given the scalar observations at its end, and its root Λ."""
 
     slope: Float[Array, "d d"]
     shift: Float[Array, " d"]
@@ -43,59 +43,64 @@ class _Mean(NamedTuple):
 
 
 def back(h: Information, step: LinearisedStep, scalars: Scalars) -> Information:
-    """h_i, from h_{i+1} and what is seen at the end of the step."""
-    (E, f, root), seen = _seen(step, scalars)
+    """Return h_i, from h_{i+1} and the scalar observations at the end of the step."""
+    (E, f, root), of_scalars = _seen(step, scalars)
     factor, half = tilt_factor(root, h)
     W = jnp.stack([solve_lower(factor, row) for row in half])  # Wᵀ
     w = solve_lower(factor, matvec(root.T, h.shift))
     H = h.precision - matmul(W, W.T)
     r = h.shift - matvec(W, w) - matvec(H, f)
-    shift = seen.shift + matvec(E.T, r)
-    precision = seen.precision + matmul(E.T, matmul(H, E))
+    shift = of_scalars.shift + matvec(E.T, r)
+    precision = of_scalars.precision + matmul(E.T, matmul(H, E))
+    # Rounding makes the precision asymmetric, and the recursion would amplify that.
     return Information(shift, (precision + precision.T) / 2)
 
 
 def _seen(step: LinearisedStep, scalars: Scalars) -> tuple[_Mean, Information]:
-    """What is seen at the end of the step makes of its mean, and what it says of its beginning."""
+    """Condition a step on the scalar observations at its end.
+
+    **Returns:** the conditional mean and root, and the log density of the observations as a
+    quadratic function of the beginning of the step.
+    """
     E, f, root = step
     shift, precision = jnp.zeros_like(f), jnp.zeros_like(E)
     for row, value, variance, is_seen in zip(*scalars, strict=True):
-        seen = seen_of(root, row, variance)
+        factors = seen_of(root, row, variance)
         slope, residual = matvec(E.T, row), value - dot(row, f)
-        weight = jnp.where(is_seen, 1 / seen.variance, 0)
+        weight = jnp.where(is_seen, 1 / factors.variance, 0)
         shift += slope * residual * weight
         precision += slope[:, None] * slope * weight
-        E = E - seen.gain[:, None] * slope
-        f = f + seen.gain * residual
-        root = root_after(root, seen)
+        E = E - factors.gain[:, None] * slope
+        f = f + factors.gain * residual
+        root = root_after(root, factors)
     return _Mean(E, f, root), Information(shift, precision)
 
 
-def _remembered(h: Information, kept: Float[Array, ""] | None) -> Information:
-    """h to this power; all of it where there is none."""
-    return h if kept is None else Information(kept * h.shift, kept * h.precision)
+def _remembered(h: Information, power: Float[Array, ""] | None) -> Information:
+    """Return h to the power `kept`; h itself if that is `None`."""
+    return h if power is None else Information(power * h.shift, power * h.precision)
 
 
 def _tilted_mean(h: Information, inputs: tuple[LinearisedStep, Scalars, Array | None]):
-    """Γ and m, and what is left of h."""
-    step, scalars, kept = inputs
+    """Return Γ, m and the power of h_{i+1} in the step."""
+    step, scalars, power = inputs
     (E, f, root), _ = _seen(step, scalars)
-    h = _remembered(h, kept)
+    h = _remembered(h, power)
     factor, half = tilt_factor(root, h)
 
     def pulled(v):
-        """Λ (ℛ ℛᵀ)⁻¹ v."""
+        """Return Λ (ℛ ℛᵀ)⁻¹ v."""
         return matvec(root, solve_lower_transposed(factor, solve_lower(factor, v)))
 
     gain = jnp.stack([pulled(row) for row in half])  # H G
     m = f - matvec(gain.T, f) + pulled(matvec(root.T, h.shift))
-    return E - matmul(gain.T, E), m, kept
+    return E - matmul(gain.T, E), m, power
 
 
 def _through_mean(mean: tuple[Array, Array, Array | None], h_dot: Information) -> Information:
-    """Of a change of h_{i+1}, that of h_i."""
-    slope, shift, kept = mean
-    h_dot = _remembered(h_dot, kept)
+    """Return the change of h_i for a change of h_{i+1}."""
+    slope, shift, power = mean
+    h_dot = _remembered(h_dot, power)
     r = matvec(slope.T, h_dot.shift - matvec(h_dot.precision, shift))
     return Information(r, matmul(slope.T, matmul(h_dot.precision, slope)))
 
@@ -104,24 +109,30 @@ def information_filter(
     steps: LinearisedStep,
     scalars: Scalars,
     over_lanes: Callable[[Callable], Callable] | None = None,
-    kept: Float[Array, "K N"] | None = None,
+    power: Float[Array, "K N"] | None = None,
 ) -> Information:
-    """h at the beginning of every step, for steps with leading axes (K, N), and what is seen at the
-    ends of segments, leading axis K. Where there are lanes, in the last axis, `over_lanes` maps a
-    function of one point over them; then there are no derivatives. `kept` is the power of h that
-    goes through each step, by default all of it."""
+    """Return h at the beginning of every step.
+
+    **Arguments:**
+
+    - `steps`: steps of the linear process, leading axes (K, N).
+    - `scalars`: observations at the ends of segments, leading axis K.
+    - `over_lanes`: maps a function of one point over lanes in the last axis. Pass it if there are
+        lanes; derivatives are then not available.
+    - `kept`: power of h_{i+1} that enters each step, by default 1.
+    """
     K, N = steps.shift.shape[:2]
     last = Information(jnp.zeros_like(steps.shift[0, 0]), jnp.zeros_like(steps.decay[0, 0]))
-    each_step = flat(steps), at_every_step(scalars, N), None if kept is None else kept.ravel()
-    inputs = jax.tree.map(lambda leaf: leaf[::-1], each_step)
+    by_step = flat(steps), at_every_step(scalars, N), None if power is None else power.ravel()
+    inputs = jax.tree.map(lambda leaf: leaf[::-1], by_step)
 
     def one(h, inputs):
-        step, scalars, kept = inputs
-        return back(_remembered(h, kept), step, scalars), None
+        step, scalars, power = inputs
+        return back(_remembered(h, power), step, scalars), None
 
     if over_lanes is None:
         h, _ = recursion(one, last, inputs, StateDerivative(_tilted_mean, _through_mean))
     else:
-        each = over_lanes(lambda h, inputs: one(h, inputs)[0])
-        h = lax.scan(lambda h, inputs: 2 * (each(h, inputs),), last, inputs)[1]
+        of_lanes = over_lanes(lambda h, inputs: one(h, inputs)[0])
+        h = lax.scan(lambda h, inputs: 2 * (of_lanes(h, inputs),), last, inputs)[1]
     return jax.tree.map(lambda leaf: leaf[::-1].reshape(K, N, *leaf.shape[1:]), h)

@@ -45,23 +45,25 @@ from .record import Steps
 from .segments import flat, following, split_last
 from .tilted_step import NormalStep
 
-# Of the moves: the share accepted to which β is tuned.
+# Acceptance rate to which the warm-up tunes β.
 _TARGET = 0.4
 
 
 class Paths(NamedTuple):
-    """Of C chains: x_0, and the points at the ends of all steps."""
+    """Paths of C chains: x_0, and the points at the ends of all steps."""
 
     start: Float[Array, "d C"]
     points: Float[Array, "K N d C"]
 
 
 class GuidesToEnds(NamedTuple):
-    """What guides steps to any end e: log h is quadratic in x and e together, so that its precision
-    does not depend on e, and its shift is r + Tᵀe. Chains share it, block by block.
+    """Guides of the steps of blocks, to any end e of the block.
 
-    - `guide`: for e = 0.
-    - `turn`, `next_turn`: T at the beginning and at the end of the step.
+    log h is quadratic in x and e together. Hence its precision does not depend on e, and its shift
+    is r + Tᵀe. All chains share these guides.
+
+    - `guide`: guides to e = 0.
+    - `turn`, `next_turn`: T at the beginning and at the end of each step.
     """
 
     guide: Guide
@@ -69,7 +71,7 @@ class GuidesToEnds(NamedTuple):
     next_turn: Float[Array, "d d *lanes"]
 
     def to(self, end: Float[Array, " d"]) -> Guide:
-        """The guide of one step to this end."""
+        """Return the guide of one step to this end."""
         guide = self.guide
         h = guide.h._replace(shift=guide.h.shift + matvec(self.turn.T, end))
         next_h = guide.next_h._replace(shift=guide.next_h.shift + matvec(self.next_turn.T, end))
@@ -77,14 +79,16 @@ class GuidesToEnds(NamedTuple):
 
 
 class Blocks(NamedTuple):
-    """One cut of a record into B blocks of J segments; arrays have blocks in the last axis.
+    """Partition of a record into B blocks of J segments. Arrays have the blocks in the last axis.
 
-    - `segment`: which segments the blocks are made of, -1 before the record and K after it.
-    - `guides`: of all steps, leading axes (J, N), to the end ξ.
-    - `scalars`, `rows`: what is seen at the ends of segments, leading axis J.
-    - `first`, `first_row`, `root`: what is seen of x_0, and the root of its law; of other blocks
-        nothing, and zero. `mean`: that of the law of x_0, shape (d,).
-    - `goes_on`: after which of them there is more of the record.
+    - `segment`: indices of the segments of each block, -1 before the record and K after it.
+    - `guides`: guides of all steps to the end ξ, leading axes (J, N).
+    - `scalars`, `rows`: observations at the ends of segments, leading axis J.
+    - `first`, `first_row`: observation of x_0, for the first block; other blocks have a missing
+        one.
+    - `root`: root of the covariance of x_0, for the first block; zero for other blocks.
+    - `mean`: mean of the law of x_0, shape (d,).
+    - `goes_on`: whether a part of the record follows the block.
     """
 
     segment: Int[Array, "J B"]
@@ -99,7 +103,7 @@ class Blocks(NamedTuple):
 
 
 def cuts(num_segments: int, length: int) -> Int[np.ndarray, "2 J B"]:
-    """Which segments the blocks of each cut are made of."""
+    """Return the indices of the segments of each block, for both partitions."""
     length = min(length, num_segments)
     num_blocks = -(-(num_segments + length // 2) // length)
 
@@ -111,14 +115,20 @@ def cuts(num_segments: int, length: int) -> Int[np.ndarray, "2 J B"]:
 
 
 def has_length(problem: RecordProblem) -> Bool[Array, " K"]:
-    """Which segments are a part of the record: those beyond its end have steps of length zero."""
+    """Return the mask of the segments that belong to the record.
+
+    Additional segments beyond its end have steps of length zero.
+    """
     return jnp.any(problem.record.dt > 0, axis=1)
 
 
 def has_segments(problem: RecordProblem, length: int) -> Bool[Array, "2 B"]:
-    """Which blocks of each cut hold a part of the record: the last may lie beyond it."""
-    some = jnp.pad(has_length(problem), 1)
-    return jnp.any(some[cuts(problem.num_segments, length) + 1], axis=1)
+    """Return the mask of the blocks that contain a part of the record.
+
+    The last block of a partition may lie beyond the record.
+    """
+    in_record = jnp.pad(has_length(problem), 1)
+    return jnp.any(in_record[cuts(problem.num_segments, length) + 1], axis=1)
 
 
 def blocks_of(
@@ -127,41 +137,41 @@ def blocks_of(
     guide: Guidance,
     segment: Int[np.ndarray, "J B"],
 ) -> Blocks:
-    """The blocks of one cut, of a record that is guided along these points."""
+    """Return the blocks of one partition of a record that is guided along these points."""
     (K, N), d = problem.record.dt.shape, problem.dim
     outside = (segment < 0) | (segment >= K)
     inside = np.clip(segment, 0, K - 1)
-    # Outside the record there is one point, and steps of no length.
+    # Outside the record the path stays at its first or last point, by steps of length zero.
     of_step = np.where(outside, np.where(segment < 0, 0, K * N - 1), 0)[:, None]
     number = np.where(outside[:, None], of_step, inside[:, None] * N + np.arange(N)[:, None])
     edge = np.where(segment < 0, 0, K * N)[:, None]
     here = points[np.where(outside[:, None], edge, number)]  # (J, N, B, d)
-    there = points[np.where(outside[:, None], edge, number + 1)]
+    next_here = points[np.where(outside[:, None], edge, number + 1)]
     lengths = jax.tree.map(lambda leaf: leaf.reshape(-1)[number], problem.record.steps())
     lengths = lengths._replace(dt=jnp.where(outside[:, None], 0, lengths.dt))
     dtype = points.dtype
-    still = LinearisedStep(jnp.eye(d, dtype=dtype), *2 * [jnp.zeros((), dtype)])
+    no_step = LinearisedStep(jnp.eye(d, dtype=dtype), *2 * [jnp.zeros((), dtype)])
     steps = jax.tree.map(
         lambda leaf, none: jnp.where(
             outside.reshape(len(outside), 1, -1, *(leaf.ndim - 1) * [1]), none, leaf[number]
         ),
         flat(guide.linear),
-        still,
+        no_step,
     )
-    everything = jax.tree.map(
+    all_scalars = jax.tree.map(
         lambda first, rest: jnp.concatenate([first[None], rest]), guide.first, guide.scalars
     )
-    everything = _filled(everything, d)
-    nothing = _nothing_like(jax.tree.map(lambda leaf: leaf[0], everything))
+    all_scalars = _filled(all_scalars, d)
+    missing = _nothing_like(jax.tree.map(lambda leaf: leaf[0], all_scalars))
 
     def seen(place: np.ndarray, absent: np.ndarray) -> Scalars:
-        """At these ends of segments, nothing where it is absent; their axes first."""
+        """Return the scalars at these ends of segments, missing ones where `absent`."""
 
         def of(all_, none):
             here = all_[place]
             return jnp.where(absent.reshape(*absent.shape, *[1] * none.ndim), none, here)
 
-        return jax.tree.map(of, everything, nothing)
+        return jax.tree.map(of, all_scalars, missing)
 
     lanes_last = lambda tree, axis: jax.tree.map(lambda leaf: jnp.moveaxis(leaf, axis, -1), tree)
     is_first = np.arange(segment.shape[1]) == 0
@@ -170,11 +180,11 @@ def blocks_of(
     rows = Row(jnp.where(outside[..., None], jnp.nan, values[at_end]), times[at_end])
     lane_times = jnp.broadcast_to(times[0], is_first.shape)
     first_row = Row(jnp.where(is_first, values[0][:, None], jnp.nan), lane_times)
-    # Whether a segment has a length, or one that comes after it.
+    # Whether the segment itself or a later one belongs to the record.
     after = jnp.cumsum(has_length(problem)[::-1])[::-1] > 0
     goes_on = jnp.append(after[1:], False)[inside[-1]]
     scalars = lanes_last(seen(at_end, outside), 1)
-    along = lanes_last(here, 2), lanes_last(there, 2), lengths
+    along = lanes_last(here, 2), lanes_last(next_here, 2), lengths
     return Blocks(
         jnp.asarray(segment),
         _guides_to_ends(lanes_last(steps, 2), scalars, goes_on, *along),
@@ -189,7 +199,7 @@ def blocks_of(
 
 
 def _nothing_like(scalars: Scalars) -> Scalars:
-    """Of as many rows, of which nothing is seen."""
+    """Return scalars of the same shape, all missing."""
     return Scalars(
         jnp.zeros_like(scalars.rows),
         jnp.zeros_like(scalars.values),
@@ -199,7 +209,7 @@ def _nothing_like(scalars: Scalars) -> Scalars:
 
 
 def _filled(scalars: Scalars, num: int) -> Scalars:
-    """With at least so many rows, of which nothing is seen in those that were not there."""
+    """Return the scalars with at least `num` rows; additional rows are missing."""
     lacking = max(num - scalars.values.shape[1], 0)
     pad = lambda leaf, value: jnp.pad(
         leaf, [(0, 0), (0, lacking), *[(0, 0)] * (leaf.ndim - 2)], constant_values=value
@@ -208,13 +218,13 @@ def _filled(scalars: Scalars, num: int) -> Scalars:
 
 
 class _Lanes(NamedTuple):
-    """The blocks of all chains, B C lanes in the last axis: their old paths, what guides paths to
-    the ends of these, and how far noise turns.
+    """Blocks of all chains as B C lanes in the last axis, with their old paths and the size of the
+    move.
 
-    - `start`, `old`: where the old paths begin, and their points, leading axes (J, N).
-    - `end`: where the old paths end, counted from ξ.
-    - `scalars`: what is seen at the ends of segments.
-    - `is_first`: which begin where the record does.
+    - `start`, `old`: beginnings of the old paths, and their points, leading axes (J, N).
+    - `end`: ends of the old paths, relative to ξ.
+    - `scalars`: observations at the ends of segments.
+    - `is_first`: whether the block begins at the beginning of the record.
     - `rho`, `beta`: √(1 - β²), and β.
     """
 
@@ -228,7 +238,7 @@ class _Lanes(NamedTuple):
 
 
 class _State(NamedTuple):
-    """The old and the new path of each lane, and their log weights."""
+    """Points of the old and the new path of each lane, and log weights of the paths up to there."""
 
     old: Float[Array, "d lanes"]
     new: Float[Array, "d lanes"]
@@ -244,7 +254,7 @@ def move(
     scale: Float[Array, " B"],
     paths: Paths,
 ) -> tuple[Paths, Bool[Array, "B C"]]:
-    """New paths of all blocks, with β = `scale`; and which blocks took theirs."""
+    """Propose new paths of all blocks with β = `scale`; return the paths, and which were accepted."""
     noise_key, start_key, accept_key = jax.random.split(key, 3)
     lanes = _lanes_of(blocks, scale, paths)
     first = _new_starts(start_key, problem, model, blocks, lanes)
@@ -252,7 +262,7 @@ def move(
     rate = acceptance_rate(nan_to_neg_inf(last.log_old), nan_to_neg_inf(last.log_new))
     accepted = jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate
 
-    # The blocks one after the other, without what reaches beyond the record.
+    # Join the blocks, and cut off the parts beyond the record.
     (J, B), (K, N), (d, C) = blocks.segment.shape, problem.record.dt.shape, paths.start.shape
     points = jnp.where(accepted, new, lanes.old).reshape(J, N, d, B, C)
     points = jnp.moveaxis(points, 3, 0).reshape(B * J, N, d, C)
@@ -262,10 +272,11 @@ def move(
 
 
 def _lanes_of(blocks: Blocks, scale: Float[Array, " B"], paths: Paths) -> _Lanes:
+    """Return the blocks of all chains as lanes."""
     B, (N, d, C) = blocks.segment.shape[1], paths.points.shape[1:]
     spread = functools.partial(_for_chains, C)
     joined = lambda leaf: leaf.reshape(*leaf.shape[:-2], B * C)
-    # The old paths of the blocks: before the record x_0, after it the last point.
+    # Old paths of the blocks, with x_0 before the record and the last point after it.
     padded = jnp.concatenate(
         [
             jnp.broadcast_to(paths.start, (1, N, d, C)),
@@ -290,19 +301,23 @@ def _guides_to_ends(
     next_points: Float[Array, "J N d B"],
     lengths: Steps,
 ) -> GuidesToEnds:
-    """By the filter to the end 0; and side by side to each of the unit vectors, with all else that
-    r is made of zero, for T."""
+    """Return the guides of all steps to any end of their block.
+
+    d + 1 information filters run side by side. One has the end 0. The others have the unit vectors
+    as ends and zero in all other terms of r, so their shifts are the rows of T.
+    """
     d, B = points.shape[2:]
-    several = functools.partial(_for_chains, d + 1)
-    whole = jnp.tile(jnp.eye(1, d + 1, dtype=points.dtype)[0], B)
-    linear, scalars = several(linear), several(scalars)
-    linear = linear._replace(shift=linear.shift * whole)
-    scalars = scalars._replace(values=scalars.values * whole)
+    for_ends = functools.partial(_for_chains, d + 1)
+    # 1 in the lane of the end 0, and 0 in the lanes of the unit vectors.
+    is_zero_end = jnp.tile(jnp.eye(1, d + 1, dtype=points.dtype)[0], B)
+    linear, scalars = for_ends(linear), for_ends(scalars)
+    linear = linear._replace(shift=linear.shift * is_zero_end)
+    scalars = scalars._replace(values=scalars.values * is_zero_end)
     ends = jnp.tile(jnp.eye(d, d + 1, 1, dtype=points.dtype), (1, B))
-    h = information_filter(linear, _pinned(scalars, several(goes_on), ends), _in_lanes)
-    each = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], B, d + 1), h)
-    zero = jax.tree.map(lambda leaf: leaf[..., 0], each)
-    turn = jnp.moveaxis(each.shift[..., 1:], -1, 2)
+    h = information_filter(linear, _pinned(scalars, for_ends(goes_on), ends), _in_lanes)
+    by_end = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], B, d + 1), h)
+    zero = jax.tree.map(lambda leaf: leaf[..., 0], by_end)
+    turn = jnp.moveaxis(by_end.shift[..., 1:], -1, 2)
     guide = Guide(points, zero, next_points, following(zero), lengths)
     return GuidesToEnds(guide, turn, following(turn))
 
@@ -310,7 +325,10 @@ def _guides_to_ends(
 def _pinned(
     scalars: Scalars, goes_on: Bool[Array, " lanes"], end: Float[Array, "d lanes"]
 ) -> Scalars:
-    """What is seen at the ends of segments, where unless the record has ended the last is exact."""
+    """Return the scalars with the end of each block as an exact observation.
+
+    If the record ends in a block, the last observation of this block stays.
+    """
     last = jax.tree.map(lambda leaf: leaf[-1], scalars)
     exact = _seen_exactly(end, last, goes_on)
     return jax.tree.map(lambda leaf, pin: leaf.at[-1].set(pin), scalars, exact)
@@ -319,15 +337,15 @@ def _pinned(
 def _new_starts(
     key: Key[Array, ""], problem: RecordProblem, model: Diffusion, blocks: Blocks, lanes: _Lanes
 ) -> _State:
-    """Where the paths begin: new only where the record does."""
+    """Sample the beginnings of the new paths: new points only at the beginning of the record."""
     spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
-    nothing = _no_noise(blocks)
+    hidden = _no_noise(blocks)
 
     def of_start(x, mean, root, first, step, end, eta, rho, beta):
         guide = step.to(end)
         law = guided_start(NormalStep(mean, root), first, guide.point, guide.h)
         solve = functools.partial(solve_root, root)
-        zeta, log_old = law.noise_and_log_weight(x, solve, nothing)
+        zeta, log_old = law.noise_and_log_weight(x, solve, hidden)
         new, log_new = law.point_and_log_weight(_turned(zeta, eta, rho, beta))
         return new, log_old, log_new
 
@@ -358,16 +376,16 @@ def _new_points(
     lanes: _Lanes,
     first: _State,
 ) -> tuple[_State, Float[Array, "J N d lanes"]]:
-    """The rest of the new paths, and the weights of both."""
+    """Sample the points of the new paths; compute the log weights of the old and new paths."""
     spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
     density, dynamics_at = problem.density, model.forward_at(problem.like)
-    nothing, corrected = _no_noise(blocks), _corrections(problem, model, spread)
+    hidden, corrected = _no_noise(blocks), _corrections(problem, model, spread)
 
     def step_of(old, new, old_next, eta, step, end, scalars, rho, beta):
         guide = step.to(end)
         law = target_law(density, dynamics_at, old, guide.step)
         here = guided_law(law, guide, scalars)
-        zeta, log_old = here.noise_and_log_weight(old_next, law.solve, nothing)
+        zeta, log_old = here.noise_and_log_weight(old_next, law.solve, hidden)
         law = target_law(density, dynamics_at, new, guide.step)
         there = guided_law(law, guide, scalars)
         new, log_new = there.point_and_log_weight(_turned(zeta, eta, rho, beta))
@@ -375,7 +393,7 @@ def _new_points(
 
     def advance(state: _State, old_next, eta, step, scalars) -> _State:
         axes = (*6 * [-1], None if scalars is None else -1, -1, -1)
-        # Of chains no more is kept than they do not share.
+        # Guides and rows are spread over the chains step by step, to save memory.
         each = (state.old, state.new, old_next, eta, spread(step), lanes.end, scalars)
         new, log_old, log_new = over_lanes(*axes)(step_of)(*each, lanes.rho, lanes.beta)
         return _State(old_next, new, state.log_old + log_old, state.log_new + log_new)
@@ -391,7 +409,7 @@ def _new_points(
         plain, (old_last, eta_last, guide_last) = split_last((old, eta, guides))
         state, path = lax.scan(one, state, plain)
         state = advance(state, old_last, eta_last, guide_last, scalars)
-        # What is seen at a pinned end weighs both paths alike.
+        # At a pinned end both paths have the same state, so this term cancels there.
         state = state._replace(
             log_old=state.log_old + corrected(row, state.old),
             log_new=state.log_new + corrected(row, state.new),
@@ -404,34 +422,42 @@ def _new_points(
 
 
 def _for_chains(num_chains: int, tree: PyTree) -> PyTree:
-    """What belongs to blocks, in the lanes of all chains."""
+    """Repeat the entries of blocks for the lanes of all chains."""
     return jax.tree.map(lambda leaf: jnp.repeat(leaf, num_chains, axis=-1), tree)
 
 
 def _turned(zeta, eta, rho, beta):
-    """ζ' = √(1 - β²) ζ + β η; of a path of no weight ζ may be anything."""
+    """Return the new noise ζ' = √(1 - β²) ζ + β η.
+
+    ζ of a path of weight zero may be NaN; zero replaces it.
+    """
     return rho * jnp.where(jnp.isfinite(zeta), zeta, 0) + beta * eta
 
 
 def _no_noise(blocks: Blocks) -> Float[Array, " n"]:
-    """In the place of noise that does not move a path: it stays apart from all that does."""
+    """Return zeros for the noise that does not move a path.
+
+    This noise is independent of the path, so its value does not matter.
+    """
     return jnp.zeros(blocks.first.values.shape[0], blocks.mean.dtype)
 
 
 def _corrections(
     problem: RecordProblem, model: Diffusion, spread: Callable[[PyTree], PyTree]
 ) -> Callable[[Row, Float[Array, "d lanes"]], Float[Array, " lanes"]]:
-    """Of what blocks saw, and the states of their lanes."""
-    each = over_lanes(-1, -1)(correction(problem, model))
-    return lambda row, x: each(spread(row), x)
+    """Return a function of rows of blocks and states of lanes, with the terms of `correction`."""
+    of_lanes = over_lanes(-1, -1)(correction(problem, model))
+    return lambda row, x: of_lanes(spread(row), x)
 
 
 def blocks_of_both_cuts(
     problem: RecordProblem, points: Float[Array, "points d"], guide: Guidance, length: int
 ) -> Blocks:
-    """The blocks of both cuts, in a leading axis."""
-    each = [blocks_of(problem, points, guide, cut) for cut in cuts(problem.num_segments, length)]
-    return jax.tree.map(lambda *both: jnp.stack(both), *each)
+    """Return the blocks of both partitions, stacked in a leading axis."""
+    partitions = [
+        blocks_of(problem, points, guide, cut) for cut in cuts(problem.num_segments, length)
+    ]
+    return jax.tree.map(lambda *both: jnp.stack(both), *partitions)
 
 
 def sweep(
@@ -442,32 +468,43 @@ def sweep(
     log_scales: Float[Array, "2 B"],
     paths: Paths,
 ) -> tuple[Paths, Bool[Array, "2 B C"]]:
-    """New paths of all blocks of one cut, then of the other, with log β; and which took theirs."""
+    """Propose new paths of all blocks of one partition, then of the other, with the given log β.
+
+    **Returns:** the paths, and which blocks accepted their proposals.
+    """
 
     def one(paths, inputs):
         number, blocks, log_scale = inputs
-        mine = jax.random.fold_in(key, number)
-        return move(mine, problem, model, blocks, jnp.exp(log_scale), paths)
+        cut_key = jax.random.fold_in(key, number)
+        return move(cut_key, problem, model, blocks, jnp.exp(log_scale), paths)
 
     return lax.scan(one, paths, (jnp.arange(2), both, log_scales))
 
 
 def tuned(
-    log_scales: Float[Array, "*moves"], taken: Bool[Array, "*moves C"], number: Float[Array, ""]
+    log_scales: Float[Array, "*moves"], accepted: Bool[Array, "*moves C"], number: Float[Array, ""]
 ) -> Float[Array, "*moves"]:
-    """log β after the sweep of this number in a warm-up, in which these moves were accepted."""
-    share = jnp.mean(taken.astype(log_scales.dtype), axis=-1)
+    """Return the adapted log β after sweep `number` of a warm-up.
+
+    `taken` states which moves of this sweep were accepted. The step of this stochastic
+    approximation falls like `number`^-0.6.
+    """
+    share = jnp.mean(accepted.astype(log_scales.dtype), axis=-1)
     return jnp.minimum(log_scales + number**-0.6 * (share - _TARGET), 0)
 
 
 def _in_lanes(function: Callable) -> Callable:
+    """Map a function of one block over the last axis of all arguments."""
     return lambda *arguments: over_lanes(*len(arguments) * [-1])(function)(*arguments)
 
 
 def _seen_exactly(
     point: Float[Array, "d lanes"], otherwise: Scalars, where: Bool[Array, " lanes"]
 ) -> Scalars:
-    """The state itself, counted from ξ, as what is seen; in other lanes what is seen there."""
+    """Return exact observations of the state in some lanes, and the present ones in the others.
+
+    `point` is relative to ξ.
+    """
     d, rows = point.shape[0], otherwise.values.shape[0]
     exact = Scalars(
         jnp.broadcast_to(jnp.eye(rows, d, dtype=point.dtype)[..., None], otherwise.rows.shape),

@@ -8,23 +8,29 @@ from .observation import Scalars
 
 
 def flat(tree: PyTree) -> PyTree:
-    """With one axis of steps in the place of those of segments and their steps."""
+    """Merge the axes (K, N) of segments and steps into one axis of steps."""
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), tree)
 
 
 def at_every_step(scalars: Scalars, num_steps: int) -> Scalars:
-    """What is seen at the ends of segments, as what is seen at the ends of all steps: nothing at
-    most of them. For loops that would else have a second body for the last step of a segment."""
+    """Return the observations at the ends of segments as observations at the ends of all steps.
 
-    def spread(leaf, nothing):
-        between = jnp.full((leaf.shape[0], num_steps - 1, *leaf.shape[1:]), nothing, leaf.dtype)
+    All but the last step of a segment have a missing observation. A loop over all steps then needs
+    no second body for the last step of a segment.
+    """
+
+    def spread(leaf, missing):
+        between = jnp.full((leaf.shape[0], num_steps - 1, *leaf.shape[1:]), missing, leaf.dtype)
         return jnp.concatenate([between, leaf[:, None]], axis=1)
 
     return flat(Scalars(*map(spread, scalars, (0, 0, 1, False))))
 
 
 def following(tree: PyTree) -> PyTree:
-    """What belongs to the beginnings of steps, axes (K, N), at their ends: zero at the last."""
+    """Return quantities of the ends of steps, from those of their beginnings with axes (K, N).
+
+    The last entry is zero.
+    """
 
     def shifted(leaf):
         steps = flat(leaf)
@@ -34,10 +40,10 @@ def following(tree: PyTree) -> PyTree:
 
 
 def split_last(tree: PyTree) -> tuple[PyTree, PyTree]:
-    """All but the last, and the last, along the first axis."""
+    """Split arrays along the first axis into all but the last entry, and the last entry."""
     return jax.tree.map(lambda leaf: leaf[:-1], tree), jax.tree.map(lambda leaf: leaf[-1], tree)
 
 
 def split_first(tree: PyTree) -> tuple[PyTree, PyTree]:
-    """The first, and all others, along the first axis."""
+    """Split arrays along the first axis into the first entry, and all other entries."""
     return jax.tree.map(lambda leaf: leaf[0], tree), jax.tree.map(lambda leaf: leaf[1:], tree)

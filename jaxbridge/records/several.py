@@ -26,30 +26,37 @@ from .record import Record, as_records, split_records
 
 
 class Records(eqx.Module):
-    """R records, whose axis is the first of all arrays of `stacked.record`; and how many times each
-    has something, or nothing, to be seen at."""
+    """R records with a common model. Arrays of `stacked.record` have the axis of records first.
+
+    `num_times` holds the number of times of each record, including times of missing observations.
+    """
 
     stacked: RecordProblem
     num_times: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def number(self) -> int:
-        """R."""
+        """Return R, the number of records."""
         return len(self.num_times)
 
     def coarsened(self, level: int = 1) -> "Records":
-        """The same with steps that are 2^level as long."""
+        """Return the records with steps 2^`level` times as long."""
         record = _coarsened(self.stacked.record, level)
         return Records(dataclasses.replace(self.stacked, record=record), self.num_times)
 
     @property
     def moving(self) -> Bool[Array, " N"]:
-        """Which steps of a segment have a length in any of the records: others are left out."""
+        """Return the mask of the steps of a segment that have a positive length in any record.
+
+        The other steps can be left out.
+        """
         return jnp.any(self.stacked.record.dt > 0, axis=(0, 1))
 
     def each(self, function: Callable, *mapped: PyTree) -> Any:
-        """`function(problem, *mapped)` of each record, with their axis in front of what is mapped
-        and of all results."""
+        """Evaluate `function(problem, *mapped)` for each record.
+
+        `mapped` and all results have a leading axis of records.
+        """
 
         def one(record: Record, *mapped: PyTree):
             return function(dataclasses.replace(self.stacked, record=record), *mapped)
@@ -57,13 +64,18 @@ class Records(eqx.Module):
         arguments = self.stacked.record, *mapped
         if self.number > 1:
             return jax.vmap(one)(*arguments)
-        # A single record takes no lanes: under `vmap` both branches of a `cond` would be run.
+        # A single record is not mapped, because `vmap` evaluates both branches of a `cond`.
         return _with_axis(one(*_without_axis(arguments)))
 
     def at_observations(self, values: Float[Array, "R ends"]) -> Float[Array, " n"]:
-        """What belongs to the ends of segments, at all observations, record after record."""
-        each = zip(values, self.stacked.record.which, self.num_times, strict=True)
-        return jnp.concatenate([mine[which[:num]] for mine, which, num in each])
+        """Return the entries at observations, record after record.
+
+        `values` has an entry for each end of a segment.
+        """
+        records = zip(values, self.stacked.record.which, self.num_times, strict=True)
+        return jnp.concatenate(
+            [record_values[which[:num]] for record_values, which, num in records]
+        )
 
 
 def as_record_problems(
@@ -79,13 +91,16 @@ def as_record_problems(
     density: AbstractStepDensity | None = None,
     for_weights: bool = False,
 ) -> Records:
-    """What the arguments that all who read one record, or several, share say (`for_weights` as in
-    `as_record_problem`).
+    """Validate the arguments common to all functions that take one or several records.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    `for_weights` is explained in `as_record_problem`.
+
+    **Returns:** `Records`.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """
-    seen = split_records(times, observations)
-    records = as_records(seen, num_steps, step_size, initial_time)
+    pairs = split_records(times, observations)
+    records = as_records(pairs, num_steps, step_size, initial_time)
     law = density, False, for_weights
     problem = problem_of(model, records[0], observation, initial, *law)
     for record in records[1:]:
@@ -95,10 +110,10 @@ def as_record_problems(
     return Records(dataclasses.replace(problem, record=_stacked(records)), num_times)
 
 
-# One program each, where there would be one for every array.
+# Compiled as one program, because JAX would otherwise compile one for every array.
 @compiled_sooner
 def _stacked(records: list[Record]) -> Record:
-    """Records of one length, with an axis in front."""
+    """Pad records to a common length and stack them in a leading axis."""
     num_segments = max(len(record.dt) for record in records)
     num_times = max(len(record.which) for record in records)
     same = [_padded(record, num_segments, num_times) for record in records]
@@ -107,21 +122,24 @@ def _stacked(records: list[Record]) -> Record:
 
 @compiled_sooner
 def _coarsened(stacked: Record, level: int) -> Record:
+    """Return stacked records with steps 2^`level` times as long."""
     return jax.vmap(lambda record: record.coarsened(level))(stacked)
 
 
 @compiled_sooner
 def _without_axis(tree: PyTree) -> PyTree:
+    """Remove the leading axis of a single record."""
     return jax.tree.map(lambda leaf: leaf[0], tree)
 
 
 @compiled_sooner
 def _with_axis(tree: PyTree) -> PyTree:
+    """Add the leading axis of a single record."""
     return jax.tree.map(lambda leaf: leaf[None], tree)
 
 
 def _padded(record: Record, num_segments: int, num_times: int) -> Record:
-    """With so many segments, the last of which have no length and nothing to be seen."""
+    """Pad a record with segments of length zero and missing observations."""
     more, last = num_segments - record.dt.shape[0], record.since[-1]
     return Record(
         record.clock,
@@ -133,16 +151,21 @@ def _padded(record: Record, num_segments: int, num_times: int) -> Record:
 
 
 def stacked(*alike: PyTree) -> tuple[PyTree, PyTree]:
-    """The arrays of what is of one form, for instance on several grids, in a leading axis; and all
-    else, which `equinox.combine` joins to those of one: so that they go through one program."""
-    arrays, rest = zip(*(eqx.partition(each, eqx.is_array) for each in alike), strict=True)
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays), rest[0]
+    """Stack the arrays of pytrees of one structure, for instance of records on several grids.
+
+    One compiled program then serves all of them.
+
+    **Returns:** the arrays with a leading axis, and all other leaves. `equinox.combine` joins these
+    to the arrays of one pytree.
+    """
+    arrays, others = zip(*(eqx.partition(tree, eqx.is_array) for tree in alike), strict=True)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays), others[0]
 
 
 def linearisations(
     records: Records, model: Diffusion
 ) -> tuple[Float[Array, "R points d"], GuideCheck]:
-    """The points along which each record is linearised, and how good a guide that makes."""
+    """Return the points of the linearisation of each record, and checks of the guides."""
 
     def one(problem: RecordProblem):
         points, _, check = linearised(problem, model)
