@@ -99,7 +99,7 @@ def _with_h(
     here, next_here, steps = path
     # h_{i+1} to the power exp(-γ δ) enters step i.
     power = None if rate is None else jnp.exp(-rate * steps.dt)
-    h = information_filter(linear, scalars, kept=power)
+    h = information_filter(linear, scalars, power=power)
     guides = Guide(here, h, next_here, following(h), steps)
     h_first = jax.tree.map(lambda leaf: leaf[0, 0], h)
     start = guided_start(initial, first, here[0, 0], h_first)
@@ -182,10 +182,10 @@ def corrections(
 def correction(
     problem: RecordProblem, model: Diffusion
 ) -> Callable[[Row, Float[Array, " d"]], Float[Array, ""]]:
-    """Return a function of an observation and a state, with the log weight's term for a general model.
+    """Return a function of an observation and a state: the log weight's term for a general model.
 
-    The term is log g minus the log density of the guess. It is NaN outside the state space, because
-    no step from the last state would detect that.
+    The term is log g minus the log density of the guess. It is NaN outside the state space. The
+    last state of a path begins no step, so this check is needed there.
     """
     inside = model.state_space()
 

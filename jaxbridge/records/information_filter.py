@@ -11,9 +11,9 @@ The derivative of h_i with respect to h_{i+1} has a simpler form. Given all late
 has the mean Γu + m of the tilted step. A small change of log h_{i+1} changes log h_i by its
 conditional mean. Hence
 
-    Ḣ_i = Γᵀ Ḣ Γ,   ṙ_i = Γᵀ (ṙ - Ḣ m),   Γ = (I - G H) E,   m = (I - G H) f + G r,
+    Ḣ_i = Γᵀ Ḣ Γ,   ṙ_i = Γᵀ (ṙ - Ḣ m),   Γ = (I - G H) E,   m = (I - G H) f + G r.
 
-with G = Λ (ℛ ℛᵀ)⁻¹ Λᵀ, the covariance of u' given all later observations.
+Here G = Λ (ℛ ℛᵀ)⁻¹ Λᵀ is the covariance of u' given all later observations.
 
 With a discount rate (`forgetting`), a power of h_{i+1} below one enters the step.
 """
@@ -52,7 +52,7 @@ def back(h: Information, step: LinearisedStep, scalars: Scalars) -> Information:
     r = h.shift - matvec(W, w) - matvec(H, f)
     shift = of_scalars.shift + matvec(E.T, r)
     precision = of_scalars.precision + matmul(E.T, matmul(H, E))
-    # Rounding makes the precision asymmetric, and the recursion would amplify that.
+    # Rounding makes the precision slightly asymmetric.
     return Information(shift, (precision + precision.T) / 2)
 
 
@@ -77,7 +77,7 @@ def _seen(step: LinearisedStep, scalars: Scalars) -> tuple[_Mean, Information]:
 
 
 def _remembered(h: Information, power: Float[Array, ""] | None) -> Information:
-    """Return h to the power `kept`; h itself if that is `None`."""
+    """Return h to the given power; h itself if `power` is `None`."""
     return h if power is None else Information(power * h.shift, power * h.precision)
 
 
@@ -119,7 +119,7 @@ def information_filter(
     - `scalars`: observations at the ends of segments, leading axis K.
     - `over_lanes`: maps a function of one point over lanes in the last axis. Pass it if there are
         lanes; derivatives are then not available.
-    - `kept`: power of h_{i+1} that enters each step, by default 1.
+    - `power`: power of h_{i+1} that enters each step, by default 1.
     """
     K, N = steps.shift.shape[:2]
     last = Information(jnp.zeros_like(steps.shift[0, 0]), jnp.zeros_like(steps.decay[0, 0]))

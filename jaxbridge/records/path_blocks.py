@@ -159,7 +159,7 @@ def blocks_of(
         no_step,
     )
     all_scalars = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest]), guide.first, guide.scalars
+        lambda first, tail: jnp.concatenate([first[None], tail]), guide.first, guide.scalars
     )
     all_scalars = _filled(all_scalars, d)
     missing = _nothing_like(jax.tree.map(lambda leaf: leaf[0], all_scalars))
@@ -218,8 +218,7 @@ def _filled(scalars: Scalars, num: int) -> Scalars:
 
 
 class _Lanes(NamedTuple):
-    """Blocks of all chains as B C lanes in the last axis, with their old paths and the size of the
-    move.
+    """Blocks of all chains as B C lanes in the last axis, and the size of their moves.
 
     - `start`, `old`: beginnings of the old paths, and their points, leading axes (J, N).
     - `end`: ends of the old paths, relative to ξ.
@@ -254,7 +253,10 @@ def move(
     scale: Float[Array, " B"],
     paths: Paths,
 ) -> tuple[Paths, Bool[Array, "B C"]]:
-    """Propose new paths of all blocks with β = `scale`; return the paths, and which were accepted."""
+    """Propose new paths of all blocks with β = `scale`.
+
+    **Returns:** the paths, and which blocks accepted their proposals.
+    """
     noise_key, start_key, accept_key = jax.random.split(key, 3)
     lanes = _lanes_of(blocks, scale, paths)
     first = _new_starts(start_key, problem, model, blocks, lanes)
@@ -429,7 +431,7 @@ def _for_chains(num_chains: int, tree: PyTree) -> PyTree:
 def _turned(zeta, eta, rho, beta):
     """Return the new noise ζ' = √(1 - β²) ζ + β η.
 
-    ζ of a path of weight zero may be NaN; zero replaces it.
+    ζ of a path of weight zero may not be finite; zero replaces it.
     """
     return rho * jnp.where(jnp.isfinite(zeta), zeta, 0) + beta * eta
 

@@ -1,4 +1,7 @@
-"""Validated problem of a record: model, observations, observation model and initial law."""
+"""Validated problem of a record: model, observations, observation model and initial law.
+
+All functions that take records validate their arguments here, so their errors are the same.
+"""
 
 import equinox as eqx
 import jax
@@ -15,12 +18,15 @@ from .initial import Initial, as_initial, bound, check_initial
 from .observation import LinearGaussian, Observation, Row, Scalars, check_observation
 from .record import Record, as_records, split_records
 
-# Beyond twice as many, how many dimensions a state may have that are tried for what to say.
+# Dimensions up to 2 d plus this number are tried, to name the right one in the error message.
 _MOST_TRIED = 8
 
 
 class RecordProblem(eqx.Module):
-    """A record of a model, how it was seen, and where it began; `density` is that of the steps."""
+    """Record of a model, with the observation model and the law of the first state.
+
+    `density` is the density of the steps.
+    """
 
     model: Diffusion
     record: Record
@@ -31,25 +37,26 @@ class RecordProblem(eqx.Module):
 
     @property
     def num_steps(self) -> int:
-        """N, of each segment."""
+        """Return N, the number of steps per segment."""
         return self.record.num_steps
 
     @property
     def num_segments(self) -> int:
+        """Return K, the number of segments."""
         return self.record.dt.shape[-2]
 
     @property
     def like(self) -> Float[Array, " d"]:
-        """A point, of which only shape and dtype count."""
+        """Return an example of a state, which shows only shape and dtype."""
         return jnp.zeros(self.dim, self.record.dt.dtype)
 
     @property
     def rows(self) -> Row:
-        """What is seen at the ends of segments, with a leading axis K + 1."""
+        """Return the observations at the ends of segments, leading axis K + 1."""
         return Row(self.record.values, self.record.times)
 
     def scalars(self, model: Diffusion) -> Scalars:
-        """The same as independent numbers."""
+        """Return the observations as independent scalars, leading axis K + 1."""
         of_one = lambda row: self.observation.scalars(row, model.params, self.dim)
         return jax.vmap(of_one)(self.rows)
 
@@ -68,19 +75,23 @@ def as_record_problem(
     any_constant: bool = False,
     for_weights: bool = False,
 ) -> RecordProblem:
-    """What the arguments that all who read one record share say. The constant of ν may be unknown
-    where only paths at fixed parameters are asked for, `any_constant`. `for_weights` states that
-    the noise of a given path is never needed (`most_accurate_density`).
+    """Validate the arguments common to all functions that take one record.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Arguments** beside those of `innovations`:
+
+    - `any_constant`: whether the stationary density may be unnormalised. It may be if only paths at
+        fixed parameters are needed.
+    - `for_weights`: whether the noise of a given path is never needed (`most_accurate_density`).
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """
-    seen = split_records(times, observations)
-    if len(seen) > 1:
+    pairs = split_records(times, observations)
+    if len(pairs) > 1:
         raise ValueError(
-            f"`observations` contain {len(seen)} records, but this function takes one: call it for "
+            f"`observations` contain {len(pairs)} records, but this function takes one: call it for "
             "each record, because records are independent given the parameters."
         )
-    (record,) = as_records(seen, num_steps, step_size, initial_time)
+    (record,) = as_records(pairs, num_steps, step_size, initial_time)
     return problem_of(model, record, observation, initial, density, any_constant, for_weights)
 
 
@@ -93,9 +104,9 @@ def problem_of(
     any_constant: bool = False,
     for_weights: bool = False,
 ) -> RecordProblem:
-    """What is asked of a record.
+    """Validate the model, observation model and initial law of a record.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """
     check_diffusion(model)
     check_observation(observation)
@@ -131,12 +142,12 @@ def problem_of(
 
 
 def _check_dimension(model: Diffusion, guess: LinearGaussian, like: Float[Array, " d"]) -> None:
-    """Raise `ValueError` where the model's state has other dimensions than what is seen of it."""
+    """Raise `ValueError` if the dimensions of the model and of the observation model differ."""
     if _has_dimension(model, like):
         return
     (d,), most = like.shape, 2 * like.shape[0] + _MOST_TRIED
     fits = [n for n in range(1, most) if _has_dimension(model, jnp.zeros(n, like.dtype))]
-    if not fits:  # the model's own fault, which is told where it is used
+    if not fits:  # the error is in the model, and its evaluation reports it
         return
     if guess.matrix is None:
         raise ValueError(
@@ -152,7 +163,7 @@ def _check_dimension(model: Diffusion, guess: LinearGaussian, like: Float[Array,
 
 
 def _has_dimension(model: Diffusion, like: Float[Array, " d"]) -> bool:
-    """Whether points like this one are states of the model."""
+    """Return whether the model accepts states of this shape."""
 
     def coefficients(model, x):
         dynamics = model.forward_at(x)(jnp.zeros((), x.dtype))
@@ -160,14 +171,13 @@ def _has_dimension(model: Diffusion, like: Float[Array, " d"]) -> bool:
 
     try:
         _, sigma = jax.eval_shape(coefficients, model, like)
-    except Exception:  # whatever functions of the user's raise
+    except Exception:  # functions of the user may raise anything
         return False
     return sigma.shape[0] == like.shape[0]
 
 
 def check_clock(model: Diffusion, observation: Observation, record: Record) -> None:
-    """Raise `ValueError` where something depends on times that are too far from zero for their
-    precision."""
+    """Raise `ValueError` if the precision of large times is too low for time-dependent functions."""
     if model.depends_on_time:
         check_resolved(record.clock, record.since, record.dt)
     elif observation.depends_on_time:
@@ -175,25 +185,24 @@ def check_clock(model: Diffusion, observation: Observation, record: Record) -> N
 
 
 def check_domain(model: Diffusion, observation: Observation, record: Record) -> None:
-    """Raise `ValueError` where a state that was seen whole and without noise is none of the
-    model's."""
+    """Raise `ValueError` if a complete exact observation is outside the state space."""
     is_inside = model.state_space()
     if is_inside is None or not isinstance(observation, LinearGaussian):
         return
     if observation.depends_on_time:
         return
-    d, seen = record.values.shape[-1], record.values[record.which]
-    if is_traced(model, observation, seen):
+    d, values = record.values.shape[-1], record.values[record.which]
+    if is_traced(model, observation, values):
         return
-    matrix = np.asarray(observation.matrix_for(d, d, seen.dtype), float)
-    at = record.times[0]
-    R = np.asarray(observation.covariance_for(model.params, d, at))
+    matrix = np.asarray(observation.matrix_for(d, d, values.dtype), float)
+    first_time = record.times[0]
+    R = np.asarray(observation.covariance_for(model.params, d, first_time))
     if matrix.shape != (d, d) or np.any(R):
         return
-    whole = np.all(np.isfinite(np.asarray(seen)), axis=1)
-    states = np.linalg.solve(matrix, np.where(whole[:, None], seen, 0).T).T
-    inside = jax.vmap(is_inside)(jnp.asarray(states, seen.dtype))
-    outside = np.flatnonzero(whole & ~np.asarray(inside))
+    complete = np.all(np.isfinite(np.asarray(values)), axis=1)
+    states = np.linalg.solve(matrix, np.where(complete[:, None], values, 0).T).T
+    inside = jax.vmap(is_inside)(jnp.asarray(states, values.dtype))
+    outside = np.flatnonzero(complete & ~np.asarray(inside))
     if outside.size:
         raise ValueError(
             f"`observations[{outside[0]}]` is an exact observation of the state "

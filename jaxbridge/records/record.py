@@ -26,26 +26,28 @@ from ..engine.checks import (
 from ..engine.compiled import compiled_sooner
 from ..engine.times import Clock, Times, as_times, check_increasing
 
-# What the end of a segment costs, in steps.
+# Cost of the end of a segment (observation, resampling), in steps.
 _STEPS_PER_SEGMENT = 4
 
 
 class Steps(NamedTuple):
-    """Of steps, their lengths δ, and the times at their middles, where coefficients that depend on
-    time are taken."""
+    """Lengths δ of steps, and the times at their middles.
+
+    Time-dependent coefficients are evaluated at the middles.
+    """
 
     dt: Float[Array, "*steps"]
     time: Float[Array, "*steps"]
 
 
 class Record(eqx.Module):
-    """K segments of N steps.
+    """Record of K segments with N steps each.
 
-    - `clock`: the caller's, whose origin is the first time.
-    - `since`: times of the ends of segments since then, shape (K + 1,).
-    - `dt`: the lengths of the steps of each, shape (K, N); a step of length zero stays where it is.
-    - `values`: what is seen at these times, shape (K + 1, m), NaN where nothing is.
-    - `which`: the place of each observation among the ends of segments.
+    - `clock`: the caller's time, with the first time as origin.
+    - `since`: times of the ends of segments since the first time, shape (K + 1,).
+    - `dt`: lengths of the steps, shape (K, N). A path does not move in a step of length zero.
+    - `values`: observations at the ends of segments, shape (K + 1, m), NaN for missing values.
+    - `which`: index of the end of a segment for each observation.
     """
 
     clock: Clock
@@ -56,12 +58,15 @@ class Record(eqx.Module):
 
     @property
     def num_steps(self) -> int:
-        """N."""
+        """Return N, the number of steps per segment."""
         return self.dt.shape[-1]
 
     @property
     def durations(self) -> Float[Array, " K"]:
-        """How long segments are: of times that are large rounding would leave little."""
+        """Return the lengths of the segments, as sums of steps.
+
+        Differences of large times would lose precision.
+        """
         return jnp.sum(self.dt, axis=1)
 
     @property
@@ -70,22 +75,26 @@ class Record(eqx.Module):
         return self.clock(self.since)
 
     def grid(self) -> Float[Array, " points"]:
-        """Return the times of all points since the first."""
+        """Return the times of all points, since the first time."""
         return jnp.append(self._beginnings().ravel(), self.since[-1])
 
     def steps(self) -> Steps:
-        """All steps, shape (K, N)."""
+        """Return all steps, shape (K, N)."""
         return Steps(self.dt, self.clock(self._beginnings() + self.dt / 2))
 
     def _beginnings(self) -> Float[Array, "K N"]:
-        """Return the times at which steps begin, since the first."""
-        within = jnp.cumsum(self.dt, axis=1) - self.dt  # first, so that a segment begins on time
+        """Return the times at which steps begin, since the first time."""
+        within = jnp.cumsum(self.dt, axis=1) - self.dt  # begins with exactly zero
         return self.since[:-1, None] + within
 
     def coarsened(self, level: int = 1) -> "Record":
-        """The same with steps that are 2^level as long, the first of a segment what is left of N,
-        for programs that are compiled for N: of each the last of its parts has the length and the
-        others have none, so that the last of a segment has noise to be seen exactly."""
+        """Return the record with steps 2^`level` times as long.
+
+        The shape (K, N) stays, so compiled programs can be used again. Each long step has its
+        length in the last of its parts; the others have length zero. Hence the last step of a
+        segment has noise, as an exact observation needs. If 2^`level` does not divide N, the first
+        long step of each segment is shorter.
+        """
         size = 2**level
         left_out = -self.num_steps % size
         parts = jnp.pad(self.dt, ((0, 0), (left_out, 0))).reshape(len(self.dt), -1, size)
@@ -94,42 +103,54 @@ class Record(eqx.Module):
 
 
 def as_records(
-    seen: list[tuple[Numbers, Numbers]],
+    pairs: list[tuple[Numbers, Numbers]],
     num_steps: int | None,
     step_size: float | None,
     initial_time: Numbers | None = None,
 ) -> list[Record]:
-    """The records of times and of what was seen at them, `num_steps` between two times, or so many
-    that none is longer than `step_size`; from `initial_time` on. All have the same N.
+    """Validate times and observations of records, and split their intervals into segments and steps.
 
-    **Raises:** `ValueError` that says what is wrong with which time or observation.
+    **Arguments:**
+
+    - `seen`: times and observations of each record.
+    - `num_steps`, `step_size`: number of steps between two times, or their maximum length. N is the
+        same for all records.
+    - `initial_time`: time of the initial law, if it is before the first time.
+
+    **Raises:** `ValueError` that names the invalid time or observation.
     """
     check = lambda times, values: _checked(times, values, initial_time)
-    each = of_each(check, seen)
-    widths = [values.shape[1] for _, values in each]
+    checked = of_each(check, pairs)
+    widths = [values.shape[1] for _, values in checked]
     if len(set(widths)) > 1:
         raise ValueError(
             "several records must have the same number of observed components (columns of "
             f"`observations`); got {widths}."
         )
-    with jax.ensure_compile_time_eval():  # so that gaps that are known stay so
-        gaps = jnp.concatenate([times.gaps for times, _ in each])
+    with jax.ensure_compile_time_eval():  # so that concrete intervals stay concrete inside `jit`
+        gaps = jnp.concatenate([times.gaps for times, _ in checked])
     num_steps, segments = _segments(gaps, num_steps, step_size)
-    ends = np.cumsum([len(times.gaps) for times, _ in each])[:-1]
+    ends = np.cumsum([len(times.gaps) for times, _ in checked])[:-1]
     counts = np.split(segments, ends)
     return [
         _cut(
-            *times.clock(_dtype(times, values)), times.gaps, values, num_steps, tuple(mine.tolist())
+            *times.clock(_dtype(times, values)),
+            times.gaps,
+            values,
+            num_steps,
+            tuple(segment_counts.tolist()),
         )
-        for (times, values), mine in zip(each, counts, strict=True)
+        for (times, values), segment_counts in zip(checked, counts, strict=True)
     ]
 
 
 def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, Numbers]]:
-    """Times and observations of each of several records: of lists of them, or of arrays with a
-    leading axis; or of the only one. Records may share their `times`.
+    """Return the times and observations of each record.
 
-    **Raises:** `ValueError` where there are not as many of the one as of the other.
+    Several records are lists of times and observations, or arrays with a leading axis. They may
+    share `times`.
+
+    **Raises:** `ValueError` if the numbers of times and observations differ.
     """
     if _num_axes(observations) != 3 and not _has_rows(times):
         return [(times, observations)]
@@ -146,30 +167,30 @@ def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, 
 
 
 def _has_rows(times: Numbers) -> bool:
-    """Whether there are the times of several records, each of two or more."""
+    """Return whether `times` contains several rows, each with two times or more."""
     several = isinstance(times, list | tuple | np.ndarray | jax.Array) and _num_axes(times) == 2
     return several and len(times) > 0 and len(times[0]) > 1  # pyright: ignore
 
 
-def of_each(function: Callable[..., Any], seen: list[tuple[Numbers, Numbers]]) -> list[Any]:
-    """`function(times, observations)` of each record, whose errors say of which they are, if there
-    are several.
+def of_each(function: Callable[..., Any], pairs: list[tuple[Numbers, Numbers]]) -> list[Any]:
+    """Evaluate `function(times, observations)` for each record.
 
-    **Raises:** what it raises.
+    **Raises:** the errors of `function`. If there are several records, the message begins with the
+    number of the record.
     """
-    if len(seen) == 1:
-        return [function(*seen[0])]
-    made = []
-    for number, (times, observations) in enumerate(seen):
+    if len(pairs) == 1:
+        return [function(*pairs[0])]
+    results = []
+    for number, (times, observations) in enumerate(pairs):
         try:
-            made.append(function(times, observations))
+            results.append(function(times, observations))
         except (ValueError, TypeError) as error:
             raise type(error)(f"in record {number}: {error}") from error
-    return made
+    return results
 
 
 def _num_axes(value: Any) -> int:
-    """Of an array, or of nested lists, by their first entries."""
+    """Return the number of axes of an array, or of nested lists by their first entries."""
     if hasattr(value, "ndim"):
         return value.ndim
     is_list = isinstance(value, list | tuple)
@@ -177,48 +198,60 @@ def _num_axes(value: Any) -> int:
 
 
 def as_rows(observations: Numbers) -> Float[Array, "n m"]:
-    """Return observations as an array, a row for each time; what is `None` or masked is NaN, and a
-    series of numbers is one column."""
+    """Return observations as an array with one row per time.
+
+    `None` and masked values become NaN. A series of numbers becomes one column.
+    """
     values = as_floating("observations", missing_as_nan(_filled("observations", observations)))
     return values[:, None] if values.ndim == 1 else values
 
 
 def _dtype(times: Times, values: Array) -> jnp.dtype:
+    """Return the dtype of paths."""
     return jnp.promote_types(times.dtype, values.dtype)
 
 
 def _checked(
     times: Numbers, observations: Numbers, initial_time: Numbers | None
 ) -> tuple[Times, Float[Array, "n m"]]:
-    """Times and values.
+    """Validate the times and observations of one record.
 
-    **Raises:** `ValueError` that says what is wrong with which time or observation.
+    **Returns:** the times, and the observations as an array with one row per time. A missing
+    observation is added at `initial_time`.
+
+    **Raises:** `ValueError` that names the invalid time or observation.
     """
     values = as_rows(observations)
-    known = as_times("times", _filled("times", times))
+    checked_times = as_times("times", _filled("times", times))
     if initial_time is not None:
-        seen = known
-        known = seen.preceded("initial_time", initial_time)
-        nothing = jnp.full((len(known.gaps) - len(seen.gaps), *values.shape[1:]), jnp.nan)
-        values = jnp.concatenate([nothing.astype(values.dtype), values])
-    if len(known.shape) != 1 or values.ndim != 2 or values.shape[0] != known.shape[0]:
+        observed_times = checked_times
+        checked_times = observed_times.preceded("initial_time", initial_time)
+        missing = jnp.full(
+            (len(checked_times.gaps) - len(observed_times.gaps), *values.shape[1:]), jnp.nan
+        )
+        values = jnp.concatenate([missing.astype(values.dtype), values])
+    if (
+        len(checked_times.shape) != 1
+        or values.ndim != 2
+        or values.shape[0] != checked_times.shape[0]
+    ):
         raise ValueError(
             "`times` must have shape (n,) and `observations` (n, m), one row per time; got "
-            f"{known.shape} and {values.shape}."
+            f"{checked_times.shape} and {values.shape}."
         )
-    if known.shape[0] < 2 or values.shape[1] == 0:
+    if checked_times.shape[0] < 2 or values.shape[1] == 0:
         raise ValueError(
             "a record needs at least two times and one observed component; got `observations` of "
             f"shape {values.shape}."
         )
-    check_precision("`times` and `observations`", _dtype(known, values))
-    check_increasing(known)
+    check_precision("`times` and `observations`", _dtype(checked_times, values))
+    check_increasing(checked_times)
     if not is_traced(values):
         infinite = np.argwhere(np.isinf(values))
         if infinite.size:
             i, j = infinite[0]
             raise ValueError(f"`observations[{i}, {j}]` is infinite: pass NaN for a missing value.")
-    return known, values
+    return checked_times, values
 
 
 @compiled_sooner
@@ -230,7 +263,7 @@ def _cut(
     num_steps: int,
     segments: tuple[int, ...],
 ) -> Record:
-    """The record, with so many segments to each gap."""
+    """Return the record with the given number of segments in each interval between two times."""
     dtype = since.dtype
     which = np.concatenate([[0], np.cumsum(segments)])
     ends = jnp.full((which[-1] + 1, values.shape[1]), jnp.nan, dtype).at[which].set(values)
@@ -243,7 +276,7 @@ def _cut(
 
 
 def _filled(name: str, values: Numbers) -> Numbers:
-    """What a masked array of NumPy holds, with NaN in the place of what is masked."""
+    """Return a masked NumPy array as an array with NaN for masked values; other values unchanged."""
     if not isinstance(values, np.ma.MaskedArray):
         return values
     if name == "times" and np.ma.getmaskarray(values).any():
@@ -256,14 +289,17 @@ def _filled(name: str, values: Numbers) -> Numbers:
 def _segments(
     gaps: Array, num_steps: int | None, step_size: float | None
 ) -> tuple[int, Int[np.ndarray, " n"]]:
-    """N, and of how many segments each gap is made."""
+    """Return N, and the number of segments of each interval between two times.
+
+    With `step_size`, N minimises the cost: N plus `_STEPS_PER_SEGMENT` for each segment.
+    """
     if step_size is None:
         num_steps = check_num_steps(10 if num_steps is None else num_steps, gaps.shape[0])
         return num_steps, np.ones(gaps.shape[0], int)
-    wanted = count_steps(gaps, num_steps, step_size)
+    step_counts = count_steps(gaps, num_steps, step_size)
 
     def cost(steps: int) -> int:
-        return int(np.sum(-(-wanted // steps)) * (steps + _STEPS_PER_SEGMENT))
+        return int(np.sum(-(-step_counts // steps)) * (steps + _STEPS_PER_SEGMENT))
 
-    best = min(np.unique(wanted).tolist(), key=cost)
-    return int(best), -(-wanted // best)
+    best = min(np.unique(step_counts).tolist(), key=cost)
+    return int(best), -(-step_counts // best)
