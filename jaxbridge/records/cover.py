@@ -34,26 +34,26 @@ from .initial import ladder, log_normal
 from .observation import Scalars
 from .tilted_step import Information, NormalStep
 
-# Kernels, and how often new ones are drawn from the last.
+# Number of kernels, and of rounds of draws without a sampler.
 _NUM_KERNELS, _NUM_ROUNDS = 256, 2
-# How much wider than ν what covers its tails is.
+# Widths of the laws for the tails, relative to ν.
 _WIDER = (1.0, 2.0, 4.0, 8.0)
-# To what share of all draws a kernel reaches.
+# Share of all draws within the width of a kernel.
 _NEAREST = 1 / 16
 
 
 class Cover(NamedTuple):
-    """A mixture of J normal laws."""
+    """Mixture of J normal laws."""
 
     log_shares: Float[Array, " J"]
     laws: NormalStep
 
     def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:
-        """log q(x)."""
+        """Return log q(x)."""
         return logsumexp(self.log_shares + jax.vmap(lambda law: log_normal(law, x))(self.laws))
 
     def points(self, positions: Float[Array, " n"], zeta: Float[Array, "n d"]):
-        """Draws, from uniform positions and normal noise."""
+        """Sample points, from uniform positions and normal noise."""
 
         def one(j, zeta):
             return self.laws.mean[j] + matvec(self.laws.root[j], zeta)
@@ -62,20 +62,20 @@ class Cover(NamedTuple):
 
 
 class CoveredStart(NamedTuple):
-    """The laws of a cover, given what is seen at t_0 and h_0, and their shares."""
+    """Laws of a cover, given the observation at t_0 and tilted by h_0, and their log shares."""
 
     laws: GuidedLaw
     log_shares: Float[Array, " J"]
 
     @property
     def log_integral(self) -> Float[Array, ""]:
-        """The log of the integral of the cover times what it is tilted by."""
+        """Return the log of the integral of the cover times its tilt."""
         return logsumexp(self.log_shares)
 
     def points(
         self, positions: Float[Array, " n"], zeta: Float[Array, "d n"]
     ) -> Float[Array, "d n"]:
-        """Draws of x_0, from uniform positions and normal noise."""
+        """Sample x_0, from uniform positions and normal noise."""
 
         def one(j, zeta):
             law = jax.tree.map(lambda leaf: leaf[j], self.laws)
@@ -85,25 +85,26 @@ class CoveredStart(NamedTuple):
 
 
 def chosen(log_shares: Float[Array, " J"], positions: Float[Array, " n"]):
-    """Which are at these positions of [0, 1), in the order in which they come."""
+    """Return the indices of the laws at these positions in [0, 1), by the inverse of their cdf."""
     bounds = jnp.cumsum(normalise_weights(nan_to_neg_inf(log_shares)))
     bounds = bounds / jnp.maximum(bounds[-1], jnp.finfo(bounds.dtype).tiny)
     return jnp.minimum(jnp.searchsorted(bounds, positions, side="right"), len(bounds) - 1)
 
 
 def cover(model: Diffusion, normal: NormalStep) -> Cover:
-    """Of ν, from the normal law in its place."""
+    """Return the cover of ν, given the normal law in place of ν."""
     model, (d,), dtype = model.prepared(), normal.mean.shape, normal.mean.dtype
     keys = jax.random.split(jax.random.key(0), _NUM_ROUNDS + 1)
-    alike = jnp.zeros(_NUM_KERNELS, dtype)
+    # Fixed keys make the cover a function of the parameters only.
+    equal_weights = jnp.zeros(_NUM_KERNELS, dtype)
     if model.has_sampler:
         keys = jax.random.split(keys[0], _NUM_KERNELS)
-        return _fitted(jax.vmap(model.sample_stationary)(keys).astype(dtype), alike, normal)
-    evenly = (jnp.arange(_NUM_KERNELS, dtype=dtype) + 0.5) / _NUM_KERNELS
+        return _fitted(jax.vmap(model.sample_stationary)(keys).astype(dtype), equal_weights, normal)
+    positions = (jnp.arange(_NUM_KERNELS, dtype=dtype) + 0.5) / _NUM_KERNELS
     points, log_weights = ladder(model, normal)
-    law = _fitted(points[chosen(log_weights, evenly)], alike, normal)
+    law = _fitted(points[chosen(log_weights, positions)], equal_weights, normal)
     for key in keys[1:]:
-        points = law.points(evenly, jax.random.normal(key, (_NUM_KERNELS, d), dtype))
+        points = law.points(positions, jax.random.normal(key, (_NUM_KERNELS, d), dtype))
         log_ratio = jax.vmap(lambda x, law=law: model.log_stationary(x) - law.log_density(x))
         law = _fitted(points, nan_to_neg_inf(log_ratio(points)), normal)
     return law
@@ -112,13 +113,13 @@ def cover(model: Diffusion, normal: NormalStep) -> Cover:
 def _fitted(
     points: Float[Array, "M d"], log_weights: Float[Array, " M"], normal: NormalStep
 ) -> Cover:
-    """The mixture that weighted draws make, without those that are not finite."""
+    """Fit the mixture to weighted draws; draws that are not finite are left out."""
     (M, d), dtype = points.shape, points.dtype
     finite = jnp.all(is_finite(points), axis=1)
     points = jnp.where(finite[:, None], points, normal.mean)
     weights = normalise_weights(jnp.where(finite, log_weights, -jnp.inf))
     mean = weights @ points
-    # Some of the normal law's own, for draws that are all one point.
+    # A small part of the normal law's covariance, in case all draws are one point.
     S = (points - mean).T @ (weights[:, None] * (points - mean))
     root = cholesky(S + 1e-3 * matmul(normal.root, normal.root.T))
     usable = jnp.all(jnp.isfinite(root))
@@ -135,8 +136,8 @@ def _fitted(
     means = jnp.concatenate([jnp.broadcast_to(mean, (len(wider), d)), normal.mean[None]])
     kernels = NormalStep(points, widths[:, None, None] * root)
     laws = jax.tree.map(lambda *both: jnp.concatenate(both), kernels, NormalStep(means, wide))
-    some = weights > 0
-    shares = jnp.where(some, jnp.log(jnp.where(some, weights, 1)), -jnp.inf)
+    is_positive = weights > 0
+    shares = jnp.where(is_positive, jnp.log(jnp.where(is_positive, weights, 1)), -jnp.inf)
     even = jnp.full(len(means), -np.log(len(means)), dtype)
     return Cover(jnp.concatenate([shares, even]) - np.log(2), laws)
 
@@ -144,7 +145,7 @@ def _fitted(
 def covered_start(
     law: Cover, scalars: Scalars, point: Float[Array, " d"], h: Information
 ) -> CoveredStart:
-    """The cover given what is seen at t_0, counted from the point, and h_0."""
+    """Return the cover given the observation at t_0, relative to the point, and tilted by h_0."""
 
     def one(part: NormalStep):
         tilted = guided_start(part, scalars, point, h)

@@ -32,21 +32,26 @@ from ..engine.averages import nan_to_neg_inf
 from .particle_filter import Filtered
 from .several import Records
 
-# γ times the mean time between observations; and a variance of log p̂ by which all weights are
-# equal, and nothing is missed: a larger one says nothing of what all filters miss.
+# Rates γ times the mean time between observations. Below the variance `_ALL_EQUAL` of log p̂ all
+# weights count as equal. A larger variance does not show whether all filters miss the same paths.
 _RATES, _ALL_EQUAL = (0.0, 0.5, 2.0, 8.0, 64.0), 1e-4
-# By how much log p̂ may be below the largest where parameters count, and what is lost at any of them
-# at most.
+# Parameters count if log p̂ is at most `_LIKELY` below the largest. The loss of each is bounded, so
+# that a single parameter does not decide.
 _LIKELY, _LARGEST_LOSS = 10.0, 5.0
-# With so few steps between observations nearly all is forgotten, or nothing, at the last.
+# With so few steps, halving their number changes the discount of a whole segment too much.
 _FEW_STEPS = 4
-# By how much a filter that lost all its particles is below the best beside it.
+# log p̂ of a filter that lost all its particles, below that of the best filter.
 _LOST = 50.0
 
 
 class Choice(NamedTuple):
-    """The best rate so far, and its mean of log p̂ less two standard errors; the same without
-    forgetting; and whether all weights were equal at one rate, and no other is worth a pilot."""
+    """Best discount rate so far.
+
+    - `rate`: the rate.
+    - `score`: mean of log p̂ at this rate, minus two standard errors.
+    - `of_none`: the score without a discount.
+    - `settled`: whether all weights were equal at some rate. Then no other rate needs a pilot run.
+    """
 
     rate: Float[Array, ""]
     score: Float[Array, ""]
@@ -55,7 +60,7 @@ class Choice(NamedTuple):
 
 
 def rates_for(records: Records) -> Float[Array, " rates"]:
-    """Those that may be tried, from zero on."""
+    """Return the rates to try, in increasing order from zero."""
     record = records.stacked.record
     num_seen = jnp.sum(jnp.any(jnp.isfinite(record.values), axis=-1))
     rates = jnp.asarray(_RATES, record.dt.dtype)
@@ -63,20 +68,23 @@ def rates_for(records: Records) -> Float[Array, " rates"]:
 
 
 def half_will_do(records: Records) -> bool:
-    """Whether pilots may have half as many steps."""
+    """Return whether pilot runs may use half as many steps."""
     return records.stacked.num_steps > _FEW_STEPS
 
 
 def undecided(dtype) -> Choice:
-    """Before anything was tried."""
-    nothing = jnp.full((), -jnp.inf, dtype)
-    return Choice(jnp.zeros((), dtype), nothing, nothing, jnp.zeros((), bool))
+    """Return the choice before any pilot run."""
+    lowest = jnp.full((), -jnp.inf, dtype)
+    return Choice(jnp.zeros((), dtype), lowest, lowest, jnp.zeros((), bool))
 
 
 def chosen_of(
     best: Choice, rate: Float[Array, ""], filtered: Filtered, num_particles: int
 ) -> Choice:
-    """The better one, where filters of all records at this rate made this of them."""
+    """Return the better of the best rate so far and `rate`.
+
+    `filtered` holds the pilot filters of all records at `rate`.
+    """
     score, variance = _score_and_variance(filtered, num_particles)
     return Choice(
         jnp.where(score > best.score, rate, best.rate),
@@ -87,7 +95,10 @@ def chosen_of(
 
 
 def confirmed(best: Choice, filtered: Filtered, num_particles: int) -> Choice:
-    """With its rate where other filters at it say that it is better than none, else with none."""
+    """Return the choice with its rate if a second set of filters confirms it, and rate zero otherwise.
+
+    It is confirmed if the second score exceeds the score without a discount.
+    """
     score, _ = _score_and_variance(filtered, num_particles)
     return best._replace(rate=jnp.where(score > best.of_none, best.rate, 0))
 
@@ -95,6 +106,7 @@ def confirmed(best: Choice, filtered: Filtered, num_particles: int) -> Choice:
 def _score_and_variance(
     filtered: Filtered, num_particles: int
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return the mean of log p̂ minus two standard errors, and the variance of log p̂."""
     log_estimate, R = _not_lost(filtered.log_estimate), filtered.log_estimate.shape[1]
     variance = _variance(log_estimate, filtered, num_particles)
     mean = jnp.sum(jnp.mean(log_estimate, axis=1))
@@ -102,7 +114,7 @@ def _score_and_variance(
 
 
 def _not_lost(log_estimate: Float[Array, "records R"]) -> Float[Array, "records R"]:
-    """With a floor for filters that lost all particles, beside others."""
+    """Bound log p̂ from below, for filters that lost all particles while others did not."""
     best = jnp.max(log_estimate, axis=1, keepdims=True)
     return jnp.maximum(log_estimate, best - _LOST)
 
@@ -110,17 +122,26 @@ def _not_lost(log_estimate: Float[Array, "records R"]) -> Float[Array, "records 
 def _variance(
     log_estimate: Float[Array, "records R"], filtered: Filtered, num_particles: int
 ) -> Float[Array, ""]:
-    """That of log p̂ of all records: what filters tell of themselves, or their spread."""
-    told = jnp.mean(jax.vmap(lambda each: each.variance(num_particles))(filtered), axis=1)
+    """Return the variance of log p̂ of all records.
+
+    For each record it is the larger of the filters' own estimate and of the variance between
+    filters.
+    """
+    estimated = jnp.mean(
+        jax.vmap(lambda filters: filters.variance(num_particles))(filtered), axis=1
+    )
     spread = jnp.var(log_estimate, axis=1, ddof=min(1, log_estimate.shape[1] - 1))
-    return jnp.sum(jnp.maximum(told, spread))
+    return jnp.sum(jnp.maximum(estimated, spread))
 
 
 def rate_for_several(
     run: Callable[[Float[Array, ""]], Filtered], records: Records, num_particles: int
 ) -> Float[Array, ""]:
-    """The rate for several models, which are an axis in front of what `run` makes at one. Where
-    all weights are equal at all of them without forgetting, nothing else is tried."""
+    """Return the common rate for several models.
+
+    `run` evaluates filters at a rate; its results have a leading axis of models. If all weights are
+    equal for all models without a discount, no other rate is tried.
+    """
 
     def mean_and_equal(filtered: Filtered):
         log_estimate = _not_lost(filtered.log_estimate)
@@ -142,8 +163,7 @@ def rate_for_several(
 
 
 def loses_least(means: Float[Array, "rates models"]) -> Int[Array, ""]:
-    """At which rate the mean of log p̂ is least below that at the best, over models that are
-    likely."""
+    """Return the index of the rate with the smallest total loss over the likely models."""
     best = jnp.max(means, axis=0)
     likely = best > jnp.max(best) - _LIKELY
     loss = jnp.where(likely, jnp.minimum(best - means, _LARGEST_LOSS), 0)

@@ -28,13 +28,18 @@ from .initial import calls_for_cover, log_ratio
 from .problem import RecordProblem
 from .segments import split_first, split_last
 
-# Particles are resampled where fewer than this share of them count.
+# Particles are resampled if the effective share of them is below this bound.
 _FEWEST_EFFECTIVE = 0.5
 
 
 class Filtered(NamedTuple):
-    """What filters estimate: log p̂; the effective number of particles at the ends of segments, and
-    k̂ of the weights of all; and how many were lost."""
+    """Estimates of R filters.
+
+    - `log_estimate`: log p̂ of each filter.
+    - `size`: effective number of particles at the ends of segments.
+    - `pareto_k`: k̂ of the weights of all filters at the ends of segments.
+    - `num_nonfinite`: number of lost particles of each filter.
+    """
 
     log_estimate: Float[Array, " R"]
     size: Float[Array, "R ends"]
@@ -42,21 +47,24 @@ class Filtered(NamedTuple):
     num_nonfinite: Int[Array, " R"]
 
     def variance(self, num_particles: int) -> Float[Array, " R"]:
-        """That of log p̂ to first order, as one filter knows it: of each mean of weights that went
-        into p̂, those before resampling and the last. Infinite where no particle is left."""
+        """Return the variance of log p̂ to first order, as a single filter estimates it.
+
+        It is the sum over the means of weights that enter p̂: those before resampling, and the
+        last. It is infinite if no particle is left.
+        """
         share = self.size / num_particles
         counts = _is_poor(self.size, num_particles).at[:, -1].set(True)
-        each = jnp.where(share > 0, 1 / share - 1, jnp.inf)
-        return jnp.sum(jnp.where(counts, each, 0), axis=1) / num_particles
+        terms = jnp.where(share > 0, 1 / share - 1, jnp.inf)
+        return jnp.sum(jnp.where(counts, terms, 0), axis=1) / num_particles
 
 
 def _is_poor(size: Float[Array, "..."], num_particles: int) -> Bool[Array, "..."]:
-    """Whether so few particles count that they are resampled."""
+    """Return whether the effective sample size is so small that particles are resampled."""
     return size < _FEWEST_EFFECTIVE * num_particles
 
 
 class _Particles(NamedTuple):
-    """Particles of all filters as lanes, and what is known of the filters."""
+    """Particles of all filters as lanes, and the state of each filter."""
 
     x: Float[Array, "d lanes"]
     log_weight: Float[Array, "R P"]
@@ -65,8 +73,11 @@ class _Particles(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """Of the particles of all filters at the end of a segment: how many are effective in each, and
-    log weights, those of each relative to their sum."""
+    """Weights of the particles of all filters at the end of a segment.
+
+    - `size`: effective number of particles of each filter.
+    - `relative`: log weights relative to their sum within each filter.
+    """
 
     size: Float[Array, " R"]
     relative: Float[Array, " lanes"]
@@ -80,8 +91,10 @@ def run_filters(
     size: tuple[int, int],
     moving: Bool[Array, " N"] | None = None,
 ) -> Filtered:
-    """R filters of P particles. Steps that are known not to be `moving`, whatever the record, take
-    no time."""
+    """Run R filters with P particles each; `size` is (R, P).
+
+    Steps that are not `moving` have length zero in every record and are skipped.
+    """
     R, P = size
     d, dtype = problem.dim, problem.like.dtype
     (first_row, rows), dynamics_at = split_first(problem.rows), model.forward_at(problem.like)
@@ -89,10 +102,10 @@ def run_filters(
     most = 0.01 / jnp.finfo(dtype).eps
 
     def weighed(state: _Particles, key, change) -> tuple[_Particles, _Weights]:
-        """With what came to the weights, resampled where that is called for."""
+        """Update the weights by `change`, and resample the filters that need it."""
         change = change.reshape(R, P)
         log_weight = state.log_weight + change
-        # Of a path that had exploded h was so small that what it gives back is lost to rounding.
+        # h of an exploded path is so small that dividing by it leaves only rounding errors.
         finite = jnp.all(jnp.isfinite(state.x), axis=0).reshape(R, P) & (change < most)
         log_weight = jnp.where(finite, log_weight, -jnp.inf)
         lost = jnp.sum(~finite & (state.log_weight > -jnp.inf), axis=1, dtype=jnp.int32)
@@ -152,9 +165,11 @@ def run_filters(
 def _starts(
     key: Key[Array, ""], problem: RecordProblem, model: Diffusion, guide: Guidance, R: int, P: int
 ) -> tuple[Float[Array, "d lanes"], Float[Array, " lanes"]]:
-    """The first states of all particles, and their log weights, where observations are of their
-    guess. A law that is not normal is covered by a mixture, whose parts each filter takes in
-    proportion to their shares."""
+    """Sample the first states of all particles; return them with their log weights under the guess.
+
+    A mixture covers a law that is not normal. Each filter samples the parts of the mixture in
+    proportion to their shares.
+    """
     dtype = problem.like.dtype
     noise_key, position_key = jax.random.split(key)
     zeta = jax.random.normal(noise_key, (problem.dim, R * P), dtype)
@@ -166,6 +181,7 @@ def _starts(
     h = jax.tree.map(lambda leaf: leaf[0, 0], guide.steps.h)
     start = covered_start(law, guide.first, guide.start.origin, h)
     uniform = jax.random.uniform(position_key, (R, 1), dtype)
+    # Stratified positions, as in systematic resampling.
     positions = (uniform + jnp.arange(P, dtype=dtype)) / P
     x = start.points(positions.ravel(), zeta)
     log_nu = model.prepared().log_stationary
@@ -174,7 +190,7 @@ def _starts(
 
 
 def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) -> _Particles:
-    """Those filters whose particles are poor with particles that are alike."""
+    """Resample the filters whose effective sample size is `poor`; the new weights are equal."""
     R, P = state.log_weight.shape
     dtype = state.log_weight.dtype
     weights = normalise_weights(state.log_weight)
@@ -186,7 +202,7 @@ def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) 
     chosen = jnp.where(poor[:, None], jnp.minimum(chosen, P - 1), jnp.arange(P, dtype=chosen.dtype))
     lanes = (jnp.arange(R, dtype=chosen.dtype)[:, None] * P + chosen).ravel()
     log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
-    # Where no particle is left there is nothing to go on with: the estimate is zero.
+    # If no particle is left, the estimate is zero and all weights stay zero.
     level = jnp.where(poor, log_mean, 0)
     fresh = jnp.where(log_mean > -jnp.inf, 0.0, -jnp.inf)[:, None].astype(dtype)
     log_weight = jnp.where(poor[:, None], fresh, state.log_weight)

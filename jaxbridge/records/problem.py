@@ -88,8 +88,8 @@ def as_record_problem(
     pairs = split_records(times, observations)
     if len(pairs) > 1:
         raise ValueError(
-            f"`observations` contain {len(pairs)} records, but this function takes one: call it for "
-            "each record, because records are independent given the parameters."
+            f"`observations` contain {len(pairs)} records, but this function takes one: call it "
+            "for each record, because records are independent given the parameters."
         )
     (record,) = as_records(pairs, num_steps, step_size, initial_time)
     return problem_of(model, record, observation, initial, density, any_constant, for_weights)
@@ -177,7 +177,7 @@ def _has_dimension(model: Diffusion, like: Float[Array, " d"]) -> bool:
 
 
 def check_clock(model: Diffusion, observation: Observation, record: Record) -> None:
-    """Raise `ValueError` if the precision of large times is too low for time-dependent functions."""
+    """Raise `ValueError` if large times are too imprecise for time-dependent functions."""
     if model.depends_on_time:
         check_resolved(record.clock, record.since, record.dt)
     elif observation.depends_on_time:

@@ -108,11 +108,11 @@ def as_records(
     step_size: float | None,
     initial_time: Numbers | None = None,
 ) -> list[Record]:
-    """Validate times and observations of records, and split their intervals into segments and steps.
+    """Validate times and observations; split the intervals of each record into segments and steps.
 
     **Arguments:**
 
-    - `seen`: times and observations of each record.
+    - `pairs`: times and observations of each record.
     - `num_steps`, `step_size`: number of steps between two times, or their maximum length. N is the
         same for all records.
     - `initial_time`: time of the initial law, if it is before the first time.
@@ -276,7 +276,7 @@ def _cut(
 
 
 def _filled(name: str, values: Numbers) -> Numbers:
-    """Return a masked NumPy array as an array with NaN for masked values; other values unchanged."""
+    """Return a masked NumPy array with NaN in place of masked values; other values unchanged."""
     if not isinstance(values, np.ma.MaskedArray):
         return values
     if name == "times" and np.ma.getmaskarray(values).any():

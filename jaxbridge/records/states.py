@@ -58,15 +58,20 @@ from .path_blocks import tuned
 from .problem import RecordProblem
 from .record import Record
 
-# Draws of ν for the moments of q, which is made so much wider, for tails that are not normal.
+# Number of draws of ν for the moments of q. q is wider by this factor, for tails that are not normal.
 _NUM_DRAWS, _WIDER = 512, 1.3
-# Pairs of ends of each segment between which "auto" tries the ways to join them.
+# Number of pairs of states of each segment between which "auto" tries the methods.
 _NUM_PILOTS = 6
 
 
 class States(NamedTuple):
-    """Of C chains: the states at the ends of segments, a path of each segment, and log ŵ.
-    `num_truncated` counts the weights that have been cut off so far."""
+    """States of C chains.
+
+    - `x`: states at the ends of segments.
+    - `paths`: a path of each segment.
+    - `log_weights`: log ŵ of each segment.
+    - `num_truncated`: number of weights that were truncated so far.
+    """
 
     x: Float[Array, "C ends d"]
     paths: Float[Array, "C K points d"]
@@ -75,22 +80,25 @@ class States(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Which states and which paths moved in one iteration."""
+    """Masks of the states and of the paths that moved in one iteration."""
 
     states: Bool[Array, "C ends"]
     paths: Bool[Array, "C K"]
 
 
 class NormalLaws(NamedTuple):
-    """q of each state: means and lower triangular roots of covariances."""
+    """Laws q of each state: means, and lower triangular roots of the covariances."""
 
     mean: Float[Array, "ends d"]
     root: Float[Array, "ends d d"]
 
 
 class StateSampler(eqx.Module):
-    """What does not change from iteration to iteration; `proposal` is for the intervals of all
-    chains, each with its K segments in a row, and `movable` says which states are not known."""
+    """Quantities that are the same in all iterations.
+
+    - `proposal`: for the intervals of all chains, the K segments of each chain in a row.
+    - `movable`: whether a state is unknown. Only a first state given as a point is known.
+    """
 
     problem: RecordProblem
     model: Diffusion
@@ -101,7 +109,7 @@ class StateSampler(eqx.Module):
     num_proposals: int = eqx.field(static=True)
 
     def log_target(self, x: Float[Array, "C ends d"]) -> Float[Array, "C ends"]:
-        """log g(y_k|x_k), and of the first state its law."""
+        """Return log g(y_k|x_k). That of the first state includes the log density of its law."""
         problem = self.problem
         corrected = correction(problem, problem.model)
 
@@ -118,7 +126,7 @@ class StateSampler(eqx.Module):
         return nan_to_neg_inf(logs)
 
     def log_q(self, x: Float[Array, "C ends d"]) -> Float[Array, "C ends"]:
-        """log q up to a constant."""
+        """Return log q up to a constant."""
 
         def of_one(mean, root, x):
             white = solve_lower(root, x - mean)
@@ -127,20 +135,22 @@ class StateSampler(eqx.Module):
         return jax.vmap(lambda x: jax.vmap(of_one)(*self.laws, x))(x)
 
     def paths(self, key: Key[Array, ""], x: Float[Array, "C ends d"]) -> States:
-        """New paths of all segments between these states."""
+        """Sample new paths of all segments between these states."""
         draw_key, pick_key = jax.random.split(key)
         C, ends, d = x.shape
         num = C * (ends - 1)
         durations = jnp.tile(self.problem.record.durations, C)
         intervals = Intervals(x[:, :-1].reshape(num, d), x[:, 1:].reshape(num, d), durations)
         keys = jax.random.split(draw_key, (num, self.num_proposals))
-        drawn = self.proposal.draw(keys, self.model, intervals, self.problem.num_steps, None, True)
-        log_weights = nan_to_neg_inf(drawn.log_weights)
+        proposed = self.proposal.draw(
+            keys, self.model, intervals, self.problem.num_steps, None, True
+        )
+        log_weights = nan_to_neg_inf(proposed.log_weights)
         picked = jax.random.categorical(pick_key, log_weights)
-        paths = jnp.take_along_axis(drawn.paths, picked[:, None, None, None], axis=1)[:, 0]
+        paths = jnp.take_along_axis(proposed.paths, picked[:, None, None, None], axis=1)[:, 0]
         log_mean = jax.nn.logsumexp(log_weights, axis=1) - math.log(self.num_proposals)
         paths, log_mean = paths.reshape(C, ends - 1, -1, d), log_mean.reshape(C, ends - 1)
-        return States(x, paths, log_mean, jnp.sum(drawn.truncated, dtype=jnp.int32))
+        return States(x, paths, log_mean, jnp.sum(proposed.truncated, dtype=jnp.int32))
 
     def move_states(
         self,
@@ -150,13 +160,16 @@ class StateSampler(eqx.Module):
         walk: Bool[Array, ""],
         log_scales: Float[Array, " ends"],
     ) -> tuple[States, Bool[Array, "C ends"]]:
-        """The states with even or odd k, and what is beside them; which moved."""
+        """Move the states with even or odd k, together with the paths on both sides.
+
+        **Returns:** the new states, and which of them moved.
+        """
         noise_key, path_key, accept_key = jax.random.split(key, 3)
         x, (mean, root) = state.x, self.laws
         noise = jnp.einsum("kij,ckj->cki", root, jax.random.normal(noise_key, x.shape, x.dtype))
         proposed = jnp.where(walk, x + jnp.exp(log_scales)[:, None] * noise, mean + noise)
-        mine = self.movable & (np.arange(x.shape[1]) % 2 == parity)
-        new = self.paths(path_key, jnp.where(mine[:, None], proposed, x))
+        moving = self.movable & (np.arange(x.shape[1]) % 2 == parity)
+        new = self.paths(path_key, jnp.where(moving[:, None], proposed, x))
 
         def of_states(state):
             beside = jnp.pad(state.log_weights, ((0, 0), (1, 1)))
@@ -164,7 +177,7 @@ class StateSampler(eqx.Module):
             return beside[:, :-1] + beside[:, 1:] + self.log_target(state.x) - log_q
 
         rate = acceptance_rate(nan_to_neg_inf(of_states(state)), nan_to_neg_inf(of_states(new)))
-        accepted = mine & (jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate)
+        accepted = moving & (jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate)
         beside = accepted[:, :-1] | accepted[:, 1:]
         return States(
             jnp.where(accepted[..., None], new.x, x),
@@ -174,7 +187,10 @@ class StateSampler(eqx.Module):
         ), accepted
 
     def move_paths(self, key: Key[Array, ""], state: States) -> tuple[States, Bool[Array, "C K"]]:
-        """New paths between the same states, and which of them were taken."""
+        """Propose new paths between the same states.
+
+        **Returns:** the new states, and which paths were accepted.
+        """
         path_key, accept_key = jax.random.split(key)
         new = self.paths(path_key, state.x)
         rate = acceptance_rate(state.log_weights, new.log_weights)
@@ -193,7 +209,7 @@ class StateSampler(eqx.Module):
         walk: Bool[Array, ""],
         log_scales: Float[Array, " ends"],
     ) -> tuple[States, Moved]:
-        """Even states, odd states, paths."""
+        """Move the even states, then the odd states, then the paths."""
         even_key, odd_key, path_key = jax.random.split(key, 3)
         state, even = self.move_states(even_key, state, 0, walk, log_scales)
         state, odd = self.move_states(odd_key, state, 1, walk, log_scales)
@@ -203,9 +219,15 @@ class StateSampler(eqx.Module):
 
 
 class Draws(NamedTuple):
-    """Times of the points `since` the first, draws of whole paths, the share of moves `accepted`,
-    of each state or block, the chains in which one was `stuck`, the number of weights that were cut
-    off, and the record on the grid of the paths."""
+    """Draws of paths of a whole record.
+
+    - `since`: times of the points since the first time.
+    - `paths`: draws of whole paths.
+    - `accepted`: acceptance rate of each state or block.
+    - `stuck`: whether a state, path or block of the chain never moved.
+    - `num_truncated`: number of weights that were truncated.
+    - `record`: the record on the grid of the paths.
+    """
 
     since: Float[Array, " points"]
     paths: Float[Array, "n C points d"]
@@ -223,11 +245,12 @@ def sample_states(
     counts: tuple[int, int, int],
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Draws:
-    """So many draws, after so many iterations of a warm-up, with so many paths in each ŵ; from
-    guided paths of the whole record.
+    """Sample paths of a record by moving states and bridges, starting from guided paths.
 
-    **Raises:** `ValueError` where the proposal does not fit, too little is known of the stationary
-    law, or components are seen without noise.
+    `counts` holds the number of draws, of iterations of the warm-up, and of paths in each ŵ.
+
+    **Raises:** `ValueError` for an unsuitable proposal, a model without a stationary law, or exact
+    observations.
     """
     model, K = problem.model, problem.num_segments
     scalars = problem.scalars(model)
@@ -239,7 +262,7 @@ def sample_states(
     pilot_key = key_for("states", key)
     laws = _normal_laws(pilot_key, problem, scalars, intervals)
     proposal = _prepared(pilot_key, problem, proposal, laws, first[0])
-    proposal = proposal.of(np.tile(np.arange(K), len(guided)))  # all chains alike
+    proposal = proposal.of(np.tile(np.arange(K), len(guided)))  # the same proposal for all chains
     assert isinstance(proposal, AbstractWeightedProposal)
     point = not isinstance(bound(problem.initial, model), Stationary | GaussianLaw)
     movable = jnp.ones(K + 1, bool).at[0].set(not point)
@@ -250,15 +273,17 @@ def sample_states(
     dt = durations[:, None] * jnp.asarray(within, durations.dtype)
     record = dataclasses.replace(problem.record, dt=dt)
     grid = record.grid()
-    paths, moved, cut = _run(key, sampler, guided, (num_draws, num_warmup), progress_meter)
-    ever = jnp.all(jnp.any(moved.states, axis=0) | ~movable, axis=1)
-    ever &= jnp.all(jnp.any(moved.paths, axis=0), axis=1)
+    paths, moved, num_truncated = _run(
+        key, sampler, guided, (num_draws, num_warmup), progress_meter
+    )
+    all_moved = jnp.all(jnp.any(moved.states, axis=0) | ~movable, axis=1)
+    all_moved &= jnp.all(jnp.any(moved.paths, axis=0), axis=1)
     accepted = jnp.mean(moved.states.astype(grid.dtype), axis=(0, 1))
-    return Draws(grid, paths, accepted, ~ever, cut, record)
+    return Draws(grid, paths, accepted, ~all_moved, num_truncated, record)
 
 
 def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars) -> None:
-    """Raise `ValueError` where states cannot move with this proposal."""
+    """Raise `ValueError` if states cannot move with this proposal."""
     model, law = problem.model, bound(problem.initial, problem.model)
     if model.depends_on_time or not model.sigma_is_invertible(problem.like):
         raise ValueError(
@@ -298,9 +323,12 @@ def _prepared(
     laws: NormalLaws,
     guided: Float[Array, "ends d"],
 ) -> AbstractProposal:
-    """The proposal for the segments of one chain. "auto" tries each between several states that
-    may be its ends: what is best between two in one well may be useless between two wells. In the
-    place of what is outside the state space are those of a guided path."""
+    """Prepare the proposal for the segments of one chain.
+
+    "auto" tries the methods on each segment between several likely pairs of states. The best method
+    within one well may be useless between two wells. States of a guided path replace those outside
+    the state space.
+    """
     model, num_steps, (ends, d) = problem.model, problem.num_steps, laws.mean.shape
     noise = jax.random.normal(key, (ends, _NUM_PILOTS, d), laws.mean.dtype)
     x = laws.mean[:, None] + jnp.einsum("kij,knj->kni", laws.root, noise)
@@ -320,21 +348,22 @@ def _prepared(
 def _normal_laws(
     key: Key[Array, ""], problem: RecordProblem, scalars: Scalars, intervals: Intervals
 ) -> NormalLaws:
-    """q: N(m, S) of the stationary law, times the normal guess of what was seen."""
+    """Return q: the normal approximation of ν, conditioned on the observation under its guess."""
     model = problem.model.prepared()
     keys = jax.random.split(key, _NUM_DRAWS)
     if model.has_sampler:
         draws = jax.vmap(model.sample_stationary)(keys)
     else:
-        made = with_start_law(
+        with_law = with_start_law(
             key, model, Coupling(), intervals.end, intervals.duration, problem.num_steps
         )
-        law: Any = made.start_law  # with a density, and so with draws
+        law: Any = with_law.start_law  # it has a density, and so a sampler
         draws = jax.vmap(lambda key: law.sample(key, model))(keys)
     draws = draws.astype(problem.like.dtype)
     mean, eye = jnp.mean(draws, axis=0), jnp.eye(problem.dim, dtype=draws.dtype)
     centred = draws - mean
     S = centred.T @ centred / _NUM_DRAWS
+    # A small multiple of I keeps S invertible.
     S += 1e-6 * jnp.max(jnp.diagonal(S)) * eye
     before = any_inverse(S)
 
@@ -355,26 +384,28 @@ def _run(
     counts: tuple[int, int],
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> tuple[Float[Array, "n C points d"], Moved, Int[Array, ""]]:
+    """Run the chains; return the draws, the moves, and the number of truncated weights."""
     num_draws, num_warmup = counts
     N, (C, _, d), dtype = sampler.problem.num_steps, guided.shape, guided.dtype
     first_key, key = jax.random.split(key)
 
     def step(carry: tuple[States, Array], i: Int[Array, ""]):
         state, log_scales = carry
+        # The random walk and the independent proposals alternate; only the walk is tuned.
         walk = i % 2 == 0
         state, moved = sampler.sweep(jax.random.fold_in(key, i), state, walk, log_scales)
-        learnt = tuned(log_scales, moved.states.T, (i // 2 + 1).astype(dtype))
-        log_scales = jnp.where(walk & (i < num_warmup), learnt, log_scales)
+        new_scales = tuned(log_scales, moved.states.T, (i // 2 + 1).astype(dtype))
+        log_scales = jnp.where(walk & (i < num_warmup), new_scales, log_scales)
         path = state.paths[:, :, :-1].reshape(C, -1, d)
         return (state, log_scales), (jnp.concatenate([path, state.x[:, -1:]], axis=1), moved)
 
     state = sampler.paths(first_key, guided[:, ::N])
-    # Where no proposal became a bridge the guided path stands in, with no weight.
+    # If no proposal became a bridge, the chain starts from the guided path with weight zero.
     within = jnp.arange(sampler.problem.num_segments)[:, None] * N + jnp.arange(N + 1)
-    found = (state.log_weights > -jnp.inf)[..., None, None]
-    state = state._replace(paths=jnp.where(found, state.paths, guided[:, within]))
+    is_bridge = (state.log_weights > -jnp.inf)[..., None, None]
+    state = state._replace(paths=jnp.where(is_bridge, state.paths, guided[:, within]))
     init = state, jnp.zeros(sampler.movable.shape, dtype)
     steps = jnp.arange(num_warmup + num_draws)
-    (state, _), made = metered_scan(step, init, steps, progress_meter)
-    paths, moved = jax.tree.map(lambda leaf: leaf[num_warmup:], made)
+    (state, _), outputs = metered_scan(step, init, steps, progress_meter)
+    paths, moved = jax.tree.map(lambda leaf: leaf[num_warmup:], outputs)
     return paths, moved, state.num_truncated

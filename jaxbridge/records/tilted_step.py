@@ -1,7 +1,7 @@
 """Normal step, conditioned on observations at its end and tilted by later observations.
 
 Points are relative to a point ξ' of the path of the linearisation, u = x' - ξ'. Let a step be u ~
-N(e, Λ Λᵀ), with Λ of shape (d, m). The observation is a scalar y = c·u + N(0, ρ). With b = Λᵀc and
+N(e, Λ Λᵀ), with Λ of shape (d, m). The observation is a scalar y = c·u + N(0, ρ). Let b = Λᵀc and
 s = |b|² + ρ, the step given y has the law
 
     N(e + Λ b (y - c·e) / s, Λ⁺ Λ⁺ᵀ),    Λ⁺ = Λ (I - b bᵀ / (s (1 + √(ρ/s)))).
@@ -134,7 +134,10 @@ class Tilted(NamedTuple):
         return self.exponent - self._log_det()
 
     def pulled(self, zeta: Float[Array, " m"]) -> Float[Array, " m"]:
-        """Return z = ℛ⁻ᵀ (v + ζ), the noise that leads the step before tilting to the same point."""
+        """Return z = ℛ⁻ᵀ (v + ζ).
+
+        The step before tilting leads to the same point with the noise z as the tilted step with ζ.
+        """
         return solve_lower_transposed(self.factor, self.shift + zeta)
 
     def point(self, pulled: Float[Array, " m"]) -> Float[Array, " d"]:
