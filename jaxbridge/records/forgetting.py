@@ -38,7 +38,8 @@ _RATES, _ALL_EQUAL = (0.0, 0.5, 2.0, 8.0, 64.0), 1e-4
 # Parameters count if log p̂ is at most `_LIKELY` below the largest. The loss of each is bounded, so
 # that a single parameter does not decide.
 _LIKELY, _LARGEST_LOSS = 10.0, 5.0
-# With so few steps, halving their number changes the discount of a whole segment too much.
+# With so few steps per segment, a single step discounts almost everything or nothing. Pilot runs
+# then use the full grid.
 _FEW_STEPS = 4
 # log p̂ of a filter that lost all its particles, below that of the best filter.
 _LOST = 50.0
@@ -95,7 +96,7 @@ def chosen_of(
 
 
 def confirmed(best: Choice, filtered: Filtered, num_particles: int) -> Choice:
-    """Return the choice with its rate if a second set of filters confirms it, and rate zero otherwise.
+    """Return the choice, with rate zero unless a second set of filters confirms its rate.
 
     It is confirmed if the second score exceeds the score without a discount.
     """

@@ -41,19 +41,21 @@ from ..models.tracing import uses_argument
 from .observation import Scalars, log_density_of
 from .tilted_step import NormalStep
 
-# Of Newton's method for the mode of ν, from the origin.
+# Number of iterations of Newton's method for the mode of ν, from the origin.
 _NEWTON_STEPS = 50
-# How much wider than at the mode the laws of the ladder are, and how many points each has. So many
-# that count tell a covariance.
+# Widths of the laws of the ladder relative to the law at the mode, and the number of points of each.
+# About `_ENOUGH` effective points determine a covariance.
 _WIDTHS, _NUM_POINTS, _ENOUGH = 2.0 ** np.arange(8), 128, 10
 
 Initial = Any  # a point, a `GaussianLaw`, `Stationary()`, or a function of params to one of these
 
 
 def initial_law(initial: Initial, model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
-    """The law of X(t_0), a point like this one, or a normal law in its place (`log_ratio`).
+    """Return the law of X(t_0), or the normal law in place of ν.
 
-    **Raises:** `TypeError` and `ValueError` for what is none.
+    `like` shows shape and dtype of a state. `log_ratio` is the importance ratio of the two laws.
+
+    **Raises:** `TypeError` and `ValueError` for an invalid law.
     """
     dtype = like.dtype
     initial = bound(initial, model)
@@ -71,7 +73,7 @@ def initial_law(initial: Initial, model: Diffusion, like: Float[Array, " d"]) ->
 
 
 def check_initial(initial: Initial, model: Diffusion, like: Float[Array, " d"]) -> None:
-    """Raise `TypeError` and `ValueError` for what is no law of a point like this one."""
+    """Raise `TypeError` and `ValueError` for an invalid law of a state with the shape of `like`."""
     if isinstance(bound(initial, model), Stationary):
         jax.eval_shape(lambda model, x: model.log_stationary(x), model, like)
         return
@@ -87,21 +89,24 @@ def check_initial(initial: Initial, model: Diffusion, like: Float[Array, " d"]) 
 def log_ratio(
     initial: Initial, model: Diffusion, normal: NormalStep, x: Float[Array, " d"]
 ) -> Float[Array, ""]:
-    """log of the density of X(t_0) over that of the normal law in its place: nothing, but for ν."""
+    """Return the log density of X(t_0) minus that of the normal law in its place.
+
+    It is zero unless X(t_0) has the law ν.
+    """
     if not isinstance(bound(initial, model), Stationary):
         return jnp.zeros((), x.dtype)
     return model.log_stationary(x) - log_normal(normal, x)
 
 
 def log_normal(law: NormalStep, x: Float[Array, " d"]) -> Float[Array, ""]:
-    """The log density of a normal law that has one."""
+    """Return the log density of a normal law with an invertible root."""
     white = solve_lower(law.root, x - law.mean)
     log_scale = jnp.sum(jnp.log(math.sqrt(2 * math.pi) * jnp.diagonal(law.root)))
     return -dot(white, white) / 2 - log_scale
 
 
 class _OfParams(eqx.Module):
-    """A function of params that gives the law, as a pytree."""
+    """Function of `params` that returns the law, as a pytree."""
 
     function: Callable[[PyTree], Any] = eqx.field(static=True)
     captured: Captured
@@ -117,7 +122,7 @@ class _OfParams(eqx.Module):
 
 
 def as_initial(initial: Initial) -> Initial:
-    """What the user gave, as a pytree of arrays."""
+    """Return the user's law as a pytree of arrays."""
     is_function = callable(initial) and jax.tree_util.all_leaves([initial])
     if not is_function:
         return initial
@@ -126,13 +131,14 @@ def as_initial(initial: Initial) -> Initial:
 
 
 def bound(initial: Initial, model: Diffusion) -> Initial:
-    """The law at the model's parameters, where it is a function of them."""
+    """Return the law at the model's parameters, if it is a function of them."""
     if isinstance(initial, GaussianLaw | Stationary) or not callable(initial):
         return initial
     return initial(model.params)
 
 
 def _check_shape(mean: Array, like: Float[Array, " d"]) -> None:
+    """Raise `ValueError` if the mean of the law has another shape than a state."""
     if mean.shape != like.shape:
         raise ValueError(
             f"`initial` must be a point of shape {like.shape}, a `GaussianLaw` of such points or "
@@ -141,18 +147,20 @@ def _check_shape(mean: Array, like: Float[Array, " d"]) -> None:
 
 
 def calls_for_cover(initial: Initial, model: Diffusion, like: Float[Array, " d"]) -> bool:
-    """Whether X(t_0) has the law ν, and that is not a normal law."""
+    """Return whether X(t_0) has the law ν and ν is not normal."""
     return isinstance(bound(initial, model), Stationary) and not is_normal(model, like)
 
 
 def is_normal(model: Diffusion, like: Float[Array, " d"]) -> bool:
-    """Whether ν is a normal law, seen from whether the second derivatives of log ν depend on the
-    point."""
+    """Return whether ν is a normal law.
+
+    It is if the second derivatives of log ν do not depend on the point.
+    """
     return not uses_argument(jax.hessian(model.log_stationary), like)
 
 
 def _stationary(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
-    """ν, or the normal law with its mean and covariance."""
+    """Return ν if it is normal, otherwise the normal law with its mean and covariance."""
     model = model.prepared()
     mode = _at_mode(model, like)
     if is_normal(model, like):
@@ -160,23 +168,27 @@ def _stationary(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     points, log_weights = ladder(model, mode)
     weights = normalise_weights(log_weights)
     mean = weights @ points
-    away = points - mean
+    centred = points - mean
+    # The weight of the covariance at the mode falls with the effective number of points.
     lack = 1 / (1 + effective_size(weights) / _ENOUGH) ** 2
-    covariance = away.T @ (weights[:, None] * away) + lack * matmul(mode.root, mode.root.T)
+    covariance = centred.T @ (weights[:, None] * centred) + lack * matmul(mode.root, mode.root.T)
     root = cholesky(covariance)
     usable = jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(root))
     return jax.tree.map(lambda a, b: jnp.where(usable, a, b), NormalStep(mean, root), mode)
 
 
 def ladder(model: Diffusion, mode: NormalStep) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:
-    """Points of normal laws around a mode, at fixed noise, and their log weights as draws of ν."""
+    """Return points of normal laws around a mode, and their log weights as draws of ν.
+
+    The noise is fixed, so both are smooth functions of the parameters.
+    """
     (d,), dtype = mode.mean.shape, mode.mean.dtype
     widths = jnp.asarray(_WIDTHS, dtype)
     zeta = jax.random.normal(jax.random.key(0), (len(widths), _NUM_POINTS, d), dtype)
     white = (widths[:, None, None] * zeta).reshape(-1, d)
     points = mode.mean + jax.vmap(lambda white: matvec(mode.root, white))(white)
     square = jnp.sum(white**2, axis=1)
-    # Of all laws, up to what they have in common.
+    # Log densities of the laws, without the common constant.
     log_laws = -square[:, None] / (2 * widths**2) - d * jnp.log(widths)
     log_nu = jax.vmap(lambda x: model.log_stationary(x))(points)
     return points, nan_to_neg_inf(log_nu - logsumexp(log_laws, axis=1))
@@ -185,26 +197,29 @@ def ladder(model: Diffusion, mode: NormalStep) -> tuple[Float[Array, "n d"], Flo
 def likeliest(
     initial: Initial, model: Diffusion, normal: NormalStep, scalars: Scalars
 ) -> Float[Array, " d"]:
-    """A likely X(t_0), given what is seen of it: the mean of a normal law, or that point of the
-    ladder around ν. In a well, and not between two, as a mean may be."""
+    """Return a likely X(t_0), given the observation at t_0.
+
+    For a normal law it is the mean, for ν the best point of the ladder. This point is inside a
+    well. The mean may be between two wells.
+    """
     if not calls_for_cover(initial, model, normal.mean):
         return normal.mean
     noisy = scalars._replace(seen=scalars.seen & (scalars.variances > 0))
     points, _ = ladder(model, normal)
     log_nu = model.prepared().log_stationary
     logs = jax.vmap(lambda x: log_nu(x) + log_density_of(noisy, x))(points)
-    best, known = jnp.argmax(nan_to_neg_inf(logs)), jnp.any(logs > -jnp.inf)
-    return jnp.where(known, points[best], normal.mean)
+    best, any_positive = jnp.argmax(nan_to_neg_inf(logs)), jnp.any(logs > -jnp.inf)
+    return jnp.where(any_positive, points[best], normal.mean)
 
 
 def _at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
-    """The normal law with the mode of ν and the curvature of log ν there."""
+    """Return the normal law at the mode of ν, with the curvature of log ν there."""
     log_nu = model.log_stationary
     eye = jnp.eye(like.shape[0], dtype=like.dtype)
 
     def precision(x):
         hessian = -jax.hessian(log_nu)(x)
-        # Gershgorin's bound: where log ν is not concave, steps are those of a steeper one.
+        # If log ν is not concave here, Gershgorin's bound shifts the eigenvalues above zero.
         off = jnp.sum(jnp.abs(hessian), axis=1) - jnp.abs(jnp.diagonal(hessian))
         least = jnp.min(jnp.diagonal(hessian) - off)
         size = jnp.max(jnp.abs(hessian)) + jnp.finfo(like.dtype).tiny
@@ -213,10 +228,10 @@ def _at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
         return jnp.where(good, hessian, hessian + (0.1 * size - jnp.minimum(least, 0)) * eye)
 
     def newton(_, x):
-        moved = x + matvec(inverse(precision(x)), jax.grad(log_nu)(x))
-        return jnp.where(jnp.all(jnp.isfinite(moved)), moved, x)
+        new_x = x + matvec(inverse(precision(x)), jax.grad(log_nu)(x))
+        return jnp.where(jnp.all(jnp.isfinite(new_x)), new_x, x)
 
-    # A last step from the mode moves it as the parameters do, and no further.
+    # The last step from the mode gives the derivative by the parameters (implicit function theorem).
     mode = lax.fori_loop(0, _NEWTON_STEPS, newton, jnp.zeros_like(like))
     mode = newton(0, lax.stop_gradient(mode))
     return NormalStep(mode, cholesky(inverse(precision(mode))))

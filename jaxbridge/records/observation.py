@@ -25,8 +25,10 @@ from ..models.tracing import takes_time
 
 
 class Scalars(NamedTuple):
-    """Independent numbers seen of one state x: `values` = `rows` x + N(0, diag(`variances`)), those
-    of which `seen` is true. The others have row 0 and variance 1."""
+    """Independent scalar observations of one state x: `values` = `rows` x + N(0, diag(`variances`)).
+
+    `seen` is false for missing scalars, which have row 0 and variance 1.
+    """
 
     rows: Float[Array, "m d"]
     values: Float[Array, " m"]
@@ -35,7 +37,7 @@ class Scalars(NamedTuple):
 
 
 class Row(NamedTuple):
-    """What is seen at one time: y, NaN where nothing is, and the time."""
+    """Observation y at one time, NaN for missing components, and the time."""
 
     y: Float[Array, "m *lanes"]
     time: Float[Array, "*lanes"]
@@ -87,12 +89,12 @@ class LinearGaussian(eqx.Module):
 
     @property
     def linear(self) -> "LinearGaussian":
-        """The linear observation model of the guide: this one."""
+        """Return the linear observation model of the guide: this one."""
         return self
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether R depends on time."""
+        """Return whether R depends on time."""
         return takes_time(self._function, 1)
 
     def covariance_for(self, params: PyTree, m: int, time: Float[Array, ""]) -> Float[Array, "m m"]:
@@ -135,8 +137,8 @@ class LinearGaussian(eqx.Module):
         if is_traced(matrix, R):
             return
         _check_covariance(R)
-        each = [np.asarray(part, float) for part in (matrix, R)]
-        rank = np.linalg.matrix_rank(np.hstack([a / max(np.abs(a).max(), 1e-300) for a in each]))
+        blocks = [np.asarray(part, float) for part in (matrix, R)]
+        rank = np.linalg.matrix_rank(np.hstack([a / max(np.abs(a).max(), 1e-300) for a in blocks]))
         if rank < m:
             raise ValueError(
                 f"{m} components are observed, but `matrix` and `covariance` side by side have "
@@ -147,23 +149,23 @@ class LinearGaussian(eqx.Module):
     def scalars(self, row: Row, params: PyTree, d: int) -> Scalars:
         """Return the observations as independent scalars."""
         y, time = row
-        m, seen = y.shape[0], jnp.isfinite(y)
-        rows = jnp.where(seen[:, None], self.matrix_for(d, m, y.dtype), 0)
+        m, present = y.shape[0], jnp.isfinite(y)
+        rows = jnp.where(present[:, None], self.matrix_for(d, m, y.dtype), 0)
         R = self.covariance_for(params, m, time)
-        R = jnp.where(seen[:, None] & seen, R, 0)
-        made, sizes, possible = _independent(Scalars(rows, jnp.where(seen, y, 0), R, seen))
-        follows, agrees = _follows(made, sizes)
-        made = made._replace(
-            rows=jnp.where(follows[:, None], 0, made.rows),
-            values=jnp.where(follows, 0, made.values),
-            variances=jnp.where(follows, 1, made.variances),
-            seen=seen & ~follows,
+        R = jnp.where(present[:, None] & present, R, 0)
+        scalars, sizes, possible = _independent(Scalars(rows, jnp.where(present, y, 0), R, present))
+        follows, agrees = _follows(scalars, sizes)
+        scalars = scalars._replace(
+            rows=jnp.where(follows[:, None], 0, scalars.rows),
+            values=jnp.where(follows, 0, scalars.values),
+            variances=jnp.where(follows, 1, scalars.variances),
+            seen=present & ~follows,
         )
-        # Where nothing explains y it is as if nothing of x were seen, but what has no density.
+        # If no state explains y, the scalars do not depend on x, and their log density is -inf.
         beyond = 2 * np.sqrt(float(jnp.finfo(y.dtype).max))
-        never = Scalars(jnp.zeros_like(rows), jnp.full_like(y, beyond), jnp.ones_like(y), seen)
+        never = Scalars(jnp.zeros_like(rows), jnp.full_like(y, beyond), jnp.ones_like(y), present)
         explained = possible & jnp.all(agrees)
-        return jax.tree.map(lambda a, b: jnp.where(explained, a, b), made, never)
+        return jax.tree.map(lambda a, b: jnp.where(explained, a, b), scalars, never)
 
     def correction(self, row, x, params):
         """Return log g minus the log density of the guide's model: zero."""
@@ -209,12 +211,12 @@ class ObservationDensity(eqx.Module):
 
     @property
     def linear(self) -> LinearGaussian:
-        """The linear observation model of the guide: `guess`."""
+        """Return the linear observation model of the guide: `guess`."""
         return self.guess
 
     @property
     def depends_on_time(self) -> bool:
-        """Whether g or the guess depends on time."""
+        """Return whether g or the guess depends on time."""
         return takes_time(self._log_density, 3) or self.guess.depends_on_time
 
     def check(self, m: int, like: Array, time: Float[Array, ""], params: PyTree) -> None:
@@ -229,74 +231,80 @@ class ObservationDensity(eqx.Module):
     def correction(self, row: Row, x: Float[Array, " d"], params: PyTree) -> Float[Array, ""]:
         """Return log g(y | x) minus the log density of the guess."""
         y, time = row
-        seen = jnp.any(jnp.isfinite(y))
-        shown = jnp.where(seen, y, jnp.zeros_like(y))
-        arguments = (shown, x, params)
+        present = jnp.any(jnp.isfinite(y))
+        y_filled = jnp.where(present, y, jnp.zeros_like(y))
+        arguments = (y_filled, x, params)
         if takes_time(self._log_density, 3):
             arguments = (*arguments, time)
         true = named("log_density", self._captured.call)(self._log_density, *arguments)
         true = check_value("log_density", true, (), x)
         guess = log_density_of(self.scalars(row, params, x.shape[0]), x)
-        return jnp.where(seen, true - guess, 0)
+        return jnp.where(present, true - guess, 0)
 
 
 Observation = LinearGaussian | ObservationDensity
 
 
 def log_density_of(scalars: Scalars, x: Float[Array, " d"]) -> Float[Array, ""]:
-    """The log density of what was seen, given x."""
+    """Return the log density of the scalar observations, given x."""
     total = jnp.zeros((), x.dtype)
-    for row, value, variance, seen in zip(*scalars, strict=True):
+    for row, value, variance, present in zip(*scalars, strict=True):
         residual = value - dot(row, x)
-        each = residual**2 / variance + jnp.log(2 * np.pi * variance)
-        total -= jnp.where(seen, each, 0) / 2
+        terms = residual**2 / variance + jnp.log(2 * np.pi * variance)
+        total -= jnp.where(present, terms, 0) / 2
     return total
 
 
 def _independent(
-    given: Scalars,
+    correlated: Scalars,
 ) -> tuple[Scalars, tuple[Float[Array, " m"], Float[Array, " m"]], Bool[Array, ""]]:
-    """Of numbers with a matrix in the place of variances, R = U D Uᵀ by elimination: independent
-    ones; the sizes of what their rows and values are the sums of; and whether R is a covariance, up
-    to rounding."""
-    m, eps = given.values.shape[0], 100 * jnp.finfo(given.values.dtype).eps
-    rows, values = list(given.rows), list(given.values)
+    """Return independent scalars by the elimination R = U D Uᵀ.
+
+    The `variances` of `given` hold the matrix R.
+
+    **Returns:** the scalars; bounds on the size of the terms in their rows and values, as scales of
+    the rounding errors; and whether R is a covariance up to rounding.
+    """
+    m, eps = correlated.values.shape[0], 100 * jnp.finfo(correlated.values.dtype).eps
+    rows, values = list(correlated.rows), list(correlated.values)
     sizes = [[safe_norm(row) for row in rows], [jnp.abs(value) for value in values]]
-    R = given.variances
-    rest = [[R[i, j] for j in range(m)] for i in range(m)]
+    R = correlated.variances
+    remainder = [[R[i, j] for j in range(m)] for i in range(m)]
     variances, possible = [], jnp.ones((), bool)
     for k in range(m):
-        pivot = jnp.where(jnp.abs(rest[k][k]) <= eps * jnp.abs(R[k, k]), 0, rest[k][k])
-        some = pivot > 0
+        pivot = jnp.where(jnp.abs(remainder[k][k]) <= eps * jnp.abs(R[k, k]), 0, remainder[k][k])
+        is_positive = pivot > 0
         possible &= pivot >= 0
-        variances.append(jnp.where(given.seen[k], jnp.maximum(pivot, 0), 1))
+        variances.append(jnp.where(correlated.seen[k], jnp.maximum(pivot, 0), 1))
         for i in range(k + 1, m):
             least = eps * jnp.sqrt(jnp.abs(R[k, k] * R[i, i]))
-            possible &= some | (jnp.abs(rest[i][k]) <= least)
-            factor = jnp.where(some, rest[i][k] / jnp.where(some, pivot, 1), 0)
+            possible &= is_positive | (jnp.abs(remainder[i][k]) <= least)
+            factor = jnp.where(is_positive, remainder[i][k] / jnp.where(is_positive, pivot, 1), 0)
             for changed, size in zip((rows, values), sizes, strict=True):
                 size[i] = size[i] + jnp.abs(factor) * size[k]
                 changed[i] = changed[i] - factor * changed[k]
             for j in range(k + 1, m):
-                rest[i][j] = rest[i][j] - factor * rest[k][j]
+                remainder[i][j] = remainder[i][j] - factor * remainder[k][j]
     of_rows, of_values = (jnp.stack(size) for size in sizes)
-    made = Scalars(jnp.stack(rows), jnp.stack(values), jnp.stack(variances), given.seen)
-    return made, (of_rows, of_values), possible
+    independent = Scalars(jnp.stack(rows), jnp.stack(values), jnp.stack(variances), correlated.seen)
+    return independent, (of_rows, of_values), possible
 
 
 def _follows(
     scalars: Scalars, sizes: tuple[Float[Array, " m"], Float[Array, " m"]]
 ) -> tuple[Bool[Array, " m"], Bool[Array, " m"]]:
-    """Which of the exact numbers follow from those before them, and which agree with these, up to
-    rounding: by Gram and Schmidt's procedure."""
+    """Return which exact scalars follow from the previous ones, and which agree with these.
+
+    This is the Gram–Schmidt process, up to rounding errors relative to `sizes`.
+    """
     eps = 100 * jnp.finfo(scalars.values.dtype).eps
     directions, follows, agrees = [], [], []
-    for row, value, variance, seen, row_size, size in zip(*scalars, *sizes, strict=True):
+    for row, value, variance, present, row_size, size in zip(*scalars, *sizes, strict=True):
         for direction, along in directions:
             share = dot(row, direction)
             row, value = row - share * direction, value - share * along
             size = size + jnp.abs(share * along)
-        length, exact = safe_norm(row), seen & (variance == 0)
+        length, exact = safe_norm(row), present & (variance == 0)
         new = length > eps * row_size
         follows.append(exact & ~new)
         agrees.append(~follows[-1] | (jnp.abs(value) <= eps * size))
@@ -306,7 +314,7 @@ def _follows(
 
 
 def check_observation(observation) -> None:
-    """Raise `TypeError` for anything but a way of seeing the state."""
+    """Raise `TypeError` for anything but an observation model."""
     if not isinstance(observation, LinearGaussian | ObservationDensity):
         raise TypeError(
             "`observation` must be a `LinearGaussian` or an `ObservationDensity`; got "
@@ -315,26 +323,28 @@ def check_observation(observation) -> None:
 
 
 def _check_covariance(R: Array) -> None:
+    """Raise `ValueError` for an invalid R, as far as its values are concrete."""
     if R.ndim > 2 or (R.ndim == 2 and R.shape[0] != R.shape[1]):
         raise ValueError(f"`covariance` must have shape (), (m,) or (m, m); got shape {R.shape}.")
     if is_traced(R):
         return
-    known = np.asarray(R, float)
-    if not np.all(np.isfinite(known)):
-        raise ValueError(f"`covariance` must be finite; got {known}.")
-    if known.ndim < 2:
-        good = np.all(known >= 0)
+    matrix = np.asarray(R, float)
+    if not np.all(np.isfinite(matrix)):
+        raise ValueError(f"`covariance` must be finite; got {matrix}.")
+    if matrix.ndim < 2:
+        good = np.all(matrix >= 0)
     else:
-        size = 100 * np.finfo(R.dtype).eps * np.abs(known).max()
-        good = np.abs(known - known.T).max() <= size and np.linalg.eigvalsh(known).min() >= -size
+        size = 100 * np.finfo(R.dtype).eps * np.abs(matrix).max()
+        good = np.abs(matrix - matrix.T).max() <= size and np.linalg.eigvalsh(matrix).min() >= -size
     if not good:
         raise ValueError(
             "`covariance` must be symmetric, without negative variances (zero for exact "
-            f"components); got {known}."
+            f"components); got {matrix}."
         )
 
 
 def _check_positive(R: Array) -> None:
+    """Raise `ValueError` if a variance of the guess is not positive."""
     if is_traced(R):
         return
     if np.any((np.diagonal(R) if R.ndim == 2 else np.asarray(R)) <= 0):

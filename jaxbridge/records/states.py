@@ -58,7 +58,7 @@ from .path_blocks import tuned
 from .problem import RecordProblem
 from .record import Record
 
-# Number of draws of ν for the moments of q. q is wider by this factor, for tails that are not normal.
+# Number of draws of ν for the moments of q. The factor widens q, for tails that are not normal.
 _NUM_DRAWS, _WIDER = 512, 1.3
 # Number of pairs of states of each segment between which "auto" tries the methods.
 _NUM_PILOTS = 6
@@ -273,12 +273,12 @@ def sample_states(
     dt = durations[:, None] * jnp.asarray(within, durations.dtype)
     record = dataclasses.replace(problem.record, dt=dt)
     grid = record.grid()
-    paths, moved, num_truncated = _run(
+    paths, moves, num_truncated = _run(
         key, sampler, guided, (num_draws, num_warmup), progress_meter
     )
-    all_moved = jnp.all(jnp.any(moved.states, axis=0) | ~movable, axis=1)
-    all_moved &= jnp.all(jnp.any(moved.paths, axis=0), axis=1)
-    accepted = jnp.mean(moved.states.astype(grid.dtype), axis=(0, 1))
+    all_moved = jnp.all(jnp.any(moves.states, axis=0) | ~movable, axis=1)
+    all_moved &= jnp.all(jnp.any(moves.paths, axis=0), axis=1)
+    accepted = jnp.mean(moves.states.astype(grid.dtype), axis=(0, 1))
     return Draws(grid, paths, accepted, ~all_moved, num_truncated, record)
 
 
@@ -393,11 +393,11 @@ def _run(
         state, log_scales = carry
         # The random walk and the independent proposals alternate; only the walk is tuned.
         walk = i % 2 == 0
-        state, moved = sampler.sweep(jax.random.fold_in(key, i), state, walk, log_scales)
-        new_scales = tuned(log_scales, moved.states.T, (i // 2 + 1).astype(dtype))
+        state, moves = sampler.sweep(jax.random.fold_in(key, i), state, walk, log_scales)
+        new_scales = tuned(log_scales, moves.states.T, (i // 2 + 1).astype(dtype))
         log_scales = jnp.where(walk & (i < num_warmup), new_scales, log_scales)
         path = state.paths[:, :, :-1].reshape(C, -1, d)
-        return (state, log_scales), (jnp.concatenate([path, state.x[:, -1:]], axis=1), moved)
+        return (state, log_scales), (jnp.concatenate([path, state.x[:, -1:]], axis=1), moves)
 
     state = sampler.paths(first_key, guided[:, ::N])
     # If no proposal became a bridge, the chain starts from the guided path with weight zero.
@@ -407,5 +407,5 @@ def _run(
     init = state, jnp.zeros(sampler.movable.shape, dtype)
     steps = jnp.arange(num_warmup + num_draws)
     (state, _), outputs = metered_scan(step, init, steps, progress_meter)
-    paths, moved = jax.tree.map(lambda leaf: leaf[num_warmup:], outputs)
-    return paths, moved, state.num_truncated
+    paths, moves = jax.tree.map(lambda leaf: leaf[num_warmup:], outputs)
+    return paths, moves, state.num_truncated

@@ -1,8 +1,8 @@
 """Normal step, conditioned on observations at its end and tilted by later observations.
 
 Points are relative to a point ξ' of the path of the linearisation, u = x' - ξ'. Let a step be u ~
-N(e, Λ Λᵀ), with Λ of shape (d, m). The observation is a scalar y = c·u + N(0, ρ). Let b = Λᵀc and
-s = |b|² + ρ, the step given y has the law
+N(e, Λ Λᵀ), with Λ of shape (d, m). The observation is a scalar y = c·u + N(0, ρ). Let b = Λᵀc and s
+= |b|² + ρ. Given y the step has the law
 
     N(e + Λ b (y - c·e) / s, Λ⁺ Λ⁺ᵀ),    Λ⁺ = Λ (I - b bᵀ / (s (1 + √(ρ/s)))).
 
