@@ -43,7 +43,7 @@ from .tilted_step import NormalStep
 
 # Number of iterations of Newton's method for the mode of ν, from the origin.
 _NEWTON_STEPS = 50
-# Widths of the laws of the ladder relative to the law at the mode, and the number of points of each.
+# Widths of the laws of the ladder relative to the law at the mode, and number of points of each.
 # About `_ENOUGH` effective points determine a covariance.
 _WIDTHS, _NUM_POINTS, _ENOUGH = 2.0 ** np.arange(8), 128, 10
 
@@ -231,7 +231,7 @@ def _at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
         new_x = x + matvec(inverse(precision(x)), jax.grad(log_nu)(x))
         return jnp.where(jnp.all(jnp.isfinite(new_x)), new_x, x)
 
-    # The last step from the mode gives the derivative by the parameters (implicit function theorem).
+    # The last step gives the mode's derivative by the parameters (implicit function theorem).
     mode = lax.fori_loop(0, _NEWTON_STEPS, newton, jnp.zeros_like(like))
     mode = newton(0, lax.stop_gradient(mode))
     return NormalStep(mode, cholesky(inverse(precision(mode))))

@@ -54,15 +54,15 @@ from .particle_filter import Filtered, run_filters
 from .record import as_rows, of_each, split_records
 from .several import Records, as_record_problems, stacked
 
-# Fewer particles that count, or a larger standard error of a log, tell nothing; nor do tails that
-# are heavier than so many weights can show by more than the largest of many estimates of k is off.
+# An estimate is unreliable with fewer effective particles, or with a larger standard error. The
+# largest of many k̂ may exceed its bound by `_LARGEST_OF_MANY` through estimation error alone.
 _FEWEST_TRUSTED, _MOST_SPREAD, _LARGEST_OF_MANY = 5, 0.6, 0.1
 # Half the 97.7 % quantile of Student's law, by one over its degrees of freedom.
 _STUDENT = (
     1 / np.array([np.inf, 40, 20, 10, 7, 5, 4, 3, 2, 1]),
     np.array([1.0, 1.032, 1.067, 1.142, 1.214, 1.324, 1.435, 1.653, 2.263, 6.984]),
 )
-# Beyond, e^{s²} is no number of single precision.
+# Above this bound e^{s²} overflows in single precision.
 _LARGEST_VARIANCE = 80.0
 
 _UNEXPLAINED = (
@@ -128,13 +128,13 @@ class LogLikelihood(AbstractResult):
 
     @property
     def unexplained(self) -> Int[Array, ""]:
-        """Index of the first observation that no particle explains; -1 if there is none."""
+        """Return the index of the first observation that no particle explains; -1 if there is none."""
         lost = self.effective_sample_size == 0
         return jnp.where(jnp.any(lost), jnp.argmax(lost), -1)
 
     @property
     def step_error_dominates(self) -> Bool[Array, ""]:
-        """Whether the discretisation error exceeds the standard error, or may do so.
+        """Return whether the discretisation error exceeds the standard error, or may do so.
 
         Then more steps help, and more particles do not.
         """
@@ -142,7 +142,7 @@ class LogLikelihood(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """The faults of the estimate, each with a remedy.
+        """Return the faults of the estimate, each with a remedy.
 
         They are: an observation that no particle explains; few effective particles, or filters that
         disagree; heavy tails of the weights; a poor guide together with one of these; lost
@@ -164,10 +164,12 @@ class LogLikelihood(AbstractResult):
 
     @property
     def _is_heavy(self) -> Bool[Array, ""]:
+        """Return whether some k̂ exceeds the bound for so many weights."""
         return jnp.any(self.pareto_k > self._most_k)
 
     @property
     def _most_k(self) -> float:
+        """Return the bound on k̂."""
         return largest_reliable_k(self.num_weights) + _LARGEST_OF_MANY
 
     @property
@@ -177,12 +179,15 @@ class LogLikelihood(AbstractResult):
 
     @property
     def _missing(self) -> Float[Array, ""]:
-        """Return by how much `value` is too small if lost particles had weights like the others:
-        the sum over segments of -log(1 - share lost) ≈ share lost."""
+        """Return the bias of `value` if lost particles had weights like the others.
+
+        It is the sum over segments of -log(1 - share lost) ≈ share lost.
+        """
         return self.num_nonfinite.astype(self.value.dtype) / self.num_weights
 
     @property
     def _filters_agree(self) -> Bool[Array, ""]:
+        """Return whether enough particles are effective and the filters agree."""
         counted = jnp.all(self.effective_sample_size >= _FEWEST_TRUSTED)
         return counted & jnp.isfinite(self.value) & (self.standard_error < _MOST_SPREAD)
 
@@ -246,8 +251,8 @@ def log_likelihood(
                 "of `transition_log_density`: leave out `initial`, `initial_time`, `density` and "
                 "`num_filters`."
             )
-        made = _exact(key, model, times, observations, num_particles, num_steps, step_size)
-        return throw_where_untrustworthy(made, "value", model) if throw else made
+        result = _exact(key, model, times, observations, num_particles, num_steps, step_size)
+        return throw_where_untrustworthy(result, "value", model) if throw else result
     num_filters = check_count("num_filters", 8 if num_filters is None else num_filters)
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
@@ -257,20 +262,20 @@ def log_likelihood(
     grids = [records, *map(records.coarsened, levels)]
     guides, checks = zip(*map(_guides, grids), strict=True)
     filtered, rate = _filtered(key, grids, list(guides), *size)
-    made = _told(records, filtered, rate, num_filters * num_particles)
-    made = dataclasses.replace(made, guide=checks[0])
-    return throw_where_untrustworthy(made, "value", model) if throw else made
+    result = _told(records, filtered, rate, num_filters * num_particles)
+    result = dataclasses.replace(result, guide=checks[0])
+    return throw_where_untrustworthy(result, "value", model) if throw else result
 
 
 @compiled_sooner
 def _told(
     records: Records, grids: Filtered, rate: Float[Array, ""], num_weights: int
 ) -> LogLikelihood:
-    """What filters on the grid, and on coarser ones, say of all records together."""
+    """Combine the filters of all records on the grid and on coarser grids into a result."""
     values, errors = jax.vmap(_mean_of_filters)(grids.log_estimate)
     fine = jax.tree.map(lambda leaf: leaf[0], grids)
     value, error = values[0], errors[0]
-    # What rounding leaves of the sum over all steps is no change, either.
+    # Differences between grids below the rounding error of the sum over all steps do not count.
     rounding = np.sqrt(records.stacked.record.dt.size) * jnp.finfo(value.dtype).eps
     rounding = rounding.astype(value.dtype) * jnp.maximum(1, jnp.abs(value))
     order, num_steps = records.stacked.density.order, records.stacked.num_steps
@@ -291,8 +296,10 @@ def _told(
 def _mean_of_filters(
     log_estimates: Float[Array, "records num_filters"],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the log-likelihood of all records, each by the mean of its filters, and its standard
-    error."""
+    """Return the log-likelihood of all records, and its standard error.
+
+    Each record contributes the log of the mean of its filters.
+    """
     n = log_estimates.shape[1]
     log_mean, error, _ = log_mean_and_error(log_estimates)
     if n == 1:
@@ -303,17 +310,18 @@ def _mean_of_filters(
     squares = jnp.where(finite, log_estimates - centre, 0) ** 2
     spread = jnp.sum(squares / (number - 1), axis=1)
     variance = jnp.maximum(error**2, jnp.expm1(jnp.minimum(spread, _LARGEST_VARIANCE)) / n)
-    # Welch and Satterthwaite, relative to the largest, so that squares are finite.
+    # Welch–Satterthwaite degrees of freedom. Variances are relative to the largest, so that their
+    # squares are finite.
     largest = jnp.max(variance)
-    some = (largest > 0) & (largest < jnp.inf)
-    relative = jnp.where(some, variance / jnp.where(some, largest, 1), 1)
+    is_usable = (largest > 0) & (largest < jnp.inf)
+    relative = jnp.where(is_usable, variance / jnp.where(is_usable, largest, 1), 1)
     inverse_degrees = jnp.sum(relative**2) / jnp.sum(relative) ** 2 / (n - 1)
     widening = jnp.interp(inverse_degrees, *(leaf.astype(error.dtype) for leaf in _STUDENT))
     return jnp.sum(log_mean), widening * jnp.sqrt(jnp.sum(variance))
 
 
 def _guides(records: Records) -> tuple[Guidance, GuideCheck]:
-    """Of each record, at the parameters of the model."""
+    """Return the guide of each record and its check, at the parameters of the model."""
     return records.each(lambda problem: linearised(problem, problem.model)[1:])
 
 
@@ -326,12 +334,12 @@ def _exact(
     num_steps: int | None,
     step_size: float | None,
 ) -> LogLikelihood:
-    """Of observations of the whole state without noise."""
+    """Estimate the log-likelihood of exact observations of the whole state."""
     if step_size is not None:
         raise ValueError("`step_size` is for records with an `observation`: pass `num_steps`.")
     intervals = of_each(_intervals, split_records(times, observations))
-    start, end, duration = (jnp.concatenate(each) for each in zip(*intervals, strict=True))
-    made = transition_log_density(
+    start, end, duration = (jnp.concatenate(parts) for parts in zip(*intervals, strict=True))
+    density = transition_log_density(
         key,
         model,
         start,
@@ -341,34 +349,38 @@ def _exact(
         num_steps=50 if num_steps is None else num_steps,
         proposal="auto",
     )
-    value = jnp.sum(made.value)
+    value = jnp.sum(density.value)
     return LogLikelihood(
         value,
-        jnp.sqrt(jnp.sum(made.standard_error**2)),
+        jnp.sqrt(jnp.sum(density.standard_error**2)),
         value[None],
-        made.effective_sample_size,
-        made.pareto_k,
+        density.effective_sample_size,
+        density.pareto_k,
         num_proposals,
-        jnp.sum(made.num_nonfinite),
-        jnp.sum(made.step_error),
-        jnp.sqrt(jnp.sum(made.step_uncertainty**2)),
+        jnp.sum(density.num_nonfinite),
+        jnp.sum(density.step_error),
+        jnp.sqrt(jnp.sum(density.step_uncertainty**2)),
         jnp.zeros_like(value),
     )
 
 
 def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Array]:
-    """Start, end and duration of each."""
-    known, points = as_times("times", times), as_rows(observations)
-    if len(known.shape) != 1 or points.ndim != 2 or points.shape[0] != known.shape[0]:
+    """Return start, end and duration of each interval between observations."""
+    checked_times, points = as_times("times", times), as_rows(observations)
+    if (
+        len(checked_times.shape) != 1
+        or points.ndim != 2
+        or points.shape[0] != checked_times.shape[0]
+    ):
         raise ValueError(
             "`times` must have shape (n,) and `observations` (n, d), one row per time; got "
-            f"{known.shape} and {points.shape}."
+            f"{checked_times.shape} and {points.shape}."
         )
-    check_increasing(known)
-    return points[:-1], points[1:], known.gaps
+    check_increasing(checked_times)
+    return points[:-1], points[1:], checked_times.gaps
 
 
-# Kinds of stages, in this order.
+# Kinds of stages, in this order: a pilot run per rate, a confirmation of the best, and final runs.
 _PILOT, _ANOTHER_LOOK, _RUN = range(3)
 
 
@@ -376,16 +388,22 @@ _PILOT, _ANOTHER_LOOK, _RUN = range(3)
 def _filtered(
     key: Key[Array, ""], grids: list[Records], guides: list[Guidance], R: int, P: int
 ) -> tuple[Filtered, Float[Array, ""]]:
-    """Filters of all records on each grid, in a leading axis, and the rate at which their guides
-    forget: chosen by pilots, in the same loop, so that there is one body."""
-    (arrays, rest), number = stacked(*zip(grids, guides, strict=True)), grids[0].number
+    """Run filters of all records on each grid, with the chosen discount rate.
+
+    Pilot runs choose the rate in the same loop, so that the filter is compiled once.
+
+    **Returns:** the filters, with a leading axis of grids, and the rate.
+    """
+    (arrays, other_leaves), number = stacked(*zip(grids, guides, strict=True)), grids[0].number
     rates = rates_for(grids[0])
     pilot_key = key_for("forgetting", key)
-    keys = jnp.stack([pilot_key, key_for("confirmed", pilot_key), key])  # by kind of stage
+    keys = jnp.stack(
+        [pilot_key, key_for("confirmed", pilot_key), key]
+    )  # indexed by the kind of stage
 
-    @jax.jit  # for its shapes and in the loop traced once
+    @jax.jit  # traced once, for `eval_shape` and for the loop
     def run(grid, rate, key):
-        records, guides = eqx.combine(jax.tree.map(lambda leaf: leaf[grid], arrays), rest)
+        records, guides = eqx.combine(jax.tree.map(lambda leaf: leaf[grid], arrays), other_leaves)
         moving = records.moving
 
         def filters(problem, key, guide):
@@ -398,20 +416,20 @@ def _filtered(
         grid, rate, kind = inputs
 
         def make(best):
-            made = run(grid, jnp.where(kind == _PILOT, rate, best.rate), keys[kind])
-            each = chosen_of(best, rate, made, P), confirmed(best, made, P), best
-            return jax.tree.map(lambda *leaves: jnp.stack(leaves)[kind], *each), made
+            filtered = run(grid, jnp.where(kind == _PILOT, rate, best.rate), keys[kind])
+            choices = chosen_of(best, rate, filtered, P), confirmed(best, filtered, P), best
+            return jax.tree.map(lambda *leaves: jnp.stack(leaves)[kind], *choices), filtered
 
         def left_out(best):
             shapes = jax.eval_shape(make, best)[1]
             return best, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-        known = (kind == _PILOT) & best.settled | (kind == _ANOTHER_LOOK) & (best.rate == 0)
-        return lax.cond(known, left_out, make, best)
+        is_needless = (kind == _PILOT) & best.settled | (kind == _ANOTHER_LOOK) & (best.rate == 0)
+        return lax.cond(is_needless, left_out, make, best)
 
     kinds = np.array([*len(rates) * [_PILOT], _ANOTHER_LOOK, *len(grids) * [_RUN]])
     on_grid = np.where(kinds == _RUN, 0, int(half_will_do(grids[0])))
     on_grid[kinds == _RUN] = np.arange(len(grids))
     rates = jnp.pad(rates, (0, len(kinds) - len(rates)))
-    best, made = lax.scan(stage, undecided(rates.dtype), (on_grid, rates, kinds))
-    return jax.tree.map(lambda leaf: leaf[kinds == _RUN], made), best.rate
+    best, filtered = lax.scan(stage, undecided(rates.dtype), (on_grid, rates, kinds))
+    return jax.tree.map(lambda leaf: leaf[kinds == _RUN], filtered), best.rate

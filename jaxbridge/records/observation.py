@@ -25,9 +25,10 @@ from ..models.tracing import takes_time
 
 
 class Scalars(NamedTuple):
-    """Independent scalar observations of one state x: `values` = `rows` x + N(0, diag(`variances`)).
+    """Independent scalar observations of one state x.
 
-    `seen` is false for missing scalars, which have row 0 and variance 1.
+    Their law is `values` = `rows` x + N(0, diag(`variances`)). `seen` is false for missing scalars,
+    which have row 0 and variance 1.
     """
 
     rows: Float[Array, "m d"]
@@ -260,7 +261,7 @@ def _independent(
 ) -> tuple[Scalars, tuple[Float[Array, " m"], Float[Array, " m"]], Bool[Array, ""]]:
     """Return independent scalars by the elimination R = U D Uᵀ.
 
-    The `variances` of `given` hold the matrix R.
+    The `variances` of `correlated` hold the matrix R.
 
     **Returns:** the scalars; bounds on the size of the terms in their rows and values, as scales of
     the rounding errors; and whether R is a covariance up to rounding.

@@ -42,13 +42,13 @@ from .problem import RecordProblem, as_record_problem
 from .states import Draws, sample_states
 from .step_regime import steps_are_too_long
 
-# R̂ beyond which chains disagree.
+# Chains disagree if R̂ exceeds this bound.
 _MOST_R_HAT = 1.1
-# A spread of so many units in the last place is rounding.
+# A spread of at most so many units in the last place is rounding error.
 _ROUNDING = 64.0
-# The variance of D of one segment beyond which its second order says nothing of the step error.
+# If the variance of D of a segment exceeds this bound, the expansion to second order is unreliable.
 _MOST_VARIANCE = 1.0
-# What changes by no more along a path, relative to its size, is constant.
+# A quantity counts as constant if its relative changes along a path are at most this large.
 _CONSTANT = 1e-3
 
 _STUCK = (
@@ -96,8 +96,8 @@ class Smoothed(AbstractResult):
         """Return the Monte Carlo error of `mean(fn)`, entry by entry."""
 
         def error(leaf):
-            made = jnp.std(leaf, axis=(0, 1)) / jnp.sqrt(effective_size_of_chains(leaf))
-            return jnp.where(jnp.any(self.stuck), jnp.inf, made)
+            of_leaf = jnp.std(leaf, axis=(0, 1)) / jnp.sqrt(effective_size_of_chains(leaf))
+            return jnp.where(jnp.any(self.stuck), jnp.inf, of_leaf)
 
         return jax.tree.map(error, self._values(fn))
 
@@ -128,9 +128,9 @@ class Smoothed(AbstractResult):
 
         Then more steps help, and more draws do not. The result is for `mean(fn)`, entry by entry.
         """
-        told = map(StepError, *map(jax.tree.leaves, self._step_errors(fn)))
+        step_errors = map(StepError, *map(jax.tree.leaves, self._step_errors(fn)))
         errors, treedef = jax.tree.flatten(self.standard_error(fn))
-        return jax.tree.unflatten(treedef, list(map(dominates, told, errors)))
+        return jax.tree.unflatten(treedef, list(map(dominates, step_errors, errors)))
 
     def effective_sample_size(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return the effective sample size of `fn(path)`, entry by entry.
@@ -145,7 +145,7 @@ class Smoothed(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """The faults of the draws, each with a remedy.
+        """Return the faults of the draws, each with a remedy.
 
         They are: a block that never moved; truncated weights; chains that disagree at some points;
         a poor guide together with one of these; and a discretisation error of the mean path that
@@ -166,39 +166,47 @@ class Smoothed(AbstractResult):
 
     @property
     def _chains_agree(self) -> Bool[Array, ""]:
+        """Return whether R̂ is small at all points that are not constant."""
         return jnp.all((self.r_hat() < _MOST_R_HAT) | ~self._varies)
 
     @property
     def _varies(self) -> Bool[Array, "K d"]:
-        """Where the path is not known but for rounding: what was observed exactly is."""
+        """Return the mask of the entries of the path that vary by more than rounding errors.
+
+        Entries with exact observations do not vary.
+        """
         sd, size = jnp.std(self.paths, axis=(0, 1)), jnp.max(jnp.abs(self.paths), axis=(0, 1))
         return sd > _ROUNDING * float(jnp.finfo(sd.dtype).eps) * size
 
     @property
     def _errors_in_sds(self) -> tuple[StepError, Float[Array, ""]]:
-        """The step error of the mean path, and its standard error, in standard deviations of its
-        points, root mean square."""
+        """Return the discretisation error of the mean path, and its standard error.
+
+        Both are in standard deviations of the points, as root mean squares.
+        """
         variance = jnp.where(self._varies, jnp.var(self.paths, axis=(0, 1)), 0)
         in_sds = lambda value: root_mean_square_in_sds(value, variance)
         error = StepError(*map(in_sds, self._step_errors(lambda path: path)))
         return error, in_sds(self.standard_error())
 
     def _step_errors(self, fn: PathFunction) -> tuple[PyTree, PyTree]:
+        """Estimate the discretisation bias of `mean(fn)` and its uncertainty."""
         values, problem = self._values(fn), self._problem
         D = _log_halving(problem, self.paths)
-        known = jnp.max(jnp.var(D, axis=(0, 1))) <= _MOST_VARIANCE
-        D = jnp.where(known, jnp.sum(D, axis=-1), jnp.nan)
+        is_reliable = jnp.max(jnp.var(D, axis=(0, 1))) <= _MOST_VARIANCE
+        D = jnp.where(is_reliable, jnp.sum(D, axis=-1), jnp.nan)
         leaves, treedef = jax.tree.flatten(values)
         varies = _noise_varies(problem, self.paths[0, 0])
         share = share_of_order(problem.density.order)
-        each = [_change(leaf, D, share, varies) for leaf in leaves]
+        step_errors = [_change(leaf, D, share, varies) for leaf in leaves]
         mean = jnp.mean(self.paths, axis=(0, 1))
         too_long = steps_are_too_long(problem, problem.model, mean)
-        each = [unknown_where(too_long, error) for error in each]
-        values, doubts = zip(*each, strict=True)
+        step_errors = [unknown_where(too_long, error) for error in step_errors]
+        values, doubts = zip(*step_errors, strict=True)
         return jax.tree.unflatten(treedef, values), jax.tree.unflatten(treedef, doubts)
 
     def _values(self, fn: PathFunction) -> PyTree:
+        """Evaluate `fn` on all draws, in the precision of the paths."""
         like = jax.ShapeDtypeStruct(self.paths.shape[-2:], self.paths.dtype)
         values = jax.vmap(jax.vmap(as_path_function("fn", fn, like)))(self.paths)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, self.paths.dtype), values)
@@ -275,30 +283,32 @@ def smooth(
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     problem = as_record_problem(*arguments, num_steps=num_steps, any_constant=True, **options)
     num_proposals = check_count("num_proposals", 10 if num_proposals is None else num_proposals)
-    made = linearised(problem, model)
+    linearisation = linearised(problem, model)
     if proposal is None:
         sizes = counts, num_chains, block_length
-        drawn = _smooth(key, problem, made, *sizes, progress_meter)
+        draws = _smooth(key, problem, linearisation, *sizes, progress_meter)
     else:
         start_key, key = jax.random.split(key)
-        firsts = _guided_paths(start_key, problem, made, num_chains)
+        firsts = _guided_paths(start_key, problem, linearisation, num_chains)
         sizes = (*counts, num_proposals)
-        drawn = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
-    paths = jnp.moveaxis(drawn.paths, 1, 0)
-    found = (drawn.accepted, drawn.stuck, drawn.num_truncated)
-    times = problem.record.clock.exactly(drawn.since)
-    problem = dataclasses.replace(problem, record=drawn.record)
-    smoothed = Smoothed(times, paths, *found, problem, made.check)
+        draws = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
+    paths = jnp.moveaxis(draws.paths, 1, 0)
+    diagnostics = (draws.accepted, draws.stuck, draws.num_truncated)
+    times = problem.record.clock.exactly(draws.since)
+    problem = dataclasses.replace(problem, record=draws.record)
+    smoothed = Smoothed(times, paths, *diagnostics, problem, linearisation.check)
     return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
 
 
 @compiled_sooner
 def _guided_paths(
-    key: Key[Array, ""], problem: RecordProblem, made: Linearised, num_chains: int
+    key: Key[Array, ""], problem: RecordProblem, linearisation: Linearised, num_chains: int
 ) -> Float[Array, "chains points d"]:
-    """Guided paths that know nothing of each other, or where they left the finite numbers the one
-    along which they are guided."""
-    points, guide, _ = made
+    """Sample independent guided paths.
+
+    The path of the linearisation replaces a path without a finite log weight.
+    """
+    points, guide, _ = linearisation
 
     def first(key):
         noise = jax.random.normal(key, points.shape, points.dtype)
@@ -312,44 +322,48 @@ def _guided_paths(
 def _smooth(
     key: Key[Array, ""],
     problem: RecordProblem,
-    made: Linearised,
+    linearisation: Linearised,
     counts: tuple[int, int],
     num_chains: int,
     block_length: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Draws:
+    """Run the chains that move blocks of paths."""
     model, (num_draws, num_warmup) = problem.model, counts
-    points, guide, _ = made
+    points, guide, _ = linearisation
     start_key, key = jax.random.split(key)
 
-    firsts = jnp.moveaxis(_guided_paths(start_key, problem, made, num_chains), 0, -1)
+    firsts = jnp.moveaxis(_guided_paths(start_key, problem, linearisation, num_chains), 0, -1)
     (K, N), d = problem.record.dt.shape, problem.dim
     paths = Paths(firsts[0], firsts[1:].reshape(K, N, d, num_chains))
     both = blocks_of_both_cuts(problem, points, guide, block_length)
 
     def step(state, i):
         paths, log_scales = state
-        mine = jax.random.fold_in(key, i)
-        paths, taken = sweep(mine, problem, model, both, log_scales, paths)
-        learnt = tuned(log_scales, taken, (i + 1).astype(points.dtype))
+        sweep_key = jax.random.fold_in(key, i)
+        paths, accepted = sweep(sweep_key, problem, model, both, log_scales, paths)
+        new_scales = tuned(log_scales, accepted, (i + 1).astype(points.dtype))
         path = jnp.concatenate([paths.start[None], paths.points.reshape(K * N, d, num_chains)])
-        log_scales = jnp.where(i < num_warmup, learnt, log_scales)
-        return (paths, log_scales), (jnp.moveaxis(path, -1, 0), taken)
+        log_scales = jnp.where(i < num_warmup, new_scales, log_scales)
+        return (paths, log_scales), (jnp.moveaxis(path, -1, 0), accepted)
 
     init = paths, jnp.zeros((2, both.segment.shape[-1]), points.dtype)
-    _, made = metered_scan(step, init, jnp.arange(num_warmup + num_draws), progress_meter)
-    drawn, taken = jax.tree.map(lambda leaf: leaf[num_warmup:], made)
+    _, linearisation = metered_scan(step, init, jnp.arange(num_warmup + num_draws), progress_meter)
+    draws, accepted = jax.tree.map(lambda leaf: leaf[num_warmup:], linearisation)
     real = has_segments(problem, block_length)[..., None]
-    stuck = jnp.any(real & ~jnp.any(taken, axis=0), axis=(0, 1))
-    share = jnp.mean(taken.astype(points.dtype), axis=(0, -1))
+    stuck = jnp.any(real & ~jnp.any(accepted, axis=0), axis=(0, 1))
+    share = jnp.mean(accepted.astype(points.dtype), axis=(0, -1))
     record = problem.record
-    return Draws(record.grid(), drawn, share, stuck, jnp.int32(0), record)
+    return Draws(record.grid(), draws, share, stuck, jnp.int32(0), record)
 
 
 @compiled_sooner
 def _noise_varies(problem: RecordProblem, path: Float[Array, "K d"]) -> Bool[Array, ""]:
-    """Whether the noise of a step depends on the state in leading order: σ does, or where it has
-    fewer columns than rows ∇α σ, by which the drift leads it on, along this path."""
+    """Return whether the noise of a step depends on the state to leading order, along this path.
+
+    It does if σ does. In a hypoelliptic model it also does if ∇α σ does, the term by which the
+    drift spreads the noise.
+    """
     model, like = problem.model, problem.like
     if model.sigma_varies(like) or model.sigma_is_invertible(like):
         return jnp.asarray(model.sigma_varies(like))
@@ -359,16 +373,18 @@ def _noise_varies(problem: RecordProblem, path: Float[Array, "K d"]) -> Bool[Arr
         columns = columns_of(dynamics.sigma(x), x)
         return jnp.stack([jax.jvp(dynamics.drift, (x,), (column,))[1] for column in columns])
 
-    each = jax.vmap(led_on)(path)
-    return jnp.max(jnp.ptp(each, axis=0)) > _CONSTANT * jnp.max(jnp.abs(each))
+    derivatives = jax.vmap(spread_by_drift)(path)
+    return jnp.max(jnp.ptp(derivatives, axis=0)) > _CONSTANT * jnp.max(jnp.abs(derivatives))
 
 
 @compiled_sooner
 def _log_halving(
     problem: RecordProblem, paths: Float[Array, "chains n points d"]
 ) -> Float[Array, "chains n K"]:
-    """Return D of each segment of each path: pairs of steps do not reach beyond one. NaN of one
-    step."""
+    """Return D of each segment of each path; NaN for a single step.
+
+    Pairs of steps lie within one segment.
+    """
     (K, N), d, chains = problem.record.dt.shape, problem.dim, paths.shape[0]
     dynamics = problem.model.forward_at(problem.like)
     dt, time = (jnp.tile(leaf, (chains, 1)).T for leaf in problem.record.steps())
@@ -378,8 +394,8 @@ def _log_halving(
 
     def of_draw(path):
         segments = path[:, place].reshape(chains * K, N + 1, d)
-        each = log_halving_of_paths(problem.density, dynamics, dt, segments, time)
-        return each.reshape(chains, K)
+        of_segments = log_halving_of_paths(problem.density, dynamics, dt, segments, time)
+        return of_segments.reshape(chains, K)
 
     return jnp.moveaxis(lax.map(of_draw, jnp.moveaxis(paths, 1, 0)), 0, 1)
 
@@ -390,11 +406,13 @@ def _change(
     share: float,
     varies: Bool[Array, ""],
 ) -> StepError:
-    """The share of E[e^D f] / E[e^D] - E[f] that is error, to second order in D: the covariance of
-    f with D + ½ (D - ED)²."""
+    """Estimate the discretisation error of the mean of f, as a share of E[e^D f] / E[e^D] - E[f].
+
+    To second order in D this difference is the covariance of f with D + ½ (D - ED)².
+    """
     D = D - jnp.mean(D)
     D = (D + D**2 / 2).reshape(*D.shape, *[1] * (values.ndim - 2))
     products = (values - jnp.mean(values, axis=(0, 1))) * (D - jnp.mean(D))
     error = jnp.std(products, axis=(0, 1)) / jnp.sqrt(effective_size_of_chains(products))
-    told = share * jnp.mean(products, axis=(0, 1))
-    return StepError(told, jnp.hypot(share * error, jnp.where(varies, told, 0)))
+    estimate = share * jnp.mean(products, axis=(0, 1))
+    return StepError(estimate, jnp.hypot(share * error, jnp.where(varies, estimate, 0)))

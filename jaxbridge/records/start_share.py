@@ -27,7 +27,7 @@ _NUM_DRAWS = 1024
 def start_share(
     problem: RecordProblem, model: Diffusion, points: Float[Array, "points d"]
 ) -> Float[Array, ""]:
-    """The share of draws that count: of a record that is guided along these points."""
+    """Return the effective fraction of draws of x_0, for a record guided along these points."""
     dtype = problem.like.dtype
     if not calls_for_cover(problem.initial, model, problem.like):
         return jnp.ones((), dtype)
@@ -36,14 +36,15 @@ def start_share(
     h = jax.tree.map(lambda leaf: leaf[0, 0], guide.steps.h)
     start = covered_start(law, guide.first, points[0], h)
     of_first = correction(problem, model)
+    # Stratified positions: each law of the mixture gets its exact share of the draws.
     positions = (jnp.arange(_NUM_DRAWS, dtype=dtype) + 0.5) / _NUM_DRAWS
     zeta = jax.random.normal(jax.random.key(0), (problem.dim, _NUM_DRAWS), dtype)
 
     def both(x):
-        seen = of_first(split_first(problem.rows)[0], x)
+        log_factor = of_first(split_first(problem.rows)[0], x)
         to_cover = log_nu(x) - law.log_density(x) + start.log_integral
         to_normal = log_ratio(problem.initial, model, guide.initial, x) + guide.start.log_integral
-        return nan_to_neg_inf(seen + to_cover), nan_to_neg_inf(seen + to_normal)
+        return nan_to_neg_inf(log_factor + to_cover), nan_to_neg_inf(log_factor + to_normal)
 
     to_cover, to_normal = jax.vmap(both, in_axes=-1)(start.points(positions, zeta))
     log_num = math.log(_NUM_DRAWS)
