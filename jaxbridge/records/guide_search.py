@@ -34,13 +34,13 @@ from .problem import RecordProblem
 from .segments import split_first
 from .tracking import tracking_path
 
-# How often the path along which the process is linearised is found anew from the last; what log
-# weights gain by it that is worth no further turn; and the shortest of its steps.
+# Bounds of the iteration: number of linearisations, gain of the log weight that ends it, and
+# shortest step.
 _MOST_TURNS, _NO_GAIN, _SHORTEST = 30, 0.5, 2.0**-10
-# From how many particles' paths it is searched for at most. How far from an observation a path may
-# be that calls for no other start: so much beyond the largest of n normal numbers.
+# Maximum number of searches from paths of particles. They are needed if a residual exceeds the
+# typical maximum of n normal numbers, √(2 log n), by more than `_BEYOND_NOISE`.
 _MOST_PARTICLE_STARTS, _BEYOND_NOISE = 3, 1.0
-# Beyond all log weights of paths that have one.
+# Larger than all finite log weights.
 _NO_WEIGHT = 1e20
 
 
@@ -103,8 +103,12 @@ class GuideCheck(NamedTuple):
 
 
 class Linearised(NamedTuple):
-    """The points along which the process is linearised, what guides paths there, and how good that
-    is."""
+    """Linearisation of a record.
+
+    - `points`: the path of the linearisation.
+    - `guide`: the guide along this path.
+    - `check`: diagnostics of the guide.
+    """
 
     points: Float[Array, "points d"]
     guide: Guidance
@@ -112,14 +116,14 @@ class Linearised(NamedTuple):
 
 
 def no_check(number: int, dtype: np.dtype) -> GuideCheck:
-    """Return what stands in for the check of each of so many records until there is one."""
-    nothing = jnp.zeros(number, dtype)
-    return GuideCheck(nothing, nothing, jnp.zeros(number, jnp.int32))
+    """Return placeholder checks for `number` records, until there are checks."""
+    zeros = jnp.zeros(number, dtype)
+    return GuideCheck(zeros, zeros, jnp.zeros(number, jnp.int32))
 
 
 @compiled_sooner
 def check_guide(problem: RecordProblem, model: Diffusion, guide: Guidance) -> GuideCheck:
-    """Return the diagnostics of this guide of a record. No derivatives."""
+    """Return the diagnostics of this guide of a record, without derivatives."""
     problem, model, guide = without_derivatives((problem, model, guide))
     _, log_weight = _path_without_noise(problem, model, guide, guide.start.origin)
     return _check_of(guide, log_weight)
@@ -128,15 +132,17 @@ def check_guide(problem: RecordProblem, model: Diffusion, guide: Guidance) -> Gu
 def _check_of(guide: Guidance, log_weight: Float[Array, ""]) -> GuideCheck:
     """Return the diagnostics of a guide whose path without noise has this weight."""
     num_observed = jnp.sum(guide.first.seen) + jnp.sum(guide.scalars.seen)
-    # Along a path that explodes h is not finite, and no path has a weight.
+    # Along an exploding path h is not finite, and every path has weight zero.
     finite = all_finite_leaves((guide.start, guide.steps))
     residual = jnp.where(finite, _largest_residual(guide), jnp.inf)
     return GuideCheck(log_weight, residual, num_observed.astype(jnp.int32))
 
 
 def _largest_residual(guide: Guidance) -> Float[Array, ""]:
-    """Return the largest distance of an observation from the path of linearisation, in standard
-    deviations of its noise."""
+    """Return the largest distance of an observation from the path of the linearisation.
+
+    It is in standard deviations of the noise. Exact observations do not count.
+    """
 
     def of(scalars: Scalars) -> Float[Array, ""]:
         noisy = scalars.seen & (scalars.variances > 0)
@@ -149,8 +155,10 @@ def _largest_residual(guide: Guidance) -> Float[Array, ""]:
 def _path_without_noise(
     problem: RecordProblem, model: Diffusion, guide: Guidance, begin: Float[Array, " d"]
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
-    """Return the guided path without noise and its log weight. It starts at `begin` where the law
-    of X(t_0) is not normal."""
+    """Return the guided path without noise, and its log weight.
+
+    If the law of X(t_0) is not normal, the path starts at `begin`.
+    """
     noise = jnp.zeros((problem.num_segments * problem.num_steps + 1, problem.dim), begin.dtype)
     if calls_for_cover(problem.initial, model, problem.like):
         solve = functools.partial(solve_root, guide.initial.root)
@@ -161,64 +169,70 @@ def _path_without_noise(
 
 
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
-    """Return the best path found, and the guide along it. The points have no derivatives, and the
-    guide none by the model.
+    """Return the best path of all searches, and the guide along it.
 
-    The starts from particles are a program of their own, which is compiled where it is called for.
+    The points have no derivatives. The guide has none by the model. The searches from particles are
+    a separate program, which is compiled only if it is needed.
     """
     if not is_outermost():
         return _in_program(problem, model)
-    found = _from_filter(problem, model)
-    if found.check.is_near or _is_linear(problem, model):
-        return found
+    best = _from_filter(problem, model)
+    if best.check.is_near or _is_linear(problem, model):
+        return best
     for number in range(_MOST_PARTICLE_STARTS):
         new = _from_particles(problem, model, jnp.int32(number))
-        found = new if new.check.rank > found.check.rank else found
-        if found.check.is_near:
+        best = new if new.check.rank > best.check.rank else best
+        if best.check.is_near:
             break
-    return found
+    return best
 
 
-def _in_program(own: RecordProblem, own_model: Diffusion) -> Linearised:
-    """Return the same within a compiled program."""
-    problem, model = without_derivatives((own, own_model))
-    found = _from_filter(problem, model)
+def _in_program(own_problem: RecordProblem, own_model: Diffusion) -> Linearised:
+    """Return the same as `linearised`, inside a compiled program.
+
+    The guide keeps its derivatives by the observations and the initial law, but not by the model.
+    """
+    problem, model = without_derivatives((own_problem, own_model))
+    best = _from_filter(problem, model)
     if not _is_linear(problem, model):
-        found = _best_of_loop(problem, model, found)
-    own = without_captured_derivatives(own)  # as if it were in the model's parameters
-    guide = _guide_of((own, found.guide), model=model, points=found.points)
-    return found._replace(guide=guide)
+        best = _best_of_loop(problem, model, best)
+    own_problem = without_captured_derivatives(own_problem)  # like the model's parameters
+    guide = _guide_of((own_problem, best.guide), model=model, points=best.points)
+    return best._replace(guide=guide)
 
 
 def _is_linear(problem: RecordProblem, model: Diffusion) -> bool:
-    """Whether the guide is the same along any path."""
+    """Return whether the guide is the same along any path."""
     dynamics = model.forward_at(problem.like)(problem.record.times[0])
     cover = calls_for_cover(problem.initial, model, problem.like)
     return is_linear(dynamics, problem.like) and not cover
 
 
-def _best_of_loop(problem: RecordProblem, model: Diffusion, found: Linearised) -> Linearised:
-    """Search from paths of particles until one is near what is seen, in a compiled loop."""
+def _best_of_loop(problem: RecordProblem, model: Diffusion, best: Linearised) -> Linearised:
+    """Search from paths of particles until the guide is near the observations, in a compiled loop."""
 
     def search(state: tuple[Int[Array, ""], Linearised]) -> tuple[Int[Array, ""], Linearised]:
-        number, found = state
+        number, best = state
         new = _from_particles(problem, model, number)
-        better = new.check.rank > found.check.rank
-        return number + 1, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, found)
+        better = new.check.rank > best.check.rank
+        return number + 1, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
 
     goes_on = lambda state: ~state[1].check.is_near & (state[0] < _MOST_PARTICLE_STARTS)
-    return lax.while_loop(goes_on, search, (jnp.int32(0), found))[1]
+    return lax.while_loop(goes_on, search, (jnp.int32(0), best))[1]
 
 
 class _Start(NamedTuple):
-    """Points along which the process is first linearised, and where paths without noise begin where
-    the law of X(t_0) is not normal."""
+    """Start of a search.
+
+    - `points`: points of the first linearisation.
+    - `begin`: first point of paths without noise, if the law of X(t_0) is not normal.
+    """
 
     points: Float[Array, "points d"]
     begin: Float[Array, " d"]
 
 
-@compiled_sooner  # a program of its own, which all who read the record share
+@compiled_sooner  # a separate program, common to all functions that take the record
 def _from_filter(problem: RecordProblem, model: Diffusion) -> Linearised:
     """Search from the path of the extended Kalman filter."""
     return _search(problem, model, _filter_start(problem, model))
@@ -246,16 +260,22 @@ def _filter_start(problem: RecordProblem, model: Diffusion) -> _Start:
 
 
 def _particle_start(problem: RecordProblem, model: Diffusion, number: Int[Array, ""]) -> _Start:
-    """Return a likely path near that of a particle which stays near what is seen."""
+    """Return a likely path near that of a particle which stays near the observations."""
     key = jax.random.fold_in(key_for("tracking", jax.random.key(0)), number)
     points = likely_path(problem, model, tracking_path(key, problem, model))
     return _Start(points, points[0])
 
 
 class _Search(NamedTuple):
-    """Of Gauss and Newton's iteration: the points of the next turn; the best so far, the check of
-    it, and its path without noise; the length of the step to it, and whether it is
-    over."""
+    """State of the damped Gauss–Newton iteration.
+
+    - `turn`: number of the iteration.
+    - `points`: points of the next linearisation.
+    - `best`, `check`: the best points so far, their guide and its check.
+    - `path`: path without noise of the best guide.
+    - `length`: length of the step from the best points towards this path.
+    - `over`: whether the iteration has ended.
+    """
 
     turn: Int[Array, ""]
     points: Float[Array, "points d"]
@@ -267,16 +287,19 @@ class _Search(NamedTuple):
 
 
 def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> Linearised:
-    """Search from these points: linearise along the path that is guided without noise, and repeat.
+    """Search from these points: linearise along the guided path without noise, and repeat.
 
-    What counts is the weight of the path without noise: where it is large, weights fall off as
-    noise leads away from it, and where it is small paths that weigh more are missed. So a turn
-    counts that raises it, and steps are shortened until one does: excitable and chaotic systems
-    throw Gauss and Newton's iteration off for good, and between two wells its fixed point, the
-    likeliest path, guides worse than the filter's means."""
+    The criterion is the log weight of the path without noise. If it is large, weights fall with the
+    noise. If it is small, the guide misses paths of larger weight. So an iteration must raise the
+    weight, and steps are shortened until one does, for two reasons:
+
+    - in excitable and chaotic systems the Gauss–Newton iteration may diverge for good;
+    - between two wells its fixed point, the most likely path, guides worse than the means of the
+        filter.
+    """
     (points, begin), inside = start, model.state_space()
 
-    @jax.jit  # for its shapes and in the loop traced once
+    @jax.jit  # traced once, for `eval_shape` and for the loop
     def at(points):
         guide = guided(problem, model, points)
         path, log_weight = _path_without_noise(problem, model, guide, begin)
@@ -303,21 +326,27 @@ def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> Linearis
     one = jnp.ones((), points.dtype)
     init = _Search(jnp.int32(0), points, best, check, points, one, jnp.zeros((), bool))
     goes_on = lambda search: ~search.over & (search.turn < _MOST_TURNS)
-    made = lax.while_loop(goes_on, turn, init)
-    return Linearised(*made.best, made.check)
+    final = lax.while_loop(goes_on, turn, init)
+    return Linearised(*final.best, final.check)
 
 
 @eqx.filter_custom_jvp
 def _guide_of(
-    known: tuple[RecordProblem, Guidance], *, model: Diffusion, points: Float[Array, "points d"]
+    problem_and_guide: tuple[RecordProblem, Guidance],
+    *,
+    model: Diffusion,
+    points: Float[Array, "points d"],
 ) -> Guidance:
-    """The guide along these points, which is known; its derivatives are those of what was seen and
-    where it began."""
-    return known[1]
+    """Return the present guide along these points.
+
+    Its derivatives are those of the observations and of the initial law.
+    """
+    return problem_and_guide[1]
 
 
 @_guide_of.def_jvp
 def _guide_derivative(primals, tangents, *, model, points):
+    """Return the guide and its derivative by the problem, at fixed model and points."""
     ((problem, guide),), ((change, _),) = primals, tangents
     along = lambda problem: guided(problem, model, points)
     return guide, eqx.filter_jvp(along, (problem,), (change,))[1]

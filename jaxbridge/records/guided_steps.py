@@ -38,8 +38,12 @@ from .tilted_step import Information, NormalStep, Seen, Tilted, coordinates, giv
 
 
 class Guide(NamedTuple):
-    """What a step is guided by: ξ_i and h_i at its beginning, ξ_{i+1} and h_{i+1} at its end, and
-    its length and time."""
+    """Guide of a step.
+
+    - `point`, `h`: ξ_i and h_i, at the beginning.
+    - `next_point`, `next_h`: ξ_{i+1} and h_{i+1}, at the end.
+    - `step`: length and time of the step.
+    """
 
     point: Float[Array, "d *lanes"]
     h: Information
@@ -72,7 +76,7 @@ class GuidedLaw(NamedTuple):
         self, zeta: Float[Array, " m"]
     ) -> tuple[Float[Array, " d"], Float[Array, ""]]:
         """Return where the noise ζ ~ N(0, I) leads, and the log weight of the step."""
-        # Point and weight would else compute it twice.
+        # Without this, the compiler computes it twice, for the point and for the weight.
         pulled = compute_once(self.tilted.pulled(zeta))
         point = self.origin + self.tilted.point(pulled)
         log_weight = self.log_seen + self.tilted.log_ratio(zeta, pulled)
@@ -92,8 +96,10 @@ class GuidedLaw(NamedTuple):
         solve: Callable[[Float[Array, " d"]], Float[Array, " m"]],
         hidden: Float[Array, " n"],
     ) -> tuple[Float[Array, " m"], Float[Array, ""]]:
-        """Return noise that leads to this point, and the log weight of the step. `solve` is Λ⁻¹ of
-        the step before anything is seen; `hidden` as in `coordinates`."""
+        """Return noise that leads to this point, and the log weight of the step.
+
+        `solve` is Λ⁻¹ of the step before conditioning; `hidden` is explained in `coordinates`.
+        """
         displacement = solve(point - self.origin - self.tilted.step.mean)
         pulled = coordinates(displacement, self.seen, hidden[: len(self.seen)])
         zeta = self.tilted.noise(pulled)
@@ -111,7 +117,7 @@ def _log_change(scalars: Scalars, u: Float[Array, " d"], x: Float[Array, " d"]) 
 
 
 def relative(scalars: Scalars, point: Float[Array, " d"]) -> Scalars:
-    """What is seen, counted from ξ."""
+    """Return the scalar observations relative to ξ."""
     at_point = jnp.stack([dot(row, point) for row in scalars.rows])
     return scalars._replace(values=jnp.where(scalars.seen, scalars.values - at_point, 0))
 
@@ -119,13 +125,14 @@ def relative(scalars: Scalars, point: Float[Array, " d"]) -> Scalars:
 def guided_start(
     initial: NormalStep, scalars: Scalars, point: Float[Array, " d"], h: Information
 ) -> GuidedLaw:
-    """The law of x_0, given what is seen at t_0 and h_0."""
+    """Return the law of x_0, given the observation at t_0 and tilted by h_0."""
     step = NormalStep(initial.mean - point, initial.root)
+    # An exact observation of a known x_0 must agree up to rounding.
     eps, size = jnp.finfo(point.dtype).eps, jnp.abs(initial.mean) + jnp.abs(point)
     of_rows = jnp.stack([dot(jnp.abs(row), size) for row in scalars.rows])
-    step, log_seen, seen = given(step, scalars, 100 * eps * (of_rows + jnp.abs(scalars.values)))
+    step, log_seen, factors = given(step, scalars, 100 * eps * (of_rows + jnp.abs(scalars.values)))
     bent = tilted(step, h)
-    return GuidedLaw(point, bent, log_seen, seen)
+    return GuidedLaw(point, bent, log_seen, factors)
 
 
 def guided_step(
@@ -135,24 +142,27 @@ def guided_step(
     guide: Guide,
     scalars: Scalars | None,
 ) -> GuidedLaw:
-    """The law of the step from x; `scalars` are seen at its end, counted from ξ_{i+1}."""
+    """Return the law of the guided step from x.
+
+    `scalars` are the observations at its end, relative to ξ_{i+1}.
+    """
     return guided_law(target_law(density, dynamics_at, x, guide.step), guide, scalars)
 
 
 def target_law(
     density: AbstractStepDensity, dynamics_at: DynamicsAt, x: Float[Array, " d"], step: Steps
 ) -> StepLaw | DegenerateLaw:
-    """The law of the target's step from x."""
+    """Return the law of the target's step from x."""
     return density.steps_from(dynamics_at(step.time), x).law(step.dt)
 
 
 def guided_law(law: StepLaw | DegenerateLaw, guide: Guide, scalars: Scalars | None) -> GuidedLaw:
-    """The same, given the law of the target's step."""
+    """Return the law of the guided step, from the law of the target's step."""
     step = NormalStep(law.mean - guide.next_point, law.root)
-    log_seen, seen = jnp.zeros((), law.mean.dtype), []
+    log_seen, factors = jnp.zeros((), law.mean.dtype), []
     if scalars is not None:
-        step, log_seen, seen = given(step, scalars)
+        step, log_seen, factors = given(step, scalars)
     quadratic = None
     if isinstance(law, StepLaw) and law.curvature is not None:
         quadratic = law, scalars
-    return GuidedLaw(guide.next_point, tilted(step, guide.next_h), log_seen, seen, quadratic)
+    return GuidedLaw(guide.next_point, tilted(step, guide.next_h), log_seen, factors, quadratic)

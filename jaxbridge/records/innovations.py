@@ -34,7 +34,7 @@ _NOT_FINITE = (
     "space. A sampler of ξ stops there, and means of weights are too small. Use more `num_steps`: "
     "explicit steps diverge if they are too long for the drift."
 )
-# So many draws of ξ are tried.
+# Number of random ξ that `verdict` tries.
 _NUM_TRIED = 10
 
 
@@ -54,14 +54,14 @@ class Innovations(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of entries of ξ: d for x_0, and d for each step."""
+        """Return the number of entries of ξ: d for x_0, and d for each step."""
         return self.points.size
 
     @property
     def times(self) -> Float[Array | np.ndarray, " points"]:
-        """Times of the points of paths, shape (M + 1,).
+        """Return the times of the points of paths, shape (M + 1,).
 
-        It is a NumPy array of double precision if the precision of paths cannot resolve the times.
+        They are a NumPy array of double precision if the precision of paths cannot resolve them.
         """
         record = self.problem.record
         return record.clock.exactly(record.grid())
@@ -95,7 +95,7 @@ class Innovations(NamedTuple):
 
     @property
     def verdict(self) -> Verdict:
-        """The faults at the parameters of the model, each with a remedy.
+        """Return the faults at the parameters of the model, each with a remedy.
 
         They are: a poor guide, and paths of weight zero for ξ = 0 or for one of ten random ξ.
         """
@@ -109,7 +109,7 @@ class Innovations(NamedTuple):
 
     @property
     def trustworthy(self) -> Bool[Array, ""]:
-        """Whether `verdict` has no fault."""
+        """Return whether `verdict` has no fault."""
         return self.verdict.trustworthy
 
     def why(self) -> str:

@@ -30,13 +30,19 @@ from .problem import RecordProblem
 from .segments import at_every_step, flat, following, split_first
 from .tilted_step import NormalStep, given, tilted
 
-# How many iterations at most; λ at first, where it is given up, and how it falls and grows; and by
-# how much J must fall for another iteration.
+# Maximum number of iterations; first λ, largest λ (then the iteration ends), and factors by which λ
+# falls and grows; and the decrease of J that is too small for another iteration.
 _MOST_ITERATIONS, _FIRST, _LARGEST, _DOWN, _UP, _NO_GAIN = 50, 1.0, 1e5, 0.2, 4.0, 0.25
 
 
 class _Iterate(NamedTuple):
-    """A path of the diffusion, its J, λ, and whether the iteration has ended."""
+    """State of the iteration.
+
+    - `iteration`: its number.
+    - `path`, `cost`: a path of the diffusion, and its J.
+    - `damping`: λ.
+    - `ended`: whether the iteration has ended.
+    """
 
     iteration: Int[Array, ""]
     path: Float[Array, "points d"]
@@ -48,7 +54,7 @@ class _Iterate(NamedTuple):
 def likely_path(
     problem: RecordProblem, model: Diffusion, path: Float[Array, "points d"]
 ) -> Float[Array, "points d"]:
-    """Return a path near a minimum of J, from one that is finite and inside of the state space."""
+    """Return a path near a minimum of J, from a finite path inside the state space."""
 
     def iterate(last: _Iterate) -> _Iterate:
         new = _damped(problem, model, last.path, last.damping)
@@ -71,7 +77,7 @@ def likely_path(
 def _cost(
     problem: RecordProblem, model: Diffusion, path: Float[Array, "points d"]
 ) -> Float[Array, ""]:
-    """Return J; infinite of a path that leaves the finite numbers or the state space."""
+    """Return J. It is infinite for a path that is not finite or leaves the state space."""
     dynamics_at, N = model.forward_at(problem.like), problem.num_steps
 
     def of_step(x, x_next, step):
@@ -91,7 +97,10 @@ def _cost(
 
 
 def _misfit(scalars: Scalars, x: Float[Array, " d"]) -> Float[Array, ""]:
-    """Return the sum of squared residuals, in variances of the noise, but of exact numbers."""
+    """Return the sum of squared residuals, in variances of the noise.
+
+    Exact observations do not count.
+    """
     noisy = scalars.seen & (scalars.variances > 0)
     squares = (scalars.values - matvec(scalars.rows, x)) ** 2
     return jnp.sum(jnp.where(noisy, squares / jnp.where(noisy, scalars.variances, 1), 0))
@@ -103,35 +112,38 @@ def _damped(
     path: Float[Array, "points d"],
     damping: Float[Array, ""],
 ) -> Float[Array, "points d"]:
-    """Return the path of the next iteration, from that of the last."""
+    """Return the path of the next iteration, from the present one."""
     dynamics_at, steps = model.forward_at(problem.like), problem.record.steps()
     K, N = problem.num_segments, problem.num_steps
-    kept, scale = damping / (1 + damping), 1 / jnp.sqrt(1 + damping)
+    # Mean, relative to u_last, and standard deviation of the noise with the penalty.
+    mean_share, scale = damping / (1 + damping), 1 / jnp.sqrt(1 + damping)
 
     def linear(point, next_point, step):
         dynamics = dynamics_at(step.time)
         return linear_step(problem.density, dynamics, point, next_point, step.dt)
 
-    made = over_points(linear)(path[:-1], path[1:], flat(steps))
-    away = -made.shift  # Λ u of the last path
+    linearised = over_points(linear)(path[:-1], path[1:], flat(steps))
+    away = -linearised.shift  # Λ u, for the noise u of the last path
     segments = lambda leaf: leaf.reshape(K, N, *leaf.shape[1:])
-    damped = LinearisedStep(made.decay, made.shift + kept * away, scale * made.root)
-    first, rest = split_first(jax.vmap(relative)(problem.scalars(model), path[::N]))
-    h = information_filter(jax.tree.map(segments, damped), rest)
+    damped = LinearisedStep(
+        linearised.decay, linearised.shift + mean_share * away, scale * linearised.root
+    )
+    first, later = split_first(jax.vmap(relative)(problem.scalars(model), path[::N]))
+    h = information_filter(jax.tree.map(segments, damped), later)
     initial = initial_law(problem.initial, model, problem.like)
-    mean = initial.mean + kept * (path[0] - initial.mean)
+    mean = initial.mean + mean_share * (path[0] - initial.mean)
     h_first = jax.tree.map(lambda leaf: leaf[0, 0], h)
     start = guided_start(NormalStep(mean, scale * initial.root), first, path[0], h_first)
 
     def one(x, inputs):
         next_point, away, step, next_h, scalars = inputs
         law = target_law(problem.density, dynamics_at, x, step)
-        pushed = NormalStep(law.mean + kept * away - next_point, scale * law.root)
+        pushed = NormalStep(law.mean + mean_share * away - next_point, scale * law.root)
         pushed, _, _ = given(pushed, scalars)
         bent = tilted(pushed, next_h)
         x = next_point + bent.point(bent.pulled(jnp.zeros_like(x)))
         return x, x
 
     x, _ = start.point_and_log_weight(jnp.zeros_like(path[0]))
-    inputs = path[1:], away, flat(steps), flat(following(h)), at_every_step(rest, N)
+    inputs = path[1:], away, flat(steps), flat(following(h)), at_every_step(later, N)
     return jnp.concatenate([x[None], lax.scan(one, x, inputs)[1]])

@@ -23,12 +23,12 @@ from .record import Steps
 from .segments import at_every_step, flat, split_first
 from .tilted_step import NormalStep
 
-# Shares of a step that would leave the state space, of which the first that does not counts.
+# Shares of a step that would leave the state space. The largest share that stays inside is used.
 _SHARES = 2.0 ** -np.arange(12)
 
 
 class LinearisedStep(NamedTuple):
-    """u' = A u + a + Λ ζ, from u = x - ξ to u' = x' - ξ'."""
+    """Linear step u' = A u + a + Λ ζ, from u = x - ξ to u' = x' - ξ'."""
 
     decay: Float[Array, "d d"]
     shift: Float[Array, " d"]
@@ -42,7 +42,7 @@ def linear_step(
     next_point: Float[Array, " d"],
     dt: Float[Array, ""],
 ) -> LinearisedStep:
-    """The step from `point`, linearised there, relative to the two."""
+    """Return the step from `point`, linearised there, relative to both points."""
     law = density.steps_from(dynamics, point).law(dt)
     F = jax.jacfwd(dynamics.drift)(point)
     decay = density.linear_step(F, jnp.zeros_like(F), dt).decay
@@ -52,12 +52,15 @@ def linear_step(
 def filtered(
     mean: Float[Array, " d"], covariance: Float[Array, "d d"], scalars: Scalars
 ) -> tuple[Float[Array, " d"], Float[Array, "d d"]]:
-    """N(mean, covariance) given what is seen: Kalman's update, number by number."""
+    """Return N(mean, covariance) given the scalar observations.
+
+    This is the Kalman update, one scalar after the other.
+    """
     for row, value, variance, _ in zip(*scalars, strict=True):
         along = matvec(covariance, row)
         total = jnp.sum(row * along) + variance
-        some = total > 0
-        gain = jnp.where(some, along / jnp.where(some, total, 1), 0)
+        is_positive = total > 0
+        gain = jnp.where(is_positive, along / jnp.where(is_positive, total, 1), 0)
         mean = mean + gain * (value - jnp.sum(row * mean))
         covariance = covariance - gain[:, None] * along
     return mean, covariance
@@ -71,26 +74,29 @@ def extended_kalman_path(
     scalars: Scalars,
     inside: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
 ) -> Float[Array, "points d"]:
-    """The means of the extended Kalman filter, where these are finite, else the last ones that
-    are. A step that would leave the state space is shortened."""
+    """Return the means of the extended Kalman filter.
+
+    The last finite mean replaces one that is not finite. Steps that would leave the state space are
+    shortened.
+    """
 
     def checked(new, old):
         mean, covariance = _finite(new, old)
         return (mean if inside is None else stay_inside(inside, old[0], mean)), covariance
 
     def step(state, inputs):
-        (mean, covariance), ((dt, time), seen) = state, inputs
+        (mean, covariance), ((dt, time), step_scalars) = state, inputs
         law = linear_step(density, dynamics_at(time), mean, jnp.zeros_like(mean), dt)
         spread = matmul(law.root, law.root.T)
-        moved = matmul(matmul(law.decay, covariance), law.decay.T) + spread
-        before = checked((law.shift, moved), state)
-        return checked(filtered(*before, seen), before), mean
+        predicted = matmul(matmul(law.decay, covariance), law.decay.T) + spread
+        before = checked((law.shift, predicted), state)
+        return checked(filtered(*before, step_scalars), before), mean
 
     mean, root = initial
-    first, rest = split_first(scalars)
+    first, later = split_first(scalars)
     before = mean, matmul(root, root.T)
     state = checked(filtered(*before, first), before)
-    inputs = flat(steps), at_every_step(rest, steps.dt.shape[1])
+    inputs = flat(steps), at_every_step(later, steps.dt.shape[1])
     (last, _), means = lax.scan(step, state, inputs)
     return jnp.concatenate([means, last[None]])
 
@@ -100,9 +106,11 @@ def stay_inside(
     old: Float[Array, " d"],
     new: Float[Array, " d"],
 ) -> Float[Array, " d"]:
-    """Return `new` if it is inside of the state space, else a point on the way to it from `old`,
-    about half as far as the boundary: near a boundary noise may vanish, and with it the linear
-    process."""
+    """Return `new` if it is inside the state space, otherwise a point between `old` and `new`.
+
+    This point is about half as far from `old` as the boundary. Near a boundary the noise, and with
+    it the linear process, may vanish.
+    """
     shares = jnp.asarray(_SHARES, old.dtype)
     are_inside = jax.vmap(lambda share: inside(old + share * (new - old)))(shares)
     share = jnp.where(jnp.any(are_inside), shares[jnp.argmax(are_inside)] / 2, 0)
@@ -110,5 +118,6 @@ def stay_inside(
 
 
 def _finite(new, old):
+    """Return `new` if all its entries are bounded, otherwise `old`."""
     good = jnp.all(jnp.stack([jnp.all(jnp.abs(leaf) < 1e12) for leaf in new]))
     return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)

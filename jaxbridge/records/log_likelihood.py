@@ -128,7 +128,10 @@ class LogLikelihood(AbstractResult):
 
     @property
     def unexplained(self) -> Int[Array, ""]:
-        """Return the index of the first observation that no particle explains; -1 if there is none."""
+        """Return the index of the first observation that no particle explains.
+
+        It is -1 if there is none.
+        """
         lost = self.effective_sample_size == 0
         return jnp.where(jnp.any(lost), jnp.argmax(lost), -1)
 

@@ -369,7 +369,7 @@ def _noise_varies(problem: RecordProblem, path: Float[Array, "K d"]) -> Bool[Arr
         return jnp.asarray(model.sigma_varies(like))
     dynamics = model.forward_at(like)(problem.record.times[0])
 
-    def led_on(x):
+    def spread_by_drift(x):
         columns = columns_of(dynamics.sigma(x), x)
         return jnp.stack([jax.jvp(dynamics.drift, (x,), (column,))[1] for column in columns])
 

@@ -22,19 +22,22 @@ from .observation import Scalars
 from .problem import RecordProblem
 from .segments import split_first
 
-# How many particles there are, and how many of them are within a standard deviation of what is
-# seen, once its noise is taken to be as large as it must be for that.
+# Number of particles, and the number of them within a standard deviation of an observation. The
+# weights use a noise that is large enough for that.
 _NUM_PARTICLES, _NUM_NEAR = 64, 8
 
 
 def tracking_path(
     key: Key[Array, ""], problem: RecordProblem, model: Diffusion
 ) -> Float[Array, "points d"]:
-    """Return the path of a particle of a filter with tempered weights, which has followed all that
-    is seen. It may hold NaN if all particles are lost."""
+    """Return the path of one particle that stays near all observations.
+
+    The particle belongs to a filter with tempered weights. The path may contain NaN if all
+    particles are lost.
+    """
     P, N, (d,), dtype = _NUM_PARTICLES, problem.num_steps, problem.like.shape, problem.like.dtype
     dynamics_at, inside = model.forward_at(problem.like), model.state_space()
-    first, rest = split_first(problem.scalars(model))
+    first, later_scalars = split_first(problem.scalars(model))
     initial = initial_law(problem.initial, model, problem.like)
 
     def log_weights(x, scalars: Scalars):
@@ -67,7 +70,7 @@ def tracking_path(
     starts = over_lanes(-1)(lambda zeta: initial.mean + matvec(initial.root, zeta))(zeta)
     ratio = over_lanes(-1)(lambda x: log_ratio(problem.initial, model, initial, x))(starts)
     parents = _parents(uniform_key, log_weights(starts, first) + nan_to_neg_inf(ratio))
-    inputs = 1 + jnp.arange(problem.num_segments), problem.record.steps(), rest
+    inputs = 1 + jnp.arange(problem.num_segments), problem.record.steps(), later_scalars
     _, (paths, later) = lax.scan(segment, starts[:, parents], inputs)
 
     def back(lane, inputs):
@@ -81,24 +84,26 @@ def tracking_path(
 
 
 def _misfit(scalars: Scalars, x: Float[Array, " d"]) -> Float[Array, ""]:
-    """Return the sum of the squared residuals, in variances of the noise. Exact numbers have that
-    of their rounding."""
+    """Return the sum of squared residuals, in variances of the noise.
+
+    The variance of an exact observation is that of its rounding error.
+    """
     total, eps = jnp.zeros((), x.dtype), jnp.finfo(x.dtype).eps
-    for row, value, variance, seen in zip(*scalars, strict=True):
+    for row, value, variance, present in zip(*scalars, strict=True):
         size = jnp.abs(value) + 1
-        each = (value - dot(row, x)) ** 2 / jnp.maximum(variance, eps * size**2)
-        total += jnp.where(seen, each, 0)
+        square = (value - dot(row, x)) ** 2 / jnp.maximum(variance, eps * size**2)
+        total += jnp.where(present, square, 0)
     return total
 
 
 def _tempered(misfits: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
-    """Return log weights of which several count, whatever the noise."""
+    """Return log weights for which several particles count, for any noise."""
     near = jnp.sort(jnp.where(jnp.isnan(misfits), jnp.inf, misfits))[_NUM_NEAR]
     return -misfits / (2 * jnp.maximum(near, 1))
 
 
 def _parents(key: Key[Array, ""], log_weights: Float[Array, " lanes"]) -> Int[Array, " lanes"]:
-    """Return the lanes that go on, by systematic resampling."""
+    """Return the lanes of the parents, by systematic resampling."""
     P, dtype = len(log_weights), log_weights.dtype
     bounds = jnp.cumsum(normalise_weights(nan_to_neg_inf(log_weights)))
     positions = (jax.random.uniform(key, (), dtype) + jnp.arange(P, dtype=dtype)) / P
