@@ -34,8 +34,8 @@ from .problem import RecordProblem
 from .segments import split_first
 from .tracking import tracking_path
 
-# Bounds of the iteration: number of linearisations, gain of the log weight that ends it, and
-# shortest step.
+# Bounds of the iteration: number of linearisations, gain of the log weight below which it ends,
+# and shortest step.
 _MOST_TURNS, _NO_GAIN, _SHORTEST = 30, 0.5, 2.0**-10
 # Maximum number of searches from paths of particles. They are needed if a residual exceeds the
 # typical maximum of n normal numbers, √(2 log n), by more than `_BEYOND_NOISE`.
@@ -209,7 +209,7 @@ def _is_linear(problem: RecordProblem, model: Diffusion) -> bool:
 
 
 def _best_of_loop(problem: RecordProblem, model: Diffusion, best: Linearised) -> Linearised:
-    """Search from paths of particles until the guide is near the observations, in a compiled loop."""
+    """Search from paths of particles in a compiled loop, until the guide is near the observations."""
 
     def search(state: tuple[Int[Array, ""], Linearised]) -> tuple[Int[Array, ""], Linearised]:
         number, best = state
