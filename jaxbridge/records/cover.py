@@ -99,18 +99,20 @@ def cover(model: Diffusion, normal: NormalStep) -> Cover:
     equal_weights = jnp.zeros(_NUM_KERNELS, dtype)
     if model.has_sampler:
         keys = jax.random.split(keys[0], _NUM_KERNELS)
-        return _fitted(jax.vmap(model.sample_stationary)(keys).astype(dtype), equal_weights, normal)
+        return _fit_mixture(
+            jax.vmap(model.sample_stationary)(keys).astype(dtype), equal_weights, normal
+        )
     positions = (jnp.arange(_NUM_KERNELS, dtype=dtype) + 0.5) / _NUM_KERNELS
     points, log_weights = ladder(model, normal)
-    law = _fitted(points[chosen(log_weights, positions)], equal_weights, normal)
+    law = _fit_mixture(points[chosen(log_weights, positions)], equal_weights, normal)
     for key in keys[1:]:
         points = law.points(positions, jax.random.normal(key, (_NUM_KERNELS, d), dtype))
         log_ratio = jax.vmap(lambda x, law=law: model.log_stationary(x) - law.log_density(x))
-        law = _fitted(points, nan_to_neg_inf(log_ratio(points)), normal)
+        law = _fit_mixture(points, nan_to_neg_inf(log_ratio(points)), normal)
     return law
 
 
-def _fitted(
+def _fit_mixture(
     points: Float[Array, "M d"], log_weights: Float[Array, " M"], normal: NormalStep
 ) -> Cover:
     """Fit the mixture to weighted draws; draws that are not finite are left out."""
@@ -130,6 +132,7 @@ def _fitted(
     near = jnp.cumsum(weights[order], axis=1) < _NEAREST
     reach = jnp.take_along_axis(distance, order, axis=1)
     reach = jnp.take_along_axis(reach, jnp.minimum(jnp.sum(near, axis=1), M - 1)[:, None], axis=1)
+    # The distance in d dimensions grows like √d times the width.
     widths = jnp.maximum(reach[:, 0] / np.sqrt(d), 1e-3)
     wider = jnp.asarray(_WIDER, dtype)
     wide = jnp.concatenate([wider[:, None, None] * root, normal.root[None]])
@@ -139,6 +142,7 @@ def _fitted(
     is_positive = weights > 0
     shares = jnp.where(is_positive, jnp.log(jnp.where(is_positive, weights, 1)), -jnp.inf)
     even = jnp.full(len(means), -np.log(len(means)), dtype)
+    # Half of the mixture are kernels, and half wide laws.
     return Cover(jnp.concatenate([shares, even]) - np.log(2), laws)
 
 

@@ -45,7 +45,7 @@ _FEW_STEPS = 4
 _LOST = 50.0
 
 
-class Choice(NamedTuple):
+class RateChoice(NamedTuple):
     """Best discount rate so far.
 
     - `rate`: the rate.
@@ -73,21 +73,21 @@ def half_will_do(records: Records) -> bool:
     return records.stacked.num_steps > _FEW_STEPS
 
 
-def undecided(dtype) -> Choice:
+def undecided(dtype) -> RateChoice:
     """Return the choice before any pilot run."""
     lowest = jnp.full((), -jnp.inf, dtype)
-    return Choice(jnp.zeros((), dtype), lowest, lowest, jnp.zeros((), bool))
+    return RateChoice(jnp.zeros((), dtype), lowest, lowest, jnp.zeros((), bool))
 
 
 def chosen_of(
-    best: Choice, rate: Float[Array, ""], filtered: Filtered, num_particles: int
-) -> Choice:
+    best: RateChoice, rate: Float[Array, ""], filtered: Filtered, num_particles: int
+) -> RateChoice:
     """Return the better of the best rate so far and `rate`.
 
     `filtered` holds the pilot filters of all records at `rate`.
     """
     score, variance = _score_and_variance(filtered, num_particles)
-    return Choice(
+    return RateChoice(
         jnp.where(score > best.score, rate, best.rate),
         jnp.maximum(score, best.score),
         jnp.where(rate == 0, score, best.of_none),
@@ -95,7 +95,7 @@ def chosen_of(
     )
 
 
-def confirmed(best: Choice, filtered: Filtered, num_particles: int) -> Choice:
+def confirmed(best: RateChoice, filtered: Filtered, num_particles: int) -> RateChoice:
     """Return the choice, with rate zero unless a second set of filters confirms its rate.
 
     It is confirmed if the second score exceeds the score without a discount.
@@ -108,13 +108,13 @@ def _score_and_variance(
     filtered: Filtered, num_particles: int
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return the mean of log p̂ minus two standard errors, and the variance of log p̂."""
-    log_estimate, R = _not_lost(filtered.log_estimate), filtered.log_estimate.shape[1]
+    log_estimate, R = _bound_lost(filtered.log_estimate), filtered.log_estimate.shape[1]
     variance = _variance(log_estimate, filtered, num_particles)
     mean = jnp.sum(jnp.mean(log_estimate, axis=1))
     return nan_to_neg_inf(mean - 2 * jnp.sqrt(variance / R)), variance
 
 
-def _not_lost(log_estimate: Float[Array, "records R"]) -> Float[Array, "records R"]:
+def _bound_lost(log_estimate: Float[Array, "records R"]) -> Float[Array, "records R"]:
     """Bound log p̂ from below, for filters that lost all particles while others did not."""
     best = jnp.max(log_estimate, axis=1, keepdims=True)
     return jnp.maximum(log_estimate, best - _LOST)
@@ -145,7 +145,7 @@ def rate_for_several(
     """
 
     def mean_and_equal(filtered: Filtered):
-        log_estimate = _not_lost(filtered.log_estimate)
+        log_estimate = _bound_lost(filtered.log_estimate)
         variance = _variance(log_estimate, filtered, num_particles)
         return nan_to_neg_inf(jnp.sum(jnp.mean(log_estimate, axis=1))), variance < _ALL_EQUAL
 

@@ -174,6 +174,7 @@ def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     The points have no derivatives. The guide has none by the model. The searches from particles are
     a separate program, which is compiled only if it is needed.
     """
+    # Outside `jit` Python decides whether the second program has to be compiled at all.
     if not is_outermost():
         return _in_program(problem, model)
     best = _from_filter(problem, model)
@@ -209,7 +210,7 @@ def _is_linear(problem: RecordProblem, model: Diffusion) -> bool:
 
 
 def _best_of_loop(problem: RecordProblem, model: Diffusion, best: Linearised) -> Linearised:
-    """Search from paths of particles in a compiled loop, until the guide is near the observations."""
+    """Search from paths of particles until a guide is near the observations, in a compiled loop."""
 
     def search(state: tuple[Int[Array, ""], Linearised]) -> tuple[Int[Array, ""], Linearised]:
         number, best = state
@@ -221,7 +222,7 @@ def _best_of_loop(problem: RecordProblem, model: Diffusion, best: Linearised) ->
     return lax.while_loop(goes_on, search, (jnp.int32(0), best))[1]
 
 
-class _Start(NamedTuple):
+class _SearchStart(NamedTuple):
     """Start of a search.
 
     - `points`: points of the first linearisation.
@@ -244,7 +245,7 @@ def _from_particles(problem: RecordProblem, model: Diffusion, number: Int[Array,
     return _search(problem, model, _particle_start(problem, model, number))
 
 
-def _filter_start(problem: RecordProblem, model: Diffusion) -> _Start:
+def _filter_start(problem: RecordProblem, model: Diffusion) -> _SearchStart:
     """Return the path of the extended Kalman filter, from a likely point where ν is not normal."""
     initial, scalars = initial_law(problem.initial, model, problem.like), problem.scalars(model)
     begin = likeliest(problem.initial, model, initial, split_first(scalars)[0])
@@ -256,17 +257,19 @@ def _filter_start(problem: RecordProblem, model: Diffusion) -> _Start:
         scalars,
         model.state_space(),
     )
-    return _Start(points, begin)
+    return _SearchStart(points, begin)
 
 
-def _particle_start(problem: RecordProblem, model: Diffusion, number: Int[Array, ""]) -> _Start:
+def _particle_start(
+    problem: RecordProblem, model: Diffusion, number: Int[Array, ""]
+) -> _SearchStart:
     """Return a likely path near that of a particle which stays near the observations."""
     key = jax.random.fold_in(key_for("tracking", jax.random.key(0)), number)
     points = likely_path(problem, model, tracking_path(key, problem, model))
-    return _Start(points, points[0])
+    return _SearchStart(points, points[0])
 
 
-class _Search(NamedTuple):
+class _SearchState(NamedTuple):
     """State of the damped Gauss–Newton iteration.
 
     - `turn`: number of the iteration.
@@ -286,7 +289,7 @@ class _Search(NamedTuple):
     over: Bool[Array, ""]
 
 
-def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> Linearised:
+def _search(problem: RecordProblem, model: Diffusion, start: _SearchStart) -> Linearised:
     """Search from these points: linearise along the guided path without noise, and repeat.
 
     The criterion is the log weight of the path without noise. If it is large, weights fall with the
@@ -306,8 +309,9 @@ def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> Linearis
         path = jnp.where(jnp.all(jnp.isfinite(path)), path, points)
         return (points, guide), _check_of(guide, log_weight), path
 
-    def turn(search: _Search) -> _Search:
+    def turn(search: _SearchState) -> _SearchState:
         new = at(search.points)
+        # In the first iteration there is no earlier guide to compare with.
         gain = jnp.where(search.turn == 0, jnp.inf, new[1].rank - search.check.rank)
         better = (gain > _NO_GAIN) | (search.check.rank == -jnp.inf)
         old = search.best, search.check, search.path
@@ -315,16 +319,16 @@ def _search(problem: RecordProblem, model: Diffusion, start: _Start) -> Linearis
         settled = jnp.abs(gain) < _NO_GAIN
         length = jnp.where(better, jnp.minimum(2 * search.length, 1), search.length / 2)
         points = best[0] + length * (path - best[0])
-        points = jnp.where(length == 1, path, points)
+        points = jnp.where(length == 1, path, points)  # without rounding errors
         if inside is not None:
             points = jax.vmap(functools.partial(stay_inside, inside))(best[0], points)
         over = settled | (length < _SHORTEST)
-        return _Search(search.turn + 1, points, best, check, path, length, over)
+        return _SearchState(search.turn + 1, points, best, check, path, length, over)
 
     shapes = jax.eval_shape(at, points)[:2]
     best, check = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
     one = jnp.ones((), points.dtype)
-    init = _Search(jnp.int32(0), points, best, check, points, one, jnp.zeros((), bool))
+    init = _SearchState(jnp.int32(0), points, best, check, points, one, jnp.zeros((), bool))
     goes_on = lambda search: ~search.over & (search.turn < _MOST_TURNS)
     final = lax.while_loop(goes_on, turn, init)
     return Linearised(*final.best, final.check)

@@ -75,19 +75,21 @@ def guided(
         return linear_step(problem.density, dynamics, point, next_point, step.dt)
 
     steps = jax.vmap(over_points(linear))(here, next_here, record)
+    # Observations are at the ends of segments, which are N points apart.
     scalars = jax.vmap(relative)(problem.scalars(model), points[::N])
     first, later = split_first(scalars)
-    return _with_h(initial, steps, first, later, (here, next_here, record), rate)
+    return _guidance(initial, steps, first, later, (here, next_here, record), rate)
 
 
 def forgetful(guide: Guidance, rate: Float[Array, ""]) -> Guidance:
     """Return the same guide with this discount rate (`forgetting`)."""
+    # The linear process does not depend on the rate, so only h is computed again.
     steps = guide.steps
     path = steps.point, steps.next_point, steps.step
-    return _with_h(guide.initial, guide.linear, guide.first, guide.scalars, path, rate)
+    return _guidance(guide.initial, guide.linear, guide.first, guide.scalars, path, rate)
 
 
-def _with_h(
+def _guidance(
     initial: NormalStep,
     linear: LinearisedStep,
     first: Scalars,
@@ -127,7 +129,7 @@ def path_and_log_weight(
     return path, log_weight + corrections(problem, model, guide, path)
 
 
-def _of_each_step(of_step: Callable, *steps: PyTree) -> PyTree:
+def _map_steps(of_step: Callable, *steps: PyTree) -> PyTree:
     """Evaluate `of_step` for all steps in lanes. Steps are the first axis of all arrays."""
     last = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), steps)
     results = over_lanes(*[-1] * len(steps))(of_step)(*last)
@@ -161,7 +163,7 @@ def noise_and_log_weight(
         return step_law.noise_and_log_weight(x_next, law.solve, hidden)
 
     steps = path[:-1], path[1:], flat(guide.steps), scalars, hidden[1:]
-    zeta, log_weights = _of_each_step(of_step, *steps)
+    zeta, log_weights = _map_steps(of_step, *steps)
     noise = jnp.concatenate([jnp.where(still, fresh, first)[None], zeta])
     log_weight = log_start + sum_of_many(log_weights)
     return noise, log_weight + corrections(problem, model, guide, path)

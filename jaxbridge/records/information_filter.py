@@ -44,7 +44,7 @@ class _Mean(NamedTuple):
 
 def back(h: Information, step: LinearisedStep, scalars: Scalars) -> Information:
     """Return h_i, from h_{i+1} and the scalar observations at the end of the step."""
-    (E, f, root), of_scalars = _seen(step, scalars)
+    (E, f, root), of_scalars = _condition(step, scalars)
     factor, half = tilt_factor(root, h)
     W = jnp.stack([solve_lower(factor, row) for row in half])  # Wᵀ
     w = solve_lower(factor, matvec(root.T, h.shift))
@@ -56,7 +56,7 @@ def back(h: Information, step: LinearisedStep, scalars: Scalars) -> Information:
     return Information(shift, (precision + precision.T) / 2)
 
 
-def _seen(step: LinearisedStep, scalars: Scalars) -> tuple[_Mean, Information]:
+def _condition(step: LinearisedStep, scalars: Scalars) -> tuple[_Mean, Information]:
     """Condition a step on the scalar observations at its end.
 
     **Returns:** the conditional mean and root, and the log density of the observations as a
@@ -67,6 +67,7 @@ def _seen(step: LinearisedStep, scalars: Scalars) -> tuple[_Mean, Information]:
     for row, value, variance, is_seen in zip(*scalars, strict=True):
         factors = seen_of(root, row, variance)
         slope, residual = matvec(E.T, row), value - dot(row, f)
+        # A missing scalar has row 0 and thus gain 0, so only the weight needs a mask.
         weight = jnp.where(is_seen, 1 / factors.variance, 0)
         shift += slope * residual * weight
         precision += slope[:, None] * slope * weight
@@ -76,7 +77,7 @@ def _seen(step: LinearisedStep, scalars: Scalars) -> tuple[_Mean, Information]:
     return _Mean(E, f, root), Information(shift, precision)
 
 
-def _remembered(h: Information, power: Float[Array, ""] | None) -> Information:
+def _power_of(h: Information, power: Float[Array, ""] | None) -> Information:
     """Return h to the given power; h itself if `power` is `None`."""
     return h if power is None else Information(power * h.shift, power * h.precision)
 
@@ -84,8 +85,8 @@ def _remembered(h: Information, power: Float[Array, ""] | None) -> Information:
 def _tilted_mean(h: Information, inputs: tuple[LinearisedStep, Scalars, Array | None]):
     """Return Γ, m and the power of h_{i+1} in the step."""
     step, scalars, power = inputs
-    (E, f, root), _ = _seen(step, scalars)
-    h = _remembered(h, power)
+    (E, f, root), _ = _condition(step, scalars)
+    h = _power_of(h, power)
     factor, half = tilt_factor(root, h)
 
     def pulled(v):
@@ -97,10 +98,10 @@ def _tilted_mean(h: Information, inputs: tuple[LinearisedStep, Scalars, Array | 
     return E - matmul(gain.T, E), m, power
 
 
-def _through_mean(mean: tuple[Array, Array, Array | None], h_dot: Information) -> Information:
+def _change_of_h(mean: tuple[Array, Array, Array | None], h_dot: Information) -> Information:
     """Return the change of h_i for a change of h_{i+1}."""
     slope, shift, power = mean
-    h_dot = _remembered(h_dot, power)
+    h_dot = _power_of(h_dot, power)
     r = matvec(slope.T, h_dot.shift - matvec(h_dot.precision, shift))
     return Information(r, matmul(slope.T, matmul(h_dot.precision, slope)))
 
@@ -122,16 +123,17 @@ def information_filter(
     - `power`: power of h_{i+1} that enters each step, by default 1.
     """
     K, N = steps.shift.shape[:2]
+    # h = 1 after the last observation; the recursion runs backwards in time.
     last = Information(jnp.zeros_like(steps.shift[0, 0]), jnp.zeros_like(steps.decay[0, 0]))
     by_step = flat(steps), at_every_step(scalars, N), None if power is None else power.ravel()
     inputs = jax.tree.map(lambda leaf: leaf[::-1], by_step)
 
     def one(h, inputs):
         step, scalars, power = inputs
-        return back(_remembered(h, power), step, scalars), None
+        return back(_power_of(h, power), step, scalars), None
 
     if over_lanes is None:
-        h, _ = recursion(one, last, inputs, StateDerivative(_tilted_mean, _through_mean))
+        h, _ = recursion(one, last, inputs, StateDerivative(_tilted_mean, _change_of_h))
     else:
         of_lanes = over_lanes(lambda h, inputs: one(h, inputs)[0])
         h = lax.scan(lambda h, inputs: 2 * (of_lanes(h, inputs),), last, inputs)[1]

@@ -105,7 +105,7 @@ def log_normal(law: NormalStep, x: Float[Array, " d"]) -> Float[Array, ""]:
     return -dot(white, white) / 2 - log_scale
 
 
-class _OfParams(eqx.Module):
+class _LawOfParams(eqx.Module):
     """Function of `params` that returns the law, as a pytree."""
 
     function: Callable[[PyTree], Any] = eqx.field(static=True)
@@ -127,7 +127,7 @@ def as_initial(initial: Initial) -> Initial:
     if not is_function:
         return initial
     check_function("initial", initial, "(params)")
-    return _OfParams(initial)
+    return _LawOfParams(initial)
 
 
 def bound(initial: Initial, model: Diffusion) -> Initial:
@@ -162,7 +162,7 @@ def is_normal(model: Diffusion, like: Float[Array, " d"]) -> bool:
 def _stationary(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     """Return ν if it is normal, otherwise the normal law with its mean and covariance."""
     model = model.prepared()
-    mode = _at_mode(model, like)
+    mode = _law_at_mode(model, like)
     if is_normal(model, like):
         return mode
     points, log_weights = ladder(model, mode)
@@ -173,6 +173,7 @@ def _stationary(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     lack = 1 / (1 + effective_size(weights) / _ENOUGH) ** 2
     covariance = centred.T @ (weights[:, None] * centred) + lack * matmul(mode.root, mode.root.T)
     root = cholesky(covariance)
+    # If the moments are not finite, the law at the mode is used.
     usable = jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(root))
     return jax.tree.map(lambda a, b: jnp.where(usable, a, b), NormalStep(mean, root), mode)
 
@@ -212,7 +213,7 @@ def likeliest(
     return jnp.where(any_positive, points[best], normal.mean)
 
 
-def _at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
+def _law_at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     """Return the normal law at the mode of ν, with the curvature of log ν there."""
     log_nu = model.log_stationary
     eye = jnp.eye(like.shape[0], dtype=like.dtype)

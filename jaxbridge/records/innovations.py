@@ -128,6 +128,7 @@ def _path_and_log_weight(problem: RecordProblem, points, params: PyTree, xi):
     model = problem.model.with_params(params)
     guide = guided(problem, model, points)
     path, log_weight = path_and_log_weight(problem, model, guide, xi.reshape(points.shape))
+    # A path that diverged or left the state space has a weight that is not finite.
     return path, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
 
 

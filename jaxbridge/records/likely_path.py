@@ -57,12 +57,13 @@ def likely_path(
     """Return a path near a minimum of J, from a finite path inside the state space."""
 
     def iterate(last: _Iterate) -> _Iterate:
-        new = _damped(problem, model, last.path, last.damping)
+        new = _next_path(problem, model, last.path, last.damping)
         cost = _cost(problem, model, new)
         gain = last.cost - cost
         better = gain > 0
         small = last.damping * _DOWN
         damping = jnp.where(better, small, last.damping * _UP)
+        # A small gain shows convergence only if λ is small; otherwise the step is short.
         ended = jnp.where(better, (gain < _NO_GAIN) & (last.damping < 0.1), damping > _LARGEST)
         path, cost = (jnp.where(better, a, b) for a, b in ((new, last.path), (cost, last.cost)))
         return _Iterate(last.iteration + 1, path, cost, damping, ended)
@@ -106,7 +107,7 @@ def _misfit(scalars: Scalars, x: Float[Array, " d"]) -> Float[Array, ""]:
     return jnp.sum(jnp.where(noisy, squares / jnp.where(noisy, scalars.variances, 1), 0))
 
 
-def _damped(
+def _next_path(
     problem: RecordProblem,
     model: Diffusion,
     path: Float[Array, "points d"],
@@ -141,6 +142,7 @@ def _damped(
         pushed = NormalStep(law.mean + mean_share * away - next_point, scale * law.root)
         pushed, _, _ = given(pushed, scalars)
         bent = tilted(pushed, next_h)
+        # The step with noise zero is the most likely one.
         x = next_point + bent.point(bent.pulled(jnp.zeros_like(x)))
         return x, x
 

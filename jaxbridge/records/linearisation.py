@@ -59,7 +59,7 @@ def filtered(
     for row, value, variance, _ in zip(*scalars, strict=True):
         along = matvec(covariance, row)
         total = jnp.sum(row * along) + variance
-        is_positive = total > 0
+        is_positive = total > 0  # otherwise the scalar is known in advance
         gain = jnp.where(is_positive, along / jnp.where(is_positive, total, 1), 0)
         mean = mean + gain * (value - jnp.sum(row * mean))
         covariance = covariance - gain[:, None] * along
@@ -113,11 +113,13 @@ def stay_inside(
     """
     shares = jnp.asarray(_SHARES, old.dtype)
     are_inside = jax.vmap(lambda share: inside(old + share * (new - old)))(shares)
+    # Shares decrease, so the first one inside is the largest.
     share = jnp.where(jnp.any(are_inside), shares[jnp.argmax(are_inside)] / 2, 0)
     return jnp.where(inside(new), new, old + share * (new - old))
 
 
 def _finite(new, old):
     """Return `new` if all its entries are bounded, otherwise `old`."""
+    # The bound is far below overflow, so that products of a few entries stay finite.
     good = jnp.all(jnp.stack([jnp.all(jnp.abs(leaf) < 1e12) for leaf in new]))
     return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)

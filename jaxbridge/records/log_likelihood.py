@@ -254,7 +254,9 @@ def log_likelihood(
                 "of `transition_log_density`: leave out `initial`, `initial_time`, `density` and "
                 "`num_filters`."
             )
-        result = _exact(key, model, times, observations, num_particles, num_steps, step_size)
+        result = _exact_log_likelihood(
+            key, model, times, observations, num_particles, num_steps, step_size
+        )
         return throw_where_untrustworthy(result, "value", model) if throw else result
     num_filters = check_count("num_filters", 8 if num_filters is None else num_filters)
     arguments = (model, times, observations, observation, initial)
@@ -263,15 +265,15 @@ def log_likelihood(
     size = num_filters, num_particles
     levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
     grids = [records, *map(records.coarsened, levels)]
-    guides, checks = zip(*map(_guides, grids), strict=True)
-    filtered, rate = _filtered(key, grids, list(guides), *size)
-    result = _told(records, filtered, rate, num_filters * num_particles)
+    guides, checks = zip(*map(_guides_and_checks, grids), strict=True)
+    filtered, rate = _run_stages(key, grids, list(guides), *size)
+    result = _combine_filters(records, filtered, rate, num_filters * num_particles)
     result = dataclasses.replace(result, guide=checks[0])
     return throw_where_untrustworthy(result, "value", model) if throw else result
 
 
 @compiled_sooner
-def _told(
+def _combine_filters(
     records: Records, grids: Filtered, rate: Float[Array, ""], num_weights: int
 ) -> LogLikelihood:
     """Combine the filters of all records on the grid and on coarser grids into a result."""
@@ -309,6 +311,7 @@ def _mean_of_filters(
         return jnp.sum(log_mean), jnp.sqrt(jnp.sum(error**2))
     finite = jnp.isfinite(log_estimates)
     number = jnp.maximum(jnp.sum(finite, axis=1, keepdims=True).astype(error.dtype), 2)
+    # Filters that lost all particles do not count for the spread.
     centre = jnp.sum(jnp.where(finite, log_estimates, 0), axis=1, keepdims=True) / number
     squares = jnp.where(finite, log_estimates - centre, 0) ** 2
     spread = jnp.sum(squares / (number - 1), axis=1)
@@ -323,12 +326,12 @@ def _mean_of_filters(
     return jnp.sum(log_mean), widening * jnp.sqrt(jnp.sum(variance))
 
 
-def _guides(records: Records) -> tuple[Guidance, GuideCheck]:
+def _guides_and_checks(records: Records) -> tuple[Guidance, GuideCheck]:
     """Return the guide of each record and its check, at the parameters of the model."""
     return records.each(lambda problem: linearised(problem, problem.model)[1:])
 
 
-def _exact(
+def _exact_log_likelihood(
     key: Key[Array, ""],
     model: Diffusion,
     times: Numbers,
@@ -384,11 +387,11 @@ def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Arr
 
 
 # Kinds of stages, in this order: a pilot run per rate, a confirmation of the best, and final runs.
-_PILOT, _ANOTHER_LOOK, _RUN = range(3)
+_PILOT, _CONFIRMATION, _RUN = range(3)
 
 
 @compiled_sooner
-def _filtered(
+def _run_stages(
     key: Key[Array, ""], grids: list[Records], guides: list[Guidance], R: int, P: int
 ) -> tuple[Filtered, Float[Array, ""]]:
     """Run filters of all records on each grid, with the chosen discount rate.
@@ -427,10 +430,12 @@ def _filtered(
             shapes = jax.eval_shape(make, best)[1]
             return best, jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
-        is_needless = (kind == _PILOT) & best.settled | (kind == _ANOTHER_LOOK) & (best.rate == 0)
+        # Equal weights need no other rate, and rate zero needs no confirmation.
+        is_needless = (kind == _PILOT) & best.settled | (kind == _CONFIRMATION) & (best.rate == 0)
         return lax.cond(is_needless, left_out, make, best)
 
-    kinds = np.array([*len(rates) * [_PILOT], _ANOTHER_LOOK, *len(grids) * [_RUN]])
+    kinds = np.array([*len(rates) * [_PILOT], _CONFIRMATION, *len(grids) * [_RUN]])
+    # Pilot runs use the grid with half as many steps, if that is enough.
     on_grid = np.where(kinds == _RUN, 0, int(half_will_do(grids[0])))
     on_grid[kinds == _RUN] = np.arange(len(grids))
     rates = jnp.pad(rates, (0, len(kinds) - len(rates)))

@@ -233,6 +233,7 @@ class ObservationDensity(eqx.Module):
         """Return log g(y | x) minus the log density of the guess."""
         y, time = row
         present = jnp.any(jnp.isfinite(y))
+        # The user's function receives no empty row, because NaN would spoil its derivatives.
         y_filled = jnp.where(present, y, jnp.zeros_like(y))
         arguments = (y_filled, x, params)
         if takes_time(self._log_density, 3):
@@ -273,12 +274,14 @@ def _independent(
     remainder = [[R[i, j] for j in range(m)] for i in range(m)]
     variances, possible = [], jnp.ones((), bool)
     for k in range(m):
+        # A pivot within rounding errors of zero belongs to an exact component.
         pivot = jnp.where(jnp.abs(remainder[k][k]) <= eps * jnp.abs(R[k, k]), 0, remainder[k][k])
         is_positive = pivot > 0
         possible &= pivot >= 0
         variances.append(jnp.where(correlated.seen[k], jnp.maximum(pivot, 0), 1))
         for i in range(k + 1, m):
             least = eps * jnp.sqrt(jnp.abs(R[k, k] * R[i, i]))
+            # A component without variance must have zero covariances.
             possible &= is_positive | (jnp.abs(remainder[i][k]) <= least)
             factor = jnp.where(is_positive, remainder[i][k] / jnp.where(is_positive, pivot, 1), 0)
             for changed, size in zip((rows, values), sizes, strict=True):
@@ -309,6 +312,7 @@ def _follows(
         new = length > eps * row_size
         follows.append(exact & ~new)
         agrees.append(~follows[-1] | (jnp.abs(value) <= eps * size))
+        # Only exact scalars that do not follow from others give new directions.
         scale = jnp.where(exact & new, 1 / jnp.where(new, length, 1), 0)
         directions.append((row * scale, value * scale))
     return jnp.stack(follows), jnp.stack(agrees)

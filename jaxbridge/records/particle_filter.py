@@ -101,7 +101,7 @@ def run_filters(
     corrected = over_lanes(None, -1)(correction(problem, model))
     most = 0.01 / jnp.finfo(dtype).eps
 
-    def weighed(state: _Particles, key, change) -> tuple[_Particles, _Weights]:
+    def reweigh(state: _Particles, key, change) -> tuple[_Particles, _Weights]:
         """Update the weights by `change`, and resample the filters that need it."""
         change = change.reshape(R, P)
         log_weight = state.log_weight + change
@@ -116,7 +116,7 @@ def run_filters(
         resample = lambda: _resampled(key, state, poor)
         return lax.cond(jnp.any(poor), resample, lambda: state), _Weights(size, relative)
 
-    def moved(x, zeta, step, scalars):
+    def step_particles(x, zeta, step, scalars):
         def of_particle(x, zeta):
             law = guided_step(problem.density, dynamics_at, x, step, scalars)
             return law.point_and_log_weight(zeta)
@@ -129,13 +129,14 @@ def run_filters(
     def one(state, inputs):
         zeta, step, moves = inputs
 
-        def taken(x, log_weight):
-            x, change = moved(x, zeta, step, None)
+        def take_step(x, log_weight):
+            x, change = step_particles(x, zeta, step, None)
             return x, log_weight + change
 
         if moves is None:
-            return taken(*state), None
-        return lax.cond(moves, taken, lambda *state: state, *state), None
+            return take_step(*state), None
+        # Steps of length zero in all records take no time.
+        return lax.cond(moves, take_step, lambda *state: state, *state), None
 
     def segment(state: _Particles, inputs):
         number, steps, scalars, row = inputs
@@ -144,16 +145,17 @@ def run_filters(
         before, (zeta, last, _) = split_last((noise, steps, moving))
         here, first = state.x, jax.tree.map(lambda leaf: leaf[0], steps)
         (x, change), _ = lax.scan(one, (here, jnp.zeros(R * P, dtype)), before)
-        x, final = moved(x, zeta, last, scalars)
+        x, final = step_particles(x, zeta, last, scalars)
+        # h cancels between the steps of a segment, so only its two ends count.
         tilt = log_h(last.next_h, last.next_point, x) - log_h(first.h, first.point, here)
         change = change + final + tilt + corrected(row, x)
-        return weighed(state._replace(x=x), resampling_key, change)
+        return reweigh(state._replace(x=x), resampling_key, change)
 
     start_key, resampling_key = jax.random.split(jax.random.fold_in(key, 0))
     x, change = _starts(start_key, problem, model, guide, R, P)
     alike, zero = jnp.zeros((R, P), dtype), jnp.zeros(R, dtype)
     state = _Particles(x, alike, zero, jnp.zeros(R, jnp.int32))
-    state, first = weighed(state, resampling_key, change + corrected(first_row, x))
+    state, first = reweigh(state, resampling_key, change + corrected(first_row, x))
     inputs = (1 + jnp.arange(problem.num_segments), guide.steps, guide.scalars, rows)
     state, later = lax.scan(segment, state, inputs)
     log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
@@ -195,6 +197,7 @@ def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) 
     dtype = state.log_weight.dtype
     weights = normalise_weights(state.log_weight)
     uniform = jax.random.uniform(key, (R, 1), dtype)
+    # Systematic resampling: one uniform number per filter.
     positions = (uniform + jnp.arange(P, dtype=dtype)) / P
     bounds = jnp.cumsum(weights, axis=1)
     bounds = bounds / jnp.maximum(bounds[:, -1:], jnp.finfo(dtype).tiny)

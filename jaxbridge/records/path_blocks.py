@@ -111,6 +111,7 @@ def cuts(num_segments: int, length: int) -> Int[np.ndarray, "2 J B"]:
         number = np.arange(num_blocks * length) - offset
         return np.clip(number, -1, num_segments).reshape(num_blocks, length).T
 
+    # Ends of blocks in one partition are inside blocks in the other, so all points move.
     return np.stack([cut(0), cut(length // 2)])
 
 
@@ -161,10 +162,10 @@ def blocks_of(
     all_scalars = jax.tree.map(
         lambda first, tail: jnp.concatenate([first[None], tail]), guide.first, guide.scalars
     )
-    all_scalars = _filled(all_scalars, d)
-    missing = _nothing_like(jax.tree.map(lambda leaf: leaf[0], all_scalars))
+    all_scalars = _pad_rows(all_scalars, d)
+    missing = _missing_like(jax.tree.map(lambda leaf: leaf[0], all_scalars))
 
-    def seen(place: np.ndarray, absent: np.ndarray) -> Scalars:
+    def scalars_at(place: np.ndarray, absent: np.ndarray) -> Scalars:
         """Return the scalars at these ends of segments, missing ones where `absent`."""
 
         def of(all_, none):
@@ -183,14 +184,14 @@ def blocks_of(
     # Whether the segment itself or a later one belongs to the record.
     after = jnp.cumsum(has_length(problem)[::-1])[::-1] > 0
     goes_on = jnp.append(after[1:], False)[inside[-1]]
-    scalars = lanes_last(seen(at_end, outside), 1)
+    scalars = lanes_last(scalars_at(at_end, outside), 1)
     along = lanes_last(here, 2), lanes_last(next_here, 2), lengths
     return Blocks(
         jnp.asarray(segment),
         _guides_to_ends(lanes_last(steps, 2), scalars, goes_on, *along),
         scalars,
         lanes_last(rows, 1),
-        lanes_last(seen(np.zeros(len(is_first), int), ~is_first), 0),
+        lanes_last(scalars_at(np.zeros(len(is_first), int), ~is_first), 0),
         first_row,
         jnp.where(is_first, guide.initial.root[..., None], 0),
         guide.initial.mean,
@@ -198,7 +199,7 @@ def blocks_of(
     )
 
 
-def _nothing_like(scalars: Scalars) -> Scalars:
+def _missing_like(scalars: Scalars) -> Scalars:
     """Return scalars of the same shape, all missing."""
     return Scalars(
         jnp.zeros_like(scalars.rows),
@@ -208,7 +209,7 @@ def _nothing_like(scalars: Scalars) -> Scalars:
     )
 
 
-def _filled(scalars: Scalars, num: int) -> Scalars:
+def _pad_rows(scalars: Scalars, num: int) -> Scalars:
     """Return the scalars with at least `num` rows; additional rows are missing."""
     lacking = max(num - scalars.values.shape[1], 0)
     pad = lambda leaf, value: jnp.pad(
@@ -236,7 +237,7 @@ class _Lanes(NamedTuple):
     beta: Float[Array, " lanes"]
 
 
-class _State(NamedTuple):
+class _PathPair(NamedTuple):
     """Points of the old and the new path of each lane, and log weights of the paths up to there."""
 
     old: Float[Array, "d lanes"]
@@ -253,7 +254,7 @@ def move(
     scale: Float[Array, " B"],
     paths: Paths,
 ) -> tuple[Paths, Bool[Array, "B C"]]:
-    """Propose new paths of all blocks with β = `scale`.
+    """Move the paths of all blocks, with β = `scale`.
 
     **Returns:** the paths, and which blocks accepted their proposals.
     """
@@ -268,6 +269,7 @@ def move(
     (J, B), (K, N), (d, C) = blocks.segment.shape, problem.record.dt.shape, paths.start.shape
     points = jnp.where(accepted, new, lanes.old).reshape(J, N, d, B, C)
     points = jnp.moveaxis(points, 3, 0).reshape(B * J, N, d, C)
+    # The first segment of the record, after those before it in the first block.
     begin = jnp.argmax(blocks.segment.T.ravel() == 0)
     start = jnp.where(accepted, first.new, lanes.start).reshape(d, B, C)[:, 0]
     return Paths(start, lax.dynamic_slice_in_dim(points, begin, K)), accepted.reshape(B, C)
@@ -289,7 +291,7 @@ def _lanes_of(blocks: Blocks, scale: Float[Array, " B"], paths: Paths) -> _Lanes
     old = joined(jnp.moveaxis(padded[blocks.segment + 1], 1, -2))  # (J, N, d, B C)
     start = joined(jnp.moveaxis(padded[jnp.maximum(blocks.segment[0], 0), -1], 0, -2))
     end = old[-1, -1] - spread(blocks.guides.guide.next_point[-1, -1])
-    scalars = _pinned(spread(blocks.scalars), spread(blocks.goes_on), end)
+    scalars = _pin_ends(spread(blocks.scalars), spread(blocks.goes_on), end)
     is_first = spread(jnp.asarray(np.arange(B) == 0))
     size = spread((jnp.sqrt(1 - scale**2), scale))
     return _Lanes(start, old, end, scalars, is_first, *size)
@@ -316,7 +318,7 @@ def _guides_to_ends(
     linear = linear._replace(shift=linear.shift * is_zero_end)
     scalars = scalars._replace(values=scalars.values * is_zero_end)
     ends = jnp.tile(jnp.eye(d, d + 1, 1, dtype=points.dtype), (1, B))
-    h = information_filter(linear, _pinned(scalars, for_ends(goes_on), ends), _in_lanes)
+    h = information_filter(linear, _pin_ends(scalars, for_ends(goes_on), ends), _in_lanes)
     by_end = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], B, d + 1), h)
     zero = jax.tree.map(lambda leaf: leaf[..., 0], by_end)
     turn = jnp.moveaxis(by_end.shift[..., 1:], -1, 2)
@@ -324,7 +326,7 @@ def _guides_to_ends(
     return GuidesToEnds(guide, turn, following(turn))
 
 
-def _pinned(
+def _pin_ends(
     scalars: Scalars, goes_on: Bool[Array, " lanes"], end: Float[Array, "d lanes"]
 ) -> Scalars:
     """Return the scalars with the end of each block as an exact observation.
@@ -332,13 +334,13 @@ def _pinned(
     If the record ends in a block, the last observation of this block stays.
     """
     last = jax.tree.map(lambda leaf: leaf[-1], scalars)
-    exact = _seen_exactly(end, last, goes_on)
+    exact = _exact_in_lanes(end, last, goes_on)
     return jax.tree.map(lambda leaf, pin: leaf.at[-1].set(pin), scalars, exact)
 
 
 def _new_starts(
     key: Key[Array, ""], problem: RecordProblem, model: Diffusion, blocks: Blocks, lanes: _Lanes
-) -> _State:
+) -> _PathPair:
     """Sample the beginnings of the new paths: new points only at the beginning of the record."""
     spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
     hidden = _no_noise(blocks)
@@ -348,10 +350,11 @@ def _new_starts(
         law = guided_start(NormalStep(mean, root), first, guide.point, guide.h)
         solve = functools.partial(solve_root, root)
         zeta, log_old = law.noise_and_log_weight(x, solve, hidden)
-        new, log_new = law.point_and_log_weight(_turned(zeta, eta, rho, beta))
+        new, log_new = law.point_and_log_weight(_new_noise(zeta, eta, rho, beta))
         return new, log_old, log_new
 
     initial = NormalStep(blocks.mean, blocks.root[..., 0])
+    # Other blocks begin at a fixed point: the mean is this point, and the root is zero.
     means = jnp.where(lanes.is_first, initial.mean[:, None], lanes.start)
     step = spread(jax.tree.map(lambda leaf: leaf[0, 0], blocks.guides))
     eta = jax.random.normal(key, lanes.start.shape, lanes.start.dtype)
@@ -367,7 +370,7 @@ def _new_starts(
         return log_start + corrected(blocks.first_row, x) + ratio
 
     log_weights = log_weight(lanes.start, log_old), log_weight(new, log_new)
-    return _State(lanes.start, new, *log_weights)
+    return _PathPair(lanes.start, new, *log_weights)
 
 
 def _new_points(
@@ -376,8 +379,8 @@ def _new_points(
     model: Diffusion,
     blocks: Blocks,
     lanes: _Lanes,
-    first: _State,
-) -> tuple[_State, Float[Array, "J N d lanes"]]:
+    first: _PathPair,
+) -> tuple[_PathPair, Float[Array, "J N d lanes"]]:
     """Sample the points of the new paths; compute the log weights of the old and new paths."""
     spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
     density, dynamics_at = problem.density, model.forward_at(problem.like)
@@ -390,15 +393,15 @@ def _new_points(
         zeta, log_old = here.noise_and_log_weight(old_next, law.solve, hidden)
         law = target_law(density, dynamics_at, new, guide.step)
         there = guided_law(law, guide, scalars)
-        new, log_new = there.point_and_log_weight(_turned(zeta, eta, rho, beta))
+        new, log_new = there.point_and_log_weight(_new_noise(zeta, eta, rho, beta))
         return new, log_old, log_new
 
-    def advance(state: _State, old_next, eta, step, scalars) -> _State:
+    def advance(state: _PathPair, old_next, eta, step, scalars) -> _PathPair:
         axes = (*6 * [-1], None if scalars is None else -1, -1, -1)
         # Guides and rows are spread over the chains step by step, to save memory.
         each = (state.old, state.new, old_next, eta, spread(step), lanes.end, scalars)
         new, log_old, log_new = over_lanes(*axes)(step_of)(*each, lanes.rho, lanes.beta)
-        return _State(old_next, new, state.log_old + log_old, state.log_new + log_new)
+        return _PathPair(old_next, new, state.log_old + log_old, state.log_new + log_new)
 
     def one(state, inputs):
         old_next, eta, step = inputs
@@ -428,7 +431,7 @@ def _for_chains(num_chains: int, tree: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: jnp.repeat(leaf, num_chains, axis=-1), tree)
 
 
-def _turned(zeta, eta, rho, beta):
+def _new_noise(zeta, eta, rho, beta):
     """Return the new noise ζ' = √(1 - β²) ζ + β η.
 
     ζ of a path of weight zero may not be finite; zero replaces it.
@@ -470,7 +473,7 @@ def sweep(
     log_scales: Float[Array, "2 B"],
     paths: Paths,
 ) -> tuple[Paths, Bool[Array, "2 B C"]]:
-    """Propose new paths of all blocks of one partition, then of the other, with the given log β.
+    """Move the paths of all blocks of one partition, then of the other, with the given log β.
 
     **Returns:** the paths, and which blocks accepted their proposals.
     """
@@ -492,6 +495,7 @@ def tuned(
     approximation falls like `number`^-0.6.
     """
     share = jnp.mean(accepted.astype(log_scales.dtype), axis=-1)
+    # β is at most 1.
     return jnp.minimum(log_scales + number**-0.6 * (share - _TARGET), 0)
 
 
@@ -500,7 +504,7 @@ def _in_lanes(function: Callable) -> Callable:
     return lambda *arguments: over_lanes(*len(arguments) * [-1])(function)(*arguments)
 
 
-def _seen_exactly(
+def _exact_in_lanes(
     point: Float[Array, "d lanes"], otherwise: Scalars, where: Bool[Array, " lanes"]
 ) -> Scalars:
     """Return exact observations of the state in some lanes, and the present ones in the others.

@@ -112,6 +112,7 @@ def problem_of(
     check_observation(observation)
     m = record.values.shape[1]
     guess = observation.linear
+    # Without a matrix the whole state is observed.
     dim = m if guess.matrix is None else guess.matrix.shape[1]
     like = jnp.zeros(dim, record.values.dtype)
     _check_dimension(model, guess, like)
@@ -170,6 +171,7 @@ def _has_dimension(model: Diffusion, like: Float[Array, " d"]) -> bool:
         return dynamics.drift(x), dynamics.sigma(x).as_matrix(len(x), x.dtype)
 
     try:
+        # Shapes are enough, so nothing is computed.
         _, sigma = jax.eval_shape(coefficients, model, like)
     except Exception:  # functions of the user may raise anything
         return False
@@ -189,7 +191,7 @@ def check_domain(model: Diffusion, observation: Observation, record: Record) -> 
     is_inside = model.state_space()
     if is_inside is None or not isinstance(observation, LinearGaussian):
         return
-    if observation.depends_on_time:
+    if observation.depends_on_time:  # the noise may vanish at some times only
         return
     d, values = record.values.shape[-1], record.values[record.which]
     if is_traced(model, observation, values):
@@ -197,6 +199,7 @@ def check_domain(model: Diffusion, observation: Observation, record: Record) -> 
     matrix = np.asarray(observation.matrix_for(d, d, values.dtype), float)
     first_time = record.times[0]
     R = np.asarray(observation.covariance_for(model.params, d, first_time))
+    # Only complete observations without noise determine the state.
     if matrix.shape != (d, d) or np.any(R):
         return
     complete = np.all(np.isfinite(np.asarray(values)), axis=1)

@@ -96,7 +96,7 @@ class Record(eqx.Module):
         long step of each segment is shorter.
         """
         size = 2**level
-        left_out = -self.num_steps % size
+        left_out = -self.num_steps % size  # padding in front, so that the last step is complete
         parts = jnp.pad(self.dt, ((0, 0), (left_out, 0))).reshape(len(self.dt), -1, size)
         dt = jnp.zeros_like(parts).at[..., -1].set(jnp.sum(parts, axis=-1))
         return dataclasses.replace(self, dt=dt.reshape(len(self.dt), -1)[:, left_out:])
@@ -119,7 +119,7 @@ def as_records(
 
     **Raises:** `ValueError` that names the invalid time or observation.
     """
-    check = lambda times, values: _checked(times, values, initial_time)
+    check = lambda times, values: _check_record(times, values, initial_time)
     checked = of_each(check, pairs)
     widths = [values.shape[1] for _, values in checked]
     if len(set(widths)) > 1:
@@ -133,7 +133,7 @@ def as_records(
     ends = np.cumsum([len(times.gaps) for times, _ in checked])[:-1]
     counts = np.split(segments, ends)
     return [
-        _cut(
+        _split_into_segments(
             *times.clock(_dtype(times, values)),
             times.gaps,
             values,
@@ -168,6 +168,7 @@ def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, 
 
 def _has_rows(times: Numbers) -> bool:
     """Return whether `times` contains several rows, each with two times or more."""
+    # Times of shape (n, 1) count as one record; its check reports the wrong shape.
     several = isinstance(times, list | tuple | np.ndarray | jax.Array) and _num_axes(times) == 2
     return several and len(times) > 0 and len(times[0]) > 1  # pyright: ignore
 
@@ -202,7 +203,7 @@ def as_rows(observations: Numbers) -> Float[Array, "n m"]:
 
     `None` and masked values become NaN. A series of numbers becomes one column.
     """
-    values = as_floating("observations", missing_as_nan(_filled("observations", observations)))
+    values = as_floating("observations", missing_as_nan(_unmask("observations", observations)))
     return values[:, None] if values.ndim == 1 else values
 
 
@@ -211,7 +212,7 @@ def _dtype(times: Times, values: Array) -> jnp.dtype:
     return jnp.promote_types(times.dtype, values.dtype)
 
 
-def _checked(
+def _check_record(
     times: Numbers, observations: Numbers, initial_time: Numbers | None
 ) -> tuple[Times, Float[Array, "n m"]]:
     """Validate the times and observations of one record.
@@ -222,10 +223,11 @@ def _checked(
     **Raises:** `ValueError` that names the invalid time or observation.
     """
     values = as_rows(observations)
-    checked_times = as_times("times", _filled("times", times))
+    checked_times = as_times("times", _unmask("times", times))
     if initial_time is not None:
         observed_times = checked_times
         checked_times = observed_times.preceded("initial_time", initial_time)
+        # No time is added if the times begin with `initial_time`.
         missing = jnp.full(
             (len(checked_times.gaps) - len(observed_times.gaps), *values.shape[1:]), jnp.nan
         )
@@ -255,7 +257,7 @@ def _checked(
 
 
 @compiled_sooner
-def _cut(
+def _split_into_segments(
     clock: Clock,
     since: Float[Array, " n"],
     gaps: Float[Array, " gaps"],
@@ -275,7 +277,7 @@ def _cut(
     return Record(clock, jnp.append(start, since[-1]), dt, ends, jnp.asarray(which))
 
 
-def _filled(name: str, values: Numbers) -> Numbers:
+def _unmask(name: str, values: Numbers) -> Numbers:
     """Return a masked NumPy array with NaN in place of masked values; other values unchanged."""
     if not isinstance(values, np.ma.MaskedArray):
         return values
@@ -299,6 +301,7 @@ def _segments(
     step_counts = count_steps(gaps, num_steps, step_size)
 
     def cost(steps: int) -> int:
+        # -(-a // b) is a / b rounded up.
         return int(np.sum(-(-step_counts // steps)) * (steps + _STEPS_PER_SEGMENT))
 
     best = min(np.unique(step_counts).tolist(), key=cost)

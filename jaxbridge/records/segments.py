@@ -23,6 +23,7 @@ def at_every_step(scalars: Scalars, num_steps: int) -> Scalars:
         between = jnp.full((leaf.shape[0], num_steps - 1, *leaf.shape[1:]), missing, leaf.dtype)
         return jnp.concatenate([between, leaf[:, None]], axis=1)
 
+    # Missing scalars have row 0, value 0 and variance 1.
     return flat(Scalars(*map(spread, scalars, (0, 0, 1, False))))
 
 
@@ -34,6 +35,7 @@ def following(tree: PyTree) -> PyTree:
 
     def shifted(leaf):
         steps = flat(leaf)
+        # h = 1 at the end of the record, so r = 0 and H = 0.
         return jnp.concatenate([steps[1:], jnp.zeros_like(steps[:1])]).reshape(leaf.shape)
 
     return jax.tree.map(shifted, tree)

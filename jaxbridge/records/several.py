@@ -72,6 +72,7 @@ class Records(eqx.Module):
 
         `values` has an entry for each end of a segment.
         """
+        # `which` is padded to the longest record, so only its first entries count.
         records = zip(values, self.stacked.record.which, self.num_times, strict=True)
         return jnp.concatenate(
             [record_values[which[:num]] for record_values, which, num in records]

@@ -46,7 +46,7 @@ from .step_regime import steps_are_too_long
 _MOST_R_HAT = 1.1
 # A spread of at most so many units in the last place is rounding error.
 _ROUNDING = 64.0
-# If the variance of D of a segment exceeds this bound, the expansion to second order is unreliable.
+# If the variance of D of a segment exceeds this bound, the second-order expansion is unreliable.
 _MOST_VARIANCE = 1.0
 # A quantity counts as constant if its relative changes along a path are at most this large.
 _CONSTANT = 1e-3
@@ -198,7 +198,7 @@ class Smoothed(AbstractResult):
         leaves, treedef = jax.tree.flatten(values)
         varies = _noise_varies(problem, self.paths[0, 0])
         share = share_of_order(problem.density.order)
-        step_errors = [_change(leaf, D, share, varies) for leaf in leaves]
+        step_errors = [_error_from_halving(leaf, D, share, varies) for leaf in leaves]
         mean = jnp.mean(self.paths, axis=(0, 1))
         too_long = steps_are_too_long(problem, problem.model, mean)
         step_errors = [unknown_where(too_long, error) for error in step_errors]
@@ -286,7 +286,7 @@ def smooth(
     linearisation = linearised(problem, model)
     if proposal is None:
         sizes = counts, num_chains, block_length
-        draws = _smooth(key, problem, linearisation, *sizes, progress_meter)
+        draws = _run_block_chains(key, problem, linearisation, *sizes, progress_meter)
     else:
         start_key, key = jax.random.split(key)
         firsts = _guided_paths(start_key, problem, linearisation, num_chains)
@@ -295,6 +295,7 @@ def smooth(
     paths = jnp.moveaxis(draws.paths, 1, 0)
     diagnostics = (draws.accepted, draws.stuck, draws.num_truncated)
     times = problem.record.clock.exactly(draws.since)
+    # Discretisation errors need the grid of the paths, which a `proposal` may choose.
     problem = dataclasses.replace(problem, record=draws.record)
     smoothed = Smoothed(times, paths, *diagnostics, problem, linearisation.check)
     return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
@@ -319,7 +320,7 @@ def _guided_paths(
 
 
 @compiled_sooner
-def _smooth(
+def _run_block_chains(
     key: Key[Array, ""],
     problem: RecordProblem,
     linearisation: Linearised,
@@ -344,12 +345,14 @@ def _smooth(
         paths, accepted = sweep(sweep_key, problem, model, both, log_scales, paths)
         new_scales = tuned(log_scales, accepted, (i + 1).astype(points.dtype))
         path = jnp.concatenate([paths.start[None], paths.points.reshape(K * N, d, num_chains)])
+        # β is constant after the warm-up, so that the chain is homogeneous.
         log_scales = jnp.where(i < num_warmup, new_scales, log_scales)
         return (paths, log_scales), (jnp.moveaxis(path, -1, 0), accepted)
 
     init = paths, jnp.zeros((2, both.segment.shape[-1]), points.dtype)
     _, linearisation = metered_scan(step, init, jnp.arange(num_warmup + num_draws), progress_meter)
     draws, accepted = jax.tree.map(lambda leaf: leaf[num_warmup:], linearisation)
+    # Blocks beyond the record never move and do not count as stuck.
     real = has_segments(problem, block_length)[..., None]
     stuck = jnp.any(real & ~jnp.any(accepted, axis=0), axis=(0, 1))
     share = jnp.mean(accepted.astype(points.dtype), axis=(0, -1))
@@ -397,10 +400,11 @@ def _log_halving(
         of_segments = log_halving_of_paths(problem.density, dynamics, dt, segments, time)
         return of_segments.reshape(chains, K)
 
+    # One draw of all chains at a time, to save memory.
     return jnp.moveaxis(lax.map(of_draw, jnp.moveaxis(paths, 1, 0)), 0, 1)
 
 
-def _change(
+def _error_from_halving(
     values: Float[Array, "chains n ..."],
     D: Float[Array, "chains n"],
     share: float,

@@ -113,10 +113,10 @@ class StateSampler(eqx.Module):
         problem = self.problem
         corrected = correction(problem, problem.model)
 
-        def seen(scalars, row, x):
+        def log_g(scalars, row, x):
             return log_density_of(scalars, x) + corrected(row, x)
 
-        of_chain = over_points(seen)
+        of_chain = over_points(log_g)
         logs = jax.vmap(lambda x: of_chain(self.scalars, problem.rows, x))(x)
         law = bound(problem.initial, problem.model)
         if isinstance(law, Stationary):
@@ -130,7 +130,7 @@ class StateSampler(eqx.Module):
 
         def of_one(mean, root, x):
             white = solve_lower(root, x - mean)
-            return -dot(white, white) / 2
+            return -dot(white, white) / 2  # the normaliser cancels in acceptance ratios
 
         return jax.vmap(lambda x: jax.vmap(of_one)(*self.laws, x))(x)
 
@@ -168,6 +168,7 @@ class StateSampler(eqx.Module):
         x, (mean, root) = state.x, self.laws
         noise = jnp.einsum("kij,ckj->cki", root, jax.random.normal(noise_key, x.shape, x.dtype))
         proposed = jnp.where(walk, x + jnp.exp(log_scales)[:, None] * noise, mean + noise)
+        # At most one end of each segment moves, so the decisions are independent.
         moving = self.movable & (np.arange(x.shape[1]) % 2 == parity)
         new = self.paths(path_key, jnp.where(moving[:, None], proposed, x))
 
@@ -255,13 +256,13 @@ def sample_states(
     model, K = problem.model, problem.num_segments
     scalars = problem.scalars(model)
     proposal = as_proposal(proposal, model, problem.like)
-    _check(proposal, problem, scalars)
+    _check_proposal(proposal, problem, scalars)
     first = guided[:, :: problem.num_steps]
     durations = problem.record.durations
     intervals = Intervals(first[0, :-1], first[0, 1:], durations)
     pilot_key = key_for("states", key)
     laws = _normal_laws(pilot_key, problem, scalars, intervals)
-    proposal = _prepared(pilot_key, problem, proposal, laws, first[0])
+    proposal = _prepare_proposal(pilot_key, problem, proposal, laws, first[0])
     proposal = proposal.of(np.tile(np.arange(K), len(guided)))  # the same proposal for all chains
     assert isinstance(proposal, AbstractWeightedProposal)
     point = not isinstance(bound(problem.initial, model), Stationary | GaussianLaw)
@@ -273,7 +274,7 @@ def sample_states(
     dt = durations[:, None] * jnp.asarray(within, durations.dtype)
     record = dataclasses.replace(problem.record, dt=dt)
     grid = record.grid()
-    paths, moves, num_truncated = _run(
+    paths, moves, num_truncated = _run_state_chains(
         key, sampler, guided, (num_draws, num_warmup), progress_meter
     )
     all_moved = jnp.all(jnp.any(moves.states, axis=0) | ~movable, axis=1)
@@ -282,7 +283,7 @@ def sample_states(
     return Draws(grid, paths, accepted, ~all_moved, num_truncated, record)
 
 
-def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars) -> None:
+def _check_proposal(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars) -> None:
     """Raise `ValueError` if states cannot move with this proposal."""
     model, law = problem.model, bound(problem.initial, problem.model)
     if model.depends_on_time or not model.sigma_is_invertible(problem.like):
@@ -316,7 +317,7 @@ def _check(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars)
             )
 
 
-def _prepared(
+def _prepare_proposal(
     key: Key[Array, ""],
     problem: RecordProblem,
     proposal: AbstractProposal,
@@ -377,7 +378,7 @@ def _normal_laws(
 
 
 @compiled_sooner
-def _run(
+def _run_state_chains(
     key: Key[Array, ""],
     sampler: StateSampler,
     guided: Float[Array, "C points d"],

@@ -81,6 +81,7 @@ def seen_of(root: Float[Array, "d m"], row: Float[Array, " d"], variance) -> See
     safe = jnp.where(total > 0, total, 1)
     ratio = variance / safe
     exact = ratio <= 0
+    # The inner `where` keeps the derivative of the root finite at zero.
     left = jnp.where(exact, 0, jnp.sqrt(jnp.where(exact, 1, ratio)))
     return Seen(along, 1 / (safe * (1 + left)), matvec(root, along) / safe, total, left)
 
@@ -149,6 +150,7 @@ class Tilted(NamedTuple):
 
         It is log N(z; 0, I) - log N(ζ; 0, I) - log det ℛ. It is at most ½|ζ|², because det ℛ ≥ 1.
         """
+        # (|ζ|² - |z|²) / 2 as a product, which avoids cancellation.
         return dot(zeta - pulled, zeta + pulled) / 2 - self._log_det()
 
     def _log_det(self) -> Float[Array, ""]:
@@ -166,6 +168,7 @@ def tilt_factor(
     """Return ℛ of I + ΛᵀHΛ = ℛ ℛᵀ, and HΛ."""
     half = matmul(h.precision, root)
     K = matmul(root.T, half)
+    # Rounding makes K slightly asymmetric.
     return cholesky(jnp.eye(K.shape[0], dtype=K.dtype) + (K + K.T) / 2), half
 
 

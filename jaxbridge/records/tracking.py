@@ -78,6 +78,7 @@ def tracking_path(
         lane = parents[lane]
         return lane, path[..., lane]
 
+    # After resampling all weights are equal, so the ancestors of lane 0 are as good as any.
     lane, path = lax.scan(back, jnp.int32(0), (paths, later), reverse=True)
     begin = starts[:, parents[lane]]
     return jnp.concatenate([begin[None], path.reshape(-1, d)])
