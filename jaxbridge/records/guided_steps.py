@@ -85,6 +85,7 @@ class GuidedLaw(NamedTuple):
         law, scalars = self.quadratic
         bent = law.bent(point)
         if scalars is not None:
+            # Only the normal part of the step meets an exact observation.
             is_exact = jnp.any(scalars.seen & (scalars.variances == 0))
             bent = jnp.where(is_exact, point, bent)
             log_weight += _log_change(scalars, point - self.origin, bent - self.origin)
@@ -110,7 +111,7 @@ def _log_change(scalars: Scalars, u: Float[Array, " d"], x: Float[Array, " d"]) 
     """Return log g(y| x) - log g(y| u) for scalar observations, counted from ξ' like the points."""
     log_change = jnp.zeros((), u.dtype)
     for row, value, variance, is_seen in zip(*scalars, strict=True):
-        noisy = is_seen & (variance > 0)
+        noisy = is_seen & (variance > 0)  # an exact scalar has no density
         squares = (value - dot(row, u)) ** 2 - (value - dot(row, x)) ** 2
         log_change += jnp.where(noisy, squares / jnp.where(noisy, 2 * variance, 1), 0)
     return log_change

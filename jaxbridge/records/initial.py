@@ -77,6 +77,7 @@ def check_initial(initial: Initial, model: Diffusion, like: Float[Array, " d"]) 
     if isinstance(bound(initial, model), Stationary):
         jax.eval_shape(lambda model, x: model.log_stationary(x), model, like)
         return
+    # This runs all checks of types and shapes without computing the law.
     jax.eval_shape(lambda model: initial_law(initial, model, like), model)
     point = bound(initial, model)
     if isinstance(point, GaussianLaw) or is_traced(point, model):

@@ -203,6 +203,6 @@ def innovations(
         warnings.warn(
             "the likelihood at ξ = 0 and the model's parameters is zero, so no sampler can start "
             "there: see `why()` of the result.",
-            stacklevel=3,
+            stacklevel=3,  # the caller of the decorated function
         )
     return Innovations(problem, points, check)

@@ -293,7 +293,7 @@ def _segments(
 ) -> tuple[int, Int[np.ndarray, " n"]]:
     """Return N, and the number of segments of each interval between two times.
 
-    With `step_size`, N minimises the cost: N plus `_STEPS_PER_SEGMENT` for each segment.
+    With `step_size`, N minimises the total cost of all segments, N + `_STEPS_PER_SEGMENT` each.
     """
     if step_size is None:
         num_steps = check_num_steps(10 if num_steps is None else num_steps, gaps.shape[0])

@@ -352,7 +352,7 @@ def _run_block_chains(
     init = paths, jnp.zeros((2, both.segment.shape[-1]), points.dtype)
     _, linearisation = metered_scan(step, init, jnp.arange(num_warmup + num_draws), progress_meter)
     draws, accepted = jax.tree.map(lambda leaf: leaf[num_warmup:], linearisation)
-    # Blocks beyond the record never move and do not count as stuck.
+    # Blocks beyond the record do not count as stuck.
     real = has_segments(problem, block_length)[..., None]
     stuck = jnp.any(real & ~jnp.any(accepted, axis=0), axis=(0, 1))
     share = jnp.mean(accepted.astype(points.dtype), axis=(0, -1))

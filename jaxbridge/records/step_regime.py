@@ -22,7 +22,7 @@ def steps_are_too_long(
     ends, durations = path[:: problem.num_steps], problem.record.durations
     intervals = Intervals(ends[:-1], ends[1:], durations)
     share = share_in_regime(jnp.ones_like(durations), model, intervals, problem.num_steps)
-    moving = durations > 0
+    moving = durations > 0  # segments of length zero lie beyond the record
     number = jnp.maximum(jnp.sum(moving), 1).astype(durations.dtype)
     too_long = jnp.sum(moving & (share == UNKNOWN_SHARE)).astype(durations.dtype)
     return too_long > MOST_TOO_LONG * number
