@@ -85,7 +85,10 @@ class CoveredStart(NamedTuple):
 
 
 def chosen(log_shares: Float[Array, " J"], positions: Float[Array, " n"]):
-    """Return the indices of the laws at these positions in [0, 1), by inverting the cumulative shares."""
+    """Return the indices of the laws at these positions in [0, 1).
+
+    They come from inverting the cumulative shares.
+    """
     bounds = jnp.cumsum(normalise_weights(nan_to_neg_inf(log_shares)))
     bounds = bounds / jnp.maximum(bounds[-1], jnp.finfo(bounds.dtype).tiny)
     return jnp.minimum(jnp.searchsorted(bounds, positions, side="right"), len(bounds) - 1)
