@@ -5,12 +5,14 @@ from jaxbridge.studies.command import Command
 from .accuracy import ACCURACY
 from .bayes import BAYES
 from .benchmark import BENCHMARK
+from .orders import ORDERS
 from .rivals import RIVALS
 
 PARTS = {
     "accuracy": (ACCURACY,),
     "bayes": (BAYES,),
     "bench": (BENCHMARK,),
+    "orders": (ORDERS,),
     "rivals": (RIVALS,),
 }
 
