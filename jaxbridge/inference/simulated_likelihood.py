@@ -48,22 +48,28 @@ from .newton import (
 from .parameters import Parameters
 from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 
-# Paths of each interval for a noisy gradient.
+# Number of paths per interval for a noisy gradient.
 _FEW = 8
-# Less than rounding leaves of a sum, in logarithms.
+# Log of a relative weight that is below the rounding error of a sum.
 _NO_WEIGHT = -60.0
-# Newton's method has arrived where the square of the next step, in standard errors, is less.
+# Newton's method has converged if the squared next step, in standard errors, is smaller.
 _GAIN = 1e-5
-# Points that are tried, and the shortest fraction of a step so bounded.
+# Maximum number of trial points, and the smallest fraction of a bounded step.
 _MOST_POINTS = 60
 _SHORTEST = 1e-4
 
 
 class Simulated(NamedTuple):
-    """ℓ̂ and its derivatives at one θ, over the intervals that have any path: its value, ∇ℓ̂, the
-    covariance of that by the noise of the paths, and -∇²ℓ̂; the effective number of paths of each
-    interval, and k̂ of their weights; how many intervals have none; the rounding error of the
-    value; and how many paths of each interval have a weight, were simulated, and were lost."""
+    """Simulated log-likelihood ℓ̂ and its derivatives at one θ, over the intervals with paths.
+
+    - `value`, `gradient`, `information`: ℓ̂, ∇ℓ̂ and -∇²ℓ̂.
+    - `covariance`: covariance of ∇ℓ̂ due to the noise of the paths.
+    - `effective_sample_size`, `pareto_k`: those of the weights of each interval.
+    - `num_missing`: number of intervals without a path.
+    - `rounding`: rounding error of `value`.
+    - `num_found`, `num_simulated`, `num_nonfinite`: numbers of paths of each interval that have a
+      weight, were simulated, and diverged or left the state space.
+    """
 
     value: Float[Array, ""]
     gradient: Float[Array, " p"]
@@ -79,8 +85,10 @@ class Simulated(NamedTuple):
 
 
 class Maximum(NamedTuple):
-    """Where Newton's method ended, what ℓ̂ is there, whether that is a maximum, and by how much ℓ̂
-    falls around it."""
+    """Result of Newton's method: the last θ, ℓ̂ at it, and checks of the maximum.
+
+    `found` states whether θ is a maximum, and `fall` is the decrease of ℓ̂ around it.
+    """
 
     theta: Float[Array, " p"]
     simulated: Simulated
@@ -97,27 +105,30 @@ _NO_DERIVATIVE = (
 def as_pulled(
     proposal: Any, model: Diffusion, like: Float[Array, " d"], budget: Budget
 ) -> AbstractProposal:
-    """The proposal that the user gave, "auto" without couplings.
+    """Return the proposal of the user, where "auto" excludes couplings.
 
-    **Raises:** `ValueError` and `TypeError` for one whose weights have no derivatives.
+    **Raises:** `ValueError` and `TypeError` for a proposal whose weights have no derivatives.
     """
     if isinstance(proposal, str) and proposal == "auto":
         proposal = choice_between(guided_candidates(), budget, left_out=_NO_DERIVATIVE)
-    given = as_proposal(proposal, model, like, budget, for_density=True)
-    if given.coupled:
+    pulled = as_proposal(proposal, model, like, budget, for_density=True)
+    if pulled.coupled:
         raise ValueError(
             f"{_NO_DERIVATIVE}. Use a guided proposal, such as `Guided()` or "
             '`ModifiedDiffusionBridge()`, or "auto", or the function `pmmh`.'
         )
-    return given
+    return pulled
 
 
 def pulled_blocks(
     key: Key[Array, ""], model: Diffusion, problem: Problem, proposal: AbstractProposal
 ) -> tuple[Block, ...]:
-    """The blocks with one proposal each, for derivatives of a choice between several run each for
-    all intervals: that which leaves the least variance in all at this model, or, where the user has
-    chosen interval by interval, a block for each."""
+    """Return blocks with a single proposal each.
+
+    The derivatives of a choice between proposals would run all of them for all intervals. Hence
+    "auto" selects the proposal with the smallest total variance at `model`. A choice of the user
+    for each interval gives a block for each proposal.
+    """
     blocks = make_blocks(key, model, problem, proposal, Budget(), "density")
     if proposal.is_open:
         return tuple(_decided(block) for block in blocks)
@@ -125,7 +136,10 @@ def pulled_blocks(
 
 
 def _decided(block: Block) -> Block:
-    """One candidate for all intervals. The error of ℓ̂ is Σ 1/(effective paths) over them."""
+    """Return the block with the best candidate for all its intervals.
+
+    The squared error of ℓ̂ is the sum of 1 / (effective sample size) over the intervals.
+    """
     if is_traced(block.proposal):
         raise ValueError(
             '`proposal="auto"` needs pilot runs, which cannot run inside `jit`: pass a guided '
@@ -135,12 +149,12 @@ def _decided(block: Block) -> Block:
 
 
 def _split(block: Block) -> list[Block]:
-    """A block for each candidate that was chosen."""
-    made = []
+    """Return one block for each selected candidate."""
+    blocks = []
     for which, single in block.proposal.split():
-        mine = jax.tree.map(lambda leaf, which=which: leaf[which], block.intervals)
-        made.append(Block(mine, block.index[which], block.fractions, single))
-    return made
+        intervals = jax.tree.map(lambda leaf, which=which: leaf[which], block.intervals)
+        blocks.append(Block(intervals, block.index[which], block.fractions, single))
+    return blocks
 
 
 def _log_weights(
@@ -150,34 +164,37 @@ def _log_weights(
     num_paths: int,
     theta: Float[Array, " p"],
 ) -> tuple[Float[Array, "I n"], Bool[Array, "I n"], Int[Array, "I n"]]:
-    """log w at θ of the paths with this noise, zero for those that were lost, or have no weight
-    beside others, for where a path nearly overflows its derivatives do; which are not; and how many
-    left the state space or the finite numbers."""
+    """Return log w at θ of paths with fixed noise, masks of active paths, and counts of lost ones.
+
+    A path is inactive if it diverged, left the state space, or has a negligible weight: when a path
+    nearly overflows, its derivatives do overflow. Its log w is replaced by zero.
+    """
     keys = jax.random.split(key, (block.intervals.start.shape[0], num_paths))
-    nothing = jnp.zeros(0, jnp.int32)  # no path is kept
+    no_points = jnp.zeros(0, jnp.int32)  # return no point of the paths
     model = parameters.bind(theta).prepared()
-    drawn = block.proposal.draw(keys, model, block.intervals, block.num_steps, nothing, True)
-    largest = jnp.max(drawn.log_weights, axis=1, keepdims=True)
-    found = drawn.found & (drawn.log_weights > largest + _NO_WEIGHT)
-    return jnp.where(found, drawn.log_weights, 0), found, drawn.num_nonfinite
+    draws = block.proposal.draw(keys, model, block.intervals, block.num_steps, no_points, True)
+    largest = jnp.max(draws.log_weights, axis=1, keepdims=True)
+    active = draws.found & (draws.log_weights > largest + _NO_WEIGHT)
+    return jnp.where(active, draws.log_weights, 0), active, draws.num_nonfinite
 
 
 def _log_densities(
-    log_weights: Float[Array, "I n"], found: Bool[Array, "I n"]
+    log_weights: Float[Array, "I n"], active: Bool[Array, "I n"]
 ) -> Float[Array, " I"]:
-    """log p̂ of each interval with half the relative variance of p̂ added; zero where no path was
-    found."""
-    n, some = log_weights.shape[1], jnp.any(found, axis=1)
-    largest = jnp.max(log_weights, axis=1, initial=-jnp.inf, where=found)
-    largest = lax.stop_gradient(jnp.where(some, largest, 0))
-    # What is lost has no weight, and is not raised to a power: in reverse mode a masked 0 · ∞
-    # would be NaN.
-    weights = jnp.exp(jnp.where(found, log_weights - largest[:, None], 0))
-    weights = jnp.where(found, weights, 0)
+    """Return log p̂ of each interval plus half the relative variance of p̂.
+
+    It is zero for intervals without an active path.
+    """
+    n, has_paths = log_weights.shape[1], jnp.any(active, axis=1)
+    largest = jnp.max(log_weights, axis=1, initial=-jnp.inf, where=active)
+    largest = lax.stop_gradient(jnp.where(has_paths, largest, 0))
+    # Mask before `exp`, too: in reverse mode 0 · ∞ of a masked entry would be NaN.
+    weights = jnp.exp(jnp.where(active, log_weights - largest[:, None], 0))
+    weights = jnp.where(active, weights, 0)
     sums, squares = jnp.sum(weights, axis=1), jnp.sum(weights**2, axis=1)
-    sums = jnp.where(some, sums, 1)
+    sums = jnp.where(has_paths, sums, 1)
     variance = (squares / sums**2 - 1 / n) * (n / (n - 1))
-    return jnp.where(some, jnp.log(sums) + largest - np.log(n) + variance / 2, 0)
+    return jnp.where(has_paths, jnp.log(sums) + largest - np.log(n) + variance / 2, 0)
 
 
 def simulated_value(
@@ -187,7 +204,7 @@ def simulated_value(
     theta: Float[Array, " p"],
     num_paths: int,
 ) -> Float[Array, ""]:
-    """ℓ̂ at θ with the noise of this key."""
+    """Return ℓ̂ at θ, with the noise of this key."""
     value = jnp.zeros((), theta.dtype)
     for block_key, block in with_keys(key, blocks):
         value += jnp.sum(
@@ -203,12 +220,12 @@ def simulated(
     theta: Float[Array, " p"],
     num_paths: int,
 ) -> Simulated:
-    """ℓ̂ at θ with the noise of this key, and all that is to be known of it."""
-    made = [
+    """Return ℓ̂ at θ, with the noise of this key, its derivatives and its diagnostics."""
+    parts = [
         _of_block(block_key, parameters, block, theta, num_paths)
         for block_key, block in with_keys(key, blocks)
     ]
-    return over_intervals(blocks, made)
+    return over_intervals(blocks, parts)
 
 
 @compiled_sooner
@@ -219,8 +236,10 @@ def step_error_of_score(
     maximum: Maximum,
     num_paths: int,
 ) -> StepError:
-    """That of ∇ℓ̂ at the maximum, by as many paths of half as many steps; NaN where a path has one
-    step only."""
+    """Estimate the discretisation error of ∇ℓ̂ at the maximum.
+
+    The estimate uses as many paths with half as many steps. It is NaN if a path has a single step.
+    """
     parameters, blocks = nondifferentiable((parameters, blocks))
     model = parameters.bind(maximum.theta)
     error, variance = jnp.zeros_like(maximum.theta), jnp.zeros_like(maximum.theta)
@@ -232,19 +251,20 @@ def step_error_of_score(
             np.diff(block.proposal.fractions(block.num_steps // 2)), error.dtype
         )
         half = replace(block, fractions=fractions)
-        # Of all that are pulled each has one order for all intervals.
+        # The block has a single proposal, so all intervals have the same order of error.
         share = block.proposal.step_share(model, block.intervals)[0]
 
         def difference(theta, key=block_key, block=block, half=half):
             values = (
-                jnp.sum(_log_densities(*_log_weights(key, parameters, each, num_paths, theta)[:2]))
-                for each in (block, half)
+                jnp.sum(_log_densities(*_log_weights(key, parameters, grid, num_paths, theta)[:2]))
+                for grid in (block, half)
             )
             fine, coarse = values
             return coarse - fine
 
         error += share * jax.jacfwd(difference)(maximum.theta)
         variance = jnp.maximum(variance, share**2)
+    # The variances of both grids are added, as for independent noise.
     noise = 2 * jnp.diagonal(maximum.simulated.covariance)
     return StepError(error, jnp.sqrt(variance * noise))
 
@@ -253,43 +273,43 @@ def _of_block(
     key, parameters, block: Block, theta: Float[Array, " p"], num_paths: int
 ) -> Simulated:
     def log_weights(theta):
-        made, *counts = _log_weights(key, parameters, block, num_paths, theta)
-        return made, (made, *counts)
+        log_w, *counts = _log_weights(key, parameters, block, num_paths, theta)
+        return log_w, (log_w, *counts)
 
     def first(theta):
-        g, made = jax.jacfwd(log_weights, has_aux=True)(theta)
-        return g, (*made, g)
+        g, values = jax.jacfwd(log_weights, has_aux=True)(theta)
+        return g, (*values, g)
 
-    H, (made, found, num_nonfinite, g) = jax.jacfwd(first, has_aux=True)(theta)
+    H, (log_w, active, num_nonfinite, g) = jax.jacfwd(first, has_aux=True)(theta)
 
     def total(t):
-        """ℓ̂ at θ + t, with the log weights expanded to second order."""
-        return jnp.sum(_log_densities(made + g @ t + ((H @ t) @ t) / 2, found))
+        """Return ℓ̂ at θ + t, with the log weights expanded to second order."""
+        return jnp.sum(_log_densities(log_w + g @ t + ((H @ t) @ t) / 2, active))
 
     at_theta = jnp.zeros_like(theta)
     information = -jax.jacfwd(jax.grad(total))(at_theta)
-    weights = normalise_weights(jnp.where(found, made, -jnp.inf))
+    weights = normalise_weights(jnp.where(active, log_w, -jnp.inf))
     mean = jnp.sum(weights[..., None] * g, axis=1, keepdims=True)
     deviation = weights[..., None] * (g - mean)
-    some = jnp.any(found, axis=1)
-    densities = _log_densities(made, found)
+    has_paths = jnp.any(active, axis=1)
+    densities = _log_densities(log_w, active)
     return Simulated(
         jnp.sum(densities),
         jax.grad(total)(at_theta),
         jnp.einsum("kji,kjl->il", deviation, deviation),
         (information + information.T) / 2,
         effective_size(weights),
-        pareto_k(jnp.where(found, made, -jnp.inf)),
-        jnp.sum(~some, dtype=jnp.int32),
+        pareto_k(jnp.where(active, log_w, -jnp.inf)),
+        jnp.sum(~has_paths, dtype=jnp.int32),
         4 * jnp.finfo(theta.dtype).eps * jnp.sum(jnp.abs(densities)),
-        jnp.sum(found, axis=1, dtype=jnp.int32),
-        jnp.full(len(found), num_paths, jnp.int32),
+        jnp.sum(active, axis=1, dtype=jnp.int32),
+        jnp.full(len(active), num_paths, jnp.int32),
         jnp.sum(num_nonfinite, axis=1, dtype=jnp.int32),
     )
 
 
 class _Ascent(NamedTuple):
-    """The best point so far, the step from there, and the fraction of it to be tried next."""
+    """State of the ascent: the best point so far, the step from it, and the next fraction of it."""
 
     i: Int[Array, ""]
     theta: Float[Array, " p"]
@@ -307,16 +327,15 @@ def newton_ascent(
     starts: Float[Array, "starts p"],
     num_paths: int,
 ) -> Maximum:
-    """The maximum of ℓ̂ at fixed noise by Newton's method, from the best of several points, the
-    first of which must be allowed.
+    """Maximise ℓ̂ with fixed noise by Newton's method, from the best of several starting points.
 
-    A step that leads down, out of the constraint, or to where more intervals have no path, is
-    shortened.
+    The first starting point must satisfy the constraint. A step is shortened if it decreases ℓ̂,
+    leaves the constraint, or leads to more intervals without a path.
     """
     parameters, blocks, starts = nondifferentiable((parameters, blocks, starts))
     at_start = len(starts)
 
-    @jax.jit  # for its shapes and in the loop traced once
+    @jax.jit  # traced once for both its shapes and the loop
     def at(theta):
         return simulated(key, parameters, blocks, theta, num_paths)
 
@@ -325,24 +344,24 @@ def newton_ascent(
         starting = state.i < at_start
         tried = jnp.where(starting, start, state.theta + state.fraction * state.step)
         inside = parameters.allowed(tried)
-        # Outside the constraint the model may not be simulated.
-        made, old = at(jnp.where(inside, tried, starts[0])), state.simulated
+        # The simulation of the model may fail outside the constraint.
+        new, old = at(jnp.where(inside, tried, starts[0])), state.simulated
         expected = jnp.where(starting, 0, 1e-4 * state.fraction * (old.gradient @ state.step))
-        higher = made.value >= old.value + expected - jnp.where(starting, 0, old.rounding)
-        fewer, as_many = made.num_missing < old.num_missing, made.num_missing == old.num_missing
-        finite = all_finite_leaves(made._replace(pareto_k=made.rounding))  # k̂ need not be
+        higher = new.value >= old.value + expected - jnp.where(starting, 0, old.rounding)
+        fewer, as_many = new.num_missing < old.num_missing, new.num_missing == old.num_missing
+        finite = all_finite_leaves(new._replace(pareto_k=new.rounding))  # k̂ need not be
         better = inside & finite & (fewer | (as_many & higher))
-        theta, made = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old), (tried, made), (state.theta, old)
+        theta, new = jax.tree.map(
+            lambda new, old: jnp.where(better, new, old), (tried, new), (state.theta, old)
         )
-        step = ascent_direction(made.gradient, made.information)
-        gain = made.gradient @ step
-        # A leap could end where weights are so uneven that ℓ̂ has maxima of its own.
+        step = ascent_direction(new.gradient, new.information)
+        gain = new.gradient @ step
+        # A long step could end at a spurious maximum of ℓ̂, where weights are very uneven.
         longest = longest_fraction(gain)
         fraction = jnp.where(better | starting, longest, state.fraction / 3).astype(theta.dtype)
-        # The last point that was tried is better, or no shorter step would do.
+        # Stop if the next step is negligible, or if shorter steps brought no increase.
         done = (state.i + 1 >= at_start) & ((gain < _GAIN) | (fraction < _SHORTEST * longest))
-        return _Ascent(state.i + 1, theta, made, step, fraction, done)
+        return _Ascent(state.i + 1, theta, new, step, fraction, done)
 
     nowhere = jax.tree.map(
         lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(at, starts[0])
@@ -354,18 +373,18 @@ def newton_ascent(
     one, no = jnp.ones_like(starts[0, 0]), jnp.array(False)
     first = _Ascent(jnp.int32(0), starts[0], nowhere, jnp.zeros_like(starts[0]), one, no)
     last = lax.while_loop(lambda state: ~state.done & (state.i < _MOST_POINTS), next_point, first)
-    made = last.simulated
-    offsets = allowed_offsets(parameters, last.theta, made.information)
+    at_last = last.simulated
+    offsets = allowed_offsets(parameters, last.theta, at_last.information)
     values = lax.map(
         lambda point: simulated_value(key, parameters, blocks, point, num_paths),
         (last.theta + offsets).reshape(-1, len(last.theta)),
     )
-    rises = values.reshape(offsets.shape[:-1]) - made.value
-    slope = Slope(made.gradient, made.covariance, made.information, rises)
-    # Where weights are very uneven ℓ̂ has maxima of its own. By rounding a step may seem to lead
-    # down that does not.
-    found = is_maximum(slope) & (made.gradient @ last.step < 100 * _GAIN)
-    return Maximum(last.theta, made, found, falls(slope, offsets))
+    rises = values.reshape(offsets.shape[:-1]) - at_last.value
+    slope = Slope(at_last.gradient, at_last.covariance, at_last.information, rises)
+    # ℓ̂ has spurious maxima where weights are very uneven. The tolerance on the gain is wider than
+    # `_GAIN` because rounding errors may reject an ascending step.
+    converged = is_maximum(slope) & (at_last.gradient @ last.step < 100 * _GAIN)
+    return Maximum(last.theta, at_last, converged, falls(slope, offsets))
 
 
 @compiled_sooner
@@ -376,7 +395,7 @@ def stochastic_ascent(
     search: Search,
     theta: Float[Array, " p"],
 ) -> tuple[Float[Array, "n p"], SearchInfo]:
-    """The optimiser's iterates along ∇ℓ̂ with new noise in each, and what was lost on the way."""
+    """Return the optimiser's iterates along ∇ℓ̂ with new noise in each, and counts of failures."""
     rule = search.rule
     assert isinstance(rule, Gradient)
     parameters, blocks, theta = nondifferentiable((parameters, blocks, theta))
@@ -385,9 +404,9 @@ def stochastic_ascent(
     def mean_log_likelihood(theta, key):
         value, missing = jnp.zeros((), theta.dtype), jnp.int32(0)
         for block_key, block in with_keys(key, blocks):
-            made, found, _ = _log_weights(block_key, parameters, block, _FEW, theta)
-            value += jnp.sum(_log_densities(made, found))
-            missing += jnp.sum(~jnp.any(found, axis=1), dtype=jnp.int32)
+            log_weights, active, _ = _log_weights(block_key, parameters, block, _FEW, theta)
+            value += jnp.sum(_log_densities(log_weights, active))
+            missing += jnp.sum(~jnp.any(active, axis=1), dtype=jnp.int32)
         return value / num_intervals, missing
 
     def propose(i, theta, memory, _):
