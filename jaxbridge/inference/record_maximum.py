@@ -1,26 +1,28 @@
 """Maximum likelihood from noisy or partial records.
 
-With ξ ~ N(0, I) and the path of ξ at θ (`record_paths`) the likelihood is E[w(θ, ξ)]. The law of ξ
-does not depend on θ. Hence Fisher's identity and that of Louis (1982) are
+Let ξ ~ N(0, I), and let w(θ, ξ) be the weight of its path at θ (`record_paths`). The likelihood is
+L(θ) = E[w(θ, ξ)]. The law of ξ does not depend on θ. Hence by Fisher and by Louis (1982)
 
-    ∇ log L(θ) = E[∇ log w | y],    -∇² log L(θ) = -E[∇² log w | y] - Cov(∇ log w | y),
+    ∇ log L(θ) = E[∇ log w | y],    -∇² log L(θ) = -E[∇² log w | y] - Cov(∇ log w | y).
 
-with means over ξ given θ and the data, and derivatives in θ. They hold for parameters of σ, of the
-noise and of the initial law as well as for those of the drift, for every step size.
+The means are over ξ given θ and the data, and the derivatives are in θ. The identities hold for
+every step size. They hold for parameters of the drift, of σ, of the noise and of the initial law.
 
-In each iteration chains of paths move given the current θ. The paths are converted to ξ, and an
-optimiser moves θ along the mean of ∇ log w, which changes the paths with θ (Gu & Kong 1998).
+*Search.* In each iteration chains of paths move given the current θ. The paths are converted to ξ,
+and an optimiser moves θ along the mean of ∇ log w (Gu & Kong 1998). The paths change with θ.
 Newton's method continues from the average of the second half of the iterates (`newton`). In its
-passes the chains run with fixed θ. The difference log L(θ + d) - log L(θ) is the log of the mean of
-w(θ + d) / w(θ) given the data. The first two cumulants of the log ratio estimate it.
+passes the chains run with fixed θ.
 
-∇² log w is a difference of ∇ log w at θ ± h e_j, because derivatives take three times as long to
-compile. h is a fraction of 1 / √D_j, with D_j the mean of -∂²_j log w. This would be the standard
-error if ξ were known.
+*Differences of log L.* log L(θ + d) - log L(θ) is the log of the mean of w(θ + d) / w(θ) given the
+data. The first two cumulants of the log ratio estimate it.
 
-Let e = log L_N - log L be the discretisation error of the log-likelihood, about a fixed fraction of
-log L_{N/2} - log L_N. It moves the maximum by I⁻¹ ∇e. With the weight w̃ of half as many steps and
-D = log w̃ / w,
+*Second derivatives.* ∇² log w is approximated by differences of ∇ log w at θ ± h e_j. Exact second
+derivatives take three times as long to compile. h is a fraction of 1 / √D_j, where D_j is the mean
+of -∂²_j log w. 1 / √D_j would be the standard error of θ_j if ξ were observed.
+
+*Discretisation error.* The error of the log-likelihood, e = log L_N - log L, is about a fixed
+fraction of log L_{N/2} - log L_N. It moves the maximum by I⁻¹ ∇e. Let w̃ be the weight with
+half as many steps, and D = log w̃ / w. Then
 
     ∇ log L_{N/2} = E[(w̃ / w) ∇ log w̃ | y] / E[w̃ / w | y]
                   ≈ E[∇ log w̃ | y] + Cov(D + ½ (D - ED)², ∇ log w̃ | y).
@@ -58,15 +60,15 @@ from .record_paths import At, RecordPaths, as_record_paths, movable, share_of_st
 from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 
 _CHAINS = 8
-# Of the chains before θ moves.
+# Burn-in of the chains, in sweeps, before θ moves.
 _SWEEPS = 50
-# h of differences, as a share; and by how many draws before those that count it is learnt, while
-# the chains settle at a new θ.
+# The step h of differences, as a fraction of 1 / √D_j; and the number of draws at a new θ that
+# adapt h. They are discarded, because the chains are not yet in equilibrium.
 _DIFFERENCE, _LEARNING = 0.05, 20
 
 _MOST_R_HAT = 1.1
-# Chains that disagree by no more than rounding agree: beside this Monte Carlo error, in standard
-# errors, R̂ matters.
+# R̂ is ignored if the Monte Carlo error is smaller than this fraction of a standard error: then
+# rounding errors alone can make R̂ large.
 _MATTERS = 0.01
 _STUCK = "A block of a path never moved. Use more `num_bridges` or more steps."
 _APART = "Chains of paths disagree (R̂ of the gradient above 1.1). Use more `num_bridges`."
@@ -156,15 +158,20 @@ class RecordMaximumLikelihood(AbstractResult):
 
 
 class _Chains(NamedTuple):
-    """Paths of all chains, and log β of the moves of their blocks."""
+    """Paths of all chains, and log β of the moves of the blocks of these paths."""
 
     paths: Float[Array, "chains R points d"]
     log_scales: Float[Array, "chains R 2 B"]
 
 
 class _Draw(NamedTuple):
-    """Of one ξ: ∇ log w and ∇² log w, log w̃ / w and ∇ log w̃; by how much log w rises from θ to
-    points around it; and which blocks moved."""
+    """Values for one ξ.
+
+    - `gradient`, `hessian`: ∇ log w and ∇² log w.
+    - `log_ratio`, `coarse`: log w̃ / w and ∇ log w̃.
+    - `rises`: increases of log w from θ to 2p points around it.
+    - `taken`: whether each block moved.
+    """
 
     gradient: Float[Array, "*n p"]
     hessian: Float[Array, "*n p p"]
@@ -182,19 +189,20 @@ def maximum_of_records(
     search: Search,
     num_draws: int,
 ) -> RecordMaximumLikelihood:
-    """The estimate, by so many draws of each chain at the end."""
+    """Return the estimate; Newton's method uses `num_draws` draws of each chain in each pass."""
     parameters.check_allowed(theta)
     run_key, last_key = jax.random.split(key)
     completion = as_record_paths(parameters, records, theta)
     iterates, chains, info = _approximate(run_key, completion, search, theta)
     rough = jnp.mean(iterates[len(iterates) // 2 :], axis=0)
-    # What guides well at the first θ need not do so at the last.
+    # A good guide at the first θ may be poor at the last one.
     completion = as_record_paths(parameters, records, rough)
     passes = _refined(last_key, completion, rough, chains, num_draws, search.progress_meter)
     return _summary(completion, iterates, info, passes)
 
 
 def _of_chains(function: Callable, key: Key[Array, ""], *mapped: PyTree) -> PyTree:
+    """Return `function(key, *arguments)` of each chain, with separate keys."""
     return jax.vmap(function)(jax.random.split(key, _CHAINS), *mapped)
 
 
@@ -205,24 +213,26 @@ def _swept(
     chains: _Chains,
     number: Int[Array, ""],
 ) -> tuple[_Chains, Bool[Array, "chains R 2 B"]]:
-    """The paths after a sweep given θ, the `number`-th in which moves learn their size; and which
-    blocks moved."""
-    renewed = lambda key, *each: completion.renewed(key, at, *each)
-    paths, taken = _of_chains(renewed, key, *chains)
-    log_scales = tuned(chains.log_scales, taken, (number + 1).astype(at.theta.dtype))
-    return _Chains(paths, log_scales), taken[..., 0]
+    """Return the chains after a sweep given θ, and whether each block moved.
+
+    `number` counts the sweeps that adapt the scales of moves, from zero.
+    """
+    renewed = lambda key, *chain: completion.renewed(key, at, *chain)
+    paths, accepted = _of_chains(renewed, key, *chains)
+    log_scales = tuned(chains.log_scales, accepted, (number + 1).astype(at.theta.dtype))
+    return _Chains(paths, log_scales), accepted[..., 0]
 
 
 @compiled_sooner
 def _approximate(
     key: Key[Array, ""], completion: RecordPaths, search: Search, theta: Float[Array, " p"]
 ) -> tuple[Float[Array, "n p"], _Chains, SearchInfo]:
-    """The iterates of the stochastic approximation, and where chains are at its end."""
+    """Return the iterates of the stochastic approximation, and the last state of the chains."""
     completion = nondifferentiable(completion)
     first_key, run_key = jax.random.split(key)
     parameters, rule = completion.parameters, search.rule
     assert isinstance(rule, Gradient)
-    number_seen = sum(completion.fine.records.num_times)
+    num_observed = sum(completion.fine.records.num_times)
 
     def propose(i, theta, memory, chains):
         sweep_key, noise_key = jax.random.split(jax.random.fold_in(run_key, i))
@@ -230,13 +240,13 @@ def _approximate(
         chains, _ = _swept(sweep_key, completion, at, chains, i)
         read = lambda key, paths: completion.noise(key, at, paths)[0]
         noise = _of_chains(read, noise_key, chains.paths)
-        gradient = jax.grad(_mean_log_weight)(theta, completion, noise) / number_seen
+        gradient = jax.grad(_mean_log_weight)(theta, completion, noise) / num_observed
         new = rule.ascend(theta, memory, gradient)
         burnt_in = i >= _SWEEPS
         new_theta, new_memory = jax.tree.map(
             lambda new, old: jnp.where(burnt_in, new, old), new, (theta, memory)
         )
-        # As `iterate` decides it: paths follow θ where that moves.
+        # The same test as in `iterate`, so that paths change only if θ does.
         moves = parameters.allowed(new_theta) & all_finite_leaves(new_memory)
         goal = completion.at(jnp.where(moves, new_theta, theta))
         paths, log_weights = jax.vmap(lambda noise: completion.of_noise(goal, noise))(noise)
@@ -254,11 +264,11 @@ def _approximate(
 def _mean_log_weight(
     theta: Float[Array, " p"], completion: RecordPaths, noise: Float[Array, "chains R points d"]
 ) -> Float[Array, ""]:
-    """The mean over chains, of those with a path that has weight."""
+    """Return the mean of log w over the chains whose path has a finite log w."""
     at = completion.at(theta)
-    each = jax.vmap(lambda noise: completion.of_noise(at, noise)[1])(noise)
-    good = jnp.isfinite(each)
-    return jnp.sum(jnp.where(good, each, 0)) / jnp.maximum(jnp.sum(good.astype(each.dtype)), 1)
+    values = jax.vmap(lambda noise: completion.of_noise(at, noise)[1])(noise)
+    good = jnp.isfinite(values)
+    return jnp.sum(jnp.where(good, values, 0)) / jnp.maximum(jnp.sum(good.astype(values.dtype)), 1)
 
 
 @compiled_sooner
@@ -270,13 +280,13 @@ def _refined(
     num_draws: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> Passes:
-    """Newton's method from θ, with so many draws of each chain in a pass."""
+    """Run Newton's method from θ, with `num_draws` draws of each chain in each pass."""
     completion, theta, chains = nondifferentiable((completion, theta, chains))
 
     def evaluate(i, theta, offsets, memory):
         where, key_of_pass = (theta, offsets, memory), jax.random.fold_in(key, i)
-        made = _draws_at(key_of_pass, completion, *where, num_draws, progress_meter)
-        draws, chains, h = made
+        result = _draws_at(key_of_pass, completion, *where, num_draws, progress_meter)
+        draws, chains, h = result
         return _slope(draws, h), draws, (chains, h)
 
     h = jnp.where(theta == 0, 0.01, 0.01 * jnp.abs(theta))
@@ -292,31 +302,32 @@ def _draws_at(
     num_draws: int,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> tuple[_Draw, _Chains, Float[Array, " p"]]:
-    """Of all chains, axes (chains, n), at θ; where the chains are then; and h."""
+    """Return draws of all chains at θ, with axes (chains, n), the last chains, and h."""
     p, here = len(theta), completion.at(theta)
 
-    def derivatives(key, paths, taken, h):
+    def derivatives(key, paths, accepted, h):
         noise, log_weight = completion.noise(key, here, paths)
         log_w = lambda theta, coarse: completion.either_log_weight(theta, noise, coarse)
-        apart = jnp.diag(h)
+        shifts = jnp.diag(h)
         zeros = jnp.zeros((2, p), h.dtype)
-        around = theta + jnp.concatenate([zeros, apart, -apart, offsets.reshape(2 * p, p)])
+        around = theta + jnp.concatenate([zeros, shifts, -shifts, offsets.reshape(2 * p, p)])
+        # Points: θ with fine steps, θ with coarse steps, θ ± h e_j, and θ + offsets.
         is_coarse = jnp.arange(4 * p + 2) == 1
         values, slopes = lax.map(lambda at: jax.value_and_grad(log_w)(*at), (around, is_coarse))
         hessian = (slopes[2 : 2 + p] - slopes[2 + p : 2 + 2 * p]) / (2 * h[:, None])
         hessian = (hessian + hessian.T) / 2
         rises = (values[2 + 2 * p :] - values[0]).reshape(2, p)
-        return _Draw(slopes[0], hessian, values[1] - log_weight, slopes[1], rises, taken)
+        return _Draw(slopes[0], hessian, values[1] - log_weight, slopes[1], rises, accepted)
 
     def draw(state, i):
         chains, h = state
         sweep_key, noise_key = jax.random.split(jax.random.fold_in(key, i))
-        moved, taken = _swept(sweep_key, completion, here, chains, i)
-        chains = chains._replace(paths=moved.paths)
-        each = lambda key, paths, taken: derivatives(key, paths, taken, h)
-        made = _of_chains(each, noise_key, chains.paths, taken)
-        curvature = -jnp.diagonal(jnp.nanmean(made.hessian, axis=0))
-        return (chains, jnp.where(i < _LEARNING, _nearer(h, curvature), h)), made
+        swept, accepted = _swept(sweep_key, completion, here, chains, i)
+        chains = chains._replace(paths=swept.paths)
+        of_chain = lambda key, paths, taken: derivatives(key, paths, taken, h)
+        draws = _of_chains(of_chain, noise_key, chains.paths, accepted)
+        curvature = -jnp.diagonal(jnp.nanmean(draws.hessian, axis=0))
+        return (chains, jnp.where(i < _LEARNING, _nearer(h, curvature), h)), draws
 
     numbers = jnp.arange(_LEARNING + num_draws)
     (chains, h), draws = metered_scan(draw, start, numbers, progress_meter)
@@ -325,33 +336,41 @@ def _draws_at(
 
 
 def _nearer(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> Float[Array, " p"]:
-    """The h that suits such a curvature, or what is nearer to it than the last one."""
-    wanted = _DIFFERENCE * lax.rsqrt(jnp.abs(curvature))
-    return jnp.where(jnp.isfinite(wanted), jnp.clip(wanted, h / 8, h * 8), h / 8)
+    """Return the h for this curvature, changed by at most a factor of 8.
+
+    Where the curvature is not finite, h is divided by 8.
+    """
+    target = _DIFFERENCE * lax.rsqrt(jnp.abs(curvature))
+    return jnp.where(jnp.isfinite(target), jnp.clip(target, h / 8, h * 8), h / 8)
 
 
 def _slope(draws: _Draw, h: Float[Array, " p"]) -> Slope:
-    """Log L near θ by Fisher's and Louis's identities, NaN if h does not suit the curvature."""
+    """Return log L near θ by the identities of Fisher and Louis.
+
+    The information is NaN if h is off by more than a factor of 2. Then Newton's method does not use it.
+    """
     p = len(h)
     gradients = draws.gradient.reshape(-1, p)
     gradient, spread = jnp.mean(gradients, axis=0), jnp.cov(gradients.T).reshape(p, p)
     curvature = -jnp.mean(draws.hessian, axis=(0, 1))
-    learnt = jnp.all(jnp.abs(jnp.log(_nearer(h, jnp.diagonal(curvature)) / h)) < jnp.log(2.0))
+    is_adapted = jnp.all(jnp.abs(jnp.log(_nearer(h, jnp.diagonal(curvature)) / h)) < jnp.log(2.0))
     size = effective_size_of_chains(draws.gradient)
     covariance = spread / jnp.sqrt(size[:, None] * size)
-    information = jnp.where(learnt, curvature - spread, jnp.nan)
+    information = jnp.where(is_adapted, curvature - spread, jnp.nan)
     return Slope(gradient, covariance, information, _rises(draws.rises))
 
 
-def _rises(each: Float[Array, "chains n 2 p"]) -> Float[Array, "2 p"]:
-    """The log of the mean of exponentials, by two cumulants and no more than the largest; -inf
-    where none is finite."""
-    finite = jnp.isfinite(each)
-    number = jnp.sum(finite, axis=(0, 1)).astype(each.dtype)
-    mean = jnp.sum(jnp.where(finite, each, 0), axis=(0, 1)) / jnp.maximum(number, 1)
-    squares = jnp.where(finite, each - mean, 0) ** 2
+def _rises(exponents: Float[Array, "chains n 2 p"]) -> Float[Array, "2 p"]:
+    """Return the log of the mean of exponentials by two cumulants, at most the largest exponent.
+
+    It is -inf if no exponent is finite.
+    """
+    finite = jnp.isfinite(exponents)
+    number = jnp.sum(finite, axis=(0, 1)).astype(exponents.dtype)
+    mean = jnp.sum(jnp.where(finite, exponents, 0), axis=(0, 1)) / jnp.maximum(number, 1)
+    squares = jnp.where(finite, exponents - mean, 0) ** 2
     variance = jnp.sum(squares, axis=(0, 1)) / jnp.maximum(number, 1)
-    largest = jnp.max(jnp.where(finite, each, -jnp.inf), axis=(0, 1))
+    largest = jnp.max(jnp.where(finite, exponents, -jnp.inf), axis=(0, 1))
     return jnp.minimum(mean + variance / 2, largest)
 
 
@@ -359,14 +378,15 @@ def _rises(each: Float[Array, "chains n 2 p"]) -> Float[Array, "2 p"]:
 def _summary(
     completion: RecordPaths, iterates: Float[Array, "n p"], info: SearchInfo, passes: Passes
 ) -> RecordMaximumLikelihood:
-    """The estimate where Newton's method ended, with its errors."""
+    """Return the estimate at the last θ of Newton's method, with its errors."""
     parameters, slope, draws = completion.parameters, passes.slope, passes.details
     covariance = jnp.linalg.inv(slope.information)
-    left = covariance @ slope.covariance @ covariance
+    # Delta method: an error of the score moves its zero by the inverse information times it.
+    noise = covariance @ slope.covariance @ covariance
     stuck = jnp.any(
         movable(completion.fine.records) & ~jnp.any(draws.taken, axis=1), axis=(1, 2, 3)
     )
-    monte_carlo = jnp.sqrt(jnp.diagonal(left))
+    monte_carlo = jnp.sqrt(jnp.diagonal(noise))
     monte_carlo = jnp.where(jnp.any(stuck), jnp.inf, monte_carlo)
     step_error = _step_error(completion, draws, covariance)
     return RecordMaximumLikelihood(
@@ -391,13 +411,13 @@ def _summary(
 def _step_error(
     completion: RecordPaths, draws: _Draw, covariance: Float[Array, "p p"]
 ) -> StepError:
-    """I⁻¹ ∇e, with its standard error by the chains."""
+    """Estimate I⁻¹ ∇e, the discretisation error of the estimate, with its standard error."""
     if completion.num_steps == 1:
         return StepError(*2 * [jnp.full_like(draws.gradient[0, 0], jnp.nan)])
     centred = draws.coarse - jnp.mean(draws.coarse, axis=(0, 1))
     deviation = draws.log_ratio - jnp.mean(draws.log_ratio)
     ratio = (deviation + (deviation**2 - jnp.mean(deviation**2)) / 2)[..., None]
-    each = (draws.coarse - draws.gradient + ratio * centred) @ covariance
-    each = share_of_step_error(completion.fine.records) * each
-    size = effective_size_of_chains(each)
-    return StepError(jnp.mean(each, axis=(0, 1)), jnp.std(each, axis=(0, 1)) / jnp.sqrt(size))
+    errors = (draws.coarse - draws.gradient + ratio * centred) @ covariance
+    errors = share_of_step_error(completion.fine.records) * errors
+    size = effective_size_of_chains(errors)
+    return StepError(jnp.mean(errors, axis=(0, 1)), jnp.std(errors, axis=(0, 1)) / jnp.sqrt(size))
