@@ -2,8 +2,8 @@
 
 Given θ the bridges of all intervals are independent, and a separate Markov kernel renews each of
 them (`bridge_kernels`). Given the bridges the log-likelihood of θ is that of the completed path. It
-is quadratic if the drift is linear in θ. The module detects this from the program of the Hessian,
-in which θ does not occur.
+is quadratic if the drift is linear in θ. The module detects this from the traced program of the
+Hessian, which then does not use θ.
 """
 
 import math
@@ -40,9 +40,13 @@ Paths = tuple[Float[Array, "_ _ d"], ...]
 
 
 class Augmentation(eqx.Module):
-    """How the observations are completed: by bridges of all intervals, in blocks of one number of
-    steps each, with a kernel for each block; the form of the likelihood of their paths, and
-    whether it is quadratic in θ."""
+    """Data augmentation by bridges of all intervals.
+
+    - `blocks`, `kernels`: blocks of intervals with the same number of steps, and a bridge kernel
+      for each block.
+    - `form`: form of the likelihood of the paths.
+    - `is_quadratic`: whether the log-likelihood is quadratic in θ.
+    """
 
     blocks: tuple[Block, ...]
     kernels: tuple[AbstractBridgeKernel, ...]
@@ -51,7 +55,7 @@ class Augmentation(eqx.Module):
 
     @property
     def like(self) -> Float[Array, " d"]:
-        """A point, of which only shape and dtype count."""
+        """Return a point of the state space. Only its shape and dtype are used."""
         return self.blocks[0].problem.like
 
     @property
@@ -59,50 +63,57 @@ class Augmentation(eqx.Module):
         return sum(len(block.index) for block in self.blocks)
 
     def check_paths(self, paths: tuple[Float[Array, "..."], ...], chains: tuple[int, ...]) -> None:
-        """Raise `ValueError` where these are no paths between the observations."""
-        wanted = [
+        """Raise `ValueError` unless these are paths between the observations.
+
+        `chains` is the leading shape of the paths, () or (number of chains,).
+        """
+        expected = [
             (*chains, len(block.index), block.num_steps + 1, block.intervals.start.shape[1])
             for block in self.blocks
         ]
-        shapes = [mine.shape for mine in paths]
-        if shapes != wanted:
+        shapes = [array.shape for array in paths]
+        if shapes != expected:
             raise ValueError(
                 f"`init` is a state with paths of shapes {shapes}, but these observations and "
-                f"numbers of steps need {wanted}: pass the same observations and `num_steps` as "
+                f"numbers of steps need {expected}: pass the same observations and `num_steps` as "
                 "before, or unknown parameters as `init`."
             )
-        for block, mine in zip(self.blocks, paths, strict=True):
+        for block, array in zip(self.blocks, paths, strict=True):
             ends = (block.intervals.start, block.intervals.end)
-            for end, found in zip(ends, (mine[..., 0, :], mine[..., -1, :]), strict=True):
-                if not is_traced(end, found) and not np.allclose(found, end, atol=1e-6, rtol=1e-4):
+            for end, last in zip(ends, (array[..., 0, :], array[..., -1, :]), strict=True):
+                if not is_traced(end, last) and not np.allclose(last, end, atol=1e-6, rtol=1e-4):
                     raise ValueError(
                         "`init` is a state whose paths do not join these observations: pass the "
                         "same observations as before, or unknown parameters as `init`."
                     )
 
     def first(self, key: Key[Array, ""], model: Diffusion) -> tuple[Paths, Bool[Array, " I"]]:
-        """Paths to start from, and which of them the proposal itself has found, in the order of the
-        blocks. Where it finds none, whatever its weight, a straight line serves, or, if couplings
-        may be used (inside `jit` all of a choice), a modified diffusion bridge: a chain may start
-        anywhere."""
+        """Sample initial paths; return them, and whether the proposal found each, in block order.
+
+        An interval without a bridge gets a placeholder, because a chain may start anywhere. It is a
+        modified diffusion bridge if the proposal may use couplings, which includes any choice of
+        proposals inside `jit`. Otherwise, or if that bridge is not finite, it is a straight line.
+        """
         model = model.prepared()
 
         def of_block(block, kernel, keys):
             intervals, num_steps = block.intervals, block.num_steps
             found_keys, other_keys = split_each(keys, 2)
-            found = kernel.first(found_keys, model, intervals, num_steps)
-            better = [found]
+            proposed = kernel.first(found_keys, model, intervals, num_steps)
+            preferred = [proposed]
             if block.proposal.coupled:
                 other = ModifiedDiffusionBridge(EulerDensity()).draw(
                     other_keys[:, None], model, intervals, num_steps, None, False
                 )
-                better = [other.paths[:, 0], found]
-            done = jnp.concatenate([jnp.zeros(1), jnp.cumsum(block.fractions)]).astype(found.dtype)
+                preferred = [other.paths[:, 0], proposed]
+            done = jnp.concatenate([jnp.zeros(1), jnp.cumsum(block.fractions)]).astype(
+                proposed.dtype
+            )
             start, end = intervals.start[:, None], intervals.end[:, None]
             path = start + done[:, None] * (end - start)
-            for each in better:
-                path = jnp.where(is_there(each)[:, None, None], each, path)
-            return path, is_there(found)
+            for candidate in preferred:  # the last finite one is used
+                path = jnp.where(is_there(candidate)[:, None, None], candidate, path)
+            return path, is_there(proposed)
 
         paths, found = zip(*map(of_block, self.blocks, self.kernels, self._keys(key)), strict=True)
         return paths, jnp.concatenate(found)
@@ -110,37 +121,40 @@ class Augmentation(eqx.Module):
     def renew(
         self, key: Key[Array, ""], model: Diffusion, paths: Paths
     ) -> tuple[Paths, BridgeInfo]:
-        """One step of every bridge, at the parameters of this model."""
+        """Return the paths after one step of each bridge kernel, at the parameters of `model`."""
         model = model.prepared()
 
-        def of_block(block, kernel, keys, mine):
-            return kernel.renew(keys, model, block.intervals, mine)
+        def of_block(block, kernel, keys, current):
+            return kernel.renew(keys, model, block.intervals, current)
 
-        made = map(of_block, self.blocks, self.kernels, self._keys(key), paths)
-        paths, infos = zip(*made, strict=True)
+        results = map(of_block, self.blocks, self.kernels, self._keys(key), paths)
+        paths, infos = zip(*results, strict=True)
         return paths, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *infos)
 
     def log_likelihood(self, model: Diffusion, paths: Paths) -> Float[Array, ""]:
-        """That of all paths."""
+        """Return the log-likelihood of all paths."""
 
-        def of_block(block, mine):
-            return log_likelihoods(model, block.steps, mine, self.form)
+        def of_block(block, array):
+            return log_likelihoods(model, block.steps, array, self.form)
 
         return jnp.sum(jnp.concatenate(list(map(of_block, self.blocks, paths))))
 
     def log_step_error(self, model: Diffusion, paths: Paths) -> Float[Array, ""]:
-        """A function of these paths whose mean, given θ, is the step error of log L(θ): half as
-        many steps make each path e^D times as likely (`halving`), so that they change log p of an
-        interval by log E[e^D], to leading order E[D + ½ D²]; of that a share is the error.
-        (Not E[D], for the variance of D is of the same order; nor E[e^D - 1], which is -1 however
-        far steps are out of all proportion, and would tell of no error.) Infinite where steps are
-        too long for the drift in more than 2 % of the intervals."""
+        """Estimate the discretisation error of log L(θ) by a function of the paths.
+
+        Its mean given θ is the error. With half as many steps a path is e^D times as likely
+        (`halving`), so log p of an interval changes by log E[e^D], to leading order E[D + ½ D²].
+        The error is a fixed share of this change. It is infinite if steps are too long for the
+        drift in more than 2 % of the intervals.
+        """
         model, form = model.prepared(), self.form
 
-        def of_block(block, mine):
-            halvings = block.log_halvings(model, mine, form)
+        def of_block(block, array):
+            halvings = block.log_halvings(model, array, form)
             share = block.step_shares(model, form)
             in_regime = share_in_regime(share, model, block.intervals, block.num_steps)
+            # D² has the same order as the mean of D. E[e^D - 1] is no alternative: it is about -1
+            # for steps that are far too long, which would hide the error.
             error = jnp.sum(share * (halvings + halvings**2 / 2))
             return error, jnp.sum(in_regime == UNKNOWN_SHARE)
 
@@ -149,8 +163,8 @@ class Augmentation(eqx.Module):
         return jnp.where(hopeless, jnp.inf, sum(errors))
 
     def points(self, paths: Paths) -> tuple[Float[Array, "points d"], Float[Array, " points"]]:
-        """All points of the paths but their ends, and the steps that begin there."""
-        points = [mine[:, :-1].reshape(-1, mine.shape[-1]) for mine in paths]
+        """Return the points of all paths without the last ones, and the step sizes after them."""
+        points = [array[:, :-1].reshape(-1, array.shape[-1]) for array in paths]
         steps = [block.steps.T.reshape(-1) for block in self.blocks]
         return jnp.concatenate(points), jnp.concatenate(steps)
 
@@ -161,7 +175,7 @@ class Augmentation(eqx.Module):
 
 
 def is_there(paths: Float[Array, "I points d"]) -> Bool[Array, " I"]:
-    """Which paths are not missing."""
+    """Return whether each path exists: missing paths are NaN."""
     return jnp.all(jnp.isfinite(paths), axis=(1, 2))
 
 
@@ -174,9 +188,9 @@ def augment(
     method: Literal["pseudo_marginal", "renewal"] | None,
     budget: Budget,
 ) -> Augmentation:
-    """The augmentation that the user asked for; pilot runs and burn-ins are at this θ.
+    """Build the data augmentation. Pilot runs and burn-ins use this θ.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """
     check_choice("bridges", bridges, ("exact", "approximate"))
     if method is not None:
@@ -216,11 +230,12 @@ def _kernel(
 def _quadratic_form(
     problem: Problem, theta: Float[Array, " p"], forms: Sequence[Form]
 ) -> Form | None:
-    """The first of these forms in which the log likelihood is quadratic in θ, if there is one."""
+    """Return the first form in which the log-likelihood is quadratic in θ, or `None`."""
     like, parameters = problem.like, problem.parameters
     for form in forms:
 
         def log_likelihood(theta, form: Form = form):
+            # One step suffices: dependence on θ is a property of the program, not of its numbers.
             steps, paths = jnp.ones((1, 1), like.dtype), jnp.stack([like, like])[None]
             return log_likelihoods(parameters.bind(theta), steps, paths, form)[0]
 

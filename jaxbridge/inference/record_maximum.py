@@ -21,8 +21,8 @@ derivatives take three times as long to compile. h is a fraction of 1 / √D_j, 
 of -∂²_j log w. 1 / √D_j would be the standard error of θ_j if ξ were observed.
 
 *Discretisation error.* The error of the log-likelihood, e = log L_N - log L, is about a fixed
-fraction of log L_{N/2} - log L_N. It moves the maximum by I⁻¹ ∇e. Let w̃ be the weight with
-half as many steps, and D = log w̃ / w. Then
+fraction of log L_{N/2} - log L_N. The error moves the maximum by I⁻¹ ∇e. Let w̃ be the weight with
+half as many steps, and D = log w̃ / w. Then:
 
     ∇ log L_{N/2} = E[(w̃ / w) ∇ log w̃ | y] / E[w̃ / w | y]
                   ≈ E[∇ log w̃ | y] + Cov(D + ½ (D - ED)², ∇ log w̃ | y).
@@ -122,7 +122,7 @@ class RecordMaximumLikelihood(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """The faults of the estimate, each with a remedy.
+        """Return the faults of the estimate, each with a remedy.
 
         They are: no maximum, or none inside; a block of a path that never moved; chains that
         disagree; a poor guide; and a discretisation error that dominates and exceeds 0.05 standard
@@ -149,7 +149,7 @@ class RecordMaximumLikelihood(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:
-        """Whether the discretisation error exceeds the standard error, or may do so; shape (p,).
+        """Return whether the discretisation error exceeds the standard error, or may do so; shape (p,).
 
         Then use more steps.
         """
@@ -347,7 +347,8 @@ def _nearer(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> Float[Array
 def _slope(draws: _Draw, h: Float[Array, " p"]) -> Slope:
     """Return log L near θ by the identities of Fisher and Louis.
 
-    The information is NaN if h is off by more than a factor of 2. Then Newton's method does not use it.
+    The information is NaN, and Newton's method does not use it, if h is off by more than a factor
+    of 2.
     """
     p = len(h)
     gradients = draws.gradient.reshape(-1, p)
