@@ -64,7 +64,7 @@ from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_paths import check_no_bridges, check_no_record, unguided
 from .warm_up import stages
 
-# A noisier estimate, or weights that are cut off in a larger share of iterations, spoil the chain.
+# Limits of the variance of the log-likelihood estimates, and of the share of truncated iterations.
 _MOST_VARIANCE, _MOST_TRUNCATED = 5.0, 0.01
 _NOISY = (
     "The variance of the log-likelihood estimates (`log_likelihood_variance`) is above 5, so the "
@@ -79,12 +79,12 @@ _NOISY_IN_PART = (
     "enters such regions and then stays long, so it may have missed a tail, and errors are too "
     "small. Use more `num_proposals`."
 )
-# For so many parameters it is decided how likelihoods are estimated.
+# Number of likely θ at which pilot runs tune the estimator of the likelihood.
 _NUM_LIKELY = 8
 
 
 class _Chain(NamedTuple):
-    """Where a chain is: θ, the estimate that it holds with its variance, and S."""
+    """State of a chain inside the loop: θ, the estimate at θ with its variance, and S."""
 
     theta: Float[Array, "*chains p"]
     log_likelihood: Float[Array, "*chains"]
@@ -171,7 +171,7 @@ class PMMHPosterior(AbstractPosterior):
 
     @property
     def stuck(self) -> Bool[Array, "*chains"]:
-        """Whether a chain never moved, shape (*chains,).
+        """Return whether a chain never moved, shape (*chains,).
 
         Then its draws do not represent the posterior, `effective_sample_size` is zero, and
         `standard_error` is infinite.
@@ -307,7 +307,7 @@ def pmmh(
 
         def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:
             grids = unguided(records), unguided(records.coarsened())
-            no_rate = jnp.zeros((), unknown.dtype)  # stands in until there are pilots
+            no_rate = jnp.zeros((), unknown.dtype)  # a placeholder until the pilot runs
             likelihood = RecordLikelihood(*grids, no_rate, num_proposals)
             return likelihood if state is None else _guided_by_state(likelihood, state)
 
@@ -319,17 +319,17 @@ def pmmh(
     sampler = _Sampler(parameters, likelihood, log_prior)
     start = (theta, root) if state is None else state
     size = (num_warmup, num_iterations, thin)
-    made = _run(run_key, sampler, start, size, covariance is None, progress_meter)
-    check_likelihood_was_found(jnp.all(made.log_likelihood == -jnp.inf, axis=-1))
-    return replace(made, state=made.state._replace(proposals=likelihood.proposals))
+    posterior = _run(run_key, sampler, start, size, covariance is None, progress_meter)
+    check_likelihood_was_found(jnp.all(posterior.log_likelihood == -jnp.inf, axis=-1))
+    return replace(posterior, state=posterior.state._replace(proposals=likelihood.proposals))
 
 
 def _blocks_of_state(
     state: PMMHState, problem: Problem, pilot_model: Diffusion
 ) -> tuple[Block, ...]:
-    """The intervals with the proposals of earlier draws.
+    """Return blocks of the intervals with the proposals of earlier draws.
 
-    **Raises:** `ValueError` where these were for other intervals.
+    **Raises:** `ValueError` if the proposals are for other intervals.
     """
     groups = problem.groups
     if len(state.proposals) != len(groups):
@@ -345,11 +345,11 @@ def _blocks_of_state(
 
 
 def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLikelihood:
-    """With the guide of earlier draws.
+    """Return the likelihood with the guide of earlier draws.
 
-    **Raises:** `ValueError` where that was for other records.
+    **Raises:** `ValueError` if the guide is for other records.
     """
-    shapes = [jax.tree.map(jnp.shape, each) for each in (state.guide, likelihood.guide)]
+    shapes = [jax.tree.map(jnp.shape, guide) for guide in (state.guide, likelihood.guide)]
     if state.guide is None or shapes[0] != shapes[1]:
         raise ValueError(
             "`init` is a state of draws from other records: pass the same `times`, `num_steps` "
@@ -359,9 +359,13 @@ def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLi
 
 
 class PMMHInfo(NamedTuple):
-    """Counts of one step: acceptance, refusal for lack of an estimate, and truncated weights.
+    """Counts of one step.
 
-    After the warm-up also the acceptance probability, and the share of lost paths times it.
+    - `accepted`: whether the proposed θ was accepted.
+    - `num_without_estimate`: rejections for lack of an estimate.
+    - `num_truncated`: truncated weights.
+    - `acceptance`, `share_lost`: acceptance probability, and the share of lost paths times it; zero
+      in the warm-up.
     """
 
     accepted: Int[Array, "*chains"]
@@ -372,8 +376,12 @@ class PMMHInfo(NamedTuple):
 
 
 class _Run(NamedTuple):
-    """A chain, what guides its likelihood, how many iterations it has done, and what was counted in
-    those of this call."""
+    """State of the loop.
+
+    - `chain`, `guide`: state of the chains, and the guide of their likelihood.
+    - `num_done`: number of iterations so far, with those of earlier calls.
+    - `counted`: counts of the iterations of this call.
+    """
 
     chain: _Chain
     guide: Guide | None
@@ -382,15 +390,17 @@ class _Run(NamedTuple):
 
 
 class _Sampler(eqx.Module):
-    """What does not change from iteration to iteration, and the steps of one chain."""
+    """Constants of the sampler, and the steps of one chain."""
 
     parameters: Parameters
     likelihood: AbstractLikelihood
     log_prior: NormalDensity | GivenDensity
 
     def near(self, key: Key[Array, ""], chain: _Chain) -> "_Sampler":
-        """With what estimates best where the first chain is, and not much worse where any of them
-        may come to."""
+        """Return the sampler with a likelihood that is tuned at the current θ of the chains.
+
+        The likelihood is linearised at θ of the first chain, and pilot runs at likely θ tune it.
+        """
         walk_key, pilot_key = jax.random.split(key)
         around = self._likely(walk_key, chain)
         theta = first_chain(chain.theta)
@@ -398,23 +408,26 @@ class _Sampler(eqx.Module):
         return _Sampler(self.parameters, likelihood, self.log_prior)
 
     def _likely(self, key: Key[Array, ""], chain: _Chain) -> Float[Array, "n p"]:
-        """Parameters that are about as likely as those of the chains: proposals are as wide as the
-        posterior but for a factor of 2.4 / √p (Roberts & Rosenthal 2001)."""
+        """Sample θ that are about as likely as those of the chains.
+
+        Proposals have the width of the posterior times 2.4 / √p (Roberts & Rosenthal 2001).
+        """
         p = chain.theta.shape[-1]
         theta, root = chain.theta.reshape(-1, p), chain.root.reshape(-1, p, p)
         which = jnp.arange(_NUM_LIKELY) % len(theta)
         noise = jax.random.normal(key, (_NUM_LIKELY, p), theta.dtype)
+        # √p / 2 is about √p / 2.4, so the moves are about as wide as the posterior.
         wide = (np.sqrt(p) / 2).astype(theta.dtype) * jax.vmap(matvec)(root[which], noise)
-        moved = theta[which] + wide
-        allowed = jax.vmap(self.parameters.allowed)(moved)
-        return jnp.where(allowed[:, None], moved, theta[which])
+        likely = theta[which] + wide
+        allowed = jax.vmap(self.parameters.allowed)(likely)
+        return jnp.where(allowed[:, None], likely, theta[which])
 
     def likely_root(self, chain: _Chain) -> Float[Array, "*chains p p"]:
-        """S of all chains, as wide as the likelihood where the first is."""
+        """Return S of all chains, with the width of the likelihood at θ of the first chain."""
         theta, root = first_chain(chain.theta), chain.root
         one = root.reshape(-1, *root.shape[-2:])[0]
-        made = self.likelihood.likely_root(self.parameters, self.log_prior, theta, one)
-        return jnp.broadcast_to(made, root.shape)
+        likely = self.likelihood.likely_root(self.parameters, self.log_prior, theta, one)
+        return jnp.broadcast_to(likely, root.shape)
 
     def estimate(self, key: Key[Array, ""], theta: Float[Array, " p"]) -> Estimate:
         return self.likelihood.estimate(key, self.parameters.bind(theta))
@@ -435,26 +448,26 @@ class _Sampler(eqx.Module):
         number: Int[Array, ""],
         learning: Bool[Array, ""],
     ) -> tuple[_Chain, PMMHInfo]:
-        """The step of this number, from one on, in which S moves while the chain is learning."""
+        """Make the step with this number, counted from one; S is adapted if `learning`."""
         walk_key, estimate_key, accept_key = jax.random.split(key, 3)
         noise = jax.random.normal(walk_key, state.theta.shape, state.theta.dtype)
         proposed = state.theta + state.root @ noise
         inside = self.parameters.allowed(proposed)
-        # Outside the constraint the model may not be simulated: θ stands in, and is refused.
+        # Outside the constraint the simulation may fail: simulate at the old θ, and reject.
         proposed = jnp.where(inside, proposed, state.theta)
-        made = self.estimate(estimate_key, proposed)
-        new = jnp.where(inside, made.log_likelihood + self.log_prior(proposed), -jnp.inf)
+        estimate = self.estimate(estimate_key, proposed)
+        new = jnp.where(inside, estimate.log_likelihood + self.log_prior(proposed), -jnp.inf)
         rate = acceptance_rate(state.log_likelihood + self.log_prior(state.theta), new)
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
         root = learnt(state.root, noise, rate, number, learning)
-        moved = _Chain(proposed, *made[:3], root)
-        without = inside & (made.log_likelihood == -jnp.inf)
-        chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), moved, state)
+        candidate = _Chain(proposed, *estimate[:3], root)
+        without = inside & (estimate.log_likelihood == -jnp.inf)
+        chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
         count = lambda which: which.astype(jnp.int32)
-        # Where parameters are improbable, explosions say nothing about the posterior.
+        # Weighted by acceptance: explosions at improbable θ do not affect the posterior.
         weight = jnp.where(learning, 0, rate)
-        lost = jnp.where(weight > 0, weight * made.share_lost, 0)
-        info = PMMHInfo(count(accepted), count(without), made.num_truncated, weight, lost)
+        lost = jnp.where(weight > 0, weight * estimate.share_lost, 0)
+        info = PMMHInfo(count(accepted), count(without), estimate.num_truncated, weight, lost)
         return chain._replace(root=root), info
 
 
@@ -467,12 +480,16 @@ def _run(
     finds_root: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> PMMHPosterior:
-    """After so many iterations of the warm-up, so many draws, with so many iterations each. The
-    first moves of θ are by the root of `start`, or as wide as the likelihood if it `finds_root`."""
+    """Run the warm-up and the draws of all chains.
+
+    - `start`: initial θ and the root S of its first moves, or the state of earlier draws.
+    - `size`: (number of warm-up iterations, number of draws, iterations per draw).
+    - `finds_root`: whether S is replaced by one with the width of the likelihood.
+    """
     sampler, start = nondifferentiable((sampler, start))
     fresh = not isinstance(start, PMMHState)
     num_warmup, num_iterations, thin = size
-    # The warm-up counts in draws, too, so that there is one loop.
+    # The warm-up is measured in draws, too, so that one loop serves both.
     skipped = -(-num_warmup // thin)
     guide = sampler.likelihood.guide
     state = _not_begun(guide, *start) if fresh else _going_on(start)
@@ -485,21 +502,24 @@ def _run(
             pilot_key = jax.random.fold_in(key_for("pilots", key), run.num_done)
             near = sampler.near(pilot_key, run.chain)
             if finds_root:
-                found = lambda chain: near.likely_root(chain)  # `cond` hashes it
-                root = lax.cond(i == 0, found, lambda chain: chain.root, run.chain)
+                likely_root = lambda chain: near.likely_root(chain)  # `cond` hashes it
+                root = lax.cond(i == 0, likely_root, lambda chain: chain.root, run.chain)
                 run = run._replace(chain=run.chain._replace(root=root))
-        # An estimate by the guide before may be a lucky one, which a chain would hold on to.
+        # Estimate anew: a high estimate with the old, poorer guide could block the chain.
         first_key = jax.random.fold_in(key, -run.num_done)  # iterations have positive numbers
         chain = over_chains(near.start, first_key, (run.chain.theta, run.chain.root))
         return run._replace(chain=chain, guide=near.likelihood.guide), near
 
     def log_step_error(near, i, run):
-        """That of the held estimate, or one of its own for some of the draws."""
+        """Return the discretisation error of the stored estimates.
+
+        If the estimates do not contain it, it is estimated for some of the draws.
+        """
         if near.likelihood.tells_step_error:
             return run.chain.log_step_error
         own_key = jax.random.fold_in(key_for("step error", key), run.num_done)
-        known = lambda theta: over_chains(near.log_step_error, own_key, theta)
-        return step_errors_of_some(known, run.chain.theta, i - skipped, num_iterations)
+        function = lambda theta: over_chains(near.log_step_error, own_key, theta)
+        return step_errors_of_some(function, run.chain.theta, i - skipped, num_iterations)
 
     def draw(near, run, i):
         def iterate(run, i):
@@ -517,15 +537,15 @@ def _run(
     bounds = stages(to_guide, skipped + num_iterations)
     run, draws = metered_stages(begin, draw, state, bounds, num_iterations, progress_meter)
     held, accepted = draws
-    others = (held.log_likelihood, held.log_step_error, accepted)
-    fields, others = drawn(sampler.parameters, held.theta, *others)
-    log_likelihood, of_likelihood, accepted = others
+    values = (held.log_likelihood, held.log_step_error, accepted)
+    fields, values = drawn(sampler.parameters, held.theta, *values)
+    log_likelihood, log_step_errors, accepted = values
     return PMMHPosterior(
         **fields,
         log_likelihood=log_likelihood,
         log_likelihood_variance=jnp.median(held.variance, axis=0),
         variance_in_part=jnp.quantile(held.variance, 0.9, axis=0, method="lower"),
-        log_step_error=of_likelihood,
+        log_step_error=log_step_errors,
         sigma_varies=sampler.parameters.model.sigma_varies(sampler.likelihood.like),
         accepted=accepted,
         num_without_estimate=run.counted.num_without_estimate,
@@ -547,18 +567,21 @@ def _mean_share_lost(counted: PMMHInfo) -> Float[Array, "*chains"]:
 def _not_begun(
     guide: Guide | None, theta: Float[Array, "*chains p"], root: Float[Array, "p p"]
 ) -> _Run:
-    """Before there is an estimate."""
+    """Return the state of the loop before the first estimate, with zeros as placeholders."""
     chains = theta.shape[:-1]
-    nothing, none = jnp.zeros(chains, theta.dtype), jnp.zeros(chains, jnp.int32)
+    zeros, no_counts = jnp.zeros(chains, theta.dtype), jnp.zeros(chains, jnp.int32)
     root = jnp.broadcast_to(root, (*chains, *root.shape))
-    chain = _Chain(theta, nothing, nothing, nothing, root)
-    return _Run(chain, guide, jnp.int32(0), PMMHInfo(none, none, none, nothing, nothing))
+    chain = _Chain(theta, zeros, zeros, zeros, root)
+    return _Run(chain, guide, jnp.int32(0), PMMHInfo(no_counts, no_counts, no_counts, zeros, zeros))
 
 
 def _going_on(state: PMMHState) -> _Run:
+    """Return the state of the loop that continues earlier draws, with new counts."""
     chain = _Chain(
         state.theta, state.log_likelihood, state.variance, state.log_step_error, state.root
     )
-    none = jnp.zeros(chain.log_likelihood.shape, jnp.int32)
-    nothing = jnp.zeros_like(chain.log_likelihood)
-    return _Run(chain, state.guide, state.num_done, PMMHInfo(none, none, none, nothing, nothing))
+    no_counts = jnp.zeros(chain.log_likelihood.shape, jnp.int32)
+    zeros = jnp.zeros_like(chain.log_likelihood)
+    return _Run(
+        chain, state.guide, state.num_done, PMMHInfo(no_counts, no_counts, no_counts, zeros, zeros)
+    )

@@ -21,13 +21,13 @@ from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..schemes import StepError, dominates, step_faults, unknown_where
 from .parameters import Parameters, init_vectors, of_rows
 
-# Of about so many of the draws the step error is worked out: as many as tell a covariance, for it
-# takes a good part of the time of an iteration.
+# The discretisation error is computed for about so many draws: enough for a covariance. For all
+# draws it would take a large part of the run time.
 _STEP_ERRORS = 256
-# Of fewer draws a covariance tells nothing; nor if steps are too long for the drift in a larger
-# share of them.
+# No covariance is estimated from fewer draws, nor if steps are too long for the drift in a larger
+# share of the draws.
 _FEWEST, _MOST_INFINITE = 10, 0.1
-# Limits of chains that agree, and of draws that are worth an error.
+# Largest R̂ of chains that agree, and smallest effective sample size with a reliable error.
 _MOST_R_HAT, _FEWEST_EFFECTIVE = 1.1, 25
 _APART = (
     "Chains, or halves of a chain, disagree (R̂ above 1.1 for some parameter): they have not "
@@ -38,7 +38,7 @@ _FEW = (
     "The effective sample size of some parameter is below 25: its mean and its error are "
     "unreliable. Use more `num_iterations`."
 )
-# A walk that is refused more often is not adapted, or estimates are too noisy.
+# At a lower acceptance rate the walk is not adapted, or the estimates are too noisy.
 _LEAST_ACCEPTED = 0.05
 _REFUSED = (
     "Some chain accepted less than 5 % of the proposed parameters: it moves slowly, so errors may "
@@ -63,7 +63,7 @@ class AbstractPosterior(AbstractResult):
     @property
     @abstractmethod
     def _stuck(self) -> Bool[Array, "*chains"] | bool:
-        """Whether a path that is drawn with them never moved."""
+        """Return whether a path that is sampled together with θ never moved."""
 
     @property
     @abstractmethod
@@ -72,7 +72,7 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """The faults of the draws, each with a remedy.
+        """Return the faults of the draws, each with a remedy.
 
         They are: a parameter or block that never moved, chains that disagree, few effective draws,
         those of the sampler, and a discretisation error that dominates and exceeds 0.05 posterior
@@ -96,7 +96,7 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def effective_sample_size(self) -> Float[Array, " p"]:
-        """Effective sample size of each unknown parameter, from all chains, shape (p,).
+        """Return the effective sample size of each unknown parameter, from all chains, shape (p,).
 
         It is small if chains disagree. It is zero if the parameter, or a path drawn with it, never
         moved in some chain.
@@ -105,28 +105,29 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def _moved(self) -> Bool[Array, " p"]:
-        """Whether each parameter moved in all chains, and all that is drawn with it."""
-        moved = jnp.all(jnp.any(self._chains != self._chains[:, :1], axis=1), axis=0)
-        return moved & ~jnp.any(jnp.asarray(self._stuck))
+        """Return whether each parameter, and the paths sampled with it, moved in all chains."""
+        has_moved = jnp.all(jnp.any(self._chains != self._chains[:, :1], axis=1), axis=0)
+        return has_moved & ~jnp.any(jnp.asarray(self._stuck))
 
     @property
     def r_hat(self) -> Float[Array, " p"]:
-        """R̂ of each unknown parameter, from the halves of all chains, shape (p,)."""
+        """Return R̂ of each unknown parameter, from the halves of all chains, shape (p,)."""
         return potential_scale_reduction(self._chains)
 
     @property
     def step_error(self) -> Float[Array, " p"]:
-        """Estimated discretisation bias of the posterior means (estimate minus limit), shape (p,).
+        """Return the estimated discretisation bias of the posterior means, shape (p,).
 
-        To first order it is the covariance of θ and `log_step_error`. NaN if that is not available,
-        for instance with one step. It is also NaN, with an infinite uncertainty, if the steps are
-        too long for the drift (`log_step_error` is infinite) in more than a tenth of the draws.
+        The bias is the estimate minus its limit. To first order it is the covariance of θ and
+        `log_step_error`. NaN if that is not available, for instance with one step. It is also NaN,
+        with an infinite uncertainty, if the steps are too long for the drift (`log_step_error` is
+        infinite) in more than a tenth of the draws.
         """
         return self._step_error.value
 
     @property
     def step_uncertainty(self) -> Float[Array, " p"]:
-        """Standard error of `step_error`, shape (p,).
+        """Return the standard error of `step_error`, shape (p,).
 
         For a state-dependent σ it is at least `step_error` itself. There the estimate from half as
         many steps may be too large by a factor of two or three.
@@ -136,41 +137,41 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def standard_error(self) -> Float[Array, " p"]:
-        """Monte Carlo error of the posterior mean of each unknown parameter, shape (p,).
+        """Return the Monte Carlo error of each unknown parameter's posterior mean, shape (p,).
 
         It is infinite if the parameter, or a path drawn with it, never moved in some chain.
         """
         draws = self.theta.reshape(-1, self.theta.shape[-1])
-        made = jnp.std(draws, axis=0) / jnp.sqrt(self.effective_sample_size)
-        return jnp.where(self._moved, made, jnp.inf)
+        errors = jnp.std(draws, axis=0) / jnp.sqrt(self.effective_sample_size)
+        return jnp.where(self._moved, errors, jnp.inf)
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:
-        """Whether the discretisation error exceeds the Monte Carlo error, or may do so; shape (p,).
+        """Return whether the discretisation error exceeds the Monte Carlo error, or may do so.
 
-        Then more steps help, and more iterations do not.
+        Shape (p,). If true, more steps help, and more iterations do not.
         """
-        # Not by `step_uncertainty`: beside a doubt of its own size no error would be seen.
+        # `step_uncertainty` may be as large as the error itself, and would hide it.
         return dominates(self._step_error, self.standard_error)
 
     @property
     def _step_error(self) -> StepError:
-        known = jnp.isfinite(self.log_step_error)
-        number = jnp.sum(known)
-        error = jnp.where(known, self.log_step_error, 0)
-        error = jnp.where(known, error - jnp.sum(error) / number.astype(error.dtype), 0)
+        computed = jnp.isfinite(self.log_step_error)
+        number = jnp.sum(computed)
+        error = jnp.where(computed, self.log_step_error, 0)
+        error = jnp.where(computed, error - jnp.sum(error) / number.astype(error.dtype), 0)
         deviation = self.theta - jnp.mean(self.theta, axis=tuple(range(self.theta.ndim - 1)))
         products = (deviation * error[..., None]).reshape(-1, self.theta.shape[-1])
         count = jnp.maximum(number, 1).astype(products.dtype)
         mean = jnp.sum(products, axis=0) / count
-        each = jnp.where(known.reshape(-1, 1), products - mean, 0)
-        # Draws that follow each other are not independent, and no more so than those of θ.
+        deviations = jnp.where(computed.reshape(-1, 1), products - mean, 0)
+        # Consecutive draws are dependent, so the effective sample size of θ replaces their number.
         share = self.effective_sample_size / error.size
-        spread = jnp.sqrt(jnp.sum(each**2, axis=0) / jnp.minimum(count * share, count)) / jnp.sqrt(
-            count
-        )
-        few = number < _FEWEST
-        error = StepError(jnp.where(few, jnp.nan, mean), jnp.where(few, jnp.nan, spread))
+        spread = jnp.sqrt(
+            jnp.sum(deviations**2, axis=0) / jnp.minimum(count * share, count)
+        ) / jnp.sqrt(count)
+        too_few = number < _FEWEST
+        error = StepError(jnp.where(too_few, jnp.nan, mean), jnp.where(too_few, jnp.nan, spread))
         infinite = jnp.sum(jnp.isinf(self.log_step_error)).astype(products.dtype)
         return unknown_where(
             infinite > _MOST_INFINITE * (infinite + number.astype(infinite.dtype)), error
@@ -198,13 +199,15 @@ class AbstractPosterior(AbstractResult):
 
 
 def refused_moves(accepted: Bool[Array, "*chains n"]) -> Fault:
-    """Return the fault of a random walk of which hardly any move is accepted."""
+    """Return the fault of a random walk whose acceptance rate is below 5 %."""
     return Fault(jnp.any(jnp.mean(accepted, axis=-1) < _LEAST_ACCEPTED), _REFUSED)
 
 
 def check_likelihood_was_found(never: Bool[Array, "*chains"]) -> None:
-    """Raise `ValueError` where a chain `never` came to parameters and paths whose likelihood is
-    finite; under `jit` the draws are flagged instead."""
+    """Raise `ValueError` if a chain never reached a positive likelihood.
+
+    `never` is true for such chains. Under `jit` the draws are flagged instead.
+    """
     if not is_traced(never) and (stuck := np.flatnonzero(np.asarray(never))).size:
         raise ValueError(
             f"the likelihood at the start parameters is zero, also with paths guided by all "
@@ -222,7 +225,11 @@ def starting_points(
     log_prior: Callable[[Array], Array],
     state_type: type,
 ) -> tuple[Float[Array, "*chains p"], Any]:
-    """θ of each chain, and the state to go on from, if `init` is one."""
+    """Return θ of each chain, and the state to continue if `init` is one, else `None`.
+
+    **Raises:** `ValueError` for an `init` that does not fit the parameters or chains, violates the
+    constraint, or has a prior density that is not finite and positive.
+    """
     chains = () if num_chains is None else (check_count("num_chains", num_chains),)
     state = init if isinstance(init, state_type) else None
     if state is not None:
@@ -254,7 +261,7 @@ def starting_points(
 
 
 def check_covariance_is_used(covariance: Any, state: Any) -> None:
-    """Raise `ValueError` for a `covariance` beside a state to go on from."""
+    """Raise `ValueError` for a `covariance` together with a state to continue."""
     if state is not None and covariance is not None:
         raise ValueError(
             "`covariance` is for a new start: omit it, because a state as `init` has its own."
@@ -262,18 +269,20 @@ def check_covariance_is_used(covariance: Any, state: Any) -> None:
 
 
 def first_chain(theta: Float[Array, "*chains p"]) -> Float[Array, " p"]:
-    """θ of the first chain, at which proposals are chosen."""
+    """Return θ of the first chain, at which proposals are selected."""
     return theta.reshape(-1, theta.shape[-1])[0]
 
 
 def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
-    """`function(key, state)` of each chain, with keys of their own if there are several; θ is the
-    first leaf of the state."""
+    """Return `function(key, state)` of each chain, with separate keys for several chains.
+
+    The first leaf of the state must be θ.
+    """
     theta = jax.tree.leaves(state)[0]
     if theta.ndim == 1:
         return function(key, state)
     keys = jax.random.split(key, len(theta))
-    return jax.vmap(lambda *each: function(*each))(keys, state)
+    return jax.vmap(lambda *chain: function(*chain))(keys, state)
 
 
 def step_errors_of_some(
@@ -282,31 +291,36 @@ def step_errors_of_some(
     number: Int[Array, ""],
     num_draws: int,
 ) -> Float[Array, "*chains"]:
-    """`function(state)` of some of so many draws, with numbers from zero on; NaN of the others."""
+    """Return `function(state)` for about 256 of `num_draws` evenly spaced draws, NaN for others.
+
+    `number` counts the draws from zero. It is negative in the warm-up.
+    """
     every = max(1, num_draws // _STEP_ERRORS)
     shape = jax.eval_shape(function, state)
-    called_for = (number >= 0) & (number % every == every - 1)
-    return lax.cond(called_for, function, lambda _: jnp.full_like(shape, jnp.nan), state)
+    is_selected = (number >= 0) & (number % every == every - 1)
+    return lax.cond(is_selected, function, lambda _: jnp.full_like(shape, jnp.nan), state)
 
 
 @compiled_sooner
 def first_states(start: Callable, key: Key[Array, ""], state: PyTree) -> Any:
-    """The states that chains start from: key number 0 is theirs, and iterations have the others."""
+    """Return the first states of the chains, from key number 0; iterations use other numbers."""
     return over_chains(start, jax.random.fold_in(key, 0), state)
 
 
 def drawn(
-    parameters: Parameters, theta: Float[Array, "n *chains p"], *others: PyTree
+    parameters: Parameters, theta: Float[Array, "n *chains p"], *values: PyTree
 ) -> tuple[dict[str, Any], PyTree]:
-    """The fields of a posterior that θ makes, and what else was kept of each draw, with axes
-    (*chains, n) in front."""
-    full = eqx.filter_vmap(parameters.full)  # parameters may be other things than numbers
+    """Return the fields `params`, `theta` and `names` of a posterior, and the other values.
+
+    All arrays get the leading axes (*chains, n).
+    """
+    full = eqx.filter_vmap(parameters.full)  # parameters may contain objects that are no arrays
     if theta.ndim == 3:
         full = eqx.filter_vmap(full)
-        theta, others = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, others))
-    return {"params": full(theta), "theta": theta, "names": parameters.names}, others
+        theta, values = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, values))
+    return {"params": full(theta), "theta": theta, "names": parameters.names}, values
 
 
 def summed(infos: PyTree) -> PyTree:
-    """What was counted, over the first axis."""
+    """Return the counts, summed over the first axis."""
     return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0, dtype=jnp.int32), infos)

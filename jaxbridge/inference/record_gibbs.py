@@ -2,20 +2,20 @@
 
 The state is (θ, path). Two moves alternate:
 
-- the path moves given θ;
-- the path is converted to its noise ξ (`record_paths`), and θ moves given ξ by a normal random walk
-  with the target π(θ) w(θ, ξ). The path changes with θ.
+- The path moves given θ.
+- The path is converted to its noise ξ (`record_paths`), and θ moves given ξ by a normal random
+  walk. The target is π(θ) w(θ, ξ). The path changes with θ.
 
-Hence the unknown parameters may be those of the drift, of σ, of the noise and of the initial law,
-for every step size.
+Hence any parameters may be unknown: those of the drift, of σ, of the noise and of the initial law.
+This holds for every step size.
 
 The guide is linearised along a path that is likely at some θ. It may be poor at a θ far away.
 Neither the law of the path given θ nor that of θ given ξ depends on the guide, so the warm-up
 replaces it (`warm_up`).
 
-The discretisation error of the likelihood is that of E[w̃ / w] (`record_paths`), with D = log w̃ / w
-and `relative_change` instead of e^D. If half as many steps are too long for the drift, a path may
-diverge; then its w̃ is zero.
+The discretisation error of the likelihood follows from E[w̃ / w] (`record_paths`). The function
+`relative_change` of D = log w̃ / w replaces e^D. If half as many steps are too few
+for the drift, a path may diverge; then its w̃ is zero.
 """
 
 from typing import NamedTuple
@@ -78,7 +78,7 @@ class RecordState(NamedTuple):
 
 
 class GuidedState(NamedTuple):
-    """The same, with what guides paths at θ, which is worked out once for each θ."""
+    """A `RecordState` with the guides at its θ, which are computed once for each θ."""
 
     state: RecordState
     guides: Guidance
@@ -129,7 +129,7 @@ class RecordPosterior(AbstractPosterior):
 
 
 class RecordSampler(eqx.Module):
-    """What does not change from iteration to iteration, and the steps of one chain."""
+    """Constants of the sampler, and the steps of one chain."""
 
     completion: RecordPaths
     log_prior: NormalDensity | GivenDensity
@@ -148,16 +148,20 @@ class RecordSampler(eqx.Module):
     def step(
         self, key: Key[Array, ""], guided: GuidedState, learning: Bool[Array, ""]
     ) -> tuple[GuidedState, tuple[Bool[Array, ""], Bool[Array, ""], Bool[Array, "R 2 B 1"]]]:
-        """The paths given θ, then θ given ξ; both learn the size of their moves. Whether θ moved,
-        whether paths have a weight, and which blocks moved."""
+        """Move the paths given θ, then θ given ξ; `learning` adapts the scales of both moves.
+
+        Return the state, whether θ moved, whether the paths have a weight, and whether each block
+        moved.
+        """
         path_key, noise_key, walk_key, accept_key = jax.random.split(key, 4)
         state, guides = guided
         theta, log_scales = state.theta, state.log_scales
         here = At(theta, guides)
-        paths, taken = self.completion.renewed(path_key, here, state.paths, log_scales)
+        paths, blocks_moved = self.completion.renewed(path_key, here, state.paths, log_scales)
         noise, log_weight = self.completion.noise(noise_key, here, paths)
         step = jax.random.normal(walk_key, theta.shape, theta.dtype)
         proposed = theta + state.root @ step
+        # Outside the constraint the model may be invalid: evaluate at θ, and reject.
         inside = self.parameters.allowed(proposed)
         there = self.completion.at(jnp.where(inside, proposed, theta))
         new_paths, new_weight = self.completion.of_noise(there, noise)
@@ -168,11 +172,11 @@ class RecordSampler(eqx.Module):
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
 
         number = state.num_done + 1
-        scales = tuned(log_scales, taken, number.astype(rate.dtype))
+        scales = tuned(log_scales, blocks_moved, number.astype(rate.dtype))
         (theta, guides), paths = jax.tree.map(
             lambda new, old: jnp.where(accepted, new, old), (there, new_paths), (here, paths)
         )
-        moved = RecordState(
+        new_state = RecordState(
             theta,
             paths,
             learnt(state.root, step, rate, number, learning),
@@ -180,10 +184,13 @@ class RecordSampler(eqx.Module):
             number,
         )
         has_weight = nan_to_neg_inf(jnp.where(accepted, new_weight, log_weight)) > -jnp.inf
-        return GuidedState(moved, guides), (accepted, has_weight, taken)
+        return GuidedState(new_state, guides), (accepted, has_weight, blocks_moved)
 
     def log_ratio(self, key: Key[Array, ""], guided: GuidedState) -> Float[Array, ""]:
-        """log w̃ / w, of steps of twice the length."""
+        """Return log w̃ / w, with w̃ the weight for steps of twice the size.
+
+        It is NaN if the path has no weight, and infinite if steps are too long for the drift.
+        """
         (state, guides), completion = guided, self.completion
         noise, log_weight = completion.noise(key, At(state.theta, guides), state.paths)
         ratio = nan_to_neg_inf(completion.coarse_log_weight(state.theta, noise)) - log_weight
@@ -201,10 +208,13 @@ def sample_records(
     finds_root: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> RecordPosterior:
-    """After so many iterations of the warm-up, so many draws, with so many iterations each. The
-    first moves of θ are by the root of `start`, or as wide as the likelihood if it `finds_root`.
+    """Sample parameters and paths.
 
-    **Raises:** `ValueError` where no paths with a weight were found.
+    - `start`: initial θ and the root S of its first moves, or the state of earlier draws.
+    - `size`: (number of warm-up iterations, number of draws, iterations per draw).
+    - `finds_root`: whether S is replaced by one with the width of the likelihood.
+
+    **Raises:** `ValueError` if a chain never has paths with a positive weight.
     """
     arguments = (key, parameters, records, log_prior, start, size, finds_root, progress_meter)
     posterior, never = _sample_records(*arguments)
@@ -223,13 +233,13 @@ def _sample_records(
     finds_root: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> tuple[RecordPosterior, Bool[Array, "*chains"]]:
-    """The posterior, and which chains never found paths with a weight."""
+    """Return the posterior, and whether each chain never had paths with a weight."""
     parameters, records, log_prior, start = nondifferentiable(
         (parameters, records, log_prior, start)
     )
     fresh = not isinstance(start, RecordState)
     num_warmup, num_iterations, thin = size
-    # The warm-up counts in draws, too, so that there is one loop.
+    # The warm-up is measured in draws, too, so that one loop serves both.
     skipped = -(-num_warmup // thin)
 
     def begin(guided, i):
@@ -241,8 +251,8 @@ def _sample_records(
             root = state.root
             if finds_root:
                 of_chain = first_chain(state.theta), root.reshape(-1, *root.shape[-2:])[0]
-                made = likely_root(parameters, completion.fine, log_prior, *of_chain)
-                root = jnp.broadcast_to(made, root.shape)
+                likely = likely_root(parameters, completion.fine, log_prior, *of_chain)
+                root = jnp.broadcast_to(likely, root.shape)
             return over_chains(sampler.start, jax.random.fold_in(key, 0), (state.theta, root))
 
         if fresh:
@@ -250,44 +260,45 @@ def _sample_records(
         return GuidedState(state, _guides_of(completion, state.theta)), sampler
 
     def number(guided):
-        return guided.state.num_done.reshape(-1)[0]  # 0 made the first paths
+        return guided.state.num_done.reshape(-1)[0]  # key 0 is for the first paths
 
     def log_ratios(sampler, i, guided):
         theta = guided.state.theta
         own_key = jax.random.fold_in(key_for("step error", key), number(guided))
-        known = lambda guided: over_chains(sampler.log_ratio, own_key, guided)
+        function = lambda guided: over_chains(sampler.log_ratio, own_key, guided)
         if records.stacked.num_steps == 1:
             return jnp.full(theta.shape[:-1], jnp.nan, theta.dtype)
-        return step_errors_of_some(known, guided, i - skipped, num_iterations)
+        return step_errors_of_some(function, guided, i - skipped, num_iterations)
 
     def draw(sampler, guided, i):
         def iterate(guided, i):
             step = lambda key, guided: sampler.step(key, guided, i < num_warmup)
             return over_chains(step, jax.random.fold_in(key, number(guided) + 1), guided)
 
-        made = lax.scan(iterate, guided, i * thin + jnp.arange(thin))
-        guided, (moved, has_weight, taken) = made
+        result = lax.scan(iterate, guided, i * thin + jnp.arange(thin))
+        guided, (theta_moved, has_weight, blocks_moved) = result
         theta = guided.state.theta
-        share = jnp.mean(taken.astype(theta.dtype), axis=0)
+        share = jnp.mean(blocks_moved.astype(theta.dtype), axis=0)
         weights = jnp.any(has_weight, axis=0), log_ratios(sampler, i, guided)
-        made = theta, jnp.any(moved, axis=0), share[..., 0], *weights
-        return guided, (made, sampler.completion.fine.check)
+        result = theta, jnp.any(theta_moved, axis=0), share[..., 0], *weights
+        return guided, (result, sampler.completion.fine.check)
 
     bounds = stages(skipped if fresh else 0, skipped + num_iterations)
     state = _not_begun(records, *start) if fresh else start
     init = GuidedState(state, _no_guides(parameters, records, state.theta))
     (state, _), draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
     draws, checks = draws
-    fields, (moved, taken, has_weight, log_ratio) = drawn(parameters, *draws)
+    fields, (theta_moved, blocks_moved, has_weight, log_ratio) = drawn(parameters, *draws)
     real = movable(records)
-    ever = jnp.any(taken > 0, axis=-4)  # of all draws
+    ever = jnp.any(blocks_moved > 0, axis=-4)  # in any draw
+    # Centred at the median: a factor of w̃ / w that all draws share does not move posterior means.
     too_long = log_ratio == jnp.inf
     change = relative_change(log_ratio, jnp.nanmedian(jnp.where(too_long, jnp.nan, log_ratio)))
     change = jnp.where(too_long, jnp.inf, change)
     posterior = RecordPosterior(
         **fields,
-        parameters_moved=moved,
-        blocks_moved=jnp.mean(taken, axis=(-3, -2, -1), where=real),
+        parameters_moved=theta_moved,
+        blocks_moved=jnp.mean(blocks_moved, axis=(-3, -2, -1), where=real),
         stuck=jnp.any(real & ~ever, axis=(-3, -2, -1)),
         log_step_error=share_of_step_error(records) * change,
         sigma_varies=parameters.model.sigma_varies(records.stacked.like),
@@ -300,7 +311,7 @@ def _sample_records(
 def _not_begun(
     records: Records, theta: Float[Array, "*chains p"], root: Float[Array, "p p"]
 ) -> RecordState:
-    """The state before there are paths."""
+    """Return the state before the first paths, with placeholders for them."""
     chains = theta.shape[:-1]
     paths, log_scales, root, num_done = (
         jnp.broadcast_to(leaf, (*chains, *leaf.shape))
@@ -310,7 +321,7 @@ def _not_begun(
 
 
 def _guides_of(completion: RecordPaths, theta: Float[Array, "*chains p"]) -> Guidance:
-    """At θ of one chain, or of each of several."""
+    """Return the guides at θ of one chain, or of each of several chains."""
     of_chain = lambda theta: completion.at(theta).guides
     return of_chain(theta) if theta.ndim == 1 else jax.vmap(of_chain)(theta)
 
@@ -318,7 +329,7 @@ def _guides_of(completion: RecordPaths, theta: Float[Array, "*chains p"]) -> Gui
 def _no_guides(
     parameters: Parameters, records: Records, theta: Float[Array, "*chains p"]
 ) -> Guidance:
-    """What stands in for the guides before there are any."""
+    """Return placeholders with the shapes of the guides."""
     completion = RecordPaths(parameters, unguided(records), unguided(records))
     shapes = jax.eval_shape(lambda theta: _guides_of(completion, theta), theta)
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)

@@ -1,12 +1,12 @@
 """Maximum likelihood from noisy or partial records.
 
 Let ξ ~ N(0, I), and let w(θ, ξ) be the weight of its path at θ (`record_paths`). The likelihood is
-L(θ) = E[w(θ, ξ)]. The law of ξ does not depend on θ. Hence by Fisher and by Louis (1982)
+L(θ) = E[w(θ, ξ)]. The law of ξ does not depend on θ. The identities of Fisher and of Louis (1982) give:
 
     ∇ log L(θ) = E[∇ log w | y],    -∇² log L(θ) = -E[∇² log w | y] - Cov(∇ log w | y).
 
-The means are over ξ given θ and the data, and the derivatives are in θ. The identities hold for
-every step size. They hold for parameters of the drift, of σ, of the noise and of the initial law.
+Means are over ξ given θ and the data, derivatives in θ. The identities hold for every step size.
+They hold for parameters of the drift, of σ, of the noise and of the initial law.
 
 *Search.* In each iteration chains of paths move given the current θ. The paths are converted to ξ,
 and an optimiser moves θ along the mean of ∇ log w (Gu & Kong 1998). The paths change with θ.
@@ -22,7 +22,7 @@ of -∂²_j log w. 1 / √D_j would be the standard error of θ_j if ξ were obs
 
 *Discretisation error.* The error of the log-likelihood, e = log L_N - log L, is about a fixed
 fraction of log L_{N/2} - log L_N. The error moves the maximum by I⁻¹ ∇e. Let w̃ be the weight with
-half as many steps, and D = log w̃ / w. Then:
+half as many steps, and let D = log w̃ / w. Then:
 
     ∇ log L_{N/2} = E[(w̃ / w) ∇ log w̃ | y] / E[w̃ / w | y]
                   ≈ E[∇ log w̃ | y] + Cov(D + ½ (D - ED)², ∇ log w̃ | y).
@@ -149,9 +149,9 @@ class RecordMaximumLikelihood(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:
-        """Return whether the discretisation error exceeds the standard error, or may do so; shape (p,).
+        """Return whether the discretisation error exceeds the standard error, or may do so.
 
-        Then use more steps.
+        Shape (p,). If true, use more steps.
         """
         error = StepError(self.step_error, self.step_uncertainty)
         return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))

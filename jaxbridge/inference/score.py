@@ -41,12 +41,17 @@ from .blocks import Block, make_blocks, over_intervals, target_forms, with_keys
 from .data import Problem, as_problem
 from .parameters import Parameters, as_parameters
 
-# Bridges of all intervals that are made at a time.
+# Maximum number of bridges in one batch, over all intervals of a block.
 _PATHS = 8_192
 
 
 class PathCounts(NamedTuple):
-    """Of the paths of each interval: how many became bridges, were simulated, and were lost."""
+    """Numbers of paths of each interval.
+
+    - `found`: bridges with a positive weight.
+    - `simulated`: simulated paths.
+    - `nonfinite`: paths that diverged or left the state space.
+    """
 
     found: Int[Array, " I"]
     simulated: Int[Array, " I"]
@@ -89,7 +94,7 @@ class Score(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """The faults of the score, each with a remedy.
+        """Return the faults of the score, each with a remedy.
 
         They are: intervals without a bridge; weights that are truncated or have heavy tails; too
         many lost paths in an interval; and a discretisation error that dominates and exceeds 0.05
@@ -113,8 +118,10 @@ class Score(AbstractResult):
     @property
     def _lost(self) -> Fault:
         """Return the fault of lost paths in any interval."""
-        found, simulated, nonfinite = self.counts
-        return lost_paths(nonfinite, simulated, self.effective_sample_size, found).in_any()
+        num_found, num_simulated, num_nonfinite = self.counts
+        return lost_paths(
+            num_nonfinite, num_simulated, self.effective_sample_size, num_found
+        ).in_any()
 
 
 @public_entry
@@ -171,8 +178,10 @@ def score(
 
 
 class Scorer(eqx.Module):
-    """Estimator of the score at any θ, by so many bridges of each interval: the proposals are
-    decided, for all θ alike."""
+    """Estimator of the score at any θ, with `num_bridges` bridges per interval.
+
+    The proposals are selected beforehand, and are the same for all θ.
+    """
 
     parameters: Parameters
     blocks: tuple[Block, ...]
@@ -183,13 +192,12 @@ class Scorer(eqx.Module):
     def at(
         self, key: Key[Array, ""], theta: Float[Array, " p"], offsets: Float[Array, "*shape p"]
     ) -> tuple[Score, Float[Array, "*shape"]]:
-        """Return the score at θ, and by how much the log-likelihood rises from there to
-        θ + offsets."""
-        made = [
+        """Return the score at θ, and the log-likelihood at θ + offsets minus that at θ."""
+        sums = [
             _of_block(block_key, self, theta, offsets, block)
             for block_key, block in with_keys(key, self.blocks)
         ]
-        return _over_all(self.parameters, self.blocks, made)
+        return _over_all(self.parameters, self.blocks, sums)
 
 
 def scorer_at(
@@ -201,7 +209,7 @@ def scorer_at(
     num_bridges: int,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> Scorer:
-    """Return the estimator whose proposals are decided at θ."""
+    """Return the estimator with proposals that are selected at θ."""
     model = problem.parameters.bind(theta)
     blocks = make_blocks(key, model, problem, proposal, budget, "means")
     form = target_forms(blocks, model)[0]
@@ -215,7 +223,7 @@ def as_score(
     num_missing: Int[Array, ""],
     num_truncated: Int[Array, ""],
 ) -> Score:
-    """Of sums over the intervals."""
+    """Return the `Score` of sums over the intervals."""
     error = jnp.sqrt(jnp.maximum(jnp.diagonal(sums.covariance), 0))
     return Score(
         parameters.each(sums.gradient),
@@ -233,11 +241,14 @@ def as_score(
 
 
 class _Sums(NamedTuple):
-    """Σ over intervals of the score, of the covariance of its error, and of the information; the
-    effective number of bridges of each, and k̂; the step error of the score, with the square of
-    its uncertainty; how many weights were cut off; the counts of paths in each interval; and by how
-    much the log-likelihood rises from θ
-    to points around it."""
+    """Results of the intervals of a block, or of all intervals.
+
+    - Sums over the intervals: `gradient`, `covariance` (that of the Monte Carlo error of the
+      gradient), `information`, `step_error` of the gradient, `step_variance` (square of its
+      uncertainty), `num_truncated`, and `rises` (log-likelihood at points around θ minus that at
+      θ).
+    - For each interval: `effective_sample_size`, `pareto_k`, and the numbers of paths.
+    """
 
     gradient: Float[Array, " p"]
     covariance: Float[Array, "p p"]
@@ -255,16 +266,16 @@ class _Sums(NamedTuple):
 
 @compiled_sooner
 def _over_all(
-    parameters: Parameters, blocks: tuple[Block, ...], made: Sequence[_Sums]
+    parameters: Parameters, blocks: tuple[Block, ...], of_blocks: Sequence[_Sums]
 ) -> tuple[Score, Float[Array, "*shape"]]:
-    """The score, and the rises."""
-    sums = over_intervals(blocks, made)
+    """Return the score of all intervals, and the rises of the log-likelihood."""
+    sums = over_intervals(blocks, of_blocks)
     step_error = StepError(sums.step_error, jnp.sqrt(sums.step_variance))
     missing = sums.effective_sample_size == 0
     num_missing = jnp.sum(missing, dtype=jnp.int32)
-    # Of intervals that all are without bridges nothing is known: 0 ± 0 would be a lie.
-    unknown = jnp.all(missing)
-    blank = lambda leaf, value: jnp.where(unknown, jnp.asarray(value, leaf.dtype), leaf)
+    # An empty sum is 0 ± 0, which would look like an exact score.
+    no_bridges = jnp.all(missing)
+    blank = lambda leaf, value: jnp.where(no_bridges, jnp.asarray(value, leaf.dtype), leaf)
     sums = sums._replace(
         gradient=blank(sums.gradient, jnp.nan),
         covariance=blank(sums.covariance, jnp.inf),
@@ -275,10 +286,14 @@ def _over_all(
 
 
 class _Bridges(NamedTuple):
-    """n weighted bridges of each interval, whether each was cut off, and how many paths were
-    simulated and lost for it, with the derivatives of the log density of their paths;
-    of the first m, D of `halving` with its gradient; and by how much their log density rises from θ
-    to points around it."""
+    """Weighted bridges, n for each interval.
+
+    - `log_weights`, `truncated`: log weights, and whether `max_trials` truncated them.
+    - `num_simulated`, `num_nonfinite`: numbers of simulated and of lost paths for each bridge.
+    - `gradient`, `hessian`: derivatives in θ of the log density of the path.
+    - `log_halving`, `slope`: D of `halving` for the first m bridges, and its gradient.
+    - `rises`: log density of the path at points around θ minus that at θ.
+    """
 
     log_weights: Float[Array, "I n"]
     truncated: Bool[Array, "I n"]
@@ -300,23 +315,24 @@ def _draw(
     block: Block,
     n: int,
 ) -> _Bridges:
-    """Bridges of this model, prepared at θ."""
+    """Sample n bridges of each interval of a block; `model` is prepared at θ."""
     parameters, form = scorer.parameters, scorer.form
     intervals, num_steps = block.intervals, block.num_steps
     m = num_looked(n, model.sigma_varies(intervals.start[0]))
     keys = jax.random.split(key, (len(block.index), n))
-    drawn = block.proposal.draw(keys, model, intervals, num_steps, None, False)
+    draws = block.proposal.draw(keys, model, intervals, num_steps, None, False)
+    # A constant path replaces a missing bridge, so that all derivatives are finite.
     start = intervals.start[:, None, None]
-    paths = jnp.where(drawn.found[..., None, None], drawn.paths, start)
+    paths = jnp.where(draws.found[..., None, None], draws.paths, start)
     steps = jnp.repeat(block.steps, n, axis=1)
 
     def log_f(theta):
-        every = paths.reshape(-1, *paths.shape[2:])
-        return log_likelihoods(parameters.bind(theta), steps, every, form).reshape(-1, n)
+        flat = paths.reshape(-1, *paths.shape[2:])
+        return log_likelihoods(parameters.bind(theta), steps, flat, form).reshape(-1, n)
 
     def log_halving(theta):
-        some = paths[:, :m].reshape(-1, *paths.shape[2:])
-        return block.log_halvings(parameters.bind(theta).prepared(), some, form).reshape(-1, m)
+        flat = paths[:, :m].reshape(-1, *paths.shape[2:])
+        return block.log_halvings(parameters.bind(theta).prepared(), flat, form).reshape(-1, m)
 
     gradient = jax.jacfwd(log_f)
     derivatives = (gradient(theta), jax.jacfwd(gradient)(theta))
@@ -325,8 +341,8 @@ def _draw(
     none = jnp.zeros((0, len(keys), n), theta.dtype)
     around = lax.map(log_f, points) - log_f(theta) if len(points) else none
     rises = jnp.moveaxis(around, 0, -1).reshape(len(keys), n, *offsets.shape[:-1])
-    counts = drawn.truncated, drawn.num_simulated, drawn.num_nonfinite
-    return _Bridges(drawn.log_weights, *counts, *derivatives, *halvings, rises)
+    counts = draws.truncated, draws.num_simulated, draws.num_nonfinite
+    return _Bridges(draws.log_weights, *counts, *derivatives, *halvings, rises)
 
 
 @compiled_sooner
@@ -345,22 +361,22 @@ def _of_block(
     num_batches = -(-num_bridges // at_once)
 
     def batch(_, i):
-        mine = jax.random.fold_in(key, i)
-        return None, _draw(mine, scorer, theta, offsets, model, block, at_once)
+        batch_key = jax.random.fold_in(key, i)
+        return None, _draw(batch_key, scorer, theta, offsets, model, block, at_once)
 
-    _, made = metered_scan(batch, None, jnp.arange(num_batches), scorer.progress_meter)
+    _, batches = metered_scan(batch, None, jnp.arange(num_batches), scorer.progress_meter)
 
     def join(leaf, number: int):
-        """The first so many of each batch, of all batches."""
+        """Return the first `number` bridges of each batch, joined over the batches."""
         leaf = jnp.moveaxis(leaf[:, :, :number], 0, 1)
         return leaf.reshape(num_intervals, num_batches * leaf.shape[2], *leaf.shape[3:])
 
-    m = made.log_halving.shape[2]
-    some = _Bridges(*(join(leaf, m) for leaf in made))
+    m = batches.log_halving.shape[2]
+    halved = _Bridges(*(join(leaf, m) for leaf in batches))
     share = block.step_shares(model, form)
-    halves = (some.gradient, some.gradient + some.slope)
-    error = error_of_mean(some.log_weights, some.log_halving, share, *halves)
-    all_bridges = (*made[:6], made.rises)
+    halves = (halved.gradient, halved.gradient + halved.slope)
+    error = error_of_mean(halved.log_weights, halved.log_halving, share, *halves)
+    all_bridges = (*batches[:6], batches.rises)
     all_bridges = (join(leaf, at_once)[:, :num_bridges] for leaf in all_bridges)
     log_weights, truncated, num_simulated, num_nonfinite, g, H, rises = all_bridges
     weights = normalise_weights(log_weights)
@@ -368,9 +384,9 @@ def _of_block(
     deviation = g - mean[:, None]
     products = deviation[..., :, None] * deviation[..., None, :]
     squares = jnp.sum(weights**2, axis=1)
-    # Of n independent bridges; a weighted mean of squares is too small by 1 - Σ w².
-    less = jnp.where(squares < 1, 1 - squares, 1)[:, None, None]
-    spread = jnp.sum(weights[..., None, None] * products, axis=1) / less
+    # A weighted variance of n independent bridges is too small by the factor 1 - Σ w².
+    factor = jnp.where(squares < 1, 1 - squares, 1)[:, None, None]
+    spread = jnp.sum(weights[..., None, None] * products, axis=1) / factor
     covariance = jnp.sum(weights[..., None, None] ** 2 * products, axis=1)
     information = -jnp.sum(weights[..., None, None] * H, axis=1) - spread
     return _Sums(
@@ -390,14 +406,17 @@ def _of_block(
 
 
 def _rises(
-    weights: Float[Array, "I n"], each: Float[Array, "I n *shape"]
+    weights: Float[Array, "I n"], exponents: Float[Array, "I n *shape"]
 ) -> Float[Array, "*shape"]:
-    """Σ over intervals of the log of the weighted mean of exponentials, of those with bridges."""
-    weights = align_axes(weights, each)
-    used = (weights > 0) & (each < jnp.inf)
-    largest = jnp.max(jnp.where(used, each, -jnp.inf), axis=1, keepdims=True)
+    """Return Σ log(weighted mean of exponentials) over the intervals with bridges.
+
+    The largest exponent of each interval is factored out, against overflow.
+    """
+    weights = align_axes(weights, exponents)
+    used = (weights > 0) & (exponents < jnp.inf)
+    largest = jnp.max(jnp.where(used, exponents, -jnp.inf), axis=1, keepdims=True)
     largest = jnp.where(jnp.isfinite(largest), largest, 0)
-    ratios = jnp.where(used, weights * jnp.exp(jnp.where(used, each - largest, 0)), 0)
+    ratios = jnp.where(used, weights * jnp.exp(jnp.where(used, exponents - largest, 0)), 0)
     logs = jnp.log(jnp.sum(ratios, axis=1)) + largest[:, 0]
-    some = jnp.any(weights > 0, axis=1)
-    return jnp.sum(jnp.where(some, logs, 0), axis=0)
+    has_bridges = jnp.any(weights > 0, axis=1)
+    return jnp.sum(jnp.where(has_bridges, logs, 0), axis=0)
