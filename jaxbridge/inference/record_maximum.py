@@ -1,7 +1,8 @@
 """Maximum likelihood from noisy or partial records.
 
 Let ξ ~ N(0, I), and let w(θ, ξ) be the weight of its path at θ (`record_paths`). The likelihood is
-L(θ) = E[w(θ, ξ)]. The law of ξ does not depend on θ. The identities of Fisher and of Louis (1982) give:
+L(θ) = E[w(θ, ξ)]. The law of ξ does not depend on θ. The identities of Fisher and of Louis
+(1982) give:
 
     ∇ log L(θ) = E[∇ log w | y],    -∇² log L(θ) = -E[∇² log w | y] - Cov(∇ log w | y).
 
@@ -22,7 +23,7 @@ of -∂²_j log w. 1 / √D_j would be the standard error of θ_j if ξ were obs
 
 *Discretisation error.* The error of the log-likelihood, e = log L_N - log L, is about a fixed
 fraction of log L_{N/2} - log L_N. The error moves the maximum by I⁻¹ ∇e. Let w̃ be the weight with
-half as many steps, and let D = log w̃ / w. Then:
+half as many steps, and D = log w̃ / w. Then
 
     ∇ log L_{N/2} = E[(w̃ / w) ∇ log w̃ | y] / E[w̃ / w | y]
                   ≈ E[∇ log w̃ | y] + Cov(D + ½ (D - ED)², ∇ log w̃ | y).

@@ -43,20 +43,21 @@ from ..records import (
 from ..schemes import share_of_grid
 from .parameters import Parameters
 
-# Intervals between observations that move at once.
+# Number of intervals between observations in a block, which moves at once.
 _BLOCK_LENGTH = 10
 
-
-# How often the width of the likelihood is found anew from the last, and by which factors.
+# Number of secant steps for the width of the likelihood, and the bounds of their factors.
 _NUM_SECANTS, _SECANT = 6, (1 / 16, 8.0)
 
-# What says nothing about bridges.
+# Defaults of the arguments about bridges.
 _USUAL = {"proposal": "auto", "bridges": "exact", "method": "gradient"}
 
 
 class GuidedRecords(NamedTuple):
-    """Records, the points along which each is linearised, whatever the parameters, and how good a
-    guide that makes."""
+    """Records, the points along which the model is linearised for each, and checks of the guides.
+
+    The points are the same for all parameters.
+    """
 
     records: Records
     points: Float[Array, "R points d"]
@@ -64,15 +65,18 @@ class GuidedRecords(NamedTuple):
 
 
 class At(NamedTuple):
-    """θ, and what guides the paths of each record there."""
+    """Parameters θ, and the guides of the paths of each record at θ."""
 
     theta: Float[Array, " p"]
     guides: Guidance
 
 
 class RecordPaths(eqx.Module):
-    """What makes and moves the paths of R records, of one chain; `coarse` have half as many
-    steps."""
+    """Paths of R records in one chain, as functions of θ and noise.
+
+    - `fine`: records with their grids, and points of linearisation.
+    - `coarse`: the same with half as many steps.
+    """
 
     parameters: Parameters
     fine: GuidedRecords
@@ -80,17 +84,20 @@ class RecordPaths(eqx.Module):
 
     @property
     def num_steps(self) -> int:
-        """N, of each segment."""
+        """Return N, the number of steps of each segment."""
         return self.fine.records.stacked.num_steps
 
     def at(self, theta: Float[Array, " p"]) -> At:
-        """θ, and what guides paths there."""
+        """Return θ and the guides at θ."""
         return At(theta, _guides(self.fine, self.parameters.bind(theta)))
 
     def first(
         self, key: Key[Array, ""], at: At
     ) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:
-        """Paths to begin with, and log β of the moves of their blocks."""
+        """Sample the first paths; return them, and log β of the moves of their blocks.
+
+        The points of linearisation replace a path without weight.
+        """
         model, (records, points, _) = self.parameters.bind(at.theta), self.fine
 
         def one(problem, key, points, guide):
@@ -108,15 +115,15 @@ class RecordPaths(eqx.Module):
         paths: Float[Array, "R points d"],
         log_scales: Float[Array, "R 2 B"],
     ) -> tuple[Float[Array, "R points d"], Bool[Array, "R 2 B 1"]]:
-        """The paths after a sweep given θ, and which blocks moved."""
+        """Return the paths after a sweep given θ, and whether each block moved."""
         model, (records, points, _) = self.parameters.bind(at.theta), self.fine
 
         def one(problem, key, points, guide, log_scales, path):
             (K, N), d = problem.record.dt.shape, problem.dim
             both = blocks_of_both_cuts(problem, points, guide, _BLOCK_LENGTH)
             old = Paths(path[0][:, None], path[1:].reshape(K, N, d, 1))
-            made, taken = sweep(key, problem, model, both, log_scales, old)
-            return jnp.concatenate([made.start.T, made.points.reshape(K * N, d)]), taken
+            new, accepted = sweep(key, problem, model, both, log_scales, old)
+            return jnp.concatenate([new.start.T, new.points.reshape(K * N, d)]), accepted
 
         keys = jax.random.split(key, records.number)
         return records.each(one, keys, points, at.guides, log_scales, paths)
@@ -124,7 +131,7 @@ class RecordPaths(eqx.Module):
     def noise(
         self, key: Key[Array, ""], at: At, paths: Float[Array, "R points d"]
     ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
-        """ξ of these paths, and log w."""
+        """Return ξ of these paths, and log w."""
         model, records = self.parameters.bind(at.theta), self.fine.records
 
         def one(problem, key, guide, path):
@@ -137,13 +144,13 @@ class RecordPaths(eqx.Module):
     def of_noise(
         self, at: At, noise: Float[Array, "R points d"]
     ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
-        """The paths of ξ, and log w."""
+        """Return the paths of ξ, and log w."""
         return _of_noise(self.fine.records, self.parameters.bind(at.theta), at.guides, noise)
 
     def steps_are_too_long(
         self, theta: Float[Array, " p"], paths: Float[Array, "R points d"]
     ) -> Bool[Array, ""]:
-        """Whether steps are too long for the drift along the path of some record."""
+        """Return whether steps are too long for the drift along the path of any record."""
         model = self.parameters.bind(theta)
         one = lambda problem, path: steps_are_too_long(problem, model, path)
         return jnp.any(self.fine.records.each(one, paths))
@@ -151,13 +158,13 @@ class RecordPaths(eqx.Module):
     def coarse_log_weight(
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
     ) -> Float[Array, ""]:
-        """log w̃ of ξ, with steps of twice the length."""
+        """Return log w̃ of ξ, with steps of twice the size."""
         return self._log_weight(self.coarse, theta, self._coarsened(noise))
 
     def either_log_weight(
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"], coarse: Bool[Array, ""]
     ) -> Float[Array, ""]:
-        """log w̃ of ξ or log w, as `coarse` says: one program for both."""
+        """Return log w̃ of ξ if `coarse`, else log w. One program serves both."""
         choose = lambda a, b: jnp.where(coarse, a, b) if eqx.is_array(a) else b
         grid = jax.tree.map(choose, self.coarse, self.fine)
         return self._log_weight(grid, theta, jnp.where(coarse, self._coarsened(noise), noise))
@@ -172,41 +179,44 @@ class RecordPaths(eqx.Module):
         return jax.vmap(lambda noise: _of_pairs(noise, self.num_steps))(noise)
 
 
-def check_no_bridges(**given: Any) -> None:
-    """Raise `ValueError` where one of these arguments, which are about bridges between complete
-    observations, is neither `None` nor what it is by default."""
+def check_no_bridges(**arguments: Any) -> None:
+    """Raise `ValueError` if an argument about bridges is neither `None` nor its default.
+
+    Such arguments are for complete observations without noise only.
+    """
     usual = lambda name, value: isinstance(value, str) and value == _USUAL.get(name)
-    asked = [name for name, value in given.items() if value is not None and not usual(name, value)]
-    if asked:
+    set_names = [
+        name for name, value in arguments.items() if value is not None and not usual(name, value)
+    ]
+    if names:
         raise ValueError(
-            f"{' and '.join(f'`{name}`' for name in asked)}: for complete observations without "
+            f"{' and '.join(f'`{name}`' for name in names)}: for complete observations without "
             "noise. Omit this argument, or omit `observation`."
         )
 
 
-def check_no_record(**given: Any) -> None:
-    """Raise `ValueError` where one of these arguments, which are about records with an
-    `observation`, is not `None`."""
-    asked = [f"`{name}`" for name, value in given.items() if value is not None]
-    if asked:
+def check_no_record(**arguments: Any) -> None:
+    """Raise `ValueError` if an argument for records with an `observation` is not `None`."""
+    set_names = [f"`{name}`" for name, value in arguments.items() if value is not None]
+    if set_names:
         raise ValueError(
-            f"{' and '.join(asked)}: for records with an `observation`. Pass one, for instance "
+            f"{' and '.join(set_names)}: for records with an `observation`. Pass one, for instance "
             "`observation=jb.LinearGaussian(covariance=0.01)`, or omit this argument."
         )
 
 
 def movable(records: Records) -> Bool[Array, "R 2 B"]:
-    """Which blocks hold a part of a record."""
+    """Return whether each block contains a part of its record; the other blocks are padding."""
     return records.each(lambda problem: has_segments(problem, _BLOCK_LENGTH))
 
 
 def share_of_step_error(records: Records) -> float:
-    """The step error as a share of what half as many steps change."""
+    """Return the discretisation error as a share of the change by half as many steps."""
     return share_of_grid(records.stacked.density.order, records.stacked.num_steps)
 
 
 def unguided(records: Records) -> GuidedRecords:
-    """With points that stand in until there are some."""
+    """Return the records with zeros as placeholders for the points of linearisation."""
     problem = records.stacked
     shape = records.number, problem.num_segments * problem.num_steps + 1, problem.dim
     dtype = problem.like.dtype
@@ -214,23 +224,25 @@ def unguided(records: Records) -> GuidedRecords:
 
 
 def on_both_grids(function: Callable, fine: PyTree, coarse: PyTree) -> Any:
-    """`function` of what has fine and of what has coarse steps, in arrays of one shape: one after
-    the other, in a leading axis, and compiled once."""
-    arrays, rest = stacked(fine, coarse)
-    return lax.map(lambda arrays: function(eqx.combine(arrays, rest)), arrays)
+    """Return `function` of `fine` and of `coarse`, stacked along a leading axis.
+
+    Both have arrays of the same shapes, so `function` is compiled once.
+    """
+    arrays, static = stacked(fine, coarse)
+    return lax.map(lambda arrays: function(eqx.combine(arrays, static)), arrays)
 
 
 def guided_near(
     fine: Records, coarse: Records, model: Diffusion
 ) -> tuple[GuidedRecords, GuidedRecords]:
-    """Linearised at the parameters of this model."""
-    made = on_both_grids(lambda records: linearisations(records, model), fine, coarse)
-    of_fine, of_coarse = (jax.tree.map(lambda leaf, i=i: leaf[i], made) for i in range(2))
+    """Return both records with points of linearisation at the parameters of `model`."""
+    points = on_both_grids(lambda records: linearisations(records, model), fine, coarse)
+    of_fine, of_coarse = (jax.tree.map(lambda leaf, i=i: leaf[i], points) for i in range(2))
     return GuidedRecords(fine, *of_fine), GuidedRecords(coarse, *of_coarse)
 
 
 def no_paths(records: Records) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:
-    """What stands in for paths, and log β of the moves of their blocks, until there are some."""
+    """Return placeholders of the paths, and log β = 0 of the moves of their blocks."""
     num_blocks = cuts(records.stacked.num_segments, _BLOCK_LENGTH).shape[-1]
     points = unguided(records).points
     return points, jnp.zeros((records.number, 2, num_blocks), points.dtype)
@@ -240,7 +252,7 @@ def no_paths(records: Records) -> tuple[Float[Array, "R points d"], Float[Array,
 def as_record_paths(
     parameters: Parameters, records: Records, theta: Float[Array, " p"]
 ) -> RecordPaths:
-    """Linearised at θ."""
+    """Return the paths of the records, linearised at θ."""
     grids = guided_near(records, records.coarsened(), parameters.bind(theta))
     return RecordPaths(parameters, *grids)
 
@@ -252,12 +264,12 @@ def likely_root(
     theta: Float[Array, " p"],
     root: Float[Array, "p p"],
 ) -> Float[Array, "p p"]:
-    """Return S of first moves that are as wide as the posterior of each parameter given the others.
+    """Return S of first moves with the widths of each parameter's posterior given the others.
 
-    The likelihood is that of the guided path without noise, which is exact but for a constant
-    where the model is linear. The width h is where the mean of the log densities at θ ± h is ½
-    below that at θ, at most what the prior spans, ten times `root`; it is found by a few secants,
-    which needs no derivatives and takes any start. `root` is kept where the path has no weight.
+    The likelihood is that of the guided path without noise. For a linear model it is exact up to a
+    constant. At the width h the mean of the log densities at θ ± h is ½ below the log density at θ.
+    A few secant steps find h; they need no derivatives and any start will do. h is at most ten
+    times `root`, the width of the prior. If the path has no weight, `root` is returned.
     """
     points, p = grid.points, theta.shape[0]
 
@@ -271,18 +283,20 @@ def likely_root(
         steps = jnp.diag(width)
         values = lax.map(log_density, jnp.concatenate([theta[None], theta + steps, theta - steps]))
         drop = values[0] - (values[1 : p + 1] + values[p + 1 :]) / 2
+        # For a quadratic the drop is proportional to h², so at h / √(2 drop) it is ½.
         factor = jnp.clip(lax.rsqrt(2 * jnp.maximum(drop, 1e-3)), *_SECANT)
         factor = jnp.where(values[0] > -jnp.inf, factor, 1)
         return jnp.minimum(width * factor, 10 * jnp.diagonal(root)), values[0]
 
     first = jnp.diagonal(root)
     width, values = lax.scan(turn, first, length=_NUM_SECANTS)
+    # The best factor for random walks with a normal target (Roberts & Rosenthal 2001).
     width = width * np.asarray(2.4 / np.sqrt(p), theta.dtype)
     return jnp.where(values[0] > -jnp.inf, jnp.diag(width), root)
 
 
 def _guides(grid: GuidedRecords, model: Diffusion) -> Guidance:
-    """What guides the paths of each record."""
+    """Return the guides of the paths of each record."""
     return grid.records.each(lambda problem, points: guided(problem, model, points), grid.points)
 
 
@@ -297,8 +311,11 @@ def _of_noise(
 
 
 def _of_pairs(noise: Float[Array, "points d"], num_steps: int) -> Float[Array, "points d"]:
-    """The noise of steps of twice the length, as `Record.coarsened` has them: of each pair of a
-    segment the second step."""
+    """Return the noise of steps of twice the size, on the grid of `Record.coarsened`.
+
+    The shape is that of the fine grid. The scaled sum of each pair is the noise of its second step;
+    its first step has no length on that grid.
+    """
     odd = num_steps % 2
     segments = noise[1:].reshape(-1, num_steps, noise.shape[-1])
     first, second = segments[:, odd::2], segments[:, odd + 1 :: 2]
