@@ -42,14 +42,18 @@ _NO_SAMPLER = (
 )
 _FOR_APPROXIMATE = ('bridges="approximate"', 'bridges="exact"')
 
-# What bridges are for: means at this θ alone; where θ moves, their weights, estimates of the
-# density, or the renewal kernel of a coupling; or, approximate, pairs of a coupling as they are.
+# Purpose of the bridges. "means": means at a single θ. For a θ that moves: "weights", "density"
+# (estimates of the transition density), or "renewal" (the renewal kernel of a coupling).
+# "approximate": unweighted pairs of a coupling.
 Use = Literal["means", "weights", "density", "renewal", "approximate"]
 
 
 class Block(eqx.Module):
-    """Intervals with one number of steps, which are these fractions of their durations; which of
-    all intervals they are; and their proposal."""
+    """Intervals with the same number of steps, and their proposal.
+
+    - `index`: positions of the intervals among all intervals.
+    - `fractions`: step sizes as fractions of the durations.
+    """
 
     intervals: Intervals
     index: Int[Array, " I"]
@@ -62,7 +66,7 @@ class Block(eqx.Module):
 
     @property
     def problem(self) -> BridgeProblem:
-        """The bridges of these intervals."""
+        """Return the bridge problem of the intervals."""
         return BridgeProblem(self.intervals, None, self.num_steps, True, True)
 
     @property
@@ -72,15 +76,19 @@ class Block(eqx.Module):
     def log_halvings(
         self, model: Diffusion, paths: Float[Array, "P points d"], form: Form
     ) -> Float[Array, " P"]:
-        """D of `halving` under the step law of this form of the likelihood, of paths that are as
-        many for each interval."""
+        """Return D of `halving` for paths under the step law of this form of the likelihood.
+
+        All intervals have the same number of paths, and `P` is the total number.
+        """
         steps = jnp.repeat(self.steps, paths.shape[0] // len(self.index), axis=1)
         dynamics = model.forward(self.intervals.start[0])
         return log_halving_of_paths(density_of_form(form), dynamics, steps, paths)
 
     def step_shares(self, model: Diffusion, form: Form) -> Float[Array, " I"]:
-        """The step error of each interval, of its bridges or of this form, as a share of what half
-        as many steps change."""
+        """Return the discretisation error as a share of the change by half as many steps.
+
+        It is the larger one of the shares of the bridges and of this form, for each interval.
+        """
         share = share_of_order(density_of_form(form).order)
         return jnp.maximum(guessed(self.proposal.step_share(model, self.intervals)), share)
 
@@ -93,8 +101,9 @@ def make_blocks(
     budget: Budget,
     use: Use,
 ) -> tuple[Block, ...]:
-    """The proposal that the user gave, checked, and settled and prepared for each block at this
-    model, from which θ moves unless means are wanted.
+    """Validate the user's proposal; select and prepare the proposal of each block at `model`.
+
+    Unless `use` is "means" or "approximate", the proposals must be valid for every θ.
 
     **Raises:** `ValueError` and `TypeError` for a proposal that does not fit.
     """
@@ -105,28 +114,28 @@ def make_blocks(
     if moving and is_auto and needs_burn_in(Stationary(), model) and not model.has_density:
         left_out = why_left_out(model, for_density) or _NO_SAMPLER
         proposal = choice_between(guided_candidates(), budget, left_out=left_out)
-    given = as_proposal(proposal, model, like, budget, for_density)
-    given.check(model, problem.intervals)
+    selected = as_proposal(proposal, model, like, budget, for_density)
+    selected.check(model, problem.intervals)
     if for_density:
-        given.check_for_density(model)
+        selected.check_for_density(model)
     if moving:
-        _check_for_moving(given, model)
+        _check_for_moving(selected, model)
     if use in ("renewal", "approximate"):
-        given = as_pairs(given) if weighted else as_pairs(given, *_FOR_APPROXIMATE)
-    # A choice is made for all intervals at once, in as many steps as the longest has, so that each
-    # candidate's pilot run is one program.
+        selected = as_pairs(selected) if weighted else as_pairs(selected, *_FOR_APPROXIMATE)
+    # Select for all intervals at once, with the largest number of steps: then the pilot run of each
+    # candidate is compiled once.
     choice_key, key = jax.random.split(key)
     most = max(group.num_steps for group in groups)
-    chosen = resolve(given, choice_key, model, problem.intervals, most)
+    resolved = resolve(selected, choice_key, model, problem.intervals, most)
     blocks = []
     for block_key, group in zip(jax.random.split(key, len(groups)), groups, strict=True):
-        mine, at = chosen.of(group.which), (block_key, model, group.intervals, group.num_steps)
-        blocks.append(block_of(group, mine.prepared(*at) if weighted else as_pairs(mine)))
+        single, at = resolved.of(group.which), (block_key, model, group.intervals, group.num_steps)
+        blocks.append(block_of(group, single.prepared(*at) if weighted else as_pairs(single)))
     return tuple(blocks)
 
 
 def block_of(group: Group, proposal: AbstractWeightedProposal) -> Block:
-    """The intervals of a group with a proposal that is settled for them."""
+    """Return the block of a group of intervals with its selected proposal."""
     fractions = np.diff(proposal.fractions(group.num_steps))
     fractions = jnp.asarray(fractions, group.intervals.duration.dtype)
     return Block(group.intervals, jnp.asarray(group.which), fractions, proposal)
@@ -135,29 +144,34 @@ def block_of(group: Group, proposal: AbstractWeightedProposal) -> Block:
 def with_keys(
     key: Key[Array, ""], blocks: tuple[Block, ...]
 ) -> Iterator[tuple[Key[Array, ""], Block]]:
-    """Each block with a key of its own."""
+    """Yield each block with a separate key."""
     return zip(jax.random.split(key, len(blocks)), blocks, strict=True)
 
 
-def over_intervals(blocks: tuple[Block, ...], made: Sequence[Any]) -> Any:
-    """What was made of each block, named tuples, for all intervals: sums, and of the effective
-    number of paths, k̂ and the counts of each interval those of all, in their order."""
+def over_intervals(blocks: tuple[Block, ...], of_blocks: Sequence[Any]) -> Any:
+    """Combine the results of the blocks, which are named tuples, to one for all intervals.
+
+    Fields with a value for each interval are joined in the order of the intervals: effective sample
+    size, k̂ and counts. The other fields are summed.
+    """
     order = jnp.argsort(jnp.concatenate([block.index for block in blocks]))
     fields = ("effective_sample_size", "pareto_k", "num_found", "num_simulated", "num_nonfinite")
-    each = {f: jnp.concatenate([getattr(one, f) for one in made])[order] for f in fields}
-    sums = [one._replace(**dict.fromkeys(fields, 0)) for one in made]
-    return jax.tree.map(lambda *leaves: sum(leaves), *sums)._replace(**each)
+    joined = {f: jnp.concatenate([getattr(one, f) for one in of_blocks])[order] for f in fields}
+    sums = [one._replace(**dict.fromkeys(fields, 0)) for one in of_blocks]
+    return jax.tree.map(lambda *leaves: sum(leaves), *sums)._replace(**joined)
 
 
 def target_forms(blocks: tuple[Block, ...], model: Diffusion) -> tuple[Form, ...]:
-    """Those of the path likelihood that go with the bridges of all blocks."""
+    """Return the forms of the path likelihood that match the bridges of all blocks."""
     targets = [single.target for block in blocks for single in block.proposal.singles]
     return forms_of_targets(targets, model, blocks[0].intervals.start[0])
 
 
 def _check_for_moving(proposal: AbstractProposal, model: Diffusion) -> None:
-    """Raise `ValueError` where something is known at the first parameters only. (A start law with a
-    density serves at all.)"""
+    """Raise `ValueError` for a proposal that is valid at the first parameters only.
+
+    A proposal whose start law has a density is valid at all parameters.
+    """
     if any(single.must_measure(model) for single in proposal.singles) and not model.has_density:
         raise ValueError(
             "this model has no sampler of its stationary law, and the length of a burn-in depends "

@@ -32,14 +32,18 @@ from .blocks import Block, with_keys
 from .parameters import Parameters
 from .record_paths import GuidedRecords, guided_near, likely_root, on_both_grids
 
-# At least so many filters at each of several parameters, and so many particles, are a pilot.
+# A pilot run has at least so many filters at each θ, and so many particles in all of them.
 _FEWEST_FILTERS, _FEWEST_PARTICLES = 16, 128
 
 
 class Guide(NamedTuple):
-    """What guides the filters of R records: the points along which each is linearised, on the grid
-    and on one of half as many steps, the rate at which it forgets,
-    and how good it is on the grid."""
+    """Guides of the filters of R records.
+
+    - `fine`, `coarse`: points along which the model is linearised, on the grid and on the grid with
+      half as many steps.
+    - `rate`: discount rate of the guides.
+    - `check`: diagnostics of the guides on the fine grid.
+    """
 
     fine: Float[Array, "R points d"]
     coarse: Float[Array, "R coarse_points d"]
@@ -67,36 +71,45 @@ class Estimate(NamedTuple):
 def _infinite_where_unknown(
     error: Float[Array, " I"], uncertainty: Float[Array, " I"]
 ) -> Float[Array, " I"]:
-    """Return step errors, infinite instead of NaN where steps are too long for an estimate."""
+    """Return discretisation errors, infinite instead of NaN if steps are too long to estimate them.
+
+    Such errors are NaN with an infinite uncertainty.
+    """
     return jnp.where(jnp.isnan(error) & jnp.isinf(uncertainty), jnp.inf, error)
 
 
 def _share(
-    part: Int[Array, " I"], whole: Int[Array, " I"], like: Float[Array, ""]
+    part: Int[Array, " I"], total: Int[Array, " I"], like: Float[Array, ""]
 ) -> Float[Array, " I"]:
-    """Return part / whole, zero of nothing."""
-    return part.astype(like.dtype) / jnp.maximum(whole, 1).astype(like.dtype)
+    """Return part / total, or zero if the total is zero."""
+    return part.astype(like.dtype) / jnp.maximum(total, 1).astype(like.dtype)
 
 
 class AbstractLikelihood(eqx.Module):
-    """What estimates the likelihood of the observations, exp(`estimate`) with mean L(θ).
+    """Base class of estimators of the likelihood L(θ) of the observations.
 
-    A chain calls `estimate` once in each iteration, at the parameters that it proposes, and holds
-    on to what it gets until a proposal is accepted. While it warms up it asks for another of the
-    kind, by `near`, wherever there is a `guide`. Of some draws it asks for the step error: it is
-    that of the estimate it holds where `tells_step_error`, and else is worked out by
-    `log_step_error`. All of it is traced inside one compiled loop, and under `vmap` over chains.
+    exp(`estimate`) has the mean L(θ).
+
+    - A chain calls `estimate` once in each iteration, at the proposed θ. It stores the estimate
+      until a proposal is accepted.
+    - During the warm-up it replaces the estimator by `near`, if there is a `guide`.
+    - For some draws it needs the discretisation error. If `tells_step_error`, the stored estimate
+      contains the error; otherwise `log_step_error` computes it.
+
+    All methods are traced inside one compiled loop, and under `vmap` over chains.
     """
 
     @abstractmethod
     def estimate(self, key: Key[Array, ""], model: Diffusion) -> Estimate:
-        """One estimate for this model, from random numbers that depend on the key only. Never NaN:
-        -inf where none is to be had, which refuses the parameters and is counted."""
+        """Estimate the likelihood of this model, with random numbers that depend on the key only.
+
+        The log-likelihood is never NaN. It is -inf without an estimate; then the chain rejects the
+        parameters, and counts this.
+        """
 
     @abstractmethod
     def log_step_error(self, key: Key[Array, ""], model: Diffusion) -> Float[Array, ""]:
-        """By how much log L(θ) is too large for the length of the steps, with noise of its own; NaN
-        where it is not known."""
+        """Estimate the discretisation error of log L(θ) with separate noise; NaN if unavailable."""
 
     @abstractmethod
     def near(
@@ -106,9 +119,11 @@ class AbstractLikelihood(eqx.Module):
         theta: Float[Array, " p"],
         around: Float[Array, "n p"],
     ) -> "AbstractLikelihood":
-        """What estimates the same with less variance where a chain is, at θ, and where it may come
-        to, `around` it, for the models `at` these: leaves may change, and no shapes, for both are
-        states of one loop."""
+        """Return an estimator of the same likelihood with a smaller variance near θ.
+
+        `around` are θ that the chains may visit, and `at` returns the model at a θ. All shapes must
+        remain, because both estimators are states of one loop.
+        """
 
     @abstractmethod
     def likely_root(
@@ -118,34 +133,37 @@ class AbstractLikelihood(eqx.Module):
         theta: Float[Array, " p"],
         root: Float[Array, "p p"],
     ) -> Float[Array, "p p"]:
-        """S of first moves from θ that are as wide as the likelihood, where that is known without
-        random numbers; else the given one. Asked for where there is a `guide`."""
+        """Return S of first moves from θ with the width of the likelihood.
+
+        If this needs random numbers, return `root`. The sampler calls it if there is a `guide`.
+        """
 
     @property
     @abstractmethod
     def guide(self) -> Guide | None:
-        """What `near` finds anew, for one that goes on with the same; `None` where that is
-        nothing."""
+        """Return the guide that `near` replaces, for continued chains; `None` if there is none."""
 
     @property
     @abstractmethod
     def tells_step_error(self) -> bool:
-        """Whether `log_step_error` of an `Estimate` is told at no cost worth mentioning."""
+        """Return whether every `Estimate` contains its `log_step_error`, at little extra cost."""
 
     @property
     @abstractmethod
     def like(self) -> Float[Array, " d"]:
-        """A point of the state space, of which only shape and dtype count."""
+        """Return a point of the state space. Only its shape and dtype are used."""
 
     @property
     @abstractmethod
     def proposals(self) -> tuple[AbstractWeightedProposal, ...]:
-        """Of the paths, decided, for each group of intervals: kept in the state in which a chain
-        ends, so that one that goes on has the same. Empty where there is nothing to decide."""
+        """Return the selected proposals of the paths, one for each group of intervals.
+
+        The last state of a chain stores them for continued chains. Empty for particle filters.
+        """
 
 
 class TransitionLikelihood(AbstractLikelihood):
-    """Transition densities by so many weighted paths for each interval."""
+    """Product of transition densities, each estimated by `num_proposals` weighted paths."""
 
     blocks: tuple[Block, ...]
     num_proposals: int = eqx.field(static=True)
@@ -157,17 +175,17 @@ class TransitionLikelihood(AbstractLikelihood):
         num_intervals = sum(len(block.index) for block in self.blocks)
         for block_key, block in with_keys(key, self.blocks):
             arguments = (model, block.proposal, block.problem, self.num_proposals)
-            made = estimate_log_density(block_key, *arguments, held=True)
-            mine = Estimate(
-                jnp.sum(made.value),
-                jnp.sum(made.standard_error**2),
-                jnp.sum(_infinite_where_unknown(made.step_error, made.step_uncertainty)),
-                jnp.sum(made.num_truncated, dtype=jnp.int32),
-                jnp.sum(_share(made.num_nonfinite, made.num_simulated, zero)) / num_intervals,
+            density = estimate_log_density(block_key, *arguments, held=True)
+            of_block = Estimate(
+                jnp.sum(density.value),
+                jnp.sum(density.standard_error**2),
+                jnp.sum(_infinite_where_unknown(density.step_error, density.step_uncertainty)),
+                jnp.sum(density.num_truncated, dtype=jnp.int32),
+                jnp.sum(_share(density.num_nonfinite, density.num_simulated, zero)) / num_intervals,
             )
-            total = jax.tree.map(jnp.add, total, mine)
-        known = ~jnp.isnan(total.log_likelihood)
-        return total._replace(log_likelihood=jnp.where(known, total.log_likelihood, -jnp.inf))
+            total = jax.tree.map(jnp.add, total, of_block)
+        is_number = ~jnp.isnan(total.log_likelihood)
+        return total._replace(log_likelihood=jnp.where(is_number, total.log_likelihood, -jnp.inf))
 
     def log_step_error(self, key, model):
         return self.estimate(key, model).log_step_error
@@ -196,8 +214,12 @@ class TransitionLikelihood(AbstractLikelihood):
 
 
 class RecordLikelihood(AbstractLikelihood):
-    """Guided particle filters of all records, linearised along the same points at all parameters,
-    with one rate at which guides forget; and with half as many steps, which tell the step error."""
+    """Guided particle filters of all records.
+
+    - `fine`: records with the points of linearisation, which are the same at all parameters.
+    - `coarse`: the same with half as many steps, for the discretisation error.
+    - `rate`: discount rate of all guides.
+    """
 
     fine: GuidedRecords
     coarse: GuidedRecords
@@ -215,7 +237,7 @@ class RecordLikelihood(AbstractLikelihood):
             return jnp.full((), jnp.nan, problem.like.dtype)
         estimate = lambda grid: self._estimate(key, model, grid, skips=True)
         log_p, variance, _ = on_both_grids(estimate, self.fine, self.coarse)
-        # The mean of log p̂ is too small by half its variance.
+        # The mean of log p̂ is below log p by half the variance of log p̂.
         fine, coarse = log_p + variance / 2
         error = share_of_grid(problem.density.order, problem.num_steps) * (coarse - fine)
         one = lambda problem, points: steps_are_too_long(problem, model, points)
@@ -245,7 +267,7 @@ class RecordLikelihood(AbstractLikelihood):
         return Guide(self.fine.points, self.coarse.points, self.rate, self.fine.check)
 
     def guided_by(self, guide: Guide) -> "RecordLikelihood":
-        """The same with what another has as `guide`."""
+        """Return the same estimator with this guide."""
         fine = self.fine._replace(points=guide.fine, check=guide.check)
         coarse = self.coarse._replace(points=guide.coarse)
         return RecordLikelihood(fine, coarse, guide.rate, self.num_particles)
@@ -257,12 +279,15 @@ class RecordLikelihood(AbstractLikelihood):
     def _estimate(
         self, key: Key[Array, ""], model: Diffusion, grid: GuidedRecords, skips: bool = False
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """log p̂ with its variance, of one filter of each record, and the mass that lost particles
-        may be missing from it."""
-        made = self._filtered(key, model, grid, self.rate, 1, skips)
-        variance = jax.vmap(lambda each: each.variance(self.num_particles))(made)
-        lost = jnp.sum(made.num_nonfinite).astype(variance.dtype) / self.num_particles
-        return jnp.sum(made.log_estimate), jnp.sum(variance), lost
+        """Estimate log p with one filter of each record.
+
+        Return the estimate, its variance, and the mass that lost particles may be missing: their
+        number divided by the number of particles.
+        """
+        filtered = self._filtered(key, model, grid, self.rate, 1, skips)
+        variance = jax.vmap(lambda record: record.variance(self.num_particles))(filtered)
+        lost = jnp.sum(filtered.num_nonfinite).astype(variance.dtype) / self.num_particles
+        return jnp.sum(filtered.log_estimate), jnp.sum(variance), lost
 
     def _filtered(
         self,
@@ -273,8 +298,11 @@ class RecordLikelihood(AbstractLikelihood):
         num_filters: int,
         skips: bool,
     ) -> Filtered:
-        """So many filters of each record, whose guides forget at this rate. To skip steps of no
-        length takes a decision at each, which pays where there are many: on the coarse grid."""
+        """Run `num_filters` filters of each record with this discount rate of the guides.
+
+        `skips` skips steps of zero length. The test at each step takes time, so this is faster only
+        on the coarse grid, which has many such steps.
+        """
         (records, points, _), size = grid, (num_filters, self.num_particles)
         moving = records.moving if skips else None
 

@@ -26,7 +26,10 @@ Constraint = Callable[[PyTree], Any]
 
 
 class Parameters(eqx.Module):
-    """The model, which of its parameters are unknown, and which values of these are allowed."""
+    """Model with a selection of unknown parameters and a constraint on them.
+
+    Converts between these parameters and vectors θ.
+    """
 
     model: Diffusion
     where: Callable[[PyTree], PyTree] | None = eqx.field(static=True)
@@ -34,51 +37,56 @@ class Parameters(eqx.Module):
 
     @property
     def params(self) -> PyTree:
-        """The unknown parameters, as they are in the model."""
+        """Return the unknown parameters of the model."""
         return self.model.params if self.where is None else pick(self.where, self.model.params)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of θ's entries, as the model's parameters have them: "alpha", "B[0,1]"; "0" and
-        "1" for those of a tuple, and "theta" where the parameters are one array without a name."""
+        """Return the names of the entries of θ.
+
+        Examples are "alpha" and "B[0,1]", "0" and "1" for entries of a tuple, and "theta" if the
+        parameters are one array without a name.
+        """
 
         def entries(path, leaf):
             name = jax.tree_util.keystr(path, simple=True, separator=".") or "theta"
             shape = [leaf.shape] if eqx.is_inexact_array(leaf) else []
-            places = [",".join(map(str, place)) for each in shape for place in np.ndindex(each)]
+            places = [",".join(map(str, place)) for sizes in shape for place in np.ndindex(sizes)]
             return [f"{name}[{place}]" if place else name for place in places]
 
         named = jax.tree_util.tree_map_with_path(entries, self.model.params)
         return tuple(jax.tree.leaves(named if self.where is None else self.where(named)))
 
     def vector(self, params: PyTree) -> Float[Array, " p"]:
-        """θ of these unknown parameters."""
+        """Return θ, given the unknown parameters."""
         return ravel_pytree(eqx.filter(params, eqx.is_inexact_array))[0]
 
     def select(self, theta: Float[Array, " p"]) -> PyTree:
-        """The unknown parameters of θ, in its dtype."""
+        """Return the unknown parameters, given θ, in its dtype."""
         return eqx.combine(
             self.each(theta), eqx.filter(self.params, eqx.is_inexact_array, inverse=True)
         )
 
     def each(self, values: Float[Array, " p"]) -> PyTree:
-        """What belongs to the entries of θ, as a score does, where they stand in the unknown
-        parameters; `None` for what is no entry."""
+        """Return values of the entries of θ, such as a score, as a pytree like the parameters.
+
+        Leaves without an entry in θ are `None`.
+        """
         floats = eqx.filter(self.params, eqx.is_inexact_array)
         return ravel_pytree(cast_floats(floats, values.dtype))[1](values)
 
     def full(self, theta: Float[Array, " p"]) -> PyTree:
-        """All parameters of the model, the unknown ones from θ."""
+        """Return all parameters of the model, with the unknown ones from θ."""
         if self.where is None:
             return self.select(theta)
         return eqx.tree_at(self.where, self.model.params, self.select(theta))
 
     def bind(self, theta: Float[Array, " p"]) -> Diffusion:
-        """The model at θ."""
+        """Return the model with the parameters θ."""
         return self.model.with_params(self.full(theta))
 
     def allowed(self, theta: Float[Array, " p"]) -> Bool[Array, ""]:
-        """Whether θ is finite and satisfies the constraint."""
+        """Return whether θ is finite and satisfies the constraint."""
         finite = jnp.all(jnp.isfinite(theta))
         if self.constraint is None:
             return finite
@@ -92,7 +100,7 @@ class Parameters(eqx.Module):
         return finite & value
 
     def check_allowed(self, theta: Float[Array, "*chains p"]) -> None:
-        """Raise `ValueError` where a visible θ does not satisfy the constraint."""
+        """Raise `ValueError` if a concrete θ is not finite or violates the constraint."""
         ok = of_rows(self.allowed, theta)
         if not is_traced(ok) and not np.all(np.asarray(ok)):
             row = theta.reshape(-1, theta.shape[-1])[int(np.argmin(ok))]
@@ -102,9 +110,9 @@ class Parameters(eqx.Module):
 
 @compiled_sooner
 def of_rows(function: Callable, theta: Float[Array, "*chains p"]) -> Array:
-    """`function` at θ of each chain, in one axis."""
-    each = lambda row: function(row)  # `vmap` wants a function, and this may be a module
-    return jax.vmap(each)(theta.reshape(-1, theta.shape[-1]))
+    """Return `function` at θ of each chain, along one axis."""
+    of_row = lambda row: function(row)  # `vmap` takes functions only, and this may be a module
+    return jax.vmap(of_row)(theta.reshape(-1, theta.shape[-1]))
 
 
 def as_parameters(
@@ -113,8 +121,13 @@ def as_parameters(
     constraint: Constraint | None = None,
     prior: Any = None,
 ) -> Parameters:
-    """The parameters that the user wants to know, checked as far as can be without data. Integers
-    among them are unknown where `where` or the prior names them."""
+    """Return the unknown parameters, after the checks that need no data.
+
+    Integers are fixed unless `where` selects them or the prior has entries for them.
+
+    **Raises:** `TypeError` if `model` is no diffusion, or `where` or `constraint` no function;
+    `ValueError` if `where` selects no parts of the parameters.
+    """
     check_diffusion(model)
     check_function("where", where, "(params)", optional=True)
     check_function("constraint", constraint, "(unknown)", optional=True)
@@ -125,10 +138,11 @@ def as_parameters(
 def _with_named_integers(
     params: PyTree, where: Callable[[PyTree], PyTree] | None, prior: Any
 ) -> PyTree:
-    """Return the parameters with those integers as floating point numbers that `where` picks or
-    that have entries of their own in a prior of pytrees.
+    """Return the parameters, with unknown integers converted to floating-point numbers.
 
-    **Warns:** where all parameters are asked for, of integers that are held fixed.
+    An integer is unknown if `where` selects it, or if the prior is a pytree with an entry for it.
+
+    **Warns:** if there is no `where` and some integers remain fixed.
     """
     picked = params if where is None else pick(where, params)
     if not any(map(_is_integer, jax.tree.leaves(picked))):
@@ -156,9 +170,9 @@ def _with_named_integers(
 
 
 def pick(where: Callable[[PyTree], PyTree], params: PyTree) -> PyTree:
-    """Return what `where` picks from the parameters.
+    """Return the parameters that `where` selects.
 
-    **Raises:** `ValueError` where it takes what is not there, or returns what is no part of them.
+    **Raises:** `ValueError` if `where` fails, or returns anything but parts of the parameters.
     """
     picked = evaluated("where", where, params)
     try:
@@ -182,15 +196,20 @@ def _as_float(leaf: Any) -> Array:
 
 
 def _is_plain(tree: PyTree) -> bool:
-    """Return whether a pytree has no containers but tuples, lists and dictionaries: integers in
-    others, as in neural networks, are sizes."""
+    """Return whether tuples, lists and dictionaries are the only containers of a pytree.
+
+    Integers in other containers, such as neural networks, are sizes.
+    """
     plain = lambda node: isinstance(node, tuple | list | dict)
     nodes = jax.tree.leaves(tree, is_leaf=lambda node: not plain(node))
     return jax.tree_util.all_leaves(nodes)
 
 
 def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p"]:
-    """θ as it is in the model, in this dtype, checked."""
+    """Return θ of the model's parameters, in this dtype.
+
+    **Raises:** `ValueError` if θ is empty or not finite, or if the coordinates depend on it.
+    """
     theta = parameters.vector(cast_floats(parameters.params, dtype))
     if theta.size == 0:
         raise ValueError(
@@ -216,27 +235,31 @@ def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p
 def init_vectors(
     parameters: Parameters, init: PyTree, chains: tuple[int, ...]
 ) -> Float[Array, "*chains p"]:
-    """θ of the unknown parameters that the user wants to start from, for each chain its own if
-    they have such an axis."""
-    known = parameters.params
-    if jax.tree.structure(init) != jax.tree.structure(known):
+    """Return θ of the start parameters `init`.
+
+    If the leaves of `init` have a leading axis of chains, θ has it, too.
+
+    **Raises:** `ValueError` if the structure or the shapes of `init` are wrong.
+    """
+    like = parameters.params
+    if jax.tree.structure(init) != jax.tree.structure(like):
         raise ValueError(
             "`init` must be the `state` of earlier draws, or a pytree like the unknown parameters, "
-            f"{jax.tree.structure(known)}; got {jax.tree.structure(init)}."
+            f"{jax.tree.structure(like)}; got {jax.tree.structure(init)}."
         )
     init = jax.tree.map(
-        lambda leaf, given: as_floating("init", given) if eqx.is_inexact_array(leaf) else None,
-        known,
+        lambda leaf, value: as_floating("init", value) if eqx.is_inexact_array(leaf) else None,
+        like,
         init,
     )
-    floats = eqx.filter(known, eqx.is_inexact_array)
+    floats = eqx.filter(like, eqx.is_inexact_array)
     shapes = [
-        (given.shape, leaf.shape)
-        for given, leaf in zip(jax.tree.leaves(init), jax.tree.leaves(floats), strict=True)
+        (value.shape, leaf.shape)
+        for value, leaf in zip(jax.tree.leaves(init), jax.tree.leaves(floats), strict=True)
     ]
-    if all(given == leaf for given, leaf in shapes):
+    if all(shape == leaf for shape, leaf in shapes):
         return parameters.vector(init)
-    if chains and all(given == (*chains, *leaf) for given, leaf in shapes):
+    if chains and all(shape == (*chains, *leaf) for shape, leaf in shapes):
         return jax.vmap(parameters.vector)(init)
     raise ValueError(
         f"`init` must have leaves of the shapes of the unknown parameters, {[s for _, s in shapes]}"

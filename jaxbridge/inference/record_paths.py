@@ -185,7 +185,7 @@ def check_no_bridges(**arguments: Any) -> None:
     Such arguments are for complete observations without noise only.
     """
     usual = lambda name, value: isinstance(value, str) and value == _USUAL.get(name)
-    set_names = [
+    names = [
         name for name, value in arguments.items() if value is not None and not usual(name, value)
     ]
     if names:
@@ -197,10 +197,10 @@ def check_no_bridges(**arguments: Any) -> None:
 
 def check_no_record(**arguments: Any) -> None:
     """Raise `ValueError` if an argument for records with an `observation` is not `None`."""
-    set_names = [f"`{name}`" for name, value in arguments.items() if value is not None]
-    if set_names:
+    names = [f"`{name}`" for name, value in arguments.items() if value is not None]
+    if names:
         raise ValueError(
-            f"{' and '.join(set_names)}: for records with an `observation`. Pass one, for instance "
+            f"{' and '.join(names)}: for records with an `observation`. Pass one, for instance "
             "`observation=jb.LinearGaussian(covariance=0.01)`, or omit this argument."
         )
 
