@@ -29,12 +29,16 @@ from ..proposals import AbstractWeightedProposal, CoupledPairs
 
 
 class BridgeInfo(NamedTuple):
-    """Of one step on all intervals: whether the path of each was replaced; how many paths were
-    simulated, or weighed, for it; whether no proposal was found though one was called for. Then
-    the path stays, which leaves the exact law invariant, for whether one is found does not
-    depend on the path. Then, whether a weight was cut off by a bound on its trials, or the run
-    that replaces a sampler of the stationary law by one on its steps. Last, how many paths left the
-    state space or the finite numbers."""
+    """Events of one step, for each interval.
+
+    - `moved`: whether the path was replaced.
+    - `num_simulated`: number of simulated or reweighted paths.
+    - `missing`: whether a proposal was needed but not found. Then the path stays. This leaves the
+      exact law invariant, because the event does not depend on the path.
+    - `truncated`: whether a weight was truncated by the bound on its trials, or a burn-in for the
+      stationary law by the bound on its steps.
+    - `num_nonfinite`: number of paths that diverged or left the state space.
+    """
 
     moved: Bool[Array, " I"]
     num_simulated: Int[Array, " I"]
@@ -44,13 +48,13 @@ class BridgeInfo(NamedTuple):
 
 
 class AbstractBridgeKernel(eqx.Module):
-    """A Markov kernel on the bridges of many intervals."""
+    """Base class of Markov kernels on the bridges of many intervals."""
 
     @abstractmethod
     def first(
         self, keys: Key[Array, " I"], model: Diffusion, intervals: Intervals, num_steps: int
     ) -> Float[Array, "I points d"]:
-        """Paths to start from, NaN where none was found."""
+        """Sample the first paths; they are NaN for intervals without a proposal."""
 
     @abstractmethod
     def renew(
@@ -60,11 +64,11 @@ class AbstractBridgeKernel(eqx.Module):
         intervals: Intervals,
         paths: Float[Array, "I points d"],
     ) -> tuple[Float[Array, "I points d"], BridgeInfo]:
-        """One step of each."""
+        """Return the paths after one step of each bridge, and its events."""
 
 
 class ByRenewal(AbstractBridgeKernel):
-    """The renewal kernel."""
+    """Renewal kernel: it replaces a bridge when the associated diffusion hits it."""
 
     pairs: CoupledPairs
 
@@ -72,8 +76,8 @@ class ByRenewal(AbstractBridgeKernel):
         return first_paths(keys, model, self.pairs, intervals, num_steps)[0]
 
     def renew(self, keys, model, intervals, paths):
-        everything = jnp.ones(len(keys), bool)
-        paths, info = renew(keys, model, self.pairs, intervals, paths, everything)
+        all_intervals = jnp.ones(len(keys), bool)
+        paths, info = renew(keys, model, self.pairs, intervals, paths, all_intervals)
         num_steps = paths.shape[1] - 1
         law, dt = self.pairs.coupling.start_law, intervals.duration / num_steps
         cut = run_is_cut(law, model, dt, num_steps)
@@ -82,17 +86,18 @@ class ByRenewal(AbstractBridgeKernel):
 
 
 class ByWeights(AbstractBridgeKernel):
-    """The pseudo-marginal kernel."""
+    """Pseudo-marginal kernel: it accepts a new bridge with the ratio of the weights."""
 
     proposal: AbstractWeightedProposal
 
     def first(self, keys, model, intervals, num_steps):
-        drawn = self.proposal.draw(keys[:, None], model, intervals, num_steps, None, False)
-        return drawn.paths[:, 0]
+        draws = self.proposal.draw(keys[:, None], model, intervals, num_steps, None, False)
+        return draws.paths[:, 0]
 
     def renew(self, keys, model, intervals, paths):
         weigh_keys, draw_keys, accept_keys = split_each(keys, 3)
         num_steps = paths.shape[1] - 1
+        # A new weight of the current path from its law given the path and the current θ.
         old = self.proposal.reweigh(weigh_keys, model, intervals, paths)
         new = self.proposal.draw(draw_keys[:, None], model, intervals, num_steps, None, False)
         uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=paths.dtype))(accept_keys)
@@ -106,7 +111,7 @@ class ByWeights(AbstractBridgeKernel):
 
 
 class Unweighted(AbstractBridgeKernel):
-    """A new approximate bridge each time."""
+    """Approximate kernel: it accepts each new approximate bridge."""
 
     pairs: CoupledPairs
 
@@ -116,7 +121,7 @@ class Unweighted(AbstractBridgeKernel):
     def renew(self, keys, model, intervals, paths):
         num_steps = paths.shape[1] - 1
         proposed = propose_paths(keys, model, self.pairs, intervals, None, num_steps)
-        found = proposed.num_found > 0
-        paths = jnp.where(found[:, None, None], proposed.outputs.paths, paths)
-        counts = found, proposed.num_trials, ~found, jnp.zeros_like(found)
+        has_bridge = proposed.num_found > 0
+        paths = jnp.where(has_bridge[:, None, None], proposed.outputs.paths, paths)
+        counts = has_bridge, proposed.num_trials, ~has_bridge, jnp.zeros_like(has_bridge)
         return paths, BridgeInfo(*counts, proposed.num_nonfinite)

@@ -28,15 +28,15 @@ from ..models.tracing import uses_argument
 from ..records import as_rows, of_each, split_records
 from .parameters import Parameters, theta_of_model
 
-# Numbers of steps are looked at as so many per factor of two.
+# Numbers of steps are rounded to so many levels per factor of two.
 _LEVELS_PER_OCTAVE = 2
-# A number of steps of its own takes seconds to compile, as long as so many steps of paths take in
-# each of a thousand sweeps.
+# Cost of a further number of steps, in steps of paths. Its compilation takes seconds, as long as so
+# many steps take in a thousand sweeps.
 _STEPS_PER_GROUP = 2**15
 
 
 class Group(NamedTuple):
-    """Intervals with the same number of steps, and which of all intervals they are."""
+    """Intervals with the same number of steps; `which` are their positions among all intervals."""
 
     intervals: Intervals
     which: Int[np.ndarray, " I"]
@@ -44,33 +44,33 @@ class Group(NamedTuple):
 
 
 def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> Intervals:
-    """The intervals between n + 1 observations, or of several records, one after the other.
+    """Return the intervals between n + 1 observations, or those of several records in sequence.
 
-    **Raises:** `ValueError` that says what is wrong with which time or observation.
+    **Raises:** `ValueError` that names the invalid time or observation.
     """
     one = lambda times, observations: _intervals(model, times, observations)
-    each = of_each(one, split_records(times, observations))
-    with jax.ensure_compile_time_eval():  # so that what is known stays so
-        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *each)
+    intervals = of_each(one, split_records(times, observations))
+    with jax.ensure_compile_time_eval():  # concrete values stay concrete inside `jit`
+        return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *intervals)
 
 
 def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Intervals:
-    """Those of one record."""
-    known = as_times("times", _unmasked("times", times))
+    """Return the intervals of one record, after all checks."""
+    grid = as_times("times", _unmasked("times", times))
     observations = as_rows(_unmasked("observations", observations))
-    if len(known.shape) != 1:
-        raise ValueError(f"`times` must have shape (n + 1,); got shape {known.shape}.")
-    if observations.ndim != 2 or observations.shape[0] != known.shape[0]:
+    if len(grid.shape) != 1:
+        raise ValueError(f"`times` must have shape (n + 1,); got shape {grid.shape}.")
+    if observations.ndim != 2 or observations.shape[0] != grid.shape[0]:
         raise ValueError(
-            f"`observations` must have shape ({known.shape[0]}, d), one row per entry of `times`; "
+            f"`observations` must have shape ({grid.shape[0]}, d), one row per entry of `times`; "
             f"got shape {observations.shape}."
         )
-    if known.shape[0] < 2:
-        raise ValueError(f"`observations` must be two or more; got {known.shape[0]}.")
-    check_precision(
-        "`times` and `observations`", jnp.promote_types(known.dtype, observations.dtype)
-    )
-    check_increasing(known)
+    if grid.shape[0] < 2:
+        raise ValueError(
+            f"`times` and `observations` need at least two entries; got {grid.shape[0]}."
+        )
+    check_precision("`times` and `observations`", jnp.promote_types(grid.dtype, observations.dtype))
+    check_increasing(grid)
     if not is_traced(observations):
         _check_finite(np.asarray(observations))
         _check_state_space(model, observations)
@@ -78,11 +78,12 @@ def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Inter
         index_without_compiling(observations, slice(-1)),
         index_without_compiling(observations, slice(1, None)),
     )
-    intervals, _, _ = as_intervals(before, after, known.gaps)
+    intervals, _, _ = as_intervals(before, after, grid.gaps)
     return intervals
 
 
 def _check_finite(observations: np.ndarray) -> None:
+    """Raise `ValueError` for the first observation that is not finite."""
     finite = np.isfinite(observations)
     missing = np.flatnonzero(~finite.all(axis=1))
     if not missing.size:
@@ -102,15 +103,18 @@ def _check_finite(observations: np.ndarray) -> None:
 
 
 def _unmasked(name: str, values: Numbers) -> Numbers:
-    """What a masked array of NumPy holds, if nothing in it is masked."""
+    """Return the data of a masked NumPy array.
+
+    **Raises:** `ValueError` if an entry is masked.
+    """
     if not isinstance(values, np.ma.MaskedArray):
         return values
     mask = np.ma.getmaskarray(values)
     if mask.any():
         place = np.argwhere(mask)[0]
         which = f"`{name}[{place[0]}]`" if place.size else f"`{name}`"
-        whole = place.size < 2 or mask[place[0]].all()
-        coordinate = "" if whole else f", in coordinate {place[1]},"
+        all_masked = place.size < 2 or mask[place[0]].all()
+        coordinate = "" if all_masked else f", in coordinate {place[1]},"
         raise ValueError(
             f"{which} is masked{coordinate} but observations must be complete: leave out the whole "
             "row with its time."
@@ -119,6 +123,7 @@ def _unmasked(name: str, values: Numbers) -> Numbers:
 
 
 def _check_state_space(model: Diffusion, observations: Array) -> None:
+    """Raise `ValueError` for the first observation outside the model's state space."""
     if is_traced(model):
         return
 
@@ -134,7 +139,7 @@ def _check_state_space(model: Diffusion, observations: Array) -> None:
 
 @compiled_sooner
 def _inside(model: Diffusion, observations: Float[Array, "n d"]) -> Bool[Array, " n"]:
-    """At which points coefficients and stationary density are finite."""
+    """Return whether the coefficients and the stationary density are finite at each point."""
 
     def finite(x):
         values = [model.drift(x), model.diffusion(x)]
@@ -147,8 +152,11 @@ def _inside(model: Diffusion, observations: Float[Array, "n d"]) -> Bool[Array, 
 def step_groups(
     intervals: Intervals, num_steps: int | None, step_size: float | None
 ) -> tuple[Group, ...]:
-    """All intervals with `num_steps` steps; or each with so many that none is longer than about
-    `step_size`, in groups that are worth their compilation."""
+    """Group the intervals by number of steps.
+
+    With `num_steps` there is one group. With `step_size` the steps are at most about that long, and
+    intervals with similar numbers of steps share a group, because each group is compiled.
+    """
 
     def group(which: Int[np.ndarray, " I"], num_steps: int) -> Group:
         if len(which) == len(durations):
@@ -163,23 +171,28 @@ def step_groups(
     if step_size is None:
         num_steps = check_num_steps(50 if num_steps is None else num_steps, len(durations))
         return (group(np.arange(len(durations)), num_steps),)
-    wanted = count_steps(durations, num_steps, step_size)
-    levels = np.ceil(np.log2(wanted) * _LEVELS_PER_OCTAVE)
-    alike = [wanted[levels == level] for level in np.unique(levels)]
+    required = count_steps(durations, num_steps, step_size)
+    levels = np.ceil(np.log2(required) * _LEVELS_PER_OCTAVE)
+    by_level = [required[levels == level] for level in np.unique(levels)]
     ends = _cheapest_groups(
-        [int(numbers.max()) for numbers in alike], [len(each) for each in alike]
+        [int(numbers.max()) for numbers in by_level], [len(numbers) for numbers in by_level]
     )
     return tuple(
-        group(np.flatnonzero((wanted > below) & (wanted <= most)), most)
+        group(np.flatnonzero((required > below) & (required <= most)), most)
         for below, most in zip([0, *ends[:-1]], ends, strict=True)
     )
 
 
 def _cheapest_groups(numbers: list[int], counts: list[int]) -> list[int]:
-    """The numbers of steps of groups, each of which serves intervals that call for as many or for
-    fewer: those with the least sum of all steps and of what the groups cost. `numbers` increase,
-    and `counts` are of the intervals that call for so many."""
-    best: list[tuple[int, list[int]]] = [(0, [])]  # for the first 0, 1, ... of the numbers
+    """Return the numbers of steps of the groups with the smallest total cost.
+
+    A group contains the intervals that require at most its number of steps and more than that of
+    the previous group. The cost is the number of all steps plus `_STEPS_PER_GROUP` per group.
+    `numbers` are the required numbers of steps, increasing, and `counts` those of intervals with
+    each of them.
+    """
+    # Dynamic programming: `best[k]` is the cheapest partition of the first k numbers.
+    best: list[tuple[int, list[int]]] = [(0, [])]
     for last, number in enumerate(numbers, 1):
         ways = [
             (best[first][0] + _STEPS_PER_GROUP + number * sum(counts[first:last]), first)
@@ -191,8 +204,12 @@ def _cheapest_groups(numbers: list[int], counts: list[int]) -> list[int]:
 
 
 class Problem(NamedTuple):
-    """The unknown parameters, with θ as it is in the model, and the intervals between the
-    observations, in groups of one number of steps."""
+    """Exact observations with unknown parameters.
+
+    - `parameters`, `theta`: the unknown parameters, and their values in the model.
+    - `intervals`, `groups`: all intervals between observations, and the same in groups with the
+      same number of steps.
+    """
 
     parameters: Parameters
     theta: Float[Array, " p"]
@@ -201,17 +218,17 @@ class Problem(NamedTuple):
 
     @property
     def like(self) -> Float[Array, " d"]:
-        """A point of the state space."""
+        """Return a point of the state space."""
         return index_without_compiling(self.intervals.start, 0)
 
     @property
     def sigma_is_unknown(self) -> bool:
-        """Whether σ depends on the unknown parameters."""
+        """Return whether σ depends on the unknown parameters."""
         like, parameters = self.like, self.parameters
         return uses_argument(lambda theta: parameters.bind(theta).diffusion(like), self.theta)
 
     def check_sigma_known(self, instead: str) -> None:
-        """Raise `ValueError` where σ depends on the unknown parameters, that says what to do."""
+        """Raise `ValueError` if σ depends on the unknown parameters; `instead` is the remedy."""
         self.parameters.model.check_invertible_sigma(self.like)
         if self.sigma_is_unknown:
             raise ValueError(
@@ -227,9 +244,9 @@ def as_problem(
     num_steps: int | None,
     step_size: float | None,
 ) -> Problem:
-    """What the arguments that all ways of inference share say.
+    """Validate the arguments common to all functions that take exact observations.
 
-    **Raises:** `ValueError` and `TypeError` for arguments that do not fit.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """
     check_key(key)
     intervals = as_observations(parameters.model, times, observations)

@@ -8,11 +8,11 @@ drift is linear in θ. Then θ given the paths is normal,
 with derivatives by automatic differentiation at any θ_0. The kernel repeats the draw until it
 satisfies the constraint.
 
-*Metropolis–Hastings.* Otherwise the proposals are normal and would be exact for a quadratic,
+*Metropolis–Hastings.* Otherwise the proposals are normal. They would be exact for a quadratic:
 
-    θ' ~ N(θ + (1 - √(1-τ²)) G⁻¹ g, τ² G⁻¹),    G = ∫ Jᵀ J dt + (prior precision),  J = ∂_θ σ⁻¹α,
+    θ' ~ N(θ + (1 - √(1-τ²)) G⁻¹ g, τ² G⁻¹),    G = ∫ Jᵀ J dt + (prior precision),  J = ∂_θ σ⁻¹α.
 
-with the gradient g and the information G of the paths at θ. The factor τ is random: 1 (a Newton
+Here g is the gradient and G the information of the paths at θ. The factor τ is random: 1 (a Newton
 step) or smaller. With τ = 1 and constant G the proposal is the exact draw and always accepted.
 """
 
@@ -33,10 +33,10 @@ from .augmentation import Augmentation, Paths
 from .parameters import Parameters
 from .priors import NormalDensity
 
-# Draws from a normal law until one satisfies the constraint: if none does, θ stays, which leaves
-# the law invariant too.
+# Maximum number of normal draws until one satisfies the constraint. If none does, θ stays, which
+# leaves the law invariant, too.
 _MOST_DRAWS = 100
-# Steps of Metropolis–Hastings, by chance one of these.
+# Values of τ, with equal probabilities.
 _SCALES = (1.0, 0.3)
 
 
@@ -48,7 +48,7 @@ class ParameterStep(NamedTuple):
 
 
 class CompleteData(NamedTuple):
-    """What a step of θ is made from: the augmented observations, and the prior."""
+    """Complete data and prior, which define the law of θ given the paths."""
 
     parameters: Parameters
     augmentation: Augmentation
@@ -59,16 +59,16 @@ class CompleteData(NamedTuple):
         return self.augmentation.log_likelihood(self.parameters.bind(theta), self.paths)
 
     def log_posterior_inside(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
-        """log of likelihood times prior, as if there were no constraint."""
+        """Return the log of likelihood times prior, without the constraint."""
         return self.log_likelihood(theta) + self.log_prior(theta)
 
     def log_posterior(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
-        """-inf where the constraint is not satisfied."""
+        """Return the log of likelihood times prior; -inf where the constraint is violated."""
         inside = self.parameters.allowed(theta)
         return jnp.where(inside, self.log_posterior_inside(theta), -jnp.inf)
 
     def information(self, theta: Float[Array, " p"]) -> Float[Array, "p p"]:
-        """G(θ), with the prior's precision where it is normal."""
+        """Return G(θ), with the precision of the prior if it is normal."""
         points, steps = self.augmentation.points(self.paths)
 
         def of_point(x, dt):
@@ -86,20 +86,20 @@ class CompleteData(NamedTuple):
 
 
 class AbstractParameterKernel(eqx.Module):
-    """A Markov kernel on θ, given the paths."""
+    """Base class of Markov kernels on θ, given the paths."""
 
     @abstractmethod
     def step(
         self, key: Key[Array, ""], theta: Float[Array, " p"], data: CompleteData
     ) -> ParameterStep:
-        """One step from θ."""
+        """Return the result of one step from θ."""
 
 
 class NormalDraw(AbstractParameterKernel):
-    """θ from its normal law given the paths."""
+    """Exact draw of θ from its normal law given the paths, within the constraint."""
 
     def step(self, key, theta, data):
-        # Forward over reverse where there are many parameters.
+        # Forward mode is cheaper for one or two parameters, forward over reverse for more.
         gradient = (jax.jacfwd if len(theta) < 3 else jax.grad)(data.log_posterior_inside)
         root = any_cholesky(-jax.jacfwd(gradient)(theta))
         mean = theta + _solve_root(root, gradient(theta))
@@ -107,15 +107,15 @@ class NormalDraw(AbstractParameterKernel):
         def draw(carry):
             i, _, _ = carry
             noise = jax.random.normal(jax.random.fold_in(key, i), theta.shape, theta.dtype)
-            drawn = mean + any_solve(root.T, noise)
-            return i + 1, drawn, data.parameters.allowed(drawn)
+            proposed = mean + any_solve(root.T, noise)
+            return i + 1, proposed, data.parameters.allowed(proposed)
 
         def missed(carry):
             i, _, ok = carry
             return (i < _MOST_DRAWS) & ~ok
 
-        _, drawn, ok = lax.while_loop(missed, draw, (jnp.int32(0), theta, jnp.asarray(False)))
-        return ParameterStep(jnp.where(ok, drawn, theta), ok)
+        _, proposed, ok = lax.while_loop(missed, draw, (jnp.int32(0), theta, jnp.asarray(False)))
+        return ParameterStep(jnp.where(ok, proposed, theta), ok)
 
 
 class NewtonStep(AbstractParameterKernel):
@@ -126,7 +126,7 @@ class NewtonStep(AbstractParameterKernel):
         tau = jax.random.choice(scale_key, jnp.asarray(_SCALES, theta.dtype))
 
         def evaluate(theta):
-            """The log density at θ, and mean and root of the proposals from it."""
+            """Return the log density at θ, and the mean and precision root of proposals from θ."""
             value, gradient = jax.value_and_grad(data.log_posterior_inside)(theta)
             root = any_cholesky(data.information(theta))
             mean = theta + (1 - jnp.sqrt((1 - tau) * (1 + tau))) * _solve_root(root, gradient)
@@ -144,14 +144,16 @@ class NewtonStep(AbstractParameterKernel):
         other_value, other_mean, other_root = evaluate(proposed)
         log_ratio = other_value - value + log_density(theta, other_mean, other_root)
         log_ratio -= log_density(proposed, mean, root)
-        # A comparison with NaN is false, and refuses.
+        # A comparison with NaN is false, so a NaN ratio rejects.
         accepted = ok & (jnp.log(jax.random.uniform(accept_key, dtype=theta.dtype)) < log_ratio)
         return ParameterStep(jnp.where(accepted, proposed, theta), accepted)
 
 
 class GivenKernel(AbstractParameterKernel):
-    """A kernel of the user's, as BlackJAX makes them from a log density: `init(position)` and
-    `step(key, state) -> (state, info)`, on the unknown parameters."""
+    """Kernel of the user on the unknown parameters, with the interface of BlackJAX.
+
+    `build(log_density)` returns it, with `init(position)` and `step(key, state) -> (state, info)`.
+    """
 
     build: Callable[[Callable], Any] = eqx.field(static=True)
 
@@ -169,26 +171,30 @@ class GivenKernel(AbstractParameterKernel):
             state, _ = kernel.step(key, kernel.init(params))
             return data.parameters.vector(state.position)
 
-        moved = evaluated("parameter_kernel", step, key, data.parameters.select(theta))
-        if moved.shape != theta.shape:
+        new_theta = evaluated("parameter_kernel", step, key, data.parameters.select(theta))
+        if new_theta.shape != theta.shape:
             raise ValueError(
                 "`parameter_kernel` must preserve the structure of the unknown parameters; it "
-                f"returned {moved.size} numbers instead of {theta.size}."
+                f"returned {new_theta.size} numbers instead of {theta.size}."
             )
-        ok = data.parameters.allowed(moved)
-        moved = jnp.where(ok, moved, theta)
-        return ParameterStep(moved, jnp.any(moved != theta))
+        ok = data.parameters.allowed(new_theta)
+        new_theta = jnp.where(ok, new_theta, theta)
+        return ParameterStep(new_theta, jnp.any(new_theta != theta))
 
 
 def check_kernel(kernel: Any) -> None:
-    """Raise `TypeError` for anything but a function, or `None`."""
+    """Raise `TypeError` unless the kernel is a function or `None`."""
     check_function("parameter_kernel", kernel, "(log_density)", optional=True)
 
 
 def choose_kernel(
     kernel: Callable[[Callable], Any] | None, is_quadratic: bool, log_prior: Callable
 ) -> AbstractParameterKernel:
-    """The user's, if there is one; else the exact draw where it is to be had."""
+    """Return the kernel of the user if there is one, else the exact draw if it is available.
+
+    The exact draw needs a quadratic log-likelihood and a normal prior. The last resort is
+    Metropolis–Hastings.
+    """
     if kernel is not None:
         return GivenKernel(kernel)
     exact = is_quadratic and isinstance(log_prior, NormalDensity)
@@ -196,5 +202,5 @@ def choose_kernel(
 
 
 def _solve_root(root: Float[Array, "p p"], right: Float[Array, " p"]) -> Float[Array, " p"]:
-    """(L Lᵀ)⁻¹ v."""
+    """Return (L Lᵀ)⁻¹ v for the root L."""
     return any_solve(root.T, any_solve(root, right))

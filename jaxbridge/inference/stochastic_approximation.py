@@ -29,7 +29,7 @@ from .parameters import Parameters
 
 
 class SearchInfo(NamedTuple):
-    """Bridges that were not found, weights that were cut off, and steps that were not made."""
+    """Numbers of missing bridges, truncated weights, and iterations without a step of θ."""
 
     missing: Int[Array, "*n"]
     truncated: Int[Array, "*n"]
@@ -37,7 +37,7 @@ class SearchInfo(NamedTuple):
 
 
 class Gradient(eqx.Module):
-    """Steps of an optimiser."""
+    """Rule that moves θ by steps of an optimiser along the gradient of the log-likelihood."""
 
     optimizer: optax.GradientTransformation = eqx.field(static=True)
 
@@ -47,7 +47,10 @@ class Gradient(eqx.Module):
     def ascend(
         self, theta: Float[Array, " p"], memory: PyTree, gradient: Float[Array, " p"]
     ) -> tuple[Float[Array, " p"], PyTree]:
-        """θ after a step along the gradient of the mean log likelihood per interval."""
+        """Return θ and the optimiser's state after one step.
+
+        `gradient` is that of the mean log-likelihood per interval.
+        """
         updates, memory = self.optimizer.update(-gradient, memory, theta)
         return theta + jnp.asarray(updates), memory
 
@@ -59,8 +62,10 @@ class Gradient(eqx.Module):
 
 
 class EM(eqx.Module):
-    """The maximum of the averaged expansions of the log likelihood; they are averaged over the
-    later half of the iterations so far, about."""
+    """Rule that moves θ to the maximum of averaged expansions of the log-likelihood.
+
+    The average is weighted towards the later iterations, about the second half.
+    """
 
     def init(self, theta: Float[Array, " p"]) -> PyTree:
         return theta, jnp.zeros((*theta.shape, *theta.shape), theta.dtype)
@@ -70,15 +75,15 @@ class EM(eqx.Module):
     ) -> tuple[Float[Array, " p"], PyTree]:
         gradient = jax.grad(data.log_likelihood)(theta)
         P = data.information(theta)
-        made = gradient + P @ theta, P
+        expansion = gradient + P @ theta, P  # c and P of cᵀθ - ½ θᵀPθ
         gain = jnp.minimum(1.0, 2.0 / (i + 1).astype(theta.dtype))
-        memory = jax.tree.map(lambda old, new: old + gain * (new - old), memory, made)
+        memory = jax.tree.map(lambda old, new: old + gain * (new - old), memory, expansion)
         c, P = memory
         return any_solve(P, c), memory
 
 
 class Search(NamedTuple):
-    """How θ is moved, how often, and who is told."""
+    """Settings of a search: the rule that moves θ, the number of iterations, the meter."""
 
     rule: Gradient | EM
     num_iterations: int
@@ -93,7 +98,7 @@ def approximate(
     search: Search,
     theta: Float[Array, " p"],
 ) -> tuple[Float[Array, "n p"], SearchInfo]:
-    """The iterates by a rule over bridges, and what was lost on the way."""
+    """Return the iterates of the stochastic approximation over bridges, and failure counts."""
     parameters, augmentation = nondifferentiable((parameters, augmentation))
     first_key, run_key = jax.random.split(key)
 
@@ -101,8 +106,8 @@ def approximate(
         bridge_key = jax.random.fold_in(run_key, i)
         paths, bridges = augmentation.renew(bridge_key, parameters.bind(theta), paths)
         data = CompleteData(parameters, augmentation, paths, jnp.zeros_like)
-        moved = search.rule.update(i, theta, memory, data)
-        return moved, paths, (bridges.missing, bridges.truncated)
+        updated = search.rule.update(i, theta, memory, data)
+        return updated, paths, (bridges.missing, bridges.truncated)
 
     first, _ = augmentation.first(first_key, parameters.bind(theta))
     iterates, _, info = iterate(propose, parameters, search, theta, first)
@@ -116,9 +121,12 @@ def iterate(
     theta: Float[Array, " p"],
     paths: PyTree,
 ) -> tuple[Float[Array, "n p"], PyTree, SearchInfo]:
-    """The iterates from θ and paths, and the last paths. `propose(i, θ, memory, paths)` makes
-    ((θ, memory), paths, what was missing and truncated), with what the rule remembers; θ stays
-    where that leads out of the constraint, or to what is not finite."""
+    """Iterate `propose` from θ and paths; return the iterates, the last paths and the counts.
+
+    `propose(i, θ, memory, paths)` returns ((θ, memory), paths, (missing, truncated)). The memory
+    is the state of the rule. θ does not move if the new θ violates the constraint or if the new θ
+    or memory is not finite.
+    """
 
     def step(state, i):
         theta, memory, paths = state
@@ -126,7 +134,7 @@ def iterate(
         finite = all_finite_leaves(new_memory)
         ok = parameters.allowed(new_theta) & finite
         theta = jnp.where(ok, new_theta, theta)
-        # What an optimiser remembers must not be spoilt for all steps to come.
+        # A memory with NaN would spoil all later steps.
         memory = jax.tree.map(lambda new, old: jnp.where(finite, new, old), new_memory, memory)
         info = _counted(SearchInfo(missing, truncated, ~ok))
         return (theta, memory, paths), (theta, info)
