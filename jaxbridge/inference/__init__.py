@@ -23,10 +23,11 @@ by number of steps, and `blocks` selects a proposal for each group. The methods 
   cases Newton's method follows (`newton`).
 
 *Records* with noisy, partial or missing observations. The likelihood is E[w(θ, ξ)], the mean weight
-of paths that are functions of normal noise ξ (`record_paths`). `gibbs` draws from
-π(θ) N(ξ; 0, I) w(θ, ξ) (`record_gibbs`) and finds a guide during the warm-up (`warm_up`). `pmmh`
-uses particle filters, and `maximum_likelihood` uses chains of paths (`record_maximum`).
+of paths that are functions of normal noise ξ (`record_paths`). `gibbs` samples from
+π(θ) N(ξ; 0, I) w(θ, ξ) (`record_gibbs`), with a guide from the warm-up (`warm_up`). `pmmh` uses
+particle filters (`likelihood_estimates`), and `maximum_likelihood` uses chains of paths
+(`record_maximum`).
 
-`posterior` has the parts that `gibbs` and `pmmh` share: start, continuation and diagnostics of
-chains.
+`posterior` contains the common parts of `gibbs` and `pmmh`: start, continuation and diagnostics of
+chains. `parameter_walk` contains the random walks of θ.
 """

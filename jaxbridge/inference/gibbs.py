@@ -50,7 +50,7 @@ from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_gibbs import RecordPosterior, RecordState, sample_records
 from .record_paths import check_no_bridges, check_no_record
 
-# Weights that are cut off in a larger share of iterations spoil the law.
+# Largest share of iterations with truncated weights.
 _MOST_TRUNCATED = 0.01
 _MISSING = (
     "The proposal found no bridge for some intervals (`num_missing` does not fall to zero), so the "
@@ -129,7 +129,8 @@ class GibbsPosterior(AbstractPosterior):
 
     @property
     def _faults(self):
-        # Counted in every iteration: a stand-in that no proposal has replaced.
+        # A placeholder that no proposal has replaced is counted in every iteration, so bridges are
+        # still missing if the minimum over the second half of the draws is positive.
         late = self.num_missing[..., self.num_missing.shape[-1] // 2 :]
         often = jnp.mean(self.num_truncated > 0, axis=-1) > _MOST_TRUNCATED
         return (
@@ -279,7 +280,7 @@ def gibbs(
 
 
 class GibbsInfo(NamedTuple):
-    """Counted in one iteration: θ's moves, bridges that were replaced, and as in the posterior."""
+    """Counts of one iteration: moves of θ, replaced bridges, and those of the posterior."""
 
     parameters_moved: Int[Array, "*chains"]
     bridges_moved: Int[Array, "*chains"]
@@ -290,7 +291,7 @@ class GibbsInfo(NamedTuple):
 
 
 class _Sampler(eqx.Module):
-    """What does not change from iteration to iteration, and the steps of one chain."""
+    """Constants of the sampler, and the steps of one chain."""
 
     parameters: Parameters
     augmentation: Augmentation
@@ -302,15 +303,15 @@ class _Sampler(eqx.Module):
         return GibbsState(theta, *self.augmentation.first(key, model), jnp.int32(0))
 
     def step(self, key: Key[Array, ""], state: GibbsState) -> tuple[GibbsState, GibbsInfo]:
-        """Bridges given θ, then θ given bridges."""
+        """Draw the bridges given θ, then θ given the bridges."""
         bridge_key, parameter_key = jax.random.split(key)
         model = self.parameters.bind(state.theta)
         paths, bridges = self.augmentation.renew(bridge_key, model, state.paths)
-        found = state.found | bridges.moved
+        has_bridge = state.found | bridges.moved
         data = CompleteData(self.parameters, self.augmentation, paths, self.log_prior)
         theta, accepted = self.kernel.step(parameter_key, state.theta, data)
-        counted = bridges._replace(missing=bridges.missing | ~found)
-        return GibbsState(theta, paths, found, state.num_done), GibbsInfo(
+        counted = bridges._replace(missing=bridges.missing | ~has_bridge)
+        return GibbsState(theta, paths, has_bridge, state.num_done), GibbsInfo(
             accepted, *summed(counted)
         )
 
@@ -333,7 +334,7 @@ def _run(
     of_chains = jax.vmap(one) if state.theta.ndim == 2 else one
 
     def draw(state, i):
-        number = state.num_done.reshape(-1)[0] + 1  # 0 made the first paths
+        number = state.num_done.reshape(-1)[0] + 1  # key 0 is for the first paths
         keys = jax.random.split(jax.random.fold_in(key, number), thin)
         step = lambda state, key: over_chains(sampler.step, key, state)
         state, infos = lax.scan(step, state, keys)

@@ -50,7 +50,7 @@ from .simulated_likelihood import (
 )
 from .stochastic_approximation import EM, Gradient, Search, SearchInfo, approximate
 
-# Made once, for optimisers are compared by identity.
+# Created once, because optimisers are compared by identity.
 _ADAM = optax.adam(1e-2)
 
 
@@ -101,7 +101,7 @@ class MaximumLikelihood(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """The faults of the estimate, each with a remedy.
+        """Return the faults of the estimate, each with a remedy.
 
         They are: no maximum, or none inside; those of the weights of `score`; and a discretisation
         error that dominates and exceeds 0.05 standard errors.
@@ -118,9 +118,9 @@ class MaximumLikelihood(AbstractResult):
 
     @property
     def step_error_dominates(self) -> Bool[Array, " p"]:
-        """Whether the discretisation error exceeds the standard error, or may do so; shape (p,).
+        """Return whether the discretisation error exceeds the standard error, or may do so.
 
-        Then use more steps.
+        Shape (p,). If true, use more steps.
         """
         error = StepError(self.step_error, self.step_uncertainty)
         return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
@@ -254,7 +254,7 @@ def _by_bridges(
     search: Search,
     num_bridges: int,
 ) -> MaximumLikelihood:
-    """Stochastic approximation, and Newton's method."""
+    """Estimate θ by stochastic approximation over bridges, then by Newton's method."""
     parameters, theta = problem.parameters, problem.theta
     augment_key, run_key, score_key = jax.random.split(key, 3)
     augmentation = augment(augment_key, problem, theta, proposal, "exact", None, budget)
@@ -262,16 +262,16 @@ def _by_bridges(
     rough = iterates[-1] if isinstance(search.rule, EM) else _mean_of_later(iterates)
     scorer = scorer_at(score_key, problem, rough, proposal, budget, num_bridges)
     passes = _refined(score_key, parameters, scorer, rough)
-    found = passes.converged & is_maximum(passes.slope)
+    is_found = passes.converged & is_maximum(passes.slope)
     fall = falls(passes.slope, passes.offsets)
-    return _summary(parameters, passes.theta, iterates, passes.details, info, found, fall)
+    return _summary(parameters, passes.theta, iterates, passes.details, info, is_found, fall)
 
 
 @compiled_sooner
 def _refined(
     key: Key[Array, ""], parameters: Parameters, scorer: Scorer, theta: Float[Array, " p"]
 ) -> Passes:
-    """Newton's method from θ, with new bridges in each pass."""
+    """Run Newton's method from θ, with new bridges in each pass."""
     scorer, theta = nondifferentiable((scorer, theta))
 
     def evaluate(i, theta, offsets, memory):
@@ -289,26 +289,27 @@ def _by_simulation(
     search: Search,
     num_bridges: int,
 ) -> MaximumLikelihood:
-    """The maximum of the simulated likelihood."""
+    """Estimate θ by the maximum of the simulated likelihood."""
     parameters, theta = problem.parameters, problem.theta
     proposal = as_pulled(proposal, parameters.model, problem.like, budget)
     pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
     blocks = pulled_blocks(pilot_key, parameters.bind(theta), problem, proposal)
     iterates, info = stochastic_ascent(run_key, parameters, blocks, search, theta)
     last = iterates[-1]
-    # What suits the data at the first θ need not do so at the last.
+    # A good proposal at the first θ may be poor at the last one.
     blocks = pulled_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
     starts = jnp.stack([theta, last, _mean_of_later(iterates)])
     maximum = newton_ascent(last_key, parameters, blocks, starts, num_bridges)
-    made = maximum.simulated
+    result = maximum.simulated
     step_error = step_error_of_score(last_key, parameters, blocks, maximum, num_bridges)
-    at_maximum = as_score(parameters, made, step_error, made.num_missing, jnp.int32(0))
-    found, fall = maximum.found, maximum.fall
-    return _summary(parameters, maximum.theta, iterates, at_maximum, info, found, fall)
+    at_maximum = as_score(parameters, result, step_error, result.num_missing, jnp.int32(0))
+    is_found, fall = maximum.found, maximum.fall
+    return _summary(parameters, maximum.theta, iterates, at_maximum, info, is_found, fall)
 
 
 @compiled_sooner
 def _mean_of_later(iterates: Float[Array, "n p"]) -> Float[Array, " p"]:
+    """Return the mean of the second half of the iterates."""
     return jnp.mean(iterates[len(iterates) // 2 :], axis=0)
 
 
@@ -319,16 +320,16 @@ def _summary(
     iterates: Float[Array, "n p"],
     score: Score,
     info: SearchInfo,
-    found: Bool[Array, ""],
+    is_found: Bool[Array, ""],
     fall: Float[Array, "2 p"],
 ) -> MaximumLikelihood:
-    """The estimate with its errors, which are those of the score times the inverse information."""
+    """Return the estimate with its errors: those of the score times the inverse information."""
     covariance = jnp.linalg.inv(score.information)
-    left = covariance @ score.covariance @ covariance
-    # Where the score is too large by this, so is its zero by that times the inverse information.
+    noise = covariance @ score.covariance @ covariance
+    # An error of the score moves its zero by the inverse information times that error.
     step_doubt = jnp.sqrt(covariance**2 @ score.step_uncertainty**2)
     standard, monte_carlo = (
-        parameters.each(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, left)
+        parameters.each(jnp.sqrt(jnp.diagonal(matrix))) for matrix in (covariance, noise)
     )
     return MaximumLikelihood(
         parameters.full(estimate),
@@ -343,6 +344,6 @@ def _summary(
         info.missing,
         info.truncated + score.num_truncated,
         info.refused,
-        found,
+        is_found,
         fall,
     )

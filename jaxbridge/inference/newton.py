@@ -5,8 +5,8 @@ observed information I. The method has converged if the next step I⁻¹g is sho
 
     gᵀI⁻¹g ≤ max(10⁻³, 4 tr I⁻¹S),
 
-in squares of standard errors. The point is a maximum if I is positive definite and much larger than
-S.
+in squares of standard errors. The point is a maximum if I is positive definite and much larger
+than S.
 
 A likelihood whose maximum is at infinity needs a further check: far out, steps are short, too, and
 I is small and positive. But there log L does not fall as its curvature predicts. Hence each pass
@@ -27,15 +27,15 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from ..engine.verdict import Fault
 from .parameters import Parameters
 
-# The square of the next step of a search that has converged: at least, and in Monte Carlo errors.
+# The two limits of the squared next step after convergence (see above).
 _SHORT, _SHORT_IN_ERRORS = 1e-3, 4.0
-# The longest step, in standard errors, and by how many halvings it returns to the constraint.
+# The longest step in standard errors, and the number of its halved lengths that are tried until one
+# satisfies the constraint.
 _LONGEST, _HALVINGS = 2.0, 8
 _MOST_PASSES = 15
-# A Monte Carlo error of more, in standard errors, is too much for a maximum.
+# Largest Monte Carlo error at a maximum, in standard errors.
 _NOISE = 0.5
-# log L falls by ½ at one standard error from a maximum where it is quadratic; less than this share
-# of that is no maximum.
+# Smallest fall at a maximum. A quadratic log L falls by ½ at one standard error from its maximum.
 _LEAST_FALL = 0.1
 
 _NO_MAXIMUM = (
@@ -51,8 +51,12 @@ _NOT_INSIDE = (
 
 
 class Slope(NamedTuple):
-    """Log L near θ: its gradient, with the covariance of the Monte Carlo error, the observed
-    information, and by how much it rises from θ to each of 2p points around it."""
+    """Log-likelihood near θ.
+
+    - `gradient`, `covariance`: its gradient, and the covariance of its Monte Carlo error.
+    - `information`: observed information.
+    - `rises`: log-likelihood at each of 2p points around θ minus that at θ.
+    """
 
     gradient: Float[Array, " p"]
     covariance: Float[Array, "p p"]
@@ -61,9 +65,15 @@ class Slope(NamedTuple):
 
 
 class Passes(NamedTuple):
-    """Newton's method after some passes: θ of the next one, the step that leads there, the longest
-    that was allowed, and its gain in squares of standard errors; what the last pass found, with the
-    `offsets` of its points, and details; what it hands on to the next."""
+    """State of Newton's method after `number` passes.
+
+    - `theta`, `step`: θ of the next pass, and the step to it.
+    - `longest`, `gain`: the longest step that was allowed, in standard errors, and the squared
+      length of the full Newton step.
+    - `offsets`, `slope`, `details`: points of the last pass around its θ, and its results.
+    - `memory`: values for the next pass.
+    - `converged`: whether the method has converged.
+    """
 
     number: Int[Array, ""]
     theta: Float[Array, " p"]
@@ -86,9 +96,9 @@ def newton_passes(
     """Iterate Newton's method from θ until it has converged, for a bounded number of passes.
 
     `evaluate(i, θ, offsets, memory)` returns the `Slope` at θ with the rises at θ + offsets, any
-    details, and the memory that the next pass is given.
+    details, and the memory for the next pass.
     """
-    evaluate = jax.jit(evaluate)  # for its shapes and in the loop traced once
+    evaluate = jax.jit(evaluate)  # traced once for both its shapes and the loop
     p = len(theta)
     offsets = jnp.zeros((2, p, p), theta.dtype)
     shapes = jax.eval_shape(evaluate, jnp.int32(0), theta, offsets, memory)[:2]
@@ -100,10 +110,10 @@ def newton_passes(
         slope, details, memory = evaluate(state.number, here, offsets, state.memory)
         step, longest, short = _next_step(parameters, state, slope)
         gain = slope.gradient @ ascent_direction(slope.gradient, slope.information)
-        # The first pass has no points around, and none is skipped.
+        # The first pass has no information for its offsets, so a second one always follows.
         converged = short & (state.number > 0)
-        moved = here + step, step, longest, gain
-        return Passes(state.number + 1, *moved, offsets, slope, details, memory, converged)
+        next_point = here + step, step, longest, gain
+        return Passes(state.number + 1, *next_point, offsets, slope, details, memory, converged)
 
     def goes_on(state: Passes) -> Bool[Array, ""]:
         return ~state.converged & (state.number < _MOST_PASSES)
@@ -116,14 +126,17 @@ def newton_passes(
 
 
 def is_maximum(slope: Slope) -> Bool[Array, ""]:
-    """Return whether the information is positive definite, and clearly so beside its noise."""
+    """Return whether the information is positive definite by more than the Monte Carlo errors."""
     clear = _NOISE**2 * slope.information - slope.covariance
     return jnp.all(jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(clear), clear, -1)) > 0)
 
 
 def falls(slope: Slope, offsets: Float[Array, "2 p p"]) -> Float[Array, "2 p"]:
-    """Return by how much log L falls at each offset beside its linear part, in units in which a
-    quadratic function falls by ½; infinite at a point that has no likelihood, or is not allowed."""
+    """Return the fall of log L at each offset, without the linear part of log L.
+
+    It is scaled such that a quadratic function falls by ½. It is infinite at a point with zero
+    likelihood or outside the constraint.
+    """
     linear = offsets @ slope.gradient
     quadratic = jnp.einsum("spi,ij,spj->sp", offsets, slope.information, offsets)
     fall = (linear - slope.rises) / jnp.where(quadratic > 0, quadratic, 1)
@@ -140,9 +153,11 @@ def maximum_faults(newton: Bool[Array, ""], fall: Float[Array, "2 p"]) -> tuple[
 def allowed_offsets(
     parameters: Parameters, theta: Float[Array, " p"], information: Float[Array, "p p"]
 ) -> Float[Array, "2 p p"]:
-    """Return the moves of each entry by one standard error, below and above, with the others at
-    their maximum given it; zero where they leave the constraint, or the information is not positive
-    definite."""
+    """Return moves of each entry by one standard error, down and up.
+
+    The other entries move to their maximum given this entry. A move is zero if it leaves the
+    constraint, or if the information is not positive definite.
+    """
     covariance = jnp.linalg.inv(information)
     variances = jnp.diagonal(covariance)
     ok = jnp.all(jnp.isfinite(covariance)) & jnp.all(variances > 0)
@@ -155,8 +170,11 @@ def allowed_offsets(
 def ascent_direction(
     gradient: Float[Array, " p"], information: Float[Array, "p p"]
 ) -> Float[Array, " p"]:
-    """Newton's step where log L is concave; elsewhere that with curvatures of the other sign turned
-    round, in units in which those along the axes are ±1: uphill in any case."""
+    """Return Newton's step where log L is concave, and an ascending step elsewhere.
+
+    Parameters are scaled such that the curvatures along the axes are ±1. Then the eigenvalues of
+    the information are replaced by their absolute values, so every step ascends.
+    """
     scale = jnp.sqrt(jnp.abs(jnp.diagonal(information)))
     scale = jnp.where((scale > 0) & jnp.isfinite(scale), scale, 1)
     scaled = information / scale[:, None] / scale
@@ -164,7 +182,7 @@ def ascent_direction(
         jnp.all(jnp.isfinite(scaled)), scaled, jnp.eye(len(scale), dtype=scale.dtype)
     )
     curvature, axes = jnp.linalg.eigh(scaled)
-    # Below this a curvature is not known from zero.
+    # Rounding hides smaller curvatures.
     curvature = jnp.maximum(jnp.abs(curvature), 10 * jnp.finfo(scale.dtype).eps)
     return axes @ ((axes.T @ (gradient / scale)) / curvature) / scale
 
@@ -172,35 +190,36 @@ def ascent_direction(
 def longest_fraction(
     gain: Float[Array, ""], longest: Float[Array, ""] | float = _LONGEST
 ) -> Float[Array, ""]:
-    """Return the share of a step of this gain, its squared length in standard errors, that is not
-    too long."""
+    """Return the fraction of a step that is at most `longest`.
+
+    `gain` is the squared length of the step in standard errors.
+    """
     return longest / jnp.sqrt(jnp.maximum(gain, longest**2))
 
 
 def _next_step(
     parameters: Parameters, state: Passes, slope: Slope
 ) -> tuple[Float[Array, " p"], Float[Array, ""], Bool[Array, ""]]:
-    """The step from θ and the longest that is allowed after it, and whether it is so short that the
-    search has converged.
+    """Return the next step, the longest step allowed after it, and whether the search converged.
 
-    The longest step doubles while steps do not lead beyond a maximum. One that led far beyond, or
-    to where nothing is known, is taken back but for a quarter.
+    The longest step doubles while steps do not pass a maximum. If the last step led far beyond a
+    maximum, or to a point without usable information, three quarters of it are taken back.
     """
     theta, (gradient, covariance, information, _) = state.theta, slope
     step = ascent_direction(gradient, information)
     gain = gradient @ step
     usable = jnp.all(jnp.isfinite(information)) & jnp.isfinite(gain)
-    came = jnp.any(state.step != 0)
-    beyond = came & (gradient @ state.step < 0)
-    too_far = (beyond & (gain > state.gain)) | (came & ~usable)
-    longest = jnp.where(came & ~beyond, 2 * state.longest, _LONGEST)
+    has_moved = jnp.any(state.step != 0)
+    beyond = has_moved & (gradient @ state.step < 0)
+    too_far = (beyond & (gain > state.gain)) | (has_moved & ~usable)
+    longest = jnp.where(has_moved & ~beyond, 2 * state.longest, _LONGEST)
     forward = longest_fraction(gain, longest).astype(step.dtype) * step
-    # Where the information is unknown at first the pass is repeated.
+    # Without usable information the next pass repeats this θ.
     forward = jnp.where(usable, forward, 0)
     fractions = 0.5 ** jnp.arange(_HALVINGS, dtype=step.dtype)
-    tried = fractions[:, None] * forward
-    allowed = jax.vmap(lambda move: parameters.allowed(theta + move))(tried)
-    forward = jnp.where(jnp.any(allowed), tried[jnp.argmax(allowed)], 0)
+    trials = fractions[:, None] * forward
+    allowed = jax.vmap(lambda move: parameters.allowed(theta + move))(trials)
+    forward = jnp.where(jnp.any(allowed), trials[jnp.argmax(allowed)], 0)
     noise = jnp.trace(jnp.linalg.inv(information) @ covariance)
     short = gain <= jnp.maximum(_SHORT, _SHORT_IN_ERRORS * noise)
     back = jnp.where(too_far & ~short, -0.75 * state.step, forward)

@@ -1,10 +1,12 @@
-"""Normal random walks of θ, with a covariance S Sᵀ that the warm-up adapts (Vihola 2012):
+"""Normal random walks of θ with moves S ξ, ξ ~ N(0, I).
 
-    S Sᵀ ← e^{2 κ_i (α_i - α*)} S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,
+The warm-up adapts their covariance S Sᵀ (Vihola 2012):
 
-from the acceptance rates α_i of moves S ξ. The first factor, with κ_i = 6 / (i + 5), adapts the
-size of the moves in tens of iterations; the second factor alone needs hundreds. κ follows
-Garthwaite, Fan & Sisson (2016): 1 / (α* (1 - α*)) divided by i.
+    S Sᵀ ← e^{2 κ_i (α_i - α*)} S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,    η_i = min(1, p i^(-2/3)).
+
+Here α_i is the acceptance probability of iteration i, and α* the target. The first factor, with
+κ_i = 6 / (i + 5), adapts the size of the moves in tens of iterations. The second factor alone needs
+hundreds. κ follows Garthwaite, Fan & Sisson (2016), who use 1 / (α* (1 - α*)) divided by i.
 """
 
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ from ..engine.checks import Numbers, as_floating, is_traced
 from ..engine.linalg import any_cholesky, any_inverse
 from .priors import GivenDensity, NormalDensity
 
-# Acceptance rates that random walks are tuned to; less than without noise in the likelihood.
+# Target acceptance rate of random walks. It is below that for exact likelihoods, as noise requires.
 _TARGET = 0.2
 
 
@@ -24,7 +26,13 @@ def first_root(
     log_prior: NormalDensity | GivenDensity,
     theta: Float[Array, " p"],
 ) -> Float[Array, "p p"]:
-    """S of the first moves: of the given covariance, or a tenth of what the prior or θ spans."""
+    """Return S of the first moves, from `covariance` if it is not `None`.
+
+    By default S is diagonal: a tenth of the prior's standard deviations, or of |θ| if the prior is
+    not normal, where |θ| counts as at least 0.1.
+
+    **Raises:** `ValueError` unless `covariance` has a valid shape and is positive definite.
+    """
     p = theta.shape[0]
     if covariance is not None:
         matrix = as_floating("covariance", covariance).astype(theta.dtype)
@@ -34,9 +42,9 @@ def first_root(
             )
         matrix = jnp.diag(matrix) if matrix.ndim == 1 else matrix
         if not is_traced(matrix):
-            known = np.asarray(matrix, float)
-            symmetric = np.allclose(known, known.T, rtol=1e-5)
-            if not (np.all(np.isfinite(known)) and symmetric and np.linalg.eigvalsh(known)[0] > 0):
+            array = np.asarray(matrix, float)
+            symmetric = np.allclose(array, array.T, rtol=1e-5)
+            if not (np.all(np.isfinite(array)) and symmetric and np.linalg.eigvalsh(array)[0] > 0):
                 raise ValueError(
                     "`covariance` must be finite, symmetric and positive definite; got "
                     f"{covariance}."
@@ -55,11 +63,15 @@ def learnt(
     number: Int[Array, ""],
     learning: Bool[Array, ""],
 ) -> Float[Array, "p p"]:
-    """S after a move with this noise, accepted with probability `rate` (none where that is NaN), in
-    the iteration of this number, from one on; as it was unless the chain is still learning."""
+    """Adapt S after a move S ξ with this noise ξ and acceptance probability `rate`.
+
+    `number` counts the iterations from one. A rate of NaN counts as zero. S remains unless the
+    chain is `learning` and the new S is finite.
+    """
     gain = jnp.minimum(1.0, len(noise) * number.astype(root.dtype) ** (-2 / 3))
     excess = jnp.where(jnp.isnan(rate), 0, rate) - _TARGET
-    moved = root @ (noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6))
-    new = any_cholesky(root @ root.T + gain * excess * jnp.outer(moved, moved))
+    direction = root @ (noise / jnp.maximum(jnp.linalg.norm(noise), 1e-6))
+    new = any_cholesky(root @ root.T + gain * excess * jnp.outer(direction, direction))
+    # κ has i + 5 instead of i, so that the first moves do not change S by a large factor.
     new = new * jnp.exp(6 / (number.astype(root.dtype) + 5) * excess)
     return jnp.where(learning & jnp.all(jnp.isfinite(new)), new, root)

@@ -3,11 +3,10 @@
 The likelihood of exact observations is a product of transition densities, and weighted proposals
 estimate it without bias (`exact.density`). The chain accepts with the ratio of estimates and stores
 the estimate of its state. Its law is the exact posterior up to the discretisation error (Andrieu &
-Roberts 2009). Proposals of θ are normal random walks. The warm-up adapts their covariance S Sᵀ,
+Roberts 2009).
 
-    S Sᵀ ← S [I + η_i (α_i - α*) ξ ξᵀ / |ξ|²] Sᵀ,    η_i = min(1, p i^(-2/3)),
-
-from the acceptance rates α_i (Vihola 2012; `parameter_walk`). After the warm-up it is fixed.
+Proposals of θ are normal random walks. The warm-up adapts their covariance S Sᵀ to the acceptance
+rates (`parameter_walk`). After the warm-up it is fixed.
 """
 
 from collections.abc import Callable

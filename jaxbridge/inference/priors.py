@@ -43,7 +43,7 @@ class NormalPrior(eqx.Module):
 
 
 class NormalDensity(eqx.Module):
-    """N(mean, precision⁻¹), up to the constant."""
+    """Log density of N(mean, precision⁻¹) as a function of θ, up to a constant."""
 
     mean: Float[Array, " p"]
     precision: Float[Array, "p p"]
@@ -54,7 +54,7 @@ class NormalDensity(eqx.Module):
 
 
 class GivenDensity(eqx.Module):
-    """The user's log density of the unknown parameters, as a function of θ."""
+    """Log density of the user, as a function of θ instead of the unknown parameters."""
 
     parameters: Parameters
     function: Callable[[PyTree], Any] = eqx.field(static=True)
@@ -80,7 +80,10 @@ Prior = NormalPrior | Callable[[PyTree], Any]
 def as_normal(
     prior: NormalPrior, parameters: Parameters, theta: Float[Array, " p"]
 ) -> NormalDensity:
-    """The prior of θ, with its shapes checked."""
+    """Return the log density of θ under a normal prior.
+
+    **Raises:** `ValueError` if shapes do not fit, or mean and variance are invalid.
+    """
     p = theta.shape[0]
     mean = _as_array("mean", prior.mean, parameters, theta)
     variance = _as_array("variance", prior.variance, parameters, theta)
@@ -109,7 +112,7 @@ def as_normal(
 def _normal(mean: Float[Array, "..."], variance: Float[Array, "..."], p: int) -> NormalDensity:
     if variance.ndim == 2:
         precision = any_inverse(variance)
-        precision = (precision + precision.T) / 2
+        precision = (precision + precision.T) / 2  # symmetric up to the last bit
     else:
         precision = jnp.diag(jnp.broadcast_to(1 / variance, (p,)))
     return NormalDensity(jnp.broadcast_to(mean, (p,)), precision)
@@ -118,25 +121,25 @@ def _normal(mean: Float[Array, "..."], variance: Float[Array, "..."], p: int) ->
 def _as_array(
     name: str, value: PyTree, parameters: Parameters, theta: Float[Array, " p"]
 ) -> Float[Array, "..."]:
-    """What the user gave as an array, pytrees like the parameters as a vector."""
-    everything, structure = jax.tree.flatten(parameters.params)
-    like = list(filter(eqx.is_inexact_array, everything))  # what else there is, θ leaves out
+    """Return the mean or variance of the prior as an array; a pytree becomes a vector."""
+    leaves, structure = jax.tree.flatten(parameters.params)
+    like = list(filter(eqx.is_inexact_array, leaves))  # θ contains no other leaves
     if hasattr(value, "ndim"):
         is_matrix = name == "variance" and value.shape == (len(theta), len(theta))
         if len(like) == 1 and value.shape == like[0].shape and not is_matrix:
             value = jnp.ravel(value)
     elif jax.tree.structure(value) == structure:
         full = []
-        for leaf, known in zip(jax.tree.leaves(value), everything, strict=True):
-            if not eqx.is_inexact_array(known):
+        for leaf, parameter in zip(jax.tree.leaves(value), leaves, strict=True):
+            if not eqx.is_inexact_array(parameter):
                 continue
             leaf = as_floating(f"prior.{name}", leaf)
-            if leaf.shape not in ((), known.shape):
+            if leaf.shape not in ((), parameter.shape):
                 raise ValueError(
                     f"`prior.{name}` must have leaves of the shapes of the parameters; got shape "
-                    f"{leaf.shape} for parameters of shape {known.shape}."
+                    f"{leaf.shape} for parameters of shape {parameter.shape}."
                 )
-            full.append(jnp.broadcast_to(leaf, known.shape).ravel())
+            full.append(jnp.broadcast_to(leaf, parameter.shape).ravel())
         value = jnp.concatenate(full)
     elif isinstance(value, dict):
         raise ValueError(
@@ -149,7 +152,10 @@ def _as_array(
 def as_log_prior(
     prior: Prior, parameters: Parameters, theta: Float[Array, " p"]
 ) -> NormalDensity | GivenDensity:
-    """The prior's log density, a function of θ."""
+    """Return the log density of the prior as a function of θ.
+
+    **Raises:** `ValueError` and `TypeError` for an invalid prior.
+    """
     if isinstance(prior, NormalPrior):
         return as_normal(prior, parameters, theta)
     if not callable(prior):
