@@ -112,8 +112,8 @@ class Augmentation(eqx.Module):
             start, end = intervals.start[:, None], intervals.end[:, None]
             path = start + done[:, None] * (end - start)
             for candidate in preferred:  # the last finite one is used
-                path = jnp.where(is_there(candidate)[:, None, None], candidate, path)
-            return path, is_there(proposed)
+                path = jnp.where(is_complete(candidate)[:, None, None], candidate, path)
+            return path, is_complete(proposed)
 
         paths, found = zip(*map(of_block, self.blocks, self.kernels, self._keys(key)), strict=True)
         return paths, jnp.concatenate(found)
@@ -174,7 +174,7 @@ class Augmentation(eqx.Module):
         ]
 
 
-def is_there(paths: Float[Array, "I points d"]) -> Bool[Array, " I"]:
+def is_complete(paths: Float[Array, "I points d"]) -> Bool[Array, " I"]:
     """Return whether each path exists: missing paths are NaN."""
     return jnp.all(jnp.isfinite(paths), axis=(1, 2))
 

@@ -38,13 +38,13 @@ from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
     check_covariance_is_used,
-    drawn,
     first_chain,
     first_states,
     over_chains,
+    posterior_fields,
     starting_points,
-    step_errors_of_some,
-    summed,
+    sum_counts,
+    thinned_step_errors,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_gibbs import RecordPosterior, RecordState, sample_records
@@ -312,7 +312,7 @@ class _Sampler(eqx.Module):
         theta, accepted = self.kernel.step(parameter_key, state.theta, data)
         counted = bridges._replace(missing=bridges.missing | ~has_bridge)
         return GibbsState(theta, paths, has_bridge, state.num_done), GibbsInfo(
-            accepted, *summed(counted)
+            accepted, *sum_counts(counted)
         )
 
     def log_step_error(self, state: GibbsState) -> Float[Array, ""]:
@@ -339,11 +339,11 @@ def _run(
         step = lambda state, key: over_chains(sampler.step, key, state)
         state, infos = lax.scan(step, state, keys)
         state = state._replace(num_done=state.num_done + 1)
-        errors = step_errors_of_some(of_chains, state, i, num_iterations)
-        return state, (state.theta, summed(infos), errors)
+        errors = thinned_step_errors(of_chains, state, i, num_iterations)
+        return state, (state.theta, sum_counts(infos), errors)
 
     state, draws = metered_scan(draw, state, jnp.arange(num_iterations), progress_meter)
-    fields, (info, log_step_error) = drawn(sampler.parameters, *draws)
+    fields, (info, log_step_error) = posterior_fields(sampler.parameters, *draws)
     num_bridges = thin * sampler.augmentation.num_intervals
     info = info._replace(
         parameters_moved=info.parameters_moved > 0,

@@ -42,9 +42,9 @@ from .record_maximum import RecordMaximumLikelihood, maximum_of_records
 from .record_paths import check_no_bridges, check_no_record
 from .score import Score, Scorer, as_score, scorer_at
 from .simulated_likelihood import (
-    as_pulled,
+    as_differentiable,
+    differentiable_blocks,
     newton_ascent,
-    pulled_blocks,
     step_error_of_score,
     stochastic_ascent,
 )
@@ -261,14 +261,14 @@ def _by_bridges(
     iterates, info = approximate(run_key, parameters, augmentation, search, theta)
     rough = iterates[-1] if isinstance(search.rule, EM) else _mean_of_later(iterates)
     scorer = scorer_at(score_key, problem, rough, proposal, budget, num_bridges)
-    passes = _refined(score_key, parameters, scorer, rough)
+    passes = _newton_from(score_key, parameters, scorer, rough)
     is_found = passes.converged & is_maximum(passes.slope)
     fall = falls(passes.slope, passes.offsets)
     return _summary(parameters, passes.theta, iterates, passes.details, info, is_found, fall)
 
 
 @compiled_sooner
-def _refined(
+def _newton_from(
     key: Key[Array, ""], parameters: Parameters, scorer: Scorer, theta: Float[Array, " p"]
 ) -> Passes:
     """Run Newton's method from θ, with new bridges in each pass."""
@@ -291,13 +291,13 @@ def _by_simulation(
 ) -> MaximumLikelihood:
     """Estimate θ by the maximum of the simulated likelihood."""
     parameters, theta = problem.parameters, problem.theta
-    proposal = as_pulled(proposal, parameters.model, problem.like, budget)
+    proposal = as_differentiable(proposal, parameters.model, problem.like, budget)
     pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
-    blocks = pulled_blocks(pilot_key, parameters.bind(theta), problem, proposal)
+    blocks = differentiable_blocks(pilot_key, parameters.bind(theta), problem, proposal)
     iterates, info = stochastic_ascent(run_key, parameters, blocks, search, theta)
     last = iterates[-1]
     # A good proposal at the first θ may be poor at the last one.
-    blocks = pulled_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
+    blocks = differentiable_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
     starts = jnp.stack([theta, last, _mean_of_later(iterates)])
     maximum = newton_ascent(last_key, parameters, blocks, starts, num_bridges)
     result = maximum.simulated

@@ -56,7 +56,7 @@ def first_root(
     return 0.1 * jnp.diag(jnp.maximum(jnp.abs(theta), 0.1))
 
 
-def learnt(
+def adapt_covariance(
     root: Float[Array, "p p"],
     noise: Float[Array, " p"],
     rate: Float[Array, ""],

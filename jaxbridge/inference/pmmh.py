@@ -46,18 +46,18 @@ from .likelihood_estimates import (
     RecordLikelihood,
     TransitionLikelihood,
 )
-from .parameter_walk import first_root, learnt
+from .parameter_walk import adapt_covariance, first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
     check_covariance_is_used,
     check_likelihood_was_found,
-    drawn,
     first_chain,
     over_chains,
+    posterior_fields,
     refused_moves,
     starting_points,
-    step_errors_of_some,
+    thinned_step_errors,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_paths import check_no_bridges, check_no_record, unguided
@@ -458,7 +458,7 @@ class _Sampler(eqx.Module):
         new = jnp.where(inside, estimate.log_likelihood + self.log_prior(proposed), -jnp.inf)
         rate = acceptance_rate(state.log_likelihood + self.log_prior(state.theta), new)
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
-        root = learnt(state.root, noise, rate, number, learning)
+        root = adapt_covariance(state.root, noise, rate, number, learning)
         candidate = _Chain(proposed, *estimate[:3], root)
         without = inside & (estimate.log_likelihood == -jnp.inf)
         chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
@@ -491,7 +491,7 @@ def _run(
     # The warm-up is measured in draws, too, so that one loop serves both.
     skipped = -(-num_warmup // thin)
     guide = sampler.likelihood.guide
-    state = _not_begun(guide, *start) if fresh else _going_on(start)
+    state = _initial_state(guide, *start) if fresh else _continued_state(start)
 
     def begin(run, i):
         if not fresh:
@@ -518,7 +518,7 @@ def _run(
             return run.chain.log_step_error
         own_key = jax.random.fold_in(key_for("step error", key), run.num_done)
         function = lambda theta: over_chains(near.log_step_error, own_key, theta)
-        return step_errors_of_some(function, run.chain.theta, i - skipped, num_iterations)
+        return thinned_step_errors(function, run.chain.theta, i - skipped, num_iterations)
 
     def draw(near, run, i):
         def iterate(run, i):
@@ -537,7 +537,7 @@ def _run(
     run, draws = metered_stages(begin, draw, state, bounds, num_iterations, progress_meter)
     held, accepted = draws
     values = (held.log_likelihood, held.log_step_error, accepted)
-    fields, values = drawn(sampler.parameters, held.theta, *values)
+    fields, values = posterior_fields(sampler.parameters, held.theta, *values)
     log_likelihood, log_step_errors, accepted = values
     return PMMHPosterior(
         **fields,
@@ -563,7 +563,7 @@ def _mean_share_lost(counted: PMMHInfo) -> Float[Array, "*chains"]:
     return jnp.where(weight > 0, counted.share_lost / jnp.where(weight > 0, weight, 1), 0)
 
 
-def _not_begun(
+def _initial_state(
     guide: Guide | None, theta: Float[Array, "*chains p"], root: Float[Array, "p p"]
 ) -> _Run:
     """Return the state of the loop before the first estimate, with zeros as placeholders."""
@@ -574,7 +574,7 @@ def _not_begun(
     return _Run(chain, guide, jnp.int32(0), PMMHInfo(no_counts, no_counts, no_counts, zeros, zeros))
 
 
-def _going_on(state: PMMHState) -> _Run:
+def _continued_state(state: PMMHState) -> _Run:
     """Return the state of the loop that continues earlier draws, with new counts."""
     chain = _Chain(
         state.theta, state.log_likelihood, state.variance, state.log_step_error, state.root

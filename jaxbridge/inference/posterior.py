@@ -285,7 +285,7 @@ def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
     return jax.vmap(lambda *chain: function(*chain))(keys, state)
 
 
-def step_errors_of_some(
+def thinned_step_errors(
     function: Callable[[PyTree], Float[Array, "*chains"]],
     state: PyTree,
     number: Int[Array, ""],
@@ -307,7 +307,7 @@ def first_states(start: Callable, key: Key[Array, ""], state: PyTree) -> Any:
     return over_chains(start, jax.random.fold_in(key, 0), state)
 
 
-def drawn(
+def posterior_fields(
     parameters: Parameters, theta: Float[Array, "n *chains p"], *values: PyTree
 ) -> tuple[dict[str, Any], PyTree]:
     """Return the fields `params`, `theta` and `names` of a posterior, and the other values.
@@ -321,6 +321,6 @@ def drawn(
     return {"params": full(theta), "theta": theta, "names": parameters.names}, values
 
 
-def summed(infos: PyTree) -> PyTree:
+def sum_counts(infos: PyTree) -> PyTree:
     """Return the counts, summed over the first axis."""
     return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0, dtype=jnp.int32), infos)

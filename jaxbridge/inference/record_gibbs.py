@@ -35,20 +35,20 @@ from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..records import Guidance, GuideCheck, Records, tuned
 from ..schemes import relative_change
-from .parameter_walk import learnt
+from .parameter_walk import adapt_covariance
 from .parameters import Parameters
 from .posterior import (
     AbstractPosterior,
     check_likelihood_was_found,
-    drawn,
     first_chain,
     over_chains,
+    posterior_fields,
     refused_moves,
-    step_errors_of_some,
+    thinned_step_errors,
 )
 from .priors import GivenDensity, NormalDensity
 from .record_paths import (
-    At,
+    GuidedTheta,
     RecordPaths,
     as_record_paths,
     likely_root,
@@ -156,7 +156,7 @@ class RecordSampler(eqx.Module):
         path_key, noise_key, walk_key, accept_key = jax.random.split(key, 4)
         state, guides = guided
         theta, log_scales = state.theta, state.log_scales
-        here = At(theta, guides)
+        here = GuidedTheta(theta, guides)
         paths, blocks_moved = self.completion.renewed(path_key, here, state.paths, log_scales)
         noise, log_weight = self.completion.noise(noise_key, here, paths)
         step = jax.random.normal(walk_key, theta.shape, theta.dtype)
@@ -179,7 +179,7 @@ class RecordSampler(eqx.Module):
         new_state = RecordState(
             theta,
             paths,
-            learnt(state.root, step, rate, number, learning),
+            adapt_covariance(state.root, step, rate, number, learning),
             jnp.where(learning, scales, log_scales),
             number,
         )
@@ -192,7 +192,7 @@ class RecordSampler(eqx.Module):
         It is NaN if the path has no weight, and infinite if steps are too long for the drift.
         """
         (state, guides), completion = guided, self.completion
-        noise, log_weight = completion.noise(key, At(state.theta, guides), state.paths)
+        noise, log_weight = completion.noise(key, GuidedTheta(state.theta, guides), state.paths)
         ratio = nan_to_neg_inf(completion.coarse_log_weight(state.theta, noise)) - log_weight
         ratio = jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
         return jnp.where(completion.steps_are_too_long(state.theta, state.paths), jnp.inf, ratio)
@@ -268,7 +268,7 @@ def _sample_records(
         function = lambda guided: over_chains(sampler.log_ratio, own_key, guided)
         if records.stacked.num_steps == 1:
             return jnp.full(theta.shape[:-1], jnp.nan, theta.dtype)
-        return step_errors_of_some(function, guided, i - skipped, num_iterations)
+        return thinned_step_errors(function, guided, i - skipped, num_iterations)
 
     def draw(sampler, guided, i):
         def iterate(guided, i):
@@ -284,11 +284,13 @@ def _sample_records(
         return guided, (result, sampler.completion.fine.check)
 
     bounds = stages(skipped if fresh else 0, skipped + num_iterations)
-    state = _not_begun(records, *start) if fresh else start
+    state = _initial_state(records, *start) if fresh else start
     init = GuidedState(state, _no_guides(parameters, records, state.theta))
     (state, _), draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
     draws, checks = draws
-    fields, (theta_moved, blocks_moved, has_weight, log_ratio) = drawn(parameters, *draws)
+    fields, (theta_moved, blocks_moved, has_weight, log_ratio) = posterior_fields(
+        parameters, *draws
+    )
     real = movable(records)
     ever = jnp.any(blocks_moved > 0, axis=-4)  # in any draw
     # Centred at the median: a factor of w̃ / w that all draws share does not move posterior means.
@@ -308,7 +310,7 @@ def _sample_records(
     return posterior, ~jnp.any(has_weight, axis=-1)
 
 
-def _not_begun(
+def _initial_state(
     records: Records, theta: Float[Array, "*chains p"], root: Float[Array, "p p"]
 ) -> RecordState:
     """Return the state before the first paths, with placeholders for them."""

@@ -57,7 +57,7 @@ from .newton import (
     newton_passes,
 )
 from .parameters import Parameters
-from .record_paths import At, RecordPaths, as_record_paths, movable, share_of_step_error
+from .record_paths import GuidedTheta, RecordPaths, as_record_paths, movable, share_of_step_error
 from .stochastic_approximation import Gradient, Search, SearchInfo, iterate
 
 _CHAINS = 8
@@ -198,7 +198,7 @@ def maximum_of_records(
     rough = jnp.mean(iterates[len(iterates) // 2 :], axis=0)
     # A good guide at the first θ may be poor at the last one.
     completion = as_record_paths(parameters, records, rough)
-    passes = _refined(last_key, completion, rough, chains, num_draws, search.progress_meter)
+    passes = _newton_from(last_key, completion, rough, chains, num_draws, search.progress_meter)
     return _summary(completion, iterates, info, passes)
 
 
@@ -207,10 +207,10 @@ def _of_chains(function: Callable, key: Key[Array, ""], *mapped: PyTree) -> PyTr
     return jax.vmap(function)(jax.random.split(key, _CHAINS), *mapped)
 
 
-def _swept(
+def _sweep(
     key: Key[Array, ""],
     completion: RecordPaths,
-    at: At,
+    at: GuidedTheta,
     chains: _Chains,
     number: Int[Array, ""],
 ) -> tuple[_Chains, Bool[Array, "chains R 2 B"]]:
@@ -238,7 +238,7 @@ def _approximate(
     def propose(i, theta, memory, chains):
         sweep_key, noise_key = jax.random.split(jax.random.fold_in(run_key, i))
         at = completion.at(theta)
-        chains, _ = _swept(sweep_key, completion, at, chains, i)
+        chains, _ = _sweep(sweep_key, completion, at, chains, i)
         read = lambda key, paths: completion.noise(key, at, paths)[0]
         noise = _of_chains(read, noise_key, chains.paths)
         gradient = jax.grad(_mean_log_weight)(theta, completion, noise) / num_observed
@@ -273,7 +273,7 @@ def _mean_log_weight(
 
 
 @compiled_sooner
-def _refined(
+def _newton_from(
     key: Key[Array, ""],
     completion: RecordPaths,
     theta: Float[Array, " p"],
@@ -323,12 +323,12 @@ def _draws_at(
     def draw(state, i):
         chains, h = state
         sweep_key, noise_key = jax.random.split(jax.random.fold_in(key, i))
-        swept, accepted = _swept(sweep_key, completion, here, chains, i)
+        swept, accepted = _sweep(sweep_key, completion, here, chains, i)
         chains = chains._replace(paths=swept.paths)
         of_chain = lambda key, paths, taken: derivatives(key, paths, taken, h)
         draws = _of_chains(of_chain, noise_key, chains.paths, accepted)
         curvature = -jnp.diagonal(jnp.nanmean(draws.hessian, axis=0))
-        return (chains, jnp.where(i < _LEARNING, _nearer(h, curvature), h)), draws
+        return (chains, jnp.where(i < _LEARNING, _adapt_difference(h, curvature), h)), draws
 
     numbers = jnp.arange(_LEARNING + num_draws)
     (chains, h), draws = metered_scan(draw, start, numbers, progress_meter)
@@ -336,7 +336,7 @@ def _draws_at(
     return draws, chains, h
 
 
-def _nearer(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> Float[Array, " p"]:
+def _adapt_difference(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> Float[Array, " p"]:
     """Return the h for this curvature, changed by at most a factor of 8.
 
     Where the curvature is not finite, h is divided by 8.
@@ -355,7 +355,9 @@ def _slope(draws: _Draw, h: Float[Array, " p"]) -> Slope:
     gradients = draws.gradient.reshape(-1, p)
     gradient, spread = jnp.mean(gradients, axis=0), jnp.cov(gradients.T).reshape(p, p)
     curvature = -jnp.mean(draws.hessian, axis=(0, 1))
-    is_adapted = jnp.all(jnp.abs(jnp.log(_nearer(h, jnp.diagonal(curvature)) / h)) < jnp.log(2.0))
+    is_adapted = jnp.all(
+        jnp.abs(jnp.log(_adapt_difference(h, jnp.diagonal(curvature)) / h)) < jnp.log(2.0)
+    )
     size = effective_size_of_chains(draws.gradient)
     covariance = spread / jnp.sqrt(size[:, None] * size)
     information = jnp.where(is_adapted, curvature - spread, jnp.nan)

@@ -64,7 +64,7 @@ class GuidedRecords(NamedTuple):
     check: GuideCheck
 
 
-class At(NamedTuple):
+class GuidedTheta(NamedTuple):
     """Parameters θ, and the guides of the paths of each record at θ."""
 
     theta: Float[Array, " p"]
@@ -87,12 +87,12 @@ class RecordPaths(eqx.Module):
         """Return N, the number of steps of each segment."""
         return self.fine.records.stacked.num_steps
 
-    def at(self, theta: Float[Array, " p"]) -> At:
+    def at(self, theta: Float[Array, " p"]) -> GuidedTheta:
         """Return θ and the guides at θ."""
-        return At(theta, _guides(self.fine, self.parameters.bind(theta)))
+        return GuidedTheta(theta, _guides(self.fine, self.parameters.bind(theta)))
 
     def first(
-        self, key: Key[Array, ""], at: At
+        self, key: Key[Array, ""], at: GuidedTheta
     ) -> tuple[Float[Array, "R points d"], Float[Array, "R 2 B"]]:
         """Sample the first paths; return them, and log β of the moves of their blocks.
 
@@ -111,7 +111,7 @@ class RecordPaths(eqx.Module):
     def renewed(
         self,
         key: Key[Array, ""],
-        at: At,
+        at: GuidedTheta,
         paths: Float[Array, "R points d"],
         log_scales: Float[Array, "R 2 B"],
     ) -> tuple[Float[Array, "R points d"], Bool[Array, "R 2 B 1"]]:
@@ -129,7 +129,7 @@ class RecordPaths(eqx.Module):
         return records.each(one, keys, points, at.guides, log_scales, paths)
 
     def noise(
-        self, key: Key[Array, ""], at: At, paths: Float[Array, "R points d"]
+        self, key: Key[Array, ""], at: GuidedTheta, paths: Float[Array, "R points d"]
     ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
         """Return ξ of these paths, and log w."""
         model, records = self.parameters.bind(at.theta), self.fine.records
@@ -142,10 +142,10 @@ class RecordPaths(eqx.Module):
         return noise, jnp.sum(log_weight)
 
     def of_noise(
-        self, at: At, noise: Float[Array, "R points d"]
+        self, at: GuidedTheta, noise: Float[Array, "R points d"]
     ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
         """Return the paths of ξ, and log w."""
-        return _of_noise(self.fine.records, self.parameters.bind(at.theta), at.guides, noise)
+        return _paths_of_noise(self.fine.records, self.parameters.bind(at.theta), at.guides, noise)
 
     def steps_are_too_long(
         self, theta: Float[Array, " p"], paths: Float[Array, "R points d"]
@@ -173,10 +173,10 @@ class RecordPaths(eqx.Module):
         self, grid: GuidedRecords, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
     ) -> Float[Array, ""]:
         model = self.parameters.bind(theta)
-        return _of_noise(grid.records, model, _guides(grid, model), noise)[1]
+        return _paths_of_noise(grid.records, model, _guides(grid, model), noise)[1]
 
     def _coarsened(self, noise: Float[Array, "R points d"]) -> Float[Array, "R points d"]:
-        return jax.vmap(lambda noise: _of_pairs(noise, self.num_steps))(noise)
+        return jax.vmap(lambda noise: _pair_noise(noise, self.num_steps))(noise)
 
 
 def check_no_bridges(**arguments: Any) -> None:
@@ -275,7 +275,9 @@ def likely_root(
 
     def log_density(theta):
         model = parameters.bind(theta)
-        _, log_weight = _of_noise(grid.records, model, _guides(grid, model), jnp.zeros_like(points))
+        _, log_weight = _paths_of_noise(
+            grid.records, model, _guides(grid, model), jnp.zeros_like(points)
+        )
         allowed = parameters.allowed(theta)
         return jnp.where(allowed, nan_to_neg_inf(log_weight) + log_prior(theta), -jnp.inf)
 
@@ -300,7 +302,7 @@ def _guides(grid: GuidedRecords, model: Diffusion) -> Guidance:
     return grid.records.each(lambda problem, points: guided(problem, model, points), grid.points)
 
 
-def _of_noise(
+def _paths_of_noise(
     records: Records, model: Diffusion, guides: Guidance, noise: Float[Array, "R points d"]
 ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
     def one(problem, guide, noise):
@@ -310,7 +312,7 @@ def _of_noise(
     return paths, jnp.sum(log_weight)
 
 
-def _of_pairs(noise: Float[Array, "points d"], num_steps: int) -> Float[Array, "points d"]:
+def _pair_noise(noise: Float[Array, "points d"], num_steps: int) -> Float[Array, "points d"]:
     """Return the noise of steps of twice the size, on the grid of `Record.coarsened`.
 
     The shape is that of the fine grid. The scaled sum of each pair is the noise of its second step;

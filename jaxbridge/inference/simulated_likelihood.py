@@ -102,7 +102,7 @@ _NO_DERIVATIVE = (
 )
 
 
-def as_pulled(
+def as_differentiable(
     proposal: Any, model: Diffusion, like: Float[Array, " d"], budget: Budget
 ) -> AbstractProposal:
     """Return the proposal of the user, where "auto" excludes couplings.
@@ -120,7 +120,7 @@ def as_pulled(
     return pulled
 
 
-def pulled_blocks(
+def differentiable_blocks(
     key: Key[Array, ""], model: Diffusion, problem: Problem, proposal: AbstractProposal
 ) -> tuple[Block, ...]:
     """Return blocks with a single proposal each.
@@ -131,11 +131,11 @@ def pulled_blocks(
     """
     blocks = make_blocks(key, model, problem, proposal, Budget(), "density")
     if proposal.is_open:
-        return tuple(_decided(block) for block in blocks)
+        return tuple(_with_best_candidate(block) for block in blocks)
     return tuple(single for block in blocks for single in _split(block))
 
 
-def _decided(block: Block) -> Block:
+def _with_best_candidate(block: Block) -> Block:
     """Return the block with the best candidate for all its intervals.
 
     The squared error of ℓ̂ is the sum of 1 / (effective sample size) over the intervals.

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbridge.inference.parameter_walk import learnt
+from jaxbridge.inference.parameter_walk import adapt_covariance
 from jaxbridge.inference.pmmh import PMMHPosterior
 from jaxbridge.inference.posterior import check_likelihood_was_found
 
@@ -69,7 +69,7 @@ def test_the_size_of_moves_is_found_early(scale):
             new = x + root @ noise
             rate = jnp.minimum(1, jnp.exp(jnp.sum(x**2 - new**2) / 2))
             x = jnp.where(jax.random.uniform(accept_key) < rate, new, x)
-            return (x, learnt(root, noise, rate, i, jnp.asarray(True))), None
+            return (x, adapt_covariance(root, noise, rate, i, jnp.asarray(True))), None
 
         init = jnp.zeros(1), scale * jnp.eye(1)
         return jax.lax.scan(step, init, jnp.arange(1, 101))[0][1]

@@ -115,7 +115,7 @@ def few(times, data, num_steps, model):
     key = jax.random.key(0)
     parameters = as_parameters(model, None, POSITIVE)
     problem = as_problem(key, parameters, times, data, num_steps, None)
-    blocks = simulated_likelihood.pulled_blocks(key, model, problem, BRIDGE)
+    blocks = simulated_likelihood.differentiable_blocks(key, model, problem, BRIDGE)
     return parameters, blocks, problem.theta
 
 
@@ -216,14 +216,14 @@ def test_a_choice_is_made_once_or_kept(unchecked):
     times, data, *_ = ou_problem()
     model, key = ou_1d(), jax.random.key(0)
     problem = as_problem(key, as_parameters(model, None), times[:5], data[:5], 5, None)
-    auto = simulated_likelihood.as_pulled("auto", model, problem.like, Budget())
-    (block,) = simulated_likelihood.pulled_blocks(key, model, problem, auto)
+    auto = simulated_likelihood.as_differentiable("auto", model, problem.like, Budget())
+    (block,) = simulated_likelihood.differentiable_blocks(key, model, problem, auto)
     assert isinstance(block.proposal, jb.Guided | jb.ModifiedDiffusionBridge)
     candidates = guided_candidates()
     made = jb.choose_proposal(
         key, model, *problem.intervals, candidates=candidates, num_steps=5, num_pilot=32
     )
-    blocks = simulated_likelihood.pulled_blocks(key, model, problem, made)
+    blocks = simulated_likelihood.differentiable_blocks(key, model, problem, made)
     assert len(blocks) == len(made.used)
     for block in blocks:
         for i in block.index.tolist():
