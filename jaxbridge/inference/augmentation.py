@@ -81,6 +81,7 @@ class Augmentation(eqx.Module):
         for block, array in zip(self.blocks, paths, strict=True):
             ends = (block.intervals.start, block.intervals.end)
             for end, last in zip(ends, (array[..., 0, :], array[..., -1, :]), strict=True):
+                # Traced ends cannot be compared. Ends may differ from the observations by rounding.
                 if not is_traced(end, last) and not np.allclose(last, end, atol=1e-6, rtol=1e-4):
                     raise ValueError(
                         "`init` is a state whose paths do not join these observations: pass the "
@@ -106,6 +107,7 @@ class Augmentation(eqx.Module):
                     other_keys[:, None], model, intervals, num_steps, None, False
                 )
                 preferred = [other.paths[:, 0], proposed]
+            # Elapsed fraction of the interval at each point.
             done = jnp.concatenate([jnp.zeros(1), jnp.cumsum(block.fractions)]).astype(
                 proposed.dtype
             )
@@ -152,6 +154,7 @@ class Augmentation(eqx.Module):
         def of_block(block, array):
             halvings = block.log_halvings(model, array, form)
             share = block.step_shares(model, form)
+            # Where a step exceeds the relaxation time of the drift, the leading term means nothing.
             in_regime = share_in_regime(share, model, block.intervals, block.num_steps)
             # D² has the same order as the mean of D. E[e^D - 1] is no alternative: it is about -1
             # for steps that are far too long, which would hide the error.
@@ -202,6 +205,7 @@ def augment(
         use = "renewal"
     if proposal is None and use == "weights" and method is None:
         proposal = "auto"
+    # Renewal and approximate bridges use pairs without hitting counts as weights.
     by_pairs = method is None and isinstance(proposal, AbstractCoupling)
     if use != "weights" or by_pairs:
         reason = (
@@ -222,6 +226,7 @@ def _kernel(
 ) -> AbstractBridgeKernel:
     if use == "approximate":
         return Unweighted(as_pairs(proposal))
+    # The default for a coupling: the renewal kernel stores no weight.
     if use == "renewal" or (method is None and proposal.by_coupling is not None):
         return ByRenewal(as_pairs(proposal))
     return ByWeights(proposal)

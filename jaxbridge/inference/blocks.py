@@ -80,6 +80,7 @@ class Block(eqx.Module):
 
         All intervals have the same number of paths, and `P` is the total number.
         """
+        # The paths of an interval are consecutive, as in `jnp.repeat`.
         steps = jnp.repeat(self.steps, paths.shape[0] // len(self.index), axis=1)
         dynamics = model.forward(self.intervals.start[0])
         return log_halving_of_paths(density_of_form(form), dynamics, steps, paths)
@@ -111,6 +112,7 @@ def make_blocks(
     for_density, weighted = use == "density", use != "approximate"
     moving = use in ("weights", "density", "renewal")
     is_auto = isinstance(proposal, str) and proposal == "auto"
+    # A burn-in has a length for one θ only, so "auto" then selects guided proposals.
     if moving and is_auto and needs_burn_in(Stationary(), model) and not model.has_density:
         left_out = why_left_out(model, for_density) or _NO_SAMPLER
         proposal = choice_between(guided_candidates(), budget, left_out=left_out)
@@ -154,6 +156,7 @@ def over_intervals(blocks: tuple[Block, ...], of_blocks: Sequence[Any]) -> Any:
     Fields with a value for each interval are joined in the order of the intervals: effective sample
     size, k̂ and counts. The other fields are summed.
     """
+    # Blocks are not in the order of the intervals; this restores it.
     order = jnp.argsort(jnp.concatenate([block.index for block in blocks]))
     fields = ("effective_sample_size", "pareto_k", "num_found", "num_simulated", "num_nonfinite")
     joined = {f: jnp.concatenate([getattr(one, f) for one in of_blocks])[order] for f in fields}

@@ -77,8 +77,10 @@ class ByRenewal(AbstractBridgeKernel):
 
     def renew(self, keys, model, intervals, paths):
         all_intervals = jnp.ones(len(keys), bool)
+        # The current path is kept where no associated diffusion has hit it.
         paths, info = renew(keys, model, self.pairs, intervals, paths, all_intervals)
         num_steps = paths.shape[1] - 1
+        # The length of a burn-in may be limited; the draw is then only approximately stationary.
         law, dt = self.pairs.coupling.start_law, intervals.duration / num_steps
         cut = run_is_cut(law, model, dt, num_steps)
         counts = info.is_accepted, info.num_simulated, info.is_missing, cut
@@ -101,6 +103,7 @@ class ByWeights(AbstractBridgeKernel):
         old = self.proposal.reweigh(weigh_keys, model, intervals, paths)
         new = self.proposal.draw(draw_keys[:, None], model, intervals, num_steps, None, False)
         uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=paths.dtype))(accept_keys)
+        # A missing proposal has weight zero and is never accepted.
         accepted = uniform < acceptance_rate(old.log_weights[:, 0], new.log_weights[:, 0])
         num_simulated = old.num_simulated[:, 0] + new.num_simulated[:, 0]
         paths = jnp.where(accepted[:, None, None], new.paths[:, 0], paths)

@@ -74,6 +74,7 @@ def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Inter
     if not is_traced(observations):
         _check_finite(np.asarray(observations))
         _check_state_space(model, observations)
+    # Slices of JAX arrays would compile a program for each shape.
     before, after = (
         index_without_compiling(observations, slice(-1)),
         index_without_compiling(observations, slice(1, None)),
@@ -124,6 +125,7 @@ def _unmasked(name: str, values: Numbers) -> Numbers:
 
 def _check_state_space(model: Diffusion, observations: Array) -> None:
     """Raise `ValueError` for the first observation outside the model's state space."""
+    # The coefficients of a traced model have no values yet.
     if is_traced(model):
         return
 
@@ -172,6 +174,7 @@ def step_groups(
         num_steps = check_num_steps(50 if num_steps is None else num_steps, len(durations))
         return (group(np.arange(len(durations)), num_steps),)
     required = count_steps(durations, num_steps, step_size)
+    # Grouping by level keeps the number of candidates for a group small.
     levels = np.ceil(np.log2(required) * _LEVELS_PER_OCTAVE)
     by_level = [required[levels == level] for level in np.unique(levels)]
     ends = _cheapest_groups(

@@ -334,9 +334,11 @@ def _run(
     of_chains = jax.vmap(one) if state.theta.ndim == 2 else one
 
     def draw(state, i):
+        # All chains have made the same number of draws.
         number = state.num_done.reshape(-1)[0] + 1  # key 0 is for the first paths
         keys = jax.random.split(jax.random.fold_in(key, number), thin)
         step = lambda state, key: over_chains(sampler.step, key, state)
+        # Iterations between draws are not stored.
         state, infos = lax.scan(step, state, keys)
         state = state._replace(num_done=state.num_done + 1)
         errors = thinned_step_errors(of_chains, state, i, num_iterations)
@@ -344,6 +346,7 @@ def _run(
 
     state, draws = metered_scan(draw, state, jnp.arange(num_iterations), progress_meter)
     fields, (info, log_step_error) = posterior_fields(sampler.parameters, *draws)
+    # `bridges_moved` counts the moves of all iterations of a draw.
     num_bridges = thin * sampler.augmentation.num_intervals
     info = info._replace(
         parameters_moved=info.parameters_moved > 0,

@@ -184,6 +184,7 @@ class TransitionLikelihood(AbstractLikelihood):
                 jnp.sum(_share(density.num_nonfinite, density.num_simulated, zero)) / num_intervals,
             )
             total = jax.tree.map(jnp.add, total, of_block)
+        # NaN counts as an estimate of zero.
         is_number = ~jnp.isnan(total.log_likelihood)
         return total._replace(log_likelihood=jnp.where(is_number, total.log_likelihood, -jnp.inf))
 
@@ -241,6 +242,7 @@ class RecordLikelihood(AbstractLikelihood):
         fine, coarse = log_p + variance / 2
         error = share_of_grid(problem.density.order, problem.num_steps) * (coarse - fine)
         one = lambda problem, points: steps_are_too_long(problem, model, points)
+        # Then the difference of the two grids is no leading-order error.
         too_long = self.fine.records.each(one, self.fine.points)
         return jnp.where(jnp.any(too_long), jnp.inf, error)
 
@@ -249,6 +251,7 @@ class RecordLikelihood(AbstractLikelihood):
         fine, coarse = guided_near(records, self.coarse.records, at(theta))
         num_filters = max(_FEWEST_FILTERS, _FEWEST_PARTICLES // P)
         keys = jax.random.split(key, len(around))
+        # Pilot runs only compare discount rates, so half as many steps may suffice.
         grid = coarse if half_will_do(records) else fine
 
         def pilots(rate):
@@ -285,6 +288,7 @@ class RecordLikelihood(AbstractLikelihood):
         number divided by the number of particles.
         """
         filtered = self._filtered(key, model, grid, self.rate, 1, skips)
+        # Records are independent, so variances add.
         variance = jax.vmap(lambda record: record.variance(self.num_particles))(filtered)
         lost = jnp.sum(filtered.num_nonfinite).astype(variance.dtype) / self.num_particles
         return jnp.sum(filtered.log_estimate), jnp.sum(variance), lost

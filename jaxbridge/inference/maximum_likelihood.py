@@ -259,8 +259,10 @@ def _by_bridges(
     augment_key, run_key, score_key = jax.random.split(key, 3)
     augmentation = augment(augment_key, problem, theta, proposal, "exact", None, budget)
     iterates, info = approximate(run_key, parameters, augmentation, search, theta)
+    # EM averages its statistics already. Iterates of an optimiser fluctuate around the maximum.
     rough = iterates[-1] if isinstance(search.rule, EM) else _mean_of_later(iterates)
     scorer = scorer_at(score_key, problem, rough, proposal, budget, num_bridges)
+    # New bridges: those of the search depend on the iterates.
     passes = _newton_from(score_key, parameters, scorer, rough)
     is_found = passes.converged & is_maximum(passes.slope)
     fall = falls(passes.slope, passes.offsets)
@@ -298,6 +300,7 @@ def _by_simulation(
     last = iterates[-1]
     # A good proposal at the first θ may be poor at the last one.
     blocks = differentiable_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
+    # The first start satisfies the constraint; the mean of allowed iterates may not.
     starts = jnp.stack([theta, last, _mean_of_later(iterates)])
     maximum = newton_ascent(last_key, parameters, blocks, starts, num_bridges)
     result = maximum.simulated
@@ -325,6 +328,7 @@ def _summary(
 ) -> MaximumLikelihood:
     """Return the estimate with its errors: those of the score times the inverse information."""
     covariance = jnp.linalg.inv(score.information)
+    # Delta method, with the inverse information as the derivative of the zero.
     noise = covariance @ score.covariance @ covariance
     # An error of the score moves its zero by the inverse information times that error.
     step_doubt = jnp.sqrt(covariance**2 @ score.step_uncertainty**2)

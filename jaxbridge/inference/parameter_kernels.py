@@ -69,6 +69,7 @@ class CompleteData(NamedTuple):
 
     def information(self, theta: Float[Array, " p"]) -> Float[Array, "p p"]:
         """Return G(θ), with the precision of the prior if it is normal."""
+        # A sum over the steps replaces the integral over time.
         points, steps = self.augmentation.points(self.paths)
 
         def of_point(x, dt):
@@ -101,6 +102,7 @@ class NormalDraw(AbstractParameterKernel):
     def step(self, key, theta, data):
         # Forward mode is cheaper for one or two parameters, forward over reverse for more.
         gradient = (jax.jacfwd if len(theta) < 3 else jax.grad)(data.log_posterior_inside)
+        # The Hessian of a quadratic is constant, so any θ will do.
         root = any_cholesky(-jax.jacfwd(gradient)(theta))
         mean = theta + _solve_root(root, gradient(theta))
 
@@ -142,6 +144,7 @@ class NewtonStep(AbstractParameterKernel):
         ok = data.parameters.allowed(proposed)
         proposed = jnp.where(ok, proposed, theta)
         other_value, other_mean, other_root = evaluate(proposed)
+        # The proposal depends on θ, so the ratio contains both proposal densities.
         log_ratio = other_value - value + log_density(theta, other_mean, other_root)
         log_ratio -= log_density(proposed, mean, root)
         # A comparison with NaN is false, so a NaN ratio rejects.
@@ -163,6 +166,7 @@ class GivenKernel(AbstractParameterKernel):
 
         def step(key, params):
             kernel = self.build(log_density)
+            # A kernel may be any object with these two functions.
             if not all(callable(getattr(kernel, part, None)) for part in ("init", "step")):
                 raise TypeError(
                     "`parameter_kernel` must return a kernel with functions `init(position)` and "

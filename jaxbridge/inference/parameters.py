@@ -73,6 +73,7 @@ class Parameters(eqx.Module):
         Leaves without an entry in θ are `None`.
         """
         floats = eqx.filter(self.params, eqx.is_inexact_array)
+        # The inverse of raveling, for leaves in the dtype of `values`.
         return ravel_pytree(cast_floats(floats, values.dtype))[1](values)
 
     def full(self, theta: Float[Array, " p"]) -> PyTree:
@@ -147,8 +148,10 @@ def _with_named_integers(
     picked = params if where is None else pick(where, params)
     if not any(map(_is_integer, jax.tree.leaves(picked))):
         return params
+    # A pytree as mean or variance has an entry for each integer that is unknown.
     means = [getattr(prior, name, None) for name in ("mean", "variance")]
     structure = jax.tree.structure(picked)
+    # A single parameter has the structure of a number, so a prior cannot name it.
     named_by_prior = structure.num_nodes > 1 and structure in map(jax.tree.structure, means)
     if named_by_prior or (where is not None and _is_plain(picked)):
         floats = jax.tree.map(lambda leaf: _as_float(leaf) if _is_integer(leaf) else leaf, picked)
@@ -164,6 +167,7 @@ def _with_named_integers(
             f"the integers {', '.join(f'`{name}`' for name in names)} among `params` are held "
             "fixed: pass floats (1.0 instead of 1) to infer them, or select the unknown "
             "parameters by `where=`.",
+            # Points at the caller of the public function.
             stacklevel=5,
         )
     return params
@@ -176,6 +180,7 @@ def pick(where: Callable[[PyTree], PyTree], params: PyTree) -> PyTree:
     """
     picked = evaluated("where", where, params)
     try:
+        # `tree_at` fails unless `where` returns distinct nodes of `params`.
         eqx.tree_at(where, params, picked)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(

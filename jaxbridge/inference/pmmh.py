@@ -188,10 +188,10 @@ class PMMHPosterior(AbstractPosterior):
         often = jnp.any(share > _MOST_TRUNCATED)
         in_part = ~noisy & ~jnp.all(self.variance_in_part < _MOST_VARIANCE)
         refused, lost = refused_moves(self.accepted), self.share_lost
-        hampered = noisy | in_part | refused.present | jnp.any(self.stuck)
+        mixes_poorly = noisy | in_part | refused.present | jnp.any(self.stuck)
         return (
             refused,
-            *(() if self.guide is None else (self.guide.fault(hampered),)),
+            *(() if self.guide is None else (self.guide.fault(mixes_poorly),)),
             Fault(noisy, _NOISY),
             Fault(in_part, _NOISY_IN_PART),
             Fault(often, _TRUNCATED),
@@ -457,9 +457,11 @@ class _Sampler(eqx.Module):
         estimate = self.estimate(estimate_key, proposed)
         new = jnp.where(inside, estimate.log_likelihood + self.log_prior(proposed), -jnp.inf)
         rate = acceptance_rate(state.log_likelihood + self.log_prior(state.theta), new)
+        # A comparison with NaN is false, so a NaN rate rejects.
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
         root = adapt_covariance(state.root, noise, rate, number, learning)
         candidate = _Chain(proposed, *estimate[:3], root)
+        # Outside the constraint no estimate was needed.
         without = inside & (estimate.log_likelihood == -jnp.inf)
         chain = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), candidate, state)
         count = lambda which: which.astype(jnp.int32)
@@ -498,6 +500,7 @@ def _run(
             return run, sampler
         near = sampler
         if guide is not None:
+            # Named keys do not collide with the numbered keys of the iterations.
             pilot_key = jax.random.fold_in(key_for("pilots", key), run.num_done)
             near = sampler.near(pilot_key, run.chain)
             if finds_root:
@@ -524,6 +527,7 @@ def _run(
         def iterate(run, i):
             step = lambda key, chain: near.step(key, chain, i + 1, i < num_warmup)
             number = run.num_done + 1
+            # Numbered keys, so that a continued chain uses the subsequent random numbers.
             chain, info = over_chains(step, jax.random.fold_in(key, number), run.chain)
             counted = jax.tree.map(lambda so_far, one: so_far + one, run.counted, info)
             return _Run(chain, run.guide, number, counted), info.accepted
@@ -532,6 +536,7 @@ def _run(
         held = run.chain._replace(root=None, log_step_error=log_step_error(near, i, run))
         return run, (held, jnp.any(accepted > 0, axis=0))
 
+    # Only the warm-up of new chains with guides has stages.
     to_guide = skipped if fresh and guide is not None else 0
     bounds = stages(to_guide, skipped + num_iterations)
     run, draws = metered_stages(begin, draw, state, bounds, num_iterations, progress_meter)
@@ -543,6 +548,7 @@ def _run(
         **fields,
         log_likelihood=log_likelihood,
         log_likelihood_variance=jnp.median(held.variance, axis=0),
+        # No interpolation: between infinite variances it gives NaN.
         variance_in_part=jnp.quantile(held.variance, 0.9, axis=0, method="lower"),
         log_step_error=log_step_errors,
         sigma_varies=sampler.parameters.model.sigma_varies(sampler.likelihood.like),

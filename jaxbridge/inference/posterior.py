@@ -133,6 +133,7 @@ class AbstractPosterior(AbstractResult):
         many steps may be too large by a factor of two or three.
         """
         value, noise = self._step_error
+        # The estimate may be too large by its own size.
         return jnp.hypot(noise, value) if self.sigma_varies else noise
 
     @property
@@ -193,6 +194,7 @@ class AbstractPosterior(AbstractResult):
             for path, leaf in leaves
             if eqx.is_array(leaf)
         }
+        # Version 1 changed the arguments of `from_dict`.
         if int(arviz.__version__.split(".")[0]) >= 1:
             return arviz.from_dict({"posterior": posterior})
         return arviz.from_dict(posterior=posterior)
@@ -298,6 +300,7 @@ def thinned_step_errors(
     every = max(1, num_draws // _STEP_ERRORS)
     shape = jax.eval_shape(function, state)
     is_selected = (number >= 0) & (number % every == every - 1)
+    # `cond` computes the function for the selected draws only.
     return lax.cond(is_selected, function, lambda _: jnp.full_like(shape, jnp.nan), state)
 
 
@@ -317,6 +320,7 @@ def posterior_fields(
     full = eqx.filter_vmap(parameters.full)  # parameters may contain objects that are no arrays
     if theta.ndim == 3:
         full = eqx.filter_vmap(full)
+        # Loops put draws before chains.
         theta, values = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (theta, values))
     return {"params": full(theta), "theta": theta, "names": parameters.names}, values
 

@@ -62,6 +62,7 @@ class GivenDensity(eqx.Module):
 
     def __init__(self, parameters: Parameters, function: Callable[[PyTree], Any]):
         self.parameters, self.function = parameters, function
+        # Keeps derivatives in traced values that the function closes over.
         self.captured = Captured(function)
 
     def __call__(self, theta: Float[Array, " p"]) -> Float[Array, ""]:
@@ -125,6 +126,7 @@ def _as_array(
     leaves, structure = jax.tree.flatten(parameters.params)
     like = list(filter(eqx.is_inexact_array, leaves))  # θ contains no other leaves
     if hasattr(value, "ndim"):
+        # A (p, p) variance is a covariance matrix, also if the parameter has this shape.
         is_matrix = name == "variance" and value.shape == (len(theta), len(theta))
         if len(like) == 1 and value.shape == like[0].shape and not is_matrix:
             value = jnp.ravel(value)

@@ -124,8 +124,8 @@ class RecordPosterior(AbstractPosterior):
     @property
     def _faults(self):
         refused = refused_moves(self.parameters_moved)
-        hampered = refused.present | jnp.any(self.stuck)
-        return refused, *(() if self.guide is None else (self.guide.fault(hampered),))
+        mixes_poorly = refused.present | jnp.any(self.stuck)
+        return refused, *(() if self.guide is None else (self.guide.fault(mixes_poorly),))
 
 
 class RecordSampler(eqx.Module):
@@ -157,6 +157,7 @@ class RecordSampler(eqx.Module):
         state, guides = guided
         theta, log_scales = state.theta, state.log_scales
         here = GuidedTheta(theta, guides)
+        # This move leaves the law of the path given θ invariant, whatever the guide.
         paths, blocks_moved = self.completion.renewed(path_key, here, state.paths, log_scales)
         noise, log_weight = self.completion.noise(noise_key, here, paths)
         step = jax.random.normal(walk_key, theta.shape, theta.dtype)
@@ -165,6 +166,7 @@ class RecordSampler(eqx.Module):
         inside = self.parameters.allowed(proposed)
         there = self.completion.at(jnp.where(inside, proposed, theta))
         new_paths, new_weight = self.completion.of_noise(there, noise)
+        # Given ξ the target is π(θ) w(θ, ξ): the density of ξ cancels.
         new = jnp.where(inside, new_weight + self.log_prior(there.theta), -jnp.inf)
         rate = acceptance_rate(
             nan_to_neg_inf(log_weight) + self.log_prior(theta), nan_to_neg_inf(new)
@@ -194,6 +196,7 @@ class RecordSampler(eqx.Module):
         (state, guides), completion = guided, self.completion
         noise, log_weight = completion.noise(key, GuidedTheta(state.theta, guides), state.paths)
         ratio = nan_to_neg_inf(completion.coarse_log_weight(state.theta, noise)) - log_weight
+        # A path without weight, such as a placeholder, has no ratio.
         ratio = jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
         return jnp.where(completion.steps_are_too_long(state.theta, state.paths), jnp.inf, ratio)
 
@@ -256,6 +259,7 @@ def _sample_records(
             return over_chains(sampler.start, jax.random.fold_in(key, 0), (state.theta, root))
 
         if fresh:
+            # Stages share one compiled loop, and only the first one creates paths.
             state = lax.cond(i == 0, first, lambda state: state, state)
         return GuidedState(state, _guides_of(completion, state.theta)), sampler
 

@@ -241,6 +241,7 @@ def _approximate(
         chains, _ = _sweep(sweep_key, completion, at, chains, i)
         read = lambda key, paths: completion.noise(key, at, paths)[0]
         noise = _of_chains(read, noise_key, chains.paths)
+        # Per observation, so that one learning rate suits records of all lengths.
         gradient = jax.grad(_mean_log_weight)(theta, completion, noise) / num_observed
         new = rule.ascend(theta, memory, gradient)
         burnt_in = i >= _SWEEPS
@@ -251,6 +252,7 @@ def _approximate(
         moves = parameters.allowed(new_theta) & all_finite_leaves(new_memory)
         goal = completion.at(jnp.where(moves, new_theta, theta))
         paths, log_weights = jax.vmap(lambda noise: completion.of_noise(goal, noise))(noise)
+        # Keep the old path where the new one has no weight.
         good = jnp.isfinite(log_weights)[:, None, None, None]
         chains = chains._replace(paths=jnp.where(good, paths, chains.paths))
         return (new_theta, new_memory), chains, (jnp.int32(0), jnp.int32(0))
@@ -332,6 +334,7 @@ def _draws_at(
 
     numbers = jnp.arange(_LEARNING + num_draws)
     (chains, h), draws = metered_scan(draw, start, numbers, progress_meter)
+    # Discard the draws that adapt h; put chains before draws.
     draws = jax.tree.map(lambda leaf: jnp.moveaxis(leaf[_LEARNING:], 0, 1), draws)
     return draws, chains, h
 
@@ -359,6 +362,7 @@ def _slope(draws: _Draw, h: Float[Array, " p"]) -> Slope:
         jnp.abs(jnp.log(_adapt_difference(h, jnp.diagonal(curvature)) / h)) < jnp.log(2.0)
     )
     size = effective_size_of_chains(draws.gradient)
+    # The geometric mean of both effective sample sizes stands in for that of a product.
     covariance = spread / jnp.sqrt(size[:, None] * size)
     information = jnp.where(is_adapted, curvature - spread, jnp.nan)
     return Slope(gradient, covariance, information, _rises(draws.rises))
@@ -375,6 +379,7 @@ def _rises(exponents: Float[Array, "chains n 2 p"]) -> Float[Array, "2 p"]:
     squares = jnp.where(finite, exponents - mean, 0) ** 2
     variance = jnp.sum(squares, axis=(0, 1)) / jnp.maximum(number, 1)
     largest = jnp.max(jnp.where(finite, exponents, -jnp.inf), axis=(0, 1))
+    # The log of a mean of exponentials never exceeds the largest exponent.
     return jnp.minimum(mean + variance / 2, largest)
 
 
@@ -391,6 +396,7 @@ def _summary(
         movable(completion.fine.records) & ~jnp.any(draws.taken, axis=1), axis=(1, 2, 3)
     )
     monte_carlo = jnp.sqrt(jnp.diagonal(noise))
+    # A block that never moved makes the draws, and so their spread, meaningless.
     monte_carlo = jnp.where(jnp.any(stuck), jnp.inf, monte_carlo)
     step_error = _step_error(completion, draws, covariance)
     return RecordMaximumLikelihood(

@@ -287,6 +287,7 @@ def likely_root(
         drop = values[0] - (values[1 : p + 1] + values[p + 1 :]) / 2
         # For a quadratic the drop is proportional to h², so at h / √(2 drop) it is ½.
         factor = jnp.clip(lax.rsqrt(2 * jnp.maximum(drop, 1e-3)), *_SECANT)
+        # Without weight at θ there is no drop to measure.
         factor = jnp.where(values[0] > -jnp.inf, factor, 1)
         return jnp.minimum(width * factor, 10 * jnp.diagonal(root)), values[0]
 
@@ -318,6 +319,7 @@ def _pair_noise(noise: Float[Array, "points d"], num_steps: int) -> Float[Array,
     The shape is that of the fine grid. The scaled sum of each pair is the noise of its second step;
     its first step has no length on that grid.
     """
+    # The first step of a segment with odd N has no partner and remains.
     odd = num_steps % 2
     segments = noise[1:].reshape(-1, num_steps, noise.shape[-1])
     first, second = segments[:, odd::2], segments[:, odd + 1 :: 2]

@@ -212,6 +212,7 @@ def scorer_at(
     """Return the estimator with proposals that are selected at θ."""
     model = problem.parameters.bind(theta)
     blocks = make_blocks(key, model, problem, proposal, budget, "means")
+    # The weights belong to the target of this form, so the score must use it, too.
     form = target_forms(blocks, model)[0]
     return Scorer(problem.parameters, blocks, form, num_bridges, progress_meter)
 
@@ -318,6 +319,7 @@ def _draw(
     """Sample n bridges of each interval of a block; `model` is prepared at θ."""
     parameters, form = scorer.parameters, scorer.form
     intervals, num_steps = block.intervals, block.num_steps
+    # D is hardly random for constant σ, so few paths suffice there.
     m = num_looked(n, model.sigma_varies(intervals.start[0]))
     keys = jax.random.split(key, (len(block.index), n))
     draws = block.proposal.draw(keys, model, intervals, num_steps, None, False)
@@ -334,6 +336,7 @@ def _draw(
         flat = paths[:, :m].reshape(-1, *paths.shape[2:])
         return block.log_halvings(parameters.bind(theta).prepared(), flat, form).reshape(-1, m)
 
+    # Forward mode: there are few parameters and many paths.
     gradient = jax.jacfwd(log_f)
     derivatives = (gradient(theta), jax.jacfwd(gradient)(theta))
     halvings = (log_halving(theta), jax.jacfwd(log_halving)(theta))
@@ -358,6 +361,7 @@ def _of_block(
     form = scorer.form
     num_intervals = len(block.index)
     at_once = min(num_bridges, max(1, _PATHS // num_intervals))
+    # Batches bound the memory for paths.
     num_batches = -(-num_bridges // at_once)
 
     def batch(_, i):
@@ -388,6 +392,7 @@ def _of_block(
     factor = jnp.where(squares < 1, 1 - squares, 1)[:, None, None]
     spread = jnp.sum(weights[..., None, None] * products, axis=1) / factor
     covariance = jnp.sum(weights[..., None, None] ** 2 * products, axis=1)
+    # Louis: mean of the negative Hessian minus the variance of the gradient.
     information = -jnp.sum(weights[..., None, None] * H, axis=1) - spread
     return _Sums(
         jnp.sum(mean, axis=0),
@@ -412,6 +417,7 @@ def _rises(
 
     The largest exponent of each interval is factored out, against overflow.
     """
+    # One weight serves all points around θ.
     weights = align_axes(weights, exponents)
     used = (weights > 0) & (exponents < jnp.inf)
     largest = jnp.max(jnp.where(used, exponents, -jnp.inf), axis=1, keepdims=True)

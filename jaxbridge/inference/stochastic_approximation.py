@@ -51,12 +51,14 @@ class Gradient(eqx.Module):
 
         `gradient` is that of the mean log-likelihood per interval.
         """
+        # Optimisers of optax minimise, hence the sign.
         updates, memory = self.optimizer.update(-gradient, memory, theta)
         return theta + jnp.asarray(updates), memory
 
     def update(
         self, i: Int[Array, ""], theta: Float[Array, " p"], memory: PyTree, data: CompleteData
     ) -> tuple[Float[Array, " p"], PyTree]:
+        # Per interval, so that one learning rate suits data of all sizes.
         gradient = jax.grad(data.log_likelihood)(theta) / data.augmentation.num_intervals
         return self.ascend(theta, memory, gradient)
 
@@ -76,6 +78,7 @@ class EM(eqx.Module):
         gradient = jax.grad(data.log_likelihood)(theta)
         P = data.information(theta)
         expansion = gradient + P @ theta, P  # c and P of cᵀθ - ½ θᵀPθ
+        # Weights 2 / i give an average over about the second half of the iterations.
         gain = jnp.minimum(1.0, 2.0 / (i + 1).astype(theta.dtype))
         memory = jax.tree.map(lambda old, new: old + gain * (new - old), memory, expansion)
         c, P = memory
@@ -109,6 +112,7 @@ def approximate(
         updated = search.rule.update(i, theta, memory, data)
         return updated, paths, (bridges.missing, bridges.truncated)
 
+    # Placeholders are allowed: the first iterations replace them.
     first, _ = augmentation.first(first_key, parameters.bind(theta))
     iterates, _, info = iterate(propose, parameters, search, theta, first)
     return iterates, info
