@@ -799,8 +799,10 @@ PATHS = jb.RecordState(jnp.ones(1), None, None, None, 0)
 going_on = functools.partial(pmmh, init=CHAIN)
 
 UNUSED = [
-    *each("initial", lambda call: call(**INITIAL), [gibbs, pmmh, maximum], "`initial`: for rec"),
-    ("num_warmup", gibbs(num_warmup=3), "`num_warmup`: for records"),
+    *each(
+        "initial", lambda call: call(**INITIAL), [gibbs, pmmh, maximum], "`initial`: only for rec"
+    ),
+    ("num_warmup", gibbs(num_warmup=3), "`num_warmup`: only for records"),
     *(
         (name, exactly_seen(**{name: value}), f"without an `observation` .*leave out .*`{name}`")
         for name, value in [

@@ -106,7 +106,10 @@ class Parameters(eqx.Module):
         if not is_traced(ok) and not np.all(np.asarray(ok)):
             row = theta.reshape(-1, theta.shape[-1])[int(np.argmin(ok))]
             why = "are not finite" if self.constraint is None else "do not satisfy `constraint`"
-            raise ValueError(f"the start parameters {self.select(row)} {why}.")
+            raise ValueError(
+                f"the start parameters {self.select(row)} {why}: pass valid ones as `init`, or as "
+                "`params` of the model."
+            )
 
 
 @compiled_sooner
@@ -268,6 +271,6 @@ def init_vectors(
         return jax.vmap(parameters.vector)(init)
     raise ValueError(
         f"`init` must have leaves of the shapes of the unknown parameters, {[s for _, s in shapes]}"
-        f", with a leading axis of {chains[0] if chains else 'no'} chains if they differ; got "
+        f"{f', or with a leading axis of {chains[0]} chains' if chains else ''}; got "
         f"{[s for s, _ in shapes]}."
     )

@@ -190,8 +190,8 @@ def check_no_bridges(**arguments: Any) -> None:
     ]
     if names:
         raise ValueError(
-            f"{' and '.join(f'`{name}`' for name in names)}: for complete observations without "
-            "noise. Omit this argument, or omit `observation`."
+            f"{' and '.join(f'`{name}`' for name in names)}: only for complete observations "
+            "without noise. Omit this argument, or omit `observation`."
         )
 
 
@@ -200,8 +200,8 @@ def check_no_record(**arguments: Any) -> None:
     names = [f"`{name}`" for name, value in arguments.items() if value is not None]
     if names:
         raise ValueError(
-            f"{' and '.join(names)}: for records with an `observation`. Pass one, for instance "
-            "`observation=jb.LinearGaussian(covariance=0.01)`, or omit this argument."
+            f"{' and '.join(names)}: only for records with an `observation`. Pass one, for "
+            "instance `observation=jb.LinearGaussian(covariance=0.01)`, or omit this argument."
         )
 
 
