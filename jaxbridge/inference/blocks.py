@@ -86,9 +86,10 @@ class Block(eqx.Module):
         return log_halving_of_paths(density_of_form(form), dynamics, steps, paths)
 
     def step_shares(self, model: Diffusion, form: Form) -> Float[Array, " I"]:
-        """Return the discretisation error as a share of the change by half as many steps.
+        """Return the discretisation error of each interval, as a fraction of a change.
 
-        It is the larger one of the shares of the bridges and of this form, for each interval.
+        The change is that from half as many steps. The fraction is the larger one of those for the
+        bridges and for this form of the likelihood.
         """
         share = share_of_order(density_of_form(form).order)
         return jnp.maximum(guessed(self.proposal.step_share(model, self.intervals)), share)

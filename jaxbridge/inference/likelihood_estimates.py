@@ -284,8 +284,8 @@ class RecordLikelihood(AbstractLikelihood):
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         """Estimate log p with one filter of each record.
 
-        Return the estimate, its variance, and the mass that lost particles may be missing: their
-        number divided by the number of particles.
+        Return the estimate, its variance, and the mass that may be missing: the number of lost
+        particles divided by that of all particles of a filter.
         """
         filtered = self._filtered(key, model, grid, self.rate, 1, skips)
         # Records are independent, so variances add.

@@ -14,8 +14,8 @@ Neither the law of the path given θ nor that of θ given ξ depends on the guid
 replaces it (`warm_up`).
 
 The discretisation error of the likelihood follows from E[w̃ / w] (`record_paths`). The function
-`relative_change` of D = log w̃ / w replaces e^D. If half as many steps are too few
-for the drift, a path may diverge; then its w̃ is zero.
+`relative_change` of D = log w̃ / w replaces e^D. If half as many steps are too few for the drift, a
+path may diverge; then its w̃ is zero.
 """
 
 from typing import NamedTuple

@@ -342,7 +342,7 @@ def _draws_at(
 def _adapt_difference(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> Float[Array, " p"]:
     """Return the h for this curvature, changed by at most a factor of 8.
 
-    Where the curvature is not finite, h is divided by 8.
+    If the curvature is zero or NaN, h is divided by 8.
     """
     target = _DIFFERENCE * lax.rsqrt(jnp.abs(curvature))
     return jnp.where(jnp.isfinite(target), jnp.clip(target, h / 8, h * 8), h / 8)

@@ -211,7 +211,7 @@ def movable(records: Records) -> Bool[Array, "R 2 B"]:
 
 
 def share_of_step_error(records: Records) -> float:
-    """Return the discretisation error as a share of the change by half as many steps."""
+    """Return the discretisation error as a fraction of the change from half as many steps."""
     return share_of_grid(records.stacked.density.order, records.stacked.num_steps)
 
 

@@ -290,7 +290,8 @@ class _Bridges(NamedTuple):
     """Weighted bridges, n for each interval.
 
     - `log_weights`, `truncated`: log weights, and whether `max_trials` truncated them.
-    - `num_simulated`, `num_nonfinite`: numbers of simulated and of lost paths for each bridge.
+    - `num_simulated`, `num_nonfinite`: numbers of simulated paths for each bridge, and of those
+      that diverged or left the state space.
     - `gradient`, `hessian`: derivatives in θ of the log density of the path.
     - `log_halving`, `slope`: D of `halving` for the first m bridges, and its gradient.
     - `rises`: log density of the path at points around θ minus that at θ.

@@ -309,7 +309,7 @@ def _of_block(
 
 
 class _Ascent(NamedTuple):
-    """State of the ascent: the best point so far, the step from it, and the next fraction of it."""
+    """State of the ascent: the best point so far, the step from it, and the next trial fraction."""
 
     i: Int[Array, ""]
     theta: Float[Array, " p"]
