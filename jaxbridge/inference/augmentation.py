@@ -80,9 +80,9 @@ class Augmentation(eqx.Module):
             )
         for block, array in zip(self.blocks, paths, strict=True):
             ends = (block.intervals.start, block.intervals.end)
-            for end, last in zip(ends, (array[..., 0, :], array[..., -1, :]), strict=True):
+            for end, point in zip(ends, (array[..., 0, :], array[..., -1, :]), strict=True):
                 # Traced ends cannot be compared. Ends may differ from the observations by rounding.
-                if not is_traced(end, last) and not np.allclose(last, end, atol=1e-6, rtol=1e-4):
+                if not is_traced(end, point) and not np.allclose(point, end, atol=1e-6, rtol=1e-4):
                     raise ValueError(
                         "`init` is a state whose paths do not join these observations: pass the "
                         "same observations as before, or unknown parameters as `init`."
