@@ -69,7 +69,9 @@ _MOST_COLUMNS = 16
 
 
 def matmul(left: Float[Array, "n k"], right: Float[Array, "k m"]) -> Float[Array, "n m"]:
-    """Compute `left @ right` as a sum of outer products."""
+    """Compute `left @ right`, as a sum of outer products if there are at most 16."""
+    if left.shape[1] > _MOST_COLUMNS:
+        return left @ right
     return _sum([left[:, j : j + 1] * right[j] for j in range(left.shape[1])])
 
 

@@ -125,12 +125,10 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         # A density that is not normal was selected for weights and is unusable for paths.
         if self.density is not None and (for_density or self.density.is_normal):
             return self
-        return self._with_density(
-            most_accurate_density(model.sigma_varies(like), True, for_density)
-        )
+        return self._with_density(most_accurate_density(model, like, for_density))
 
     def most_accurate(self, model, like, for_density=False):
-        density = most_accurate_density(model.sigma_varies(like), True, for_density)
+        density = most_accurate_density(model, like, for_density)
         if self.density is not None and self.density.order >= density.order:
             return self
         return self._with_density(density)

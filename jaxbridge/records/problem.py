@@ -137,8 +137,7 @@ def problem_of(
     check_clock(model, observation, record)
     density = check_step_density(density)
     if density is None:
-        about_sigma = model.sigma_varies(like), model.sigma_is_invertible(like)
-        density = most_accurate_density(*about_sigma, for_weights)
+        density = most_accurate_density(model, like, for_weights)
     return RecordProblem(model, record, observation, initial, density, dim)
 
 

@@ -49,6 +49,7 @@ from jaxtyping import Array, Float
 
 from ..engine.lanes import compute_once
 from ..engine.linalg import matmul, semidefinite_factor, sum_first_axis
+from ..models.diffusion import Diffusion
 from ..models.dynamics import Dynamics
 from ..models.sigma import columns_of, covariance_of
 from .step_law import DegenerateLaw, StepLaw, root_of_length
@@ -317,17 +318,23 @@ def check_step_density(density: AbstractStepDensity | None) -> AbstractStepDensi
 
 
 def most_accurate_density(
-    sigma_varies: bool, invertible: bool = True, for_weights: bool = False
+    model: Diffusion, like: Float[Array, " d"], for_weights: bool = False
 ) -> AbstractStepDensity:
-    """Return the most accurate step density of a model.
+    """Return the most accurate step density of a model, for points like `like`.
 
     `for_weights` states that only weights are needed. Then the steps need not be normal.
     """
-    if not sigma_varies:
+    if not model.sigma_varies(like):
         return ItoTaylorDensity()
-    if invertible:
-        return QuadraticDensity() if for_weights else EulerDensity()
-    return HypoellipticDensity()
+    if not model.sigma_is_invertible(like):
+        return HypoellipticDensity()
+    is_small = like.shape[0] <= _LARGEST_QUADRATIC
+    return QuadraticDensity() if for_weights and is_small else EulerDensity()
+
+
+# Quadratic steps take time and memory of order d⁴ and d³. Up to so many dimensions their accuracy
+# is worth that.
+_LARGEST_QUADRATIC = 10
 
 
 def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:

@@ -12,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 import jaxbridge as jb
 from jaxbridge.models.linear import linear_transition
-from jaxbridge.schemes import QuadraticDensity
+from jaxbridge.schemes import QuadraticDensity, most_accurate_density
 
 DENSITIES = {"euler": jb.EulerDensity(), "ito_taylor": jb.ItoTaylorDensity()}
 J = np.array([[0.0, 1.0], [-1.0, 0.0]])
@@ -444,3 +444,11 @@ def test_quadratic_steps_depend_on_the_covariance_only(x64):
     )
     for name in ("mean", "covariance", "curvature"):
         np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), atol=1e-12)
+
+
+def test_quadratic_steps_are_for_weights_in_few_dimensions():
+    """Memory grows as d³ and time as d⁴; and paths need steps with an inverse."""
+    for d, for_weights, expected in [(10, True, True), (11, True, False), (10, False, False)]:
+        model, like = jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + x**2), jnp.zeros(d)
+        density = most_accurate_density(model, like, for_weights)
+        assert isinstance(density, QuadraticDensity if expected else jb.EulerDensity)
