@@ -631,7 +631,7 @@ TUNING = [
     (
         "no ν",
         fit(BLIND, *POINT, for_density=True),
-        "need the stationary density, with any start law",
+        "need the stationary density, whatever the start law",
     ),
     ("constant", choose_pairs(for_density=True), "in proportion to exp of `log_stationary`"),
     (

@@ -256,10 +256,11 @@ def _propose_numbered(
     meeting_step: Int[Array, " lanes"] | None = None,
     time_scale: Float[Array, " lanes"] | float = 1.0,
 ) -> Proposals:
-    """Return the proposals with these numbers, of these intervals.
+    """Return one proposal in each lane: the one with this `number` among those of this `interval`.
 
-    The result depends on nothing else, unless `meeting_step` asks for a replay. `time_scale`
-    multiplies the durations.
+    Its random numbers depend only on the key of the interval and on `number`. So the same call
+    reproduces a proposal. With `meeting_step` the pair is joined at that step, and the meeting rule
+    is ignored (see `propose`). `time_scale` multiplies the durations.
     """
     start, end, duration = inputs.intervals
     lanes = Intervals(start[interval].T, end[interval].T, duration[interval] * time_scale)

@@ -153,8 +153,11 @@ class Coupling(AbstractCoupling):
         return eqx.tree_at(lambda c: c.gamma, self, _in_range(gamma.astype(self.gamma.dtype)))
 
     def _couple(self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None):
-        """Return {I - (1-γ)Π} w + √(1-γ²) u ΔU. The map is symmetric, so it serves both
-        directions."""
+        """Return {I - (1-γ) Π} ΔW + √(1-γ²) u ΔU, where Π = u uᵀ projects onto the unit vector u.
+
+        The joint law of both noises is symmetric. So the same map gives the driven noise from the
+        driving noise, and the driving from the driven.
+        """
         # Only the component along u changes.
         along_u = -(1 - self.gamma) * dot(frame.u, dw)
         if du is not None:

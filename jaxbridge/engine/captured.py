@@ -235,7 +235,7 @@ def call_with_captured(fn: Callable, args: tuple, kwargs: dict[str, Any]) -> Any
             except _UnknownTracers as unknown:
                 context.add(unknown.function, unknown.tracers)
     raise TypeError(
-        "A function of the model, the observation model or the prior closes over a traced value "
-        "that cannot be followed; its derivative would be wrong. Pass this value through "
-        "`params` instead."
+        "A function of the model, the observation model or the prior closes over traced values "
+        "that could not be passed to the compiled program, so derivatives with respect to them "
+        "would be wrong. Pass these values through `params` instead."
     )

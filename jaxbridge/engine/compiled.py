@@ -37,7 +37,10 @@ _LESS_MEMORY = (
 
 
 def compiled(fn: Callable) -> Callable:
-    """Compile `fn` once for each structure of its arguments; arrays in the arguments are traced."""
+    """Compile `fn`; arrays in the arguments are traced, all other values are static.
+
+    It is compiled again for arguments of new structure, shapes, dtypes or static values.
+    """
     return _compiled(fn, lambda *_, **__: False)
 
 

@@ -25,7 +25,10 @@ _Result = TypeVar("_Result")
 
 
 def public_entry(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Decorate a public function: as `disable_guards`, and pass captured values as arguments."""
+    """Decorate a public function: apply `disable_guards`, and pass captured values as arguments.
+
+    Captured values are traced values that user functions close over (`captured`).
+    """
 
     @disable_guards
     @functools.wraps(fn)

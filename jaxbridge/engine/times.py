@@ -30,7 +30,10 @@ class Clock(NamedTuple):
     origin: Float[Array, "2"]
 
     def __call__(self, since: Float[Array, "*n"]) -> Float[Array, "*n"]:
-        """Return the caller's times, rounded once, for times since the origin."""
+        """Convert times since the origin to the caller's times.
+
+        Only the final sum has a rounding error that matters.
+        """
         return self.origin[0] + (self.origin[1] + since)
 
     def exactly(self, since: Float[Array, " n"]) -> Float[Array | np.ndarray, " n"]:

@@ -178,10 +178,10 @@ def throw_where_untrustworthy(result: _Result, field: str, model: PyTree) -> _Re
 def missing_bridges(
     missing: Bool[Array, "*I"], coupled: bool = True, argument: str = "max_proposals"
 ) -> Fault:
-    """Return the fault of missing bridges.
+    """Return the `Fault` that reports missing bridges, present where `missing` is true.
 
-    If `coupled`, pairs did not meet within the number of proposals that `argument` sets; otherwise
-    paths failed.
+    Its sentence states the cause. If `coupled`, no pair met within the number of proposals that
+    `argument` sets; otherwise paths failed.
     """
     return Fault(missing, _MISSING.format(argument=argument) if coupled else _FAILED)
 

@@ -235,7 +235,8 @@ class Problem(NamedTuple):
         self.parameters.model.check_invertible_sigma(self.like)
         if self.sigma_is_unknown:
             raise ValueError(
-                "σ depends on the unknown parameters, but a complete path determines σ: " + instead
+                "σ depends on the unknown parameters. This method uses the likelihood of complete "
+                "paths, which determine σ: " + instead
             )
 
 

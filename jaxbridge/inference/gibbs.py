@@ -258,9 +258,7 @@ def gibbs(
     for_records = {"initial": initial, "initial_time": initial_time}
     check_no_record(num_warmup=num_warmup, covariance=covariance, **for_records)
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
-    problem.check_sigma_known(
-        "use `pmmh`, which needs no path, or select other parameters by `where=`."
-    )
+    problem.check_sigma_known("use `pmmh`, which does not, or select other parameters by `where=`.")
     check_kernel(parameter_kernel)
     log_prior = as_log_prior(prior, parameters, problem.theta)
     theta, state = starting_points(

@@ -133,9 +133,11 @@ class AbstractLikelihood(eqx.Module):
         theta: Float[Array, " p"],
         root: Float[Array, "p p"],
     ) -> Float[Array, "p p"]:
-        """Return S of first moves from θ with the width of the likelihood.
+        """Return a root S of the covariance S Sᵀ of the first proposals from θ.
 
-        If this needs random numbers, return `root`. The sampler calls it if there is a `guide`.
+        Each parameter moves by about the width of its posterior given the other parameters. `root`
+        is the default S. It is returned if the likelihood cannot be evaluated without random
+        numbers. The sampler calls this method only if there is a `guide`.
         """
 
     @property

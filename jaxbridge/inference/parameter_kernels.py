@@ -93,7 +93,7 @@ class AbstractParameterKernel(eqx.Module):
     def step(
         self, key: Key[Array, ""], theta: Float[Array, " p"], data: CompleteData
     ) -> ParameterStep:
-        """Return the result of one step from θ."""
+        """Run one step of the kernel from θ; return the new θ and whether it moved."""
 
 
 class NormalDraw(AbstractParameterKernel):

@@ -243,8 +243,8 @@ def starting_points(
             )
         if theta.shape[:-1] != chains and num_chains is not None:
             raise ValueError(
-                f"`init` is a state of chains {theta.shape[:-1]}, but `num_chains` is "
-                f"{num_chains}: omit `num_chains`."
+                f"`init` is the state of chains of shape {theta.shape[:-1]}, but `num_chains` is "
+                f"{num_chains}: omit `num_chains` to continue all chains of the state."
             )
     elif init is not None:
         theta = init_vectors(parameters, init, chains).astype(theta.dtype)
@@ -266,7 +266,8 @@ def check_covariance_is_used(covariance: Any, state: Any) -> None:
     """Raise `ValueError` for a `covariance` together with a state to continue."""
     if state is not None and covariance is not None:
         raise ValueError(
-            "`covariance` is for a new start: omit it, because a state as `init` has its own."
+            "`covariance` is for a new start, but `init` is the state of earlier chains, which "
+            "contains their covariance. Omit `covariance`."
         )
 
 

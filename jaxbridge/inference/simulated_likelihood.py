@@ -166,8 +166,9 @@ def _log_weights(
 ) -> tuple[Float[Array, "I n"], Bool[Array, "I n"], Int[Array, "I n"]]:
     """Return log w at θ of paths with fixed noise, masks of active paths, and counts of lost ones.
 
-    A path is inactive if it diverged, left the state space, or has a negligible weight: when a path
-    nearly overflows, its derivatives do overflow. Its log w is replaced by zero.
+    A path is inactive if it diverged, left the state space, or has a negligible weight. A path with
+    negligible weight is left out because it may be close to overflow, and its derivatives then
+    overflow. The log w of an inactive path is replaced by zero.
     """
     keys = jax.random.split(key, (block.intervals.start.shape[0], num_paths))
     no_points = jnp.zeros(0, jnp.int32)  # return no point of the paths

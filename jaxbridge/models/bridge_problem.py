@@ -162,8 +162,8 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
     shortest = 2**30 * float(jnp.finfo(dtype).tiny)
     if not is_traced(duration) and np.any(np.asarray(duration) < shortest):
         raise ValueError(
-            f"`duration` = {duration} is too short for steps of type {dtype}: choose a smaller "
-            "unit of time."
+            f"`duration` = {duration} is too short: in {dtype} it must be at least "
+            f"{shortest:.2g}. Choose a smaller unit of time."
         )
     num_intervals = max(lengths, default=1)
     d = points["start"].shape[-1]

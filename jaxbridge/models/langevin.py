@@ -136,7 +136,10 @@ def _positive_number(temperature: Numbers) -> float:
 
 @dataclasses.dataclass(frozen=True)
 class _StationaryDrift:
-    """Drift ½ ν⁻¹ div(ν (V + `sign` Q)): `sign` is 1, or -1 for the time reversal."""
+    """Drift ½ ν⁻¹ div(ν (V + `sign` Q)) of `stationary_diffusion`.
+
+    `sign` is 1, or -1 for the time reversal.
+    """
 
     log_density: Callable
     V: Callable | None

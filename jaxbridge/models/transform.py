@@ -65,8 +65,8 @@ class Transformed(eqx.Module):
         paths = getattr(bridges, "paths", None)
         if paths is None:
             raise TypeError(
-                "`bridges` must be a result of `sample_bridges`, `sample_weighted_bridges` or "
-                f"`sample_exact_bridges`; got {type(bridges).__name__}."
+                "`bridges` must be a result of `sample_bridges`, `sample_weighted_bridges`, "
+                f"`weigh_bridges` or `sample_exact_bridges`; got {type(bridges).__name__}."
             )
         inverse = lambda y: value_at("inverse", self.inverse, y.shape, y)
         mapped = jax.vmap(inverse)(_rows(paths))

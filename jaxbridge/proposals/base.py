@@ -53,11 +53,15 @@ class WeightedPaths(NamedTuple):
     def step_error(
         self, share: Float[Array, " I"], num_steps: int, sigma_varies: bool, held: bool = False
     ) -> StepError:
-        """Return the step error of log p̂, with p̂ the mean of the weights.
+        """Return the discretisation error of log p̂, where p̂ is the mean of the weights.
 
         For a state-dependent σ it needs `log_coarse`, which is only available if no points of the
-        paths are stored. `share` is the result of `step_share`. `held` states that a
-        pseudo-marginal chain keeps these weights, so that their law is tilted by p̂.
+        paths are stored.
+
+        - `share`: the result of `step_share`.
+        - `held`: whether the weights belong to the current state of a pseudo-marginal chain. The
+            chain prefers states with a large p̂, so the density of such weights is the usual one
+            times p̂, up to a constant.
         """
         # For constant σ, D varies little, so e^D compares the two grids more precisely.
         if not sigma_varies:

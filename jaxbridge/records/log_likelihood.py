@@ -327,7 +327,7 @@ def _mean_of_filters(
 
 
 def _guides_and_checks(records: Records) -> tuple[Guidance, GuideCheck]:
-    """Return the guide of each record and its check, at the parameters of the model."""
+    """Return the guide of each record and its diagnostics, at the parameters of the model."""
     return records.each(lambda problem: linearised(problem, problem.model)[1:])
 
 

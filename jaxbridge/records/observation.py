@@ -121,7 +121,10 @@ class LinearGaussian(eqx.Module):
         return self.matrix.astype(dtype)
 
     def check(self, m: int, like: Array, time: Float[Array, ""], params: PyTree) -> None:
-        """Raise `ValueError` if observations of m components of a state do not fit."""
+        """Raise `ValueError` if this model does not fit observations of m components.
+
+        `like` is a point of the state space, and `time` the time of an observation.
+        """
         (d,) = like.shape
         rows = d if self.matrix is None else self.matrix.shape[0]
         if self.matrix is not None and self.matrix.shape[1] != d:
@@ -221,7 +224,10 @@ class ObservationDensity(eqx.Module):
         return takes_time(self._log_density, 3) or self.guess.depends_on_time
 
     def check(self, m: int, like: Array, time: Float[Array, ""], params: PyTree) -> None:
-        """Raise `ValueError` if observations of m components of a state do not fit."""
+        """Raise `ValueError` if the guess does not fit observations of m components.
+
+        `like` is a point of the state space, and `time` the time of an observation.
+        """
         self.guess.check(m, like, time, params)
         _check_positive(self.guess.covariance_for(params, m, time))
 

@@ -8,7 +8,7 @@ from .observation import Scalars
 
 
 def flat(tree: PyTree) -> PyTree:
-    """Merge the axes (K, N) of segments and steps into one axis of steps."""
+    """Merge the first two axes, (K, N) of segments and their steps, into one axis of K N steps."""
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), tree)
 
 

@@ -44,7 +44,10 @@ class StepLaw(NamedTuple):
 
     @property
     def matrix(self) -> Float[Array, "d d"]:
-        """S as a matrix of shape (d, d), also if `covariance` is a scalar."""
+        """Covariance S in noise coordinates as a matrix, shape (d, d).
+
+        `covariance` may instead be a scalar.
+        """
         S, d = self.covariance, self.mean.shape[0]
         return S * jnp.eye(d, dtype=self.mean.dtype) if S.ndim == 0 else S
 

@@ -131,7 +131,7 @@ def _is_tuning_worthwhile(choice: Choice) -> bool:
 def _tuned_coupling(
     key: Key[Array, ""], model: Diffusion, problem: BridgeProblem, for_density: bool
 ) -> Coupling | None:
-    """Return the most efficient of two couplings with fitted start laws.
+    """Return the best coupling of pilot runs with γ = 0 and γ = ½, each with several start laws.
 
     Return `None` if no pilot run succeeded.
     """

@@ -214,9 +214,9 @@ def coupling_pilots(
     check_key(key)
     if for_density and not model.has_density:
         raise ValueError(
-            "transition densities by couplings need the stationary density, with any start law, "
-            "and this model has none: give `Diffusion` a `log_stationary` (up to a constant), or "
-            "use a guided proposal."
+            "transition densities by couplings need the stationary density, whatever the start "
+            "law, but this model has none. Pass `log_stationary` (up to a constant) to "
+            "`Diffusion`, or use a guided proposal."
         )
     if not isinstance(coupling, Coupling):
         raise TypeError(
