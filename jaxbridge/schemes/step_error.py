@@ -32,14 +32,14 @@ from ..engine.verdict import Fault
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 
-# Fewer effective paths than this, or than this share of those without e^D, tell nothing.
+# Fewer effective paths than this, or than this share of those without e^D, give no estimate.
 _FEWEST_EFFECTIVE, _LEAST_OVERLAP = 5, 0.1
 # In units of relaxation times. Steps that are twice as long are then unstable.
 _LONGEST_STEP = 1.0
 # A smaller step error, in log p or in standard deviations, does not matter to users.
 _MATTERS = 0.05
-# What rounding adds to log p is no matter below this.
-_FELT = 1e-3
+# A smaller rounding error of log p does not matter.
+_LEAST_ROUNDING = 1e-3
 _SHORTER = "Use more steps (`num_steps`, or a smaller `step_size`)."
 _FOR_COUPLINGS = " For stiff drift use the scheme `SemiImplicit()` of the coupling."
 _TOO_LARGE = (
@@ -75,8 +75,11 @@ _TOO_UNCERTAIN = (
 
 
 class StepError(NamedTuple):
-    """An estimate's error by its steps, with a standard error of that; not a number where nothing
-    is known."""
+    """Discretisation error of an estimate.
+
+    - `value`: the estimated error, NaN if it is unknown.
+    - `uncertainty`: its standard error.
+    """
 
     value: Inexact[Array, "..."]
     uncertainty: Inexact[Array, "..."]
@@ -88,20 +91,23 @@ def error_of_log_mean(
     share: Float[Array, "*I"],
     held: bool = False,
 ) -> StepError:
-    """Of the log of the mean of the weights; `held` if a pseudo-marginal chain holds on to them,
-    for then their law is tilted by that mean."""
-    weights, known = _known(log_weights, log_halving)
-    D = jnp.where(known, log_halving, 0)
+    """Estimate the step error of the log of the mean of the weights.
+
+    `held` states that the weights are the state of a pseudo-marginal chain. Their law is then
+    tilted by their mean.
+    """
+    weights, has_D = _known_weights(log_weights, log_halving)
+    D = jnp.where(has_D, log_halving, 0)
     largest = jnp.max(jnp.where(weights > 0, D, -jnp.inf), axis=-1, keepdims=True)
     largest = jnp.where(jnp.isfinite(largest), largest, 0)
     factors = jnp.where(weights > 0, jnp.exp(D - largest), 0)
     mean = jnp.sum(weights * factors, axis=-1)
-    some = mean > 0
-    ratio = jnp.where(some, mean, 1)
-    # Normalised before they are squared, for beside a large D the others are tiny.
+    is_positive = mean > 0
+    ratio = jnp.where(is_positive, mean, 1)
+    # Normalised before they are squared: relative to a large D the other factors are tiny.
     coarse = weights * factors / ratio[..., None]
     change = jnp.log(ratio) + largest[..., 0]
-    return _error_of_log_ratio(weights, coarse, share, change, some, held)
+    return _error_of_log_ratio(weights, coarse, share, change, is_positive, held)
 
 
 def error_of_coupled_grids(
@@ -111,33 +117,33 @@ def error_of_coupled_grids(
     num_steps: int,
     held: bool = False,
 ) -> StepError:
-    """Return the step error of the log of the mean of the weights, from weights of paths of half as
-    many steps with the same noise: NaN where there is none, -inf where that path was lost.
+    """Estimate the step error of the log of the mean of the weights, from coarse paths.
 
-    An odd step is left as it is: of first order errors the grids have N and 2N - 1 parts, so that
-    the change counts for N/(N - 1).
+    `log_coarse` are the log weights of paths of half as many steps with the same noise. They are
+    NaN for paths without a coarse path, and -inf for a lost coarse path. If N is odd, the last
+    step is the same on both grids, so the change is scaled by N/(N - 1).
     """
-    looked = ~jnp.isnan(log_coarse)
-    logs = [jnp.where(looked, log, -jnp.inf) for log in (log_weights, log_coarse)]
+    has_coarse = ~jnp.isnan(log_coarse)
+    logs = [jnp.where(has_coarse, log, -jnp.inf) for log in (log_weights, log_coarse)]
     weights, coarse = (normalise_weights(log) for log in logs)
     fine_sum, coarse_sum = (logsumexp(log, axis=-1) for log in logs)
-    some = jnp.isfinite(fine_sum) & jnp.isfinite(coarse_sum)
-    change = jnp.where(some, coarse_sum, 0) - jnp.where(some, fine_sum, 0)
+    is_known = jnp.isfinite(fine_sum) & jnp.isfinite(coarse_sum)
+    change = jnp.where(is_known, coarse_sum, 0) - jnp.where(is_known, fine_sum, 0)
     share = share * num_steps / max(num_steps - num_steps % 2, 1)
-    return _error_of_log_ratio(weights, coarse, share, change, some, held)
+    return _error_of_log_ratio(weights, coarse, share, change, is_known, held)
 
 
-def _error_of_log_ratio(weights, coarse, share, change, some, held):
-    """Return the error from the log of the ratio of two means, by their normalised weights."""
+def _error_of_log_ratio(weights, coarse, share, change, is_known, held):
+    """Return the step error from the log of the ratio of two means, by their normalised weights."""
     spread = jnp.sqrt(jnp.sum((coarse - weights) ** 2, axis=-1))
-    # The mean of the log of a mean is too small by half its relative variance, and here are two;
-    # under the law that the mean of the weights tilts, that of the log of their ratio by half its
-    # variance.
+    # The log of a mean is too small on average, by half its relative variance; there are two such
+    # logs. Under the law that is tilted by the mean, the log of the ratio is too small by half its
+    # own variance.
     fresh = jnp.sum(coarse**2, axis=-1) - jnp.sum(weights**2, axis=-1)
     overlap = _overlap(weights, coarse)
     bias = jnp.where(overlap, spread**2 if held else fresh, 0) / 2
     spread = jnp.where(overlap, spread, jnp.inf)
-    return _told(share, change + bias, spread, some)
+    return _scale(share, change + bias, spread, is_known)
 
 
 def error_of_mean(
@@ -147,57 +153,61 @@ def error_of_mean(
     values: Inexact[Array, "..."],
     coarse_values: Inexact[Array, "..."] | None = None,
 ) -> StepError:
-    """Of the weighted mean of these values, shape (*I, n, ...), entry by entry; half as many steps
-    may have values of their own."""
+    """Estimate the step error of the weighted mean of values, entry by entry.
+
+    `values` has shape (*I, n, ...). `coarse_values` are the values for half as many steps, by
+    default the same.
+    """
     coarse_values = values if coarse_values is None else coarse_values
-    weights, known = _known(log_weights, log_halving)
-    D = jnp.where(known, log_halving, -jnp.inf)
+    weights, has_D = _known_weights(log_weights, log_halving)
+    D = jnp.where(has_D, log_halving, -jnp.inf)
     coarse = normalise_weights(
         jnp.where(weights > 0, jnp.log(jnp.where(weights > 0, weights, 1)) + D, D)
     )
     axis = weights.ndim - 1
     fine_mean, coarse_mean = weighted_mean(weights, values), weighted_mean(coarse, coarse_values)
-    each = align_axes(coarse, values) * (coarse_values - jnp.expand_dims(coarse_mean, axis))
-    each -= align_axes(weights, values) * (values - jnp.expand_dims(fine_mean, axis))
-    spread = jnp.sqrt(jnp.sum(jnp.where(align_axes(known, values), each, 0) ** 2, axis))
+    terms = align_axes(coarse, values) * (coarse_values - jnp.expand_dims(coarse_mean, axis))
+    terms -= align_axes(weights, values) * (values - jnp.expand_dims(fine_mean, axis))
+    spread = jnp.sqrt(jnp.sum(jnp.where(align_axes(has_D, values), terms, 0) ** 2, axis))
     overlap = _overlap(weights, coarse)
     share, overlap = (
         leaf.reshape(*leaf.shape, *[1] * (spread.ndim - leaf.ndim)) for leaf in (share, overlap)
     )
     spread = jnp.where(overlap, spread, jnp.inf)
-    some = jnp.isfinite(coarse_mean) & jnp.isfinite(fine_mean)
-    change = jnp.where(some, coarse_mean - fine_mean, 0)
-    return _told(share, change, jnp.where(some, spread, 0), some)
+    is_known = jnp.isfinite(coarse_mean) & jnp.isfinite(fine_mean)
+    change = jnp.where(is_known, coarse_mean - fine_mean, 0)
+    return _scale(share, change, jnp.where(is_known, spread, 0), is_known)
 
 
 def relative_change(D: Float[Array, "..."], typical: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return e^(D - typical) - 1 to second order, of which a covariance tells what a mean changes
-    by under the weights e^D.
+    """Return e^(D - typical) - 1, to second order above zero and exactly below.
 
-    It is exact below zero: a draw that half as many steps lose, D = -∞, counts as missing, -1, and
-    no more. Above zero e^D would have no finite variance where D has a normal law.
+    Its covariance with a function is the change of the function's mean under the weights e^D.
+    A draw that half as many steps lose, D = -∞, counts as missing, -1. Above zero e^D itself may
+    have no finite variance.
     """
     D = D - typical
     above = jnp.maximum(D, 0)
     return jnp.where(D < 0, jnp.expm1(jnp.minimum(D, 0)), above + above**2 / 2)
 
 
-@jax.jit  # one program where it is called outside of any
+@jax.jit  # a single program if the caller is not compiled
 def dominates(error: StepError, standard_error: Inexact[Array, "..."]) -> Bool[Array, "..."]:
-    """Whether the step error is beyond the standard error, or could be without being seen."""
-    size, doubt = jnp.abs(error.value), error.uncertainty
-    return ~((size <= jnp.maximum(standard_error, 2 * doubt)) & (doubt <= 3 * standard_error))
+    """Return whether the step error exceeds the standard error, or may do so undetected."""
+    size, uncertainty = jnp.abs(error.value), error.uncertainty
+    is_small = size <= jnp.maximum(standard_error, 2 * uncertainty)
+    return ~(is_small & (uncertainty <= 3 * standard_error))
 
 
 def with_rounding(error: StepError, num_steps: int, d: int) -> StepError:
-    """The error of the log of a mean of weights, in doubt by what rounding may add to that.
+    """Add the rounding error to the uncertainty of the log of a mean of weights.
 
-    Log weights are sums over steps of log densities near one, each of which is known to half a
-    unit in the last place of one, and errors along a path need not cancel: N d ε/2, ε = 1.2e-7 in
-    single precision. It is told where there are so many steps that it is felt.
+    Log weights are sums over steps of numbers near one. Each has an error of half a unit in the
+    last place, and the errors along a path need not cancel. The bound is N d ε/2, with ε = 1.2e-7
+    in single precision. It is added if it exceeds 0.001.
     """
     rounding = num_steps * d * float(jnp.finfo(error.value.dtype).eps) / 2
-    if rounding < _FELT:
+    if rounding < _LEAST_ROUNDING:
         return error
     return error._replace(uncertainty=jnp.hypot(error.uncertainty, rounding))
 
@@ -213,30 +223,31 @@ def root_mean_square_in_sds(
     return jnp.sqrt(jnp.sum(squares, axis=(-2, -1)) / number)
 
 
-@partial(jax.jit, static_argnames="coupled")  # one program where it is called outside of any
+@partial(jax.jit, static_argnames="coupled")  # a single program if the caller is not compiled
 def step_faults(
     error: StepError,
     standard_error: Inexact[Array, "..."],
     sd: Inexact[Array, "..."] | float = 1.0,
     coupled: bool = False,
 ) -> tuple[Fault, ...]:
-    """Return the faults of a step error that dominates and that matters: it, or its uncertainty, is
-    beyond 0.05 in the log of a density, or 0.05 of a standard deviation `sd`.
+    """Return the faults of a step error that dominates and that matters.
 
-    At most one of them is present in each entry: the error is large, or unknown for one of three
-    reasons, or its estimate is too uncertain. `coupled` states that the paths are from a coupling,
-    which has no estimate for a state-dependent σ.
+    It matters if it, or its uncertainty, exceeds 0.05 in the log of a density, or 0.05 of a
+    standard deviation `sd`. At most one fault is present in each entry: the error is large, or
+    unknown for one of three reasons, or its estimate is too uncertain. `coupled` states that the
+    paths are from a coupling, which has no estimate for a state-dependent σ.
     """
-    size, doubt, floor = jnp.abs(error.value), error.uncertainty, _MATTERS * sd
-    present = dominates(error, standard_error) & ~((size <= floor) & (doubt <= floor))
-    values = jnp.broadcast_arrays(present, error.value, doubt, standard_error)[1:]
+    size, uncertainty, floor = jnp.abs(error.value), error.uncertainty, _MATTERS * sd
+    present = dominates(error, standard_error) & ~((size <= floor) & (uncertainty <= floor))
+    values = jnp.broadcast_arrays(present, error.value, uncertainty, standard_error)[1:]
     detail = "the estimate is {:.2g} ± {:.1g}, and the standard error {:.2g}"
     too_large = _TOO_LARGE + _FOR_COUPLINGS if coupled else _TOO_LARGE
+    too_long = _TOO_LONG_OR_VARYING_SIGMA if coupled else _TOO_LONG
     cases = (
-        (jnp.isnan(size) & jnp.isinf(doubt), _TOO_LONG_OR_VARYING_SIGMA if coupled else _TOO_LONG),
+        (jnp.isnan(size) & jnp.isinf(uncertainty), too_long),
         (jnp.isnan(size), _NO_ESTIMATE),
-        (~jnp.isfinite(doubt), _NO_COMPARISON),
-        (size > jnp.maximum(standard_error, 2 * doubt), too_large),
+        (~jnp.isfinite(uncertainty), _NO_COMPARISON),
+        (size > jnp.maximum(standard_error, 2 * uncertainty), too_large),
         (jnp.ones_like(present), _TOO_UNCERTAIN),
     )
     faults = []
@@ -249,32 +260,31 @@ def step_faults(
 
 
 def share_of_order(order: int) -> float:
-    """(2^p - 1)⁻¹."""
+    """Return (2^p - 1)⁻¹, the error of order p over the change under half as many steps."""
     return 1 / (2**order - 1)
 
 
-# Of an error of which D says nothing: figures were wrong by factors of 10,000.
+# D has no information about the error. Estimates from it were wrong by factors of 10,000.
 UNKNOWN_SHARE = math.inf
-# A smaller share of intervals whose steps are too long does not matter to a sum over all.
+# A smaller share of intervals with too long steps does not matter to a sum over all intervals.
 MOST_TOO_LONG = 0.02
 _GUESS = 3.0
 
 
 def guessed(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
-    """The share, with a guess on the safe side of those that are not known."""
+    """Return the share, with a large guess in place of an unknown one."""
     return jnp.where(share == UNKNOWN_SHARE, _GUESS, share)
 
 
 def share_in_regime(
     share: Float[Array, "*I"], model: Diffusion, intervals: Intervals, num_steps: int
 ) -> Float[Array, "*I"]:
-    """Return the share, infinite for intervals in which a leading term has no meaning, as a step is
-    longer than the relaxation time at either end; zero stays zero.
+    """Return the share, infinite if a step is longer than the relaxation time at either end.
 
-    The mean of a step of length δ is a polynomial of δ∇α in the place of an exponential function.
-    That of half as many steps is unstable where the spectral radius ρ of ∇α has 2δρ > 2. There
-    changes can have any size and either sign, and nearly none by chance. One end is enough: paths
-    from a slow tail to a fast centre, or from one wall of a well to another, are wrong there.
+    A share of zero stays zero. The mean of a step of length δ is a polynomial of δ∇α, in place of
+    an exponential function. Half as many steps are unstable if the spectral radius ρ of ∇α has
+    2δρ > 2. Then changes can have any size and either sign, and may be small by chance. One end is
+    enough: paths from a slow tail to a fast centre, or between the walls of a well, are wrong then.
     """
 
     def rate(x):
@@ -292,34 +302,37 @@ def unknown_where(unknown: Bool[Array, ""], error: StepError) -> StepError:
 
 
 def share_of_known_order(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
-    """(2^p - 1)⁻¹ of a share that may be told too large, to be on the safe side."""
+    """Return (2^p - 1)⁻¹ from a share that may be a large guess."""
     return jnp.minimum(share, 1)
 
 
 def _overlap(weights: Float[Array, "*I n"], coarse: Float[Array, "*I n"]) -> Bool[Array, "*I"]:
-    """Whether many of the paths have weight under both laws, and there are many at all: one alone
-    would have no uncertainty."""
+    """Return whether enough paths have weight under both laws, and enough paths have weight at all.
+
+    A single path would have no uncertainty.
+    """
     size = effective_size(weights)
     return (effective_size(coarse) >= _LEAST_OVERLAP * size) & (size >= _FEWEST_EFFECTIVE)
 
 
-def _known(
+def _known_weights(
     log_weights: Float[Array, "*I n"], log_halving: Float[Array, "*I n"]
 ) -> tuple[Float[Array, "*I n"], Bool[Array, "*I n"]]:
-    """The normalised weights of the paths of which D is known, and which these are. A D that is
-    not a number though it was worked out is that of steps out of all proportion: -∞."""
-    looked = ~jnp.isnan(log_halving)
-    known = looked & (log_weights > -jnp.inf)
-    return normalise_weights(jnp.where(known, log_weights, -jnp.inf)), known
+    """Return the normalised weights of the paths with a D, and a mask of these paths."""
+    has_D = ~jnp.isnan(log_halving) & (log_weights > -jnp.inf)
+    return normalise_weights(jnp.where(has_D, log_weights, -jnp.inf)), has_D
 
 
-def _told(share, change, spread, some):
-    """Return the share of a change, with its uncertainty: exactly zero where the share is, NaN with
-    an infinite uncertainty where the share is not known, NaN where nothing is."""
+def _scale(share, change, spread, is_known):
+    """Return the share of a change, with its uncertainty.
+
+    Both are zero for a share of zero. The value is NaN with an infinite uncertainty for an unknown
+    share. Both are NaN for an unknown change.
+    """
     share = jnp.asarray(share, change.dtype)
     unknown = share == UNKNOWN_SHARE
-    known = jnp.where(unknown, 1, share)
-    of = lambda value: jnp.where(share == 0, 0, jnp.where(some, known * value, jnp.nan))
+    factor = jnp.where(unknown, 1, share)
+    of = lambda value: jnp.where(share == 0, 0, jnp.where(is_known, factor * value, jnp.nan))
     value, uncertainty = of(change), of(spread)
     return StepError(
         jnp.where(unknown, jnp.nan, value),
