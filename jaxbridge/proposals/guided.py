@@ -1,4 +1,4 @@
-"""Guided proposals: chains of normal steps that end in b.
+"""Guided proposals: chains with normal noise that end in b.
 
 On a grid 0 = t_0 < ... < t_N = T with steps δ_i, the target is a chain (`step_density`) with steps
 
@@ -699,8 +699,8 @@ def _fractions(
     """Return (T - t_i) / T of the grid, and the indices of the points of the coarse grid.
 
     The coarse grid has half as many steps. The last step needs a normal law. If other steps are not
-    normal, the last one has a lower order. Hence it is split into steps of ½, ¼, ..., 2^-k of its
-    length, and the last of these is about T / N².
+    normal, it is an Euler step, which adds an error of the square of its length. Hence it is split
+    into steps of ½, ¼, ..., 2^-k of its length, and the last of these is about T / N².
     """
     fractions = proposal.remaining(num_steps)
     coarse = [*range(0, num_steps, 2)]

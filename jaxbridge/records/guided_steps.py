@@ -16,10 +16,11 @@ u, and the step to x' = u + O(δ). The noise is guided as above, with the observ
 weight takes the factor g(y| x') / g(y| u) in addition. An exact observation has no such factor: the
 step to it is the normal part alone.
 
-The weight also equals ∫ p(x'| x) g(y| x') h_{i+1}(x') dx' / h_i(x) times h_i(x) / h_{i+1}(x'),
-whose product over a path telescopes. The code must not sum this form. Explicit steps that are far
-too long for the drift (δ |∇drift| above 2) may lead to log h = -1e30. Differences of such numbers
-have rounding errors of ±1e14, so a very unlikely path would get a weight of e^{1e14}.
+For normal steps the weight also equals ∫ p(x'| x) g(y| x') h_{i+1}(x') dx' / h_i(x) times
+h_i(x) / h_{i+1}(x'), whose product over a path telescopes. The code must not sum this form. Explicit
+steps that are far too long for the drift (δ |∇drift| above 2) may lead to log h = -1e30.
+Differences of such numbers have rounding errors of ±1e14, so a very unlikely path would get a
+weight of e^{1e14}.
 """
 
 from collections.abc import Callable

@@ -4,7 +4,8 @@ The target of a weighted path is a Markov chain on its grid, with normal steps
 
     x' ~ N(μ(x), δ σ(x) S(x) σ(x)ᵀ).
 
-Each step has a probability density. Hence the mean of the weights is the transition density of the
+(Steps of `QuadraticDensity` are functions of normal noise.) Each step, or its noise, has a
+probability density. Hence the mean of the weights is the transition density of the
 chain, which is finite for every model. Its distance from p_T is the discretisation error.
 
 *Euler.* `EulerDensity` has μ = x + αδ and S = I. Its error is O(δ), for any σ.
@@ -240,18 +241,22 @@ class QuadraticDensity(AbstractStepDensity):
     The step is x' = μ + √δ b [n + ½ √δ Σ_jl Q_·jl (n_j n_l - S_jl)] with n ~ N(0, S) and
     μ = x + αδ + ½δ² L⁰α. The covariance of n is
 
-        S = (I + ¼δ M)²,    M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ_jl Q_·jl Q_·jl.
+        S = I + ½δ M + δ²M²/12,    M = b⁻¹ L⁰V b⁻ᵀ + A + Aᵀ - Σ_jl Q_·jl Q_·jl.
 
     Its first three moments equal those of the diffusion up to O(δ³):
 
     - the mean is μ;
-    - the third cumulant is 3 δ² Q in noise coordinates. This is ½ (V∇V + ...), a sum over the three
-        choices of the differentiated coordinate;
+    - the third cumulant is 3 δ² Q in noise coordinates. This is ½ δ² (V∇V + ...), a sum over the
+        three choices of the differentiated coordinate;
     - the quadratic part adds ½δ² Σ_jl Q_·jl Q_·jl to the covariance, which M subtracts.
 
     This gives weak order 2 (Kloeden & Platen 1992, section 14.5). All roots of V give the same law.
-    S is a square, hence never indefinite. Weights of paths use the density of n. An exactly
-    observed end needs the density of x' itself, so the last step must have another law.
+    The term of order δ² makes S at least ¼ I for every step size. It equals that of
+    `ItoTaylorDensity` if Q = 0 and A is symmetric. Weights of paths use the density of n. An
+    exactly observed end needs the density of x' itself, so the last step must have another law.
+
+    V must be twice differentiable. At a point where its derivatives are not finite, the path is
+    lost; `EulerDensity` needs no derivatives.
     """
 
     order: ClassVar[int] = 2
@@ -283,8 +288,8 @@ class QuadraticDensity(AbstractStepDensity):
         identity = jnp.eye(d, dtype=x.dtype)
 
         def law(dt):
-            root = identity + dt / 4 * M  # S = (I + ¼δ M)²
-            return StepLaw(x + dt * drift + dt**2 / 2 * bend, sigma, matmul(root, root), dt, Q)
+            S = identity + dt / 2 * M + dt**2 / 12 * matmul(M, M)
+            return StepLaw(x + dt * drift + dt**2 / 2 * bend, sigma, S, dt, Q)
 
         def decay(dt):
             return identity + dt * A + dt**2 / 2 * matmul(A, A)

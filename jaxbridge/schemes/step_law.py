@@ -74,14 +74,18 @@ class StepLaw(NamedTuple):
     def bent(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return the end of the step whose normal part ends in `point`,
 
-        x' = point + ½ δ σ Σ_jl Q_·jl (n_j n_l - S_jl),    point = μ + √δ σ n.
+            x' = point + ½ δ σ Σ_jl Q_·jl (n_j n_l - S_jl),    point = μ + √δ σ n.
+
+        For δ = 0 it is `point` itself.
         """
         if self.curvature is None:
             return point
-        n = self._scaled(point)
+        moving = self.dt > 0
+        n = self._replace(dt=jnp.where(moving, self.dt, 1))._scaled(point)  # avoids 0 / 0
         square = (n[:, None] * n - self.covariance).reshape(-1)
         rows = self.curvature.reshape(n.shape[0], -1)
-        return point + self.dt / 2 * self.sigma.mv(matvec(rows, square))
+        bent = point + self.dt / 2 * self.sigma.mv(matvec(rows, square))
+        return jnp.where(moving, bent, point)
 
     def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return ξ, the normalised noise of the step to `point`: the inverse of `point`."""

@@ -88,11 +88,11 @@ def test_weight_is_the_density_of_a_path_by_hand():
     rate, level, sigma = PARAMS
     dt, zeta = 0.3, jnp.array([0.4, -0.8])  # of the fixed start, and of the step
     path = np.asarray(paths.path(positional[0].params, zeta), float)[:, 0]
-    # n of x' = μ + √δ b n + ½ δ b b' (n² - S), with S = (1 + ¼ δ M)² in closed form
+    # n of x' = μ + √δ b n + ½ δ b b' (n² - S), with S = 1 + ½ δM + δ²M²/12 in closed form
     drift, b, slope = rate * (level - START), sigma * np.sqrt(START), sigma / (2 * np.sqrt(START))
     mean = START + drift * dt - rate * drift * dt**2 / 2
     M = sigma**2 * drift / b**2 - 2 * rate - slope**2
-    S = (1 + dt / 4 * M) ** 2
+    S = 1 + dt / 2 * M + dt**2 * M**2 / 12
     roots = np.roots([dt * b * slope / 2, np.sqrt(dt) * b, mean - path[1] - dt * b * slope * S / 2])
     log_weight = float(paths.log_weight(positional[0].params, zeta))
     seen = norm.logpdf(0.7, path[1], 0.2)
@@ -105,3 +105,41 @@ def test_weight_is_the_density_of_a_path_by_hand():
         for n, m in zip(np.sort(roots), np.sort(near), strict=True)
     ]
     assert min(abs(log_weight - c) for c in candidates) < 5e-3
+
+
+@pytest.mark.slow
+def test_records_of_unequal_length_have_the_sum_of_their_likelihoods():
+    """The shorter one is filled with steps of no length, which move nothing."""
+    model = jb.Diffusion(lambda x, p: -p * x, lambda x, p: 0.3 * jnp.sqrt(1 + x**2), params=0.8)
+    observed = [np.array([0.1, 0.3, 0.2, -0.1, 0.2]), np.array([0.2, 0.4, 0.1])]
+    times = [np.arange(1.0, 1 + len(values)) for values in observed]
+    options = dict(
+        observation=jb.LinearGaussian(covariance=0.04), initial=[0.2], initial_time=0.0,
+        num_steps=4, num_particles=200,
+    )  # fmt: skip
+    key = jax.random.key(0)
+    alone = [
+        jb.log_likelihood(key, model, t, values[:, None], **options)
+        for t, values in zip(times, observed, strict=True)
+    ]
+    both = jb.log_likelihood(key, model, times, [v[:, None] for v in observed], **options)
+    error = np.sqrt(sum(float(one.standard_error) ** 2 for one in (*alone, both)))
+    assert int(both.num_nonfinite) == 0
+    assert abs(float(both.value) - sum(float(one.value) for one in alone)) < 5 * error + 1e-3
+
+
+@pytest.mark.slow
+def test_a_relaxation_time_of_half_a_step():
+    """κδ = 2 in a coordinate of constant noise, beside a geometric Brownian motion."""
+    rate, sigma = 16.0, 0.3
+    model = jb.Diffusion(
+        lambda x, p: jnp.stack([-rate * x[0], 0.1 * x[1]]),
+        lambda x, p: jnp.stack([jnp.ones_like(x[0]), sigma * x[1]]),
+    )
+    exact = norm.logpdf(0.1, 0.05 * np.exp(-rate), np.sqrt(-np.expm1(-2 * rate) / (2 * rate)))
+    exact += norm.logpdf(np.log(1.2), 0.1 - sigma**2 / 2, sigma) - np.log(1.2)
+    made = jb.transition_log_density(
+        jax.random.key(0), model, [0.05, 1.0], [0.1, 1.2], 1.0,
+        num_proposals=4000, num_steps=8, proposal=jb.Guided(),
+    )  # fmt: skip
+    assert int(made.num_nonfinite) == 0 and abs(float(made.value) - exact) < 0.3

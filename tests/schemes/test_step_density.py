@@ -452,3 +452,16 @@ def test_quadratic_steps_are_for_weights_in_few_dimensions():
         model, like = jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + x**2), jnp.zeros(d)
         density = most_accurate_density(model, like, for_weights)
         assert isinstance(density, QuadraticDensity if expected else jb.EulerDensity)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1, 2.0, 7.0, 1e3])
+def test_quadratic_steps_have_a_positive_covariance(dt, x64):
+    """S ≥ ¼ I also for a relaxation time of half a step, and a step of no length moves nothing."""
+    sigma = lambda x, p: jnp.stack([jnp.ones_like(x[0]), 0.3 * x[1]])
+    for rate in (1.0, 2 / max(dt, 0.1), 30.0):
+        drift = lambda x, p, rate=rate: jnp.stack([-rate * x[0], 0.1 * x[1]])
+        x = jnp.array([0.3, 0.8])
+        law = step_law(QuadraticDensity(), jb.Diffusion(drift, sigma), x, dt)
+        assert np.linalg.eigvalsh(np.asarray(law.covariance))[0] > 0.25 - 1e-9
+        if dt == 0:
+            np.testing.assert_array_equal(law.bent(x), x)
