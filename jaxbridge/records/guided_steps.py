@@ -17,8 +17,8 @@ weight takes the factor g(y| x') / g(y| u) in addition. An exact observation has
 step to it is the normal part alone.
 
 For normal steps the weight also equals ∫ p(x'| x) g(y| x') h_{i+1}(x') dx' / h_i(x) times
-h_i(x) / h_{i+1}(x'), whose product over a path telescopes. The code must not sum this form. Explicit
-steps that are far too long for the drift (δ |∇drift| above 2) may lead to log h = -1e30.
+h_i(x) / h_{i+1}(x'), whose product over a path telescopes. The code must not sum this form.
+Explicit steps that are far too long for the drift (δ |∇drift| above 2) may lead to log h = -1e30.
 Differences of such numbers have rounding errors of ±1e14, so a very unlikely path would get a
 weight of e^{1e14}.
 """
