@@ -235,7 +235,7 @@ def test_two_grids_leave_less_of_a_step_error():
         start,
         end,
         1.0,
-        proposals=[jb.ModifiedDiffusionBridge()],
+        proposals=[jb.ModifiedDiffusionBridge(jb.EulerDensity())],
         num_steps=(16,),
         methods=("weights", "extrapolated_weights", "density", "extrapolated_density"),
         num_bridges=100_000,
