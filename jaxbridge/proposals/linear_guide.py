@@ -87,8 +87,8 @@ class Guided(AbstractGuidedProposal):
         - a matrix F of shape (d, d), with α̃ = α(b) and σ̃ = σ(b).
     - `density`: step density of the target. The default is the most accurate one:
         `ItoTaylorDensity()` for constant σ. For a state-dependent σ it is `EulerDensity()` for
-        paths. For `transition_log_density`, `pmmh` and `maximum_likelihood` it has steps of weak
-        order 2 that are not normal.
+        paths. For `transition_log_density`, `pmmh`, and `maximum_likelihood` with an unknown σ it
+        has steps of weak order 2 that are not normal.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ], between 1 (equal steps) and 4. Above 1 the steps
         shrink towards the end, which helps if σ varies much along the path.
 
