@@ -63,7 +63,7 @@ def choose_proposal(
     - `for_density`: true if the choice is for `transition_log_density` or `pmmh`. Then the default
         couplings from the stationary law need a model that is declared `normalised`. On a single
         interval where all other candidates are inefficient, a coupling with a fitted start law is
-        added.
+        added. Guided proposals then have steps of weak order 2 also for a state-dependent σ.
 
     **Returns:** `Choice`, which prints as a table.
 
