@@ -33,7 +33,7 @@ from ..engine.lanes import compute_once
 from ..engine.linalg import dot
 from ..models.dynamics import DynamicsAt
 from ..schemes import AbstractStepDensity, DegenerateLaw, StepLaw
-from .observation import Scalars
+from .observation import Scalars, log_density_of
 from .record import Steps
 from .tilted_step import Information, NormalStep, Seen, Tilted, coordinates, given, tilted
 
@@ -89,7 +89,12 @@ class GuidedLaw(NamedTuple):
             # Only the normal part of the step meets an exact observation.
             is_exact = jnp.any(scalars.seen & (scalars.variances == 0))
             bent = jnp.where(is_exact, point, bent)
-            log_weight += _log_change(scalars, point - self.origin, bent - self.origin)
+            # An exact scalar has no density; here it keeps the point, which cancels its term.
+            safe = scalars._replace(
+                variances=jnp.where(scalars.variances > 0, scalars.variances, 1)
+            )
+            log_weight += log_density_of(safe, bent - self.origin)
+            log_weight -= log_density_of(safe, point - self.origin)
         return bent, log_weight
 
     def noise_and_log_weight(
@@ -106,16 +111,6 @@ class GuidedLaw(NamedTuple):
         pulled = coordinates(displacement, self.seen, hidden[: len(self.seen)])
         zeta = self.tilted.noise(pulled)
         return zeta, self.log_seen + self.tilted.log_ratio(zeta, pulled)
-
-
-def _log_change(scalars: Scalars, u: Float[Array, " d"], x: Float[Array, " d"]) -> Float[Array, ""]:
-    """Return log g(y| x) - log g(y| u) for scalar observations, counted from ξ' like the points."""
-    log_change = jnp.zeros((), u.dtype)
-    for row, value, variance, is_seen in zip(*scalars, strict=True):
-        noisy = is_seen & (variance > 0)  # an exact scalar has no density
-        squares = (value - dot(row, u)) ** 2 - (value - dot(row, x)) ** 2
-        log_change += jnp.where(noisy, squares / jnp.where(noisy, 2 * variance, 1), 0)
-    return log_change
 
 
 def relative(scalars: Scalars, point: Float[Array, " d"]) -> Scalars:
