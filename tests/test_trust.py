@@ -535,7 +535,7 @@ def test_lost_paths_of_a_jacobi_diffusion():
     for proposal in (jb.ModifiedDiffusionBridge(), jb.Guided()):
         arguments = (jax.random.key(0), model, [start], [end], 1.0)
         estimate = jb.transition_log_density(*arguments, proposal=proposal, **options)
-        assert float(estimate.value) - jacobi_log_density(shape, start, end, 1.0) < -0.5
+        assert float(estimate.value) - jacobi_log_density(shape, start, end, 1.0) < -0.25
         assert "attains its boundary" in estimate.why()
     weighted = jb.sample_weighted_bridges(
         *arguments, num_bridges=2_000, num_steps=100, proposal=proposal

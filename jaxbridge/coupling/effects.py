@@ -48,8 +48,8 @@ def effects(
     - `num_steps`, `save_at`: as in `sample_bridges`.
 
     **Returns:** `Effects`, which prints as a table. Couplings do not apply if σ has fewer columns
-    than rows, or if coefficients depend on time. Then the last two rows state what the paths of
-    records simulate.
+    than rows, or if coefficients depend on time. Then the last three rows state what guided paths
+    simulate.
 
     **Raises:** `ValueError` if no dimension fits, or if the time reversal is unknown; `TypeError`
     if `model` is not a `Diffusion` or `coupling` is not a `Coupling`.
@@ -73,12 +73,17 @@ def effects(
         )
     # Couplings need an invertible σ and a stationary law, so time-independent coefficients.
     invertible, depends_on_time = model.sigma_is_invertible(like), model.depends_on_time
-    noise_by_drift = decisions.noise_by_drift(invertible)
-    time = decisions.time(depends_on_time)
+    of_guided_paths = {
+        "noise_by_drift": decisions.noise_by_drift(invertible),
+        "quadratic_noise": decisions.quadratic_noise(
+            invertible, model.sigma_varies(like), like.shape[0]
+        ),
+        "time": decisions.time(depends_on_time),
+    }
     if not invertible:
-        return decisions.without_pairs(noise_by_drift, time, "σ has fewer columns than rows")
+        return decisions.without_pairs(of_guided_paths, "σ has fewer columns than rows")
     if depends_on_time:
-        return decisions.without_pairs(noise_by_drift, time, "coefficients depend on time")
+        return decisions.without_pairs(of_guided_paths, "coefficients depend on time")
     model.check_reversal()
     forward = model.forward(like)
     # The types of σ before and after the change to the triangular root; nothing is computed.
@@ -101,8 +106,7 @@ def effects(
         decisions.stratonovich(scheme.stratonovich, forward.sigma_varies),
         decisions.stored_times(None if save_at is None else as_floating("save_at", save_at).size),
         decisions.early_stop(chunk_shape(num_steps)[0]),
-        noise_by_drift,
-        time,
+        **of_guided_paths,
     )
 
 

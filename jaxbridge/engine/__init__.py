@@ -17,7 +17,7 @@ Random numbers and lanes:
   steps of one path at once.
 - `rejection` runs attempts for many problems side by side until each problem has its successes.
 - `devices` splits lanes over devices, `batch_size` chooses their number, `progress` adds progress
-  meters to loops.
+  meters to loops, and `interrupt` lets such loops end after Ctrl-C.
 
 Compilation:
 

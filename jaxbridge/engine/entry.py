@@ -4,10 +4,12 @@
   values. `jax.transfer_guard` is therefore off inside.
 - NaN marks missing values and -inf is the log of a zero weight, as each result documents.
   `jax.debug_nans` and `jax.debug_infs` are therefore off inside.
+- Ctrl-C ends a call with a progress meter within about a second (`interrupt`).
 - Under a transformation, traced values that user functions close over become arguments
   (`captured`).
 """
 
+import contextlib
 import functools
 import inspect
 from collections.abc import Callable
@@ -19,6 +21,7 @@ from .arguments import SHARED
 from .captured import call_with_captured
 from .compiled import is_outermost
 from .devices import on_whole_batches
+from .interrupt import listening
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -47,7 +50,13 @@ def disable_guards(fn: Callable[_Arguments, _Result]) -> Callable[_Arguments, _R
         for name in shared:  # these arguments are keyword-only in all public functions
             if name in kwargs:
                 SHARED[name](name, kwargs[name])
-        with jax.transfer_guard("allow"), jax.debug_nans(False), jax.debug_infs(False):
+        is_metered = kwargs.get("progress_meter") is not None
+        with (
+            jax.transfer_guard("allow"),
+            jax.debug_nans(False),
+            jax.debug_infs(False),
+            listening() if is_metered else contextlib.nullcontext(),
+        ):
             return on_whole_batches(fn, *args, **kwargs)
 
     return entered

@@ -11,13 +11,17 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from .interrupt import InterruptibleMeter
+
 _State = TypeVar("_State")
 _Context = TypeVar("_Context")
 
 
 def as_meter(progress_meter: diffrax.AbstractProgressMeter | None) -> diffrax.AbstractProgressMeter:
-    """Return the given progress meter, or `NoProgressMeter()` for `None`."""
-    return diffrax.NoProgressMeter() if progress_meter is None else progress_meter
+    """Return the given progress meter, which also looks for Ctrl-C, or none that has any effect."""
+    if progress_meter is None or isinstance(progress_meter, diffrax.NoProgressMeter):
+        return diffrax.NoProgressMeter()
+    return InterruptibleMeter(progress_meter)
 
 
 def metered_scan(

@@ -34,6 +34,8 @@ class Effects(NamedTuple):
     - `early_stop`: a loop over associated paths that stops once all of them have hit.
     - `noise_by_drift`: noise that the drift transports, within a step, to coordinates that σ does
         not reach. For paths of records.
+    - `quadratic_noise`: the part of a step that is quadratic in its noise, by derivatives of V. For
+        weights of guided paths.
     - `time`: coefficients evaluated at the middle of each step. For paths of records.
     """
 
@@ -49,6 +51,7 @@ class Effects(NamedTuple):
     stored_times: Effect
     early_stop: Effect
     noise_by_drift: Effect
+    quadratic_noise: Effect
     time: Effect
 
     def __str__(self) -> str:
@@ -60,11 +63,10 @@ class Effects(NamedTuple):
         return "\n".join(lines)
 
 
-def without_pairs(noise_by_drift: Effect, time: Effect, why: str) -> Effects:
+def without_pairs(of_guided_paths: dict[str, Effect], why: str) -> Effects:
     """Return the effects for a model without couplings; `why` is the reason for their absence."""
     no_pair = Effect(False, f"no coupling applies: {why}")
-    record_effects = {"noise_by_drift": noise_by_drift, "time": time}
-    return Effects(**{name: record_effects.get(name, no_pair) for name in Effects._fields})
+    return Effects(**{name: of_guided_paths.get(name, no_pair) for name in Effects._fields})
 
 
 def noise_by_drift(invertible: bool) -> Effect:
@@ -72,6 +74,22 @@ def noise_by_drift(invertible: bool) -> Effect:
     if invertible:
         return Effect(False, "σ reaches all coordinates")
     return Effect(True, "σ has fewer columns than rows: the drift transports the noise")
+
+
+# Quadratic steps take time and memory of order d⁴ and d³. Up to so many dimensions their accuracy
+# is worth that.
+_LARGEST_QUADRATIC = 10
+
+
+def quadratic_noise(invertible: bool, sigma_varies: bool, d: int) -> Effect:
+    """Decide whether steps of weights are quadratic in their noise (`QuadraticDensity`)."""
+    if not sigma_varies:
+        return Effect(False, "σ does not depend on the state: steps of weak order 2 are normal")
+    if not invertible:
+        return Effect(False, "σ has fewer columns than rows: the steps are normal")
+    if d > _LARGEST_QUADRATIC:
+        return Effect(False, f"more than {_LARGEST_QUADRATIC} dimensions: Euler steps are cheaper")
+    return Effect(True, "σ depends on the state; for weights, not for stored paths")
 
 
 def time(depends_on_time: bool) -> Effect:

@@ -50,6 +50,7 @@ from jaxtyping import Array, Float
 
 from ..engine.lanes import compute_once
 from ..engine.linalg import matmul, semidefinite_factor, sum_first_axis
+from ..models import decisions
 from ..models.diffusion import Diffusion
 from ..models.dynamics import Dynamics
 from ..models.sigma import columns_of, covariance_of
@@ -329,17 +330,13 @@ def most_accurate_density(
 
     `for_weights` states that only weights are needed. Then the steps need not be normal.
     """
-    if not model.sigma_varies(like):
+    sigma_varies, invertible = model.sigma_varies(like), model.sigma_is_invertible(like)
+    if not sigma_varies:
         return ItoTaylorDensity()
-    if not model.sigma_is_invertible(like):
+    if not invertible:
         return HypoellipticDensity()
-    is_small = like.shape[0] <= _LARGEST_QUADRATIC
-    return QuadraticDensity() if for_weights and is_small else EulerDensity()
-
-
-# Quadratic steps take time and memory of order d⁴ and d³. Up to so many dimensions their accuracy
-# is worth that.
-_LARGEST_QUADRATIC = 10
+    quadratic = decisions.quadratic_noise(invertible, sigma_varies, like.shape[0])
+    return QuadraticDensity() if for_weights and quadratic.simulated else EulerDensity()
 
 
 def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:

@@ -177,7 +177,7 @@ def test_associated_paths_stop_early_where_the_table_says(num_steps):
 
 def test_the_table_reads_well():
     text = str(jb.effects(jb.hyperbolic(0.8, 2), jb.Coupling(-1.0)))
-    assert len(text.splitlines()) == 14
+    assert len(text.splitlines()) == 15
     assert "reverse drift" in text and "declared reversible" in text and "left out" in text
 
 
@@ -201,13 +201,13 @@ RECORDS = {
     "constant": jb.Diffusion(partly, COLUMN),
     "of time": jb.Diffusion(in_season, COLUMN),
     "varying": jb.Diffusion(partly, lambda x, p: COLUMN * (1 + x[1] ** 2)),
-    "of time, all": jb.Diffusion(in_season, lambda x, p: jnp.eye(2) * (1 + x[0] ** 2)),
+    "of time, all": jb.Diffusion(in_season, lambda x, p: jnp.eye(2) * (2 + gammaln(2 + x[0] ** 2))),
 }
 
 
 @pytest.mark.parametrize("name", slow_beyond(1, RECORDS))
 def test_steps_of_records_contain_what_the_table_says(name):
-    """The derivative of the drift's sinh, and the sine of time."""
+    """The derivatives of the drift's sinh and of σ's gamma function, and the sine of time."""
     scene, table = RECORDS[name], jb.effects(RECORDS[name])
     seen = jb.LinearGaussian([[1.0, 0.0]], 0.1)
     paths = jb.innovations(
@@ -215,6 +215,8 @@ def test_steps_of_records_contain_what_the_table_says(name):
     )
     program = program_of(lambda key: paths.path(None, jax.random.normal(key, (paths.size,))))
     in_loops = Counter(eqn.primitive.name for eqn, in_loop in program if in_loop)
-    assert table.noise_by_drift.simulated == (in_loops["cosh"] > 0)
+    drift_is_differentiated = table.noise_by_drift.simulated or table.quadratic_noise.simulated
+    assert drift_is_differentiated == (in_loops["cosh"] > 0)
+    assert table.quadratic_noise.simulated == (in_loops["digamma"] > 0)
     assert table.time.simulated == (in_loops["sin"] > 0)
     assert not table.rotation.simulated and "no coupling applies" in table.rotation.why

@@ -231,9 +231,9 @@ def test_ranks_of_true_parameters_are_uniform():
 
 @pytest.mark.slow
 @pytest.mark.optimised
-def test_the_step_error_where_sigma_varies_is_doubted():
-    """σ√x (Cox, Ingersoll & Ross 1985) in raw coordinates: the posterior mean of σ by ten steps is
-    .9 standard deviations off, and what half as many steps tell is more than that."""
+def test_posterior_where_sigma_varies():
+    """σ√x (Cox, Ingersoll & Ross 1985) in raw coordinates, ten steps an interval: the steps are of
+    order 2, and what they leave is small and told to be small."""
     data = data_sets(quick=False)[1]
     exact, params = exact_posterior(data), {"rate": 1.0, "sigma": 1.0}
     model = jb.Diffusion(data.drift, data.sigma, params=params, domain=lambda x, p: jnp.all(x > 0))
@@ -242,11 +242,13 @@ def test_the_step_error_where_sigma_varies_is_doubted():
         prior=jb.NormalPrior(1.0, 1.0), constraint=lambda p: (p["rate"] > 0) & (p["sigma"] > 0),
         num_iterations=2000, num_steps=10, num_proposals=30, num_chains=4,
     )  # fmt: skip
-    off = (np.asarray(made.theta).reshape(-1, 2).mean(axis=0) - exact.mean) / exact.sd
+    draws = np.asarray(made.theta).reshape(-1, 2)
+    off = (draws.mean(axis=0) - exact.mean) / exact.sd
     told, doubt, error = (
         np.asarray(each) / exact.sd
         for each in (made.step_error, made.step_uncertainty, made.standard_error)
     )
-    assert made.sigma_varies and made.step_error_dominates.all()
-    assert off[1] < -5 * error[1] and np.all(told < 0)
-    assert np.all(doubt >= np.abs(told)) and np.all(np.abs(told - off) < 2 * np.hypot(doubt, error))
+    assert made.sigma_varies and np.all(np.abs(told) + doubt < 0.1)
+    assert np.all(np.abs(off - told) < 5 * error + doubt + 0.05)
+    n = np.asarray(made.effective_sample_size)
+    assert np.all(np.abs(np.log(draws.std(axis=0) / exact.sd)) < 5 / np.sqrt(2 * n) + 0.05)
