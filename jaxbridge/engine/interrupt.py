@@ -20,11 +20,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float, Int, PyTree
+from jaxtyping import Array, Int, PyTree
 
 _SECONDS_BETWEEN_LOOKS = 0.25
-
-
 _NEVER = np.iinfo(np.int32).max
 
 
@@ -94,7 +92,7 @@ class InterruptibleMeter(diffrax.AbstractProgressMeter):
     def init(self) -> _Watch:
         return _Watch(self.meter.init(), jnp.int32(0), jnp.int32(0))
 
-    def step(self, state: _Watch, progress: Float[ArrayLike, ""]) -> _Watch:
+    def step(self, state: _Watch, progress: float | Array | np.ndarray) -> _Watch:
         # A pure callback, because `cond` under `vmap` takes no other.
         result = jax.ShapeDtypeStruct((), jnp.int32)
         look = lambda: jax.pure_callback(_look, result, state.step, vmap_method="sequential")
