@@ -491,8 +491,10 @@ def line_records(seed, count, thorough=True) -> Iterator[Case]:
     rng = np.random.default_rng(seed)
     chosen = [*constant_sigma()][:2] + [m for m in varying_sigma() if m.name == "logistic"]
     settings = {
-        "double well": (lambda x: x - x**3, np.ones_like, -4, 4, lambda u: u, (0.0, 0.5)),
-        "steep wells": (lambda x: 6 * x - 6 * x**3, np.ones_like, -3, 3, lambda u: u, (0.0, 0.5)),
+        "double well": (lambda x: 2 * x - 2 * x**3, np.ones_like, -4, 4, lambda u: u, (0.0, 0.5)),
+        "steep wells": (
+            lambda x: 12 * x - 12 * x**3, np.ones_like, -3, 3, lambda u: u, (0.0, 0.5),
+        ),
         "logistic": (
             lambda x: x * (1 - x), lambda x: 0.4 * x, np.log(0.02), np.log(6.0), np.exp, (1.0, 0.2),
         ),
@@ -587,7 +589,7 @@ def main() -> None:
         if case.trusted and case.is_wrong:
             print("wrong:", case[:7])
     if options.out:
-        options.out.write_text(json.dumps([case._asdict() for case in cases]))
+        options.out.write_text(json.dumps([case._asdict() for case in cases], default=float))
 
 
 if __name__ == "__main__":
