@@ -103,7 +103,9 @@ def sample_exact_bridges(
     if proposal is None and method == "crank_nicolson":
         proposal = Guided()
     budget = Budget(num_counts, max_proposals, max_trials)
-    proposal = as_proposal(proposal, model, problem.like, budget)
+    # The chain needs the noise, or the weight, of a given path.
+    is_given = position is not None
+    proposal = as_proposal(proposal, model, problem.like, budget, normal_steps=is_given)
     proposal.check(model, problem.intervals)
     if step_size is not None and method != "crank_nicolson":
         raise ValueError(

@@ -32,7 +32,15 @@ from ..engine.keys import split_each
 from ..engine.progress import metered_scan
 from ..models.bridge_problem import BridgeProblem, Intervals
 from ..models.diffusion import Diffusion
-from ..proposals import AbstractGuidedProposal, Guided, as_guided, as_proposal, noise_of, path_of
+from ..proposals import (
+    AbstractGuidedProposal,
+    Guided,
+    as_guided,
+    as_proposal,
+    noise_of,
+    num_noises,
+    path_of,
+)
 from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_position, one_interval
 
 
@@ -40,16 +48,20 @@ class CrankNicolsonState(NamedTuple):
     """State of the chain.
 
     - `position`: the path, shape (N+1, d).
-    - `noise`: the noise of the path, shape (N-1, d).
+    - `noise`: the noise of the path, shape (N-1, d); a few more numbers for steps that are not
+        normal.
     - `log_weight`: its log weight, -inf for a path that became non-finite.
     - `log_halving`: log of the factor by which half as many steps would change the weight
         (`halving`).
+    - `coarse_path`: path of half as many steps from the same noise, shape (N+1, d); `None` if the
+        path itself serves as such a path.
     """
 
     position: Float[Array, "*I points d"]
     noise: Float[Array, "*I steps d"]
     log_weight: Float[Array, "*I"]
     log_halving: Float[Array, "*I"]
+    coarse_path: Float[Array, "*I points d"] | None
 
 
 class CrankNicolsonInfo(NamedTuple):
@@ -130,13 +142,25 @@ def _init(
     model, proposal, intervals = nondifferentiable((model.prepared(), proposal, intervals))
     dynamics = model.forward(intervals.start[0])
     if paths is None:
-        noise = _sample_noise(keys, num_steps, intervals)
-        paths, log_weights, log_halving = path_of(proposal, dynamics, intervals, noise)
-    else:
-        noise, log_weights, log_halving = noise_of(proposal, dynamics, intervals, paths)
-        # A path outside the state space has no noise. Zeros let the chain leave it.
-        noise = jnp.where(jnp.isfinite(noise), noise, 0)
-    return CrankNicolsonState(paths, noise, _non_finite_to_neg_inf(log_weights), log_halving)
+        noise = _sample_noise(keys, num_noises(proposal, num_steps), intervals)
+        return _state_of(proposal, dynamics, intervals, noise, num_steps)
+    noise, log_weights, log_halving = noise_of(proposal, dynamics, intervals, paths)
+    # A path outside the state space has no noise. Zeros let the chain leave it.
+    noise = jnp.where(jnp.isfinite(noise), noise, 0)
+    return CrankNicolsonState(paths, noise, _non_finite_to_neg_inf(log_weights), log_halving, None)
+
+
+def _state_of(
+    proposal: AbstractGuidedProposal,
+    dynamics,
+    intervals: Intervals,
+    noise: Float[Array, "I steps d"],
+    num_steps: int,
+) -> CrankNicolsonState:
+    """Return the states with this noise."""
+    made = path_of(proposal, dynamics, intervals, noise, num_steps)
+    log_weights = _non_finite_to_neg_inf(made.log_weights)
+    return CrankNicolsonState(made.paths, noise, log_weights, made.log_change, made.coarse_paths)
 
 
 @compiled_sooner
@@ -160,12 +184,11 @@ def _move(
     noise_keys, accept_keys = split_each(keys, 2)
     dtype = state.noise.dtype
     beta = beta.astype(dtype)
-    # N - 1 steps have noise: the last one ends in b.
-    fresh = _sample_noise(noise_keys, state.noise.shape[1] + 1, intervals)
+    fresh = _sample_noise(noise_keys, state.noise.shape[1], intervals)
     # 1 - β² as a product keeps its digits near β = 1.
     noise = jnp.sqrt((1 - beta) * (1 + beta)) * state.noise + beta * fresh
-    paths, log_weights, log_halving = path_of(proposal, dynamics, intervals, noise)
-    candidate = CrankNicolsonState(paths, noise, _non_finite_to_neg_inf(log_weights), log_halving)
+    num_steps = state.position.shape[1] - 1
+    candidate = _state_of(proposal, dynamics, intervals, noise, num_steps)
     # The move leaves N(0, I) invariant, so the rate contains the weights only.
     rate = acceptance_rate(state.log_weight, candidate.log_weight)
     uniform = jax.vmap(lambda key: jax.random.uniform(key, dtype=dtype))(accept_keys)
@@ -201,7 +224,10 @@ def run_crank_nicolson(
     def step(state, keys):
         state, info = _move(keys, state, proposal, dynamics, intervals, beta)
         # The noise is as large as the path and is not part of the result.
-        stored = state._replace(position=problem.kept(state.position), noise=None)
+        kept = lambda path: None if path is None else problem.kept(path)
+        stored = state._replace(
+            position=kept(state.position), noise=None, coarse_path=kept(state.coarse_path)
+        )
         return state, (stored, info)
 
     _, outputs = metered_scan(step, first, step_keys.T, progress_meter)
@@ -225,17 +251,18 @@ def run_crank_nicolson(
         proposal=proposal,
         pareto_k=None,
         log_halving=problem.result(states.log_halving),
+        coarse_paths=problem.result(states.coarse_path),
         step_share=problem.result(proposal.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )
 
 
 def _sample_noise(
-    keys: Key[Array, " I"], num_steps: int, intervals: Intervals
+    keys: Key[Array, " I"], num: int, intervals: Intervals
 ) -> Float[Array, "I steps d"]:
     _, d = intervals.start.shape
     dtype = intervals.start.dtype
-    return jax.vmap(lambda key: jax.random.normal(key, (num_steps - 1, d), dtype))(keys)
+    return jax.vmap(lambda key: jax.random.normal(key, (num, d), dtype))(keys)
 
 
 def _non_finite_to_neg_inf(log_weights: Float[Array, " I"]) -> Float[Array, " I"]:

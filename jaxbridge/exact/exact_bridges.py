@@ -32,6 +32,8 @@ class AbstractExactBridges(AbstractResult):
     - `paths`, `met`: shapes (n, K, d) and (n,).
     - `log_halving`: log of the factor by which half as many steps would change the weight of a
         path, shape (n,); NaN where it was not computed.
+    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d); `None` if
+        the bridges themselves serve as such paths.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
         many steps, shape (). It is infinite if that change is uninformative, for couplings with a
         state-dependent σ(x). The uncertainty of the error is then infinite too.
@@ -41,8 +43,10 @@ class AbstractExactBridges(AbstractResult):
     paths: eqx.AbstractVar[Float[Array, "*I n K d"]]
     met: eqx.AbstractVar[Bool[Array, "*I n"]]
     log_halving: eqx.AbstractVar[Float[Array, "*I n"]]
+    coarse_paths: eqx.AbstractVar[Float[Array, "*I n K d"] | None]
     step_share: eqx.AbstractVar[Float[Array, "*I"]]
     proposal: eqx.AbstractVar[AbstractWeightedProposal]
+    num_steps: eqx.AbstractVar[int]
 
     @property
     def coupling(self) -> AbstractCoupling | None:
@@ -112,10 +116,19 @@ class AbstractExactBridges(AbstractResult):
         return StepError(*(root_mean_square_in_sds(value, variance) for value in error))
 
     def _step_errors(self, fn: PathFunction) -> PyTree:
-        def error(value):
-            return error_of_mean(self.log_mean_weights, self.log_halving, self.step_share, value)
+        share = self.step_share
 
-        return jax.tree.map(error, evaluate_on_paths(fn, fill_missing_paths(self.paths, self.met)))
+        def values(paths):
+            return evaluate_on_paths(fn, fill_missing_paths(paths, self.met))
+
+        def error(*values):
+            return error_of_mean(self.log_mean_weights, self.log_halving, share, *values)
+
+        if self.coarse_paths is None:
+            return jax.tree.map(error, values(self.paths))
+        # The last step is the same on both grids if N is odd.
+        share = share * self.num_steps / max(self.num_steps - self.num_steps % 2, 1)
+        return jax.tree.map(error, values(self.paths), values(self.coarse_paths))
 
 
 def _is_error(leaf) -> bool:

@@ -81,6 +81,8 @@ class WeightedBridges(AbstractExactBridges):
         contains their `burn_in`.
     - `log_halving`: log of the factor by which half as many steps would change a weight, shape
         (n,); NaN where it was not computed.
+    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d); `None` if
+        the bridges themselves serve as such paths.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
         many steps.
     """
@@ -94,6 +96,7 @@ class WeightedBridges(AbstractExactBridges):
     num_nonfinite: Int[Array, "*I"]
     proposal: AbstractWeightedProposal
     log_halving: Float[Array, "*I n"]
+    coarse_paths: Float[Array, "*I n K d"] | None
     step_share: Float[Array, "*I"]
     num_steps: int = eqx.field(static=True)
 
@@ -298,6 +301,7 @@ def _weigh_bridges(key, model, pairs, bridges, search):
         # The result contains the start law of its weights, with the measured burn-in.
         proposal=eqx.tree_at(lambda p: p.coupling, pairs, coupling),
         log_halving=log_halving,
+        coarse_paths=None,
         step_share=share,
         num_steps=bridges.num_steps,
     )
@@ -354,7 +358,7 @@ def sample_weighted_bridges(
     problem = bridge_problem(model, start, end, duration, num_steps)
     num_bridges = check_count("num_bridges", num_bridges)
     budget = Budget(num_counts, max_proposals, max_trials)
-    proposal = as_proposal(proposal, model, problem.like, budget)
+    proposal = as_proposal(proposal, model, problem.like, budget, normal_steps=False)
     proposal.check(model, problem.intervals)
     problem = problem.keep(save_at, duration, proposal.fractions(num_steps))
     proposal = resolve(proposal, key, model, problem.intervals, num_steps)
@@ -392,7 +396,8 @@ def _sample_weighted(
         num_simulated=problem.total(weighted_paths.num_simulated),
         num_nonfinite=problem.total(weighted_paths.num_nonfinite),
         proposal=proposal,
-        log_halving=results.log_halving,
+        log_halving=problem.result(weighted_paths.log_change),
+        coarse_paths=results.coarse_paths,
         step_share=problem.result(proposal.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )

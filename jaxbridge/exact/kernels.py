@@ -82,6 +82,8 @@ class Chain(AbstractExactBridges):
         no independent weights.
     - `log_halving`: log of the factor by which half as many steps would change the weight of a
         state, shape (n,); NaN where it was not computed.
+    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d); `None` if
+        the states themselves serve as such paths.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
         many steps.
     - `num_steps`: N.
@@ -99,6 +101,7 @@ class Chain(AbstractExactBridges):
     proposal: AbstractWeightedProposal
     pareto_k: Float[Array, "*I"] | None
     log_halving: Float[Array, "*I n"]
+    coarse_paths: Float[Array, "*I n K d"] | None
     step_share: Float[Array, "*I"]
     num_steps: int = eqx.field(static=True)
 

@@ -174,7 +174,8 @@ def run_pseudo_marginal(
     # The chain selects rows; paths are gathered once, after the scan.
     row, accepted = accept_reject(candidates.log_weights, uniform.reshape(step_keys.shape))
     interval = jnp.arange(problem.num_intervals)[:, None]
-    states = problem.result(jax.tree.map(lambda leaf: leaf[interval, row], candidates))
+    states = jax.tree.map(lambda leaf: leaf[interval, row], candidates)
+    log_change, states = problem.result((states.log_change, states))
     return Chain(
         times=problem.times(proposal.fractions(num_steps)),
         paths=states.paths,
@@ -187,7 +188,8 @@ def run_pseudo_marginal(
         num_truncated=problem.total(candidates.truncated),
         proposal=proposal,
         pareto_k=problem.result(pareto_k(candidates.log_weights)),
-        log_halving=states.log_halving,
+        log_halving=log_change,
+        coarse_paths=states.coarse_paths,
         step_share=problem.result(proposal.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )

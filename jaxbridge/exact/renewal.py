@@ -340,6 +340,7 @@ def run_renewal(
         proposal=pairs,
         pareto_k=None,
         log_halving=problem.result(log_halving),
+        coarse_paths=None,
         step_share=problem.result(pairs.share_in_regime(model, intervals, num_steps)),
         num_steps=num_steps,
     )

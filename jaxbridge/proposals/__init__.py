@@ -46,6 +46,7 @@ from .guided import (
     AbstractGuidedProposal as AbstractGuidedProposal,
     as_guided as as_guided,
     noise_of as noise_of,
+    num_noises as num_noises,
     path_of as path_of,
 )
 from .linear_guide import Guided as Guided

@@ -72,9 +72,9 @@ class Auto(AbstractProposal):
     def of(self, which):
         return self
 
-    def for_model(self, model, like, for_density=False):
+    def for_model(self, model, like, normal_steps=True):
         candidates = tuple(
-            candidate.for_model(model, like, for_density) for candidate in self.candidates
+            candidate.for_model(model, like, normal_steps) for candidate in self.candidates
         )
         return dataclasses.replace(self, candidates=candidates)
 
@@ -165,23 +165,25 @@ def as_proposal(
     like: Float[Array, " d"],
     budget: Budget = _NO_BUDGET,
     for_density: bool = False,
+    normal_steps: bool = True,
     name: str = "proposal",
 ) -> AbstractProposal:
     """Return the argument `proposal` as a proposal with all defaults of this model set.
 
     `None` stands for `Coupling()`. `like` is a point of the right shape and dtype. `for_density`
-    states that the weights estimate densities, so a constant factor matters. `name` is the argument
-    in messages.
+    states that the weights estimate densities, so a constant factor matters. `normal_steps` states
+    that paths must determine their noise; never `for_density`. `name` is the argument in messages.
 
     **Raises:** `TypeError` for anything but a coupling, a proposal or "auto". `ValueError` for a
     budget if the proposal has no use for one.
     """
+    normal_steps = normal_steps and not for_density
     if isinstance(proposal, str) and proposal == "auto":
         candidates = default_candidates(model, for_density)
         converted = choice_between(candidates, budget, left_out=why_left_out(model, for_density))
-        return converted.for_model(model, like, for_density)
+        return converted.for_model(model, like, normal_steps)
     converted = _convert(Coupling() if proposal is None else proposal, budget, name)
-    return converted.for_model(model, like, for_density)
+    return converted.for_model(model, like, normal_steps)
 
 
 def _convert(proposal: Any, budget: Budget, name: str = "proposal") -> AbstractProposal:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -39,6 +40,9 @@ class WeightedPaths(NamedTuple):
     - `log_halving`: D of `halving`, NaN if it was not computed.
     - `log_coarse`: log weight of the path of half as many steps from the same noise
         (`coupled_grids`); -inf if that path was lost, NaN if it was not computed.
+    - `coarse_paths`: those paths, or the path itself if its `log_coarse` is NaN; `None` if none
+        were stored. Between two points of the coarse grid their distance to the fine path is
+        constant.
     """
 
     paths: Float[Array, "I n K d"]
@@ -49,14 +53,25 @@ class WeightedPaths(NamedTuple):
     num_nonfinite: Int[Array, "I n"]
     log_halving: Float[Array, "I n"]
     log_coarse: Float[Array, "I n"]
+    coarse_paths: Float[Array, "I n K d"] | None
+
+    @property
+    def log_change(self) -> Float[Array, "I n"]:
+        """Return the log of the factor by which half as many steps change each weight.
+
+        It is the weight of the coarse path over that of the path, or D without coarse paths.
+        """
+        # A path that was not found has no ratio.
+        log_weights = jnp.where(self.found, self.log_weights, 0)
+        of_coarse_paths = jnp.where(self.found, self.log_coarse - log_weights, jnp.nan)
+        return jnp.where(jnp.isnan(self.log_coarse), self.log_halving, of_coarse_paths)
 
     def step_error(
         self, share: Float[Array, " I"], num_steps: int, sigma_varies: bool, held: bool = False
     ) -> StepError:
         """Return the discretisation error of log p̂, where p̂ is the mean of the weights.
 
-        For a state-dependent σ it needs `log_coarse`, which is only available if no points of the
-        paths are stored.
+        For a state-dependent σ it needs `log_coarse`.
 
         - `share`: the result of `step_share`.
         - `held`: whether the weights belong to the current state of a pseudo-marginal chain. The
@@ -97,12 +112,12 @@ class AbstractProposal(eqx.Module):
 
     @abstractmethod
     def for_model(
-        self, model: Diffusion, like: Float[Array, " d"], for_density: bool = False
+        self, model: Diffusion, like: Float[Array, " d"], normal_steps: bool = True
     ) -> "AbstractProposal":
         """Return the proposal with all defaults that depend on the model set.
 
-        `like` is a point of the right shape and dtype. `for_density` states that only weights are
-        needed, and no paths.
+        `like` is a point of the right shape and dtype. `normal_steps` states that paths must
+        determine their noise.
         """
 
     @abstractmethod
@@ -213,12 +228,12 @@ class AbstractSingleProposal(AbstractWeightedProposal):
 
     @abstractmethod
     def for_model(
-        self, model: Diffusion, like: Float[Array, " d"], for_density: bool = False
+        self, model: Diffusion, like: Float[Array, " d"], normal_steps: bool = True
     ) -> "AbstractSingleProposal":
         """Return the proposal with all defaults that depend on the model set.
 
-        `like` is a point of the right shape and dtype. `for_density` states that only weights are
-        needed, and no paths.
+        `like` is a point of the right shape and dtype. `normal_steps` states that paths must
+        determine their noise.
         """
 
     def of(self, which):
@@ -256,7 +271,7 @@ class AbstractSingleProposal(AbstractWeightedProposal):
 
     @abstractmethod
     def most_accurate(
-        self, model: Diffusion, like: Float[Array, " d"], for_density: bool = False
+        self, model: Diffusion, like: Float[Array, " d"], normal_steps: bool = True
     ) -> "AbstractSingleProposal":
         """Return the proposal with the most accurate scheme or target for this model."""
 

@@ -95,9 +95,9 @@ class Choice(AbstractWeightedProposal):
         used = self.used if is_traced(chosen) else tuple(np.unique(chosen).tolist())
         return Choice(self.candidates, *results, used, self.left_out)
 
-    def for_model(self, model, like, for_density=False):
+    def for_model(self, model, like, normal_steps=True):
         candidates = tuple(
-            candidate.for_model(model, like, for_density) for candidate in self.candidates
+            candidate.for_model(model, like, normal_steps) for candidate in self.candidates
         )
         return dataclasses.replace(self, candidates=candidates)
 
@@ -162,7 +162,7 @@ class Choice(AbstractWeightedProposal):
             mask = self.chosen == i
             mask = mask if active is None else mask & active
             part = evaluate(self.candidates[i], mask)
-            paths = part if paths is None else jax.tree.map(_select(mask), part, paths)
+            paths = part if paths is None else _join(mask, part, paths)
         assert paths is not None
         return paths
 
@@ -263,11 +263,21 @@ def _draw_guided_tangents(primals, tangents):
         return tuple(total)
 
     _, (paths, log_weights) = eqx.filter_jvp(redraw, (inputs,), (tangents[0],))
-    return primal_out, WeightedPaths(paths, log_weights, *6 * [None])  # pyright: ignore
+    return primal_out, WeightedPaths(paths, log_weights, *7 * [None])  # pyright: ignore
 
 
-def _select(mask: Bool[Array, " I"]) -> Callable[[Array, Array], Array]:
-    return lambda new, old: jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+def _join(mask: Bool[Array, " I"], new: WeightedPaths, old: WeightedPaths) -> WeightedPaths:
+    """Return the new paths where `mask` is true, else the old ones."""
+
+    def select(new, old):
+        return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    if new.coarse_paths is not None or old.coarse_paths is not None:
+        new, old = (
+            part._replace(coarse_paths=part.paths) if part.coarse_paths is None else part
+            for part in (new, old)
+        )
+    return jax.tree.map(select, new, old)
 
 
 def best_at_worst(choice: Choice, num: int) -> Choice:

@@ -96,10 +96,10 @@ class CoupledPairs(AbstractSingleProposal):
     def ingredients(self):
         return ingredients(self.coupling)
 
-    def for_model(self, model, like, for_density=False):
+    def for_model(self, model, like, normal_steps=True):
         return self
 
-    def most_accurate(self, model, like, for_density=False):
+    def most_accurate(self, model, like, normal_steps=True):
         return eqx.tree_at(lambda p: p.coupling, self, most_accurate(self.coupling))
 
     def for_pilot(self):
@@ -208,6 +208,7 @@ class CoupledPairs(AbstractSingleProposal):
                 proposed.num_nonfinite + counts.num_nonfinite,
                 log_halving,
                 jnp.full_like(log_weights, jnp.nan),
+                None,
             )
             return jax.tree.map(
                 lambda leaf: leaf.reshape(num_intervals, num_draws, *leaf.shape[1:]), weighted
@@ -241,6 +242,7 @@ class CoupledPairs(AbstractSingleProposal):
             counts.num_nonfinite,
             self.log_halving(model, intervals, paths, 1),
             jnp.full_like(log_weights, jnp.nan),
+            None,
         )
         return jax.tree.map(lambda leaf: leaf[:, None], weighted)
 

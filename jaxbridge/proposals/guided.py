@@ -120,15 +120,14 @@ class AbstractGuidedProposal(AbstractSingleProposal):
     def ingredients(self):
         return type(self.target).__name__, "", np.nan
 
-    def for_model(self, model, like, for_density=False):
+    def for_model(self, model, like, normal_steps=True):
         model.check_invertible_sigma(like)
-        # A density that is not normal was selected for weights and is unusable for paths.
-        if self.density is not None and (for_density or self.density.is_normal):
+        if self.density is not None and (self.density.is_normal or not normal_steps):
             return self
-        return self._with_density(most_accurate_density(model, like, for_density))
+        return self._with_density(most_accurate_density(model, like, normal_steps))
 
-    def most_accurate(self, model, like, for_density=False):
-        density = most_accurate_density(model, like, for_density)
+    def most_accurate(self, model, like, normal_steps=True):
+        density = most_accurate_density(model, like, normal_steps)
         if self.density is not None and self.density.order >= density.order:
             return self
         return self._with_density(density)
@@ -272,12 +271,14 @@ class _LaneState(NamedTuple):
     - `before`: the previous point, or the previous noise if there are coarse paths.
     - `log_halving`: D of `halving` so far.
     - `coarse`: coarse paths so far; `None` if none are simulated.
+    - `gap`: distance from the paths to the coarse paths, at their last common point.
     """
 
     path: _PathWeights
     before: Float[Array, "d *looked"]
     log_halving: Float[Array, "*evaluated"]
     coarse: _PathWeights | None
+    gap: Float[Array, "d *evaluated"] | None
 
     @property
     def x(self) -> Float[Array, "d *lanes"]:
@@ -331,8 +332,35 @@ class _GuidedLanes:
         start = self.spread(self.start)
         evaluated, zero = self._select_evaluated(start), jnp.zeros_like(start[0])
         zeros = jnp.zeros_like(evaluated[0])
-        coarse = None if self._coarse_dt is None else _PathWeights(evaluated, zeros, zeros)
-        return _LaneState(_PathWeights(start, zero, zero), evaluated, zeros, coarse)
+        coarse = gap = None
+        if self._coarse_dt is not None:
+            coarse, gap = _PathWeights(evaluated, zeros, zeros), jnp.zeros_like(evaluated)
+        return _LaneState(_PathWeights(start, zero, zero), evaluated, zeros, coarse, gap)
+
+    def end_points(self, with_coarse: bool) -> Float[Array, "d points"]:
+        """Return the end points of all paths, followed by those of their coarse paths."""
+        ends = [self.spread(self.end)]
+        if with_coarse:
+            ends.append(self._select_evaluated(ends[0]))
+        return jnp.concatenate(ends, axis=-1)
+
+    def points(self, state: _LaneState) -> Float[Array, "d points"]:
+        """Return the current points of all paths, followed by those of their coarse paths.
+
+        Between two points of the coarse grid, the distance between both is constant, or zero where
+        it would lead out of the state space.
+        """
+        if state.gap is None:
+            return state.x
+        here = self._select_evaluated(state.x)
+        coarse = here + state.gap
+        inside = over_lanes(-1)(self._is_inside)(coarse)
+        return jnp.concatenate([state.x, jnp.where(inside, coarse, here)], axis=-1)
+
+    def _is_inside(self, x: Float[Array, " d"]) -> Bool[Array, ""]:
+        """Return whether x is in the state space."""
+        has_sigma = jnp.isfinite(self._dynamics.sigma(x).log_abs_det())
+        return all_finite(self._dynamics.drift(x)) & has_sigma
 
     def advance(self, state: _LaneState, xi: Float[Array, "d lanes"], steps: _Steps) -> _LaneState:
         """Return the state after a step with the noise ξ."""
@@ -344,13 +372,14 @@ class _GuidedLanes:
         coarse, coarse_steps = state.coarse, steps.coarse
         if coarse_steps is None:  # the coarse path has one step only, which `finish` takes
             return state._replace(path=path)
-        coarse = lax.cond(
-            coarse_steps.ends,
+
+        def take_coarse_step():
             # The noise of both fine steps is available at the end of the pair.
-            lambda: self._take_coarse_step(coarse, state.before, here, coarse_steps),
-            lambda: coarse,
-        )
-        return _LaneState(path, here, state.log_halving, coarse)
+            stepped = self._take_coarse_step(coarse, state.before, here, coarse_steps)
+            return stepped, lax.stop_gradient(stepped.x - self._select_evaluated(path.x))
+
+        coarse, gap = lax.cond(coarse_steps.ends, take_coarse_step, lambda: (coarse, state.gap))
+        return _LaneState(path, here, state.log_halving, coarse, gap)
 
     def _take_step(
         self, path: _PathWeights, xi: Float[Array, "d lanes"], step: Step
@@ -432,10 +461,8 @@ class _GuidedLanes:
         def log_density_at_point(x, last):
             # An end point outside of the state space makes the weight NaN, so no path is found.
             end, dt = last
-            inside = all_finite(self._dynamics.drift(end))
-            inside &= jnp.isfinite(self._dynamics.sigma(end).log_abs_det())
             log_density = self._closing.steps_from(self._dynamics, x).law(dt).log_density(end)
-            return jnp.where(inside, log_density, jnp.nan)
+            return jnp.where(self._is_inside(end), log_density, jnp.nan)
 
         last = self._per_lane((self.end, dt), num_draws)
         log_density = over_lanes(-1, self._lane_axis)(log_density_at_point)(path.x, last)
@@ -473,7 +500,7 @@ class _GuidedLanes:
             lambda: self._jitted_log_halving(state.before, from_x, to_x, steps.before, steps.dt),
             lambda: jnp.zeros_like(state.log_halving),
         )
-        return _LaneState(path, from_x, state.log_halving + lax.stop_gradient(change), None)
+        return _LaneState(path, from_x, state.log_halving + lax.stop_gradient(change), None, None)
 
     def _log_halving(self, before, x, x_next, *both):
         """Return the summand of D of one pair of steps, for the first paths of each interval."""
@@ -511,26 +538,56 @@ def noise_of(
     )
 
 
+class PathsOfNoise(NamedTuple):
+    """Paths that given noise generates, one per interval.
+
+    - `log_change`: log of the factor by which half as many steps change the weight.
+    - `coarse_paths`: the paths of half as many steps from the same noise; `None` if they are the
+        paths themselves.
+    """
+
+    paths: Float[Array, "I points d"]
+    log_weights: Float[Array, " I"]
+    log_change: Float[Array, " I"]
+    coarse_paths: Float[Array, "I points d"] | None
+
+
+def num_noises(proposal: AbstractGuidedProposal, num_steps: int) -> int:
+    """Return the number of steps with noise; the last step ends in b and may be split."""
+    return len(_fractions(proposal, num_steps)[0]) - 2
+
+
 def path_of(
     proposal: AbstractGuidedProposal,
     dynamics: Dynamics,
     intervals: Intervals,
     xi: Float[Array, "I steps d"],
-) -> tuple[Float[Array, "I points d"], Float[Array, " I"], Float[Array, " I"]]:
-    """Return the paths that this noise generates, with their log weights and D.
+    num_steps: int,
+) -> PathsOfNoise:
+    """Return the paths of `num_steps` steps that this noise generates.
 
-    It is the inverse of `noise_of`. The target must have normal steps.
+    For normal steps it is the inverse of `noise_of`.
     """
-    lanes = _GuidedLanes(proposal, dynamics, intervals, xi.shape[1] + 1)
+    with_coarse = not proposal.target.is_normal and num_steps > 1
+    lanes = _GuidedLanes(proposal, dynamics, intervals, num_steps, 1, with_coarse)
 
     def step(state, inputs):
         state = lanes.advance(join_rows(state), *join_rows(inputs))
-        return split_rows(state), split_rows(state.x)
+        return split_rows(state), split_rows(lanes.points(state))
 
     inputs = split_rows((jnp.moveaxis(xi, 0, -1), lanes.steps), axis=1)
-    state, path = lax.scan(step, split_rows(lanes.begin()), inputs)
-    path = jnp.concatenate([lanes.start[None], join_rows(path, axis=1), lanes.end[None]])
-    return jnp.moveaxis(path, -1, 0), *_drop_draw_axis(lanes.finish(join_rows(state)))
+    first = lanes.begin()
+    state, points = lax.scan(step, split_rows(first), inputs)
+    log_weights, half = _drop_draw_axis(lanes.finish(join_rows(state)))
+    ends = lanes.points(first)[None], lanes.end_points(with_coarse)[None]
+    points = jnp.concatenate([ends[0], join_rows(points, axis=1)[: num_steps - 1], ends[1]])
+    paths = jnp.moveaxis(points, -1, 0)
+    if not with_coarse:
+        return PathsOfNoise(paths, log_weights, half, None)
+    paths, coarse_paths = jnp.split(paths, 2)
+    is_found = jnp.isfinite(half)[:, None, None]
+    coarse_paths = jnp.where(is_found, coarse_paths, paths)
+    return PathsOfNoise(paths, log_weights, half - log_weights, coarse_paths)
 
 
 def _drop_draw_axis(finished: tuple[Array, Array]) -> tuple[Float[Array, " I"], Float[Array, " I"]]:
@@ -544,9 +601,13 @@ def _as_weighted_paths(
     log_weights: Float[Array, "I n"],
     log_halving: Float[Array, "I n"],
     log_coarse: Float[Array, "I n"],
+    coarse_paths: Float[Array, "I n K d"] | None = None,
 ) -> WeightedPaths:
     """Return guided paths as `WeightedPaths`; paths with a non-finite weight are not found."""
     is_finite = jnp.isfinite(log_weights)
+    if coarse_paths is not None:
+        is_coarse_found = jnp.isfinite(log_coarse)[..., None, None]
+        coarse_paths = jnp.where(is_coarse_found, coarse_paths, paths)
     return WeightedPaths(
         jnp.where(is_finite[..., None, None], paths, jnp.nan),
         jnp.where(is_finite, log_weights, -jnp.inf),
@@ -556,19 +617,21 @@ def _as_weighted_paths(
         (~is_finite).astype(jnp.int32),
         log_halving,
         log_coarse,
+        coarse_paths,
     )
 
 
 class _Draws(NamedTuple):
     """Paths with log weights.
 
-    `log_halving` and `log_coarse` are those of `WeightedPaths`; they have no derivatives.
+    The other fields are those of `WeightedPaths`; they have no derivatives.
     """
 
     paths: Float[Array, "I n K d"]
     log_weights: Float[Array, "I n"]
     log_halving: Float[Array, "I n"]
     log_coarse: Float[Array, "I n"]
+    coarse_paths: Float[Array, "I n K d"] | None
 
 
 class _Inputs(NamedTuple):
@@ -614,7 +677,7 @@ def _draw_tangents(primals, tangents):
         return jnp.where(is_finite[..., None, None], paths, 0), jnp.where(is_finite, log_weights, 0)
 
     _, tangents_out = eqx.filter_jvp(redraw, (inputs,), (tangents[0],))
-    return draws, _Draws(*tangents_out, *map(jnp.zeros_like, draws[2:]))
+    return draws, _Draws(*tangents_out, *jax.tree.map(jnp.zeros_like, tuple(draws[2:])))
 
 
 def _simulate(
@@ -632,28 +695,31 @@ def _simulate(
     dynamics = model.forward(intervals.start[0])
     (num_intervals, num_draws), (_, d) = keys.shape, intervals.start.shape
     dtype = intervals.start.dtype
-    # Coarse paths differ from the fine ones, so they estimate the error of weights only.
+    # With stored points and normal steps D is available, which needs no other paths.
     only_weights = stored is not None and stored.shape[0] == 0
-    with_coarse = only_weights and dynamics.sigma_varies and num_steps > 1
+    is_coupled = only_weights or not proposal.target.is_normal
+    with_coarse = is_coupled and dynamics.sigma_varies and num_steps > 1
     lanes = _GuidedLanes(proposal, dynamics, intervals, num_steps, num_draws, with_coarse)
-    num_steps = lanes.num_steps
-    state, end = lanes.begin(), lanes.spread(lanes.end)
-    path = state.x[None][:0]  # no points between the ends if N = 1
+    # The last step may be split. The points within it are not part of the path.
+    last, num_steps = num_steps, lanes.num_steps
+    state = lanes.begin()
+    start, end = lanes.points(state), lanes.end_points(with_coarse)
+    path = start[None][:0]  # no points between the ends if N = 1
     store = slots = None
     if stored is not None:
         # Row K receives all points that are not stored. The rows of the first and the last point
         # are filled separately, because the scan covers the points between.
-        rows = jnp.broadcast_to(state.x, (stored.shape[0] + 1, *state.x.shape))
-        slots = jnp.full(num_steps + 1, stored.shape[0]).at[stored].set(jnp.arange(len(stored)))
+        rows = jnp.broadcast_to(start, (stored.shape[0] + 1, *start.shape))
+        points = jnp.where(stored == last, num_steps, stored)
+        slots = jnp.full(num_steps + 1, stored.shape[0]).at[points].set(jnp.arange(len(stored)))
         store = Store(slots[1:-1], rows)
-    start = state.x
     if num_steps > 1:
 
         def step(state, inputs):
             xi, steps = inputs
             xi = xi if noisy is None else jnp.where(noisy.reshape(-1), xi, 0)
             state = lanes.advance(state, xi, steps)
-            return state, state.x
+            return state, lanes.points(state)
 
         state, path = noisy_scan(
             step,
@@ -672,11 +738,20 @@ def _simulate(
     half = unknown.at[:, : evaluated.shape[1]].set(evaluated)
     halves = (unknown, half) if with_coarse else (half, unknown)
     if slots is None:
-        path = jnp.concatenate([start[None], path, end[None]])
+        path = jnp.concatenate([start[None], path[: last - 1], end[None]])
     else:
         path = path.at[slots[-1]].set(end)[:-1]
-    path = path.reshape(-1, d, num_intervals, num_draws)
-    return _Draws(jnp.moveaxis(path, (2, 3), (0, 1)), log_weights, *halves)
+    num_lanes = num_intervals * num_draws
+
+    def of_intervals(path):
+        path = path.reshape(*path.shape[:2], num_intervals, path.shape[2] // num_intervals)
+        return jnp.moveaxis(path, (2, 3), (0, 1))
+
+    paths, coarse_paths = of_intervals(path[:, :, :num_lanes]), None
+    if with_coarse and not only_weights:
+        coarse = of_intervals(path[:, :, num_lanes:])
+        coarse_paths = paths.at[:, : coarse.shape[1]].set(coarse)
+    return _Draws(paths, log_weights, *halves, coarse_paths)
 
 
 def _grid(

@@ -127,6 +127,7 @@ def masked(weighted: WeightedPaths, active: Bool[Array, " I"]) -> WeightedPaths:
         mask_leaf(weighted.num_nonfinite, 0),
         mask_leaf(weighted.log_halving, jnp.nan),
         mask_leaf(weighted.log_coarse, jnp.nan),
+        weighted.coarse_paths,  # without weight
     )
 
 

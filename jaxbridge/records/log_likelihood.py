@@ -261,7 +261,7 @@ def log_likelihood(
     num_filters = check_count("num_filters", 8 if num_filters is None else num_filters)
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
-    records = as_record_problems(*arguments, num_steps=num_steps, for_weights=True, **options)
+    records = as_record_problems(*arguments, num_steps=num_steps, normal_steps=False, **options)
     size = num_filters, num_particles
     levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
     grids = [records, *map(records.coarsened, levels)]

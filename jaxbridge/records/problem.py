@@ -73,7 +73,7 @@ def as_record_problem(
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
     any_constant: bool = False,
-    for_weights: bool = False,
+    normal_steps: bool = True,
 ) -> RecordProblem:
     """Validate the arguments common to all functions that take one record.
 
@@ -81,7 +81,7 @@ def as_record_problem(
 
     - `any_constant`: whether the stationary density may be unnormalised. It may be if only paths at
         fixed parameters are needed.
-    - `for_weights`: whether the noise of a given path is never needed (`most_accurate_density`).
+    - `normal_steps`: whether paths must determine their noise (`most_accurate_density`).
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """
@@ -92,7 +92,7 @@ def as_record_problem(
             "for each record, because records are independent given the parameters."
         )
     (record,) = as_records(pairs, num_steps, step_size, initial_time)
-    return problem_of(model, record, observation, initial, density, any_constant, for_weights)
+    return problem_of(model, record, observation, initial, density, any_constant, normal_steps)
 
 
 def problem_of(
@@ -102,7 +102,7 @@ def problem_of(
     initial: Initial,
     density: AbstractStepDensity | None = None,
     any_constant: bool = False,
-    for_weights: bool = False,
+    normal_steps: bool = True,
 ) -> RecordProblem:
     """Validate the model, observation model and initial law of a record.
 
@@ -137,7 +137,7 @@ def problem_of(
     check_clock(model, observation, record)
     density = check_step_density(density)
     if density is None:
-        density = most_accurate_density(model, like, for_weights)
+        density = most_accurate_density(model, like, normal_steps)
     return RecordProblem(model, record, observation, initial, density, dim)
 
 

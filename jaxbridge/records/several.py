@@ -90,11 +90,11 @@ def as_record_problems(
     step_size: float | None = None,
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
-    for_weights: bool = False,
+    normal_steps: bool = True,
 ) -> Records:
     """Validate the arguments common to all functions that take one or several records.
 
-    `for_weights` is explained in `as_record_problem`.
+    `normal_steps` is explained in `as_record_problem`.
 
     **Returns:** `Records`.
 
@@ -102,7 +102,7 @@ def as_record_problems(
     """
     pairs = split_records(times, observations)
     records = as_records(pairs, num_steps, step_size, initial_time)
-    law = density, False, for_weights
+    law = density, False, normal_steps
     problem = problem_of(model, records[0], observation, initial, *law)
     for record in records[1:]:
         check_domain(model, observation, record)

@@ -324,11 +324,11 @@ def check_step_density(density: AbstractStepDensity | None) -> AbstractStepDensi
 
 
 def most_accurate_density(
-    model: Diffusion, like: Float[Array, " d"], for_weights: bool = False
+    model: Diffusion, like: Float[Array, " d"], normal_steps: bool = True
 ) -> AbstractStepDensity:
     """Return the most accurate step density of a model, for points like `like`.
 
-    `for_weights` states that only weights are needed. Then the steps need not be normal.
+    `normal_steps` states that paths must determine their noise, so that steps must be normal.
     """
     sigma_varies, invertible = model.sigma_varies(like), model.sigma_is_invertible(like)
     if not sigma_varies:
@@ -336,7 +336,7 @@ def most_accurate_density(
     if not invertible:
         return HypoellipticDensity()
     quadratic = decisions.quadratic_noise(invertible, sigma_varies, like.shape[0])
-    return QuadraticDensity() if for_weights and quadratic.simulated else EulerDensity()
+    return EulerDensity() if normal_steps or not quadratic.simulated else QuadraticDensity()
 
 
 def _degenerate_euler(dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:

@@ -97,7 +97,7 @@ def choose_proposal(
 
     def choose_between(candidates, left_out=""):
         auto = choice_between(candidates, num_pilot=num_pilot, left_out=left_out)
-        auto = auto.for_model(model, intervals.start[0], for_density)
+        auto = auto.for_model(model, intervals.start[0], normal_steps=not for_density)
         auto.check(model, intervals)
         if for_density:
             auto.check_for_density(model)

@@ -283,7 +283,9 @@ def test_noise_makes_the_path_and_the_path_gives_the_noise(precision):
     euler = jb.EulerDensity()
     for proposal in (jb.ModifiedDiffusionBridge(euler), jb.Guided("path", euler, refinement=1.5)):
         paths, log_weights, log_halving = jax.jit(
-            lambda xi, proposal=proposal: path_of(proposal, dynamics, intervals, xi)
+            lambda xi, proposal=proposal: path_of(
+                proposal, dynamics, intervals, xi, xi.shape[1] + 1
+            )[:3]
         )(xi)
         noise, again, halving_again = jax.jit(
             lambda paths, proposal=proposal: noise_of(proposal, dynamics, intervals, paths)

@@ -121,7 +121,12 @@ def test_one_d_for_each_path(density, num_steps, x64):
     dynamics, intervals = model.forward(start[0]), Intervals(start, end, ones)
     made = [log_halving_of_paths(density, dynamics, dt, paths)]
     noise, _, D = jax.jit(lambda x: noise_of(proposal, dynamics, intervals, x))(paths)
-    made += [D, jax.jit(lambda x: path_of(proposal, dynamics, intervals, x)[2])(noise)]
+    made += [
+        D,
+        jax.jit(lambda x: path_of(proposal, dynamics, intervals, x, x.shape[1] + 1).log_change)(
+            noise
+        ),
+    ]
     for D in made:
         np.testing.assert_allclose(D, weighted.log_halving, atol=1e-9)
     assert np.isnan(weighted.log_halving).all() == (num_steps == 1)

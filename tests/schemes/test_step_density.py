@@ -448,9 +448,9 @@ def test_quadratic_steps_depend_on_the_covariance_only(x64):
 
 def test_quadratic_steps_are_for_weights_in_few_dimensions():
     """Memory grows as d³ and time as d⁴; and paths need steps with an inverse."""
-    for d, for_weights, expected in [(10, True, True), (11, True, False), (10, False, False)]:
+    for d, normal_steps, expected in [(10, False, True), (11, False, False), (10, True, False)]:
         model, like = jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + x**2), jnp.zeros(d)
-        density = most_accurate_density(model, like, for_weights)
+        density = most_accurate_density(model, like, normal_steps)
         assert isinstance(density, QuadraticDensity if expected else jb.EulerDensity)
 
 
