@@ -54,7 +54,8 @@ def sample_exact_bridges(
     depend on the state of the chain. So thousands of proposals and their counts run at a time,
     before the chain. The renewal chain runs in segments, which are joined where they agree.
 
-    Up to rounding the result is the chain of the kernel. That chain starts from `init(position,
+    Up to rounding the result is the chain of the kernel, if that has the same step density: kernels
+    have Euler steps for a state-dependent σ. The chain of the kernel starts from `init(position,
     init_key)`, and its steps have the keys `jax.random.split(run_key, num_bridges)`. Here `run_key`
     and `init_key` are the two keys of `jax.random.split(key)`.
 
@@ -65,7 +66,8 @@ def sample_exact_bridges(
     - `num_bridges`: n, the number of iterations.
     - `position`: the path from which the chain starts, shape (N+1, d), for instance the last one of
         another chain; shape (I, N+1, d) for I intervals. By default the chain proposes its first
-        path.
+        path. With a `position` and a state-dependent σ, guided proposals have Euler steps, because
+        a given path must determine its noise.
     - `proposal`: a `Coupling`, with its start law; a guided proposal (`ModifiedDiffusionBridge()`,
         `ResidualBridge()` or `Guided()`), whose target is a product of step densities; "auto",
         which selects the best one for each interval by a pilot run; or a result of

@@ -35,7 +35,7 @@ class Effects(NamedTuple):
     - `noise_by_drift`: noise that the drift transports, within a step, to coordinates that σ does
         not reach. For paths of records.
     - `quadratic_noise`: the part of a step that is quadratic in its noise, by derivatives of V. For
-        weights of guided paths.
+        guided paths.
     - `time`: coefficients evaluated at the middle of each step. For paths of records.
     """
 
@@ -82,14 +82,14 @@ _LARGEST_QUADRATIC = 10
 
 
 def quadratic_noise(invertible: bool, sigma_varies: bool, d: int) -> Effect:
-    """Decide whether steps of weights are quadratic in their noise (`QuadraticDensity`)."""
+    """Decide whether steps of guided paths are quadratic in their noise (`QuadraticDensity`)."""
     if not sigma_varies:
         return Effect(False, "σ does not depend on the state: steps of weak order 2 are normal")
     if not invertible:
         return Effect(False, "σ has fewer columns than rows: the steps are normal")
     if d > _LARGEST_QUADRATIC:
         return Effect(False, f"more than {_LARGEST_QUADRATIC} dimensions: Euler steps are cheaper")
-    return Effect(True, "σ depends on the state; for weights, not for stored paths")
+    return Effect(True, "σ depends on the state; not where given paths determine their noise")
 
 
 def time(depends_on_time: bool) -> Effect:

@@ -14,22 +14,23 @@ Hence E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b], exactly for the target chain. F
 discretisation error of the target remains: O(δ), or O(δ²) with `ItoTaylorDensity` and
 `QuadraticDensity`. Guided proposals need no stationary law.
 
-*Steps that are not normal.* If only weights are needed, the target of a state-dependent σ has steps
-of weak order 2, which are maps of normal noise (`QuadraticDensity`). Then p_i and q_i are the laws
-of the normal part of a step, and x_{i+1} is a function of that part (`StepLaw.bent`). The weight is
-a ratio of densities of the noise, so this function needs no inverse. The end b needs a density of
-x_N itself. There the last step is split, and its last part is an Euler step of about T/N².
+*Steps that are not normal.* The target of a state-dependent σ has steps of weak order 2, which are
+maps of normal noise (`QuadraticDensity`). Then p_i and q_i are the laws of the normal part of a
+step, and x_{i+1} is a function of that part (`StepLaw.bent`). The weight is a ratio of densities of
+the noise, so this function needs no inverse. If the noise of a given path is needed, the target is
+the Euler scheme instead. The end b needs a density of x_N itself. There the last step is split, and
+its last part is an Euler step of about T/N². Points within the last step are not part of a path.
 
 *Discretisation error.* A path is a function of the noise ξ_i of its steps. Half as many steps with
-other noise give another path. For a state-dependent σ, and if only weights are needed, the error is
-estimated from pairs of such paths with strongly correlated noise. A coarse step replaces two fine
-steps and has the noise
+other noise give another path. For a state-dependent σ the error is estimated from pairs of such
+paths with strongly correlated noise. A coarse step replaces two fine steps and has the noise
 
     ξ = c ξ_i + s ξ_{i+1},   c² = δ_i (T - t_{i+2}) / [(δ_i + δ_{i+1}) (T - t_{i+1})] = 1 - s².
 
 With this choice a coarse Brownian bridge equals the fine one at every other point. The coarse
 weight is unbiased for half as many steps, and its ratio to the fine weight varies much less than
-e^D of `halving`.
+e^D of `halving`. For means of functions of paths, the coarse path has all points of the fine grid:
+between two of its own points, its distance to the fine path is constant.
 """
 
 import math

@@ -63,7 +63,7 @@ def choose_proposal(
     - `for_density`: true if the choice is for `transition_log_density` or `pmmh`. Then the default
         couplings from the stationary law need a model that is declared `normalised`. On a single
         interval where all other candidates are inefficient, a coupling with a fitted start law is
-        added. Guided proposals then have steps of weak order 2 also for a state-dependent σ.
+        added.
 
     **Returns:** `Choice`, which prints as a table.
 
@@ -97,7 +97,7 @@ def choose_proposal(
 
     def choose_between(candidates, left_out=""):
         auto = choice_between(candidates, num_pilot=num_pilot, left_out=left_out)
-        auto = auto.for_model(model, intervals.start[0], normal_steps=not for_density)
+        auto = auto.for_model(model, intervals.start[0], normal_steps=False)
         auto.check(model, intervals)
         if for_density:
             auto.check_for_density(model)

@@ -22,6 +22,7 @@ from helpers import (
 import jaxbridge as jb
 from jaxbridge.models.bridge_problem import Intervals
 from jaxbridge.proposals.guided import Step, noise_of, path_of
+from jaxbridge.schemes.step_density import QuadraticDensity
 
 slow = pytest.mark.slow
 PROPOSALS = {
@@ -613,13 +614,13 @@ def test_densities_of_a_square_root_process_are_of_second_order(
     assert abs(errors[None]) < abs(euler) / 4 + noise
 
 
-def test_a_law_selected_for_a_density_draws_no_paths():
-    """Quadratic steps have no inverse, so paths of the same proposal are of the Euler scheme."""
+def test_a_law_selected_for_a_density_is_replaced_if_paths_are_given():
+    """Quadratic steps have no inverse, so chains from a given path are of the Euler scheme."""
     arguments = (jax.random.key(0), BENT, jnp.array([0.3]), jnp.array([0.7]), 0.4)
     estimate = jb.transition_log_density(*arguments, num_proposals=3, num_steps=4, proposal="auto")
-    sizes = {"num_bridges": 3, "num_steps": 4}
+    path = jnp.linspace(0.3, 0.7, 5)[:, None]
     for single in (estimate.proposal.singles[0], jb.Guided()):
-        drawn = jb.sample_weighted_bridges(*arguments, **sizes, proposal=single)
+        drawn = jb.sample_exact_bridges(*arguments, num_steps=4, proposal=single, position=path)
         assert drawn.proposal.density == jb.EulerDensity()
 
 
@@ -627,7 +628,7 @@ def test_a_law_selected_for_a_density_draws_no_paths():
 def test_the_default_is_the_most_accurate_that_the_model_has():
     arguments = (jax.random.key(0), BENT, jnp.array([0.3]), jnp.array([0.7]), 0.4)
     made = jb.sample_weighted_bridges(*arguments, num_bridges=3, num_steps=4, proposal=jb.Guided())
-    assert made.proposal.density == jb.EulerDensity()
+    assert made.proposal.density == QuadraticDensity()
     ends = jnp.array([0.3, 0.0]), jnp.array([0.7, 0.1])
     made = jb.sample_weighted_bridges(
         jax.random.key(0), two_wells(), *ends, 0.4, num_bridges=3, num_steps=4, proposal=jb.Guided()
