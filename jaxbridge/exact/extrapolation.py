@@ -141,8 +141,8 @@ def extrapolate(fine: WeightedBridges, coarse: WeightedBridges) -> ExtrapolatedB
 def extrapolate(fine: Any, coarse: Any):
     """Combine two estimates into one without the leading discretisation error (Richardson).
 
-    It is useful where the discretisation error exceeds the standard error. An example is a
-    state-dependent σ, for which all schemes are of first order.
+    It is useful where the discretisation error exceeds the standard error. An example are couplings
+    with a state-dependent σ, whose schemes are all of first order.
 
     **Arguments:**
 

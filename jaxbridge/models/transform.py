@@ -68,9 +68,13 @@ class Transformed(eqx.Module):
                 "`bridges` must be a result of `sample_bridges`, `sample_weighted_bridges`, "
                 f"`weigh_bridges` or `sample_exact_bridges`; got {type(bridges).__name__}."
             )
-        inverse = lambda y: value_at("inverse", self.inverse, y.shape, y)
-        mapped = jax.vmap(inverse)(_rows(paths))
-        return eqx.tree_at(lambda result: result.paths, bridges, mapped.reshape(paths.shape))
+        inverse = jax.vmap(lambda y: value_at("inverse", self.inverse, y.shape, y))
+        # The paths of half as many steps give the discretisation error.
+        has_coarse = getattr(bridges, "coarse_paths", None) is not None
+        names = ("paths", "coarse_paths") if has_coarse else ("paths",)
+        fields = lambda result: [getattr(result, name) for name in names]
+        mapped = [inverse(_rows(leaf)).reshape(leaf.shape) for leaf in fields(bridges)]
+        return eqx.tree_at(fields, bridges, mapped)
 
     def log_jacobian(self, x: Numbers) -> Float[Array, "*batch"]:
         """Return log |det ∇f(x)| at points of shape (d,) or (..., d).

@@ -134,3 +134,17 @@ def test_derivatives_of_weighted_means(x64):
     slope = jax.grad(mean)(0.5)
     h = 1e-5
     np.testing.assert_allclose(slope, (mean(0.5 + h) - mean(0.5 - h)) / (2 * h), rtol=1e-6)
+
+
+def test_coordinates_of_coarse_paths_change_too():
+    """Then step errors are those of functions of the new paths."""
+    inner = jb.Diffusion(lambda x, p: -x, lambda x, p: 0.5 + 0.1 * jnp.tanh(x), reversible=True)
+    map_ = jb.transform(inner, jnp.exp, jnp.log)
+    made = jb.sample_weighted_bridges(
+        jax.random.key(0), map_.model, map_.forward([0.1]), map_.forward([0.4]), 1.0,
+        num_steps=8, num_bridges=100, proposal=jb.Guided(),
+    )  # fmt: skip
+    back = map_.back(made)
+    np.testing.assert_allclose(
+        back.step_error(lambda path: jnp.exp(path)), made.step_error(), atol=1e-6
+    )
