@@ -45,7 +45,7 @@ def largest_reliable_k(number: int) -> float:
 # equal ones: (effective share, largest k̂). Among means of 100 to 4,000 weights, compared with exact
 # values, 14 % are wrong for k̂ from 0.6 to 0.7 and a share below 0.2, and 0.5 % are wrong for k̂ from
 # 0.7 to 1 and a share above 0.8.
-_UNEQUAL, _NEARLY_EQUAL = (0.2, 0.6), (0.8, 1.0)
+_UNEQUAL, NEARLY_EQUAL = (0.2, 0.6), (0.8, 1.0)
 
 # A few weights far above many others hardly change the fit of k. With few effective weights, the
 # log of the mean and its error are wrong nevertheless: for 100 weights, a bound of 5 accepts twice
@@ -63,7 +63,7 @@ def largest_reliable_k_of(
         return _MOST_RELIABLE
     share = effective / jnp.maximum(number, 1).astype(k.dtype)
     most = jnp.where(share < _UNEQUAL[0], _UNEQUAL[1], _MOST_RELIABLE)
-    return jnp.where(share > _NEARLY_EQUAL[0], _NEARLY_EQUAL[1], most).astype(k.dtype)
+    return jnp.where(share > NEARLY_EQUAL[0], NEARLY_EQUAL[1], most).astype(k.dtype)
 
 
 @jax.jit  # outside of other programs, one program for all operations

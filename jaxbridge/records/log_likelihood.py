@@ -26,7 +26,7 @@ from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
 from ..engine.keys import key_for
-from ..engine.pareto import largest_reliable_k
+from ..engine.pareto import NEARLY_EQUAL, largest_reliable_k
 from ..engine.times import as_times, check_increasing
 from ..engine.verdict import (
     AbstractResult,
@@ -75,11 +75,12 @@ _DISAGREE = (
     "possible across a gap, add observations, or use `smooth` with a `proposal`."
 )
 _HEAVY = (
-    "At some observation the weights have heavy tails: `pareto_k` is above its bound, 0.8 or less "
-    "for few particles, and infinite for fewer than 25. Particles of larger weight may be missing. "
+    "At some observation the weights have heavy tails: `pareto_k` is above its bound. The bound is "
+    "0.8, less for few particles, and 1 for nearly equal weights; for fewer than 25 particles "
+    "`pareto_k` is infinite. Particles of larger weight may be missing. "
     "Use more `num_particles`, and check that `value` does not change."
 )
-_LARGEST_K = "the largest k̂ is {:.2f}, at observation {}, and the bound {:.2f}"
+_LARGEST_K = "k̂ is {:.2f} at observation {}, and its bound {:.2f}"
 _LOST = (
     "Many particles left the state space or diverged (`num_nonfinite`). The log-likelihood may be "
     "too small by more than its standard error and 0.05. Use more steps, or coordinates without a "
@@ -171,14 +172,19 @@ class LogLikelihood(AbstractResult):
         return jnp.any(self.pareto_k > self._most_k)
 
     @property
-    def _most_k(self) -> float:
-        """Return the bound on k̂."""
-        return largest_reliable_k(self.num_weights) + _LARGEST_OF_MANY
+    def _most_k(self) -> Float[Array, " n"]:
+        """Return the bounds on k̂ for so many weights, larger ones for nearly equal weights."""
+        most = largest_reliable_k(self.num_weights) + _LARGEST_OF_MANY
+        share, most_of_equal = NEARLY_EQUAL
+        num_particles = self.num_weights / self.log_estimates.shape[0]
+        is_equal = self.effective_sample_size > share * num_particles
+        return jnp.where(is_equal, most_of_equal, most).astype(self.pareto_k.dtype)
 
     @property
     def _largest_k(self) -> tuple[Array, ...]:
-        """Return the largest k̂, the index of its observation, and the bound."""
-        return jnp.max(self.pareto_k), jnp.argmax(self.pareto_k), jnp.asarray(self._most_k)
+        """Return the k̂ farthest above its bound, the index of its observation, and the bound."""
+        where = jnp.argmax(self.pareto_k / self._most_k)
+        return self.pareto_k[where], where, self._most_k[where]
 
     @property
     def _missing(self) -> Float[Array, ""]:

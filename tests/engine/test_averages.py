@@ -26,6 +26,7 @@ def chain_of(paths):
         proposal=jb.ModifiedDiffusionBridge(),
         pareto_k=None,
         log_halving=jnp.zeros(met.shape, paths.dtype),
+        coarse_paths=None,
         step_share=jnp.ones(paths.shape[:-3], paths.dtype),
         num_steps=paths.shape[-2] - 1,
     )
@@ -80,6 +81,7 @@ def test_values_without_weight_may_be_anything():
         num_nonfinite=jnp.int32(0),
         proposal=jb.ModifiedDiffusionBridge(),
         log_halving=jnp.zeros(3),
+        coarse_paths=None,
         step_share=jnp.ones(()),
         num_steps=1,
     )

@@ -34,6 +34,7 @@ def density(key, num_steps, num_proposals=100_000, proposal=None):
 
 
 def weighted(key, num_steps, num_bridges=100_000, **options):
+    """By the Euler scheme, too."""
     return jb.sample_weighted_bridges(
         key,
         STRETCHED.model,
@@ -42,7 +43,7 @@ def weighted(key, num_steps, num_bridges=100_000, **options):
         DURATION,
         num_steps=num_steps,
         num_bridges=num_bridges,
-        proposal=jb.ModifiedDiffusionBridge(),
+        proposal=jb.ModifiedDiffusionBridge(jb.EulerDensity()),
         **options,
     )
 

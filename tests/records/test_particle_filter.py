@@ -76,9 +76,13 @@ def test_what_is_not_to_be_trusted():
         {"value": jnp.array(-jnp.inf)},
         {"standard_error": jnp.array(0.7)},
         {"effective_sample_size": jnp.array([30.0, 2.0])},
-        {"pareto_k": jnp.array([0.3, 0.9])},
+        {"pareto_k": jnp.array([0.3, 0.3, 0.9, 0.3, 0.3])},
         {"num_weights": 240},  # of so few lighter tails are too heavy
         {"step_error": jnp.array(0.3)},
         {"step_uncertainty": jnp.array(jnp.inf)},
     ):
         assert not dataclasses.replace(good, **change).trustworthy
+    # The tail of nearly equal weights is a small part of their sum; here of 500 particles a filter.
+    for effective, is_right in [(300.0, False), (450.0, True)]:
+        heavy = {"pareto_k": jnp.full(5, 0.95), "effective_sample_size": jnp.full(5, effective)}
+        assert dataclasses.replace(good, **heavy).trustworthy == is_right
