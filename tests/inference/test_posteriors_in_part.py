@@ -121,7 +121,7 @@ def test_the_maximum_is_kalmans():
 def test_ranks_of_true_parameters_are_uniform():
     """Simulation-based calibration (Talts et al. 2018) with a force that is not linear, and data of
     short steps."""
-    num_sets, num_draws, num_fine, gap = 200, 31, 20, 0.25
+    num_sets, num_draws, num_fine, gap = 120, 31, 20, 0.25
     mean, sd = jnp.array([1.0, -0.3, -2.0]), jnp.array([0.3, 0.3, 0.4])
 
     def force(x, p):
@@ -148,7 +148,7 @@ def test_ranks_of_true_parameters_are_uniform():
         values = values + jnp.exp(theta[2]) * jax.random.normal(noise_key, values.shape)
         made = jb.gibbs(
             run_key, model, np.arange(21) * gap, values, prior=jb.NormalPrior(mean, sd**2),
-            num_iterations=num_draws, num_warmup=400, thin=30, **OPTIONS,
+            num_iterations=num_draws, num_warmup=300, thin=20, **OPTIONS,
         )  # fmt: skip
         return jnp.sum(made.theta < theta, axis=0)
 

@@ -349,7 +349,7 @@ def test_the_score_by_a_choice_is_that_of_the_closed_form():
                 key, at(B), starts, ends, 0.5, num_proposals=50, num_steps=40, proposal=proposal
             ).value.sum()  # fmt: skip
 
-        keys = jax.random.split(jax.random.key(0), 200)
+        keys = jax.random.split(jax.random.key(0), 60)
         return np.asarray(jax.jit(jax.vmap(jax.grad(value), (None, 0)))(B, keys))
 
     exact = jax.grad(
@@ -360,7 +360,7 @@ def test_the_score_by_a_choice_is_that_of_the_closed_form():
     for proposal in (choice, forced):
         found = score(proposal)
         error = found.std(0) / np.sqrt(len(found))
-        assert (error < 0.05).all()
+        assert (error < 0.1).all()
         np.testing.assert_array_less(np.abs(found.mean(0) - exact), 5 * error + 0.01)
 
 

@@ -163,7 +163,7 @@ def test_short_steps_mix_as_well_as_long_ones():
     for num_steps in (5, 80):
         made = jb.gibbs(
             jax.random.key(3), model(), TIMES, record(), observation=SEEN, prior=log_prior,
-            num_iterations=3000, num_warmup=1000, num_chains=4, num_steps=num_steps,
+            num_iterations=1500, num_warmup=500, num_chains=4, num_steps=num_steps,
         )  # fmt: skip
         assert not made.stuck.any() and (made.r_hat < 1.05).all()
         sizes.append(made.effective_sample_size)

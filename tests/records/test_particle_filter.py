@@ -75,9 +75,10 @@ def test_what_is_not_to_be_trusted():
     for change in (
         {"value": jnp.array(-jnp.inf)},
         {"standard_error": jnp.array(0.7)},
-        {"effective_sample_size": jnp.array([30.0, 2.0])},
+        {"effective_sample_size": jnp.array([30.0, 30.0, 2.0, 30.0, 30.0])},
         {"pareto_k": jnp.array([0.3, 0.3, 0.9, 0.3, 0.3])},
-        {"num_weights": 240},  # of so few lighter tails are too heavy
+        # Of so few weights, lighter tails are too heavy.
+        {"num_weights": 240, "effective_sample_size": jnp.full(5, 15.0)},
         {"step_error": jnp.array(0.3)},
         {"step_uncertainty": jnp.array(jnp.inf)},
     ):
