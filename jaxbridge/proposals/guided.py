@@ -179,7 +179,7 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return 1 - self.remaining(num_steps)
 
     def step_share(self, model, intervals):
-        return jnp.full_like(intervals.duration, share_of_order(self.target.order))
+        return jnp.full_like(intervals.duration, share_of_order(self.target.usual_order))
 
     def remaining(self, num_steps: int) -> Float[np.ndarray, " points"]:
         """Return (T - t_i) / T for all i, from 1 to 0, shape (N+1,)."""

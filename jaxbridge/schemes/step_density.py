@@ -93,6 +93,16 @@ class AbstractStepDensity(eqx.Module):
     order: ClassVar[int]
     is_normal: ClassVar[bool] = True
 
+    @property
+    def usual_order(self) -> float:
+        """Return the order of the error for usual numbers of steps, for estimates of that error.
+
+        Higher terms make the errors of quadratic steps shrink more slowly at first. For CIR and
+        Jacobi diffusions twice as many steps divide them by 2.9 to 3.1 from 4 steps on, by 3.1 to
+        3.4 from 8 steps on, and by 3.3 to 3.8 from 16 steps on.
+        """
+        return self.order if self.is_normal else 1.7
+
     @abstractmethod
     def steps_from(self, dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:
         """Return the law of a step from `x` as functions of the step size."""
