@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import zeros_of
+from helpers import slow_beyond, zeros_of
 from studies.benchmark import in_markdown, load
 
 import jaxbridge as jb
@@ -132,7 +132,7 @@ SHAPES = [
 
 
 @pytest.mark.usefixtures("unchecked")
-@pytest.mark.parametrize("block", range(len(SHAPES)))
+@pytest.mark.parametrize("block", slow_beyond(1, range(len(SHAPES))))
 def test_calls_of_the_readme_are_accepted(block, monkeypatch):
     """Its computations are traced; the slow tests run them."""
     for name in ("simulate", "smooth", "gibbs", "sample_bridges", "transition_log_density"):

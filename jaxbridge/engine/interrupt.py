@@ -105,6 +105,6 @@ class InterruptibleMeter(diffrax.AbstractProgressMeter):
         jax.debug.callback(lambda look_at: None, state.look_at)
 
 
-def _look(step: np.ndarray) -> np.int32:
+def _look(step: Int[Array | np.ndarray, ""]) -> np.int32:
     # Without listener, the program runs elsewhere, for instance in another thread.
     return np.int32(_NEVER if _listener is None else _listener.look(int(step)))

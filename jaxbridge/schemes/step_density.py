@@ -102,7 +102,7 @@ class AbstractStepDensity(eqx.Module):
         32. With 1.5, the reported errors are .5 to 1.5 times the true ones (6 and 10 steps, 83
         densities).
         """
-        return self.order if self.is_normal else 1.5
+        return float(self.order) if self.is_normal else 1.5
 
     @abstractmethod
     def steps_from(self, dynamics: Dynamics, x: Float[Array, " d"]) -> StepsFrom:

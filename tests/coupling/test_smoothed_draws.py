@@ -100,6 +100,7 @@ def test_weights_have_no_tails_where_the_density_falls_off_fast():
 INTERVAL = ([0.0, 0.0], [0.5, -0.5], 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", slow_beyond(1, [0.0, 1.0]))
 def test_bridges_are_exact_though_the_draws_are_not_of_the_stationary_law(share):
     """Any draws will do: these have half the spread, and lie to one side."""

@@ -117,6 +117,7 @@ def test_batched_chain_is_the_kernel_stepped(method, law):
         assert (infos.is_accepted <= infos.is_hit).all() and infos.is_accepted.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", slow_beyond(1, ["crank_nicolson", "pseudo_marginal", "renewal"]))
 def test_a_chain_goes_on_from_a_path(method):
     """As the kernel does from the same position; of several intervals each from its own."""
@@ -148,6 +149,7 @@ def test_a_chain_goes_on_from_a_path(method):
     assert not coupled or not both.accepted[:, 0].all()  # guided moves of this process all succeed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", slow_beyond(1, ["renewal", "pseudo_marginal"]))
 def test_chains_under_vmap_share_their_lanes(method):
     """As many lanes as chains, in place of 64 or more for each; and the numbers of each alone."""

@@ -120,6 +120,7 @@ def test_given_paths_need_normal_steps():
         assert chain.coarse_paths is None
 
 
+@pytest.mark.slow
 def test_derivatives_of_weighted_means(x64):
     """Against differences of means with the same noise."""
 

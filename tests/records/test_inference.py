@@ -270,6 +270,7 @@ def test_beginnings_may_be_functions_of_parameters(law):
     assert same.initial(model().params) is not None and same.initial == problem.initial
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_differences(x64):
     values = record()[:8]
     paths = jb.innovations(model(), TIMES[:8], values, observation=SEEN, num_steps=3)

@@ -28,6 +28,7 @@ def random_record(rng, num_noises):
     return jax.tree.map(jnp.asarray, (steps, Scalars(rows, values, variances, seen)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "num_noises, transform",
     [

@@ -35,6 +35,7 @@ def nearly_normal(y, x, p):
     return -((y[0] - 3 * x[0]) ** 2) / 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "log_density, resampled", slow_beyond(1, [(of_count, True), (nearly_normal, False)])
 )

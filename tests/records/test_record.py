@@ -68,6 +68,7 @@ def log_weight(times, values=READINGS, model=ONE, **options):
     return float(made.log_weight(model.params, jnp.zeros(made.size)))
 
 
+@pytest.mark.slow
 def test_a_record_does_not_depend_on_the_zero_of_time():
     """Whole periods change nothing, or are refused: where the model depends on time, or how it is
     seen does."""

@@ -37,6 +37,7 @@ def test_a_negative_variance_explains_nothing():
         assert weigh(-0.5) == -np.inf
 
 
+@pytest.mark.slow
 def test_no_filter_takes_a_negative_variance():
     model = jb.Diffusion(drift, params=0.5)
     seen = jb.LinearGaussian(covariance=lambda p: p)

@@ -45,6 +45,7 @@ def arguments(values, gap, sd, num_steps):
     return (cir.model(PARAMS), times, values[:, None]), options
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("gap", "sd", "num_steps"),
     slow_beyond(1, [(2.0, 0.3, 10), (0.5, 0.02, 10), (1.0, 0.1, 20), (0.5, 0.0, 10)]),

@@ -141,6 +141,7 @@ def smoothed_of_steps(num_steps):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_where_sigma_varies_all_of_the_step_error_is_in_doubt():
     made = smoothed_of_steps(2)
     told, doubt = np.abs(made.step_error()), np.asarray(made.step_uncertainty())

@@ -49,6 +49,7 @@ def told(model, values, num_steps, **options):
     return jb.log_likelihood(KEY, model, TIMES, values, num_steps=num_steps, **options)
 
 
+@pytest.mark.slow
 def test_a_seasonal_process_is_kalmans(x64):
     """Of second order, for coefficients are taken in the middle of steps."""
     values = np.sin(2 * TIMES)[:, None]

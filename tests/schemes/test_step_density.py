@@ -398,7 +398,7 @@ def generator(model, g):
     return of
 
 
-@pytest.mark.parametrize("d", slow_beyond(2, [1, 2, 3]))
+@pytest.mark.parametrize("d", slow_beyond(1, [1, 2, 3]))
 def test_quadratic_steps_are_of_weak_order_2(d, x64):
     """E g(x') = g + δLg + ½δ²L²g + O(δ³) for cubic and exponential g, by quadrature over the
     noise: an oracle that has no square root and no expansion of the step in it."""
