@@ -243,10 +243,33 @@ def format_orders(rows: Sequence[OrderRow]) -> str:
     return markdown(titles, lines)
 
 
+def seconds_to(rows: Sequence[OrderRow], way: int, order: float, error: float) -> float:
+    """Return the seconds to an error of log p̂, for Euler steps (`way` 0) or those of order 2 (1).
+
+    The error is c / N^p with the order p. c is the median over the numbers of steps, N is at least
+    5, and seconds are proportional to N.
+    """
+    c = np.median([abs(row.errors[way]) * row.num_steps**order for row in rows])
+    num_steps = max(5.0, (c / error) ** (1 / order))
+    return rows[-1].seconds[way] / rows[-1].num_steps * num_steps
+
+
+def format_seconds(rows: Sequence[OrderRow]) -> str:
+    """Return a table of seconds to an error of 1 % of the density, by model."""
+    lines = []
+    for name in dict.fromkeys(row.case for row in rows):
+        group = [row for row in rows if row.case == name]
+        euler = seconds_to(group, 0, 1.0, 0.01)
+        # Higher terms make the errors shrink more slowly at first.
+        other = seconds_to(group, 1, 1.5, 0.01)
+        lines.append((name, f"{euler:.3f}", f"{other:.3f}", f"{euler / other:.1f}"))
+    return markdown(("seconds to an error of 1 %", "Euler", "order 2", "ratio"), lines)
+
+
 ORDERS = Study(
     "Transition densities with a state-dependent σ: errors of log p̂",
     run_orders,
-    format_orders,
+    lambda rows: f"{format_orders(rows)}\n\n{format_seconds(rows)}",
     """\
 "reported" is the discretisation error that each result estimates for itself, "shares" are effective
 weights per proposal. In all pairs Euler steps come first. At 10 steps those of weak order 2 are

@@ -69,6 +69,7 @@ def test_one_mode_is_an_ellipse_and_two_are_kernels():
     assert smoothed_draws(KEY, wells, jnp.zeros(1), WELLS).share == 0
 
 
+@pytest.mark.slow
 def test_draws_that_are_not_finite_or_all_the_same_make_a_law():
     points = jnp.full((512, 2), jnp.nan)
     law = smoothed_draws(KEY, points, jnp.array([3.0, -1.0]), PULLED)

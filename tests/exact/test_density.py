@@ -179,6 +179,7 @@ def test_a_law_that_nothing_hits_from_is_flagged():
     assert np.isfinite(estimate.value) and estimate.standard_error == np.inf
 
 
+@pytest.mark.slow
 def test_an_error_is_not_stated_where_weights_were_cut_off():
     """Of two intervals only the one whose bridges are hard to hit."""
     estimate = jb.transition_log_density(
@@ -220,6 +221,7 @@ def test_what_the_refusal_recommends_is_right():
         assert abs(float(estimate.value) - exact) < 5 * error + 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.optimised
 def test_rounding_of_very_many_steps_is_told():
     """In single precision 100,000 steps put log p off by 0.005, which no other error tells: all

@@ -75,6 +75,7 @@ def test_its_noise_is_that_of_a_sum(densities):
     assert float(both.standard_error) == pytest.approx(float(error), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_means_are_extrapolated_entry_by_entry():
     """The mid-point of the bridge, through arcsinh, against its closed form."""
     keys = jax.random.split(jax.random.key(1))

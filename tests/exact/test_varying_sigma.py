@@ -137,6 +137,7 @@ def test_derivatives_of_weighted_means(x64):
     np.testing.assert_allclose(slope, (mean(0.5 + h) - mean(0.5 - h)) / (2 * h), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_coordinates_of_coarse_paths_change_too():
     """Then step errors are those of functions of the new paths."""
     inner = jb.Diffusion(lambda x, p: -x, lambda x, p: 0.5 + 0.1 * jnp.tanh(x), reversible=True)

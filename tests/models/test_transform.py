@@ -200,6 +200,7 @@ def test_intervals_and_half_lines_become_lines(x64):
     np.testing.assert_allclose(line.diffusion([0.3]), [[0.7]])
 
 
+@pytest.mark.slow
 def test_paths_that_leave_the_state_space_are_misses_and_counted():
     """In the original coordinates, near the boundary: what is left are bridges inside."""
     options = dict(num_bridges=500, num_steps=20, coupling=jb.Coupling(0.0, scheme=jb.Euler()))

@@ -614,6 +614,7 @@ def test_densities_of_a_square_root_process_are_of_second_order(
     assert abs(errors[None]) < abs(euler) / 4 + noise
 
 
+@pytest.mark.slow
 def test_a_law_selected_for_a_density_is_replaced_if_paths_are_given():
     """Quadratic steps have no inverse, so chains from a given path are of the Euler scheme."""
     arguments = (jax.random.key(0), BENT, jnp.array([0.3]), jnp.array([0.7]), 0.4)

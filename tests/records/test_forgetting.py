@@ -18,6 +18,7 @@ SEEN, LAW = jb.LinearGaussian(covariance=0.04), jb.GaussianLaw([0.0], [[0.5]])
 TIMES, VALUES = np.arange(6) * 0.5, np.array([0.1, 0.7, -0.2, np.nan, -0.9, 0.3])[:, None]
 
 
+@pytest.mark.slow
 def test_likelihoods_are_unbiased_whatever_is_forgotten():
     """Of a linear model: all weights are equal where nothing is."""
     problem = as_record_problem(MODEL, TIMES, VALUES, SEEN, LAW, num_steps=4)

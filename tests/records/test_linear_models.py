@@ -17,6 +17,7 @@ RECORDS = {"plane": plane(), "exact part": plane(exact_part=True), "four": four(
 NAMES = slow_beyond(1, RECORDS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_the_filter_is_kalmans(name):
     record = RECORDS[name]

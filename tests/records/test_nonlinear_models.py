@@ -234,6 +234,7 @@ UNSEEN = (KEY, POSITIVE, np.array([0.0, 0.5, 1.0]), np.full((3, 1), np.nan))
 FROM_HALF = {"observation": jb.LinearGaussian(covariance=0.1), "initial": [0.5], "num_steps": 2}
 
 
+@pytest.mark.slow
 def test_no_path_ends_outside_of_the_state_space():
     """The likelihood is the probability that none of four steps leads there, by quadrature."""
     nodes = (np.arange(1500) + 0.5) * 0.004

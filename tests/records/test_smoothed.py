@@ -24,6 +24,7 @@ def smoothed(paths, stuck=False, num_truncated=0, model=None):
     return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, truncated, problem)
 
 
+@pytest.mark.slow
 def test_chains_in_two_wells_know_little():
     """The error of the mean of two chains that each stayed in a well is of the size of the gap."""
     paths = 0.1 * jax.random.normal(jax.random.key(0), (4, 500, 3, 1))

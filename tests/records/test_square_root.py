@@ -67,6 +67,7 @@ def test_likelihood_is_of_second_order(gap, sd, num_steps):
     assert int(made.num_nonfinite) <= int(euler.num_nonfinite)
 
 
+@pytest.mark.slow
 def test_weights_of_innovations_have_the_likelihood_as_mean():
     """The path as a function of noise has the weight that the filter's particles have."""
     gap, sd = 1.0, 0.1

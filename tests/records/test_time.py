@@ -108,6 +108,7 @@ def test_a_time_is_a_third_argument_without_a_default():
     np.testing.assert_allclose(both.diffusion([5.0, 1.0], 4.0), [[0.0], [2.0]])
 
 
+@pytest.mark.slow
 def test_what_is_for_constant_coefficients_says_what_to_use_instead():
     model = jb.seasonal_ornstein_uhlenbeck()
     ends = (KEY, model, [0.0], [0.1], 1.0)

@@ -172,6 +172,7 @@ def test_few_paths_do_not_bias_the_log_of_a_mean():
     assert np.mean(plain) < -8e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held", slow_beyond(1, [True, False]))
 def test_few_paths_do_not_bias_it_where_they_are_held_either(held):
     """Of weights and factors that are correlated; those that a chain holds are as likely as their
