@@ -1,8 +1,10 @@
 """Timing of functions."""
 
 import functools
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import jax
@@ -16,6 +18,16 @@ def timed(function: Callable[[], T]) -> tuple[T, float]:
     begin = time.perf_counter()
     result = jax.block_until_ready(function())
     return result, time.perf_counter() - begin
+
+
+def compile_side_by_side(functions: Iterable[Callable[[], Any]]) -> None:
+    """Call all functions, as many at a time as there are processors.
+
+    Their programs are then compiled side by side. Time the functions afterwards.
+    """
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        for result in pool.map(lambda function: function(), functions):
+            jax.block_until_ready(result)
 
 
 @functools.cache

@@ -7,6 +7,7 @@
 """
 
 from collections.abc import Sequence
+from functools import partial
 from itertools import groupby
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from jaxtyping import Array, Float, Key
 
 import jaxbridge as jb
 
-from .clock import fastest, timed
+from .clock import compile_side_by_side, fastest, timed
 from .paper import CASES, Fit, Point, compare, law_half_way, study_model
 from .report import Say, Study, silent, table
 
@@ -93,21 +94,25 @@ def run_exact(key: Key[Array, ""], scale: float, say: Say) -> list[ExactResult]:
         (VERY_UNLIKELY, "weights", 50_000, fitted, ""),
         (VERY_UNLIKELY, "as published", 50_000, published, ""),
     ]
+
+    def simulate(i, which):
+        ends, method, iterations, coupling, _ = runs[i]
+        simulate = {"weights": _weights, "renewal": _renewal}.get(method, _chain)
+        run_key = jax.random.fold_in(key, 2 * i + which)
+        return simulate(run_key, study_model(), ends, round(iterations * scale), coupling)
+
+    say("compiling all methods")
+    compile_side_by_side(partial(simulate, i, 0) for i in range(len(runs)))
     results = []
-    for i, (ends, method, iterations, coupling, paper_seconds) in enumerate(runs):
+    for i, (ends, method, iterations, _, paper_seconds) in enumerate(runs):
         say(f"{_words(ends)}, {method}")
-        size = round(iterations * scale)
-        results.append(_run(key, i, ends, method, size, coupling, paper_seconds))
+        made = timed(partial(simulate, i, 1))
+        results.append(_result(made, ends, method, round(iterations * scale), paper_seconds))
     return results
 
 
-def _run(key, i, ends: Ends, method, iterations, coupling, paper_seconds) -> ExactResult:
-    simulate = {"weights": _weights, "renewal": _renewal}.get(method, _chain)
-    arguments = (study_model(), ends, iterations, coupling)
-    timed(lambda: simulate(jax.random.fold_in(key, 2 * i), *arguments))  # compiles
-    (middle, weights, simulated), seconds = timed(
-        lambda: simulate(jax.random.fold_in(key, 2 * i + 1), *arguments)
-    )
+def _result(made, ends: Ends, method, iterations, paper_seconds) -> ExactResult:
+    (middle, weights, simulated), seconds = made
     law = law_half_way(*ends)
     samples, fit, error, effective = _judge(middle, weights, law)
     return ExactResult(
@@ -174,14 +179,20 @@ def run_variation(key: Key[Array, ""], num_bridges: int, say: Say) -> list[Varia
     """Estimate the regression of section 3.2 for the three bridges of the paper."""
     model, results = study_model(), []
     bridges = {case.bridge: (case.start, case.end) for case in CASES}
+
+    def of_both_laws(ends, gamma):
+        laws = (
+            (jb.Coupling(gamma), jb.Stationary()),
+            (jb.Coupling.as_published(gamma), jb.Reversed()),
+        )
+        return [partial(_variation, key, model, ends, *law, num_bridges) for law in laws]
+
+    say("compiling the variation of 1/pi")
+    compile_side_by_side(of_both_laws(UNLIKELY, 0.0))
     for name, ends in bridges.items():
         for gamma in (0.0, 0.5, 0.9, 0.99):
             say(f"{name}, variation of 1/pi for gamma {gamma:g}")
-            laws = (
-                (jb.Coupling(gamma), jb.Stationary()),
-                (jb.Coupling.as_published(gamma), jb.Reversed()),
-            )
-            both = [_variation(key, model, ends, *law, num_bridges) for law in laws]
+            both = [variation() for variation in of_both_laws(ends, gamma)]
             results.append(Variation(name, gamma, *both))
     return results
 
@@ -215,27 +226,27 @@ def run_cost(
     Each duration has `work` units of time in all, and at most 50,000 bridges.
     """
     model, costs = study_model(), []
+
+    def run(duration):
+        return jb.sample_exact_bridges(
+            key,
+            model,
+            *UNLIKELY,
+            duration,
+            num_bridges=min(round(work / duration), 50_000),
+            num_steps=round(duration / 0.02),
+            proposal=jb.Coupling(_GAMMA),
+            save_at=[duration / 2],
+        )
+
+    say("compiling all durations")
+    compile_side_by_side(partial(run, duration) for duration in durations)
     for duration in durations:
         say(f"cost of an exact bridge of duration {duration:g}")
-        num_bridges = min(round(work / duration), 50_000)
-
-        def run(duration=duration, num_bridges=num_bridges):
-            return jb.sample_exact_bridges(
-                key,
-                model,
-                *UNLIKELY,
-                duration,
-                num_bridges=num_bridges,
-                num_steps=round(duration / 0.02),
-                proposal=jb.Coupling(_GAMMA),
-                save_at=[duration / 2],
-            )
-
-        timed(run)
-        chain, seconds = fastest(run, repeats=2)
+        chain, seconds = fastest(partial(run, duration), repeats=2)
         acceptance = float(chain.acceptance_rate)
         # Effective size of a chain that moves with probability p in each step: n p / (2 - p).
-        effective = num_bridges * acceptance / (2 - acceptance)
+        effective = len(chain.accepted) * acceptance / (2 - acceptance)
         costs.append(Cost(duration, seconds / effective, acceptance))
     return costs
 
