@@ -86,6 +86,7 @@ from .inference.priors import NormalPrior
 from .inference.record_gibbs import RecordPosterior, RecordState
 from .inference.record_maximum import RecordMaximumLikelihood
 from .inference.score import Score, score
+from .inference.summary import PosteriorSummary
 from .models.diffusion import Diffusion
 from .models.fitzhugh_nagumo import FitzHughNagumoParams, fitzhugh_nagumo
 from .models.gaussian_bridge import GaussianBridge, gaussian_bridge
@@ -239,6 +240,7 @@ __all__ = [
     "RecordMaximumLikelihood",
     "score",
     "Score",
+    "PosteriorSummary",
     "NormalPrior",
     "path_log_likelihood",
     # Diagnostics and costs.

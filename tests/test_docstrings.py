@@ -35,6 +35,7 @@ RESULTS = {
     "PMMHPosterior": ["pmmh"],
     "PMMHState": ["pmmh"],
     "Pilot": ["tune_coupling"],
+    "PosteriorSummary": ["summary"],
     "RecordPosterior": ["gibbs"],
     "RecordState": ["gibbs"],
     "Score": ["score"],

@@ -20,6 +20,7 @@ from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduc
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..schemes import StepError, dominates, step_faults, unknown_where
 from .parameters import Parameters, init_vectors, of_rows
+from .summary import PosteriorSummary
 
 # The discretisation error is computed for about so many draws: enough for a covariance. For all
 # draws it would take a large part of the run time.
@@ -177,6 +178,54 @@ class AbstractPosterior(AbstractResult):
         return unknown_where(
             infinite > _MOST_INFINITE * (infinite + number.astype(infinite.dtype)), error
         )
+
+    def summary(self) -> PosteriorSummary:
+        """Return a table of the posterior, which prints as text; not inside `jit`.
+
+        It has means, standard deviations, quantiles, errors, R̂, effective sample sizes and the
+        verdict. `print(posterior)` shows it, too.
+
+        **Raises:** `TypeError` inside `jit` or `vmap`, where no numbers exist.
+
+        **Example:**
+
+        ```python
+        print(posterior.summary())
+        posterior.summary().mean  # a NumPy array
+        ```
+        """
+        if is_traced(self.theta):
+            raise TypeError(
+                "`summary` needs numbers, which do not exist inside `jit` or `vmap`: return the "
+                "posterior, and call `summary` outside."
+            )
+        num_chains, num_draws, p = self._chains.shape
+        draws = np.asarray(self._chains, float).reshape(-1, p)
+        low, median, high = np.quantile(draws, [0.025, 0.5, 0.975], axis=0)
+        as_float = lambda column: np.asarray(column, float)
+        chains = "1 chain" if num_chains == 1 else f"{num_chains} chains"
+        return PosteriorSummary(
+            title=f"{type(self).__name__}: {chains} of {num_draws:,} draws",
+            names=self.names,
+            mean=draws.mean(axis=0),
+            sd=draws.std(axis=0),
+            low=low,
+            median=median,
+            high=high,
+            standard_error=as_float(self.standard_error),
+            step_error=as_float(self.step_error),
+            r_hat=as_float(self.r_hat),
+            effective_sample_size=as_float(self.effective_sample_size),
+            verdict=self.why(),
+        )
+
+    def __str__(self) -> str:
+        """Return the table of `summary` as text."""
+        return repr(self) if is_traced(self.theta) else str(self.summary())
+
+    def _repr_html_(self) -> str:
+        """Return the table of `summary` as HTML, which notebooks show."""
+        return self.summary()._repr_html_()
 
     def to_arviz(self) -> Any:
         """Return the draws as ArviZ's `InferenceData` (`DataTree` since its version 1).
