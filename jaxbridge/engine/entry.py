@@ -4,7 +4,8 @@
   values. `jax.transfer_guard` is therefore off inside.
 - NaN marks missing values and -inf is the log of a zero weight, as each result documents.
   `jax.debug_nans` and `jax.debug_infs` are therefore off inside.
-- Ctrl-C ends a call with a progress meter within about a second (`interrupt`).
+- Ctrl-C ends a call with a progress meter at a step of its loop, within about a second
+  (`interrupt`).
 - Under a transformation, traced values that user functions close over become arguments
   (`captured`).
 """

@@ -8,6 +8,7 @@ and Python raises `KeyboardInterrupt` in the main thread.
 """
 
 import contextlib
+import os
 import signal
 import socket
 import threading
@@ -29,14 +30,23 @@ _NEVER = np.iinfo(np.int32).max
 class _Listener:
     """Signals that arrive during one call, and the pace of its loop."""
 
-    def __init__(self, signals: socket.socket):
-        self.signals, self.time, self.step = signals, time.monotonic(), 0
+    def __init__(self, signals: socket.socket, before: int):
+        self.signals, self.before = signals, before
+        self.is_interrupted, self.time, self.step = False, time.monotonic(), 0
+
+    def hear(self) -> bool:
+        """Return whether Ctrl-C has arrived; pass signals on to the caller's own file of them."""
+        with contextlib.suppress(OSError):  # no signals, or a file that takes none
+            arrived = self.signals.recv(4096)
+            self.is_interrupted |= signal.SIGINT in arrived
+            if self.before >= 0:
+                os.write(self.before, arrived)
+        return self.is_interrupted
 
     def look(self, step: int) -> int:
         """Return the step that looks next, or raise `KeyboardInterrupt` after Ctrl-C."""
-        with contextlib.suppress(BlockingIOError):
-            if signal.SIGINT in self.signals.recv(4096):
-                raise KeyboardInterrupt
+        if self.hear():
+            raise KeyboardInterrupt
         now = time.monotonic()
         # Each loop of a call counts its steps from zero.
         num_steps = max(step - self.step, 1)
@@ -76,12 +86,13 @@ def listening() -> Iterator[None]:
         for end in (reader, writer):
             end.setblocking(False)
         before = signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
-        _listener = _Listener(reader)
+        _listener = listener = _Listener(reader, before)
         try:
             yield
         finally:
             _listener = None
             signal.set_wakeup_fd(before)
+            listener.hear()
 
 
 class InterruptibleMeter(diffrax.AbstractProgressMeter):

@@ -67,7 +67,8 @@ def sample_exact_bridges(
     - `position`: the path from which the chain starts, shape (N+1, d), for instance the last one of
         another chain; shape (I, N+1, d) for I intervals. By default the chain proposes its first
         path. With a `position` and a state-dependent σ, guided proposals have Euler steps, because
-        a given path must determine its noise.
+        a given path must determine its noise. Do not pool such draws with those of a chain that
+        proposed its first path.
     - `proposal`: a `Coupling`, with its start law; a guided proposal (`ModifiedDiffusionBridge()`,
         `ResidualBridge()` or `Guided()`), whose target is a product of step densities; "auto",
         which selects the best one for each interval by a pilot run; or a result of

@@ -21,7 +21,13 @@ from ..engine.averages import (
 )
 from ..engine.verdict import AbstractResult
 from ..proposals import AbstractWeightedProposal
-from ..schemes import StepError, dominates, error_of_mean, root_mean_square_in_sds
+from ..schemes import (
+    StepError,
+    dominates,
+    error_of_mean,
+    root_mean_square_in_sds,
+    share_of_pairs,
+)
 
 
 class AbstractExactBridges(AbstractResult):
@@ -32,8 +38,9 @@ class AbstractExactBridges(AbstractResult):
     - `paths`, `met`: shapes (n, K, d) and (n,).
     - `log_halving`: log of the factor by which half as many steps would change the weight of a
         path, shape (n,); NaN where it was not computed.
-    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d); `None` if
-        the bridges themselves serve as such paths.
+    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d), and the
+        bridge itself where none was simulated; `None` if the bridges themselves serve as such
+        paths. Between the points of the coarse grid the distance to the bridge is constant.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
         many steps, shape (). It is infinite if that change is uninformative, for couplings with a
         state-dependent σ(x). The uncertainty of the error is then infinite too.
@@ -126,8 +133,7 @@ class AbstractExactBridges(AbstractResult):
 
         if self.coarse_paths is None:
             return jax.tree.map(error, values(self.paths))
-        # The last step is the same on both grids if N is odd.
-        share = share * self.num_steps / max(self.num_steps - self.num_steps % 2, 1)
+        share = share_of_pairs(share, self.num_steps)
         return jax.tree.map(error, values(self.paths), values(self.coarse_paths))
 
 

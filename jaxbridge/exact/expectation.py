@@ -42,7 +42,9 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
     - `model`: the model, with the parameters of the derivative.
 
     **Returns:** the mean of the values of `fn`, with a leading axis I for I intervals. Missing
-    bridges have no weight. The mean is NaN if all bridges of an interval are missing.
+    bridges have no weight. The mean is NaN if all bridges of an interval are missing. For guided
+    proposals with a state-dependent σ the derivative has a discretisation error of first order, and
+    the mean one of second order.
 
     **Raises:** `TypeError` for other bridges; `ValueError` if their paths are not whole.
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from ..engine.averages import PathFunction
 from ..engine.entry import public_entry
 from ..engine.verdict import AbstractResult, Fault, Verdict
-from ..schemes import StepError, dominates, share_of_known_order, step_faults
+from ..schemes import StepError, dominates, share_of_known_order, share_of_order, step_faults
 from .density import TransitionLogDensity
 from .importance import WeightedBridges
 
@@ -114,8 +114,7 @@ class ExtrapolatedBridges(AbstractResult):
         return verdict.with_finite(self.fine.mean(), self.coarse.mean())
 
     def _combined(self, fn, fine, coarse, combine):
-        # Extrapolation needs the order p only, so it also works where `step_share` is infinite.
-        share = share_of_known_order(self.fine.step_share)
+        share = leading_share(self.fine)
 
         def combine_entries(fine_entry, coarse_entry):
             if fine_entry.shape != coarse_entry.shape:
@@ -141,7 +140,7 @@ def extrapolate(fine: WeightedBridges, coarse: WeightedBridges) -> ExtrapolatedB
 def extrapolate(fine: Any, coarse: Any):
     """Combine two estimates into one without the leading discretisation error (Richardson).
 
-    It is useful where the discretisation error exceeds the standard error. An example are couplings
+    It is useful where the discretisation error exceeds the standard error. One example is couplings
     with a state-dependent σ, whose schemes are all of first order.
 
     **Arguments:**
@@ -196,10 +195,20 @@ def _check_pair(fine: Any, coarse: Any) -> None:
         )
 
 
+def leading_share(fine: TransitionLogDensity | WeightedBridges) -> Float[Array, "*I"]:
+    """Return (2^p - 1)⁻¹ with the order p of the leading error of a single proposal.
+
+    It does not depend on whether the steps are short enough for an estimate of the error.
+    """
+    target = fine.proposal.singles[0].target
+    share = share_of_known_order(fine.step_share)
+    return share if target is None else jnp.full_like(share, share_of_order(target.order))
+
+
 def _log_density(fine: TransitionLogDensity, coarse: TransitionLogDensity):
     """Return the combination. It uses values relative to the finer grid, which keeps their
     digits."""
-    share = share_of_known_order(fine.step_share)
+    share = leading_share(fine)
     is_finite = jnp.isfinite(fine.value) & (coarse.value < jnp.inf)
     ratio = jnp.where(
         is_finite, jnp.exp(coarse.value - jnp.where(is_finite, fine.value, 0)), jnp.inf

@@ -81,8 +81,9 @@ class WeightedBridges(AbstractExactBridges):
         contains their `burn_in`.
     - `log_halving`: log of the factor by which half as many steps would change a weight, shape
         (n,); NaN where it was not computed.
-    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d); `None` if
-        the bridges themselves serve as such paths.
+    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d), and the
+        bridge itself where none was simulated; `None` if the bridges themselves serve as such
+        paths. Between the points of the coarse grid the distance to the bridge is constant.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
         many steps.
     """

@@ -82,8 +82,8 @@ class Chain(AbstractExactBridges):
         no independent weights.
     - `log_halving`: log of the factor by which half as many steps would change the weight of a
         state, shape (n,); NaN where it was not computed.
-    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d); `None` if
-        the states themselves serve as such paths.
+    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d), and the
+        state itself where none was simulated; `None` if the states themselves serve as such paths.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
         many steps.
     - `num_steps`: N.

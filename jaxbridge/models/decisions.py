@@ -33,10 +33,10 @@ class Effects(NamedTuple):
     - `stored_times`: storage of all grid points, not only of the requested times.
     - `early_stop`: a loop over associated paths that stops once all of them have hit.
     - `noise_by_drift`: noise that the drift transports, within a step, to coordinates that σ does
-        not reach. For paths of records.
+        not reach. For guided paths.
     - `quadratic_noise`: the part of a step that is quadratic in its noise, by derivatives of V. For
         guided paths.
-    - `time`: coefficients evaluated at the middle of each step. For paths of records.
+    - `time`: coefficients evaluated at the middle of each step. For guided paths of records.
     """
 
     reverse_drift: Effect

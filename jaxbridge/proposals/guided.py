@@ -69,6 +69,8 @@ from .memory_blocks import block_over_devices, in_blocks, masked
 
 # Share of the duration. Shorter steps change points by less than their rounding errors.
 _SHORTEST_STEP = 1e-10
+# Path steps of a block if a progress meter is given: about a second.
+_STEPS_BETWEEN_REPORTS = 20_000_000
 
 
 class Step(NamedTuple):
@@ -203,6 +205,9 @@ class AbstractGuidedProposal(AbstractSingleProposal):
     ):
         block = block_over_devices(eqx.Partial(_draw_block, self, model, stored, num_steps))
         rows = num_devices() * most_lanes(intervals.start.shape[1])
+        if progress_meter is not None:
+            # Progress is reported, and Ctrl-C looked for, between blocks.
+            rows = min(rows, max(_STEPS_BETWEEN_REPORTS // num_steps, 1))
         return in_blocks(block, keys, intervals, rows, active, progress_meter)
 
     def reweigh(self, keys, model, intervals, paths, active=None):

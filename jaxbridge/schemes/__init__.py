@@ -87,6 +87,7 @@ from .step_error import (
     share_in_regime as share_in_regime,
     share_of_known_order as share_of_known_order,
     share_of_order as share_of_order,
+    share_of_pairs as share_of_pairs,
     step_faults as step_faults,
     unknown_where as unknown_where,
     with_rounding as with_rounding,

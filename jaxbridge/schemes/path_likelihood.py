@@ -268,7 +268,8 @@ def forms_of_targets(
     """Return the forms for bridges with these targets, the most accurate one first.
 
     A target is `None` for the diffusion itself. Bridges of the Euler chain need the likelihood of
-    that chain. With another one, paths and parameters would have no common law.
+    that chain. With another one, paths and parameters would have no common law. Quadratic steps
+    have no likelihood of paths; there the result is that of first order, "girsanov".
     """
     if any(target is not None and target.order == 1 for target in targets):
         return ("girsanov",)

@@ -95,7 +95,10 @@ class AbstractStepDensity(eqx.Module):
 
     @property
     def usual_order(self) -> float:
-        """Return the order of the error for usual numbers of steps, for estimates of that error.
+        """Return the order of the error for usual numbers of steps.
+
+        It is for the reported errors of densities and means of bridges. Records have other
+        estimates of their errors.
 
         Higher terms make the errors of quadratic steps shrink more slowly at first: for CIR and
         Jacobi diffusions by factors of 2.9 to 3.1 from 4 to 8 steps, and of 3.3 to 3.8 from 16 to

@@ -120,8 +120,7 @@ def error_of_coupled_grids(
     """Estimate the step error of the log of the mean of the weights, from coarse paths.
 
     `log_coarse` are the log weights of paths of half as many steps with the same noise. They are
-    NaN for paths without a coarse path, and -inf for a lost coarse path. If N is odd, the last
-    step is the same on both grids, so the change is scaled by N/(N - 1).
+    NaN for paths without a coarse path, and -inf for a lost coarse path.
     """
     has_coarse = ~jnp.isnan(log_coarse)
     logs = [jnp.where(has_coarse, log, -jnp.inf) for log in (log_weights, log_coarse)]
@@ -129,8 +128,16 @@ def error_of_coupled_grids(
     fine_sum, coarse_sum = (logsumexp(log, axis=-1) for log in logs)
     is_known = jnp.isfinite(fine_sum) & jnp.isfinite(coarse_sum)
     change = jnp.where(is_known, coarse_sum, 0) - jnp.where(is_known, fine_sum, 0)
-    share = share * num_steps / max(num_steps - num_steps % 2, 1)
+    share = share_of_pairs(share, num_steps)
     return _error_of_log_ratio(weights, coarse, share, change, is_known, held)
+
+
+def share_of_pairs(share: Float[Array, "*I"], num_steps: int) -> Float[Array, "*I"]:
+    """Return the share of the change by coarse steps that replace pairs of steps.
+
+    If N is odd, the last step is the same on both grids, so the share is scaled by N/(N - 1).
+    """
+    return share * num_steps / max(num_steps - num_steps % 2, 1)
 
 
 def _error_of_log_ratio(weights, coarse, share, change, is_known, held):

@@ -25,10 +25,10 @@ from ..exact import (
     sample_weighted_bridges,
     transition_log_density,
 )
+from ..exact.extrapolation import leading_share
 from ..models.diffusion import Diffusion
 from ..models.gaussian_bridge import gaussian_bridge
 from ..models.ornstein_uhlenbeck import OrnsteinUhlenbeckParams, ou_transition
-from ..schemes import share_of_known_order
 from .settings import Setting
 
 # Methods that combine two grids, and the method that runs on each grid.
@@ -160,7 +160,7 @@ def _estimate(scene: Scene, method: str, result: Any) -> Estimate:
             _estimate(scene, EXTRAPOLATED[method], part) for part in (result.fine, result.coarse)
         )
         # Extrapolation to small steps. The two runs are independent, so squared errors add up.
-        share = float(share_of_known_order(result.fine.step_share))
+        share = float(leading_share(result.fine))
         mean = fine.mean + share * (fine.mean - coarse.mean)
         return Estimate(
             mean,

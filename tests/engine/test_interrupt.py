@@ -2,16 +2,20 @@
 
 import os
 import signal
+import socket
 import threading
 import time
 
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+import jaxbridge as jb
 from jaxbridge.engine import interrupt
 from jaxbridge.engine.progress import metered_scan, metered_stages, metered_while_loop
+from jaxbridge.proposals import guided
 
 QUIET = diffrax.TextProgressMeter(2.0)  # the share never grows by so much
 MATRIX = jnp.eye(200)
@@ -83,6 +87,69 @@ def test_handlers_of_the_caller_stay_in_charge(default_handler):
     with interrupt.listening(), interrupt.listening():
         assert interrupt._listener is not None
     assert interrupt._listener is None and signal.set_wakeup_fd(before) == before
+
+
+@pytest.fixture
+def sockets():
+    """A pair of connected sockets, to read from and to write to."""
+    reader, writer = socket.socketpair()
+    with reader, writer:
+        for end in (reader, writer):
+            end.setblocking(False)
+        yield reader, writer
+
+
+def test_all_loops_of_an_interrupted_call_end(sockets):
+    """Whichever loop reads the signal first, for instance that of another thread."""
+    reader, writer = sockets
+    listener = interrupt._Listener(reader, -1)
+    assert listener.look(0) > 0
+    writer.send(bytes([signal.SIGINT]))
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            listener.look(0)
+
+
+def test_signals_are_passed_on(default_handler, sockets):
+    """To the file in which an event loop waits for them."""
+    reader, writer = sockets
+    before = signal.set_wakeup_fd(writer.fileno())
+    with pytest.raises(KeyboardInterrupt), interrupt.listening():
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+    assert signal.set_wakeup_fd(before) == writer.fileno()
+    assert signal.SIGINT in reader.recv(16)
+
+
+def test_a_metered_run_of_guided_paths_has_several_blocks(monkeypatch):
+    """Progress is reported between them; their number changes results by rounding only."""
+    monkeypatch.setattr(guided, "_STEPS_BETWEEN_REPORTS", 200)
+    model = jb.ornstein_uhlenbeck(jnp.eye(1))
+    run = lambda meter: jb.sample_weighted_bridges(
+        jax.random.key(0), model, [0.0], [0.5], 1.0, num_bridges=300, num_steps=5,
+        proposal=jb.ModifiedDiffusionBridge(), progress_meter=meter, save_at=[0.2],
+    )  # fmt: skip
+    made = run(Recorder())
+    jax.effects_barrier()
+    assert len(TOLD) > 3 and TOLD[-1] == 1
+    np.testing.assert_allclose(made.paths, run(None).paths, atol=1e-6)
+
+
+TOLD = []
+
+
+class Recorder(diffrax.AbstractProgressMeter):
+    """Keeps what it is told in a list."""
+
+    def init(self):
+        return jnp.zeros(())
+
+    def step(self, state, progress):
+        jax.debug.callback(lambda progress: TOLD.append(float(progress)), progress)
+        return state
+
+    def close(self, state):
+        pass
 
 
 def test_only_meters_look():

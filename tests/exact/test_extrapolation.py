@@ -124,3 +124,19 @@ def test_few_steps_of_a_sigma_that_turns():
     off = lambda estimate: abs(float(jnp.expm1(estimate.value - law.log_density(end))))
     assert off(fine) < 0.045 and off(jb.extrapolate(fine, coarse)) < 0.045
     assert fine.standard_error < 0.005
+
+
+def test_the_order_of_quadratic_steps_is_two():
+    """Though their reported errors, of usual numbers of steps, are those of a lower order."""
+    model = jb.Diffusion(lambda x, p: -x, lambda x, p: 0.6 * jnp.sqrt(1 + x**2))
+    fine, coarse = (
+        jb.transition_log_density(
+            jax.random.key(seed), model, [0.5], [-0.6], 1.0, num_proposals=100, num_steps=n,
+            proposal=jb.Guided(),
+        )
+        for seed, n in ((0, 8), (1, 4))
+    )  # fmt: skip
+    both = jb.extrapolate(fine, coarse)
+    p, q = np.exp(float(fine.value)), np.exp(float(coarse.value))
+    assert float(both.value) == pytest.approx(np.log(p + (p - q) / 3), abs=1e-5)
+    assert fine.step_share > 0.5
