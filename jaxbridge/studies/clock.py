@@ -3,7 +3,7 @@
 import functools
 import os
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -20,14 +20,13 @@ def timed(function: Callable[[], T]) -> tuple[T, float]:
     return result, time.perf_counter() - begin
 
 
-def compile_side_by_side(functions: Iterable[Callable[[], Any]]) -> None:
-    """Call all functions, as many at a time as there are processors.
+def compile_side_by_side(functions: Sequence[Callable[[], Any]]) -> list[Any]:
+    """Call all functions, as many at a time as there are processors; return their results.
 
     Their programs are then compiled side by side. Time the functions afterwards.
     """
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        for result in pool.map(lambda function: function(), functions):
-            jax.block_until_ready(result)
+        return jax.block_until_ready(list(pool.map(lambda function: function(), functions)))
 
 
 @functools.cache
