@@ -205,6 +205,7 @@ RECORDS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", slow_beyond(1, RECORDS))
 def test_steps_of_records_contain_what_the_table_says(name):
     """The derivatives of the drift's sinh and of σ's gamma function, and the sine of time."""

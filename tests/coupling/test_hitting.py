@@ -25,6 +25,7 @@ def some_bridges(num_bridges=3, num_steps=30, coupling=None, ends=PAPER_CASES["u
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law", [pytest.param(jb.Stationary(), marks=pytest.mark.slow), LAW], ids=["nu", "mu"]
 )

@@ -50,6 +50,7 @@ def test_chain_has_the_law_that_weights_give(proposal, step_size):
         assert abs(mean - exact) < 5 * np.hypot(error, exact_error)
 
 
+@pytest.mark.slow
 def test_chain_has_the_law_of_the_closed_form():
     """An Ornstein–Uhlenbeck bridge from Brownian bridges whose weights vary."""
     model, ends = paper_model(), ([0.785, 0.785], [1.091, 1.091])

@@ -126,6 +126,7 @@ def test_few_steps_of_a_sigma_that_turns():
     assert fine.standard_error < 0.005
 
 
+@pytest.mark.slow
 def test_the_order_of_quadratic_steps_is_two():
     """Though their reported errors, of usual numbers of steps, are those of a lower order."""
     model = jb.Diffusion(lambda x, p: -x, lambda x, p: 0.6 * jnp.sqrt(1 + x**2))

@@ -70,6 +70,7 @@ def test_chains_take_it(method):
     assert np.all(np.abs(found - mean) < 5 * error) and np.all(error < 0.03)
 
 
+@pytest.mark.slow
 def test_gibbs_takes_it():
     times, data = jnp.arange(4.0) / 4, jnp.array([[0.2], [0.1], [0.3], [0.0]])
     prior = jb.NormalPrior(jnp.zeros(1), jnp.eye(1))

@@ -138,6 +138,7 @@ def test_linear_drift_is_guided_without_error(x64, linearisation, refinement):
     np.testing.assert_array_equal(weighted.paths[:, -1], jnp.broadcast_to(end, (8, 2)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("duration, num_steps", slow_beyond(1, [(0.1, 50), (0.01, 10), (1.0, 800)]))
 @pytest.mark.parametrize(
     "name",
@@ -581,6 +582,7 @@ def test_defaults_agree_in_what_they_are_exact_for():
     assert abs(errors[jb.EulerDensity()][0]) > 5 * standard_error + 0.1 / 6**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("proposal", "start", "end", "duration", "num_steps"),
     slow_beyond(

@@ -52,6 +52,7 @@ def exact_log_likelihood(model, paths, step):
     return jnp.sum(jax.vmap(jax.vmap(of_step))(paths[:, :-1], paths[:, 1:]), axis=1)
 
 
+@pytest.mark.slow
 def test_derivatives_are_the_papers_H_and_B(precision):
     """Equation (likelihood): log L = α H_T - ½ α² B_T, for any d."""
     for d in (1, 2):

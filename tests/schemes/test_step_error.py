@@ -48,6 +48,7 @@ def test_error_of_a_log_density(density, refinement, curl, x64):
     assert bool(estimate.trustworthy) is (abs(float(estimate.step_error)) < 0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_steps", slow_beyond(1, [10, 2, 9, 40]))
 @pytest.mark.parametrize(
     "proposal", slow_beyond(1, [jb.Guided(), jb.ModifiedDiffusionBridge(refinement=1.5)])
