@@ -422,7 +422,7 @@ def test_lost_paths_do_not_spoil_derivatives():
     def middle(params):
         weighted = jb.sample_weighted_bridges(
             jax.random.key(0), root.with_params(params), jnp.array([0.3]), jnp.array([0.2]), 1.0,
-            num_bridges=200, num_steps=10, proposal=jb.ModifiedDiffusionBridge(),
+            num_bridges=200, num_steps=10, proposal=jb.ModifiedDiffusionBridge(jb.EulerDensity()),
         )  # fmt: skip
         return weighted.mean(lambda path: path[5, 0]), weighted.met
 
