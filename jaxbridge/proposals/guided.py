@@ -277,7 +277,8 @@ class _LaneState(NamedTuple):
     - `before`: the previous point, or the previous noise if there are coarse paths.
     - `log_halving`: D of `halving` so far.
     - `coarse`: coarse paths so far; `None` if none are simulated.
-    - `gap`: distance from the paths to the coarse paths, at their last common point.
+    - `gap`: distance from the paths to the coarse paths, at their last common point; `None` if
+        coarse paths are not stored.
     """
 
     path: _PathWeights
@@ -305,6 +306,7 @@ class _GuidedLanes:
         num_steps: int,
         num_draws: int = 1,
         with_coarse: bool = False,
+        stores_coarse: bool = False,
     ):
         start, end, _ = intervals
         fractions, coarse_points = _fractions(proposal, num_steps)
@@ -313,6 +315,8 @@ class _GuidedLanes:
         if with_coarse:
             arguments = (proposal, dynamics, intervals, fractions, coarse_points)
             coarse, self._coarse_dt = _coarse_grid(*arguments)
+        # Only stored coarse paths need all points of the fine grid.
+        self._stores_coarse = stores_coarse
         num_steps = self.num_steps = len(fractions) - 1
         self._num_draws, self._num_steps = num_draws, num_steps
         self._num_evaluated = num_looked(num_draws, dynamics.sigma_varies)
@@ -338,20 +342,19 @@ class _GuidedLanes:
         start = self.spread(self.start)
         evaluated, zero = self._select_evaluated(start), jnp.zeros_like(start[0])
         zeros = jnp.zeros_like(evaluated[0])
-        coarse = gap = None
-        if self._coarse_dt is not None:
-            coarse, gap = _PathWeights(evaluated, zeros, zeros), jnp.zeros_like(evaluated)
+        coarse = None if self._coarse_dt is None else _PathWeights(evaluated, zeros, zeros)
+        gap = jnp.zeros_like(evaluated) if self._stores_coarse else None
         return _LaneState(_PathWeights(start, zero, zero), evaluated, zeros, coarse, gap)
 
-    def end_points(self, with_coarse: bool) -> Float[Array, "d points"]:
-        """Return the end points of all paths, followed by those of their coarse paths."""
+    def end_points(self) -> Float[Array, "d points"]:
+        """Return the end points of all paths, followed by those of stored coarse paths."""
         ends = [self.spread(self.end)]
-        if with_coarse:
+        if self._stores_coarse:
             ends.append(self._select_evaluated(ends[0]))
         return jnp.concatenate(ends, axis=-1)
 
     def points(self, state: _LaneState) -> Float[Array, "d points"]:
-        """Return the current points of all paths, followed by those of their coarse paths.
+        """Return the current points of all paths, followed by those of stored coarse paths.
 
         Between two points of the coarse grid, the distance between both is constant, or zero where
         it would lead out of the state space.
@@ -382,6 +385,8 @@ class _GuidedLanes:
         def take_coarse_step():
             # The noise of both fine steps is available at the end of the pair.
             stepped = self._take_coarse_step(coarse, state.before, here, coarse_steps)
+            if state.gap is None:
+                return stepped, None
             return stepped, lax.stop_gradient(stepped.x - self._select_evaluated(path.x))
 
         coarse, gap = lax.cond(coarse_steps.ends, take_coarse_step, lambda: (coarse, state.gap))
@@ -575,7 +580,7 @@ def path_of(
     For normal steps it is the inverse of `noise_of`.
     """
     with_coarse = not proposal.target.is_normal and num_steps > 1
-    lanes = _GuidedLanes(proposal, dynamics, intervals, num_steps, 1, with_coarse)
+    lanes = _GuidedLanes(proposal, dynamics, intervals, num_steps, 1, with_coarse, with_coarse)
 
     def step(state, inputs):
         state = lanes.advance(join_rows(state), *join_rows(inputs))
@@ -585,7 +590,7 @@ def path_of(
     first = lanes.begin()
     state, points = lax.scan(step, split_rows(first), inputs)
     log_weights, half = _drop_draw_axis(lanes.finish(join_rows(state)))
-    ends = lanes.points(first)[None], lanes.end_points(with_coarse)[None]
+    ends = lanes.points(first)[None], lanes.end_points()[None]
     points = jnp.concatenate([ends[0], join_rows(points, axis=1)[: num_steps - 1], ends[1]])
     paths = jnp.moveaxis(points, -1, 0)
     if not with_coarse:
@@ -705,11 +710,13 @@ def _simulate(
     only_weights = stored is not None and stored.shape[0] == 0
     is_coupled = only_weights or not proposal.target.is_normal
     with_coarse = is_coupled and dynamics.sigma_varies and num_steps > 1
-    lanes = _GuidedLanes(proposal, dynamics, intervals, num_steps, num_draws, with_coarse)
+    stores_coarse = with_coarse and not only_weights
+    which = with_coarse, stores_coarse
+    lanes = _GuidedLanes(proposal, dynamics, intervals, num_steps, num_draws, *which)
     # The last step may be split. The points within it are not part of the path.
     last, num_steps = num_steps, lanes.num_steps
     state = lanes.begin()
-    start, end = lanes.points(state), lanes.end_points(with_coarse)
+    start, end = lanes.points(state), lanes.end_points()
     path = start[None][:0]  # no points between the ends if N = 1
     store = slots = None
     if stored is not None:
@@ -754,7 +761,7 @@ def _simulate(
         return jnp.moveaxis(path, (2, 3), (0, 1))
 
     paths, coarse_paths = of_intervals(path[:, :, :num_lanes]), None
-    if with_coarse and not only_weights:
+    if stores_coarse:
         coarse = of_intervals(path[:, :, num_lanes:])
         coarse_paths = paths.at[:, : coarse.shape[1]].set(coarse)
     return _Draws(paths, log_weights, *halves, coarse_paths)
