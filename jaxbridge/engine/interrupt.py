@@ -61,7 +61,11 @@ _listener: _Listener | None = None
 
 
 class _Watch(NamedTuple):
-    """State of a meter: that of the caller's, the number of this step, and of one that looks."""
+    """State of an `InterruptibleMeter`.
+
+    - `inner`: state of the caller's meter.
+    - `step`, `look_at`: numbers of this step, and of the next step that looks.
+    """
 
     inner: PyTree
     step: Int[Array, ""]
@@ -96,7 +100,7 @@ def listening() -> Iterator[None]:
 
 
 class InterruptibleMeter(diffrax.AbstractProgressMeter):
-    """The progress meter of the caller, which in addition looks for Ctrl-C at some of the steps."""
+    """Progress meter of the caller, with looks for Ctrl-C at some of the steps."""
 
     meter: diffrax.AbstractProgressMeter
 

@@ -18,7 +18,7 @@ _Context = TypeVar("_Context")
 
 
 def as_meter(progress_meter: diffrax.AbstractProgressMeter | None) -> diffrax.AbstractProgressMeter:
-    """Return the given progress meter, which also looks for Ctrl-C, or none that has any effect."""
+    """Return the progress meter with looks for Ctrl-C; for `None`, one without any effect."""
     if progress_meter is None or isinstance(progress_meter, diffrax.NoProgressMeter):
         return diffrax.NoProgressMeter()
     return InterruptibleMeter(progress_meter)

@@ -158,9 +158,11 @@ def _state_of(
     num_steps: int,
 ) -> CrankNicolsonState:
     """Return the states with this noise."""
-    made = path_of(proposal, dynamics, intervals, noise, num_steps)
-    log_weights = _non_finite_to_neg_inf(made.log_weights)
-    return CrankNicolsonState(made.paths, noise, log_weights, made.log_change, made.coarse_paths)
+    paths, log_weights, log_change, coarse_paths = path_of(
+        proposal, dynamics, intervals, noise, num_steps
+    )
+    log_weights = _non_finite_to_neg_inf(log_weights)
+    return CrankNicolsonState(paths, noise, log_weights, log_change, coarse_paths)
 
 
 @compiled_sooner

@@ -172,7 +172,8 @@ def as_proposal(
 
     `None` stands for `Coupling()`. `like` is a point of the right shape and dtype. `for_density`
     states that the weights estimate densities, so a constant factor matters. `normal_steps` states
-    that paths must determine their noise; never `for_density`. `name` is the argument in messages.
+    that paths must determine their noise; it has no effect `for_density`. `name` is the argument in
+    messages.
 
     **Raises:** `TypeError` for anything but a coupling, a proposal or "auto". `ValueError` for a
     budget if the proposal has no use for one.

@@ -270,9 +270,7 @@ class AbstractSingleProposal(AbstractWeightedProposal):
         """Return the names of scheme (or target step density) and meeting rule, and γ."""
 
     @abstractmethod
-    def most_accurate(
-        self, model: Diffusion, like: Float[Array, " d"], normal_steps: bool = True
-    ) -> "AbstractSingleProposal":
+    def most_accurate(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractSingleProposal":
         """Return the proposal with the most accurate scheme or target for this model."""
 
     @abstractmethod

@@ -99,7 +99,7 @@ class CoupledPairs(AbstractSingleProposal):
     def for_model(self, model, like, normal_steps=True):
         return self
 
-    def most_accurate(self, model, like, normal_steps=True):
+    def most_accurate(self, model, like):
         return eqx.tree_at(lambda p: p.coupling, self, most_accurate(self.coupling))
 
     def for_pilot(self):

@@ -129,8 +129,8 @@ class AbstractGuidedProposal(AbstractSingleProposal):
             return self
         return self._with_density(most_accurate_density(model, like, normal_steps))
 
-    def most_accurate(self, model, like, normal_steps=True):
-        density = most_accurate_density(model, like, normal_steps)
+    def most_accurate(self, model, like):
+        density = most_accurate_density(model, like, normal_steps=False)
         if self.density is not None and self.density.order >= density.order:
             return self
         return self._with_density(density)

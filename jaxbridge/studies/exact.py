@@ -111,13 +111,13 @@ def run_exact(key: Key[Array, ""], scale: float, say: Say) -> list[ExactResult]:
     results = []
     for i, (ends, method, iterations, _, paper_seconds) in enumerate(runs):
         say(f"{_words(ends)}, {method}")
-        made = timed(partial(simulate, i, 1))
-        results.append(_result(made, ends, method, round(iterations * scale), paper_seconds))
+        timed_run = timed(partial(simulate, i, 1))
+        results.append(_result(timed_run, ends, method, round(iterations * scale), paper_seconds))
     return results
 
 
-def _result(made, ends: Ends, method, iterations, paper_seconds) -> ExactResult:
-    (middle, weights, simulated), seconds = made
+def _result(timed_run, ends: Ends, method, iterations, paper_seconds) -> ExactResult:
+    (middle, weights, simulated), seconds = timed_run
     law = law_half_way(*ends)
     samples, fit, error, effective = _judge(middle, weights, law)
     return ExactResult(

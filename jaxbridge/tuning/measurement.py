@@ -252,7 +252,7 @@ def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
     """
     # The limit does not depend on the scheme, so the most accurate one serves for all settings.
     model, like, *_ = scene.interval("float64")
-    best = run.proposal.most_accurate(model, like, normal_steps=False)
+    best = run.proposal.most_accurate(model, like)
     limit = run._replace(proposal=best)
     half = limit._replace(num_steps=max(run.num_steps // 2, 1))
     fine = _estimate(scene, run.method, limit.result(key, scene))
