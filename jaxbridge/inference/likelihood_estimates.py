@@ -242,7 +242,7 @@ class RecordLikelihood(AbstractLikelihood):
         log_p, variance, _ = on_both_grids(estimate, self.fine, self.coarse)
         # The mean of log p̂ is below log p by half the variance of log p̂.
         fine, coarse = log_p + variance / 2
-        error = share_of_grid(problem.density.order, problem.num_steps) * (coarse - fine)
+        error = share_of_grid(problem.density.order, problem.record.lengths) * (coarse - fine)
         one = lambda problem, points: steps_are_too_long(problem, model, points)
         # Then the difference of the two grids is no leading-order error.
         too_long = self.fine.records.each(one, self.fine.points)

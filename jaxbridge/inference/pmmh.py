@@ -300,7 +300,6 @@ def pmmh(
     else:
         check_no_bridges(proposal=proposal, num_counts=num_counts, max_trials=max_trials)
         options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
-        options |= {"normal_steps": False}
         records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
 

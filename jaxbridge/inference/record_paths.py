@@ -32,10 +32,11 @@ from ..records import (
     cuts,
     guided,
     has_segments,
+    knots_and_log_weight,
     linearisations,
     no_check,
     noise_and_log_weight,
-    path_and_log_weight,
+    pair_noise,
     stacked,
     steps_are_too_long,
     sweep,
@@ -102,8 +103,8 @@ class RecordPaths(eqx.Module):
 
         def one(problem, key, points, guide):
             noise = jax.random.normal(key, points.shape, points.dtype)
-            path, log_weight = path_and_log_weight(problem, model, guide, noise)
-            return jnp.where(jnp.isfinite(log_weight), path, points)
+            knots, log_weight = knots_and_log_weight(problem, model, guide, noise)
+            return jnp.where(jnp.isfinite(log_weight), knots, points)
 
         paths = records.each(one, jax.random.split(key, records.number), points, at.guides)
         return paths, no_paths(records)[1]
@@ -176,7 +177,8 @@ class RecordPaths(eqx.Module):
         return _paths_of_noise(grid.records, model, _guides(grid, model), noise)[1]
 
     def _coarsened(self, noise: Float[Array, "R points d"]) -> Float[Array, "R points d"]:
-        return jax.vmap(lambda noise: _pair_noise(noise, self.num_steps))(noise)
+        lengths = self.fine.records.stacked.record.lengths
+        return jax.vmap(lambda noise: pair_noise(noise, lengths))(noise)
 
 
 def check_no_bridges(**arguments: Any) -> None:
@@ -212,7 +214,7 @@ def movable(records: Records) -> Bool[Array, "R 2 B"]:
 
 def share_of_step_error(records: Records) -> float:
     """Return the discretisation error as a fraction of the change from half as many steps."""
-    return share_of_grid(records.stacked.density.order, records.stacked.num_steps)
+    return share_of_grid(records.stacked.density.order, records.stacked.record.lengths)
 
 
 def unguided(records: Records) -> GuidedRecords:
@@ -307,23 +309,7 @@ def _paths_of_noise(
     records: Records, model: Diffusion, guides: Guidance, noise: Float[Array, "R points d"]
 ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
     def one(problem, guide, noise):
-        return path_and_log_weight(problem, model, guide, noise)
+        return knots_and_log_weight(problem, model, guide, noise)
 
     paths, log_weight = records.each(one, guides, noise)
     return paths, jnp.sum(log_weight)
-
-
-def _pair_noise(noise: Float[Array, "points d"], num_steps: int) -> Float[Array, "points d"]:
-    """Return the noise of steps of twice the size, on the grid of `Record.coarsened`.
-
-    The shape is that of the fine grid. The scaled sum of each pair is the noise of its second step;
-    its first step has no length on that grid.
-    """
-    # The first step of a segment with odd N has no partner and remains.
-    odd = num_steps % 2
-    segments = noise[1:].reshape(-1, num_steps, noise.shape[-1])
-    first, second = segments[:, odd::2], segments[:, odd + 1 :: 2]
-    pairs = jnp.stack([first, (first + second) * np.sqrt(0.5).astype(noise.dtype)], axis=2)
-    pairs = pairs.reshape(len(segments), -1, noise.shape[-1])
-    segments = jnp.concatenate([segments[:, :odd], pairs], axis=1)
-    return jnp.concatenate([noise[:1], segments.reshape(-1, noise.shape[-1])])

@@ -33,7 +33,6 @@ e^D of `halving`. For means of functions of paths, the coarse path has all point
 between two of its own points, its distance to the fine path is constant.
 """
 
-import math
 from abc import abstractmethod
 from typing import NamedTuple
 
@@ -63,6 +62,7 @@ from ..schemes import (
     most_accurate_density,
     num_looked,
     share_of_order,
+    splits_of_last_step,
 )
 from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
 from .memory_blocks import block_over_devices, in_blocks, masked
@@ -794,8 +794,8 @@ def _fractions(
     coarse = [*range(0, num_steps, 2)]
     if proposal.target.is_normal:
         return fractions, [*coarse, num_steps]
-    num_splits = math.ceil(math.log2(num_steps)) if num_steps > 1 else 0
-    splits = fractions[-2] * 0.5 ** np.arange(1, num_splits + 1)
+    splits = fractions[-2] * splits_of_last_step(num_steps)
+    num_splits = len(splits)
     # The last step of the coarse grid is about T / (N/2)², four times as long.
     shared = range(num_steps - 1, num_steps - 1 + max(num_splits - 1, 0))
     coarse = sorted({*coarse, *shared})

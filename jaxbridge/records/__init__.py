@@ -35,7 +35,9 @@ from .guide_search import (
 from .guided_record import (
     Guidance as Guidance,
     guided as guided,
+    knots_and_log_weight as knots_and_log_weight,
     noise_and_log_weight as noise_and_log_weight,
+    pair_noise as pair_noise,
     path_and_log_weight as path_and_log_weight,
 )
 from .initial import Initial as Initial

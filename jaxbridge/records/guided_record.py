@@ -1,6 +1,10 @@
 """Guide of a whole record: the quantities of all guided steps, computed before the simulation.
 
 The module also simulates guided paths with their weights, and recovers the noise of a path.
+
+The *knots* of a path are x_0 and the ends of the normal parts of its steps (`guided_steps`). They
+determine the path and its noise, which a path alone does not if steps are quadratic in the noise.
+For normal steps they are the path itself. At the ends of segments they are its points.
 """
 
 import functools
@@ -9,6 +13,8 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Key, PyTree
 
 from ..engine.lanes import over_lanes, over_points
@@ -19,9 +25,9 @@ from ..schemes import solve_root
 from .guided_steps import (
     Guide,
     GuidedLaw,
+    end_of_step,
     guided_law,
     guided_start,
-    guided_step,
     relative,
     target_law,
 )
@@ -31,7 +37,7 @@ from .linearisation import LinearisedStep, linear_step
 from .observation import Row, Scalars
 from .problem import RecordProblem
 from .record import Steps
-from .segments import at_every_step, flat, following, split_first
+from .segments import at_every_step, flat, following, split_first, split_last
 from .tilted_step import NormalStep
 
 
@@ -115,18 +121,83 @@ def path_and_log_weight(
 
     `noise[0]` determines x_0, and `noise[i]` step i.
     """
+    path, _, log_weight = _simulate(problem, model, guide, noise)
+    return path, log_weight
+
+
+def knots_and_log_weight(
+    problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
+) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
+    """Return the knots of the path of this noise, and its log weight."""
+    _, knots, log_weight = _simulate(problem, model, guide, noise)
+    return knots, log_weight
+
+
+def _simulate(
+    problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
+) -> tuple[Float[Array, "points d"], Float[Array, "points d"], Float[Array, ""]]:
+    """Return the path of this noise, its knots, and its log weight."""
     density, dynamics_at = problem.density, model.forward_at(problem.like)
     start, log_start = guide.start.point_and_log_weight(noise[0])
     steps = flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
+    is_last = np.arange(1, len(noise)) % problem.num_steps == 0
 
     def one(x, inputs):
-        zeta, step, scalars = inputs
-        return guided_step(density, dynamics_at, x, step, scalars).point_and_log_weight(zeta)
+        zeta, step, scalars, is_last = inputs
+        law = target_law(density, dynamics_at, x, step.step)
+        knot, log_weight = guided_law(law, step, scalars).point_and_log_weight(zeta)
+        point = end_of_step(law, knot, is_last)
+        return point, (None if density.is_normal else knot, log_weight)
 
-    points, log_weights = recursion(one, start, (noise[1:], *steps))
-    path = jnp.concatenate([start[None], points])
-    log_weight = log_start + sum_of_many(log_weights)
-    return path, log_weight + corrections(problem, model, guide, path)
+    inputs = (noise[1:], *steps, jnp.asarray(is_last))
+    points, (knots, log_weights) = recursion(one, start, inputs)
+    path, log_weight = jnp.concatenate([start[None], points]), log_start + sum_of_many(log_weights)
+    knots = path if knots is None else jnp.concatenate([start[None], knots])
+    return path, knots, log_weight + corrections(problem, model, guide, path)
+
+
+def path_of_knots(
+    problem: RecordProblem, model: Diffusion, knots: Float[Array, "points d"]
+) -> Float[Array, "points d"]:
+    """Return the path with these knots."""
+    if problem.density.is_normal:
+        return knots
+    K, N = problem.num_segments, problem.num_steps
+    density, dynamics_at = problem.density, model.forward_at(problem.like)
+    # Segments begin at known points, so they are lanes.
+    of_segments = lambda leaf: jnp.moveaxis(leaf.reshape(K, N, *leaf.shape[1:]), 0, -1)
+    inner, steps = jax.tree.map(of_segments, (knots[1:], flat(problem.record.steps())))
+
+    def one(x, inputs):
+        of_lane = lambda x, knot, step: end_of_step(target_law(density, dynamics_at, x, step), knot)
+        x = over_lanes(-1, -1, -1)(of_lane)(x, *inputs)
+        return x, x
+
+    bent, ends = split_last((inner, steps))
+    _, points = lax.scan(one, knots[:-1:N].T, bent)
+    path = jnp.moveaxis(jnp.concatenate([points, ends[0][None]]), -1, 0)
+    return jnp.concatenate([knots[:1], path.reshape(K * N, -1)])
+
+
+def pair_noise(
+    noise: Float[Array, "points d"], lengths: tuple[float, ...]
+) -> Float[Array, "points d"]:
+    """Return the noise of steps that join pairs of steps, on the grid of `Record.coarsened`.
+
+    `lengths` are those of the steps of a segment. The shape is that of the fine grid. The scaled
+    sum of each pair is the noise of its second step; its first step has no length on that grid.
+    """
+    # The first step of a segment with odd N has no partner and remains.
+    odd = len(lengths) % 2
+    scale = np.sqrt(lengths)[:, None]
+    segments = noise[1:].reshape(-1, len(lengths), noise.shape[-1])
+    scaled = segments * scale.astype(noise.dtype)
+    total = np.hypot(scale[odd::2], scale[odd + 1 :: 2]).astype(noise.dtype)
+    sums = (scaled[:, odd::2] + scaled[:, odd + 1 :: 2]) / total
+    pairs = jnp.stack([segments[:, odd::2], sums], axis=2)
+    pairs = pairs.reshape(len(segments), -1, noise.shape[-1])
+    segments = jnp.concatenate([segments[:, :odd], pairs], axis=1)
+    return jnp.concatenate([noise[:1], segments.reshape(-1, noise.shape[-1])])
 
 
 def _map_steps(of_step: Callable, *steps: PyTree) -> PyTree:
@@ -141,13 +212,14 @@ def noise_and_log_weight(
     problem: RecordProblem,
     model: Diffusion,
     guide: Guidance,
-    path: Float[Array, "points d"],
+    knots: Float[Array, "points d"],
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
-    """Return noise that leads to this path, and the log weight of the path.
+    """Return noise that leads to the path with these knots, and the log weight of the path.
 
-    This is the inverse of `path_and_log_weight`. Components of the noise that do not move the path
+    This is the inverse of `knots_and_log_weight`. Components of the noise that do not move the path
     are drawn afresh.
     """
+    path = path_of_knots(problem, model, knots)
     density, dynamics_at = problem.density, model.forward_at(problem.like)
     scalars = at_every_step(guide.scalars, problem.num_steps)
     hidden = jax.random.normal(key, (len(path), scalars.values.shape[1]), path.dtype)
@@ -157,12 +229,12 @@ def noise_and_log_weight(
     still = jnp.diagonal(guide.initial.root) == 0
     fresh = jax.random.normal(jax.random.fold_in(key, 1), first.shape, path.dtype)
 
-    def of_step(x, x_next, step, scalars, hidden):
+    def of_step(x, knot, step, scalars, hidden):
         law = target_law(density, dynamics_at, x, step.step)
         step_law = guided_law(law, step, scalars)
-        return step_law.noise_and_log_weight(x_next, law.solve, hidden)
+        return step_law.noise_and_log_weight(knot, law.solve, hidden)
 
-    steps = path[:-1], path[1:], flat(guide.steps), scalars, hidden[1:]
+    steps = path[:-1], knots[1:], flat(guide.steps), scalars, hidden[1:]
     zeta, log_weights = _map_steps(of_step, *steps)
     noise = jnp.concatenate([jnp.where(still, fresh, first)[None], zeta])
     log_weight = log_start + sum_of_many(log_weights)

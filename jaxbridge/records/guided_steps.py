@@ -11,10 +11,10 @@ with p(y| x) the density of the observation at the end of the step. Hence log w 
 at most ½|ζ|² plus the maximum log density of the observations. Rounding errors cannot exceed this
 bound.
 
-A target's step may be quadratic in its noise (`QuadraticDensity`). Its normal part leads to a point
-u, and the step to x' = u + O(δ). The noise is guided as above, with the observation of u. The
-weight takes the factor g(y| x') / g(y| u) in addition. An exact observation has no such factor: the
-step to it is the normal part alone.
+A target's step may be quadratic in its noise (`QuadraticDensity`). Its normal part leads to a knot
+u, and the step to x' = u + O(δ). The noise is guided as above, and w is the same. The steps that
+end at observations are their normal parts alone, x' = u. They are short (`Record.with_split_ends`),
+so this adds only O(δ²) to the discretisation error.
 
 For normal steps the weight also equals ∫ p(x'| x) g(y| x') h_{i+1}(x') dx' / h_i(x) times
 h_i(x) / h_{i+1}(x'), whose product over a path telescopes. The code must not sum this form.
@@ -27,13 +27,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ..engine.lanes import compute_once
 from ..engine.linalg import dot
 from ..models.dynamics import DynamicsAt
 from ..schemes import AbstractStepDensity, DegenerateLaw, StepLaw
-from .observation import Scalars, log_density_of
+from .observation import Scalars
 from .record import Steps
 from .tilted_step import Information, NormalStep, Seen, Tilted, coordinates, given, tilted
 
@@ -59,14 +59,12 @@ class GuidedLaw(NamedTuple):
     - `origin`: ξ', from which points of `tilted` count.
     - `log_seen`: log density of the observation at its end, given its beginning.
     - `seen`: factors of the conditioning on that observation.
-    - `quadratic`: the target's step and the observation, if the step is not normal.
     """
 
     origin: Float[Array, " d"]
     tilted: Tilted
     log_seen: Float[Array, ""]
     seen: list[Seen]
-    quadratic: tuple[StepLaw, Scalars | None] | None = None
 
     @property
     def log_integral(self) -> Float[Array, ""]:
@@ -76,26 +74,11 @@ class GuidedLaw(NamedTuple):
     def point_and_log_weight(
         self, zeta: Float[Array, " m"]
     ) -> tuple[Float[Array, " d"], Float[Array, ""]]:
-        """Return where the noise ζ ~ N(0, I) leads, and the log weight of the step."""
+        """Return the knot to which the noise ζ ~ N(0, I) leads, and the log weight of the step."""
         # Without this, the compiler computes it twice, for the point and for the weight.
         pulled = compute_once(self.tilted.pulled(zeta))
         point = self.origin + self.tilted.point(pulled)
-        log_weight = self.log_seen + self.tilted.log_ratio(zeta, pulled)
-        if self.quadratic is None:
-            return point, log_weight
-        law, scalars = self.quadratic
-        bent = law.bent(point)
-        if scalars is not None:
-            # Only the normal part of the step meets an exact observation.
-            is_exact = jnp.any(scalars.seen & (scalars.variances == 0))
-            bent = jnp.where(is_exact, point, bent)
-            # An exact scalar has no density; here it keeps the point, which cancels its term.
-            safe = scalars._replace(
-                variances=jnp.where(scalars.variances > 0, scalars.variances, 1)
-            )
-            log_weight += log_density_of(safe, bent - self.origin)
-            log_weight -= log_density_of(safe, point - self.origin)
-        return bent, log_weight
+        return point, self.log_seen + self.tilted.log_ratio(zeta, pulled)
 
     def noise_and_log_weight(
         self,
@@ -103,7 +86,7 @@ class GuidedLaw(NamedTuple):
         solve: Callable[[Float[Array, " d"]], Float[Array, " m"]],
         hidden: Float[Array, " n"],
     ) -> tuple[Float[Array, " m"], Float[Array, ""]]:
-        """Return noise that leads to this point, and the log weight of the step.
+        """Return noise that leads to this knot, and the log weight of the step.
 
         `solve` is Λ⁻¹ of the step before conditioning; `hidden` is explained in `coordinates`.
         """
@@ -132,20 +115,6 @@ def guided_start(
     return GuidedLaw(point, bent, log_seen, factors)
 
 
-def guided_step(
-    density: AbstractStepDensity,
-    dynamics_at: DynamicsAt,
-    x: Float[Array, " d"],
-    guide: Guide,
-    scalars: Scalars | None,
-) -> GuidedLaw:
-    """Return the law of the guided step from x.
-
-    `scalars` are the observations at its end, relative to ξ_{i+1}.
-    """
-    return guided_law(target_law(density, dynamics_at, x, guide.step), guide, scalars)
-
-
 def target_law(
     density: AbstractStepDensity, dynamics_at: DynamicsAt, x: Float[Array, " d"], step: Steps
 ) -> StepLaw | DegenerateLaw:
@@ -154,12 +123,26 @@ def target_law(
 
 
 def guided_law(law: StepLaw | DegenerateLaw, guide: Guide, scalars: Scalars | None) -> GuidedLaw:
-    """Return the law of the guided step, from the law of the target's step."""
+    """Return the law of the guided step, from the law of the target's step.
+
+    `scalars` are the observations at its end, relative to ξ_{i+1}.
+    """
     step = NormalStep(law.mean - guide.next_point, law.root)
     log_seen, factors = jnp.zeros((), law.mean.dtype), []
     if scalars is not None:
         step, log_seen, factors = given(step, scalars)
-    quadratic = None
-    if isinstance(law, StepLaw) and law.curvature is not None:
-        quadratic = law, scalars
-    return GuidedLaw(guide.next_point, tilted(step, guide.next_h), log_seen, factors, quadratic)
+    return GuidedLaw(guide.next_point, tilted(step, guide.next_h), log_seen, factors)
+
+
+def end_of_step(
+    law: StepLaw | DegenerateLaw,
+    knot: Float[Array, " d"],
+    is_last: Bool[Array, ""] | bool = False,
+) -> Float[Array, " d"]:
+    """Return the end of the target's step whose normal part ends in the knot.
+
+    It is the knot itself if the step is normal, as the last step of a segment is.
+    """
+    if isinstance(law, DegenerateLaw) or law.curvature is None or is_last is True:
+        return knot
+    return jnp.where(is_last, knot, law.bent(knot))

@@ -196,7 +196,6 @@ def innovations(
         step_size=step_size,
         initial_time=initial_time,
         density=density,
-        normal_steps=False,
     )
     points, _, check = linearised(problem, model)
     if not is_traced(check) and not check.is_usable:

@@ -267,7 +267,7 @@ def log_likelihood(
     num_filters = check_count("num_filters", 8 if num_filters is None else num_filters)
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
-    records = as_record_problems(*arguments, num_steps=num_steps, normal_steps=False, **options)
+    records = as_record_problems(*arguments, num_steps=num_steps, **options)
     size = num_filters, num_particles
     levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
     grids = [records, *map(records.coarsened, levels)]
@@ -289,8 +289,8 @@ def _combine_filters(
     # Differences between grids below the rounding error of the sum over all steps do not count.
     rounding = np.sqrt(records.stacked.record.dt.size) * jnp.finfo(value.dtype).eps
     rounding = rounding.astype(value.dtype) * jnp.maximum(1, jnp.abs(value))
-    order, num_steps = records.stacked.density.order, records.stacked.num_steps
-    step_error = error_of_grids(values, jnp.hypot(errors, rounding), order, num_steps)
+    order, lengths = records.stacked.density.order, records.stacked.record.lengths
+    step_error = error_of_grids(values, jnp.hypot(errors, rounding), order, lengths)
     return LogLikelihood(
         value,
         error,

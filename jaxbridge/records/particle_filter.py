@@ -23,7 +23,7 @@ from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
 from .cover import cover, covered_start
 from .guided_record import Guidance, correction
-from .guided_steps import guided_step
+from .guided_steps import end_of_step, guided_law, target_law
 from .initial import calls_for_cover, log_ratio
 from .problem import RecordProblem
 from .segments import split_first, split_last
@@ -118,8 +118,9 @@ def run_filters(
 
     def step_particles(x, zeta, step, scalars):
         def of_particle(x, zeta):
-            law = guided_step(problem.density, dynamics_at, x, step, scalars)
-            return law.point_and_log_weight(zeta)
+            law = target_law(problem.density, dynamics_at, x, step.step)
+            knot, log_weight = guided_law(law, step, scalars).point_and_log_weight(zeta)
+            return end_of_step(law, knot, is_last=scalars is not None), log_weight
 
         return over_lanes(-1, -1)(of_particle)(x, zeta)
 

@@ -35,7 +35,7 @@ from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..schemes import solve_root
 from .guided_record import Guidance, correction
-from .guided_steps import Guide, guided_law, guided_start, target_law
+from .guided_steps import Guide, end_of_step, guided_law, guided_start, target_law
 from .information_filter import information_filter
 from .initial import log_ratio
 from .linearisation import LinearisedStep
@@ -50,7 +50,7 @@ _TARGET = 0.4
 
 
 class Paths(NamedTuple):
-    """Paths of C chains: x_0, and the points at the ends of all steps."""
+    """Knots of the paths of C chains (`guided_record`): x_0, and those of all steps."""
 
     start: Float[Array, "d C"]
     points: Float[Array, "K N d C"]
@@ -221,7 +221,7 @@ def _pad_rows(scalars: Scalars, num: int) -> Scalars:
 class _Lanes(NamedTuple):
     """Blocks of all chains as B C lanes in the last axis, and the size of their moves.
 
-    - `start`, `old`: beginnings of the old paths, and their points, leading axes (J, N).
+    - `start`, `old`: beginnings of the old paths, and their knots, leading axes (J, N).
     - `end`: ends of the old paths, relative to ξ.
     - `scalars`: observations at the ends of segments.
     - `is_first`: whether the block begins at the beginning of the record.
@@ -381,45 +381,46 @@ def _new_points(
     lanes: _Lanes,
     first: _PathPair,
 ) -> tuple[_PathPair, Float[Array, "J N d lanes"]]:
-    """Sample the points of the new paths; compute the log weights of the old and new paths."""
+    """Sample the knots of the new paths; compute the log weights of the old and new paths."""
     spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
     density, dynamics_at = problem.density, model.forward_at(problem.like)
     hidden, corrected = _no_noise(blocks), _corrections(problem, model, spread)
 
-    def step_of(old, new, old_next, eta, step, end, scalars, rho, beta):
-        guide = step.to(end)
+    def step_of(old, new, old_knot, eta, step, end, scalars, rho, beta):
+        guide, is_last = step.to(end), scalars is not None
         law = target_law(density, dynamics_at, old, guide.step)
         here = guided_law(law, guide, scalars)
-        zeta, log_old = here.noise_and_log_weight(old_next, law.solve, hidden)
+        zeta, log_old = here.noise_and_log_weight(old_knot, law.solve, hidden)
+        old = end_of_step(law, old_knot, is_last)
         law = target_law(density, dynamics_at, new, guide.step)
         there = guided_law(law, guide, scalars)
-        new, log_new = there.point_and_log_weight(_new_noise(zeta, eta, rho, beta))
-        return new, log_old, log_new
+        knot, log_new = there.point_and_log_weight(_new_noise(zeta, eta, rho, beta))
+        return _PathPair(old, end_of_step(law, knot, is_last), log_old, log_new), knot
 
-    def advance(state: _PathPair, old_next, eta, step, scalars) -> _PathPair:
+    def advance(state: _PathPair, old_knot, eta, step, scalars) -> tuple[_PathPair, Array]:
         axes = (*6 * [-1], None if scalars is None else -1, -1, -1)
         # Guides and rows are spread over the chains step by step, to save memory.
-        each = (state.old, state.new, old_next, eta, spread(step), lanes.end, scalars)
-        new, log_old, log_new = over_lanes(*axes)(step_of)(*each, lanes.rho, lanes.beta)
-        return _PathPair(old_next, new, state.log_old + log_old, state.log_new + log_new)
+        lane_inputs = (state.old, state.new, old_knot, eta, spread(step), lanes.end, scalars)
+        pair, knot = over_lanes(*axes)(step_of)(*lane_inputs, lanes.rho, lanes.beta)
+        log_old, log_new = state.log_old + pair.log_old, state.log_new + pair.log_new
+        return pair._replace(log_old=log_old, log_new=log_new), knot
 
     def one(state, inputs):
-        old_next, eta, step = inputs
-        state = advance(state, old_next, eta, step, None)
-        return state, state.new
+        old_knot, eta, step = inputs
+        return advance(state, old_knot, eta, step, None)
 
     def segment(state, inputs):
         number, old, guides, scalars, row = inputs
         eta = jax.random.normal(jax.random.fold_in(key, number), old.shape, old.dtype)
         plain, (old_last, eta_last, guide_last) = split_last((old, eta, guides))
-        state, path = lax.scan(one, state, plain)
-        state = advance(state, old_last, eta_last, guide_last, scalars)
+        state, knots = lax.scan(one, state, plain)
+        state, last_knot = advance(state, old_last, eta_last, guide_last, scalars)
         # At a pinned end both paths have the same state, so this term cancels there.
         state = state._replace(
             log_old=state.log_old + corrected(row, state.old),
             log_new=state.log_new + corrected(row, state.new),
         )
-        return state, jnp.concatenate([path, state.new[None]])
+        return state, jnp.concatenate([knots, last_knot[None]])
 
     numbers = jnp.arange(len(lanes.old))
     inputs = (numbers, lanes.old, blocks.guides, lanes.scalars, blocks.rows)

@@ -3,6 +3,8 @@
 All functions that take records validate their arguments here, so their errors are the same.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -55,6 +57,13 @@ class RecordProblem(eqx.Module):
         """Return the observations at the ends of segments, leading axis K + 1."""
         return Row(self.record.values, self.record.times)
 
+    def on_grid(self, record: Record) -> Record:
+        """Return a record with equal steps on the grid that `density` needs.
+
+        Steps to observations are normal. If the others are not, they are split (`guided_steps`).
+        """
+        return record if self.density.is_normal else record.with_split_ends()
+
     def scalars(self, model: Diffusion) -> Scalars:
         """Return the observations as independent scalars, leading axis K + 1."""
         of_one = lambda row: self.observation.scalars(row, model.params, self.dim)
@@ -73,7 +82,7 @@ def as_record_problem(
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
     any_constant: bool = False,
-    normal_steps: bool = True,
+    normal_steps: bool = False,
 ) -> RecordProblem:
     """Validate the arguments common to all functions that take one record.
 
@@ -81,7 +90,7 @@ def as_record_problem(
 
     - `any_constant`: whether the stationary density may be unnormalised. It may be if only paths at
         fixed parameters are needed.
-    - `normal_steps`: whether paths must determine their noise (`most_accurate_density`).
+    - `normal_steps`: whether all steps must be normal (`most_accurate_density`).
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """
@@ -92,7 +101,9 @@ def as_record_problem(
             "for each record, because records are independent given the parameters."
         )
     (record,) = as_records(pairs, num_steps, step_size, initial_time)
-    return problem_of(model, record, observation, initial, density, any_constant, normal_steps)
+    law = density, any_constant, normal_steps
+    problem = problem_of(model, record, observation, initial, *law)
+    return dataclasses.replace(problem, record=problem.on_grid(record))
 
 
 def problem_of(
@@ -102,7 +113,7 @@ def problem_of(
     initial: Initial,
     density: AbstractStepDensity | None = None,
     any_constant: bool = False,
-    normal_steps: bool = True,
+    normal_steps: bool = False,
 ) -> RecordProblem:
     """Validate the model, observation model and initial law of a record.
 

@@ -25,6 +25,7 @@ from ..engine.checks import (
 )
 from ..engine.compiled import compiled_sooner
 from ..engine.times import Clock, Times, as_times, check_increasing
+from ..schemes import splits_of_last_step
 
 # Cost of the end of a segment (observation, resampling), in steps.
 _STEPS_PER_SEGMENT = 4
@@ -48,6 +49,7 @@ class Record(eqx.Module):
     - `dt`: lengths of the steps, shape (K, N). A path does not move in a step of length zero.
     - `values`: observations at the ends of segments, shape (K + 1, m), NaN for missing values.
     - `which`: index of the end of a segment for each observation.
+    - `lengths`: lengths of the steps of a segment relative to each other, before any coarsening.
     """
 
     clock: Clock
@@ -55,6 +57,7 @@ class Record(eqx.Module):
     dt: Float[Array, "K N"]
     values: Float[Array, "ends m"]
     which: Int[Array, " n"]
+    lengths: tuple[float, ...] = eqx.field(static=True)
 
     @property
     def num_steps(self) -> int:
@@ -86,6 +89,18 @@ class Record(eqx.Module):
         """Return the times at which steps begin, since the first time."""
         within = jnp.cumsum(self.dt, axis=1) - self.dt  # begins with exactly zero
         return self.since[:-1, None] + within
+
+    def with_split_ends(self) -> "Record":
+        """Return the record with the last step of each segment split into ever shorter steps.
+
+        The steps that end at observations are then short. If their law differs from that of the
+        other steps, it hardly matters.
+        """
+        splits = splits_of_last_step(self.num_steps)
+        parts = -np.diff([1.0, *splits, 0.0])
+        last = self.dt[:, -1:] * jnp.asarray(parts, self.dt.dtype)
+        dt = jnp.concatenate([self.dt[:, :-1], last], axis=1)
+        return dataclasses.replace(self, dt=dt, lengths=(*self.lengths[:-1], *parts.tolist()))
 
     def coarsened(self, level: int = 1) -> "Record":
         """Return the record with steps 2^`level` times as long.
@@ -274,7 +289,8 @@ def _split_into_segments(
     dt = (gaps / jnp.asarray(np.array(segments) * num_steps, gaps.dtype))[gap].astype(dtype)
     start = since[gap] + jnp.asarray(within * num_steps, dtype) * dt
     dt = jnp.broadcast_to(dt[:, None], (len(dt), num_steps))
-    return Record(clock, jnp.append(start, since[-1]), dt, ends, jnp.asarray(which))
+    since = jnp.append(start, since[-1])
+    return Record(clock, since, dt, ends, jnp.asarray(which), num_steps * (1.0,))
 
 
 def _unmask(name: str, values: Numbers) -> Numbers:

@@ -90,11 +90,8 @@ def as_record_problems(
     step_size: float | None = None,
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
-    normal_steps: bool = True,
 ) -> Records:
     """Validate the arguments common to all functions that take one or several records.
-
-    `normal_steps` is explained in `as_record_problem`.
 
     **Returns:** `Records`.
 
@@ -102,13 +99,13 @@ def as_record_problems(
     """
     pairs = split_records(times, observations)
     records = as_records(pairs, num_steps, step_size, initial_time)
-    law = density, False, normal_steps
-    problem = problem_of(model, records[0], observation, initial, *law)
+    problem = problem_of(model, records[0], observation, initial, density)
     for record in records[1:]:
         check_domain(model, observation, record)
         check_clock(model, observation, record)
     num_times = tuple(len(record.which) for record in records)
-    return Records(dataclasses.replace(problem, record=_stacked(records)), num_times)
+    record = _stacked([problem.on_grid(record) for record in records])
+    return Records(dataclasses.replace(problem, record=record), num_times)
 
 
 # Compiled as one program, because JAX would otherwise compile one for every array.
@@ -148,6 +145,7 @@ def _padded(record: Record, num_segments: int, num_times: int) -> Record:
         jnp.pad(record.dt, ((0, more), (0, 0))),
         jnp.pad(record.values, ((0, more), (0, 0)), constant_values=jnp.nan),
         jnp.pad(record.which, (0, num_times - len(record.which))),
+        record.lengths,
     )
 
 

@@ -5,7 +5,7 @@ Paths move in blocks (`path_blocks`), or states move together with the bridges b
 """
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.averages import PathFunction, as_path_function
+from ..engine.averages import PathFunction, as_path_function, nan_to_neg_inf
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
@@ -28,13 +28,22 @@ from ..schemes import (
     StepError,
     dominates,
     log_halving_of_paths,
+    relative_change,
     root_mean_square_in_sds,
+    share_of_grid,
     share_of_order,
     step_faults,
     unknown_where,
 )
 from .guide_search import GuideCheck, Linearised, linearised
-from .guided_record import path_and_log_weight
+from .guided_record import (
+    Guidance,
+    knots_and_log_weight,
+    noise_and_log_weight,
+    pair_noise,
+    path_and_log_weight,
+    path_of_knots,
+)
 from .initial import Initial
 from .observation import Observation
 from .path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep, tuned
@@ -48,6 +57,8 @@ _MOST_R_HAT = 1.1
 _ROUNDING = 64.0
 # If the variance of D of a segment exceeds this bound, the second-order expansion is unreliable.
 _MOST_VARIANCE = 1.0
+# With fewer paths than this share that have a coarse path, there is no estimate of step errors.
+_LEAST_COARSE = 0.5
 # A quantity counts as constant if its relative changes along a path are at most this large.
 _CONSTANT = 1e-3
 
@@ -83,6 +94,7 @@ class Smoothed(AbstractResult):
     stuck: Bool[Array, " chains"]
     num_truncated: Int[Array, ""]
     _problem: RecordProblem
+    _knots: Float[Array, "chains n K d"] | None = None
     guide: GuideCheck | None = None
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
@@ -104,9 +116,10 @@ class Smoothed(AbstractResult):
     def step_error(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Estimate the discretisation bias of `mean(fn)` to leading order, entry by entry.
 
-        With half as many steps each path is e^D times as likely (`schemes.halving`). If the scheme
-        of a `proposal` is more accurate than `density`, the estimate is too large. It is NaN in
-        these cases:
+        If all steps are normal, each path is e^D times as likely with half as many steps
+        (`schemes.halving`). For steps of order 2 with a state-dependent σ, half as many steps with
+        the same noise give another path, with e^D times its weight. If the scheme of a `proposal`
+        is more accurate than `density`, the estimate is too large. It is NaN in these cases:
 
         - one step;
         - Euler steps of a σ with fewer columns than rows;
@@ -192,23 +205,37 @@ class Smoothed(AbstractResult):
     def _step_errors(self, fn: PathFunction) -> tuple[PyTree, PyTree]:
         """Estimate the discretisation bias of `mean(fn)` and its uncertainty."""
         values, problem = self._values(fn), self._problem
-        D = _log_halving(problem, self.paths)
-        is_reliable = jnp.max(jnp.var(D, axis=(0, 1))) <= _MOST_VARIANCE
-        D = jnp.where(is_reliable, jnp.sum(D, axis=-1), jnp.nan)
         leaves, treedef = jax.tree.flatten(values)
+        if self._knots is None:
+            D, coarse_leaves = _log_halving(problem, self.paths), leaves
+            is_reliable = jnp.max(jnp.var(D, axis=(0, 1))) <= _MOST_VARIANCE
+            D, share = jnp.sum(D, axis=-1), share_of_order(problem.density.order)
+            change = relative_change(D, jnp.mean(D))
+        else:
+            D, coarse_paths = _coarse_paths(_on_both_grids(problem), self._knots)
+            coarse_leaves = jax.tree.leaves(self._values(fn, coarse_paths))
+            change = relative_change(D, jnp.median(D))
+            # Weights are of the whole record, so this is the mean over its segments.
+            is_reliable = jnp.var(change) <= _MOST_VARIANCE * problem.num_segments
+            is_reliable &= jnp.mean(D > -jnp.inf) >= _LEAST_COARSE
+            share = share_of_grid(problem.density.order, problem.record.lengths)
+        change = jnp.where(is_reliable, change, jnp.nan)
         varies = _noise_varies(problem, self.paths[0, 0])
-        share = share_of_order(problem.density.order)
-        step_errors = [_error_from_halving(leaf, D, share, varies) for leaf in leaves]
+        step_errors = [
+            _error_from_halving(*both, change, share, varies)
+            for both in zip(leaves, coarse_leaves, strict=True)
+        ]
         mean = jnp.mean(self.paths, axis=(0, 1))
         too_long = steps_are_too_long(problem, problem.model, mean)
         step_errors = [unknown_where(too_long, error) for error in step_errors]
         values, doubts = zip(*step_errors, strict=True)
         return jax.tree.unflatten(treedef, values), jax.tree.unflatten(treedef, doubts)
 
-    def _values(self, fn: PathFunction) -> PyTree:
-        """Evaluate `fn` on all draws, in the precision of the paths."""
+    def _values(self, fn: PathFunction, paths: Float[Array, "..."] | None = None) -> PyTree:
+        """Evaluate `fn` on all draws, or on these paths, in the precision of the paths."""
         like = jax.ShapeDtypeStruct(self.paths.shape[-2:], self.paths.dtype)
-        values = jax.vmap(jax.vmap(as_path_function("fn", fn, like)))(self.paths)
+        paths = self.paths if paths is None else paths
+        values = jax.vmap(jax.vmap(as_path_function("fn", fn, like)))(paths)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, self.paths.dtype), values)
 
 
@@ -281,7 +308,13 @@ def smooth(
     block_length = check_count("block_length", 10 if block_length is None else block_length, 2)
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
-    problem = as_record_problem(*arguments, num_steps=num_steps, any_constant=True, **options)
+    problem = as_record_problem(
+        *arguments,
+        num_steps=num_steps,
+        any_constant=True,
+        normal_steps=proposal is not None,  # step errors of bridges need densities of the steps
+        **options,
+    )
     num_proposals = check_count("num_proposals", 10 if num_proposals is None else num_proposals)
     linearisation = linearised(problem, model)
     if proposal is None:
@@ -292,12 +325,14 @@ def smooth(
         firsts = _guided_paths(start_key, problem, linearisation, num_chains)
         sizes = (*counts, num_proposals)
         draws = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
-    paths = jnp.moveaxis(draws.paths, 1, 0)
+    paths, knots = (
+        None if draw is None else jnp.moveaxis(draw, 1, 0) for draw in (draws.paths, draws.knots)
+    )
     diagnostics = (draws.accepted, draws.stuck, draws.num_truncated)
     times = problem.record.clock.exactly(draws.since)
     # Discretisation errors need the grid of the paths, which a `proposal` may choose.
     problem = dataclasses.replace(problem, record=draws.record)
-    smoothed = Smoothed(times, paths, *diagnostics, problem, linearisation.check)
+    smoothed = Smoothed(times, paths, *diagnostics, problem, knots, linearisation.check)
     return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
 
 
@@ -305,7 +340,7 @@ def smooth(
 def _guided_paths(
     key: Key[Array, ""], problem: RecordProblem, linearisation: Linearised, num_chains: int
 ) -> Float[Array, "chains points d"]:
-    """Sample independent guided paths.
+    """Sample the knots of independent guided paths.
 
     The path of the linearisation replaces a path without a finite log weight.
     """
@@ -313,8 +348,8 @@ def _guided_paths(
 
     def first(key):
         noise = jax.random.normal(key, points.shape, points.dtype)
-        path, log_weight = path_and_log_weight(problem, problem.model, guide, noise)
-        return jnp.where(jnp.isfinite(log_weight), path, points)
+        knots, log_weight = knots_and_log_weight(problem, problem.model, guide, noise)
+        return jnp.where(jnp.isfinite(log_weight), knots, points)
 
     return jax.vmap(first)(jax.random.split(key, num_chains))
 
@@ -344,20 +379,73 @@ def _run_block_chains(
         sweep_key = jax.random.fold_in(key, i)
         paths, accepted = sweep(sweep_key, problem, model, both, log_scales, paths)
         new_scales = tuned(log_scales, accepted, (i + 1).astype(points.dtype))
-        path = jnp.concatenate([paths.start[None], paths.points.reshape(K * N, d, num_chains)])
+        knots = jnp.concatenate([paths.start[None], paths.points.reshape(K * N, d, num_chains)])
         # β is constant after the warm-up, so that the chain is homogeneous.
         log_scales = jnp.where(i < num_warmup, new_scales, log_scales)
-        return (paths, log_scales), (jnp.moveaxis(path, -1, 0), accepted)
+        return (paths, log_scales), (jnp.moveaxis(knots, -1, 0), accepted)
 
     init = paths, jnp.zeros((2, both.segment.shape[-1]), points.dtype)
-    _, linearisation = metered_scan(step, init, jnp.arange(num_warmup + num_draws), progress_meter)
-    draws, accepted = jax.tree.map(lambda leaf: leaf[num_warmup:], linearisation)
+    _, draws = metered_scan(step, init, jnp.arange(num_warmup + num_draws), progress_meter)
+    knots, accepted = jax.tree.map(lambda leaf: leaf[num_warmup:], draws)
     # Blocks beyond the record do not count as stuck.
     real = has_segments(problem, block_length)[..., None]
     stuck = jnp.any(real & ~jnp.any(accepted, axis=0), axis=(0, 1))
     share = jnp.mean(accepted.astype(points.dtype), axis=(0, -1))
-    record = problem.record
-    return Draws(record.grid(), draws, share, stuck, jnp.int32(0), record)
+    record, is_normal = problem.record, problem.density.is_normal
+    of_chains = jax.vmap(lambda knots: path_of_knots(problem, model, knots))
+    draws = knots if is_normal else lax.map(of_chains, knots)
+    knots = None if is_normal else knots
+    return Draws(record.grid(), draws, share, stuck, jnp.int32(0), record, knots)
+
+
+class _OnGrid(NamedTuple):
+    """Problem of a record on one grid, and the guide of its paths."""
+
+    problem: RecordProblem
+    guide: Guidance
+
+
+def _on_both_grids(problem: RecordProblem) -> tuple[_OnGrid, _OnGrid]:
+    """Return the problem on its grid and on the grid of half as many steps, with their guides."""
+    coarse = dataclasses.replace(problem, record=problem.record.coarsened())
+    fine, coarse = (_OnGrid(one, linearised(one, one.model).guide) for one in (problem, coarse))
+    return fine, coarse
+
+
+@compiled_sooner
+def _coarse_paths(
+    grids: tuple[_OnGrid, _OnGrid], knots: Float[Array, "chains n points d"]
+) -> tuple[Float[Array, "chains n"], Float[Array, "chains n points d"]]:
+    """Return D and the paths of half as many steps from the noise of the paths with these knots.
+
+    D is the log weight of the coarse path minus that of the path. Between two points of the coarse
+    grid the distance of both paths is constant, or zero where the coarse path would leave the
+    state space. A coarse path without weight has D = -inf and is replaced by the path.
+    """
+    fine, coarse = grids
+    problem, lengths = fine.problem, fine.problem.record.lengths
+    model, inside = problem.model, problem.model.state_space()
+    ends = jnp.append(True, coarse.problem.record.dt.ravel() > 0)
+    last_end = lax.cummax(jnp.where(ends, jnp.arange(len(ends)), 0))
+    # Components of noise that do not move the path are independent of it, so any key will do.
+    key = jax.random.key(0)
+
+    def of_draw(knots):
+        path = path_of_knots(problem, model, knots)
+        noise, log_weight = noise_and_log_weight(key, problem, model, fine.guide, knots)
+        coarse_noise = pair_noise(noise, lengths)
+        coarse_path, log_coarse = path_and_log_weight(
+            coarse.problem, model, coarse.guide, coarse_noise
+        )
+        moved = path + (coarse_path - path)[last_end]
+        if inside is not None:
+            moved = jnp.where(jax.vmap(inside)(moved)[:, None], moved, path)
+        D = nan_to_neg_inf(log_coarse) - log_weight
+        return D, jnp.where(D > -jnp.inf, moved, path)
+
+    # One draw of all chains at a time, to save memory.
+    D, paths = lax.map(jax.vmap(of_draw), jnp.moveaxis(knots, 1, 0))
+    return D.T, jnp.moveaxis(paths, 0, 1)
 
 
 @compiled_sooner
@@ -406,17 +494,19 @@ def _log_halving(
 
 def _error_from_halving(
     values: Float[Array, "chains n ..."],
-    D: Float[Array, "chains n"],
+    coarse_values: Float[Array, "chains n ..."],
+    change: Float[Array, "chains n"],
     share: float,
     varies: Bool[Array, ""],
 ) -> StepError:
-    """Estimate the discretisation error of the mean of f, as a share of E[e^D f] / E[e^D] - E[f].
+    """Estimate the discretisation error of the mean of f, as a share of E[e^D f̃] / E[e^D] - E[f].
 
-    To second order in D this difference is the covariance of f with D + ½ (D - ED)².
+    f̃ are the values of the coarse paths, and `change` is e^D - 1 (`relative_change`). To second
+    order in D this difference is the mean of f̃ - f plus the covariance of f̃ with e^D.
     """
-    D = D - jnp.mean(D)
-    D = (D + D**2 / 2).reshape(*D.shape, *[1] * (values.ndim - 2))
-    products = (values - jnp.mean(values, axis=(0, 1))) * (D - jnp.mean(D))
+    change = (change - jnp.mean(change)).reshape(*change.shape, *[1] * (values.ndim - 2))
+    products = (coarse_values - jnp.mean(coarse_values, axis=(0, 1))) * change
+    products += coarse_values - values
     error = jnp.std(products, axis=(0, 1)) / jnp.sqrt(effective_size_of_chains(products))
     estimate = share * jnp.mean(products, axis=(0, 1))
     return StepError(estimate, jnp.hypot(share * error, jnp.where(varies, estimate, 0)))

@@ -228,6 +228,7 @@ class Draws(NamedTuple):
     - `stuck`: whether a state, path or block of the chain never moved.
     - `num_truncated`: number of weights that were truncated.
     - `record`: the record on the grid of the paths.
+    - `knots`: knots of the paths, if they are not the paths themselves.
     """
 
     since: Float[Array, " points"]
@@ -236,6 +237,7 @@ class Draws(NamedTuple):
     stuck: Bool[Array, " C"]
     num_truncated: Int[Array, ""]
     record: Record
+    knots: Float[Array, "n C points d"] | None = None
 
 
 def sample_states(
@@ -272,7 +274,7 @@ def sample_states(
     sampler = StateSampler(problem, model, proposal, laws, scalars, movable, num_proposals)
     within = np.diff(proposal.fractions(problem.num_steps))
     dt = durations[:, None] * jnp.asarray(within, durations.dtype)
-    record = dataclasses.replace(problem.record, dt=dt)
+    record = dataclasses.replace(problem.record, dt=dt, lengths=tuple(within.tolist()))
     grid = record.grid()
     paths, moves, num_truncated = _run_state_chains(
         key, sampler, guided, (num_draws, num_warmup), progress_meter

@@ -20,8 +20,9 @@ def steps_are_too_long(
     if model.depends_on_time:
         return jnp.zeros((), bool)
     ends, durations = path[:: problem.num_steps], problem.record.durations
-    intervals = Intervals(ends[:-1], ends[1:], durations)
-    share = share_in_regime(jnp.ones_like(durations), model, intervals, problem.num_steps)
+    intervals, lengths = Intervals(ends[:-1], ends[1:], durations), problem.record.lengths
+    num_longest = sum(lengths) / max(lengths)
+    share = share_in_regime(jnp.ones_like(durations), model, intervals, num_longest)
     moving = durations > 0  # segments of length zero lie beyond the record
     number = jnp.maximum(jnp.sum(moving), 1).astype(durations.dtype)
     too_long = jnp.sum(moving & (share == UNKNOWN_SHARE)).astype(durations.dtype)

@@ -37,6 +37,7 @@ from .coarse_grids import (
     error_of_grids as error_of_grids,
     num_coarse_grids as num_coarse_grids,
     share_of_grid as share_of_grid,
+    splits_of_last_step as splits_of_last_step,
 )
 from .euler import Euler as Euler
 from .fit import check_model as check_model

@@ -1,16 +1,16 @@
 """Discretisation error of an estimate, from estimates on two coarser grids.
 
-Grids with step sizes 1, 2 and 4 times as large give the estimates L_0, L_1 and L_2. (The first step
-of a coarser grid is shorter if N is not divisible.) To leading order, the error of one step of k
-times the size is C k^{p+1}. Hence the error of a grid is C S, with S the sum of k^{p+1} over its
-steps. Let c_1 = L_1 - L_0 and c_2 = L_2 - L_1. Then
+Grids whose steps join 1, 2 and 4 steps give the estimates L_0, L_1 and L_2. (The first step of a
+coarser grid joins fewer if N is not divisible.) To leading order, the error of one step of length k
+is C k^{p+1}. Hence the error of a grid is C S, with S the sum of k^{p+1} over its steps. Let
+c_1 = L_1 - L_0 and c_2 = L_2 - L_1. Then
 
     error of L_0 = s c_1,        s = S_0 / (S_1 - S_0),
     c_2 = m c_1,                 m = (S_2 - S_1) / (S_1 - S_0).
 
-If N is a power of two, then s = (2^p - 1)⁻¹ and m = 2^p. The difference c_2 - m c_1 measures the
-terms of higher order that s c_1 omits. Suppose that changes continue to shrink from grid to grid by
-the ratio ρ = c_2 / c_1. Then the omitted part is
+If steps are equal and N is a power of two, then s = (2^p - 1)⁻¹ and m = 2^p. The difference
+c_2 - m c_1 measures the terms of higher order that s c_1 omits. Suppose that changes continue to
+shrink from grid to grid by the ratio ρ = c_2 / c_1. Then the omitted part is
 
     s |c_2 - m c_1| / (ρ - 1).
 
@@ -18,6 +18,9 @@ This is an upper bound if the error has terms of two orders only. It is infinite
 shrink or alternate in sign. Terms of two orders may also cancel by chance. Hence the uncertainty
 always includes a fraction of s c_1, and all of it if N is too small for a third grid.
 """
+
+import math
+from collections.abc import Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,11 +32,23 @@ from .step_error import StepError
 _LEAST_UNCERTAINTY = 0.25
 
 
-def steps_of_grid(num_steps: int, level: int) -> list[int]:
-    """Return the steps of a coarser grid in units of fine steps: 2^level, the first one shorter."""
-    longest = 2**level
-    first = num_steps % longest
-    return [first] * (first > 0) + [longest] * (num_steps // longest)
+def splits_of_last_step(num_steps: int) -> Float[np.ndarray, " splits"]:
+    """Return the remaining fractions ½, ¼, ..., 2^-k of the last of N steps after its splits.
+
+    A last step of another law adds an error of the square of its length. With k = ⌈log₂ N⌉ it has
+    about 1/N of the length of the others.
+    """
+    return 0.5 ** np.arange(1, math.ceil(math.log2(num_steps)) + 1)
+
+
+def steps_of_grid(lengths: Sequence[float], level: int) -> list[float]:
+    """Return the lengths of the steps of a coarser grid, each of which joins 2^level steps.
+
+    The first one joins fewer if their number is not divisible.
+    """
+    size = 2**level
+    ends = range(len(lengths), 0, -size)
+    return [sum(lengths[max(end - size, 0) : end]) for end in ends][::-1]
 
 
 def num_coarse_grids(num_steps: int) -> int:
@@ -41,9 +56,12 @@ def num_coarse_grids(num_steps: int) -> int:
     return min(num_steps - 1, 2)
 
 
-def share_of_grid(order: int, num_steps: int) -> float:
-    """Return s, the discretisation error relative to the change on a grid of half as many steps."""
-    fine, coarse, _ = _sums(order, num_steps)
+def share_of_grid(order: int, lengths: Sequence[float]) -> float:
+    """Return s, the discretisation error relative to the change on a grid of half as many steps.
+
+    `lengths` are those of the steps, in any unit.
+    """
+    fine, coarse, _ = _sums(order, lengths)
     return fine / (coarse - fine)
 
 
@@ -51,21 +69,21 @@ def error_of_grids(
     values: Float[Array, " grids"],
     errors: Float[Array, " grids"],
     order: int,
-    num_steps: int,
+    lengths: Sequence[float],
 ) -> StepError:
     """Return the step error of `values[0]`, from values on successively coarser grids.
 
-    `errors` are the Monte Carlo standard errors of the values. For N = 1 there are no coarser
-    grids, and the result is NaN.
+    `errors` are the Monte Carlo standard errors of the values, `lengths` the lengths of the steps
+    in any unit. For N = 1 there are no coarser grids, and the result is NaN.
     """
-    if num_steps == 1:
+    if len(lengths) == 1:
         return StepError(*2 * [jnp.full_like(values[0], jnp.nan)])
-    share = share_of_grid(order, num_steps)
+    share = share_of_grid(order, lengths)
     change, noise = values[1] - values[0], jnp.hypot(errors[0], errors[1])
     estimate = share * change
-    if num_coarse_grids(num_steps) < 2:
+    if num_coarse_grids(len(lengths)) < 2:
         return StepError(estimate, _finite(jnp.hypot(share * noise, estimate)))
-    fine, coarse, coarser = _sums(order, num_steps)
+    fine, coarse, coarser = _sums(order, lengths)
     ratio = (coarser - coarse) / (coarse - fine)
     next_change = values[2] - values[1]
     # Only the part beyond Monte Carlo error counts as discrepancy, because `noise` has that error.
@@ -91,7 +109,7 @@ def _finite(uncertainty: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(jnp.isnan(uncertainty), jnp.inf, uncertainty)
 
 
-def _sums(order: int, num_steps: int) -> list[float]:
+def _sums(order: int, lengths: Sequence[float]) -> list[float]:
     """Return S of the three grids."""
-    grids = [steps_of_grid(num_steps, level) for level in range(3)]
+    grids = [steps_of_grid(lengths, level) for level in range(3)]
     return [float(sum(k ** (order + 1) for k in grid)) for grid in grids]

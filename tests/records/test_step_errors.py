@@ -46,7 +46,7 @@ def of_grid(record, law, num_steps, level):
 
     def step(dt):
         decay, spread = np.eye(len(record.A)), np.zeros_like(record.A)
-        for parts in steps_of_grid(num_steps, level):
+        for parts in steps_of_grid(num_steps * (1.0,), level):
             mine, noise = one(dt / num_steps * parts)
             decay, spread = mine @ decay, mine @ spread @ mine.T + noise
         return decay, spread
@@ -65,7 +65,7 @@ def test_what_is_told_covers_the_error(name, order, x64):
     for num_steps in (2, 3, 4, 5, 6, 7, 10, 20, 40):
         levels = range(1 + num_coarse_grids(num_steps))
         values = np.array([of_grid(record, law, num_steps, level) for level in levels])
-        made = error_of_grids(jnp.array(values), jnp.zeros(len(values)), order, num_steps)
+        made = error_of_grids(jnp.array(values), jnp.zeros(len(values)), order, num_steps * (1,))
         true, told, doubt = values[0] - exact, float(made.value), float(made.uncertainty)
         assert abs(true) <= abs(told) + 2 * doubt
         if order == 2 or name in ("line", "exact part"):
@@ -95,7 +95,7 @@ def test_filters_tell_it(name, density, num_steps, x64):
     levels = range(1 + num_coarse_grids(num_steps))
     values = jnp.array([of_grid(record, law, num_steps, level) for level in levels])
     order = DENSITIES[density].order
-    wanted = error_of_grids(values, jnp.zeros(len(values)), order, num_steps)
+    wanted = error_of_grids(values, jnp.zeros(len(values)), order, num_steps * (1,))
     np.testing.assert_allclose(made.value, values[0], rtol=1e-9)
     np.testing.assert_allclose(made.step_error, wanted.value, rtol=1e-6)
     np.testing.assert_allclose(made.step_uncertainty, wanted.uncertainty, rtol=1e-5)
@@ -165,10 +165,10 @@ def test_two_orders_are_covered(order, num_steps, next_order, x64):
         return np.sum(steps ** (order + 1) + next_order * steps ** (order + 2))
 
     made = error_of_grids(
-        jnp.array([value(level) for level in range(3)]), jnp.zeros(3), order, num_steps
+        jnp.array([value(level) for level in range(3)]), jnp.zeros(3), order, num_steps * (1,)
     )
     assert abs(made.value - value(0)) <= 2 * made.uncertainty
-    exact = share_of_grid(order, num_steps) * (value(1) - value(0))
+    exact = share_of_grid(order, num_steps * (1,)) * (value(1) - value(0))
     np.testing.assert_allclose(made.value, exact)
     if next_order == 0.5 and num_steps == 21:
         assert made.uncertainty < 0.3 * abs(made.value)
@@ -177,7 +177,7 @@ def test_two_orders_are_covered(order, num_steps, next_order, x64):
 def test_what_disagrees_is_unknown():
     """Changes that go to and fro, or grow, or that no grid has; noise alone is no change."""
     told = lambda values, noise=0.0, num_steps=8: error_of_grids(
-        jnp.array(values), jnp.full(len(values), noise), 1, num_steps
+        jnp.array(values), jnp.full(len(values), noise), 1, num_steps * (1,)
     )
     for values in ([0, 1, -1.0], [0, 2, 3.0], [0, 1, -jnp.inf], [0, 1, jnp.nan]):
         assert told(values).uncertainty == jnp.inf
@@ -191,5 +191,14 @@ def test_what_disagrees_is_unknown():
 
 def test_an_odd_number_of_steps():
     """One of them has no other, and changes nothing."""
-    assert share_of_grid(1, 3) == 3 / 2 and share_of_grid(1, 5) == 5 / 4
-    assert share_of_grid(2, 4) == 1 / 3 and share_of_grid(1, 4) == 1
+    assert share_of_grid(1, 3 * (1,)) == 3 / 2 and share_of_grid(1, 5 * (1,)) == 5 / 4
+    assert share_of_grid(2, 4 * (1,)) == 1 / 3 and share_of_grid(1, 4 * (1,)) == 1
+
+
+def test_steps_of_different_lengths():
+    """Pairs are joined from the last step on, and the share follows from all lengths."""
+    lengths = (1.0, 1.0, 0.5, 0.25, 0.25)
+    assert steps_of_grid(lengths, 1) == [1.0, 1.5, 0.5]
+    assert steps_of_grid(lengths, 2) == [1.0, 2.0]
+    fine, coarse = 2 + 0.5**3 + 2 * 0.25**3, 1 + 1.5**3 + 0.5**3
+    np.testing.assert_allclose(share_of_grid(2, lengths), fine / (coarse - fine))
