@@ -44,7 +44,7 @@ class Innovations(NamedTuple):
     Its methods may be passed directly to `jax.jit` and `jax.grad`.
 
     - `problem`: the model, its record and the observation model.
-    - `points`: the path of the linearisation, shape (M + 1, d).
+    - `points`: the path of the linearisation on the grid of all steps, shape (size / d, d).
     - `guide`: diagnostics of the guide along this path.
     """
 
@@ -64,11 +64,11 @@ class Innovations(NamedTuple):
         They are a NumPy array of double precision if the precision of paths cannot resolve them.
         """
         record = self.problem.record
-        return record.clock.exactly(record.grid())
+        return record.clock.exactly(record.grid()[record.stored])
 
     def path(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, "points d"]:
         """Return the path of the noise `xi` at the parameters `params`, shape (M + 1, d)."""
-        return self._run(params, xi)[0]
+        return self._run(params, xi)[0][self.problem.record.stored]
 
     def log_weight(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, ""]:
         """Return log w(θ, ξ), -inf for a path that left the state space.
@@ -171,7 +171,8 @@ def innovations(
     - `initial_time`: time of `initial`, if it is before the first of `times`.
     - `density`: step density. By default `ItoTaylorDensity()` for constant σ. For a state-dependent
         σ the steps are of weak order 2 and quadratic in the noise, or `HypoellipticDensity()` if σ
-        has fewer columns than rows.
+        has fewer columns than rows. Quadratic steps to observations are split, so `size` is larger:
+        10 steps become 14. Paths have the points of the 10.
 
     **Returns:** `Innovations`, differentiable in parameters and noise. Its `why()` reports faults
     of the guide. There is a warning if the likelihood at ξ = 0 is zero.

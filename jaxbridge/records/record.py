@@ -49,7 +49,7 @@ class Record(eqx.Module):
     - `dt`: lengths of the steps, shape (K, N). A path does not move in a step of length zero.
     - `values`: observations at the ends of segments, shape (K + 1, m), NaN for missing values.
     - `which`: index of the end of a segment for each observation.
-    - `lengths`: lengths of the steps of a segment relative to each other, before any coarsening.
+    - `lengths`: lengths of the steps of a segment, before any coarsening, in units of equal steps.
     """
 
     clock: Clock
@@ -80,6 +80,14 @@ class Record(eqx.Module):
     def grid(self) -> Float[Array, " points"]:
         """Return the times of all points, since the first time."""
         return jnp.append(self._beginnings().ravel(), self.since[-1])
+
+    @property
+    def stored(self) -> Int[np.ndarray, " points"]:
+        """Return the indices of the points that users see, without those of split steps."""
+        K, N = self.dt.shape
+        num_equal = round(sum(self.lengths))
+        begins = np.arange(K)[:, None] * N + np.arange(num_equal)
+        return np.append(begins.ravel(), K * N)
 
     def steps(self) -> Steps:
         """Return all steps, shape (K, N)."""

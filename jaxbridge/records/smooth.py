@@ -225,7 +225,7 @@ class Smoothed(AbstractResult):
             _error_from_halving(*both, change, share, varies)
             for both in zip(leaves, coarse_leaves, strict=True)
         ]
-        mean = jnp.mean(self.paths, axis=(0, 1))
+        mean = jnp.mean(self.paths if self._knots is None else self._knots, axis=(0, 1))
         too_long = steps_are_too_long(problem, problem.model, mean)
         step_errors = [unknown_where(too_long, error) for error in step_errors]
         values, doubts = zip(*step_errors, strict=True)
@@ -391,11 +391,12 @@ def _run_block_chains(
     real = has_segments(problem, block_length)[..., None]
     stuck = jnp.any(real & ~jnp.any(accepted, axis=0), axis=(0, 1))
     share = jnp.mean(accepted.astype(points.dtype), axis=(0, -1))
-    record, is_normal = problem.record, problem.density.is_normal
-    of_chains = jax.vmap(lambda knots: path_of_knots(problem, model, knots))
-    draws = knots if is_normal else lax.map(of_chains, knots)
-    knots = None if is_normal else knots
-    return Draws(record.grid(), draws, share, stuck, jnp.int32(0), record, knots)
+    record = problem.record
+    if problem.density.is_normal:
+        return Draws(record.grid(), knots, share, stuck, jnp.int32(0), record)
+    of_chains = jax.vmap(lambda knots: path_of_knots(problem, model, knots)[record.stored])
+    draws = lax.map(of_chains, knots)
+    return Draws(record.grid()[record.stored], draws, share, stuck, jnp.int32(0), record, knots)
 
 
 class _OnGrid(NamedTuple):
@@ -441,7 +442,7 @@ def _coarse_paths(
         if inside is not None:
             moved = jnp.where(jax.vmap(inside)(moved)[:, None], moved, path)
         D = nan_to_neg_inf(log_coarse) - log_weight
-        return D, jnp.where(D > -jnp.inf, moved, path)
+        return D, jnp.where(D > -jnp.inf, moved, path)[problem.record.stored]
 
     # One draw of all chains at a time, to save memory.
     D, paths = lax.map(jax.vmap(of_draw), jnp.moveaxis(knots, 1, 0))

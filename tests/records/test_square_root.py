@@ -1,5 +1,5 @@
-"""Noisy records of a square-root process, whose exact likelihood is a product of integrals over its
-known transitions: steps of weak order 2 where σ varies."""
+"""Noisy records of a square-root process, whose exact laws are integrals over known transitions:
+steps of weak order 2 where σ varies, for likelihoods, smoothed paths and posteriors."""
 
 import cir
 import jax
@@ -10,6 +10,14 @@ from helpers import slow_beyond
 from scipy.stats import norm
 
 import jaxbridge as jb
+from jaxbridge.records import (
+    as_record_problem,
+    knots_and_log_weight,
+    linearised,
+    noise_and_log_weight,
+    path_and_log_weight,
+)
+from jaxbridge.records.guided_record import path_of_knots
 
 PARAMS, START = np.array([1.2, 0.5, 0.6]), 0.5
 
@@ -25,13 +33,23 @@ def record(gap, sd, num=12, seed=3):
     if sd == 0:
         before = np.array([START, *states[:-1]])
         return values, float(np.sum(cir.log_density(PARAMS, before, np.array(states), gap)))
-    grid = np.linspace(0, 1, 1001)[1:] ** 2 * 4.0
+    return values, likelihood_by_quadrature(PARAMS, values, gap, sd)
+
+
+def filtered_by_quadrature(params, values, gap, sd, num):
+    """The grid, its widths, the transition densities, and the laws of states times likelihoods."""
+    grid = np.linspace(0, 1, num + 1)[1:] ** 2 * 4.0
     width = np.gradient(grid)
-    kernel = np.exp(cir.log_density(PARAMS, grid[:, None], grid, gap))
-    law = np.exp(cir.log_density(PARAMS, START, grid, gap)) * norm.pdf(values[0], grid, sd)
+    kernel = np.exp(cir.log_density(params, grid[:, None], grid, gap))
+    laws = [np.exp(cir.log_density(params, START, grid, gap)) * norm.pdf(values[0], grid, sd)]
     for value in values[1:]:
-        law = (law * width) @ kernel * norm.pdf(value, grid, sd)
-    return values, float(np.log(law @ width))
+        laws.append((laws[-1] * width) @ kernel * norm.pdf(value, grid, sd))
+    return grid, width, kernel, laws
+
+
+def likelihood_by_quadrature(params, values, gap, sd, num=1000):
+    _, width, _, laws = filtered_by_quadrature(params, values, gap, sd, num)
+    return float(np.log(laws[-1] @ width))
 
 
 def arguments(values, gap, sd, num_steps):
@@ -83,30 +101,142 @@ def test_weights_of_innovations_have_the_likelihood_as_mean():
     assert error < 0.02 and abs(weights.mean() - 1) < 5 * error + 0.01
 
 
-def test_weight_is_the_density_of_a_path_by_hand():
-    """One step: N(z; 0, I) / N(ζ; 0, I) / det ℛ times g(y| x'), and Euler's x' beside."""
-    positional, options = arguments(np.array([0.7]), 0.3, 0.2, 1)
-    paths = jb.innovations(*positional, **options)
+def noise_by_hand(x, x_next, dt, is_last):
+    """Both n of x' = μ + √δ b n + ½ δ b b' (n² - S), or the one of x' = μ + √δ b n, in units of √S,
+    with S = 1 + ½ δM + δ²M²/12 in closed form."""
     rate, level, sigma = PARAMS
-    dt, zeta = 0.3, jnp.array([0.4, -0.8])  # of the fixed start, and of the step
-    path = np.asarray(paths.path(positional[0].params, zeta), float)[:, 0]
-    # n of x' = μ + √δ b n + ½ δ b b' (n² - S), with S = 1 + ½ δM + δ²M²/12 in closed form
-    drift, b, slope = rate * (level - START), sigma * np.sqrt(START), sigma / (2 * np.sqrt(START))
-    mean = START + drift * dt - rate * drift * dt**2 / 2
+    drift, b, slope = rate * (level - x), sigma * np.sqrt(x), sigma / (2 * np.sqrt(x))
+    mean = x + drift * dt - rate * drift * dt**2 / 2
     M = sigma**2 * drift / b**2 - 2 * rate - slope**2
     S = 1 + dt / 2 * M + dt**2 * M**2 / 12
-    roots = np.roots([dt * b * slope / 2, np.sqrt(dt) * b, mean - path[1] - dt * b * slope * S / 2])
-    log_weight = float(paths.log_weight(positional[0].params, zeta))
-    seen = norm.logpdf(0.7, path[1], 0.2)
-    # The law of n that the step has is normal, and ζ is affine in n: N(n; 0, S) |dn / dζ|.
-    eps = 1e-3
-    there = float(np.asarray(paths.path(positional[0].params, zeta.at[1].add(eps)))[1, 0])
-    near = np.roots([dt * b * slope / 2, np.sqrt(dt) * b, mean - there - dt * b * slope * S / 2])
-    candidates = [
-        norm.logpdf(n, 0, np.sqrt(S)) + np.log(abs(m - n) / eps) - norm.logpdf(-0.8) + seen
-        for n, m in zip(np.sort(roots), np.sort(near), strict=True)
-    ]
-    assert min(abs(log_weight - c) for c in candidates) < 5e-3
+    if is_last:
+        return [(x_next - mean) / (b * np.sqrt(dt * S))]
+    bent = dt * b * slope / 2
+    return np.sort(np.roots([bent, np.sqrt(dt) * b, mean - x_next - bent * S])) / np.sqrt(S)
+
+
+def test_weight_is_the_density_of_a_path_by_hand(x64):
+    """N(z; 0, I) / N(ζ; 0, I) / det ℛ times g(y| x'): two steps, whose last is split once, so that
+    two are quadratic in their noise z and the last one is not."""
+    gap, sd, eps = 0.3, 0.2, 1e-5
+    positional, options = arguments(np.array([0.7]), gap, sd, 2)
+    paths = jb.innovations(*positional, **options)
+    zeta = np.array([0.4, -0.8, 0.5, 0.3])  # of the fixed start, and of the steps
+    run = lambda zeta: paths._run(positional[0].params, jnp.array(zeta))[0]
+    path_of = lambda zeta: np.asarray(run(zeta))[:, 0]  # with the point at the split
+    assert len(paths.times) == len(paths.path(positional[0].params, jnp.array(zeta))) == 3
+    path, lengths = path_of(zeta), gap * np.array([0.5, 0.25, 0.25])
+    log_weight = norm.logpdf(0.7, path[-1], sd)
+    for i, dt in enumerate(lengths):
+        nudged = path_of(zeta + eps * np.eye(4)[i + 1])
+        ends = path[i + 1], nudged[i + 1]
+        here, there = (noise_by_hand(path[i], end, dt, i == 2) for end in ends)
+        z, slope = min(
+            ((z, (w - z) / eps) for z, w in zip(here, there, strict=True)),
+            key=lambda pair: abs(pair[0]),
+        )  # the other root is far out
+        log_weight += norm.logpdf(z) + np.log(abs(slope)) - norm.logpdf(zeta[i + 1])
+    made = float(paths.log_weight(positional[0].params, jnp.array(zeta)))
+    np.testing.assert_allclose(made, log_weight, atol=1e-4)
+
+
+def turning(x, p):
+    return jnp.array([[1 + 0.3 * jnp.sin(x[1]), 0.2 * x[0]], [0.1 * x[1], jnp.exp(0.2 * x[0])]])
+
+
+def test_knots_determine_the_noise_and_the_path(x64):
+    """A path alone does not: two values of the noise of a step may lead to one point."""
+    plane = jb.Diffusion(lambda x, p: -x + 0.1 * jnp.roll(x, 1) ** 2, turning)
+    options = {"initial": jb.GaussianLaw([0.0, 0.2], 0.1 * np.eye(2)), "num_steps": 3}
+    seen = np.array([[0.1, 0.3], [0.4, np.nan], [-0.2, 0.1]])
+    gaussian = jb.LinearGaussian(covariance=0.04 * np.eye(2))
+    problem = as_record_problem(plane, [0.0, 0.4, 1.0], seen, gaussian, **options)
+    points, guide, _ = linearised(problem, plane)
+    xi = jax.random.normal(jax.random.key(2), points.shape)
+    path, log_weight = path_and_log_weight(problem, plane, guide, xi)
+    knots, _ = knots_and_log_weight(problem, plane, guide, xi)
+    assert np.max(np.abs(knots - path)) > 0.01
+    same_ends = np.arange(len(path)) % problem.num_steps == 0
+    np.testing.assert_array_equal(knots[same_ends], path[same_ends])
+    np.testing.assert_allclose(path_of_knots(problem, plane, knots), path, atol=1e-12)
+    again, same = noise_and_log_weight(jax.random.key(3), problem, plane, guide, knots)
+    np.testing.assert_allclose(again, xi, atol=1e-9)
+    np.testing.assert_allclose(same, log_weight, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+@pytest.mark.parametrize(
+    ("gap", "sd", "num_steps"), slow_beyond(2, [(1.0, 0.3, 5), (1.0, 0.05, 10), (0.5, 0.1, 5)])
+)
+def test_smoothed_states_are_of_second_order(gap, sd, num_steps):
+    """Means in exact standard deviations; with normal steps they are off by .05 to .15."""
+    values, _ = record(gap, sd)
+    mean, deviation = smoothed_by_quadrature(values, gap, sd)
+    positional, options = arguments(values, gap, sd, num_steps)
+    at = lambda value: np.asarray(value, float)[num_steps::num_steps, 0]  # without points of splits
+
+    def error_and_noise(density):
+        size = {"num_draws": 4000, "num_chains": 4}
+        made = jb.smooth(jax.random.key(0), *positional, **options, **size, density=density)
+        off = (at(made.mean()) - mean) / deviation
+        return made, off, at(made.standard_error()) / deviation
+
+    made, off, noise = error_and_noise(None)
+    told, doubt = (at(value) / deviation for value in (made.step_error(), made.step_uncertainty()))
+    assert made.trustworthy
+    assert np.all(np.abs(off) < 5 * noise + 2 * np.abs(told) + 0.01)
+    assert np.all(np.abs(told) < 0.05) and np.all(doubt < 0.07)
+    rms = lambda value: np.sqrt(np.mean(value**2))
+    assert rms(off) < 0.02 + 1.5 * rms(noise)
+    if sd > 0.1:  # Euler steps are not good enough
+        assert rms(error_and_noise(jb.EulerDensity())[1]) > 0.05
+
+
+def smoothed_by_quadrature(values, gap, sd):
+    """Means and standard deviations of the states given all observations."""
+    grid, width, kernel, laws = filtered_by_quadrature(PARAMS, values, gap, sd, 800)
+    after, moments = np.ones_like(grid), []
+    for law, value in zip(laws[::-1], values[::-1], strict=True):
+        weights = law * after * width
+        mean = weights @ grid / weights.sum()
+        moments.append((mean, np.sqrt(weights @ (grid - mean) ** 2 / weights.sum())))
+        after = kernel @ (norm.pdf(value, grid, sd) * after * width)
+        after /= after.max()
+    return np.array(moments[::-1]).T
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_posterior_of_gibbs_is_of_second_order():
+    """Of the rate, at five steps a gap: beside the exact posterior on a grid."""
+    gap, sd = 0.5, 0.1
+    values, _ = record(gap, sd, num=40, seed=7)
+    rates = np.exp(np.linspace(-2.2, 1.8, 81))
+    params = [(rate, *PARAMS[1:]) for rate in rates]
+    likelihood = [likelihood_by_quadrature(one, values, gap, sd, 400) for one in params]
+    log_posterior = np.array(likelihood) - np.log(rates) ** 2 / 2 / 0.8**2
+    weights = np.exp(log_posterior - log_posterior.max())
+    mean = weights @ np.log(rates) / weights.sum()
+    deviation = np.sqrt(weights @ (np.log(rates) - mean) ** 2 / weights.sum())
+    (_, times, observed), options = arguments(values, gap, sd, 5)
+    _, level, sigma = PARAMS
+    model = jb.Diffusion(
+        lambda x, p: jnp.exp(p) * (level - x),
+        lambda x, p: sigma * jnp.sqrt(x),
+        params=0.0,
+        domain=lambda x, p: jnp.all(x > 0),
+    )
+    made = jb.gibbs(
+        jax.random.key(0), model, times, observed, prior=jb.NormalPrior(0.0, 0.8), **options,
+        num_iterations=3000, num_chains=2,
+    )  # fmt: skip
+    theta = np.asarray(made.theta, float).reshape(-1)
+    error = float(made.standard_error[0]) / deviation
+    assert made.trustworthy and error < 0.05
+    assert abs(theta.mean() - mean) / deviation < 5 * error + 0.05
+    assert abs(theta.std() / deviation - 1) < 0.1
+    assert abs(float(made.step_error[0])) < 0.1 * deviation
 
 
 @pytest.mark.slow
