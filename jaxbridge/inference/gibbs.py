@@ -21,9 +21,12 @@ from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
 from ..engine.progress import metered_scan
 from ..engine.verdict import Fault, lost_paths
+from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
+from ..models.gaussian_law import GaussianLaw
 from ..proposals import Budget
 from ..records import Initial, Observation, as_record_problems
+from ..records.observation import LinearGaussian
 from .augmentation import Augmentation, augment
 from .data import as_problem
 from .parameter_kernels import (
@@ -175,8 +178,9 @@ def gibbs(
     **Arguments:**
 
     - `key`: typed key.
-    - `model`: the diffusion. Chains start from its `params`. Without an `observation` σ must not
-        depend on the unknown parameters.
+    - `model`: the diffusion. Chains start from its `params`. If σ depends on the unknown
+        parameters, exact observations count as a record whose noise is zero. Then arguments about
+        bridges do not apply.
     - `times`: increasing, shape (n + 1,), in the model's unit of time.
     - `observations`: values of the diffusion at these times, shape (n + 1, d), or (n + 1,) in one
         dimension. Pass several independent records as lists of `times` and `observations`, or with
@@ -186,7 +190,7 @@ def gibbs(
     - `num_iterations`: number of stored draws. Between two of them the chain makes `thin`
         iterations.
     - `num_steps`, `step_size`: pass one of the two. `num_steps` is N for each interval, by default
-        50, or 10 with an `observation`. `step_size` is the maximum step size, from which the number
+        50, or 10 for a record. `step_size` is the maximum step size, from which the number
         of steps of each interval follows.
     - `proposal`: a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, `Guided()`, or
         "auto", the default, which selects the best one for each interval by pilot runs. Approximate
@@ -208,14 +212,14 @@ def gibbs(
     - `observation`, `initial`, `initial_time`: observation model and initial law of a noisy or
         partial record, as in `innovations`. Then parameters of σ and of the noise may be unknown,
         too.
-    - `num_warmup`, `covariance`: for such records only. The warm-up, by default of 500 iterations,
+    - `num_warmup`, `covariance`: for records only. The warm-up, by default of 500 iterations,
         adapts the sizes of moves and the guide. `covariance` is as in `pmmh`.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
     Arguments that are functions are compared by identity: define them once to compile once.
 
-    **Returns:** `GibbsPosterior`; with an `observation`, `RecordPosterior`. Not differentiable.
+    **Returns:** `GibbsPosterior`; for a record `RecordPosterior`. Not differentiable.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
@@ -231,17 +235,28 @@ def gibbs(
     """
     num_iterations, thin = check_count("num_iterations", num_iterations), check_count("thin", thin)
     parameters = as_parameters(model, where, constraint, prior)
+    for_bridges = {
+        "proposal": proposal,
+        "bridges": bridges,
+        "method": method,
+        "parameter_kernel": parameter_kernel,
+        "num_counts": num_counts,
+        "max_proposals": max_proposals,
+        "max_trials": max_trials,
+    }
+    problem = None
     if observation is not None:
         check_key(key)
-        check_no_bridges(
-            proposal=proposal,
-            bridges=bridges,
-            method=method,
-            parameter_kernel=parameter_kernel,
-            num_counts=num_counts,
-            max_proposals=max_proposals,
-            max_trials=max_trials,
-        )
+        check_no_bridges(**for_bridges)
+    else:
+        check_no_record(initial=initial, initial_time=initial_time)
+        problem = as_problem(key, parameters, times, observations, num_steps, step_size)
+        parameters.model.check_invertible_sigma(problem.like)
+        if problem.sigma_is_unknown:
+            # Given its complete path σ cannot move, but given its noise it can.
+            check_no_bridges(sigma_is_unknown=True, **for_bridges)
+            observation, initial = LinearGaussian(covariance=0.0), _any_start(problem.intervals)
+    if observation is not None:
         options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
         records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
@@ -255,10 +270,8 @@ def gibbs(
         size = (num_warmup, num_iterations, thin)
         how = size, covariance is None, progress_meter
         return sample_records(key, parameters, records, log_prior, start, *how)
-    for_records = {"initial": initial, "initial_time": initial_time}
-    check_no_record(num_warmup=num_warmup, covariance=covariance, **for_records)
-    problem = as_problem(key, parameters, times, observations, num_steps, step_size)
-    problem.check_sigma_known("use `pmmh`, which does not, or select other parameters by `where=`.")
+    assert problem is not None
+    check_no_record(num_warmup=num_warmup, covariance=covariance)
     check_kernel(parameter_kernel)
     log_prior = as_log_prior(prior, parameters, problem.theta)
     theta, state = starting_points(
@@ -275,6 +288,14 @@ def gibbs(
     else:
         augmentation.check_paths(state.paths, theta.shape[:-1])
     return _run(run_key, sampler, state, num_iterations, thin, progress_meter)
+
+
+def _any_start(intervals: Intervals) -> GaussianLaw:
+    """Return a law of x_0, which is observed exactly: its density there is only a constant."""
+    points = intervals.start
+    variance = jnp.var(points, axis=0)
+    spread = jnp.where(variance > 0, variance, 1 + points[0] ** 2)
+    return GaussianLaw(points[0], jnp.diag(spread))
 
 
 class GibbsInfo(NamedTuple):

@@ -167,11 +167,10 @@ class AbstractPosterior(AbstractResult):
         count = jnp.maximum(number, 1).astype(products.dtype)
         mean = jnp.sum(products, axis=0) / count
         deviations = jnp.where(computed.reshape(-1, 1), products - mean, 0)
-        # Consecutive draws are dependent, so the effective sample size of θ replaces their number.
-        share = self.effective_sample_size / error.size
-        spread = jnp.sqrt(
-            jnp.sum(deviations**2, axis=0) / jnp.minimum(count * share, count)
-        ) / jnp.sqrt(count)
+        variance = jnp.sum(deviations**2, axis=0) / count
+        # These draws are evenly spaced, so they depend on each other only if they are more than
+        # the effective sample size of θ.
+        spread = jnp.sqrt(variance / jnp.minimum(self.effective_sample_size, count))
         too_few = number < _FEWEST
         error = StepError(jnp.where(too_few, jnp.nan, mean), jnp.where(too_few, jnp.nan, spread))
         infinite = jnp.sum(jnp.isinf(self.log_step_error)).astype(products.dtype)

@@ -13,9 +13,8 @@ The guide is linearised along a path that is likely at some θ. It may be poor a
 Neither the law of the path given θ nor that of θ given ξ depends on the guide, so the warm-up
 replaces it (`warm_up`).
 
-The discretisation error of the likelihood follows from E[w̃ / w] (`record_paths`). The function
-`relative_change` of D = log w̃ / w replaces e^D. If half as many steps are too few for the drift, a
-path may diverge; then its w̃ is zero.
+The discretisation error of the likelihood follows from E[w̃ / w] (`record_paths`). If half as many
+steps are too few for the drift, a path may diverge; then its w̃ is zero.
 """
 
 from typing import NamedTuple
@@ -34,7 +33,6 @@ from ..engine.keys import key_for
 from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..records import Guidance, GuideCheck, Records, tuned
-from ..schemes import relative_change
 from .parameter_walk import adapt_covariance
 from .parameters import Parameters
 from .posterior import (
@@ -64,7 +62,7 @@ class RecordState(NamedTuple):
     """State of a chain of `gibbs` with an `observation`. Several chains have a leading axis.
 
     - `theta`: θ, shape (p,).
-    - `paths`: paths of R records, at the points of their grids.
+    - `paths`: knots of the paths of R records (`records.guided_record`).
     - `root`: S of the covariance S Sᵀ of moves of θ, shape (p, p).
     - `log_scales`: log β of the moves of the blocks.
     - `num_done`: number of iterations so far.
@@ -188,17 +186,17 @@ class RecordSampler(eqx.Module):
         has_weight = nan_to_neg_inf(jnp.where(accepted, new_weight, log_weight)) > -jnp.inf
         return GuidedState(new_state, guides), (accepted, has_weight, blocks_moved)
 
-    def log_ratio(self, key: Key[Array, ""], guided: GuidedState) -> Float[Array, ""]:
-        """Return log w̃ / w, with w̃ the weight for steps of twice the size.
+    def change_by_coarse_steps(self, key: Key[Array, ""], guided: GuidedState) -> Float[Array, ""]:
+        """Return the relative change of the likelihood by steps of twice the size.
 
         It is NaN if the path has no weight, and infinite if steps are too long for the drift.
         """
         (state, guides), completion = guided, self.completion
-        noise, log_weight = completion.noise(key, GuidedTheta(state.theta, guides), state.paths)
-        ratio = nan_to_neg_inf(completion.coarse_log_weight(state.theta, noise)) - log_weight
-        # A path without weight, such as a placeholder, has no ratio.
-        ratio = jnp.where(jnp.isfinite(log_weight), ratio, jnp.nan)
-        return jnp.where(completion.steps_are_too_long(state.theta, state.paths), jnp.inf, ratio)
+        here = GuidedTheta(state.theta, guides)
+        noise, log_weight = completion.noise(key, here, state.paths)
+        # A path without weight, such as a placeholder, has no change.
+        change = completion.change_by_coarse_steps(here, noise)
+        return jnp.where(jnp.isfinite(log_weight), change, jnp.nan)
 
 
 def sample_records(
@@ -266,10 +264,10 @@ def _sample_records(
     def number(guided):
         return guided.state.num_done.reshape(-1)[0]  # key 0 is for the first paths
 
-    def log_ratios(sampler, i, guided):
+    def changes(sampler, i, guided):
         theta = guided.state.theta
         own_key = jax.random.fold_in(key_for("step error", key), number(guided))
-        function = lambda guided: over_chains(sampler.log_ratio, own_key, guided)
+        function = lambda guided: over_chains(sampler.change_by_coarse_steps, own_key, guided)
         if records.stacked.num_steps == 1:
             return jnp.full(theta.shape[:-1], jnp.nan, theta.dtype)
         return thinned_step_errors(function, guided, i - skipped, num_iterations)
@@ -283,7 +281,7 @@ def _sample_records(
         guided, (theta_moved, has_weight, blocks_moved) = result
         theta = guided.state.theta
         share = jnp.mean(blocks_moved.astype(theta.dtype), axis=0)
-        weights = jnp.any(has_weight, axis=0), log_ratios(sampler, i, guided)
+        weights = jnp.any(has_weight, axis=0), changes(sampler, i, guided)
         result = theta, jnp.any(theta_moved, axis=0), share[..., 0], *weights
         return guided, (result, sampler.completion.fine.check)
 
@@ -292,15 +290,9 @@ def _sample_records(
     init = GuidedState(state, _no_guides(parameters, records, state.theta))
     (state, _), draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
     draws, checks = draws
-    fields, (theta_moved, blocks_moved, has_weight, log_ratio) = posterior_fields(
-        parameters, *draws
-    )
+    fields, (theta_moved, blocks_moved, has_weight, change) = posterior_fields(parameters, *draws)
     real = movable(records)
     ever = jnp.any(blocks_moved > 0, axis=-4)  # in any draw
-    # Centred at the median: a factor of w̃ / w that all draws share does not move posterior means.
-    too_long = log_ratio == jnp.inf
-    change = relative_change(log_ratio, jnp.nanmedian(jnp.where(too_long, jnp.nan, log_ratio)))
-    change = jnp.where(too_long, jnp.inf, change)
     posterior = RecordPosterior(
         **fields,
         parameters_moved=theta_moved,

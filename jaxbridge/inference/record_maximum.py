@@ -47,7 +47,7 @@ from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduc
 from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..records import GuideCheck, Records, tuned
-from ..schemes import StepError, dominates, step_faults
+from ..schemes import StepError, dominates, step_faults, unknown_where
 from .newton import (
     Passes,
     Slope,
@@ -67,6 +67,8 @@ _SWEEPS = 50
 # adapt h. They are discarded, because the chains are not yet in equilibrium.
 _DIFFERENCE, _LEARNING = 0.05, 20
 
+# With fewer draws than this share whose change by coarse steps is known, there is no step error.
+_LEAST_KNOWN = 0.9
 _MOST_R_HAT = 1.1
 # R̂ is ignored if the Monte Carlo error is smaller than this fraction of a standard error: then
 # rounding errors alone can make R̂ large.
@@ -169,14 +171,14 @@ class _Draw(NamedTuple):
     """Values for one ξ.
 
     - `gradient`, `hessian`: ∇ log w and ∇² log w.
-    - `log_ratio`, `coarse`: log w̃ / w and ∇ log w̃.
+    - `change`, `coarse`: relative change of the likelihood by steps of twice the size, and ∇ log w̃.
     - `rises`: increases of log w from θ to 2p points around it.
     - `taken`: whether each block moved.
     """
 
     gradient: Float[Array, "*n p"]
     hessian: Float[Array, "*n p p"]
-    log_ratio: Float[Array, "*n"]
+    change: Float[Array, "*n"]
     coarse: Float[Array, "*n p"]
     rises: Float[Array, "*n 2 p"]
     taken: Bool[Array, "*n R 2 B"]
@@ -309,7 +311,7 @@ def _draws_at(
     p, here = len(theta), completion.at(theta)
 
     def derivatives(key, paths, accepted, h):
-        noise, log_weight = completion.noise(key, here, paths)
+        noise, _ = completion.noise(key, here, paths)
         log_w = lambda theta, coarse: completion.either_log_weight(theta, noise, coarse)
         shifts = jnp.diag(h)
         zeros = jnp.zeros((2, p), h.dtype)
@@ -320,7 +322,8 @@ def _draws_at(
         hessian = (slopes[2 : 2 + p] - slopes[2 + p : 2 + 2 * p]) / (2 * h[:, None])
         hessian = (hessian + hessian.T) / 2
         rises = (values[2 + 2 * p :] - values[0]).reshape(2, p)
-        return _Draw(slopes[0], hessian, values[1] - log_weight, slopes[1], rises, accepted)
+        change = completion.change_by_coarse_steps(here, noise)
+        return _Draw(slopes[0], hessian, change, slopes[1], rises, accepted)
 
     def draw(state, i):
         chains, h = state
@@ -425,9 +428,10 @@ def _step_error(
     if completion.num_steps == 1:
         return StepError(*2 * [jnp.full_like(draws.gradient[0, 0], jnp.nan)])
     centred = draws.coarse - jnp.mean(draws.coarse, axis=(0, 1))
-    deviation = draws.log_ratio - jnp.mean(draws.log_ratio)
-    ratio = (deviation + (deviation**2 - jnp.mean(deviation**2)) / 2)[..., None]
-    errors = (draws.coarse - draws.gradient + ratio * centred) @ covariance
+    is_known = jnp.isfinite(draws.change)
+    change = jnp.where(is_known, draws.change - jnp.mean(draws.change, where=is_known), 0)
+    errors = (draws.coarse - draws.gradient + change[..., None] * centred) @ covariance
     errors = share_of_step_error(completion.fine.records) * errors
     size = effective_size_of_chains(errors)
-    return StepError(jnp.mean(errors, axis=(0, 1)), jnp.std(errors, axis=(0, 1)) / jnp.sqrt(size))
+    error = StepError(jnp.mean(errors, axis=(0, 1)), jnp.std(errors, axis=(0, 1)) / jnp.sqrt(size))
+    return unknown_where(jnp.mean(is_known) < _LEAST_KNOWN, error)

@@ -5,9 +5,12 @@ guided steps through its record. The function has an inverse, so a path at θ gi
 path at another θ. A complete path determines σ, but ξ does not (Roberts & Stramer 2001; van der
 Meulen & Schauer 2017).
 
+Paths are represented by their knots, which determine their noise (`records.guided_record`).
+
 The discretisation error of the likelihood is that of w. Steps of twice the size have the noise
 (ζ_i + ζ_{i+1}) / √2, which is N(0, I) as well, and a weight w̃. Hence L̃(θ) = E[w̃ / w] L(θ), with
-the mean over ξ given θ and the data.
+the mean over ξ given θ and the data. The weights are products over segments, so to leading order
+the relative change is a sum of changes of segments.
 """
 
 from collections.abc import Callable
@@ -29,6 +32,7 @@ from ..records import (
     Paths,
     Records,
     blocks_of_both_cuts,
+    change_by_coarse_steps,
     cuts,
     guided,
     has_segments,
@@ -37,6 +41,7 @@ from ..records import (
     no_check,
     noise_and_log_weight,
     pair_noise,
+    path_and_log_weights,
     stacked,
     steps_are_too_long,
     sweep,
@@ -148,19 +153,25 @@ class RecordPaths(eqx.Module):
         """Return the paths of ξ, and log w."""
         return _paths_of_noise(self.fine.records, self.parameters.bind(at.theta), at.guides, noise)
 
-    def steps_are_too_long(
-        self, theta: Float[Array, " p"], paths: Float[Array, "R points d"]
-    ) -> Bool[Array, ""]:
-        """Return whether steps are too long for the drift along the path of any record."""
-        model = self.parameters.bind(theta)
-        one = lambda problem, path: steps_are_too_long(problem, model, path)
-        return jnp.any(self.fine.records.each(one, paths))
-
-    def coarse_log_weight(
-        self, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
+    def change_by_coarse_steps(
+        self, at: GuidedTheta, noise: Float[Array, "R points d"]
     ) -> Float[Array, ""]:
-        """Return log w̃ of ξ, with steps of twice the size."""
-        return self._log_weight(self.coarse, theta, self._coarsened(noise))
+        """Return the relative change of the likelihood by steps of twice the size, from one ξ.
+
+        It is infinite if steps are too long for the drift.
+        """
+        model = self.parameters.bind(at.theta)
+
+        def log_weights(grid, guides, noise):
+            one = lambda problem, *each: path_and_log_weights(problem, model, *each)
+            return grid.records.each(one, guides, noise)
+
+        paths, log_fine = log_weights(self.fine, at.guides, noise)
+        coarse = self.coarse, _guides(self.coarse, model), self._coarsened(noise)
+        change = jnp.sum(jax.vmap(change_by_coarse_steps)(log_fine, log_weights(*coarse)[1]))
+        one = lambda problem, path: steps_are_too_long(problem, model, path)
+        too_long = jnp.any(self.fine.records.each(one, paths))
+        return jnp.where(too_long, jnp.inf, change)
 
     def either_log_weight(
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"], coarse: Bool[Array, ""]
@@ -181,10 +192,10 @@ class RecordPaths(eqx.Module):
         return jax.vmap(lambda noise: pair_noise(noise, lengths))(noise)
 
 
-def check_no_bridges(**arguments: Any) -> None:
+def check_no_bridges(sigma_is_unknown: bool = False, **arguments: Any) -> None:
     """Raise `ValueError` if an argument about bridges is neither `None` nor its default.
 
-    Such arguments are for complete observations without noise only.
+    Such arguments are for complete observations without noise and a known σ only.
     """
     usual = lambda name, value: isinstance(value, str) and value == _USUAL.get(name)
     names = [
@@ -193,7 +204,12 @@ def check_no_bridges(**arguments: Any) -> None:
     if names:
         raise ValueError(
             f"{' and '.join(f'`{name}`' for name in names)}: only for complete observations "
-            "without noise. Omit this argument, or omit `observation`."
+            + (
+                "with a known σ, because a complete path determines σ. Omit this argument, use "
+                "`pmmh`, or select other parameters by `where=`."
+                if sigma_is_unknown
+                else "without noise. Omit this argument, or omit `observation`."
+            )
         )
 
 

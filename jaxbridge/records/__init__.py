@@ -34,11 +34,13 @@ from .guide_search import (
 )
 from .guided_record import (
     Guidance as Guidance,
+    change_by_coarse_steps as change_by_coarse_steps,
     guided as guided,
     knots_and_log_weight as knots_and_log_weight,
     noise_and_log_weight as noise_and_log_weight,
     pair_noise as pair_noise,
     path_and_log_weight as path_and_log_weight,
+    path_and_log_weights as path_and_log_weights,
 )
 from .initial import Initial as Initial
 from .observation import Observation as Observation

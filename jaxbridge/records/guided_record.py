@@ -21,7 +21,7 @@ from ..engine.lanes import over_lanes, over_points
 from ..engine.linalg import sum_of_many
 from ..engine.recursion import recursion
 from ..models.diffusion import Diffusion
-from ..schemes import solve_root
+from ..schemes import relative_change, solve_root
 from .guided_steps import (
     Guide,
     GuidedLaw,
@@ -114,6 +114,15 @@ def _guidance(
     return Guidance(initial, start, linear, guides, first, scalars)
 
 
+class _GuidedPath(NamedTuple):
+    """Guided path with its knots, and the log weights of its start and of its steps."""
+
+    path: Float[Array, "points d"]
+    knots: Float[Array, "points d"]
+    log_start: Float[Array, ""]
+    log_steps: Float[Array, " steps"]
+
+
 def path_and_log_weight(
     problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
@@ -121,22 +130,44 @@ def path_and_log_weight(
 
     `noise[0]` determines x_0, and `noise[i]` step i.
     """
-    path, _, log_weight = _simulate(problem, model, guide, noise)
-    return path, log_weight
+    guided_path = _guided_path(problem, model, guide, noise)
+    return guided_path.path, _log_weight(problem, model, guide, guided_path)
 
 
 def knots_and_log_weight(
     problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
 ) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
     """Return the knots of the path of this noise, and its log weight."""
-    _, knots, log_weight = _simulate(problem, model, guide, noise)
-    return knots, log_weight
+    guided_path = _guided_path(problem, model, guide, noise)
+    return guided_path.knots, _log_weight(problem, model, guide, guided_path)
 
 
-def _simulate(
+def path_and_log_weights(
     problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
-) -> tuple[Float[Array, "points d"], Float[Array, "points d"], Float[Array, ""]]:
-    """Return the path of this noise, its knots, and its log weight."""
+) -> tuple[Float[Array, "points d"], Float[Array, " ends"]]:
+    """Return the path of this noise, and the log weights of its start and of each segment.
+
+    The log weights are those of `particle_filter`: each is multiplied by h at the end of the
+    segment and divided by h at its beginning. Hence they vary little, and they are nearly
+    independent. Their sum is the log weight of the path, up to rounding errors of h.
+    """
+    guided_path = _guided_path(problem, model, guide, noise)
+    K, N = problem.num_segments, problem.num_steps
+    by_segment = jnp.sum(guided_path.log_steps.reshape(K, N), axis=1)
+    ends, steps = guided_path.path[::N], guide.steps
+    log_h = jax.vmap(lambda h, point, x: h.log(x - point))
+    first, last = (jax.tree.map(lambda leaf, i=i: leaf[:, i], steps) for i in (0, -1))
+    before = log_h(first.h, first.point, ends[:-1])
+    after = log_h(last.next_h, last.next_point, ends[1:])
+    start = (guided_path.log_start + before[0])[None]
+    log_weights = jnp.concatenate([start, by_segment + after - before])
+    return guided_path.path, log_weights + _corrections(problem, model, guide, guided_path.path)
+
+
+def _guided_path(
+    problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
+) -> _GuidedPath:
+    """Return the path of this noise."""
     density, dynamics_at = problem.density, model.forward_at(problem.like)
     start, log_start = guide.start.point_and_log_weight(noise[0])
     steps = flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
@@ -150,10 +181,18 @@ def _simulate(
         return point, (None if density.is_normal else knot, log_weight)
 
     inputs = (noise[1:], *steps, jnp.asarray(is_last))
-    points, (knots, log_weights) = recursion(one, start, inputs)
-    path, log_weight = jnp.concatenate([start[None], points]), log_start + sum_of_many(log_weights)
+    points, (knots, log_steps) = recursion(one, start, inputs)
+    path = jnp.concatenate([start[None], points])
     knots = path if knots is None else jnp.concatenate([start[None], knots])
-    return path, knots, log_weight + corrections(problem, model, guide, path)
+    return _GuidedPath(path, knots, log_start, log_steps)
+
+
+def _log_weight(
+    problem: RecordProblem, model: Diffusion, guide: Guidance, guided_path: _GuidedPath
+) -> Float[Array, ""]:
+    """Return the log weight of a path."""
+    log_weight = guided_path.log_start + sum_of_many(guided_path.log_steps)
+    return log_weight + jnp.sum(_corrections(problem, model, guide, guided_path.path))
 
 
 def path_of_knots(
@@ -238,19 +277,37 @@ def noise_and_log_weight(
     zeta, log_weights = _map_steps(of_step, *steps)
     noise = jnp.concatenate([jnp.where(still, fresh, first)[None], zeta])
     log_weight = log_start + sum_of_many(log_weights)
-    return noise, log_weight + corrections(problem, model, guide, path)
+    return noise, log_weight + jnp.sum(_corrections(problem, model, guide, path))
 
 
-def corrections(
+def _corrections(
     problem: RecordProblem, model: Diffusion, guide: Guidance, path: Float[Array, "points d"]
-) -> Float[Array, ""]:
-    """Return the terms of the log weight of a path for a general observation model and initial law.
+) -> Float[Array, " ends"]:
+    """Return the terms of the log weights for a general observation model and initial law.
 
-    They are zero for a `LinearGaussian` and a normal initial law.
+    They belong to the ends of segments, and are zero for a `LinearGaussian` and a normal initial
+    law.
     """
     of_points = over_points(correction(problem, model))
     at_observations = of_points(problem.rows, path[:: problem.num_steps])
-    return jnp.sum(at_observations) + log_ratio(problem.initial, model, guide.initial, path[0])
+    of_start = log_ratio(problem.initial, model, guide.initial, path[0])
+    return at_observations.at[0].add(of_start)
+
+
+def change_by_coarse_steps(
+    log_weights: Float[Array, " ends"], log_coarse: Float[Array, " ends"]
+) -> Float[Array, ""]:
+    """Return the relative change of the likelihood by steps of twice the size, from one path.
+
+    The arguments are those of its start and of each segment (`path_and_log_weights`), for both step
+    sizes. The likelihoods are products over segments, so this is Σ (e^{D_k} - 1), with D_k the
+    difference for segment k, to second order. The change e^D - 1 of the whole path, D = Σ D_k, has
+    the same mean to leading order, and a variance that increases with the square of the number of
+    segments. A path that half as many steps lose counts as -1.
+    """
+    D = log_coarse - log_weights
+    is_lost = ~jnp.all(jnp.isfinite(log_coarse))
+    return jnp.where(is_lost, -1, jnp.sum(relative_change(D, jnp.zeros_like(D))))
 
 
 def correction(

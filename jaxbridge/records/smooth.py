@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
-from ..engine.averages import PathFunction, as_path_function, nan_to_neg_inf
+from ..engine.averages import PathFunction, as_path_function
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
@@ -38,10 +38,11 @@ from ..schemes import (
 from .guide_search import GuideCheck, Linearised, linearised
 from .guided_record import (
     Guidance,
+    change_by_coarse_steps,
     knots_and_log_weight,
     noise_and_log_weight,
     pair_noise,
-    path_and_log_weight,
+    path_and_log_weights,
     path_of_knots,
 )
 from .initial import Initial
@@ -212,12 +213,12 @@ class Smoothed(AbstractResult):
             D, share = jnp.sum(D, axis=-1), share_of_order(problem.density.order)
             change = relative_change(D, jnp.mean(D))
         else:
-            D, coarse_paths = _coarse_paths(_on_both_grids(problem), self._knots)
+            coarse = _coarse_paths(_on_both_grids(problem), self._knots)
+            change, has_coarse, coarse_paths = coarse
             coarse_leaves = jax.tree.leaves(self._values(fn, coarse_paths))
-            change = relative_change(D, jnp.median(D))
-            # Weights are of the whole record, so this is the mean over its segments.
+            # The change is a sum, so this is the mean variance of its terms.
             is_reliable = jnp.var(change) <= _MOST_VARIANCE * problem.num_segments
-            is_reliable &= jnp.mean(D > -jnp.inf) >= _LEAST_COARSE
+            is_reliable &= jnp.mean(has_coarse) >= _LEAST_COARSE
             share = share_of_grid(problem.density.order, problem.record.lengths)
         change = jnp.where(is_reliable, change, jnp.nan)
         varies = _noise_varies(problem, self.paths[0, 0])
@@ -325,9 +326,8 @@ def smooth(
         firsts = _guided_paths(start_key, problem, linearisation, num_chains)
         sizes = (*counts, num_proposals)
         draws = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
-    paths, knots = (
-        None if draw is None else jnp.moveaxis(draw, 1, 0) for draw in (draws.paths, draws.knots)
-    )
+    by_chain = lambda draws: jnp.moveaxis(draws, 1, 0)
+    paths, knots = by_chain(draws.paths), None if draws.knots is None else by_chain(draws.knots)
     diagnostics = (draws.accepted, draws.stuck, draws.num_truncated)
     times = problem.record.clock.exactly(draws.since)
     # Discretisation errors need the grid of the paths, which a `proposal` may choose.
@@ -416,15 +416,17 @@ def _on_both_grids(problem: RecordProblem) -> tuple[_OnGrid, _OnGrid]:
 @compiled_sooner
 def _coarse_paths(
     grids: tuple[_OnGrid, _OnGrid], knots: Float[Array, "chains n points d"]
-) -> tuple[Float[Array, "chains n"], Float[Array, "chains n points d"]]:
-    """Return D and the paths of half as many steps from the noise of the paths with these knots.
+) -> tuple[Float[Array, "chains n"], Bool[Array, "chains n"], Float[Array, "chains n points d"]]:
+    """Return the paths of half as many steps from the noise of the paths with these knots.
 
-    D is the log weight of the coarse path minus that of the path. Between two points of the coarse
-    grid the distance of both paths is constant, or zero where the coarse path would leave the
-    state space. A coarse path without weight has D = -inf and is replaced by the path.
+    Between two points of the coarse grid the distance of both paths is constant, or zero where the
+    coarse path would leave the state space.
+
+    **Returns:** the relative change of the likelihood (`change_by_coarse_steps`), whether the
+    coarse path has a weight, and the coarse path, or the path itself if it has none.
     """
     fine, coarse = grids
-    problem, lengths = fine.problem, fine.problem.record.lengths
+    problem, record = fine.problem, fine.problem.record
     model, inside = problem.model, problem.model.state_space()
     ends = jnp.append(True, coarse.problem.record.dt.ravel() > 0)
     last_end = lax.cummax(jnp.where(ends, jnp.arange(len(ends)), 0))
@@ -432,21 +434,24 @@ def _coarse_paths(
     key = jax.random.key(0)
 
     def of_draw(knots):
-        path = path_of_knots(problem, model, knots)
-        noise, log_weight = noise_and_log_weight(key, problem, model, fine.guide, knots)
-        coarse_noise = pair_noise(noise, lengths)
-        coarse_path, log_coarse = path_and_log_weight(
+        noise, _ = noise_and_log_weight(key, problem, model, fine.guide, knots)
+        path, log_weights = path_and_log_weights(problem, model, fine.guide, noise)
+        coarse_noise = pair_noise(noise, record.lengths)
+        coarse_path, log_coarse = path_and_log_weights(
             coarse.problem, model, coarse.guide, coarse_noise
         )
-        moved = path + (coarse_path - path)[last_end]
+        has_weight = jnp.all(jnp.isfinite(log_coarse))
+        is_possible = has_weight
+        distance = (coarse_path - path)[last_end]
         if inside is not None:
-            moved = jnp.where(jax.vmap(inside)(moved)[:, None], moved, path)
-        D = nan_to_neg_inf(log_coarse) - log_weight
-        return D, jnp.where(D > -jnp.inf, moved, path)[problem.record.stored]
+            is_possible &= jax.vmap(inside)(path + distance)
+        shifted = path + jnp.where(is_possible[..., None], distance, 0)
+        change = change_by_coarse_steps(log_weights, log_coarse)
+        return change, has_weight, shifted[record.stored]
 
     # One draw of all chains at a time, to save memory.
-    D, paths = lax.map(jax.vmap(of_draw), jnp.moveaxis(knots, 1, 0))
-    return D.T, jnp.moveaxis(paths, 0, 1)
+    results = lax.map(jax.vmap(of_draw), jnp.moveaxis(knots, 1, 0))
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), results)
 
 
 @compiled_sooner

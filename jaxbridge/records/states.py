@@ -274,7 +274,9 @@ def sample_states(
     sampler = StateSampler(problem, model, proposal, laws, scalars, movable, num_proposals)
     within = np.diff(proposal.fractions(problem.num_steps))
     dt = durations[:, None] * jnp.asarray(within, durations.dtype)
-    record = dataclasses.replace(problem.record, dt=dt, lengths=tuple(within * problem.num_steps))
+    record = dataclasses.replace(
+        problem.record, dt=dt, lengths=tuple((problem.num_steps * within).tolist())
+    )
     grid = record.grid()
     paths, moves, num_truncated = _run_state_chains(
         key, sampler, guided, (num_draws, num_warmup), progress_meter
