@@ -6,8 +6,9 @@ turn. With exact bridges the posterior is exact up to the discretisation error. 
 bridges, as in the paper, it has the bias of the bridges in addition.
 """
 
+import os
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -28,6 +29,7 @@ from ..proposals import Budget
 from ..records import Initial, Observation, as_record_problems
 from ..records.observation import LinearGaussian
 from .augmentation import Augmentation, augment
+from .checkpoint import resumable
 from .data import as_problem
 from .parameter_kernels import (
     AbstractParameterKernel,
@@ -40,9 +42,11 @@ from .parameter_walk import first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
+    Summary,
     check_covariance_is_used,
     first_chain,
     first_states,
+    last,
     over_chains,
     posterior_fields,
     starting_points,
@@ -126,6 +130,13 @@ class GibbsPosterior(AbstractPosterior):
     completion: Augmentation
     exact_parameters: bool = eqx.field(static=True)
 
+    _summaries: ClassVar[dict[str, Summary]] = {
+        "state": last,
+        "completion": last,
+        "exact_parameters": last,
+    }
+    _continued_with: ClassVar[dict[str, Any]] = {}
+
     @property
     def _stuck(self):
         return False
@@ -144,6 +155,7 @@ class GibbsPosterior(AbstractPosterior):
 
 
 @public_entry
+@resumable
 def gibbs(
     key: Key[Array, ""],
     model: Diffusion,
@@ -172,6 +184,7 @@ def gibbs(
     max_proposals: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
+    checkpoint: str | os.PathLike | None = None,
 ) -> GibbsPosterior | RecordPosterior:
     """Sample from the posterior of a model's parameters, given discrete observations.
 
@@ -216,6 +229,9 @@ def gibbs(
         adapts the sizes of moves and the guide. `covariance` is as in `pmmh`.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
+    - `checkpoint`: path of a file, for runs that may be interrupted. The run has ten parts, after
+        each of which the file is replaced. The same call continues from the file, to the same
+        draws. R̂ and the remaining time are logged (`logging.getLogger("jaxbridge")`).
 
     Arguments that are functions are compared by identity: define them once to compile once.
 

@@ -9,9 +9,10 @@ Proposals of θ are normal random walks. The warm-up adapts their covariance S S
 rates (`parameter_walk`). After the warm-up it is fixed.
 """
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -38,6 +39,7 @@ from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal, Budget
 from ..records import GuideCheck, Initial, Observation, as_record_problems
 from .blocks import Block, block_of, make_blocks
+from .checkpoint import resumable
 from .data import Problem, as_problem
 from .likelihood_estimates import (
     AbstractLikelihood,
@@ -50,14 +52,18 @@ from .parameter_walk import adapt_covariance, first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
+    Summary,
+    average,
     check_covariance_is_used,
     check_likelihood_was_found,
     first_chain,
+    last,
     over_chains,
     posterior_fields,
     refused_moves,
     starting_points,
     thinned_step_errors,
+    total,
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_paths import check_no_bridges, check_no_record, unguided
@@ -168,6 +174,17 @@ class PMMHPosterior(AbstractPosterior):
     guide: GuideCheck | None = None
     share_lost: Float[Array, "*chains"] | None = None
 
+    _summaries: ClassVar[dict[str, Summary]] = {
+        "log_likelihood_variance": average,
+        "variance_in_part": average,
+        "num_without_estimate": total,
+        "num_truncated": total,
+        "share_lost": average,
+        "state": last,
+        "guide": last,
+    }
+    _continued_with: ClassVar[dict[str, Any]] = {"num_warmup": 0, "covariance": None}
+
     @property
     def stuck(self) -> Bool[Array, "*chains"]:
         """Return whether a chain never moved, shape (*chains,).
@@ -200,6 +217,7 @@ class PMMHPosterior(AbstractPosterior):
 
 
 @public_entry
+@resumable
 def pmmh(
     key: Key[Array, ""],
     model: Diffusion,
@@ -225,6 +243,7 @@ def pmmh(
     num_counts: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
+    checkpoint: str | os.PathLike | None = None,
 ) -> PMMHPosterior:
     """Sample from the posterior of any parameters of a model, including those of σ.
 
@@ -256,7 +275,7 @@ def pmmh(
         the guide and its discount rate by pilot runs. For unknown parameters of the noise make them
         parameters of the model, and `covariance` of `LinearGaussian` a function of them.
     - `num_counts`, `max_trials`: as in `transition_log_density`.
-    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
+    - `progress_meter`, `checkpoint`: as in `gibbs`.
 
     **Returns:** `PMMHPosterior`. Not differentiable.
 

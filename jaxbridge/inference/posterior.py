@@ -3,9 +3,10 @@
 The shared parts are the start, the continuation and the parallel run of chains.
 """
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -52,6 +53,11 @@ _STUCK = (
 )
 
 
+# A function of the values of two parts of a run, and of the share of the second one in the draws.
+Summary = Callable[[Any, Any, float], Any]
+_Posterior = TypeVar("_Posterior", bound="AbstractPosterior")
+
+
 class AbstractPosterior(AbstractResult):
     """Base class of posterior draws, with their Monte Carlo and discretisation errors."""
 
@@ -60,6 +66,12 @@ class AbstractPosterior(AbstractResult):
     names: eqx.AbstractVar[tuple[str, ...]]
     log_step_error: eqx.AbstractVar[Float[Array, "*chains n"]]
     sigma_varies: eqx.AbstractVar[bool]
+
+    state: eqx.AbstractVar[Any]
+    # Fields without a value for each draw, and how two parts of a run combine them (`joined`).
+    _summaries: ClassVar[dict[str, Summary]]
+    # Arguments, beside `init`, of a call that continues the draws.
+    _continued_with: ClassVar[dict[str, Any]]
 
     @property
     @abstractmethod
@@ -178,6 +190,52 @@ class AbstractPosterior(AbstractResult):
             infinite > _MOST_INFINITE * (infinite + number.astype(infinite.dtype)), error
         )
 
+    @property
+    def continuation(self) -> dict[str, Any]:
+        """Return the arguments of a call that continues this run, beside the original ones.
+
+        Pass the same `key`. The continued chains use its subsequent random numbers.
+
+        **Example:**
+
+        ```python
+        part = jb.gibbs(key, model, times, observations, **options)
+        later = jb.gibbs(key, model, times, observations, **options | part.continuation)
+        posterior = part.joined(later)
+        ```
+        """
+        return {"init": self.state, "num_chains": None, **self._continued_with}
+
+    def joined(self: _Posterior, later: _Posterior) -> _Posterior:
+        """Return the draws of this part of a run and of the part that continues it.
+
+        Diagnostics and errors are then those of all draws.
+
+        **Raises:** `TypeError` for a posterior of another sampler, `ValueError` for one with other
+        parameters or chains.
+        """
+        if type(later) is not type(self):
+            raise TypeError(
+                f"`later` must be a {type(self).__name__}, like this part; got {later!r}."
+            )
+        if later.names != self.names or later.theta.shape[:-2] != self.theta.shape[:-2]:
+            raise ValueError(
+                "both parts must have the same parameters and chains; got "
+                f"{self.names} of shape {self.theta.shape} and {later.names} of shape "
+                f"{later.theta.shape}."
+            )
+        axis, num_draws = self.theta.ndim - 2, [part.theta.shape[-2] for part in (self, later)]
+        share = num_draws[1] / sum(num_draws)
+        joined = lambda a, b: jnp.concatenate([a, b], axis) if eqx.is_array(a) else b
+        fields = {}
+        for field in dataclasses.fields(self):
+            parts = getattr(self, field.name), getattr(later, field.name)
+            of_both = self._summaries.get(field.name)
+            fields[field.name] = (
+                jax.tree.map(joined, *parts) if of_both is None else of_both(*parts, share)
+            )
+        return type(self)(**fields)
+
     def summary(self) -> PosteriorSummary:
         """Return a table of the posterior, which prints as text; not inside `jit`.
 
@@ -246,6 +304,21 @@ class AbstractPosterior(AbstractResult):
         if int(arviz.__version__.split(".")[0]) >= 1:
             return arviz.from_dict({"posterior": posterior})
         return arviz.from_dict(posterior=posterior)
+
+
+def last(first: Any, second: Any, share: float) -> Any:
+    """Return the value of the second part of a run."""
+    return second
+
+
+def total(first: Any, second: Any, share: float) -> Any:
+    """Return the sum of the counts of both parts of a run."""
+    return first + second
+
+
+def average(first: Any, second: Any, share: float) -> Any:
+    """Return the mean over both parts of a run; `share` is that of the second one in the draws."""
+    return None if first is None else (1 - share) * first + share * second
 
 
 def refused_moves(accepted: Bool[Array, "*chains n"]) -> Fault:

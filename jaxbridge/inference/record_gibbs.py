@@ -17,7 +17,7 @@ The discretisation error of the likelihood follows from E[w̃ / w] (`record_path
 steps are too few for the drift, a path may diverge; then its w̃ is zero.
 """
 
-from typing import NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -37,8 +37,10 @@ from .parameter_walk import adapt_covariance
 from .parameters import Parameters
 from .posterior import (
     AbstractPosterior,
+    Summary,
     check_likelihood_was_found,
     first_chain,
+    last,
     over_chains,
     posterior_fields,
     refused_moves,
@@ -114,6 +116,13 @@ class RecordPosterior(AbstractPosterior):
     sigma_varies: bool = eqx.field(static=True)
     state: RecordState
     guide: GuideCheck | None = None
+
+    _summaries: ClassVar[dict[str, Summary]] = {
+        "stuck": lambda first, second, share: first & second,
+        "state": last,
+        "guide": last,
+    }  # fmt: skip
+    _continued_with: ClassVar[dict[str, Any]] = {"num_warmup": 0, "covariance": None}
 
     @property
     def _stuck(self):

@@ -28,7 +28,6 @@ from ..schemes import (
     StepError,
     dominates,
     log_halving_of_paths,
-    relative_change,
     root_mean_square_in_sds,
     share_of_grid,
     share_of_order,
@@ -210,8 +209,11 @@ class Smoothed(AbstractResult):
         if self._knots is None:
             D, coarse_leaves = _log_halving(problem, self.paths), leaves
             is_reliable = jnp.max(jnp.var(D, axis=(0, 1))) <= _MOST_VARIANCE
-            D, share = jnp.sum(D, axis=-1), share_of_order(problem.density.order)
-            change = relative_change(D, jnp.mean(D))
+            D -= jnp.mean(D, axis=(0, 1))
+            # e^D - 1 to second order, without products of different segments: these have a small
+            # mean and a large variance.
+            change = jnp.sum(D + D**2 / 2, axis=-1)
+            share = share_of_order(problem.density.order)
         else:
             coarse = _coarse_paths(_on_both_grids(problem), self._knots)
             change, has_coarse, coarse_paths = coarse
@@ -507,8 +509,8 @@ def _error_from_halving(
 ) -> StepError:
     """Estimate the discretisation error of the mean of f, as a share of E[e^D f̃] / E[e^D] - E[f].
 
-    f̃ are the values of the coarse paths, and `change` is e^D - 1 (`relative_change`). To second
-    order in D this difference is the mean of f̃ - f plus the covariance of f̃ with e^D.
+    f̃ are the values of the coarse paths, and `change` is e^D - 1 up to a constant. This difference
+    is the mean of f̃ - f plus the covariance of f̃ with e^D, to second order in D.
     """
     change = (change - jnp.mean(change)).reshape(*change.shape, *[1] * (values.ndim - 2))
     products = (coarse_values - jnp.mean(coarse_values, axis=(0, 1))) * change

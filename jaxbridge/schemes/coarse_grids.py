@@ -59,8 +59,10 @@ def num_coarse_grids(num_steps: int) -> int:
 def share_of_grid(order: int, lengths: Sequence[float]) -> float:
     """Return s, the discretisation error relative to the change on a grid of half as many steps.
 
-    `lengths` are those of the steps, in any unit.
+    `lengths` are those of the steps, in any unit. A single step has no coarser grid: NaN.
     """
+    if len(lengths) == 1:
+        return math.nan
     fine, coarse, _ = _sums(order, lengths)
     return fine / (coarse - fine)
 

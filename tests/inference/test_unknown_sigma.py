@@ -1,0 +1,88 @@
+"""`gibbs` from exact observations with unknown parameters of σ: a record whose noise is zero."""
+
+import cir
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxbridge as jb
+
+LEVEL = 0.5
+
+
+def square_root():
+    """Cox–Ingersoll–Ross, with the logarithms of its rate and of the factor of its σ unknown."""
+    return jb.Diffusion(
+        lambda x, p: jnp.exp(p["rate"]) * (LEVEL - x),
+        lambda x, p: jnp.exp(p["sigma"]) * jnp.sqrt(x),
+        params={"rate": 0.0, "sigma": -0.5},
+        domain=lambda x, p: jnp.all(x > 0),
+    )
+
+
+def exact_posterior(records):
+    """Means and standard deviations, with normal priors N(0, 1) and N(-½, 1), on a grid."""
+    rate, sigma = np.linspace(-1.6, 1.6, 121), np.linspace(-1.1, 0.0, 111)
+    log_posterior = -(rate[:, None] ** 2) / 2 - (sigma + 0.5) ** 2 / 2
+    for x in records:
+        log_posterior += np.array(
+            [
+                [
+                    np.sum(cir.log_density((np.exp(r), LEVEL, np.exp(s)), x[:-1], x[1:], 1.0))
+                    for s in sigma
+                ]
+                for r in rate
+            ]
+        )
+    weights = np.exp(log_posterior - log_posterior.max())
+    weights /= weights.sum()
+    laws = (weights.sum(1), rate), (weights.sum(0), sigma)
+    means = np.array([law @ values for law, values in laws])
+    return means, np.sqrt([law @ values**2 for law, values in laws] - means**2)
+
+
+@pytest.mark.slow
+@pytest.mark.optimised
+def test_posterior_of_two_records_is_exact_and_of_second_order():
+    """At five steps of σ(x) over an interval; each record has its own first state."""
+    rng = np.random.default_rng(5)
+    records = [cir.simulate((1.0, LEVEL, 0.6), np.arange(n), rng)[:, 0] for n in (40.0, 25.0)]
+    mean, sd = exact_posterior(records)
+    made = jb.gibbs(
+        jax.random.key(0), square_root(), [np.arange(len(x)) for x in records],
+        [x[:, None] for x in records],
+        prior=jb.NormalPrior({"rate": 0.0, "sigma": -0.5}, {"rate": 1.0, "sigma": 1.0}),
+        num_steps=5, num_iterations=4000, num_chains=2,
+    )  # fmt: skip
+    theta = np.asarray(made.theta, float).reshape(-1, 2)
+    error = np.asarray(made.standard_error) / sd
+    assert made.trustworthy and np.all(error < 0.08)
+    assert np.all(np.abs(theta.mean(0) - mean) / sd < 4 * error + 0.05)
+    assert np.all(np.abs(theta.std(0) / sd - 1) < 0.15)
+    assert np.all(np.abs(made.step_error) + 2 * made.step_uncertainty < 0.3 * sd)
+
+
+@pytest.mark.slow
+def test_the_constant_of_the_first_state_does_not_matter():
+    """Constant σ in the plane: an observation that is constant in time has no spread."""
+    plane = jb.Diffusion(
+        lambda x, p: -x, lambda x, p: jnp.exp(p) * jnp.array([[1.0, 0.0], [0.3, 1.0]]), params=0.0
+    )
+    values = jb.simulate(jax.random.key(0), plane, [0.2, 0.0], 0.5 * np.arange(30.0))[0]
+    made = jb.gibbs(
+        jax.random.key(1), plane, 0.5 * np.arange(30.0), values, num_steps=4,
+        prior=jb.NormalPrior(0.0, 1.0), num_iterations=1500,
+    )  # fmt: skip
+    # Exact transitions: x' ~ N(e^-δ x, e^{2θ} V (1 - e^{-2δ}) / 2), so e^{2θ} has a closed form.
+    decay, root = np.exp(-0.5), np.array([[1.0, 0.0], [0.3, 1.0]])
+    white = np.linalg.solve(root, (values[1:] - decay * values[:-1]).T) / np.sqrt(
+        (1 - decay**2) / 2
+    )
+    theta = np.linspace(-0.6, 0.6, 1001)
+    log_posterior = -white.size * theta - np.sum(white**2) * np.exp(-2 * theta) / 2 - theta**2 / 2
+    weights = np.exp(log_posterior - log_posterior.max())
+    mean = weights @ theta / weights.sum()
+    sd = np.sqrt(weights @ theta**2 / weights.sum() - mean**2)
+    error = float(made.standard_error[0])
+    assert abs(float(jnp.mean(made.theta)) - mean) < 5 * error + 0.05 * sd
