@@ -287,7 +287,14 @@ class AbstractPosterior(AbstractResult):
     def to_arviz(self) -> Any:
         """Return the draws as ArviZ's `InferenceData` (`DataTree` since its version 1).
 
-        This needs the package ArviZ.
+        The group `posterior` has the parameters, and `sample_stats` the other values of each draw,
+        for instance the acceptance of moves. This needs the package ArviZ.
+
+        **Example:**
+
+        ```python
+        arviz.plot_trace(posterior.to_arviz())
+        ```
         """
         import arviz
 
@@ -300,10 +307,16 @@ class AbstractPosterior(AbstractResult):
             for path, leaf in leaves
             if eqx.is_array(leaf)
         }
+        others = ("params", "theta", *self._summaries)
+        names = [field.name for field in dataclasses.fields(self) if field.name not in others]
+        stats = {name: getattr(self, name) for name in names}
+        stats = {name: of_chains(value) for name, value in stats.items() if eqx.is_array(value)}
+        groups = {"posterior": posterior, "sample_stats": stats}
         # Version 1 changed the arguments of `from_dict`.
-        if int(arviz.__version__.split(".")[0]) >= 1:
-            return arviz.from_dict({"posterior": posterior})
-        return arviz.from_dict(posterior=posterior)
+        is_new = int(arviz.__version__.split(".")[0]) >= 1
+        if is_new:
+            return arviz.from_dict(groups)
+        return arviz.from_dict(posterior=posterior, sample_stats=stats)
 
 
 def last(first: Any, second: Any, share: float) -> Any:

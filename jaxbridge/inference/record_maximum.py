@@ -23,12 +23,10 @@ of -∂²_j log w. 1 / √D_j would be the standard error of θ_j if ξ were obs
 
 *Discretisation error.* The error of the log-likelihood, e = log L_N - log L, is about a fixed
 fraction of log L_{N/2} - log L_N. The error moves the maximum by I⁻¹ ∇e. Let w̃ be the weight with
-half as many steps, and D = log w̃ / w. Then
+half as many steps, and D_k the part of log w̃ / w that belongs to segment k. Then
 
     ∇ log L_{N/2} = E[(w̃ / w) ∇ log w̃ | y] / E[w̃ / w | y]
-                  ≈ E[∇ log w̃ | y] + Cov(D + ½ (D - ED)², ∇ log w̃ | y).
-
-For a state-dependent σ the square has the order of the mean of D.
+                  ≈ E[∇ log w̃ | y] + Cov(Σ_k (e^{D_k} - 1), ∇ log w̃ | y).
 """
 
 from collections.abc import Callable

@@ -212,6 +212,9 @@ def test_arviz_takes_the_draws():
     data = made.to_arviz()
     assert set(data.posterior.data_vars) == {"0", "1"}
     assert arviz.summary(data, var_names=["0"]).shape[0] == 1
+    moved = np.asarray(data.sample_stats["parameters_moved"])
+    np.testing.assert_array_equal(moved, np.asarray(made.parameters_moved)[None])
+    assert "bridges_moved" in data.sample_stats and "names" not in data.sample_stats
 
 
 @pytest.mark.slow
