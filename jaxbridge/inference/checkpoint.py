@@ -13,6 +13,7 @@ import logging
 import os
 import tempfile
 import time
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -22,10 +23,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..engine.checks import is_traced
+from ..engine.checks import check_count, is_traced
 from .posterior import AbstractPosterior
 
 _NUM_PARTS = 10
+# R̂ needs so many draws.
+_FEWEST_DRAWS = 4
 _LOGGER = logging.getLogger("jaxbridge")
 
 _Arguments = ParamSpec("_Arguments")
@@ -53,7 +56,7 @@ def _checked(checkpoint: Any, arguments: dict[str, Any]) -> Path:
         raise TypeError(
             f"`checkpoint` must be the path of a file, for instance 'run.npz'; got {checkpoint!r}."
         )
-    if is_traced(arguments["key"], arguments["model"], arguments["observations"]):
+    if is_traced(*arguments.values()):
         raise ValueError(
             "`checkpoint` writes a file, which compiled code cannot do: call the function outside "
             "`jit` and `vmap`, or leave out `checkpoint`."
@@ -70,7 +73,7 @@ def _run_in_parts(
     """Run all parts that the file does not contain; return the draws of all parts."""
     positional = {name: arguments.pop(name) for name in ("key", "model", "times", "observations")}
     del arguments["checkpoint"]
-    sizes = _sizes(arguments["num_iterations"])
+    sizes = _sizes(check_count("num_iterations", arguments["num_iterations"]))
     call = functools.partial(sample, *positional.values())
     begin = time.monotonic()
     posterior, num_done = call(**arguments | {"num_iterations": sizes[0]}), 1
@@ -79,8 +82,13 @@ def _run_in_parts(
     else:
         _save(path, posterior, num_done)
     _report(posterior, num_done, len(sizes), begin, 1)
+    follow = posterior.continuation
+    if getattr(posterior.state, "proposals", ()) and arguments["proposal"] == "auto":
+        # The proposals of the state were chosen with these budgets, and keep them.
+        follow |= {"num_counts": None, "max_trials": None}
     for number in range(num_done, len(sizes)):
-        part = call(**arguments | posterior.continuation | {"num_iterations": sizes[number]})
+        follow |= {"init": posterior.state, "num_iterations": sizes[number]}
+        part = call(**arguments | follow)
         posterior = posterior.joined(part)
         _save(path, posterior, number + 1)
         _report(posterior, number + 1, len(sizes), begin, number + 2 - num_done)
@@ -120,7 +128,7 @@ def _load(path: Path, first: _Posterior, sizes: list[int]) -> tuple[_Posterior, 
         with np.load(path) as file:
             num_done = int(file["num_done"])
             saved = [jnp.asarray(file[_name(number)]) for number in range(len(leaves))]
-    except (KeyError, OSError, ValueError) as error:
+    except (KeyError, OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
             f"`checkpoint`: {str(path)!r} is not a file of such a run. Pass the path of a new file."
         ) from error
@@ -144,7 +152,8 @@ def _report(
     posterior: AbstractPosterior, num_done: int, num_parts: int, begin: float, num_run: int
 ) -> None:
     """Log R̂, the effective sample size and the remaining time."""
-    if not _LOGGER.isEnabledFor(logging.INFO):
+    too_few = posterior.theta.shape[-2] < _FEWEST_DRAWS
+    if too_few or not _LOGGER.isEnabledFor(logging.INFO):
         return
     remaining = (time.monotonic() - begin) / num_run * (num_parts - num_done)
     _LOGGER.info(

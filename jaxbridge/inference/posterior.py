@@ -142,8 +142,8 @@ class AbstractPosterior(AbstractResult):
     def step_uncertainty(self) -> Float[Array, " p"]:
         """Return the standard error of `step_error`, shape (p,).
 
-        For a state-dependent σ it is at least `step_error` itself. There the estimate from half as
-        many steps may be too large by a factor of two or three.
+        For a state-dependent σ it is at least `step_error` itself. For Euler steps the estimate
+        from half as many steps may be too large by a factor of two or three.
         """
         value, noise = self._step_error
         # The estimate may be too large by its own size.
@@ -288,7 +288,9 @@ class AbstractPosterior(AbstractResult):
         """Return the draws as ArviZ's `InferenceData` (`DataTree` since its version 1).
 
         The group `posterior` has the parameters, and `sample_stats` the other values of each draw,
-        for instance the acceptance of moves. This needs the package ArviZ.
+        for instance the acceptance of moves. There `log_likelihood` of `pmmh` has the name
+        `log_likelihood_estimate`, because it has no values for single observations. This needs the
+        package ArviZ.
 
         **Example:**
 
@@ -311,6 +313,8 @@ class AbstractPosterior(AbstractResult):
         names = [field.name for field in dataclasses.fields(self) if field.name not in others]
         stats = {name: getattr(self, name) for name in names}
         stats = {name: of_chains(value) for name, value in stats.items() if eqx.is_array(value)}
+        if "log_likelihood" in stats:  # a group of ArviZ, with a value for each observation
+            stats["log_likelihood_estimate"] = stats.pop("log_likelihood")
         groups = {"posterior": posterior, "sample_stats": stats}
         # Version 1 changed the arguments of `from_dict`.
         is_new = int(arviz.__version__.split(".")[0]) >= 1

@@ -1,5 +1,7 @@
 """Gibbs sampling of parameters and paths, given noisy or partial records.
 
+Exact observations are a record without noise. They belong here if σ is unknown.
+
 The state is (θ, path). Two moves alternate:
 
 - The path moves given θ.
@@ -61,7 +63,7 @@ from .warm_up import stages
 
 
 class RecordState(NamedTuple):
-    """State of a chain of `gibbs` with an `observation`. Several chains have a leading axis.
+    """State of a chain of `gibbs` for a record. Several chains have a leading axis.
 
     - `theta`: θ, shape (p,).
     - `paths`: knots of the paths of R records (`records.guided_record`).
@@ -85,7 +87,9 @@ class GuidedState(NamedTuple):
 
 
 class RecordPosterior(AbstractPosterior):
-    """Posterior draws of the unknown parameters, from `gibbs` with an `observation`.
+    """Posterior draws of the unknown parameters, from `gibbs` for a record.
+
+    A record has an `observation`, or exact observations and an unknown σ.
 
     Arrays have a leading axis of chains if there are several.
 

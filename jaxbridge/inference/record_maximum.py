@@ -425,10 +425,13 @@ def _step_error(
     """Estimate I⁻¹ ∇e, the discretisation error of the estimate, with its standard error."""
     if completion.num_steps == 1:
         return StepError(*2 * [jnp.full_like(draws.gradient[0, 0], jnp.nan)])
-    centred = draws.coarse - jnp.mean(draws.coarse, axis=(0, 1))
-    is_known = jnp.isfinite(draws.change)
+    # A lost coarse path has no gradient.
+    has_coarse = jnp.all(jnp.isfinite(draws.coarse), axis=-1)
+    coarse = jnp.where(has_coarse[..., None], draws.coarse, draws.gradient)
+    centred = coarse - jnp.mean(coarse, axis=(0, 1))
+    is_known = jnp.isfinite(draws.change) & has_coarse
     change = jnp.where(is_known, draws.change - jnp.mean(draws.change, where=is_known), 0)
-    errors = (draws.coarse - draws.gradient + change[..., None] * centred) @ covariance
+    errors = (coarse - draws.gradient + change[..., None] * centred) @ covariance
     errors = share_of_step_error(completion.fine.records) * errors
     size = effective_size_of_chains(errors)
     error = StepError(jnp.mean(errors, axis=(0, 1)), jnp.std(errors, axis=(0, 1)) / jnp.sqrt(size))

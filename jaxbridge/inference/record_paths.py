@@ -214,7 +214,7 @@ def check_no_bridges(sigma_is_unknown: bool = False, **arguments: Any) -> None:
 
 
 def check_no_record(**arguments: Any) -> None:
-    """Raise `ValueError` if an argument for records with an `observation` is not `None`."""
+    """Raise `ValueError` if an argument for records is not `None`."""
     names = [f"`{name}`" for name, value in arguments.items() if value is not None]
     if names:
         raise ValueError(

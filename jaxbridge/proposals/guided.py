@@ -61,8 +61,9 @@ from ..schemes import (
     log_halving_of_pair,
     most_accurate_density,
     num_looked,
+    num_splits,
+    remaining_after_splits,
     share_of_order,
-    splits_of_last_step,
 )
 from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
 from .memory_blocks import block_over_devices, in_blocks, masked
@@ -794,12 +795,11 @@ def _fractions(
     coarse = [*range(0, num_steps, 2)]
     if proposal.target.is_normal:
         return fractions, [*coarse, num_steps]
-    splits = fractions[-2] * splits_of_last_step(num_steps)
-    num_splits = len(splits)
+    splits = fractions[-2] * remaining_after_splits(num_splits(num_steps))
     # The last step of the coarse grid is about T / (N/2)², four times as long.
-    shared = range(num_steps - 1, num_steps - 1 + max(num_splits - 1, 0))
+    shared = range(num_steps - 1, num_steps - 1 + max(len(splits) - 1, 0))
     coarse = sorted({*coarse, *shared})
-    return np.concatenate([fractions[:-1], splits, [0.0]]), [*coarse, num_steps + num_splits]
+    return np.concatenate([fractions[:-1], splits, [0.0]]), [*coarse, num_steps + len(splits)]
 
 
 def _coarse_grid(

@@ -172,7 +172,7 @@ def innovations(
     - `density`: step density. By default `ItoTaylorDensity()` for constant σ. For a state-dependent
         σ the steps are of weak order 2 and quadratic in the noise, or `HypoellipticDensity()` if σ
         has fewer columns than rows. Quadratic steps to observations are split, so `size` is larger:
-        10 steps become 14. Paths have the points of the 10.
+        10 steps become 14, and 1 becomes 4. Paths have the points of the 10.
 
     **Returns:** `Innovations`, differentiable in parameters and noise. Its `why()` reports faults
     of the guide. There is a warning if the likelihood at ξ = 0 is zero.

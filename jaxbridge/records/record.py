@@ -25,10 +25,12 @@ from ..engine.checks import (
 )
 from ..engine.compiled import compiled_sooner
 from ..engine.times import Clock, Times, as_times, check_increasing
-from ..schemes import splits_of_last_step
+from ..schemes import num_splits, remaining_after_splits
 
 # Cost of the end of a segment (observation, resampling), in steps.
 _STEPS_PER_SEGMENT = 4
+# Smallest number of splits of a last step. Without splits a single step would be of first order.
+_FEWEST_SPLITS = 3
 
 
 class Steps(NamedTuple):
@@ -104,8 +106,9 @@ class Record(eqx.Module):
         The steps that end at observations are then short. If their law differs from that of the
         other steps, it hardly matters.
         """
-        splits = splits_of_last_step(self.num_steps)
-        parts = -np.diff([1.0, *splits, 0.0])
+        num = max(num_splits(self.num_steps), _FEWEST_SPLITS)
+        num += (self.num_steps + num) % 2  # pairs of `coarsened` then contain all steps
+        parts = -np.diff([1.0, *remaining_after_splits(num), 0.0])
         last = self.dt[:, -1:] * jnp.asarray(parts, self.dt.dtype)
         dt = jnp.concatenate([self.dt[:, :-1], last], axis=1)
         return dataclasses.replace(self, dt=dt, lengths=(*self.lengths[:-1], *parts.tolist()))

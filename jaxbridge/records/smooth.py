@@ -123,7 +123,8 @@ class Smoothed(AbstractResult):
 
         - one step;
         - Euler steps of a σ with fewer columns than rows;
-        - steps so long that the variance of D exceeds 1 in some interval;
+        - steps so long that the variance of D exceeds 1 in some interval (for steps of order 2: on
+            average), or that more than half of the coarse paths are lost;
         - steps longer than the relaxation time of the drift. Then the uncertainty is infinite.
         """
         return self._step_errors(fn)[0]

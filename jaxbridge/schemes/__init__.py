@@ -36,8 +36,9 @@ from .base import (
 from .coarse_grids import (
     error_of_grids as error_of_grids,
     num_coarse_grids as num_coarse_grids,
+    num_splits as num_splits,
+    remaining_after_splits as remaining_after_splits,
     share_of_grid as share_of_grid,
-    splits_of_last_step as splits_of_last_step,
 )
 from .euler import Euler as Euler
 from .fit import check_model as check_model

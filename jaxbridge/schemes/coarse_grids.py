@@ -32,13 +32,18 @@ from .step_error import StepError
 _LEAST_UNCERTAINTY = 0.25
 
 
-def splits_of_last_step(num_steps: int) -> Float[np.ndarray, " splits"]:
-    """Return the remaining fractions ½, ¼, ..., 2^-k of the last of N steps after its splits.
+def num_splits(num_steps: int) -> int:
+    """Return k = ⌈log₂ N⌉, the number of splits of the last of N steps.
 
-    A last step of another law adds an error of the square of its length. With k = ⌈log₂ N⌉ it has
+    A last step of another law adds an error of the square of its length. After k splits it has
     about 1/N of the length of the others.
     """
-    return 0.5 ** np.arange(1, math.ceil(math.log2(num_steps)) + 1)
+    return math.ceil(math.log2(num_steps))
+
+
+def remaining_after_splits(num: int) -> Float[np.ndarray, " num"]:
+    """Return the remaining fractions ½, ¼, ..., 2^-k of a step after each of k splits."""
+    return 0.5 ** np.arange(1, num + 1)
 
 
 def steps_of_grid(lengths: Sequence[float], level: int) -> list[float]:

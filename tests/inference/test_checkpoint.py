@@ -71,7 +71,10 @@ def test_an_interrupted_run_goes_on_to_the_same_draws(name, tmp_path, monkeypatc
     go_on()
     with caplog.at_level("INFO", "jaxbridge"):
         resumed = run(name, tmp_path / "part.npz")
-    assert "part 4 of 9" in caplog.messages[0] and "part 9 of 9" in caplog.messages[-1]
+        assert "part 4 of 9" in caplog.messages[0] and "part 9 of 9" in caplog.messages[-1]
+        (tmp_path / "new.npz").unlink(missing_ok=True)
+        run(name, tmp_path / "new.npz")  # whose first part has too few draws for R̂
+        (tmp_path / "new.npz").unlink()
     assert_equal(resumed, whole)
     assert_equal(run(name, tmp_path / "part.npz"), whole)  # nothing is left to do
     assert sorted(file.name for file in tmp_path.iterdir()) == ["part.npz", "whole.npz"]
@@ -84,8 +87,12 @@ def test_a_file_of_another_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match="does not begin with the draws of this call"):
         run("record", tmp_path / "run.npz", MODEL.with_params(1.5))
     (tmp_path / "text.npz").write_text("no arrays")
-    with pytest.raises(ValueError, match="is not a file of such a run"):
-        run("record", tmp_path / "text.npz")
+    (tmp_path / "empty.npz").write_text("")
+    whole = (tmp_path / "run.npz").read_bytes()
+    (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
+    for name in ("text", "empty", "half"):
+        with pytest.raises(ValueError, match="is not a file of such a run"):
+            run("record", tmp_path / f"{name}.npz")
 
 
 def test_paths_that_cannot_be_files_are_refused(tmp_path):
@@ -94,6 +101,8 @@ def test_paths_that_cannot_be_files_are_refused(tmp_path):
     for path in (tmp_path, tmp_path / "none" / "run.npz"):
         with pytest.raises(ValueError, match="a file in an existing folder"):
             run("record", path)
+    with pytest.raises(ValueError, match="`num_iterations` must be"):
+        run("record", tmp_path / "run.npz", num_iterations=0)
     with pytest.raises(ValueError, match="outside `jit`"):
         sample = lambda values: jb.gibbs(
             KEY, line(), TIMES, values, **COMMON, checkpoint=tmp_path / "run.npz"

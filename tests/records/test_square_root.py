@@ -116,21 +116,21 @@ def noise_by_hand(x, x_next, dt, is_last):
 
 
 def test_weight_is_the_density_of_a_path_by_hand(x64):
-    """N(z; 0, I) / N(ζ; 0, I) / det ℛ times g(y| x'): two steps, whose last is split once, so that
-    two are quadratic in their noise z and the last one is not."""
+    """N(z; 0, I) / N(ζ; 0, I) / det ℛ times g(y| x'): of one step, which is split three times, so
+    that three are quadratic in their noise z and the last one is not."""
     gap, sd, eps = 0.3, 0.2, 1e-5
-    positional, options = arguments(np.array([0.7]), gap, sd, 2)
+    positional, options = arguments(np.array([0.7]), gap, sd, 1)
     paths = jb.innovations(*positional, **options)
-    zeta = np.array([0.4, -0.8, 0.5, 0.3])  # of the fixed start, and of the steps
+    zeta = np.array([0.4, -0.8, 0.5, 0.3, -0.2])  # of the fixed start, and of the steps
     run = lambda zeta: paths._run(positional[0].params, jnp.array(zeta))[0]
-    path_of = lambda zeta: np.asarray(run(zeta))[:, 0]  # with the point at the split
-    assert len(paths.times) == len(paths.path(positional[0].params, jnp.array(zeta))) == 3
-    path, lengths = path_of(zeta), gap * np.array([0.5, 0.25, 0.25])
+    path_of = lambda zeta: np.asarray(run(zeta))[:, 0]  # with the points of the splits
+    assert len(paths.times) == len(paths.path(positional[0].params, jnp.array(zeta))) == 2
+    path, lengths = path_of(zeta), gap * np.array([0.5, 0.25, 0.125, 0.125])
     log_weight = norm.logpdf(0.7, path[-1], sd)
     for i, dt in enumerate(lengths):
-        nudged = path_of(zeta + eps * np.eye(4)[i + 1])
+        nudged = path_of(zeta + eps * np.eye(5)[i + 1])
         ends = path[i + 1], nudged[i + 1]
-        here, there = (noise_by_hand(path[i], end, dt, i == 2) for end in ends)
+        here, there = (noise_by_hand(path[i], end, dt, i == 3) for end in ends)
         z, slope = min(
             ((z, (w - z) / eps) for z, w in zip(here, there, strict=True)),
             key=lambda pair: abs(pair[0]),
@@ -186,7 +186,7 @@ def test_smoothed_states_are_of_second_order(gap, sd, num_steps):
     told, doubt = (at(value) / deviation for value in (made.step_error(), made.step_uncertainty()))
     assert made.trustworthy
     assert np.all(np.abs(off) < 5 * noise + 2 * np.abs(told) + 0.01)
-    assert np.all(np.abs(told) < 0.05) and np.all(doubt < 0.07)
+    assert np.all(np.abs(told) < 0.1) and np.all(doubt < 0.1)
     rms = lambda value: np.sqrt(np.mean(value**2))
     assert rms(off) < 0.02 + 1.5 * rms(noise)
     if sd > 0.1:  # Euler steps are not good enough

@@ -131,13 +131,13 @@ def test_smoothed_paths_tell_it(num_steps):
             np.testing.assert_array_less(np.abs(told - change), allowance)
 
 
-def smoothed_of_steps(num_steps):
+def smoothed_of_steps(num_steps, density=None):
     """Paths of a model whose σ varies."""
     varying = jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + 0.3 * jnp.sin(x))
     return jb.smooth(
         jax.random.key(0), varying, [0.0, 0.5], [[0.3], [0.1]], num_steps=num_steps,
         observation=jb.LinearGaussian(covariance=0.1), initial=[0.3],
-        num_draws=6, num_warmup=0, num_chains=2,
+        num_draws=6, num_warmup=0, num_chains=2, density=density,
     )  # fmt: skip
 
 
@@ -150,7 +150,9 @@ def test_where_sigma_varies_all_of_the_step_error_is_in_doubt():
 
 @pytest.mark.slow
 def test_of_smoothed_paths_of_one_step_nothing_is_known():
-    made = smoothed_of_steps(1)
+    """But a step of second order is split."""
+    assert np.isfinite(smoothed_of_steps(1).step_error()).all()
+    made = smoothed_of_steps(1, jb.EulerDensity())
     assert np.isnan(made.step_error()).all() and np.isnan(made.step_uncertainty()).all()
 
 
