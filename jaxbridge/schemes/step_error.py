@@ -284,7 +284,7 @@ def guessed(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
 
 
 def share_in_regime(
-    share: Float[Array, "*I"], model: Diffusion, intervals: Intervals, num_steps: float
+    share: Float[Array, "*I"], model: Diffusion, intervals: Intervals, num_steps: int | float
 ) -> Float[Array, "*I"]:
     """Return the share, infinite if a step is longer than the relaxation time at either end.
 
