@@ -19,7 +19,7 @@ from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
 from ..engine.verdict import AbstractResult, Fault, Verdict
-from ..schemes import StepError, dominates, step_faults, unknown_where
+from ..schemes import LEAST_UNCERTAINTY, StepError, dominates, step_faults, unknown_where
 from .parameters import Parameters, init_vectors, of_rows
 from .summary import PosteriorSummary
 
@@ -142,12 +142,13 @@ class AbstractPosterior(AbstractResult):
     def step_uncertainty(self) -> Float[Array, " p"]:
         """Return the standard error of `step_error`, shape (p,).
 
-        For a state-dependent σ it is at least `step_error` itself. For Euler steps the estimate
-        from half as many steps may be too large by a factor of two or three.
+        It is at least a quarter of `step_error`, because only the leading term is estimated. For a
+        state-dependent σ it is at least `step_error` itself: for Euler steps the estimate from half
+        as many steps may be too large by a factor of two or three.
         """
         value, noise = self._step_error
-        # The estimate may be too large by its own size.
-        return jnp.hypot(noise, value) if self.sigma_varies else noise
+        # The estimate may be too large by its own size, or omits terms of higher order.
+        return jnp.hypot(noise, (1 if self.sigma_varies else LEAST_UNCERTAINTY) * value)
 
     @property
     def standard_error(self) -> Float[Array, " p"]:

@@ -34,6 +34,7 @@ from .base import (
     steps_in_lanes as steps_in_lanes,
 )
 from .coarse_grids import (
+    LEAST_UNCERTAINTY as LEAST_UNCERTAINTY,
     error_of_grids as error_of_grids,
     num_coarse_grids as num_coarse_grids,
     num_splits as num_splits,

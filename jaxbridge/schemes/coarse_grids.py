@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from .step_error import StepError
 
 # Least uncertainty, as a share of the estimated error, even if the three grids agree.
-_LEAST_UNCERTAINTY = 0.25
+LEAST_UNCERTAINTY = 0.25
 
 
 def num_splits(num_steps: int) -> int:
@@ -107,7 +107,7 @@ def error_of_grids(
         size > 0, excess * size / jnp.where(shrinking > 0, shrinking, 1), excess / ratio
     )
     omitted = jnp.where((shrinking > 0) | (size == 0), share * omitted, jnp.inf)
-    uncertainty = jnp.hypot(share * noise, jnp.hypot(omitted, _LEAST_UNCERTAINTY * estimate))
+    uncertainty = jnp.hypot(share * noise, jnp.hypot(omitted, LEAST_UNCERTAINTY * estimate))
     return StepError(estimate, _finite(uncertainty))
 
 
