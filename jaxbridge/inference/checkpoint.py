@@ -125,9 +125,10 @@ def _load(path: Path, first: _Posterior, sizes: list[int]) -> tuple[_Posterior, 
     arrays, others = eqx.partition(first, eqx.is_array)
     leaves, treedef = jax.tree.flatten(arrays)
     try:
-        with np.load(path) as file:
-            num_done = int(file["num_done"])
-            saved = [jnp.asarray(file[_name(number)]) for number in range(len(leaves))]
+        # NumPy does not close a damaged file that it opened itself.
+        with path.open("rb") as file, np.load(file) as arrays_in_file:
+            num_done = int(arrays_in_file["num_done"])
+            saved = [jnp.asarray(arrays_in_file[_name(i)]) for i in range(len(leaves))]
     except (KeyError, OSError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(
             f"`checkpoint`: {str(path)!r} is not a file of such a run. Pass the path of a new file."
