@@ -45,12 +45,12 @@ def resumable(sample: Callable[_Arguments, _Posterior]) -> Callable[_Arguments, 
             return sample(*args, **kwargs)
         call = inspect.signature(sample).bind(*args, **kwargs)
         call.apply_defaults()
-        return _run_in_parts(sample, call.arguments, _checked(checkpoint, call.arguments))
+        return _run_in_parts(sample, call.arguments, _as_path(checkpoint, call.arguments))
 
     return entered
 
 
-def _checked(checkpoint: Any, arguments: dict[str, Any]) -> Path:
+def _as_path(checkpoint: Any, arguments: dict[str, Any]) -> Path:
     """Return the path of the file, or raise for arguments with which no file can be written."""
     if not isinstance(checkpoint, str | os.PathLike):
         raise TypeError(
@@ -82,14 +82,13 @@ def _run_in_parts(
     else:
         _save(path, posterior, num_done)
     _report(posterior, num_done, len(sizes), begin, 1)
-    follow = posterior.continuation
+    continuation = posterior.continuation
     if getattr(posterior.state, "proposals", ()) and arguments["proposal"] == "auto":
         # The proposals of the state were chosen with these budgets, and keep them.
-        follow |= {"num_counts": None, "max_trials": None}
+        continuation |= {"num_counts": None, "max_trials": None}
     for number in range(num_done, len(sizes)):
-        follow |= {"init": posterior.state, "num_iterations": sizes[number]}
-        part = call(**arguments | follow)
-        posterior = posterior.joined(part)
+        continuation |= {"init": posterior.state, "num_iterations": sizes[number]}
+        posterior = posterior.joined(call(**arguments | continuation))
         _save(path, posterior, number + 1)
         _report(posterior, number + 1, len(sizes), begin, number + 2 - num_done)
     return posterior

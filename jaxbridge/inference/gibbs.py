@@ -26,8 +26,7 @@ from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
 from ..proposals import Budget
-from ..records import Initial, Observation, as_record_problems
-from ..records.observation import LinearGaussian
+from ..records import Initial, LinearGaussian, Observation, as_record_problems
 from .augmentation import Augmentation, augment
 from .checkpoint import resumable
 from .data import as_problem
@@ -42,7 +41,7 @@ from .parameter_walk import first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
-    Summary,
+    Combination,
     check_covariance_is_used,
     first_chain,
     first_states,
@@ -130,7 +129,7 @@ class GibbsPosterior(AbstractPosterior):
     completion: Augmentation
     exact_parameters: bool = eqx.field(static=True)
 
-    _summaries: ClassVar[dict[str, Summary]] = {
+    _combinations: ClassVar[dict[str, Combination]] = {
         "state": last,
         "completion": last,
         "exact_parameters": last,
@@ -271,7 +270,7 @@ def gibbs(
         if problem.sigma_is_unknown:
             # Given its complete path σ cannot move, but given its noise it can.
             check_no_bridges(sigma_is_unknown=True, **for_bridges)
-            observation, initial = LinearGaussian(covariance=0.0), _any_start(problem.intervals)
+            observation, initial = LinearGaussian(covariance=0.0), _wide_law(problem.intervals)
     if observation is not None:
         options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
         records = as_record_problems(model, times, observations, observation, initial, **options)
@@ -306,8 +305,11 @@ def gibbs(
     return _run(run_key, sampler, state, num_iterations, thin, progress_meter)
 
 
-def _any_start(intervals: Intervals) -> GaussianLaw:
-    """Return a law of x_0, which is observed exactly: its density there is only a constant."""
+def _wide_law(intervals: Intervals) -> GaussianLaw:
+    """Return a normal law that covers all observations, as `initial` of exact records.
+
+    x_0 is observed exactly, so the law adds a constant to the log-likelihood.
+    """
     points = intervals.start
     variance = jnp.var(points, axis=0)
     spread = jnp.where(variance > 0, variance, 1 + points[0] ** 2)

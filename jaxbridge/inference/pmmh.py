@@ -52,7 +52,7 @@ from .parameter_walk import adapt_covariance, first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
 from .posterior import (
     AbstractPosterior,
-    Summary,
+    Combination,
     average,
     check_covariance_is_used,
     check_likelihood_was_found,
@@ -174,7 +174,7 @@ class PMMHPosterior(AbstractPosterior):
     guide: GuideCheck | None = None
     share_lost: Float[Array, "*chains"] | None = None
 
-    _summaries: ClassVar[dict[str, Summary]] = {
+    _combinations: ClassVar[dict[str, Combination]] = {
         "log_likelihood_variance": average,
         "variance_in_part": average,
         "num_without_estimate": total,

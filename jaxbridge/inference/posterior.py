@@ -53,8 +53,8 @@ _STUCK = (
 )
 
 
-# A function of the values of two parts of a run, and of the share of the second one in the draws.
-Summary = Callable[[Any, Any, float], Any]
+# Combines the values of two parts of a run; the number is the fraction of draws in the second part.
+Combination = Callable[[Any, Any, float], Any]
 _Posterior = TypeVar("_Posterior", bound="AbstractPosterior")
 
 
@@ -68,8 +68,8 @@ class AbstractPosterior(AbstractResult):
     sigma_varies: eqx.AbstractVar[bool]
 
     state: eqx.AbstractVar[Any]
-    # Fields without a value for each draw, and how two parts of a run combine them (`joined`).
-    _summaries: ClassVar[dict[str, Summary]]
+    # Fields without a value for each draw, with the functions by which `joined` combines them.
+    _combinations: ClassVar[dict[str, Combination]]
     # Arguments, beside `init`, of a call that continues the draws.
     _continued_with: ClassVar[dict[str, Any]]
 
@@ -231,9 +231,9 @@ class AbstractPosterior(AbstractResult):
         fields = {}
         for field in dataclasses.fields(self):
             parts = getattr(self, field.name), getattr(later, field.name)
-            of_both = self._summaries.get(field.name)
+            combine = self._combinations.get(field.name)
             fields[field.name] = (
-                jax.tree.map(joined, *parts) if of_both is None else of_both(*parts, share)
+                jax.tree.map(joined, *parts) if combine is None else combine(*parts, share)
             )
         return type(self)(**fields)
 
@@ -310,7 +310,7 @@ class AbstractPosterior(AbstractResult):
             for path, leaf in leaves
             if eqx.is_array(leaf)
         }
-        others = ("params", "theta", *self._summaries)
+        others = ("params", "theta", *self._combinations)
         names = [field.name for field in dataclasses.fields(self) if field.name not in others]
         stats = {name: getattr(self, name) for name in names}
         stats = {name: of_chains(value) for name, value in stats.items() if eqx.is_array(value)}
@@ -335,7 +335,10 @@ def total(first: Any, second: Any, share: float) -> Any:
 
 
 def average(first: Any, second: Any, share: float) -> Any:
-    """Return the mean over both parts of a run; `share` is that of the second one in the draws."""
+    """Return the mean over both parts of a run.
+
+    `share` is the fraction of draws in the second part. `None` stays `None`.
+    """
     return None if first is None else (1 - share) * first + share * second
 
 

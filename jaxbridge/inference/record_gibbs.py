@@ -39,7 +39,7 @@ from .parameter_walk import adapt_covariance
 from .parameters import Parameters
 from .posterior import (
     AbstractPosterior,
-    Summary,
+    Combination,
     check_likelihood_was_found,
     first_chain,
     last,
@@ -121,7 +121,7 @@ class RecordPosterior(AbstractPosterior):
     state: RecordState
     guide: GuideCheck | None = None
 
-    _summaries: ClassVar[dict[str, Summary]] = {
+    _combinations: ClassVar[dict[str, Combination]] = {
         "stuck": lambda first, second, share: first & second,
         "state": last,
         "guide": last,

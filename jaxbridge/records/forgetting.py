@@ -70,7 +70,7 @@ def rates_for(records: Records) -> Float[Array, " rates"]:
 
 def half_will_do(records: Records) -> bool:
     """Return whether pilot runs may use half as many steps."""
-    return sum(records.stacked.record.lengths) > _FEW_STEPS
+    return records.stacked.record.num_equal_steps > _FEW_STEPS
 
 
 def undecided(dtype) -> RateChoice:

@@ -67,6 +67,11 @@ class Record(eqx.Module):
         return self.dt.shape[-1]
 
     @property
+    def num_equal_steps(self) -> int:
+        """Return the number of steps per segment before splits of the last one."""
+        return round(sum(self.lengths))
+
+    @property
     def durations(self) -> Float[Array, " K"]:
         """Return the lengths of the segments, as sums of steps.
 
@@ -87,8 +92,7 @@ class Record(eqx.Module):
     def stored(self) -> Int[np.ndarray, " points"]:
         """Return the indices of the points that users see, without those of split steps."""
         K, N = self.dt.shape
-        num_equal = round(sum(self.lengths))
-        begins = np.arange(K)[:, None] * N + np.arange(num_equal)
+        begins = np.arange(K)[:, None] * N + np.arange(self.num_equal_steps)
         return np.append(begins.ravel(), K * N)
 
     def steps(self) -> Steps:

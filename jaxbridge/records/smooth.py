@@ -226,7 +226,7 @@ class Smoothed(AbstractResult):
         change = jnp.where(is_reliable, change, jnp.nan)
         varies = _noise_varies(problem, self.paths[0, 0])
         step_errors = [
-            _error_from_halving(*both, change, share, varies)
+            _step_error_of_mean(*both, change, share, varies)
             for both in zip(leaves, coarse_leaves, strict=True)
         ]
         mean = jnp.mean(self.paths if self._knots is None else self._knots, axis=(0, 1))
@@ -501,7 +501,7 @@ def _log_halving(
     return jnp.moveaxis(lax.map(of_draw, jnp.moveaxis(paths, 1, 0)), 0, 1)
 
 
-def _error_from_halving(
+def _step_error_of_mean(
     values: Float[Array, "chains n ..."],
     coarse_values: Float[Array, "chains n ..."],
     change: Float[Array, "chains n"],

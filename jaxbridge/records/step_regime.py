@@ -20,8 +20,8 @@ def steps_are_too_long(
     if model.depends_on_time:
         return jnp.zeros((), bool)
     ends, durations = path[:: problem.num_steps], problem.record.durations
-    intervals, lengths = Intervals(ends[:-1], ends[1:], durations), problem.record.lengths
-    num_longest = sum(lengths) / max(lengths)
+    intervals, record = Intervals(ends[:-1], ends[1:], durations), problem.record
+    num_longest = record.num_equal_steps / max(record.lengths)
     share = share_in_regime(jnp.ones_like(durations), model, intervals, num_longest)
     moving = durations > 0  # segments of length zero lie beyond the record
     number = jnp.maximum(jnp.sum(moving), 1).astype(durations.dtype)
