@@ -77,15 +77,17 @@ def _over_short_time(A, V, t) -> tuple[Float[Array, ""], LinearTransition]:
     doublings = jnp.ceil(jnp.log2(jnp.maximum(lax.stop_gradient(t) * rate / _MAX_SERIES_NORM, 1)))
     doublings = jnp.minimum(doublings, _MAX_DOUBLINGS)  # the loop ends for infinite rates too
     s = t / 2**doublings
-    term, covariance_term = s * identity, s * V
-    integral, covariance = term, covariance_term
+
     # Term j of M_s is s^j A^{j-1} / j!. As Γ' = V + A Γ + Γ Aᵀ, term j of Γ_s follows from
     # term j - 1.
-    for j in range(2, _NUM_TERMS + 1):
-        term = s / j * _product(A, term)
-        product = _product(A, covariance_term)
-        covariance_term = s / j * (product + product.T)
-        integral, covariance = integral + term, covariance + covariance_term
+    def add_term(j, terms_and_sums):
+        (term, covariance_term), (integral, covariance) = terms_and_sums
+        factor, product = s / j.astype(A.dtype), _product(A, covariance_term)
+        term, covariance_term = factor * _product(A, term), factor * (product + product.T)
+        return (term, covariance_term), (integral + term, covariance + covariance_term)
+
+    first = s * identity, s * V
+    _, (integral, covariance) = lax.fori_loop(2, _NUM_TERMS + 1, add_term, (first, first))
     decay = identity + _product(A, integral)
     return doublings, LinearTransition(decay, integral, covariance)
 

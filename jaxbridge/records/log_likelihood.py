@@ -270,6 +270,8 @@ def log_likelihood(
     records = as_record_problems(*arguments, num_steps=num_steps, **options)
     size = num_filters, num_particles
     levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
+    if records.stacked.density.is_exact:
+        levels = ()
     grids = [records, *map(records.coarsened, levels)]
     guides, checks = zip(*map(_guides_and_checks, grids), strict=True)
     filtered, rate = _run_stages(key, grids, list(guides), *size)

@@ -23,6 +23,7 @@ from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
 from ..models.sigma import columns_of
+from ..proposals import AbstractProposal, as_proposal
 from ..schemes import (
     AbstractStepDensity,
     StepError,
@@ -32,6 +33,7 @@ from ..schemes import (
     share_of_grid,
     share_of_order,
     step_faults,
+    step_law_of,
     unknown_where,
 )
 from .guide_search import GuideCheck, Linearised, linearised
@@ -206,6 +208,9 @@ class Smoothed(AbstractResult):
     def _step_errors(self, fn: PathFunction) -> tuple[PyTree, PyTree]:
         """Estimate the discretisation bias of `mean(fn)` and its uncertainty."""
         values, problem = self._values(fn), self._problem
+        if problem.density.is_exact:
+            zeros = jax.tree.map(lambda leaf: jnp.zeros_like(leaf[0, 0]), values)
+            return zeros, zeros
         leaves, treedef = jax.tree.flatten(values)
         if self._knots is None:
             D, coarse_leaves = _log_halving(problem, self.paths), leaves
@@ -319,6 +324,9 @@ def smooth(
         normal_steps=proposal is not None,  # step errors of bridges need densities of the steps
         **options,
     )
+    if proposal is not None:
+        proposal = as_proposal(proposal, model, problem.like)
+        problem = dataclasses.replace(problem, density=_least_accurate(problem, proposal))
     num_proposals = check_count("num_proposals", 10 if num_proposals is None else num_proposals)
     linearisation = linearised(problem, model)
     if proposal is None:
@@ -337,6 +345,22 @@ def smooth(
     problem = dataclasses.replace(problem, record=draws.record)
     smoothed = Smoothed(times, paths, *diagnostics, problem, knots, linearisation.check)
     return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
+
+
+def _least_accurate(problem: RecordProblem, proposal: AbstractProposal) -> AbstractStepDensity:
+    """Return the step density of the lowest order, which step errors of these paths need.
+
+    The candidates are that of the problem and those of all bridges that may be used.
+    """
+
+    def of_single(single):
+        coupling = single.by_coupling
+        if coupling is None:
+            return single.target
+        return step_law_of(coupling.scheme, problem.model.forward(problem.like))[0]
+
+    densities = (problem.density, *map(of_single, proposal.singles))
+    return min(filter(None, densities), key=lambda density: density.order)
 
 
 @compiled_sooner

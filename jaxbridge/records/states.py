@@ -47,7 +47,6 @@ from ..proposals import (
     AbstractProposal,
     AbstractWeightedProposal,
     Choice,
-    as_proposal,
     best_at_worst,
     resolve,
 )
@@ -243,7 +242,7 @@ class Draws(NamedTuple):
 def sample_states(
     key: Key[Array, ""],
     problem: RecordProblem,
-    proposal: Any,
+    proposal: AbstractProposal,
     guided: Float[Array, "C points d"],
     counts: tuple[int, int, int],
     progress_meter: diffrax.AbstractProgressMeter | None,
@@ -257,7 +256,6 @@ def sample_states(
     """
     model, K = problem.model, problem.num_segments
     scalars = problem.scalars(model)
-    proposal = as_proposal(proposal, model, problem.like)
     _check_proposal(proposal, problem, scalars)
     first = guided[:, :: problem.num_steps]
     durations = problem.record.durations

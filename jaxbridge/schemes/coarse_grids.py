@@ -61,11 +61,14 @@ def num_coarse_grids(num_steps: int) -> int:
     return min(num_steps - 1, 2)
 
 
-def share_of_grid(order: int, lengths: Sequence[float]) -> float:
+def share_of_grid(order: float, lengths: Sequence[float]) -> float:
     """Return s, the discretisation error relative to the change on a grid of half as many steps.
 
-    `lengths` are those of the steps, in any unit. A single step has no coarser grid: NaN.
+    `lengths` are those of the steps, in any unit. A single step has no coarser grid: NaN. For an
+    infinite order there is no error.
     """
+    if math.isinf(order):
+        return 0.0
     if len(lengths) == 1:
         return math.nan
     fine, coarse, _ = _sums(order, lengths)
@@ -75,14 +78,17 @@ def share_of_grid(order: int, lengths: Sequence[float]) -> float:
 def error_of_grids(
     values: Float[Array, " grids"],
     errors: Float[Array, " grids"],
-    order: int,
+    order: float,
     lengths: Sequence[float],
 ) -> StepError:
     """Return the step error of `values[0]`, from values on successively coarser grids.
 
     `errors` are the Monte Carlo standard errors of the values, `lengths` the lengths of the steps
-    in any unit. For N = 1 there are no coarser grids, and the result is NaN.
+    in any unit. For N = 1 there are no coarser grids, and the result is NaN. For an infinite order
+    the error is zero.
     """
+    if math.isinf(order):
+        return StepError(*2 * [jnp.zeros_like(values[0])])
     if len(lengths) == 1:
         return StepError(*2 * [jnp.full_like(values[0], jnp.nan)])
     share = share_of_grid(order, lengths)
@@ -116,7 +122,7 @@ def _finite(uncertainty: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(jnp.isnan(uncertainty), jnp.inf, uncertainty)
 
 
-def _sums(order: int, lengths: Sequence[float]) -> list[float]:
+def _sums(order: float, lengths: Sequence[float]) -> list[float]:
     """Return S of the three grids."""
     grids = [steps_of_grid(lengths, level) for level in range(3)]
     return [float(sum(k ** (order + 1) for k in grid)) for grid in grids]

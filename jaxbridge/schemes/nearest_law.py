@@ -5,7 +5,7 @@ from .base import AbstractScheme
 from .gaussian_transition import GaussianTransition
 from .heun import Heun
 from .heun_or_euler import scheme_for
-from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity
+from .step_density import AbstractStepDensity, EulerDensity, ItoTaylorDensity, LinearDensity
 from .step_error import UNKNOWN_SHARE, share_of_order
 
 
@@ -21,7 +21,7 @@ def step_law_of(scheme: AbstractScheme, dynamics: Dynamics) -> tuple[AbstractSte
     """
     scheme = scheme_for(scheme, dynamics)
     if isinstance(scheme, GaussianTransition):
-        return EulerDensity(), 0.0  # no discretisation error
+        return LinearDensity(), 0.0
     if isinstance(scheme, Heun) and not dynamics.sigma_varies:
         return ItoTaylorDensity(), share_of_order(ItoTaylorDensity.order)
     if dynamics.sigma_varies:

@@ -35,9 +35,13 @@ coordinates without direct noise. In this case the second derivatives of σ that
 too. The code replaces l_k by l_k / √(1 + δ² |l_k|² / |σ_k|²), which has the same order of accuracy.
 Then σ + δl is nonzero wherever σ is.
 
+*Linear drift and constant σ*. The transition is normal and known in closed form (`models.linear`).
+`LinearDensity` is this law, so there is no discretisation error.
+
 Time-dependent coefficients are evaluated in the middle of a step, which preserves both orders.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -49,10 +53,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..engine.lanes import compute_once
-from ..engine.linalg import matmul, semidefinite_factor, sum_first_axis
+from ..engine.linalg import (
+    matmul,
+    matvec,
+    semidefinite_cholesky,
+    semidefinite_factor,
+    sum_first_axis,
+)
 from ..models import decisions
 from ..models.diffusion import Diffusion
-from ..models.dynamics import Dynamics
+from ..models.dynamics import Dynamics, is_linear
+from ..models.linear import linear_transition
 from ..models.sigma import columns_of, covariance_of
 from .step_law import DegenerateLaw, StepLaw, root_of_length
 
@@ -86,12 +97,18 @@ class AbstractStepDensity(eqx.Module):
 
     Class attributes:
 
-    - `order`: p in the error O(δ^p) along a path, in the mean over paths.
+    - `order`: p in the error O(δ^p) along a path, in the mean over paths; infinite if there is no
+        error.
     - `is_normal`: whether a step is normal, or else a map of normal noise (`StepLaw.bent`).
     """
 
-    order: ClassVar[int]
+    order: ClassVar[float]
     is_normal: ClassVar[bool] = True
+
+    @property
+    def is_exact(self) -> bool:
+        """Return whether there is no discretisation error."""
+        return math.isinf(self.order)
 
     @property
     def usual_order(self) -> float:
@@ -131,7 +148,7 @@ class EulerDensity(AbstractStepDensity):
     ```
     """
 
-    order: ClassVar[int] = 1
+    order: ClassVar[float] = 1
 
     def steps_from(self, dynamics, x):
         drift, sigma, d = dynamics.drift(x), dynamics.sigma(x).root(), x.shape[0]
@@ -171,7 +188,7 @@ class ItoTaylorDensity(AbstractStepDensity):
     ```
     """
 
-    order: ClassVar[int] = 2
+    order: ClassVar[float] = 2
 
     def steps_from(self, dynamics, x):
         if dynamics.sigma_varies:
@@ -231,7 +248,7 @@ class HypoellipticDensity(AbstractStepDensity):
     ```
     """
 
-    order: ClassVar[int] = 1
+    order: ClassVar[float] = 1
 
     def steps_from(self, dynamics, x):
         if dynamics.sigma(x).invertible:
@@ -274,7 +291,7 @@ class QuadraticDensity(AbstractStepDensity):
     lost; `EulerDensity` needs no derivatives.
     """
 
-    order: ClassVar[int] = 2
+    order: ClassVar[float] = 2
     is_normal: ClassVar[bool] = False
 
     def steps_from(self, dynamics, x):
@@ -315,6 +332,43 @@ class QuadraticDensity(AbstractStepDensity):
         return _linear_ito_taylor(F, V, dt)
 
 
+class LinearDensity(AbstractStepDensity):
+    """Transition density of a linear diffusion, α(x) = α(0) + F x with constant σ:
+
+        x' ~ N(x + M_δ α(x), Γ_δ),    M_δ = ∫_0^δ e^{sF} ds,    Γ_δ = ∫_0^δ e^{sF} V e^{sFᵀ} ds.
+
+    There is no discretisation error, whatever the step size and however fast the drift. σ may have
+    fewer columns than rows. Only `most_accurate_density` chooses it, for models that are linear.
+    """
+
+    order: ClassVar[float] = math.inf
+
+    def steps_from(self, dynamics, x):
+        d, sigma, drift = x.shape[0], dynamics.sigma(x), dynamics.drift(x)
+        F, V = jax.jacfwd(dynamics.drift)(x), covariance_of(sigma, x)
+        columns = jax.vmap(sigma.solve, in_axes=1, out_axes=1)  # σ⁻¹ X
+
+        def law(dt):
+            moving = dt > 0
+            dt_moving = jnp.where(moving, dt, 1)  # avoids 0 / 0
+            transition = linear_transition(F, V, dt_moving)
+            mean = jnp.where(moving, x + matvec(transition.integral, drift), x)
+            if not sigma.invertible:
+                root = semidefinite_cholesky(transition.covariance)
+                return DegenerateLaw(mean, jnp.where(moving, root, 0), dt)
+            S = columns(columns(transition.covariance / dt_moving).T)
+            return StepLaw(mean, sigma, S, dt)
+
+        def decay(dt):
+            e = linear_transition(F, V, dt).decay
+            return columns(matmul(e, sigma.as_matrix(d, x.dtype))) if sigma.invertible else e
+
+        return StepsFrom(law, decay)
+
+    def linear_step(self, F, V, dt):
+        return LinearStep(*linear_transition(F, V, dt))
+
+
 def _linear_ito_taylor(F, V, dt) -> LinearStep:
     """Return the step of the Itô–Taylor expansion for a linear drift."""
     identity = jnp.eye(F.shape[0], dtype=F.dtype)
@@ -345,6 +399,8 @@ def most_accurate_density(
     `normal_steps` states that paths must determine their noise, so that steps must be normal.
     """
     sigma_varies, invertible = model.sigma_varies(like), model.sigma_is_invertible(like)
+    if not model.depends_on_time and is_linear(model.forward(like), like):
+        return LinearDensity()
     if not sigma_varies:
         return ItoTaylorDensity()
     if not invertible:

@@ -127,7 +127,7 @@ def test_exact_transitions_have_none():
 def test_of_one_step_nothing_is_known():
     estimate = jb.transition_log_density(
         jax.random.key(0), jb.ornstein_uhlenbeck(PAPER_B), FROM, TO, 0.1, num_proposals=100,
-        num_steps=1, proposal=jb.Guided(),
+        num_steps=1, proposal=jb.Guided(density=jb.ItoTaylorDensity()),
     )  # fmt: skip
     assert np.isnan(estimate.step_error) and np.isnan(estimate.step_uncertainty)
     assert estimate.step_error_dominates and not estimate.trustworthy
@@ -281,7 +281,8 @@ def test_steps_may_be_too_long_at_one_end_only():
 def test_of_steps_beyond_the_relaxation_time_nothing_is_known(method):
     """Of four relaxation times the error is -32, and half as many steps change next to nothing."""
     model, ends, num_steps = jb.ornstein_uhlenbeck([[1.0]]), ([0.5], [0.3]), 20
-    options = {"num_steps": num_steps, "proposal": jb.Guided()}
+    density = jb.ItoTaylorDensity()  # that of a linear model has no error
+    options = {"num_steps": num_steps, "proposal": jb.Guided(density=density)}
     for steps, known in ((0.2, True), (4.02, False)):
         arguments = (jax.random.key(0), model, *ends, steps * num_steps)
         if method == "density":
