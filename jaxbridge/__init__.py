@@ -131,6 +131,7 @@ from .schemes.step_density import (
     HypoellipticDensity,
     ItoTaylorDensity,
     LinearStep,
+    LocalLinearDensity,
     StepsFrom,
 )
 from .schemes.step_law import DegenerateLaw, StepLaw
@@ -186,6 +187,7 @@ __all__ = [
     "EulerDensity",
     "HypoellipticDensity",
     "ItoTaylorDensity",
+    "LocalLinearDensity",
     # Exact bridges, by Markov chains or by weights.
     "sample_exact_bridges",
     "Chain",

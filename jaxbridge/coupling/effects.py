@@ -78,6 +78,7 @@ def effects(
         "quadratic_noise": decisions.quadratic_noise(
             invertible, model.sigma_varies(like), like.shape[0]
         ),
+        "exact_steps": decisions.exact_steps(model.is_linear(like)),
         "time": decisions.time(depends_on_time),
     }
     if not invertible:

@@ -36,6 +36,8 @@ class Effects(NamedTuple):
         not reach. For guided paths.
     - `quadratic_noise`: the part of a step that is quadratic in its noise, by derivatives of V. For
         guided paths.
+    - `exact_steps`: steps by the exponential of the drift matrix, without discretisation error. For
+        guided paths.
     - `time`: coefficients evaluated at the middle of each step. For guided paths of records.
     """
 
@@ -52,6 +54,7 @@ class Effects(NamedTuple):
     early_stop: Effect
     noise_by_drift: Effect
     quadratic_noise: Effect
+    exact_steps: Effect
     time: Effect
 
     def __str__(self) -> str:
@@ -90,6 +93,13 @@ def quadratic_noise(invertible: bool, sigma_varies: bool, d: int) -> Effect:
     if d > _LARGEST_QUADRATIC:
         return Effect(False, f"more than {_LARGEST_QUADRATIC} dimensions: Euler steps are cheaper")
     return Effect(True, "σ depends on the state; not where given paths determine their noise")
+
+
+def exact_steps(linear: bool) -> Effect:
+    """Decide whether steps of guided paths are exact transitions (`LinearDensity`)."""
+    if not linear:
+        return Effect(False, "the drift is not linear, σ varies, or a coefficient depends on time")
+    return Effect(True, "the drift is linear and σ constant, so transitions are known")
 
 
 def time(depends_on_time: bool) -> Effect:

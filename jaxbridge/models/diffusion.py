@@ -42,7 +42,7 @@ from ..engine.checks import (
 )
 from ..engine.linalg import lower_factor
 from . import decisions
-from .dynamics import Dynamics, DynamicsAt, stationary_flux
+from .dynamics import Dynamics, DynamicsAt, is_linear, stationary_flux
 from .sigma import NO_INVERSE, AbstractSigma, Constant, Diagonal, Full, Identity, Tall, Triangular
 from .tracing import takes_time, traced_once, uses_argument
 
@@ -474,6 +474,10 @@ class Diffusion(eqx.Module):
     def sigma_is_invertible(self, like: Float[Array, " d"]) -> bool:
         """Return whether σ is invertible: noise enters all coordinates. Nothing is computed."""
         return self._sigma_traits(like)[1]
+
+    def is_linear(self, like: Float[Array, " d"]) -> bool:
+        """Return whether the drift is linear, σ constant, and neither depends on time."""
+        return not self.depends_on_time and is_linear(self.forward(like), like)
 
     def check_invertible_sigma(self, like: Float[Array, " d"]) -> None:
         """Raise `ValueError` if σ has fewer columns than rows."""

@@ -72,6 +72,7 @@ from .step_density import (
     EulerDensity as EulerDensity,
     HypoellipticDensity as HypoellipticDensity,
     ItoTaylorDensity as ItoTaylorDensity,
+    LocalLinearDensity as LocalLinearDensity,
     QuadraticDensity as QuadraticDensity,
     check_step_density as check_step_density,
     most_accurate_density as most_accurate_density,

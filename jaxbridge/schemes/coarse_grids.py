@@ -61,7 +61,7 @@ def num_coarse_grids(num_steps: int) -> int:
     return min(num_steps - 1, 2)
 
 
-def share_of_grid(order: float, lengths: Sequence[float]) -> float:
+def share_of_grid(order: int | float, lengths: Sequence[float]) -> float:
     """Return s, the discretisation error relative to the change on a grid of half as many steps.
 
     `lengths` are those of the steps, in any unit. A single step has no coarser grid: NaN. For an
@@ -78,7 +78,7 @@ def share_of_grid(order: float, lengths: Sequence[float]) -> float:
 def error_of_grids(
     values: Float[Array, " grids"],
     errors: Float[Array, " grids"],
-    order: float,
+    order: int | float,
     lengths: Sequence[float],
 ) -> StepError:
     """Return the step error of `values[0]`, from values on successively coarser grids.
@@ -122,7 +122,7 @@ def _finite(uncertainty: Float[Array, ""]) -> Float[Array, ""]:
     return jnp.where(jnp.isnan(uncertainty), jnp.inf, uncertainty)
 
 
-def _sums(order: float, lengths: Sequence[float]) -> list[float]:
+def _sums(order: int | float, lengths: Sequence[float]) -> list[float]:
     """Return S of the three grids."""
     grids = [steps_of_grid(lengths, level) for level in range(3)]
     return [float(sum(k ** (order + 1) for k in grid)) for grid in grids]

@@ -36,7 +36,8 @@ too. The code replaces l_k by l_k / √(1 + δ² |l_k|² / |σ_k|²), which has 
 Then σ + δl is nonzero wherever σ is.
 
 *Linear drift and constant σ*. The transition is normal and known in closed form (`models.linear`).
-`LinearDensity` is this law, so there is no discretisation error.
+`LinearDensity` is this law, so there is no discretisation error. `LocalLinearDensity` linearises
+the drift at the start of each step.
 
 Time-dependent coefficients are evaluated in the middle of a step, which preserves both orders.
 """
@@ -62,7 +63,7 @@ from ..engine.linalg import (
 )
 from ..models import decisions
 from ..models.diffusion import Diffusion
-from ..models.dynamics import Dynamics, is_linear
+from ..models.dynamics import Dynamics
 from ..models.linear import linear_transition
 from ..models.sigma import columns_of, covariance_of
 from .step_law import DegenerateLaw, StepLaw, root_of_length
@@ -191,12 +192,7 @@ class ItoTaylorDensity(AbstractStepDensity):
     order: ClassVar[float] = 2
 
     def steps_from(self, dynamics, x):
-        if dynamics.sigma_varies:
-            raise ValueError(
-                "`ItoTaylorDensity` is for constant σ, but σ of this model depends on the state: "
-                "use `EulerDensity()`, or `HypoellipticDensity()` for a σ with fewer columns than "
-                "rows."
-            )
+        _check_constant_sigma(self, dynamics)
         sigma, d = dynamics.sigma(x), x.shape[0]
         if not sigma.invertible:
             return _degenerate_ito_taylor(dynamics, x)
@@ -344,29 +340,87 @@ class LinearDensity(AbstractStepDensity):
     order: ClassVar[float] = math.inf
 
     def steps_from(self, dynamics, x):
-        d, sigma, drift = x.shape[0], dynamics.sigma(x), dynamics.drift(x)
-        F, V = jax.jacfwd(dynamics.drift)(x), covariance_of(sigma, x)
-        columns = jax.vmap(sigma.solve, in_axes=1, out_axes=1)  # σ⁻¹ X
-
-        def law(dt):
-            moving = dt > 0
-            dt_moving = jnp.where(moving, dt, 1)  # avoids 0 / 0
-            transition = linear_transition(F, V, dt_moving)
-            mean = jnp.where(moving, x + matvec(transition.integral, drift), x)
-            if not sigma.invertible:
-                root = semidefinite_cholesky(transition.covariance)
-                return DegenerateLaw(mean, jnp.where(moving, root, 0), dt)
-            S = columns(columns(transition.covariance / dt_moving).T)
-            return StepLaw(mean, sigma, S, dt)
-
-        def decay(dt):
-            e = linear_transition(F, V, dt).decay
-            return columns(matmul(e, sigma.as_matrix(d, x.dtype))) if sigma.invertible else e
-
-        return StepsFrom(law, decay)
+        return _exponential_steps(dynamics, x, bends=False)
 
     def linear_step(self, F, V, dt):
         return LinearStep(*linear_transition(F, V, dt))
+
+
+class LocalLinearDensity(AbstractStepDensity):
+    """Step density of local linearisation, for stiff drift with constant σ.
+
+    Each step is the transition of the diffusion that is linearised at its start (Ozaki 1992; Shoji
+    & Ozaki 1998). With F = ∇α(x), M_δ = ∫_0^δ e^{sF} ds and Γ_δ = ∫_0^δ e^{sF} V e^{sFᵀ} ds,
+
+        x' ~ N(x + M_δ [α(x) + ¼ Σ_k ∂²α(λ_k, λ_k)], Γ_δ),    Γ_δ = Σ_k λ_k λ_kᵀ.
+
+    The sum is half the mean change of the drift by the noise of the step.
+
+    - Its error is O(δ²) along a path, like that of `ItoTaylorDensity`.
+    - Steps may be much longer than the shortest relaxation time, because e^{δF} is no polynomial.
+    - A step takes two to four times as long, for the exponential of a matrix.
+    - σ may have fewer columns than rows.
+
+    Steps of linear models are exact without this argument.
+
+    **Raises:** `ValueError`, at the first use, for a state-dependent σ.
+
+    **Example:**
+
+    ```python
+    proposal = jb.Guided(density=jb.LocalLinearDensity())
+    ```
+    """
+
+    order: ClassVar[float] = 2
+
+    def steps_from(self, dynamics, x):
+        _check_constant_sigma(self, dynamics)
+        return _exponential_steps(dynamics, x, bends=True)
+
+    def linear_step(self, F, V, dt):
+        return LinearStep(*linear_transition(F, V, dt))
+
+
+def _exponential_steps(dynamics: Dynamics, x: Float[Array, " d"], bends: bool) -> StepsFrom:
+    """Return steps N(x + M_δ [α + ¼ Σ_k ∂²α(λ_k, λ_k)], Γ_δ), or without the sum unless `bends`."""
+    sigma, drift, F = dynamics.sigma(x), dynamics.drift(x), jax.jacfwd(dynamics.drift)(x)
+    V = covariance_of(sigma, x)
+    columns = jax.vmap(sigma.solve, in_axes=1, out_axes=1)  # σ⁻¹ X
+
+    def law(dt):
+        moving = dt > 0
+        longer = jnp.where(moving, dt, 1)  # avoids 0 / 0
+        transition = linear_transition(F, V, longer)
+        if sigma.invertible:
+            made = StepLaw(x, sigma, columns(columns(transition.covariance / longer).T), dt)
+        else:
+            root = semidefinite_cholesky(transition.covariance)
+            made = DegenerateLaw(x, jnp.where(moving, root, 0), dt)
+        slope = drift
+        if bends:
+            bent = [_along(dynamics.drift, x, column)[1] for column in made.root.T]
+            slope = drift + sum_first_axis(jnp.stack(bent)) / 4
+        mean = x + matvec(transition.integral, slope)
+        return made._replace(mean=jnp.where(moving, mean, x))
+
+    def decay(dt):
+        matrix = linear_transition(F, V, dt).decay
+        if not sigma.invertible:
+            return matrix
+        return columns(matmul(matrix, sigma.as_matrix(len(x), x.dtype)))
+
+    return StepsFrom(law, decay)
+
+
+def _check_constant_sigma(density: AbstractStepDensity, dynamics: Dynamics) -> None:
+    """Raise `ValueError` for a state-dependent σ."""
+    if dynamics.sigma_varies:
+        raise ValueError(
+            f"`{type(density).__name__}` is for constant σ, but σ of this model depends on the "
+            "state: use `EulerDensity()`, or `HypoellipticDensity()` for a σ with fewer columns "
+            "than rows."
+        )
 
 
 def _linear_ito_taylor(F, V, dt) -> LinearStep:
@@ -385,8 +439,8 @@ def check_step_density(density: AbstractStepDensity | None) -> AbstractStepDensi
     """
     if not (density is None or isinstance(density, AbstractStepDensity)):
         raise TypeError(
-            "`density` must be `EulerDensity()`, `ItoTaylorDensity()` or `HypoellipticDensity()`; "
-            f"got {density!r}."
+            "`density` must be `EulerDensity()`, `ItoTaylorDensity()`, `LocalLinearDensity()` or "
+            f"`HypoellipticDensity()`; got {density!r}."
         )
     return density
 
@@ -399,7 +453,7 @@ def most_accurate_density(
     `normal_steps` states that paths must determine their noise, so that steps must be normal.
     """
     sigma_varies, invertible = model.sigma_varies(like), model.sigma_is_invertible(like)
-    if not model.depends_on_time and is_linear(model.forward(like), like):
+    if decisions.exact_steps(model.is_linear(like)).simulated:
         return LinearDensity()
     if not sigma_varies:
         return ItoTaylorDensity()

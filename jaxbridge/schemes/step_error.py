@@ -266,7 +266,7 @@ def step_faults(
     return tuple(faults)
 
 
-def share_of_order(order: float) -> float:
+def share_of_order(order: int | float) -> float:
     """Return (2^p - 1)⁻¹, the error of order p over the change under half as many steps."""
     return 1 / (2**order - 1)
 
