@@ -169,8 +169,8 @@ def innovations(
     - `num_steps`, `step_size`: pass one of the two, the number of steps between two times, by
         default 10, or the maximum step size.
     - `initial_time`: time of `initial`, if it is before the first of `times`.
-    - `density`: step density. By default `ItoTaylorDensity()` for constant σ. For a state-dependent
-        σ the steps are of weak order 2 and quadratic in the noise, or `HypoellipticDensity()` if σ
+    - `density`: step density. By default steps of models with linear drift and constant σ are
+        exact. For other constant σ it is `ItoTaylorDensity()`. For a state-dependent σ the steps are of weak order 2 and quadratic in the noise, or `HypoellipticDensity()` if σ
         has fewer columns than rows. Quadratic steps to observations are split, so `size` is larger:
         10 steps become 14, and 1 becomes 4. Paths have the points of the 10.
 
