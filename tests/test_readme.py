@@ -90,7 +90,9 @@ CLAIMS = {
         )
         and abs(page["mean"] - 2) < 5 * page["error"] < 2
     ),
-    "saving": lambda page: page["draws"].shape == (1500, 1) and page["state"].num_done == 1500,
+    "saving": lambda page: (
+        covers(page["posterior"].params, 0.8) and page["both"].theta.shape == (600, 1)
+    ),
     "several_devices": lambda page: bool(page["bridges"].met.all()),
     "several_records": lambda page: max(page["values_at"], key=page["values_at"].get) == 0.0,
     "speed": lambda page: page["costs"].cheapest() is not None,

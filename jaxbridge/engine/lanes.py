@@ -18,8 +18,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Bool, PyTree
 
 from .lane_forms import AbstractForm, Coordinates, LanesLast, aval, is_short
 
@@ -370,3 +371,17 @@ _ELEMENTWISE = frozenset(
     "gt integer_pow is_finite le lgamma log log1p logistic lt max min mul ne neg not or pow rem "
     "round rsqrt select_n sign sin sinh sqrt square sub tan tanh xor".split()
 )
+
+
+@custom_vmap
+def in_any_lane(condition: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Return the condition, under `vmap` whether it holds in any lane.
+
+    Then `lax.cond` remains a branch, where it would otherwise compute both sides.
+    """
+    return condition
+
+
+@in_any_lane.def_vmap
+def _over_lanes(axis_size, in_batched, condition):
+    return in_any_lane(jnp.any(condition)), False  # there may be an outer `vmap`

@@ -57,6 +57,7 @@ from ..schemes import (
     EulerDensity,
     StepLaw,
     check_model,
+    fitted_density,
     log_halving_of_all_steps,
     log_halving_of_pair,
     most_accurate_density,
@@ -239,6 +240,7 @@ class _Steps(NamedTuple):
     """Inputs of a scan over steps.
 
     - `guide`, `dt`, `remaining`: the fields of `Step`.
+    - `density`: the density of the target's step.
     - `before`: the length of the previous step.
     - `ends_pair`: whether the previous step and this one are a pair of `halving`.
     - `coarse`: the coarse steps; `None` if none are simulated.
@@ -247,6 +249,7 @@ class _Steps(NamedTuple):
     guide: PyTree
     dt: Float[Array, "*steps I"]
     remaining: Float[Array, "*steps I"]
+    density: AbstractStepDensity
     before: Float[Array, "*steps I"]
     ends_pair: Bool[Array, "*steps"]
     coarse: _CoarseSteps | None
@@ -324,15 +327,26 @@ class _GuidedLanes:
         # A single interval needs no axis of lanes, because all lanes share its values.
         self._lane_axis = None if start.shape[0] == 1 else -1
         self.start, self.end = start.T, end.T
+        self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.target
         # Pairs of `halving` are the steps (0, 1), (2, 3), ...
         before, ends = jnp.roll(dt, 1, axis=0), jnp.arange(num_steps) % 2 == 1
-        self.steps = _Steps(guide, dt[:-1], remaining[:-1], before[:-1], ends[:-1], coarse)
-        self._last = _Steps(None, dt[-1], remaining[-1], before[-1], ends[-1], None)
-        self._proposal, self._dynamics, self._density = proposal, dynamics, proposal.target
         # The end is observed exactly, so the last step needs a density of x'.
-        self._closing = self._density if self._density.is_normal else EulerDensity()
+        closing = proposal.target if proposal.target.is_normal else EulerDensity()
+        density, closing = self._fitted(proposal.target, dt), self._fitted(closing, dt)
+        inner = lambda leaf: leaf[:-1]
+        lengths = dt[:-1], remaining[:-1], jax.tree.map(inner, density)
+        self.steps = _Steps(guide, *lengths, before[:-1], ends[:-1], coarse)
+        last = lambda leaf: leaf[-1]
+        lengths = dt[-1], remaining[-1], jax.tree.map(last, closing)
+        self._last = _Steps(None, *lengths, before[-1], ends[-1], None)
         # Traced once, for the loop and for the last step.
         self._jitted_log_halving = jax.jit(self._log_halving)
+
+    def _fitted(self, density: AbstractStepDensity, dt: Float[Array, "N I"]) -> AbstractStepDensity:
+        """Return the densities of all steps, whose arrays have intervals in the last axis."""
+        like = self.start[:, 0]
+        fit = lambda dt: fitted_density(density, self._dynamics, like, dt)
+        return jax.vmap(jax.vmap(fit, out_axes=-1))(dt)
 
     def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
         """Repeat the values of each interval for all its lanes."""
@@ -374,7 +388,7 @@ class _GuidedLanes:
 
     def advance(self, state: _LaneState, xi: Float[Array, "d lanes"], steps: _Steps) -> _LaneState:
         """Return the state after a step with the noise ξ."""
-        step = self._per_lane(self._as_step(steps), self._num_draws)
+        step = self._per_lane((steps.density, self._as_step(steps)), self._num_draws)
         path = self._take_step(state.path, xi, step)
         if state.coarse is None:
             return self._update_halving(state, path, steps)
@@ -394,17 +408,21 @@ class _GuidedLanes:
         return _LaneState(path, here, state.log_halving, coarse, gap)
 
     def _take_step(
-        self, path: _PathWeights, xi: Float[Array, "d lanes"], step: Step
+        self,
+        path: _PathWeights,
+        xi: Float[Array, "d lanes"],
+        density_and_step: tuple[AbstractStepDensity, Step],
     ) -> _PathWeights:
         """Return the paths after a step with this noise."""
 
-        def step_at_point(x, xi, step):
-            target = self._density.steps_from(self._dynamics, x).law(step.dt)
+        def step_at_point(x, xi, density_and_step):
+            density, step = density_and_step
+            target = density.steps_from(self._dynamics, x).law(step.dt)
             law = self._proposal.step_law(step, x, target)
             point = law.point(xi)
             return target.bent(point), self._log_densities(target, law, point, xi)
 
-        results = over_lanes(-1, -1, self._lane_axis)(step_at_point)(path.x, xi, step)
+        results = over_lanes(-1, -1, self._lane_axis)(step_at_point)(path.x, xi, density_and_step)
         return self._add_factors(path, *results)
 
     def _take_coarse_step(
@@ -420,7 +438,8 @@ class _GuidedLanes:
         """
         xi = steps.share * before + jnp.sqrt(1 - steps.share**2) * xi
         step = Step(steps.guide, steps.dt, steps.remaining, self.end)
-        stepped = self._take_step(coarse, xi, self._per_lane(step, self._num_evaluated))
+        step = self._density, self._per_lane(step, self._num_evaluated)
+        stepped = self._take_step(coarse, xi, step)
         return lax.stop_gradient(stepped)
 
     @staticmethod
@@ -434,13 +453,14 @@ class _GuidedLanes:
     ) -> tuple[_LaneState, Float[Array, "d lanes"]]:
         """Return the state after a step to these points, and the noise ξ of the step."""
 
-        def noise_at_point(x, x_next, step):
-            target = self._density.steps_from(self._dynamics, x).law(step.dt)
+        def noise_at_point(x, x_next, density_and_step):
+            density, step = density_and_step
+            target = density.steps_from(self._dynamics, x).law(step.dt)
             law = self._proposal.step_law(step, x, target)
             xi = law.noise(x_next)
             return xi, self._log_densities(target, law, x_next, xi)
 
-        step = self._per_lane(self._as_step(steps), self._num_draws)
+        step = self._per_lane((steps.density, self._as_step(steps)), self._num_draws)
         xi, log_densities = over_lanes(-1, -1, self._lane_axis)(noise_at_point)(
             state.x, x_next, step
         )
@@ -472,11 +492,11 @@ class _GuidedLanes:
 
         def log_density_at_point(x, last):
             # An end point outside of the state space makes the weight NaN, so no path is found.
-            end, dt = last
-            log_density = self._closing.steps_from(self._dynamics, x).law(dt).log_density(end)
+            density, end, dt = last
+            log_density = density.steps_from(self._dynamics, x).law(dt).log_density(end)
             return jnp.where(self._is_inside(end), log_density, jnp.nan)
 
-        last = self._per_lane((self.end, dt), num_draws)
+        last = self._per_lane((self._last.density, self.end, dt), num_draws)
         log_density = over_lanes(-1, self._lane_axis)(log_density_at_point)(path.x, last)
         end = jnp.repeat(self.end, num_draws, axis=-1)
         return self._add_factors(path, end, (log_density, jnp.zeros_like(log_density)))
@@ -506,6 +526,8 @@ class _GuidedLanes:
 
     def _update_halving(self, state: _LaneState, path: _PathWeights, steps: _Steps) -> _LaneState:
         """Return the state with these paths, one step further, and with D updated."""
+        if self._density.is_exact:  # D is zero
+            return state._replace(path=path)
         from_x, to_x = self._select_evaluated(state.x), self._select_evaluated(path.x)
         change = lax.cond(
             steps.ends_pair,

@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float
 from ..engine.lanes import compute_once
 from ..engine.linalg import dot
 from ..models.dynamics import DynamicsAt
-from ..schemes import AbstractStepDensity, DegenerateLaw, StepLaw
+from ..schemes import DegenerateLaw, StepLaw
 from .observation import Scalars
 from .record import Steps
 from .tilted_step import Information, NormalStep, Seen, Tilted, coordinates, given, tilted
@@ -116,10 +116,10 @@ def guided_start(
 
 
 def target_law(
-    density: AbstractStepDensity, dynamics_at: DynamicsAt, x: Float[Array, " d"], step: Steps
+    dynamics_at: DynamicsAt, x: Float[Array, " d"], step: Steps
 ) -> StepLaw | DegenerateLaw:
     """Return the law of the target's step from x."""
-    return density.steps_from(dynamics_at(step.time), x).law(step.dt)
+    return step.density.steps_from(dynamics_at(step.time), x).law(step.dt)
 
 
 def guided_law(law: StepLaw | DegenerateLaw, guide: Guide, scalars: Scalars | None) -> GuidedLaw:

@@ -170,9 +170,10 @@ def innovations(
         default 10, or the maximum step size.
     - `initial_time`: time of `initial`, if it is before the first of `times`.
     - `density`: step density. By default steps of models with linear drift and constant σ are
-        exact. For other constant σ it is `ItoTaylorDensity()`. For a state-dependent σ the steps are of weak order 2 and quadratic in the noise, or `HypoellipticDensity()` if σ
-        has fewer columns than rows. Quadratic steps to observations are split, so `size` is larger:
-        10 steps become 14, and 1 becomes 4. Paths have the points of the 10.
+        exact. For other constant σ it is `ItoTaylorDensity()`. For a state-dependent σ the steps
+        are of weak order 2 and quadratic in the noise, or `HypoellipticDensity()` if σ has fewer
+        columns than rows. Quadratic steps to observations are split, so `size` is larger: 10 steps
+        become 14, and 1 becomes 4. Paths have the points of the 10.
 
     **Returns:** `Innovations`, differentiable in parameters and noise. Its `why()` reports faults
     of the guide. There is a warning if the likelihood at ξ = 0 is zero.

@@ -82,11 +82,11 @@ def _cost(
     dynamics_at, N = model.forward_at(problem.like), problem.num_steps
 
     def of_step(x, x_next, step):
-        law = target_law(problem.density, dynamics_at, x, step)
+        law = target_law(dynamics_at, x, step)
         noise = law.solve(x_next - law.mean)
         return dot(noise, noise)
 
-    squares = over_points(of_step)(path[:-1], path[1:], flat(problem.record.steps()))
+    squares = over_points(of_step)(path[:-1], path[1:], flat(problem.steps(model)))
     initial = initial_law(problem.initial, model, problem.like)
     first = solve_root(initial.root, path[0] - initial.mean)
     residuals = jax.vmap(_misfit)(problem.scalars(model), path[::N])
@@ -114,14 +114,13 @@ def _next_path(
     damping: Float[Array, ""],
 ) -> Float[Array, "points d"]:
     """Return the path of the next iteration, from the present one."""
-    dynamics_at, steps = model.forward_at(problem.like), problem.record.steps()
+    dynamics_at, steps = model.forward_at(problem.like), problem.steps(model)
     K, N = problem.num_segments, problem.num_steps
     # Mean, relative to u_last, and standard deviation of the noise with the penalty.
     mean_share, scale = damping / (1 + damping), 1 / jnp.sqrt(1 + damping)
 
     def linear(point, next_point, step):
-        dynamics = dynamics_at(step.time)
-        return linear_step(problem.density, dynamics, point, next_point, step.dt)
+        return linear_step(dynamics_at, point, next_point, step)
 
     linearised = over_points(linear)(path[:-1], path[1:], flat(steps))
     away = -linearised.shift  # Λ u, for the noise u of the last path
@@ -138,7 +137,7 @@ def _next_path(
 
     def one(x, inputs):
         next_point, away, step, next_h, scalars = inputs
-        law = target_law(problem.density, dynamics_at, x, step)
+        law = target_law(dynamics_at, x, step)
         pushed = NormalStep(law.mean + mean_share * away - next_point, scale * law.root)
         pushed, _, _ = given(pushed, scalars)
         bent = tilted(pushed, next_h)

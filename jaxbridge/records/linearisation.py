@@ -16,8 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..engine.linalg import matmul, matvec
-from ..models.dynamics import Dynamics, DynamicsAt
-from ..schemes import AbstractStepDensity
+from ..models.dynamics import DynamicsAt
 from .observation import Scalars
 from .record import Steps
 from .segments import at_every_step, flat, split_first
@@ -36,16 +35,16 @@ class LinearisedStep(NamedTuple):
 
 
 def linear_step(
-    density: AbstractStepDensity,
-    dynamics: Dynamics,
+    dynamics_at: DynamicsAt,
     point: Float[Array, " d"],
     next_point: Float[Array, " d"],
-    dt: Float[Array, ""],
+    step: Steps,
 ) -> LinearisedStep:
     """Return the step from `point`, linearised there, relative to both points."""
-    law = density.steps_from(dynamics, point).law(dt)
+    dynamics = dynamics_at(step.time)
+    law = step.density.steps_from(dynamics, point).law(step.dt)
     F = jax.jacfwd(dynamics.drift)(point)
-    decay = density.linear_step(F, jnp.zeros_like(F), dt).decay
+    decay = step.density.linear_step(F, jnp.zeros_like(F), step.dt).decay
     return LinearisedStep(decay, law.mean - next_point, law.root)
 
 
@@ -67,7 +66,6 @@ def filtered(
 
 
 def extended_kalman_path(
-    density: AbstractStepDensity,
     dynamics_at: DynamicsAt,
     initial: NormalStep,
     steps: Steps,
@@ -85,8 +83,8 @@ def extended_kalman_path(
         return (mean if inside is None else stay_inside(inside, old[0], mean)), covariance
 
     def step(state, inputs):
-        (mean, covariance), ((dt, time), step_scalars) = state, inputs
-        law = linear_step(density, dynamics_at(time), mean, jnp.zeros_like(mean), dt)
+        (mean, covariance), (of_step, step_scalars) = state, inputs
+        law = linear_step(dynamics_at, mean, jnp.zeros_like(mean), of_step)
         spread = matmul(law.root, law.root.T)
         predicted = matmul(matmul(law.decay, covariance), law.decay.T) + spread
         before = checked((law.shift, predicted), state)

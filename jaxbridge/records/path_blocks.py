@@ -148,7 +148,7 @@ def blocks_of(
     edge = np.where(segment < 0, 0, K * N)[:, None]
     here = points[np.where(outside[:, None], edge, number)]  # (J, N, B, d)
     next_here = points[np.where(outside[:, None], edge, number + 1)]
-    lengths = jax.tree.map(lambda leaf: leaf.reshape(-1)[number], problem.record.steps())
+    lengths = jax.tree.map(lambda leaf: leaf[number], flat(guide.steps.step))
     lengths = lengths._replace(dt=jnp.where(outside[:, None], 0, lengths.dt))
     dtype = points.dtype
     no_step = LinearisedStep(jnp.eye(d, dtype=dtype), *2 * [jnp.zeros((), dtype)])
@@ -185,7 +185,7 @@ def blocks_of(
     after = jnp.cumsum(has_length(problem)[::-1])[::-1] > 0
     goes_on = jnp.append(after[1:], False)[inside[-1]]
     scalars = lanes_last(scalars_at(at_end, outside), 1)
-    along = lanes_last(here, 2), lanes_last(next_here, 2), lengths
+    along = lanes_last(here, 2), lanes_last(next_here, 2), lanes_last(lengths, 2)
     return Blocks(
         jnp.asarray(segment),
         _guides_to_ends(lanes_last(steps, 2), scalars, goes_on, *along),
@@ -383,16 +383,16 @@ def _new_points(
 ) -> tuple[_PathPair, Float[Array, "J N d lanes"]]:
     """Sample the knots of the new paths; compute the log weights of the old and new paths."""
     spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
-    density, dynamics_at = problem.density, model.forward_at(problem.like)
+    dynamics_at = model.forward_at(problem.like)
     hidden, corrected = _no_noise(blocks), _corrections(problem, model, spread)
 
     def step_of(old, new, old_knot, eta, step, end, scalars, rho, beta):
         guide, is_last = step.to(end), scalars is not None
-        law = target_law(density, dynamics_at, old, guide.step)
+        law = target_law(dynamics_at, old, guide.step)
         here = guided_law(law, guide, scalars)
         zeta, log_old = here.noise_and_log_weight(old_knot, law.solve, hidden)
         old = end_of_step(law, old_knot, is_last)
-        law = target_law(density, dynamics_at, new, guide.step)
+        law = target_law(dynamics_at, new, guide.step)
         there = guided_law(law, guide, scalars)
         knot, log_new = there.point_and_log_weight(_new_noise(zeta, eta, rho, beta))
         return _PathPair(old, end_of_step(law, knot, is_last), log_old, log_new), knot

@@ -15,10 +15,15 @@ from ..coupling import Stationary
 from ..engine.checks import Numbers, is_traced
 from ..engine.times import check_resolved
 from ..models.diffusion import Diffusion, check_diffusion
-from ..schemes import AbstractStepDensity, check_step_density, most_accurate_density
+from ..schemes import (
+    AbstractStepDensity,
+    check_step_density,
+    fitted_density,
+    most_accurate_density,
+)
 from .initial import Initial, as_initial, bound, check_initial
 from .observation import LinearGaussian, Observation, Row, Scalars, check_observation
-from .record import Record, as_records, split_records
+from .record import Record, Steps, as_records, split_records
 
 # Dimensions up to 2 d plus this number are tried, to name the right one in the error message.
 _MOST_TRIED = 8
@@ -63,6 +68,15 @@ class RecordProblem(eqx.Module):
         Steps to observations are normal. If the others are not, they are split (`guided_steps`).
         """
         return record if self.density.is_normal else record.with_split_ends()
+
+    def steps(self, model: Diffusion) -> Steps:
+        """Return all steps, leading axes (K, N)."""
+        dt, times = self.record.dt, self.record.middles()
+
+        def density(dt, time):
+            return fitted_density(self.density, model.forward_at(self.like)(time), self.like, dt)
+
+        return Steps(dt, times, jax.vmap(jax.vmap(density))(dt, times))
 
     def scalars(self, model: Diffusion) -> Scalars:
         """Return the observations as independent scalars, leading axis K + 1."""

@@ -25,7 +25,7 @@ from ..engine.checks import (
 )
 from ..engine.compiled import compiled_sooner
 from ..engine.times import Clock, Times, as_times, check_increasing
-from ..schemes import num_splits, remaining_after_splits
+from ..schemes import AbstractStepDensity, num_splits, remaining_after_splits
 
 # Cost of the end of a segment (observation, resampling), in steps.
 _STEPS_PER_SEGMENT = 4
@@ -34,13 +34,14 @@ _FEWEST_SPLITS = 3
 
 
 class Steps(NamedTuple):
-    """Lengths δ of steps, and the times at their middles.
+    """Lengths δ of steps, the times at their middles, and the densities of these steps.
 
     Time-dependent coefficients are evaluated at the middles.
     """
 
     dt: Float[Array, "*steps"]
     time: Float[Array, "*steps"]
+    density: AbstractStepDensity
 
 
 class Record(eqx.Module):
@@ -95,9 +96,9 @@ class Record(eqx.Module):
         begins = np.arange(K)[:, None] * N + np.arange(self.num_equal_steps)
         return np.append(begins.ravel(), K * N)
 
-    def steps(self) -> Steps:
-        """Return all steps, shape (K, N)."""
-        return Steps(self.dt, self.clock(self._beginnings() + self.dt / 2))
+    def middles(self) -> Float[Array, "K N"]:
+        """Return the times at the middles of all steps."""
+        return self.clock(self._beginnings() + self.dt / 2)
 
     def _beginnings(self) -> Float[Array, "K N"]:
         """Return the times at which steps begin, since the first time."""

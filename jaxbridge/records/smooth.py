@@ -511,7 +511,8 @@ def _log_halving(
     """
     (K, N), d, chains = problem.record.dt.shape, problem.dim, paths.shape[0]
     dynamics = problem.model.forward_at(problem.like)
-    dt, time = (jnp.tile(leaf, (chains, 1)).T for leaf in problem.record.steps())
+    grids = problem.record.dt, problem.record.middles()
+    dt, time = (jnp.tile(leaf, (chains, 1)).T for leaf in grids)
     if not problem.model.depends_on_time:
         dynamics, time = dynamics(None), None
     place = jnp.arange(K)[:, None] * N + jnp.arange(N + 1)

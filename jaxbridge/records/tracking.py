@@ -51,7 +51,7 @@ def tracking_path(
         zeta, step = inputs
 
         def of_particle(x, zeta):
-            law = target_law(problem.density, dynamics_at, x, step)
+            law = target_law(dynamics_at, x, step)
             return law.mean + matvec(law.root, zeta)
 
         x = over_lanes(-1, -1)(of_particle)(x, zeta)
@@ -70,7 +70,7 @@ def tracking_path(
     starts = over_lanes(-1)(lambda zeta: initial.mean + matvec(initial.root, zeta))(zeta)
     ratio = over_lanes(-1)(lambda x: log_ratio(problem.initial, model, initial, x))(starts)
     parents = _parents(uniform_key, log_weights(starts, first) + nan_to_neg_inf(ratio))
-    inputs = 1 + jnp.arange(problem.num_segments), problem.record.steps(), later_scalars
+    inputs = 1 + jnp.arange(problem.num_segments), problem.steps(model), later_scalars
     _, (paths, later) = lax.scan(segment, starts[:, parents], inputs)
 
     def back(lane, inputs):

@@ -75,6 +75,7 @@ from .step_density import (
     LocalLinearDensity as LocalLinearDensity,
     QuadraticDensity as QuadraticDensity,
     check_step_density as check_step_density,
+    fitted_density as fitted_density,
     most_accurate_density as most_accurate_density,
 )
 from .step_error import (

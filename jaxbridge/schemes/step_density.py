@@ -64,7 +64,7 @@ from ..engine.linalg import (
 from ..models import decisions
 from ..models.diffusion import Diffusion
 from ..models.dynamics import Dynamics
-from ..models.linear import linear_transition
+from ..models.linear import LinearTransition, linear_transition
 from ..models.sigma import columns_of, covariance_of
 from .step_law import DegenerateLaw, StepLaw, root_of_length
 
@@ -340,10 +340,49 @@ class LinearDensity(AbstractStepDensity):
     order: ClassVar[float] = math.inf
 
     def steps_from(self, dynamics, x):
-        return _exponential_steps(dynamics, x, bends=False)
+        def transition(dt):
+            return _transition(dynamics, x, dt)
+
+        return _exponential_steps(dynamics, x, transition, bends=False)
 
     def linear_step(self, F, V, dt):
         return LinearStep(*linear_transition(F, V, dt))
+
+
+class _FittedLinearDensity(AbstractStepDensity):
+    """`LinearDensity` of one model for one step size, with its transition."""
+
+    transition: LinearTransition
+    order: ClassVar[float] = math.inf
+
+    def steps_from(self, dynamics, x):
+        return _exponential_steps(dynamics, x, lambda dt: self.transition, bends=False)
+
+    def linear_step(self, F, V, dt):
+        return LinearStep(*self.transition)
+
+
+def fitted_density(
+    density: AbstractStepDensity,
+    dynamics: Dynamics,
+    like: Float[Array, " d"],
+    dt: Float[Array, ""],
+) -> AbstractStepDensity:
+    """Return the density of steps of this length, without what each step would compute again.
+
+    `like` is a point of the right shape and dtype. A step of length zero may take the place of one.
+    """
+    if not isinstance(density, LinearDensity):
+        return density
+    return _FittedLinearDensity(_transition(dynamics, like, jnp.where(dt > 0, dt, 1)))
+
+
+def _transition(
+    dynamics: Dynamics, x: Float[Array, " d"], dt: Float[Array, ""]
+) -> LinearTransition:
+    """Return the transition of the equation linearised at x."""
+    V = covariance_of(dynamics.sigma(x), x)
+    return linear_transition(jax.jacfwd(dynamics.drift)(x), V, dt)
 
 
 class LocalLinearDensity(AbstractStepDensity):
@@ -376,22 +415,30 @@ class LocalLinearDensity(AbstractStepDensity):
 
     def steps_from(self, dynamics, x):
         _check_constant_sigma(self, dynamics)
-        return _exponential_steps(dynamics, x, bends=True)
+
+        def transition(dt):
+            return _transition(dynamics, x, dt)
+
+        return _exponential_steps(dynamics, x, transition, bends=True)
 
     def linear_step(self, F, V, dt):
         return LinearStep(*linear_transition(F, V, dt))
 
 
-def _exponential_steps(dynamics: Dynamics, x: Float[Array, " d"], bends: bool) -> StepsFrom:
+def _exponential_steps(
+    dynamics: Dynamics,
+    x: Float[Array, " d"],
+    transition_of: Callable[[Float[Array, ""]], LinearTransition],
+    bends: bool,
+) -> StepsFrom:
     """Return steps N(x + M_δ [α + ¼ Σ_k ∂²α(λ_k, λ_k)], Γ_δ), or without the sum unless `bends`."""
-    sigma, drift, F = dynamics.sigma(x), dynamics.drift(x), jax.jacfwd(dynamics.drift)(x)
-    V = covariance_of(sigma, x)
+    sigma, drift = dynamics.sigma(x), dynamics.drift(x)
     columns = jax.vmap(sigma.solve, in_axes=1, out_axes=1)  # σ⁻¹ X
 
     def law(dt):
         moving = dt > 0
         longer = jnp.where(moving, dt, 1)  # avoids 0 / 0
-        transition = linear_transition(F, V, longer)
+        transition = transition_of(longer)
         if sigma.invertible:
             made = StepLaw(x, sigma, columns(columns(transition.covariance / longer).T), dt)
         else:
@@ -405,7 +452,7 @@ def _exponential_steps(dynamics: Dynamics, x: Float[Array, " d"], bends: bool) -
         return made._replace(mean=jnp.where(moving, mean, x))
 
     def decay(dt):
-        matrix = linear_transition(F, V, dt).decay
+        matrix = transition_of(dt).decay
         if not sigma.invertible:
             return matrix
         return columns(matmul(matrix, sigma.as_matrix(len(x), x.dtype)))
