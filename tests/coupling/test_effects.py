@@ -176,9 +176,15 @@ def test_associated_paths_stop_early_where_the_table_says(num_steps):
 
 
 def test_the_table_reads_well():
-    text = str(jb.effects(jb.hyperbolic(0.8, 2), jb.Coupling(-1.0)))
-    assert len(text.splitlines()) == 15
+    table = jb.effects(jb.hyperbolic(0.8, 2), jb.Coupling(-1.0))
+    text = str(table)
+    assert len(text.splitlines()) == 1 + len(table._fields)
     assert "reverse drift" in text and "declared reversible" in text and "left out" in text
+
+
+def test_steps_are_exact_for_linear_models():
+    assert jb.effects(jb.ornstein_uhlenbeck([[1.0]])).exact_steps.simulated
+    assert not jb.effects(jb.hyperbolic(0.8, 2)).exact_steps.simulated
 
 
 def test_the_dimension_is_found():
