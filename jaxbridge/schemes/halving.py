@@ -108,6 +108,8 @@ def log_halving_of_paths(
     - `dt`: lengths of the steps, one column per path.
     - `time`: for time-dependent coefficients, the times at the middles of steps.
     """
+    if density.is_exact:
+        return jnp.zeros(paths.shape[0], paths.dtype)
     num_steps, num_pairs = dt.shape[0], dt.shape[0] // 2
     if num_pairs == 0:
         return jnp.full(paths.shape[0], jnp.nan, paths.dtype)
