@@ -161,6 +161,17 @@ def test_steps_of_other_models_are_not_exact():
         assert not most_accurate_density(model, like).is_exact
 
 
+def test_local_linearisation_is_that_of_short_steps(x64):
+    """Up to O(δ³) in the mean, where noise enters one of two coordinates and the drift is curved."""
+    model, x, sizes = jb.fitzhugh_nagumo(), jnp.array([0.7, -0.4]), np.array([0.02, 0.01, 0.005])
+    densities = jb.ItoTaylorDensity(), jb.LocalLinearDensity()
+    laws = [[step_law(density, model, x, dt) for density in densities] for dt in sizes]
+    means = [np.max(np.abs(taylor.mean - local.mean)) for taylor, local in laws]
+    assert loglog_slope(sizes, means) > 2.8
+    scales = [np.abs(local.root / taylor.root - 1)[np.tril_indices(2)] for taylor, local in laws]
+    assert np.all(loglog_slope(sizes, np.max(scales, axis=1)) > 0.9) and np.max(scales[-1]) < 0.05
+
+
 def test_local_linearisation_holds_where_drift_is_stiff(x64):
     """A step of eight relaxation times in a well, against Kolmogorov's equation."""
     model = jb.Diffusion(lambda x, p: 20 * (x - x**3), [3.0])
