@@ -281,6 +281,8 @@ def _sample_records(
         theta = guided.state.theta
         own_key = jax.random.fold_in(key_for("step error", key), number(guided))
         function = lambda guided: over_chains(sampler.change_by_coarse_steps, own_key, guided)
+        if records.stacked.density.is_exact:
+            return jnp.zeros(theta.shape[:-1], theta.dtype)
         if records.stacked.num_steps == 1:
             return jnp.full(theta.shape[:-1], jnp.nan, theta.dtype)
         return thinned_step_errors(function, guided, i - skipped, num_iterations)

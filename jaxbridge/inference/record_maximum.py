@@ -423,6 +423,8 @@ def _step_error(
     completion: RecordPaths, draws: _Draw, covariance: Float[Array, "p p"]
 ) -> StepError:
     """Estimate I⁻¹ ∇e, the discretisation error of the estimate, with its standard error."""
+    if completion.fine.records.stacked.density.is_exact:
+        return StepError(*2 * [jnp.zeros_like(draws.gradient[0, 0])])
     if completion.num_steps == 1:
         return StepError(*2 * [jnp.full_like(draws.gradient[0, 0], jnp.nan)])
     # A lost coarse path has no gradient.

@@ -245,6 +245,10 @@ def step_error_of_score(
     model = parameters.bind(maximum.theta)
     error, variance = jnp.zeros_like(maximum.theta), jnp.zeros_like(maximum.theta)
     for block_key, block in with_keys(key, blocks):
+        # The block has a single proposal, so all intervals have the same order of error.
+        target = block.proposal.singles[0].target
+        if target is not None and target.is_exact:
+            continue
         if block.num_steps < 2:
             unknown = jnp.full_like(error, jnp.nan)
             return StepError(unknown, unknown)
@@ -252,7 +256,6 @@ def step_error_of_score(
             np.diff(block.proposal.fractions(block.num_steps // 2)), error.dtype
         )
         half = replace(block, fractions=fractions)
-        # The block has a single proposal, so all intervals have the same order of error.
         share = block.proposal.step_share(model, block.intervals)[0]
 
         def difference(theta, key=block_key, block=block, half=half):

@@ -37,7 +37,7 @@ class Effects(NamedTuple):
     - `quadratic_noise`: the part of a step that is quadratic in its noise, by derivatives of V. For
         guided paths.
     - `exact_steps`: steps by the exponential of the drift matrix, without discretisation error. For
-        guided paths.
+        guided paths. (`path_log_likelihood` has an error of its own.)
     - `time`: coefficients evaluated at the middle of each step. For guided paths of records.
     """
 

@@ -24,8 +24,10 @@ from jaxtyping import Array, Float
 from ..engine.lanes import in_any_lane
 from ..engine.linalg import matmul
 
-# For ‖A‖ s ≤ 1/8 so many terms leave an error of a rounding, also in Γ, a series in 2 ‖A‖ s.
-_MAX_SERIES_NORM, _NUM_TERMS = 1 / 8, {4: 7, 8: 12}
+# For ‖A‖ s ≤ 1/8 so many terms leave an error of a rounding, also in Γ, a series in 2 ‖A‖ s. If
+# noise reaches a coordinate through others, the first terms of its variance are zero. More terms
+# keep its relative error small, for noise that is integrated up to three times.
+_MAX_SERIES_NORM, _NUM_TERMS, _MOST_INTEGRATIONS = 1 / 8, {4: 7, 8: 12}, 3
 # Sufficient for 2^60 times the shortest relaxation time.
 _MAX_DOUBLINGS = 64
 # Most steps of paths need no more doublings.
@@ -91,7 +93,8 @@ def _over_short_time(A, V, t) -> tuple[Float[Array, ""], LinearTransition]:
     integral, covariance = term, covariance_term
     # Term j of M_s is s^j A^{j-1} / j!. As Γ' = V + A Γ + Γ Aᵀ, term j of Γ_s follows from
     # term j - 1.
-    for j in range(2, _NUM_TERMS[A.dtype.itemsize] + 1):
+    num_terms = _NUM_TERMS[A.dtype.itemsize] + 2 * min(len(A) - 1, _MOST_INTEGRATIONS)
+    for j in range(2, num_terms + 1):
         term = s / j * _product(A, term)
         product = _product(A, covariance_term)
         covariance_term = s / j * (product + product.T)

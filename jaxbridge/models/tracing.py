@@ -82,3 +82,59 @@ def _dependent_results(jaxpr: jax.extend.core.Jaxpr, marked: list[bool]) -> list
             var for var, is_marked in zip(equation.outvars, outputs, strict=True) if is_marked
         )
     return [is_reached(atom) for atom in jaxpr.outvars]
+
+
+# Primitives that are linear in all of their arguments.
+_LINEAR = frozenset(
+    "add add_any broadcast_in_dim concatenate convert_element_type copy cumsum expand_dims neg pad "
+    "reduce_sum reshape rev slice split squeeze stack sub transpose unstack".split()
+)
+# Primitives that are linear in one argument at a time.
+_BILINEAR = frozenset(("mul", "dot_general"))
+# Primitives that are linear in their first arguments, as many as the number says.
+_LINEAR_IN_FIRST = {"div": 1, "dynamic_slice": 1, "gather": 1, "dynamic_update_slice": 2}
+
+
+def is_affine(function: Callable, like: Float[Array, " d"]) -> bool:
+    """Return whether `function` is an affine function of its argument, according to its jaxpr.
+
+    A derivative that does not depend on the argument would not be enough: that of a step function
+    is zero. Functions with other primitives than sums, products and rearrangements are not affine.
+    """
+    closed = jax.make_jaxpr(function)(like)
+    return _dependent_if_affine(closed.jaxpr, [True] * len(closed.jaxpr.invars)) is not None
+
+
+def _dependent_if_affine(jaxpr: jax.extend.core.Jaxpr, marked: list[bool]) -> list[bool] | None:
+    """Return `_dependent_results`, or `None` if one is not affine in the `marked` arguments."""
+    reached = {var for var, is_marked in zip(jaxpr.invars, marked, strict=True) if is_marked}
+
+    def is_reached(atom) -> bool:
+        return not isinstance(atom, jax.extend.core.Literal) and atom in reached
+
+    for equation in jaxpr.eqns:
+        name, inputs = equation.primitive.name, [is_reached(atom) for atom in equation.invars]
+        if not any(inputs):
+            continue
+        outputs: list[bool] | None = [True] * len(equation.outvars)
+        if name in ("jit", "pjit"):
+            outputs = _dependent_if_affine(equation.params["jaxpr"].jaxpr, inputs)
+        elif name == "select_n":
+            outputs = None if inputs[0] else outputs
+        elif name in _BILINEAR:
+            outputs = None if all(inputs) else outputs
+        elif name in _LINEAR_IN_FIRST:
+            outputs = None if any(inputs[_LINEAR_IN_FIRST[name] :]) else outputs
+        elif name not in _LINEAR or not _are_floating(equation.outvars):
+            return None
+        if outputs is None:
+            return None
+        reached.update(
+            var for var, is_marked in zip(equation.outvars, outputs, strict=True) if is_marked
+        )
+    return [is_reached(atom) for atom in jaxpr.outvars]
+
+
+def _are_floating(variables: Any) -> bool:
+    """Return whether all variables of a jaxpr are floating-point numbers."""
+    return all(np.issubdtype(variable.aval.dtype, np.floating) for variable in variables)

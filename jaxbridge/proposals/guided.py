@@ -12,7 +12,7 @@ target over its density under the proposal,
 
 Hence E[w h(x)] = p̂_T(a, b) E[h(x) | x_N = b], exactly for the target chain. For the diffusion the
 discretisation error of the target remains: O(δ), or O(δ²) with `ItoTaylorDensity` and
-`QuadraticDensity`. Guided proposals need no stationary law.
+`QuadraticDensity`; for linear models there is none. Guided proposals need no stationary law.
 
 *Steps that are not normal.* The target of a state-dependent σ has steps of weak order 2, which are
 maps of normal noise (`QuadraticDensity`). Then p_i and q_i are the laws of the normal part of a
@@ -51,13 +51,14 @@ from ..engine.noise import Store, noisy_scan
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..models.dynamics import Dynamics
+from ..models.linear import LinearTransition
 from ..schemes import (
     AbstractStepDensity,
     Euler,
     EulerDensity,
     StepLaw,
     check_model,
-    fitted_density,
+    known_transition,
     log_halving_of_all_steps,
     log_halving_of_pair,
     most_accurate_density,
@@ -65,6 +66,7 @@ from ..schemes import (
     num_splits,
     remaining_after_splits,
     share_of_order,
+    with_transition,
 )
 from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
 from .memory_blocks import block_over_devices, in_blocks, masked
@@ -115,8 +117,8 @@ class AbstractGuidedProposal(AbstractSingleProposal):
 
     @property
     def target_cost(self) -> float:
-        """Seconds of a step of the target relative to a normal one, measured for d ≤ 3."""
-        return 1.0 if self.target.is_normal else 2.5
+        """Seconds of a step of the target relative to an Euler step."""
+        return self.target.cost
 
     @property
     def efficiency_bound(self):
@@ -240,7 +242,7 @@ class _Steps(NamedTuple):
     """Inputs of a scan over steps.
 
     - `guide`, `dt`, `remaining`: the fields of `Step`.
-    - `density`: the density of the target's step.
+    - `transition`: that of the target's step if it is known, otherwise `None`.
     - `before`: the length of the previous step.
     - `ends_pair`: whether the previous step and this one are a pair of `halving`.
     - `coarse`: the coarse steps; `None` if none are simulated.
@@ -249,7 +251,7 @@ class _Steps(NamedTuple):
     guide: PyTree
     dt: Float[Array, "*steps I"]
     remaining: Float[Array, "*steps I"]
-    density: AbstractStepDensity
+    transition: LinearTransition | None
     before: Float[Array, "*steps I"]
     ends_pair: Bool[Array, "*steps"]
     coarse: _CoarseSteps | None
@@ -331,22 +333,20 @@ class _GuidedLanes:
         # Pairs of `halving` are the steps (0, 1), (2, 3), ...
         before, ends = jnp.roll(dt, 1, axis=0), jnp.arange(num_steps) % 2 == 1
         # The end is observed exactly, so the last step needs a density of x'.
-        closing = proposal.target if proposal.target.is_normal else EulerDensity()
-        density, closing = self._fitted(proposal.target, dt), self._fitted(closing, dt)
-        inner = lambda leaf: leaf[:-1]
-        lengths = dt[:-1], remaining[:-1], jax.tree.map(inner, density)
-        self.steps = _Steps(guide, *lengths, before[:-1], ends[:-1], coarse)
-        last = lambda leaf: leaf[-1]
-        lengths = dt[-1], remaining[-1], jax.tree.map(last, closing)
-        self._last = _Steps(None, *lengths, before[-1], ends[-1], None)
+        self._closing = proposal.target if proposal.target.is_normal else EulerDensity()
+        transition = self._transitions(dt)
+        inner = dt[:-1], remaining[:-1], jax.tree.map(lambda leaf: leaf[:-1], transition)
+        last = dt[-1], remaining[-1], jax.tree.map(lambda leaf: leaf[-1], transition)
+        self.steps = _Steps(guide, *inner, before[:-1], ends[:-1], coarse)
+        self._last = _Steps(None, *last, before[-1], ends[-1], None)
         # Traced once, for the loop and for the last step.
         self._jitted_log_halving = jax.jit(self._log_halving)
 
-    def _fitted(self, density: AbstractStepDensity, dt: Float[Array, "N I"]) -> AbstractStepDensity:
-        """Return the densities of all steps, whose arrays have intervals in the last axis."""
+    def _transitions(self, dt: Float[Array, "N I"]) -> LinearTransition | None:
+        """Return the transitions of all steps if they are known, shapes (N, ..., I)."""
         like = self.start[:, 0]
-        fit = lambda dt: fitted_density(density, self._dynamics, like, dt)
-        return jax.vmap(jax.vmap(fit, out_axes=-1))(dt)
+        of_step = lambda dt: known_transition(self._density, self._dynamics, like, dt)
+        return jax.vmap(jax.vmap(of_step, out_axes=-1))(dt)
 
     def spread(self, leaf: Float[Array, "*shape I"]) -> Float[Array, "*shape lanes"]:
         """Repeat the values of each interval for all its lanes."""
@@ -388,7 +388,7 @@ class _GuidedLanes:
 
     def advance(self, state: _LaneState, xi: Float[Array, "d lanes"], steps: _Steps) -> _LaneState:
         """Return the state after a step with the noise ξ."""
-        step = self._per_lane((steps.density, self._as_step(steps)), self._num_draws)
+        step = self._per_lane((steps.transition, self._as_step(steps)), self._num_draws)
         path = self._take_step(state.path, xi, step)
         if state.coarse is None:
             return self._update_halving(state, path, steps)
@@ -411,18 +411,20 @@ class _GuidedLanes:
         self,
         path: _PathWeights,
         xi: Float[Array, "d lanes"],
-        density_and_step: tuple[AbstractStepDensity, Step],
+        known_and_step: tuple[LinearTransition | None, Step],
     ) -> _PathWeights:
         """Return the paths after a step with this noise."""
 
-        def step_at_point(x, xi, density_and_step):
-            density, step = density_and_step
-            target = density.steps_from(self._dynamics, x).law(step.dt)
+        def step_at_point(x, xi, known_and_step):
+            known, step = known_and_step
+            target = (
+                with_transition(self._density, known).steps_from(self._dynamics, x).law(step.dt)
+            )
             law = self._proposal.step_law(step, x, target)
             point = law.point(xi)
             return target.bent(point), self._log_densities(target, law, point, xi)
 
-        results = over_lanes(-1, -1, self._lane_axis)(step_at_point)(path.x, xi, density_and_step)
+        results = over_lanes(-1, -1, self._lane_axis)(step_at_point)(path.x, xi, known_and_step)
         return self._add_factors(path, *results)
 
     def _take_coarse_step(
@@ -438,7 +440,7 @@ class _GuidedLanes:
         """
         xi = steps.share * before + jnp.sqrt(1 - steps.share**2) * xi
         step = Step(steps.guide, steps.dt, steps.remaining, self.end)
-        step = self._density, self._per_lane(step, self._num_evaluated)
+        step = None, self._per_lane(step, self._num_evaluated)
         stepped = self._take_step(coarse, xi, step)
         return lax.stop_gradient(stepped)
 
@@ -453,14 +455,16 @@ class _GuidedLanes:
     ) -> tuple[_LaneState, Float[Array, "d lanes"]]:
         """Return the state after a step to these points, and the noise ξ of the step."""
 
-        def noise_at_point(x, x_next, density_and_step):
-            density, step = density_and_step
-            target = density.steps_from(self._dynamics, x).law(step.dt)
+        def noise_at_point(x, x_next, known_and_step):
+            known, step = known_and_step
+            target = (
+                with_transition(self._density, known).steps_from(self._dynamics, x).law(step.dt)
+            )
             law = self._proposal.step_law(step, x, target)
             xi = law.noise(x_next)
             return xi, self._log_densities(target, law, x_next, xi)
 
-        step = self._per_lane((steps.density, self._as_step(steps)), self._num_draws)
+        step = self._per_lane((steps.transition, self._as_step(steps)), self._num_draws)
         xi, log_densities = over_lanes(-1, -1, self._lane_axis)(noise_at_point)(
             state.x, x_next, step
         )
@@ -492,11 +496,12 @@ class _GuidedLanes:
 
         def log_density_at_point(x, last):
             # An end point outside of the state space makes the weight NaN, so no path is found.
-            density, end, dt = last
+            known, end, dt = last
+            density = with_transition(self._closing, known)
             log_density = density.steps_from(self._dynamics, x).law(dt).log_density(end)
             return jnp.where(self._is_inside(end), log_density, jnp.nan)
 
-        last = self._per_lane((self._last.density, self.end, dt), num_draws)
+        last = self._per_lane((self._last.transition, self.end, dt), num_draws)
         log_density = over_lanes(-1, self._lane_axis)(log_density_at_point)(path.x, last)
         end = jnp.repeat(self.end, num_draws, axis=-1)
         return self._add_factors(path, end, (log_density, jnp.zeros_like(log_density)))

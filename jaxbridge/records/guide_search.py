@@ -250,6 +250,7 @@ def _filter_start(problem: RecordProblem, model: Diffusion) -> _SearchStart:
     initial, scalars = initial_law(problem.initial, model, problem.like), problem.scalars(model)
     begin = likeliest(problem.initial, model, initial, split_first(scalars)[0])
     points = extended_kalman_path(
+        problem.density,
         model.forward_at(problem.like),
         initial._replace(mean=begin),
         problem.steps(model),

@@ -77,7 +77,7 @@ def guided(
     here, next_here = of_segments(points[:-1]), of_segments(points[1:])
 
     def linear(point, next_point, step):
-        return linear_step(dynamics_at, point, next_point, step)
+        return linear_step(problem.density, dynamics_at, point, next_point, step)
 
     steps = jax.vmap(over_points(linear))(here, next_here, record)
     # Observations are at the ends of segments, which are N points apart.
@@ -174,7 +174,7 @@ def _guided_path(
 
     def one(x, inputs):
         zeta, step, scalars, is_last = inputs
-        law = target_law(dynamics_at, x, step.step)
+        law = target_law(problem.density, dynamics_at, x, step.step)
         knot, log_weight = guided_law(law, step, scalars).point_and_log_weight(zeta)
         point = end_of_step(law, knot, is_last)
         return point, (None if is_normal else knot, log_weight)
@@ -207,7 +207,9 @@ def path_of_knots(
     inner, steps = jax.tree.map(of_segments, (knots[1:], flat(problem.steps(model))))
 
     def one(x, inputs):
-        of_lane = lambda x, knot, step: end_of_step(target_law(dynamics_at, x, step), knot)
+        of_lane = lambda x, knot, step: end_of_step(
+            target_law(problem.density, dynamics_at, x, step), knot
+        )
         x = over_lanes(-1, -1, -1)(of_lane)(x, *inputs)
         return x, x
 
@@ -268,7 +270,7 @@ def noise_and_log_weight(
     fresh = jax.random.normal(jax.random.fold_in(key, 1), first.shape, path.dtype)
 
     def of_step(x, knot, step, scalars, hidden):
-        law = target_law(dynamics_at, x, step.step)
+        law = target_law(problem.density, dynamics_at, x, step.step)
         step_law = guided_law(law, step, scalars)
         return step_law.noise_and_log_weight(knot, law.solve, hidden)
 

@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float
 from ..engine.lanes import compute_once
 from ..engine.linalg import dot
 from ..models.dynamics import DynamicsAt
-from ..schemes import DegenerateLaw, StepLaw
+from ..schemes import AbstractStepDensity, DegenerateLaw, StepLaw, with_transition
 from .observation import Scalars
 from .record import Steps
 from .tilted_step import Information, NormalStep, Seen, Tilted, coordinates, given, tilted
@@ -116,10 +116,11 @@ def guided_start(
 
 
 def target_law(
-    dynamics_at: DynamicsAt, x: Float[Array, " d"], step: Steps
+    density: AbstractStepDensity, dynamics_at: DynamicsAt, x: Float[Array, " d"], step: Steps
 ) -> StepLaw | DegenerateLaw:
     """Return the law of the target's step from x."""
-    return step.density.steps_from(dynamics_at(step.time), x).law(step.dt)
+    density = with_transition(density, step.transition)
+    return density.steps_from(dynamics_at(step.time), x).law(step.dt)
 
 
 def guided_law(law: StepLaw | DegenerateLaw, guide: Guide, scalars: Scalars | None) -> GuidedLaw:

@@ -82,7 +82,7 @@ def _cost(
     dynamics_at, N = model.forward_at(problem.like), problem.num_steps
 
     def of_step(x, x_next, step):
-        law = target_law(dynamics_at, x, step)
+        law = target_law(problem.density, dynamics_at, x, step)
         noise = law.solve(x_next - law.mean)
         return dot(noise, noise)
 
@@ -120,7 +120,7 @@ def _next_path(
     mean_share, scale = damping / (1 + damping), 1 / jnp.sqrt(1 + damping)
 
     def linear(point, next_point, step):
-        return linear_step(dynamics_at, point, next_point, step)
+        return linear_step(problem.density, dynamics_at, point, next_point, step)
 
     linearised = over_points(linear)(path[:-1], path[1:], flat(steps))
     away = -linearised.shift  # Λ u, for the noise u of the last path
@@ -137,7 +137,7 @@ def _next_path(
 
     def one(x, inputs):
         next_point, away, step, next_h, scalars = inputs
-        law = target_law(dynamics_at, x, step)
+        law = target_law(problem.density, dynamics_at, x, step)
         pushed = NormalStep(law.mean + mean_share * away - next_point, scale * law.root)
         pushed, _, _ = given(pushed, scalars)
         bent = tilted(pushed, next_h)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..engine.linalg import matmul, matvec
 from ..models.dynamics import DynamicsAt
+from ..schemes import AbstractStepDensity, with_transition
 from .observation import Scalars
 from .record import Steps
 from .segments import at_every_step, flat, split_first
@@ -35,6 +36,7 @@ class LinearisedStep(NamedTuple):
 
 
 def linear_step(
+    density: AbstractStepDensity,
     dynamics_at: DynamicsAt,
     point: Float[Array, " d"],
     next_point: Float[Array, " d"],
@@ -42,9 +44,10 @@ def linear_step(
 ) -> LinearisedStep:
     """Return the step from `point`, linearised there, relative to both points."""
     dynamics = dynamics_at(step.time)
-    law = step.density.steps_from(dynamics, point).law(step.dt)
+    density = with_transition(density, step.transition)
+    law = density.steps_from(dynamics, point).law(step.dt)
     F = jax.jacfwd(dynamics.drift)(point)
-    decay = step.density.linear_step(F, jnp.zeros_like(F), step.dt).decay
+    decay = density.linear_step(F, jnp.zeros_like(F), step.dt).decay
     return LinearisedStep(decay, law.mean - next_point, law.root)
 
 
@@ -66,6 +69,7 @@ def filtered(
 
 
 def extended_kalman_path(
+    density: AbstractStepDensity,
     dynamics_at: DynamicsAt,
     initial: NormalStep,
     steps: Steps,
@@ -84,7 +88,7 @@ def extended_kalman_path(
 
     def step(state, inputs):
         (mean, covariance), (of_step, step_scalars) = state, inputs
-        law = linear_step(dynamics_at, mean, jnp.zeros_like(mean), of_step)
+        law = linear_step(density, dynamics_at, mean, jnp.zeros_like(mean), of_step)
         spread = matmul(law.root, law.root.T)
         predicted = matmul(matmul(law.decay, covariance), law.decay.T) + spread
         before = checked((law.shift, predicted), state)

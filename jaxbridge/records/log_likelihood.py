@@ -444,7 +444,7 @@ def _run_stages(
 
     kinds = np.array([*len(rates) * [_PILOT], _CONFIRMATION, *len(grids) * [_RUN]])
     # Pilot runs use the grid with half as many steps, if that is enough.
-    on_grid = np.where(kinds == _RUN, 0, int(half_will_do(grids[0])))
+    on_grid = np.where(kinds == _RUN, 0, int(len(grids) > 1 and half_will_do(grids[0])))
     on_grid[kinds == _RUN] = np.arange(len(grids))
     rates = jnp.pad(rates, (0, len(kinds) - len(rates)))
     best, filtered = lax.scan(stage, undecided(rates.dtype), (on_grid, rates, kinds))

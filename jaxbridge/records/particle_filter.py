@@ -118,7 +118,7 @@ def run_filters(
 
     def step_particles(x, zeta, step, scalars):
         def of_particle(x, zeta):
-            law = target_law(dynamics_at, x, step.step)
+            law = target_law(problem.density, dynamics_at, x, step.step)
             knot, log_weight = guided_law(law, step, scalars).point_and_log_weight(zeta)
             return end_of_step(law, knot, is_last=scalars is not None), log_weight
 

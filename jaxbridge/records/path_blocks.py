@@ -388,11 +388,11 @@ def _new_points(
 
     def step_of(old, new, old_knot, eta, step, end, scalars, rho, beta):
         guide, is_last = step.to(end), scalars is not None
-        law = target_law(dynamics_at, old, guide.step)
+        law = target_law(problem.density, dynamics_at, old, guide.step)
         here = guided_law(law, guide, scalars)
         zeta, log_old = here.noise_and_log_weight(old_knot, law.solve, hidden)
         old = end_of_step(law, old_knot, is_last)
-        law = target_law(dynamics_at, new, guide.step)
+        law = target_law(problem.density, dynamics_at, new, guide.step)
         there = guided_law(law, guide, scalars)
         knot, log_new = there.point_and_log_weight(_new_noise(zeta, eta, rho, beta))
         return _PathPair(old, end_of_step(law, knot, is_last), log_old, log_new), knot

@@ -18,7 +18,7 @@ from ..models.diffusion import Diffusion, check_diffusion
 from ..schemes import (
     AbstractStepDensity,
     check_step_density,
-    fitted_density,
+    known_transition,
     most_accurate_density,
 )
 from .initial import Initial, as_initial, bound, check_initial
@@ -73,10 +73,11 @@ class RecordProblem(eqx.Module):
         """Return all steps, leading axes (K, N)."""
         dt, times = self.record.dt, self.record.middles()
 
-        def density(dt, time):
-            return fitted_density(self.density, model.forward_at(self.like)(time), self.like, dt)
+        def transition(dt, time):
+            dynamics = model.forward_at(self.like)(time)
+            return known_transition(self.density, dynamics, self.like, dt)
 
-        return Steps(dt, times, jax.vmap(jax.vmap(density))(dt, times))
+        return Steps(dt, times, jax.vmap(jax.vmap(transition))(dt, times))
 
     def scalars(self, model: Diffusion) -> Scalars:
         """Return the observations as independent scalars, leading axis K + 1."""

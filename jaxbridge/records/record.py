@@ -25,7 +25,8 @@ from ..engine.checks import (
 )
 from ..engine.compiled import compiled_sooner
 from ..engine.times import Clock, Times, as_times, check_increasing
-from ..schemes import AbstractStepDensity, num_splits, remaining_after_splits
+from ..models.linear import LinearTransition
+from ..schemes import num_splits, remaining_after_splits
 
 # Cost of the end of a segment (observation, resampling), in steps.
 _STEPS_PER_SEGMENT = 4
@@ -34,14 +35,14 @@ _FEWEST_SPLITS = 3
 
 
 class Steps(NamedTuple):
-    """Lengths δ of steps, the times at their middles, and the densities of these steps.
+    """Lengths δ of steps, the times at their middles, and their transitions if these are known.
 
     Time-dependent coefficients are evaluated at the middles.
     """
 
     dt: Float[Array, "*steps"]
     time: Float[Array, "*steps"]
-    density: AbstractStepDensity
+    transition: LinearTransition | None
 
 
 class Record(eqx.Module):

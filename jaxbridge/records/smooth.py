@@ -26,6 +26,7 @@ from ..models.sigma import columns_of
 from ..proposals import AbstractProposal, as_proposal
 from ..schemes import (
     AbstractStepDensity,
+    ItoTaylorDensity,
     StepError,
     dominates,
     log_halving_of_paths,
@@ -120,8 +121,9 @@ class Smoothed(AbstractResult):
 
         If all steps are normal, each path is e^D times as likely with half as many steps
         (`schemes.halving`). For steps of order 2 with a state-dependent σ, half as many steps with
-        the same noise give another path, with e^D times its weight. If the scheme of a `proposal`
-        is more accurate than `density`, the estimate is too large. It is NaN in these cases:
+        the same noise give another path, with e^D times its weight. With a `proposal` the
+        estimate is for the least accurate of `density` and the steps of the bridges. It is zero if
+        steps are exact, and NaN in these cases:
 
         - one step;
         - Euler steps of a σ with fewer columns than rows;
@@ -324,25 +326,25 @@ def smooth(
         normal_steps=proposal is not None,  # step errors of bridges need densities of the steps
         **options,
     )
-    if proposal is not None:
-        proposal = as_proposal(proposal, model, problem.like)
-        problem = dataclasses.replace(problem, density=_least_accurate(problem, proposal))
+    density = problem.density
     num_proposals = check_count("num_proposals", 10 if num_proposals is None else num_proposals)
     linearisation = linearised(problem, model)
     if proposal is None:
         sizes = counts, num_chains, block_length
         draws = _run_block_chains(key, problem, linearisation, *sizes, progress_meter)
     else:
+        proposal = as_proposal(proposal, model, problem.like)
         start_key, key = jax.random.split(key)
         firsts = _guided_paths(start_key, problem, linearisation, num_chains)
         sizes = (*counts, num_proposals)
         draws = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
+        density = _least_accurate(problem, proposal)
     by_chain = lambda draws: jnp.moveaxis(draws, 1, 0)
     paths, knots = by_chain(draws.paths), None if draws.knots is None else by_chain(draws.knots)
     diagnostics = (draws.accepted, draws.stuck, draws.num_truncated)
     times = problem.record.clock.exactly(draws.since)
     # Discretisation errors need the grid of the paths, which a `proposal` may choose.
-    problem = dataclasses.replace(problem, record=draws.record)
+    problem = dataclasses.replace(problem, record=draws.record, density=density)
     smoothed = Smoothed(times, paths, *diagnostics, problem, knots, linearisation.check)
     return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
 
@@ -357,9 +359,11 @@ def _least_accurate(problem: RecordProblem, proposal: AbstractProposal) -> Abstr
         coupling = single.by_coupling
         if coupling is None:
             return single.target
-        return step_law_of(coupling.scheme, problem.model.forward(problem.like))[0]
+        law, _ = step_law_of(coupling.scheme, problem.model.forward(problem.like))
+        # Other meeting rules than `BrownianCrossing` have errors, even with exact steps.
+        return ItoTaylorDensity() if law.is_exact else law
 
-    densities = (problem.density, *map(of_single, proposal.singles))
+    densities = (*map(of_single, proposal.singles), problem.density)
     return min(filter(None, densities), key=lambda density: density.order)
 
 

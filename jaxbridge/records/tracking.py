@@ -51,7 +51,7 @@ def tracking_path(
         zeta, step = inputs
 
         def of_particle(x, zeta):
-            law = target_law(dynamics_at, x, step)
+            law = target_law(problem.density, dynamics_at, x, step)
             return law.mean + matvec(law.root, zeta)
 
         x = over_lanes(-1, -1)(of_particle)(x, zeta)

@@ -75,8 +75,9 @@ from .step_density import (
     LocalLinearDensity as LocalLinearDensity,
     QuadraticDensity as QuadraticDensity,
     check_step_density as check_step_density,
-    fitted_density as fitted_density,
+    known_transition as known_transition,
     most_accurate_density as most_accurate_density,
+    with_transition as with_transition,
 )
 from .step_error import (
     MOST_TOO_LONG as MOST_TOO_LONG,

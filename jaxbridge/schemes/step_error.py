@@ -288,10 +288,11 @@ def share_in_regime(
 ) -> Float[Array, "*I"]:
     """Return the share, infinite if a step is longer than the relaxation time at either end.
 
-    A share of zero stays zero. The mean of a step of length δ is a polynomial of δ∇α, in place of
-    an exponential function. Half as many steps are unstable if the spectral radius ρ of ∇α has
-    2δρ > 2. Then changes can have any size and either sign, and may be small by chance. One end is
-    enough: paths from a slow tail to a fast centre, or between the walls of a well, are wrong then.
+    A share of zero stays zero. The mean of a step of length δ is usually a polynomial of δ∇α, in
+    place of an exponential function. Half as many steps are unstable if the spectral radius ρ of
+    ∇α has 2δρ > 2. Then changes can have any size and either sign, and may be small by chance. One
+    end is enough: paths from a slow tail to a fast centre, or between the walls of a well, are
+    wrong then.
     """
 
     def rate(x):

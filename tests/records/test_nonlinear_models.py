@@ -140,7 +140,8 @@ def test_a_path_that_guides_worse_is_not_taken():
 
     initial = initial_law(problem.initial, problem.model, problem.like)
     begun = extended_kalman_path(
-        problem.model.forward_at(problem.like), initial, problem.steps(problem.model),
+        problem.density, problem.model.forward_at(problem.like), initial,
+        problem.steps(problem.model),
         problem.scalars(problem.model),
     )  # fmt: skip
     path, first = log_weight(begun)

@@ -12,7 +12,12 @@ from scipy.stats import multivariate_normal
 
 import jaxbridge as jb
 from jaxbridge.models.linear import linear_transition
-from jaxbridge.schemes import QuadraticDensity, most_accurate_density
+from jaxbridge.schemes import (
+    QuadraticDensity,
+    known_transition,
+    most_accurate_density,
+    with_transition,
+)
 
 DENSITIES = {
     "euler": jb.EulerDensity(),
@@ -151,18 +156,59 @@ def test_steps_of_linear_models_are_their_transitions(columns, dt, x64):
     np.testing.assert_allclose(law.root @ law.root.T, covariance, rtol=1e-6)
 
 
+def test_linear_drifts_are_recognised():
+    like, matrix = jnp.zeros(2), jnp.array([[-2.0, 1.0], [0.5, -4.0]])
+    for drift in (
+        lambda x, p: matrix @ x + jnp.array([1.0, 2.0]),
+        lambda x, p: p["rate"] * (jnp.stack([x[1], -x[0]]) - 0.5 * x),
+        lambda x, p: jnp.array([x[1], -4 * x[0] - x[1] / 2]),
+        lambda x, p: jnp.einsum("ij,j->i", matrix, x - jnp.mean(x)) - jnp.roll(x, 1),
+        lambda x, p: jnp.where(p["rate"] > 0, -x, x),
+        lambda x, p: jnp.ones(2),
+    ):
+        assert jb.Diffusion(drift, params={"rate": 1.0}).is_linear(like)
+
+
+def test_steps_of_length_zero_do_not_move(x64):
+    """As those that pad records of fewer observations."""
+    model, x = jb.ornstein_uhlenbeck([[3.0]]), jnp.array([0.5])
+    density = most_accurate_density(model, x)
+    law = step_law(density, model, x, 0.0)
+    assert law.mean == x and law.root == 0
+    transition = known_transition(density, model.forward(x), x, jnp.asarray(0.0))
+    assert density.linear_step(-3 * jnp.eye(1), jnp.eye(1), jnp.asarray(0.0)).decay == 1
+    assert with_transition(density, transition).linear_step(None, None, None).decay == 1
+
+
+@pytest.mark.parametrize("dt", [0.125, 0.01])
+def test_noise_that_is_integrated_twice(dt):
+    """In single precision, to a few roundings of each entry."""
+    chain = jnp.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    noise = jnp.diag(jnp.array([0.0, 0.0, 1.0]))
+    single = linear_transition(chain, noise, jnp.asarray(dt)).covariance
+    with jax.enable_x64(True):
+        double = linear_transition(*(jnp.asarray(a, float) for a in (chain, noise, dt))).covariance
+    np.testing.assert_allclose(single, double, rtol=1e-5)
+
+
 def test_steps_of_other_models_are_not_exact():
     like = jnp.zeros(1)
     for model in (
         jb.Diffusion(lambda x, p: -(x**3)),
         jb.Diffusion(lambda x, p: -x, lambda x, p: jnp.sqrt(1 + x**2)[:, None]),
         jb.Diffusion(lambda x, p, t: -t * x),
+        # Derivatives that are zero where they exist.
+        jb.Diffusion(lambda x, p: -jnp.sign(x)),
+        jb.Diffusion(lambda x, p: jnp.where(x > 0, -1.0, 1.0)),
+        jb.Diffusion(lambda x, p: -jnp.floor(x)),
+        jb.Diffusion(lambda x, p: jnp.array([1.0, -1.0])[x.astype(int)]),
+        jb.Diffusion(lambda x, p: jnp.ones(1), domain=lambda x, p: x[0] > 0),
     ):
         assert not most_accurate_density(model, like).is_exact
 
 
 def test_local_linearisation_is_that_of_short_steps(x64):
-    """Up to O(δ³) in the mean, where noise enters one of two coordinates and the drift is curved."""
+    """Up to O(δ³) in the mean, for a curved drift and noise in one of two coordinates."""
     model, x, sizes = jb.fitzhugh_nagumo(), jnp.array([0.7, -0.4]), np.array([0.02, 0.01, 0.005])
     densities = jb.ItoTaylorDensity(), jb.LocalLinearDensity()
     laws = [[step_law(density, model, x, dt) for density in densities] for dt in sizes]
@@ -182,8 +228,11 @@ def test_local_linearisation_holds_where_drift_is_stiff(x64):
         name: float(step_law(density, model, jnp.array(start), dt).log_density(end)) - exact
         for name, density in DENSITIES.items()
     }
-    assert abs(error["local_linear"]) < 0.3
+    assert abs(error["local_linear"]) < 0.7
     assert abs(error["ito_taylor"]) > 1
+    # On the barrier the drift expands.
+    law = step_law(jb.LocalLinearDensity(), model, jnp.array([0.1]), 0.1)
+    assert 0 < law.mean[0] < 1
 
 
 @pytest.mark.parametrize("density", EXPANSIONS.values(), ids=EXPANSIONS)
