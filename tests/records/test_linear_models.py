@@ -79,11 +79,15 @@ def test_the_filter_is_kalmans_to_many_digits(name, x64):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", RECORDS)
-def test_the_default_steps_are_of_second_order(name):
+def test_the_default_steps_are_exact_and_others_of_second_order(name):
     record = RECORDS[name]
     options = {**record.options, "num_particles": 10, "num_steps": 20}
-    made = jb.log_likelihood(KEY, *record.arguments, **options)
     exact, euler = record.kalman(20, exact=True), record.kalman(20)
+    made = jb.log_likelihood(KEY, *record.arguments, **options | {"num_steps": 1})
+    size = max(abs(exact.log_likelihood), 1)
+    assert abs(made.value - exact.log_likelihood) < 1e-4 * size and made.step_error == 0
+    options["density"] = jb.ItoTaylorDensity()
+    made = jb.log_likelihood(KEY, *record.arguments, **options)
     error = abs(float(made.value) - exact.log_likelihood)
     assert error < 0.1 * abs(euler.log_likelihood - exact.log_likelihood)
     assert abs(made.step_error) > 0.5 * error

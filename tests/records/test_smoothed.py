@@ -50,7 +50,7 @@ def test_rounding_of_what_was_observed_exactly_is_no_disagreement():
     assert jnp.max(result.r_hat()) > 1.1 and result.trustworthy
 
 
-def oscillator(rate, gap, num_steps):
+def oscillator(rate, gap, num_steps, density=None):
     """The result, and the largest and the root mean square error of means, in posterior sds."""
     A = np.array([[0.0, -1.0], [rate**2, 0.1 * rate]])
     sigma, matrix = np.diag([0.3, 0.3 * rate]), np.array([[1.0, 0.0]])
@@ -70,6 +70,7 @@ def oscillator(rate, gap, num_steps):
         num_draws=300,
         num_warmup=100,
         num_steps=num_steps,
+        density=density,
     )
     sd = np.sqrt(np.diagonal(exact.covariance, axis1=1, axis2=2))
     return result, (np.asarray(result.mean(), float) - exact.mean) / sd, sd
@@ -79,13 +80,17 @@ def oscillator(rate, gap, num_steps):
 def test_step_errors_of_a_fast_oscillator():
     """Means off by a tenth of a posterior sd are told, within a half of it; off by two nothing
     is known, and a number would mislead; and where they are right they are trusted."""
-    coarse, off, sd = oscillator(10.0, 0.3, 16)
+    law = jb.ItoTaylorDensity()
+    coarse, off, sd = oscillator(10.0, 0.3, 16, law)
     assert not coarse.trustworthy and "discretisation error" in coarse.why()
     told = np.asarray(coarse.step_error(), float) / sd
     assert np.sqrt(np.mean(off**2)) > 0.06
     assert np.sqrt(np.mean((off - told) ** 2)) < 0.7 * np.sqrt(np.mean(off**2))
-    hopeless, off, _ = oscillator(10.0, 1.0, 8)
+    hopeless, off, _ = oscillator(10.0, 1.0, 8, law)
     assert np.max(np.abs(off)) > 2 and not hopeless.trustworthy
     assert np.all(np.isnan(hopeless.step_error()))
-    fine, off, _ = oscillator(10.0, 0.1, 8)
+    fine, off, _ = oscillator(10.0, 0.1, 8, law)
     assert np.sqrt(np.mean(off**2)) < 0.1 and fine.trustworthy
+    exact, off, _ = oscillator(10.0, 1.0, 8)  # steps of linear models have no error
+    assert np.sqrt(np.mean(off**2)) < 0.1 and exact.trustworthy
+    assert np.all(exact.step_error() == 0)

@@ -7,7 +7,8 @@ import pytest
 
 import jaxbridge as jb
 
-MODEL = jb.Diffusion(lambda x, p: -p * x, [[1.0]], params=jnp.float32(1.0))
+# Linear, but not in form: steps of linear models are exact.
+MODEL = jb.Diffusion(lambda x, p: -p * x + 0 * x**3, [[1.0]], params=jnp.float32(1.0))
 TIMES, VALUES = np.arange(4) * 20.0, np.array([0.5, -0.2, 0.9, 0.1])[:, None]
 RECORD = {
     "observation": jb.LinearGaussian(covariance=0.01),
