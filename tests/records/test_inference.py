@@ -204,8 +204,11 @@ def test_several_records_have_one_posterior(method):
     times, values = zip(*((TIMES[i:j], record()[i:j]) for i, j in parts), strict=True)
     posterior = getattr(jb, method)(
         jax.random.key(1), model(), times, values, observation=SEEN, prior=log_prior,
-        num_iterations=3000, num_warmup=1000, num_chains=4, num_steps=4, thin=2,
-        **{"pmmh": {"num_proposals": 4}, "gibbs": {}}[method],
+        num_warmup=1000, num_chains=4, num_steps=4, thin=2,
+        **{
+            "pmmh": {"num_iterations": 4000, "num_proposals": 4},
+            "gibbs": {"num_iterations": 3000},
+        }[method],
     )  # fmt: skip
     mean, sd = exact_posterior(parts=parts)
     error = np.asarray(posterior.standard_error)
