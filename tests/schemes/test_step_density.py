@@ -576,3 +576,47 @@ def test_quadratic_steps_have_a_positive_covariance(dt, x64):
         assert np.linalg.eigvalsh(np.asarray(law.covariance))[0] > 0.25 - 1e-9
         if dt == 0:
             np.testing.assert_array_equal(law.bent(x), x)
+
+
+class Tempered(jb.AbstractStepDensity):
+    """Euler's steps with a factor for the variance of each coordinate: a density of a user."""
+
+    factors: jax.Array
+    name: str
+
+    order = 1
+
+    def steps_from(self, dynamics, x):
+        assert self.name == "tempered"
+        steps = jb.EulerDensity().steps_from(dynamics, x)
+
+        def law(dt):
+            return steps.law(dt)._replace(covariance=jnp.diag(self.factors))
+
+        return jb.StepsFrom(law, steps.decay)
+
+    def linear_step(self, F, V, dt):
+        return jb.EulerDensity().linear_step(F, V, dt)
+
+
+@pytest.mark.slow
+def test_step_densities_of_users_may_have_fields():
+    """An array that is no array of lanes, and a name: factors of one give Euler's steps."""
+    model = jb.Diffusion(lambda x, p: -x, lambda x, p: 1 + 0.3 * jnp.sin(x))
+    times, values = np.arange(3) * 0.5, np.array([[0.1, 0.2], [0.3, 0.0], [-0.2, 0.1]])
+    seen = {"observation": jb.LinearGaussian(covariance=0.1), "initial": [0.0, 0.0]}
+    ends = jnp.zeros((3, 2)), 0.2 * jnp.ones((3, 2)), 0.4
+
+    def numbers(density):
+        options = {"num_steps": 4, "num_proposals": 20}
+        proposal = jb.ModifiedDiffusionBridge(density)
+        log_p = jb.transition_log_density(
+            jax.random.key(0), model, *ends, **options, proposal=proposal
+        )
+        L = jb.log_likelihood(
+            jax.random.key(0), model, times, values, **seen, num_steps=4, density=density
+        )
+        return jnp.append(log_p.value, L.value)
+
+    tempered = Tempered(jnp.ones(2), "tempered")
+    np.testing.assert_allclose(numbers(tempered), numbers(jb.EulerDensity()), atol=1e-5)
