@@ -77,7 +77,7 @@ jax.config.update("jax_disable_most_optimizations", True)  # of what is made whi
 
 # Processor time (s) of a test whose programs are not compiled yet: about twice what the longest
 # tests take.
-_MOST_SECONDS, _MOST_SECONDS_SLOW = 20, 900
+_MOST_SECONDS, _MOST_SECONDS_SLOW = 30, 900
 
 
 @pytest.hookimpl(wrapper=True)
