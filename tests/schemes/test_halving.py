@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from helpers import FULL_SIGMA, NON_REVERSIBLE, slow_beyond
 from scipy.stats import multivariate_normal
-from test_step_density import DENSITIES, FROM, TO, log_density_of_chain, quadrature
+from test_step_density import EXPANSIONS, FROM, TO, log_density_of_chain, quadrature
 
 import jaxbridge as jb
 from jaxbridge.models.bridge_problem import Intervals
@@ -25,7 +25,7 @@ def weighted_paths(model, start, end, num_bridges, num_steps, density, key=0, **
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("density", slow_beyond(1, DENSITIES.values()), ids=DENSITIES)
+@pytest.mark.parametrize("density", slow_beyond(1, EXPANSIONS.values()), ids=EXPANSIONS)
 def test_linear_drift_is_known(density, x64):
     """Every D is log [q_2δ / n_2] of the points two steps apart, n_2 being two steps of the
     chain; and e^D has the quotient of the two closed forms as its mean."""
@@ -104,7 +104,7 @@ def test_factor_is_that_of_quadrature(case, x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("density", slow_beyond(1, DENSITIES.values()), ids=DENSITIES)
+@pytest.mark.parametrize("density", slow_beyond(1, EXPANSIONS.values()), ids=EXPANSIONS)
 @pytest.mark.parametrize("num_steps", slow_beyond(1, [7, 2, 1]))
 def test_one_d_for_each_path(density, num_steps, x64):
     """The loop that draws, the maps between noise and paths, and `log_halving_of_paths` agree; of

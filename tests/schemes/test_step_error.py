@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, slow_beyond
-from test_step_density import DENSITIES, FROM, TO
+from test_step_density import EXPANSIONS, FROM, TO
 
 import jaxbridge as jb
 from jaxbridge.engine.verdict import Verdict
@@ -24,7 +24,7 @@ from jaxbridge.schemes.step_error import (
 )
 
 
-@pytest.mark.parametrize("density", slow_beyond(1, DENSITIES.values()), ids=DENSITIES)
+@pytest.mark.parametrize("density", slow_beyond(1, EXPANSIONS.values()), ids=EXPANSIONS)
 @pytest.mark.parametrize("refinement", slow_beyond(1, [1.0, 1.5]))
 @pytest.mark.parametrize("curl", slow_beyond(1, [False, True]), ids=["gradient", "curl"])
 def test_error_of_a_log_density(density, refinement, curl, x64):
@@ -97,7 +97,7 @@ def test_error_of_coupled_grids_counts_lost_paths():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("density", DENSITIES.values(), ids=DENSITIES)
+@pytest.mark.parametrize("density", EXPANSIONS.values(), ids=EXPANSIONS)
 @pytest.mark.parametrize("method", ["weighted", "chain"])
 def test_error_of_a_mean(density, method, x64):
     """That of the mid-point, against the closed form."""
