@@ -101,6 +101,20 @@ def compute_once(tree: PyTree[Array]) -> PyTree[Array]:
     return jax.tree.map(lambda array: 2 * array, held)
 
 
+@custom_vmap
+def in_any_lane(condition: Bool[Array, ""]) -> Bool[Array, ""]:
+    """Return the condition, under `vmap` whether it holds in any lane.
+
+    Then `lax.cond` remains a branch, where it would otherwise compute both sides.
+    """
+    return condition
+
+
+@in_any_lane.def_vmap
+def _in_any_lane_of_batch(axis_size, in_batched, condition):
+    return in_any_lane(jnp.any(condition)), False  # there may be an outer `vmap`
+
+
 class Rows(tuple[Array, ...]):
     """Rows of an array as separate arrays, for the state of a compiled loop.
 
@@ -371,17 +385,3 @@ _ELEMENTWISE = frozenset(
     "gt integer_pow is_finite le lgamma log log1p logistic lt max min mul ne neg not or pow rem "
     "round rsqrt select_n sign sin sinh sqrt square sub tan tanh xor".split()
 )
-
-
-@custom_vmap
-def in_any_lane(condition: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Return the condition, under `vmap` whether it holds in any lane.
-
-    Then `lax.cond` remains a branch, where it would otherwise compute both sides.
-    """
-    return condition
-
-
-@in_any_lane.def_vmap
-def _over_lanes(axis_size, in_batched, condition):
-    return in_any_lane(jnp.any(condition)), False  # there may be an outer `vmap`

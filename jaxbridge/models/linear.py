@@ -88,7 +88,6 @@ def _over_short_time(A, V, t) -> tuple[Float[Array, ""], LinearTransition]:
     doublings = jnp.ceil(jnp.log2(jnp.maximum(lax.stop_gradient(t) * rate / _MAX_SERIES_NORM, 1)))
     doublings = jnp.minimum(doublings, _MAX_DOUBLINGS)  # the loop ends for infinite rates too
     s = t / 2**doublings
-
     term, covariance_term = s * identity, s * V
     integral, covariance = term, covariance_term
     # Term j of M_s is s^j A^{j-1} / j!. As Γ' = V + A Γ + Γ Aᵀ, term j of Γ_s follows from

@@ -417,15 +417,17 @@ class _GuidedLanes:
 
         def step_at_point(x, xi, known_and_step):
             known, step = known_and_step
-            target = (
-                with_transition(self._density, known).steps_from(self._dynamics, x).law(step.dt)
-            )
+            target = self._step_law(self._density, known, x, step.dt)
             law = self._proposal.step_law(step, x, target)
             point = law.point(xi)
             return target.bent(point), self._log_densities(target, law, point, xi)
 
         results = over_lanes(-1, -1, self._lane_axis)(step_at_point)(path.x, xi, known_and_step)
         return self._add_factors(path, *results)
+
+    def _step_law(self, density, known: LinearTransition | None, x, dt) -> StepLaw:
+        """Return the law of a step of this density from x, with its transition if it is known."""
+        return with_transition(density, known).steps_from(self._dynamics, x).law(dt)
 
     def _take_coarse_step(
         self,
@@ -457,9 +459,7 @@ class _GuidedLanes:
 
         def noise_at_point(x, x_next, known_and_step):
             known, step = known_and_step
-            target = (
-                with_transition(self._density, known).steps_from(self._dynamics, x).law(step.dt)
-            )
+            target = self._step_law(self._density, known, x, step.dt)
             law = self._proposal.step_law(step, x, target)
             xi = law.noise(x_next)
             return xi, self._log_densities(target, law, x_next, xi)
@@ -497,8 +497,7 @@ class _GuidedLanes:
         def log_density_at_point(x, last):
             # An end point outside of the state space makes the weight NaN, so no path is found.
             known, end, dt = last
-            density = with_transition(self._closing, known)
-            log_density = density.steps_from(self._dynamics, x).law(dt).log_density(end)
+            log_density = self._step_law(self._closing, known, x, dt).log_density(end)
             return jnp.where(self._is_inside(end), log_density, jnp.nan)
 
         last = self._per_lane((self._last.transition, self.end, dt), num_draws)

@@ -269,10 +269,9 @@ def log_likelihood(
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
     records = as_record_problems(*arguments, num_steps=num_steps, **options)
     size = num_filters, num_particles
-    levels = range(1, 1 + num_coarse_grids(records.stacked.num_steps))
-    if records.stacked.density.is_exact:
-        levels = ()
-    grids = [records, *map(records.coarsened, levels)]
+    problem = records.stacked
+    num_coarse = 0 if problem.density.is_exact else num_coarse_grids(problem.num_steps)
+    grids = [records, *map(records.coarsened, range(1, 1 + num_coarse))]
     guides, checks = zip(*map(_guides_and_checks, grids), strict=True)
     filtered, rate = _run_stages(key, grids, list(guides), *size)
     result = _combine_filters(records, filtered, rate, num_filters * num_particles)

@@ -42,6 +42,7 @@ the drift at the start of each step.
 Time-dependent coefficients are evaluated in the middle of a step, which preserves both orders.
 """
 
+import functools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
@@ -345,9 +346,7 @@ class LinearDensity(AbstractStepDensity):
     order: ClassVar[float] = math.inf
 
     def steps_from(self, dynamics, x):
-        def transition(dt):
-            return _transition(dynamics, x, dt)
-
+        transition = functools.partial(_transition, dynamics, x)
         return _exponential_steps(dynamics, x, transition, bends=False)
 
     def linear_step(self, F, V, dt):
@@ -431,10 +430,7 @@ class LocalLinearDensity(AbstractStepDensity):
 
     def steps_from(self, dynamics, x):
         _check_constant_sigma(self, dynamics)
-
-        def transition(dt):
-            return _transition(dynamics, x, dt)
-
+        transition = functools.partial(_transition, dynamics, x)
         return _exponential_steps(dynamics, x, transition, bends=True)
 
     def linear_step(self, F, V, dt):
@@ -456,14 +452,15 @@ def _exponential_steps(
         if sigma.invertible:
             S = columns(columns(transition.covariance / jnp.where(moving, dt, 1)).T)
             S = jnp.where(moving, S, jnp.eye(len(x), dtype=x.dtype))
-            made, spread = StepLaw(x, sigma, S, dt), _mean_covariance(S)
+            made = StepLaw(x, sigma, S, dt)
         else:
             root = jnp.where(moving, semidefinite_cholesky(transition.covariance), 0)
-            made, spread = DegenerateLaw(x, root, dt), None
+            made = DegenerateLaw(x, root, dt)
         slope = drift
         if bends:
             root = jnp.stack(columns_of(sigma, x), axis=1)
-            root = root if spread is None else matmul(root, cholesky(spread))
+            if isinstance(made, StepLaw):
+                root = matmul(root, cholesky(_mean_covariance(made.covariance)))
             bent = [_along(dynamics.drift, x, column)[1] for column in root.T]
             slope = drift + dt / 4 * sum_first_axis(jnp.stack(bent))
         mean = x + matvec(transition.integral, slope)

@@ -140,8 +140,8 @@ FAST = np.array([[-40.0, 25.0], [-30.0, -60.0]])
 @pytest.mark.parametrize("dt", [1e-4, 0.3, 5.0])
 @pytest.mark.parametrize("columns", [2, 1])
 def test_steps_of_linear_models_are_their_transitions(columns, dt, x64):
-    """Of up to 300 relaxation times, and for noise in one coordinate only: by Van Loan's matrix
-    exponential."""
+    """Of up to 250 relaxation times, and for noise in one coordinate only: by matrix exponentials
+    and Lyapunov's equation."""
     sigma, c, x = np.array([[1.0, 0.4], [0.0, 0.7]])[:, :columns], np.array([3.0, -1.0]), [0.2, 0.5]
     model = jb.Diffusion(lambda x, p: jnp.array(c) + FAST @ x, jnp.array(sigma))
     density, x = most_accurate_density(model, jnp.array(x)), jnp.array(x)
