@@ -60,28 +60,8 @@ def takes_time(function: Any, num_before_time: int = 2) -> bool:
 
 def uses_argument(function: Callable, like: Float[Array, " d"]) -> bool:
     """Return whether the values of `function` depend on its argument, according to its jaxpr."""
-    jaxpr = jax.make_jaxpr(function)(like).jaxpr
-    return any(_dependent_results(jaxpr, [True] * len(jaxpr.invars)))
-
-
-def _dependent_results(jaxpr: jax.extend.core.Jaxpr, marked: list[bool]) -> list[bool]:
-    """Return, for each result of a jaxpr, whether it depends on a `marked` argument."""
-    reached = {var for var, is_marked in zip(jaxpr.invars, marked, strict=True) if is_marked}
-
-    def is_reached(atom) -> bool:
-        return not isinstance(atom, jax.extend.core.Literal) and atom in reached
-
-    for equation in jaxpr.eqns:
-        inputs = [is_reached(atom) for atom in equation.invars]
-        # Follow inner calls of `jit`. Assume that other results depend on every input.
-        if equation.primitive.name in ("jit", "pjit"):
-            outputs = _dependent_results(equation.params["jaxpr"].jaxpr, inputs)
-        else:
-            outputs = [any(inputs)] * len(equation.outvars)
-        reached.update(
-            var for var, is_marked in zip(equation.outvars, outputs, strict=True) if is_marked
-        )
-    return [is_reached(atom) for atom in jaxpr.outvars]
+    followed = _follow(jax.make_jaxpr(function)(like).jaxpr, lambda equation, inputs: True)
+    return any(followed or [])
 
 
 # Primitives that are linear in all of their arguments.
@@ -101,32 +81,46 @@ def is_affine(function: Callable, like: Float[Array, " d"]) -> bool:
     A derivative that does not depend on the argument would not be enough: that of a step function
     is zero. Functions with other primitives than sums, products and rearrangements are not affine.
     """
-    closed = jax.make_jaxpr(function)(like)
-    return _dependent_if_affine(closed.jaxpr, [True] * len(closed.jaxpr.invars)) is not None
+    return _follow(jax.make_jaxpr(function)(like).jaxpr, _keeps_affine) is not None
 
 
-def _dependent_if_affine(jaxpr: jax.extend.core.Jaxpr, marked: list[bool]) -> list[bool] | None:
-    """Return `_dependent_results`, or `None` if one is not affine in the `marked` arguments."""
+def _keeps_affine(equation: jax.extend.core.JaxprEqn, inputs: list[bool]) -> bool:
+    """Return whether results are affine in the `inputs` that depend on the argument."""
+    name = equation.primitive.name
+    if name == "select_n":
+        return not inputs[0]
+    if name in _BILINEAR:
+        return not all(inputs)
+    if name in _LINEAR_IN_FIRST:
+        return not any(inputs[_LINEAR_IN_FIRST[name] :])
+    return name in _LINEAR and _are_floating(equation.outvars)
+
+
+def _follow(
+    jaxpr: jax.extend.core.Jaxpr,
+    allows: Callable[[jax.extend.core.JaxprEqn, list[bool]], bool],
+    marked: list[bool] | None = None,
+) -> list[bool] | None:
+    """Return for each result of a jaxpr whether it depends on a `marked` argument, by default any.
+
+    Return `None` if `allows(equation, inputs)` is false for an equation on the way. `inputs` states
+    which of its inputs depend on a marked argument.
+    """
+    marked = [True] * len(jaxpr.invars) if marked is None else marked
     reached = {var for var, is_marked in zip(jaxpr.invars, marked, strict=True) if is_marked}
 
     def is_reached(atom) -> bool:
         return not isinstance(atom, jax.extend.core.Literal) and atom in reached
 
     for equation in jaxpr.eqns:
-        name, inputs = equation.primitive.name, [is_reached(atom) for atom in equation.invars]
+        inputs = [is_reached(atom) for atom in equation.invars]
         if not any(inputs):
             continue
-        outputs: list[bool] | None = [True] * len(equation.outvars)
-        if name in ("jit", "pjit"):
-            outputs = _dependent_if_affine(equation.params["jaxpr"].jaxpr, inputs)
-        elif name == "select_n":
-            outputs = None if inputs[0] else outputs
-        elif name in _BILINEAR:
-            outputs = None if all(inputs) else outputs
-        elif name in _LINEAR_IN_FIRST:
-            outputs = None if any(inputs[_LINEAR_IN_FIRST[name] :]) else outputs
-        elif name not in _LINEAR or not _are_floating(equation.outvars):
-            return None
+        # Follow inner calls of `jit`. Assume that other results depend on every input.
+        if equation.primitive.name in ("jit", "pjit"):
+            outputs = _follow(equation.params["jaxpr"].jaxpr, allows, inputs)
+        else:
+            outputs = [True] * len(equation.outvars) if allows(equation, inputs) else None
         if outputs is None:
             return None
         reached.update(

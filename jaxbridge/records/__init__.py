@@ -53,7 +53,6 @@ from .path_blocks import (
     sweep as sweep,
     tuned as tuned,
 )
-from .problem import as_record_problem as as_record_problem
 from .record import as_rows as as_rows, of_each as of_each, split_records as split_records
 from .several import (
     Records as Records,

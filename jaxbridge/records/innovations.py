@@ -9,7 +9,8 @@ step size.
 
 import math
 import warnings
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,11 +23,11 @@ from ..engine.entry import public_entry
 from ..engine.verdict import Fault, Verdict
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
-from .guide_search import GuideCheck, linearised
+from .guide_search import GuideCheck
 from .guided_record import guided, path_and_log_weight
 from .initial import Initial
 from .observation import Observation
-from .problem import RecordProblem, as_record_problem
+from .several import Records, as_record_problems, linearisations
 from .start_share import start_share
 
 _NOT_FINITE = (
@@ -39,39 +40,48 @@ _NUM_TRIED = 10
 
 
 class Innovations(NamedTuple):
-    """Paths of a record as functions of noise ξ, shape (`size`,), from `innovations`.
+    """Paths of one or several records as functions of noise ξ, from `innovations`.
 
-    Its methods may be passed directly to `jax.jit` and `jax.grad`.
+    ξ has shape (`size`,): the noise of one record after the other, each as long as that of the
+    longest. Methods may be passed directly to `jax.jit` and `jax.grad`.
 
-    - `problem`: the model, its record and the observation model.
-    - `points`: the path of the linearisation on the grid of all steps, shape (size / d, d).
-    - `guide`: diagnostics of the guide along this path.
+    - `records`: the model, its records and the observation model.
+    - `points`: the path of the linearisation of each record on the grid of all steps.
+    - `guide`: diagnostics of the guide along this path, of each record.
     """
 
-    problem: RecordProblem
-    points: Float[Array, "points d"]
+    records: Records
+    points: Float[Array, "R points d"]
     guide: GuideCheck
 
     @property
     def size(self) -> int:
-        """Return the number of entries of ξ: d for x_0, and d for each step."""
+        """Return the number of entries of ξ: for each record d for x_0, and d for each step."""
         return self.points.size
 
     @property
-    def times(self) -> Float[Array | np.ndarray, " points"]:
-        """Return the times of the points of paths, shape (M + 1,).
+    def times(self) -> Any:
+        """Return the times of the points of paths, shape (M + 1,); a list for several records.
 
         They are a NumPy array of double precision if the precision of paths cannot resolve them.
         """
-        record = self.problem.record
-        return record.clock.exactly(record.grid()[record.stored])
 
-    def path(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, "points d"]:
-        """Return the path of the noise `xi` at the parameters `params`, shape (M + 1, d)."""
-        return self._run(params, xi)[0][self.problem.record.stored]
+        def of_record(number):
+            record = self.records.problem(number).record
+            return record.clock.exactly(record.grid()[record.stored])
+
+        return self._of_each(of_record)
+
+    def path(self, params: PyTree, xi: Float[Array, " size"]) -> Any:
+        """Return the path of the noise `xi` at the parameters `params`, shape (M + 1, d).
+
+        For several records it is a list of paths.
+        """
+        paths, stored = self._run(params, xi)[0], self.records.stacked.record.stored
+        return self._of_each(lambda i: paths[i, stored[: self.records.num_points(i)]])
 
     def log_weight(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, ""]:
-        """Return log w(θ, ξ), -inf for a path that left the state space.
+        """Return log w(θ, ξ), the sum over records; -inf if a path left the state space.
 
         The mean of w over ξ ~ N(0, I) is the likelihood.
         """
@@ -84,14 +94,18 @@ class Innovations(NamedTuple):
         """
         return self.log_weight(params, xi) - (xi @ xi + self.size * math.log(2 * math.pi)) / 2
 
-    def start_share(self) -> Float[Array, ""]:
+    def start_share(self) -> Float[Array, "*R"]:
         """Return the effective fraction of the draws of x_0 by normal noise, at `model.params`.
+
+        Several records have an entry each.
 
         It is 1 if the initial law is normal. Near 0 the normal law in place of the stationary law
         misses a mode or has too light tails. Then means of w over ξ are unreliable, and a sampler
         may miss a mode. `log_likelihood` uses a mixture of normal laws instead.
         """
-        return start_share(self.problem, self.problem.model, self.points)
+        model = self.records.stacked.model
+        share = lambda problem, points: start_share(problem, model, points)
+        return _single(self.records, self.records.each(share, self.points))
 
     @property
     def verdict(self) -> Verdict:
@@ -99,7 +113,7 @@ class Innovations(NamedTuple):
 
         They are: a poor guide, and paths of weight zero for ξ = 0 or for one of ten random ξ.
         """
-        params, dtype = self.problem.model.params, self.points.dtype
+        params, dtype = self.records.stacked.model.params, self.points.dtype
         keys = jax.random.split(jax.random.key(0), _NUM_TRIED)
         tried = jax.vmap(lambda key: jax.random.normal(key, (self.size,), dtype))(keys)
         tried = jnp.concatenate([jnp.zeros_like(tried[:1]), tried])
@@ -119,17 +133,31 @@ class Innovations(NamedTuple):
         """
         return self.verdict.why()
 
-    def _run(self, params: PyTree, xi) -> tuple[Float[Array, "points d"], Float[Array, ""]]:
-        return _path_and_log_weight(self.problem, self.points, params, xi)
+    def _run(self, params: PyTree, xi) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
+        return _paths_and_log_weight(self.records, self.points, params, xi)
+
+    def _of_each(self, function: Callable[[int], Any]) -> Any:
+        """Return `function(number)` of a single record, or a list for several records."""
+        values = list(map(function, range(self.records.number)))
+        return values if self.records.number > 1 else values[0]
 
 
 @compiled
-def _path_and_log_weight(problem: RecordProblem, points, params: PyTree, xi):
-    model = problem.model.with_params(params)
-    guide = guided(problem, model, points)
-    path, log_weight = path_and_log_weight(problem, model, guide, xi.reshape(points.shape))
+def _paths_and_log_weight(records: Records, points, params: PyTree, xi):
+    model = records.stacked.model.with_params(params)
+
+    def of_record(problem, points, xi):
+        return path_and_log_weight(problem, model, guided(problem, model, points), xi)
+
+    paths, log_weights = records.each(of_record, points, xi.reshape(points.shape))
+    log_weight = jnp.sum(log_weights)
     # A path that diverged or left the state space has a weight that is not finite.
-    return path, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
+    return paths, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
+
+
+def _single(records: Records, tree: PyTree) -> PyTree:
+    """Remove the leading axis of a single record."""
+    return jax.tree.map(lambda leaf: leaf[0], tree) if records.number == 1 else tree
 
 
 @public_entry
@@ -145,7 +173,7 @@ def innovations(
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
 ) -> Innovations:
-    """Return the paths of a record as smooth functions of parameters and noise.
+    """Return the paths of one or several records as smooth functions of parameters and noise.
 
     The paths are guided by all observations. Use them with any sampler or optimiser.
 
@@ -159,6 +187,8 @@ def innovations(
           resolve a step are refused with `ValueError`.
         - For traced times neither is possible: subtract a constant from them.
     - `observations`: shape (n, m), or (n,) for one component. NaN or `None` marks a missing value.
+    - Pass several independent records as lists of `times` and `observations`, or with a leading
+        axis. They are lanes of one program.
     - `observation`: observation model, a `LinearGaussian` or an `ObservationDensity`.
     - `initial`: law of the state at the first time, or a function of `params` that returns it:
         - a point, shape (d,);
@@ -188,7 +218,7 @@ def innovations(
     value, slope = jax.value_and_grad(paths.log_density)(model.params, jnp.zeros(paths.size))
     ```
     """
-    problem = as_record_problem(
+    records = as_record_problems(
         model,
         times,
         observations,
@@ -199,11 +229,11 @@ def innovations(
         initial_time=initial_time,
         density=density,
     )
-    points, _, check = linearised(problem, model)
-    if not is_traced(check) and not check.is_usable:
+    points, check = linearisations(records, model)
+    if not is_traced(check) and not np.all(check.is_usable):
         warnings.warn(
             "the likelihood at ξ = 0 and the model's parameters is zero, so no sampler can start "
             "there: see `why()` of the result.",
             stacklevel=3,  # the caller of the decorated function
         )
-    return Innovations(problem, points, check)
+    return Innovations(records, points, _single(records, check))

@@ -3,8 +3,6 @@
 All functions that take records validate their arguments here, so their errors are the same.
 """
 
-import dataclasses
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..coupling import Stationary
-from ..engine.checks import Numbers, is_traced
+from ..engine.checks import is_traced
 from ..engine.times import check_resolved
 from ..models.diffusion import Diffusion, check_diffusion
 from ..schemes import (
@@ -23,7 +21,7 @@ from ..schemes import (
 )
 from .initial import Initial, as_initial, bound, check_initial
 from .observation import LinearGaussian, Observation, Row, Scalars, check_observation
-from .record import Record, Steps, as_records, split_records
+from .record import Record, Steps
 
 # Dimensions up to 2 d plus this number are tried, to name the right one in the error message.
 _MOST_TRIED = 8
@@ -85,42 +83,6 @@ class RecordProblem(eqx.Module):
         return jax.vmap(of_one)(self.rows)
 
 
-def as_record_problem(
-    model: Diffusion,
-    times: Numbers,
-    observations: Numbers,
-    observation: Observation,
-    initial: Initial,
-    *,
-    num_steps: int | None = None,
-    step_size: float | None = None,
-    initial_time: Numbers | None = None,
-    density: AbstractStepDensity | None = None,
-    any_constant: bool = False,
-    normal_steps: bool = False,
-) -> RecordProblem:
-    """Validate the arguments common to all functions that take one record.
-
-    **Arguments** beside those of `innovations`:
-
-    - `any_constant`: whether the stationary density may be unnormalised. It may be if only paths at
-        fixed parameters are needed.
-    - `normal_steps`: whether all steps must be normal (`most_accurate_density`).
-
-    **Raises:** `ValueError` and `TypeError` for invalid arguments.
-    """
-    pairs = split_records(times, observations)
-    if len(pairs) > 1:
-        raise ValueError(
-            f"`observations` contain {len(pairs)} records, but this function takes one: call it "
-            "for each record, because records are independent given the parameters."
-        )
-    (record,) = as_records(pairs, num_steps, step_size, initial_time)
-    law = density, any_constant, normal_steps
-    problem = problem_of(model, record, observation, initial, *law)
-    return dataclasses.replace(problem, record=problem.on_grid(record))
-
-
 def problem_of(
     model: Diffusion,
     record: Record,
@@ -131,6 +93,10 @@ def problem_of(
     normal_steps: bool = False,
 ) -> RecordProblem:
     """Validate the model, observation model and initial law of a record.
+
+    - `any_constant`: whether the stationary density may be unnormalised. It may be if only paths at
+        fixed parameters are needed.
+    - `normal_steps`: whether all steps must be normal (`most_accurate_density`).
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """

@@ -28,21 +28,37 @@ from .record import Record, as_records, split_records
 class Records(eqx.Module):
     """R records with a common model. Arrays of `stacked.record` have the axis of records first.
 
-    `num_times` holds the number of times of each record, including times of missing observations.
+    `num_times` holds the number of times of each record, including times of missing observations,
+    and `num_segments` its number of segments before they are padded.
     """
 
     stacked: RecordProblem
     num_times: tuple[int, ...] = eqx.field(static=True)
+    num_segments: tuple[int, ...] = eqx.field(static=True)
 
     @property
     def number(self) -> int:
         """Return R, the number of records."""
         return len(self.num_times)
 
+    def problem(self, number: int, padded: bool = False) -> RecordProblem:
+        """Return one of the records; if `padded`, with as many segments as the longest one."""
+        record = _entry(self.stacked.record, jnp.int32(number))
+        if not padded:
+            K, num_times = self.num_segments[number], self.num_times[number]
+            record = dataclasses.replace(
+                record,
+                since=record.since[: K + 1],
+                dt=record.dt[:K],
+                values=record.values[: K + 1],
+                which=record.which[:num_times],
+            )
+        return dataclasses.replace(self.stacked, record=record)
+
     def coarsened(self, level: int = 1) -> "Records":
         """Return the records with steps 2^`level` times as long."""
         record = _coarsened(self.stacked.record, level)
-        return Records(dataclasses.replace(self.stacked, record=record), self.num_times)
+        return dataclasses.replace(self, stacked=dataclasses.replace(self.stacked, record=record))
 
     @property
     def moving(self) -> Bool[Array, " N"]:
@@ -65,7 +81,11 @@ class Records(eqx.Module):
         if self.number > 1:
             return jax.vmap(one)(*arguments)
         # A single record is not mapped, because `vmap` evaluates both branches of a `cond`.
-        return _with_axis(one(*_without_axis(arguments)))
+        return _with_axis(one(*_entry(arguments, 0)))
+
+    def num_points(self, number: int) -> int:
+        """Return the number of points of a path of this record that users see."""
+        return self.num_segments[number] * self.stacked.record.num_equal_steps + 1
 
     def at_observations(self, values: Float[Array, "R ends"]) -> Float[Array, " n"]:
         """Return the entries at observations, record after record.
@@ -90,22 +110,24 @@ def as_record_problems(
     step_size: float | None = None,
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
+    **limits: bool,
 ) -> Records:
     """Validate the arguments common to all functions that take one or several records.
 
-    **Returns:** `Records`.
+    `limits` are `any_constant` and `normal_steps` of `problem_of`.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """
     pairs = split_records(times, observations)
     records = as_records(pairs, num_steps, step_size, initial_time)
-    problem = problem_of(model, records[0], observation, initial, density)
+    problem = problem_of(model, records[0], observation, initial, density, **limits)
     for record in records[1:]:
         check_domain(model, observation, record)
         check_clock(model, observation, record)
     num_times = tuple(len(record.which) for record in records)
+    num_segments = tuple(len(record.dt) for record in records)
     record = _stacked([problem.on_grid(record) for record in records])
-    return Records(dataclasses.replace(problem, record=record), num_times)
+    return Records(dataclasses.replace(problem, record=record), num_times, num_segments)
 
 
 # Compiled as one program, because JAX would otherwise compile one for every array.
@@ -125,9 +147,9 @@ def _coarsened(stacked: Record, level: int) -> Record:
 
 
 @compiled_sooner
-def _without_axis(tree: PyTree) -> PyTree:
-    """Remove the leading axis of a single record."""
-    return jax.tree.map(lambda leaf: leaf[0], tree)
+def _entry(tree: PyTree, number: int) -> PyTree:
+    """Return the entries of one record, without the leading axis."""
+    return jax.tree.map(lambda leaf: leaf[number], tree)
 
 
 @compiled_sooner

@@ -49,8 +49,9 @@ from .guided_record import (
 )
 from .initial import Initial
 from .observation import Observation
-from .path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep, tuned
-from .problem import RecordProblem, as_record_problem
+from .path_blocks import Paths, blocks_of_both_cuts, has_length, has_segments, sweep, tuned
+from .problem import RecordProblem
+from .several import as_record_problems
 from .states import Draws, sample_states
 from .step_regime import steps_are_too_long
 
@@ -81,7 +82,6 @@ class Smoothed(AbstractResult):
 
     - `times`: times of the points, shape (K,). It is a NumPy array of double precision if the
         precision of paths cannot resolve the times.
-    - `paths`: shape (chains, n, K, d).
     - `accepted`: acceptance rate of each block in both partitions into blocks, shape (2, B); with a
         `proposal` that of each state, shape (ends,).
     - `stuck`: whether a block never moved, shape (chains,). If so in any chain, `standard_error` is
@@ -92,13 +92,18 @@ class Smoothed(AbstractResult):
     """
 
     times: Float[Array | np.ndarray, " K"]
-    paths: Float[Array, "chains n K d"]
+    _paths: Float[Array, "chains n points d"]  # of several records as long as the longest
     accepted: Float[Array, "..."]
     stuck: Bool[Array, " chains"]
     num_truncated: Int[Array, ""]
     _problem: RecordProblem
-    _knots: Float[Array, "chains n K d"] | None = None
+    _knots: Float[Array, "chains n knots d"] | None = None
     guide: GuideCheck | None = None
+
+    @property
+    def paths(self) -> Float[Array, "chains n K d"]:
+        """Return the draws, shape (chains, n, K, d)."""
+        return self._paths[:, :, : len(self.times)]
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return the mean of `fn(path)` over all draws.
@@ -215,7 +220,7 @@ class Smoothed(AbstractResult):
             return zeros, zeros
         leaves, treedef = jax.tree.flatten(values)
         if self._knots is None:
-            D, coarse_leaves = _log_halving(problem, self.paths), leaves
+            D, coarse_leaves = _log_halving(problem, self._paths), leaves
             is_reliable = jnp.max(jnp.var(D, axis=(0, 1))) <= _MOST_VARIANCE
             D -= jnp.mean(D, axis=(0, 1))
             # e^D - 1 to second order, without products of different segments: these have a small
@@ -227,16 +232,17 @@ class Smoothed(AbstractResult):
             change, has_coarse, coarse_paths = coarse
             coarse_leaves = jax.tree.leaves(self._values(fn, coarse_paths))
             # The change is a sum, so this is the mean variance of its terms.
-            is_reliable = jnp.var(change) <= _MOST_VARIANCE * problem.num_segments
+            num_segments = jnp.sum(has_length(problem)).astype(change.dtype)
+            is_reliable = jnp.var(change) <= _MOST_VARIANCE * num_segments
             is_reliable &= jnp.mean(has_coarse) >= _LEAST_COARSE
             share = share_of_grid(problem.density.order, problem.record.lengths)
         change = jnp.where(is_reliable, change, jnp.nan)
-        varies = _noise_varies(problem, self.paths[0, 0])
+        varies = _noise_varies(problem, self._paths[0, 0])
         step_errors = [
             _step_error_of_mean(*both, change, share, varies)
             for both in zip(leaves, coarse_leaves, strict=True)
         ]
-        mean = jnp.mean(self.paths if self._knots is None else self._knots, axis=(0, 1))
+        mean = jnp.mean(self._paths if self._knots is None else self._knots, axis=(0, 1))
         too_long = steps_are_too_long(problem, problem.model, mean)
         step_errors = [unknown_where(too_long, error) for error in step_errors]
         values, doubts = zip(*step_errors, strict=True)
@@ -244,10 +250,10 @@ class Smoothed(AbstractResult):
 
     def _values(self, fn: PathFunction, paths: Float[Array, "..."] | None = None) -> PyTree:
         """Evaluate `fn` on all draws, or on these paths, in the precision of the paths."""
-        like = jax.ShapeDtypeStruct(self.paths.shape[-2:], self.paths.dtype)
-        paths = self.paths if paths is None else paths
+        paths = (self._paths if paths is None else paths)[:, :, : len(self.times)]
+        like = jax.ShapeDtypeStruct(paths.shape[-2:], paths.dtype)
         values = jax.vmap(jax.vmap(as_path_function("fn", fn, like)))(paths)
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf, self.paths.dtype), values)
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf, paths.dtype), values)
 
 
 @public_entry
@@ -271,7 +277,7 @@ def smooth(
     density: AbstractStepDensity | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
-) -> Smoothed:
+) -> Any:  # a list for several records, which a type of `times` cannot tell
     """Sample paths given a whole record, by Markov chains.
 
     The law of the draws converges to the law of the path given all observations, up to the
@@ -281,7 +287,8 @@ def smooth(
 
     - `key`: typed key.
     - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
-        `initial_time`, `density`: as in `innovations`.
+        `initial_time`, `density`: as in `innovations`. Several records run one after the other, by
+        one compiled program unless there is a `proposal`.
     - `num_draws`: number of draws per chain.
     - `num_warmup`: number of iterations before the draws, which adapt the size of moves.
     - `num_chains`: number of chains, which start from independent guided paths.
@@ -297,7 +304,8 @@ def smooth(
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if the result is not `trustworthy`.
 
-    **Returns:** `Smoothed`. Not differentiable; use `innovations` for derivatives.
+    **Returns:** `Smoothed`, or a list of them for several records. Not differentiable; use
+    `innovations` for derivatives.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
@@ -319,34 +327,43 @@ def smooth(
     block_length = check_count("block_length", 10 if block_length is None else block_length, 2)
     arguments = (model, times, observations, observation, initial)
     options = {"step_size": step_size, "initial_time": initial_time, "density": density}
-    problem = as_record_problem(
+    records = as_record_problems(
         *arguments,
         num_steps=num_steps,
         any_constant=True,
         normal_steps=proposal is not None,  # step errors of bridges need densities of the steps
         **options,
     )
-    density = problem.density
     num_proposals = check_count("num_proposals", 10 if num_proposals is None else num_proposals)
-    linearisation = linearised(problem, model)
-    if proposal is None:
-        sizes = counts, num_chains, block_length
-        draws = _run_block_chains(key, problem, linearisation, *sizes, progress_meter)
-    else:
-        proposal = as_proposal(proposal, model, problem.like)
-        start_key, key = jax.random.split(key)
-        firsts = _guided_paths(start_key, problem, linearisation, num_chains)
-        sizes = (*counts, num_proposals)
-        draws = sample_states(key, problem, proposal, firsts, sizes, progress_meter)
-        density = _least_accurate(problem, proposal)
-    by_chain = lambda draws: jnp.moveaxis(draws, 1, 0)
-    paths, knots = by_chain(draws.paths), None if draws.knots is None else by_chain(draws.knots)
-    diagnostics = (draws.accepted, draws.stuck, draws.num_truncated)
-    times = problem.record.clock.exactly(draws.since)
-    # Discretisation errors need the grid of the paths, which a `proposal` may choose.
-    problem = dataclasses.replace(problem, record=draws.record, density=density)
-    smoothed = Smoothed(times, paths, *diagnostics, problem, knots, linearisation.check)
-    return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
+
+    def of_record(key: Key[Array, ""], number: int) -> Smoothed:
+        # Paths of one shape need one program. The pilots of a `proposal` need real gaps.
+        problem = records.problem(number, padded=proposal is None)
+        linearisation, density = linearised(problem, model), problem.density
+        if proposal is None:
+            sizes = counts, num_chains, block_length
+            draws = _run_block_chains(key, problem, linearisation, *sizes, progress_meter)
+            num_points = records.num_points(number)
+        else:
+            bridges = as_proposal(proposal, model, problem.like)
+            start_key, key = jax.random.split(key)
+            firsts = _guided_paths(start_key, problem, linearisation, num_chains)
+            sizes = (*counts, num_proposals)
+            draws = sample_states(key, problem, bridges, firsts, sizes, progress_meter)
+            density = _least_accurate(problem, bridges)
+            num_points = len(draws.since)
+        by_chain = lambda draws: jnp.moveaxis(draws, 1, 0)
+        paths, knots = by_chain(draws.paths), None if draws.knots is None else by_chain(draws.knots)
+        diagnostics = (draws.accepted, draws.stuck, draws.num_truncated)
+        times = problem.record.clock.exactly(draws.since[:num_points])
+        # Discretisation errors need the grid of the paths, which a `proposal` may choose.
+        problem = dataclasses.replace(problem, record=draws.record, density=density)
+        smoothed = Smoothed(times, paths, *diagnostics, problem, knots, linearisation.check)
+        return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
+
+    if records.number == 1:
+        return of_record(key, 0)
+    return list(map(of_record, jax.random.split(key, records.number), range(records.number)))
 
 
 def _least_accurate(problem: RecordProblem, proposal: AbstractProposal) -> AbstractStepDensity:
@@ -527,7 +544,8 @@ def _log_halving(
         return of_segments.reshape(chains, K)
 
     # One draw of all chains at a time, to save memory.
-    return jnp.moveaxis(lax.map(of_draw, jnp.moveaxis(paths, 1, 0)), 0, 1)
+    D = jnp.moveaxis(lax.map(of_draw, jnp.moveaxis(paths, 1, 0)), 0, 1)
+    return jnp.where(has_length(problem), D, 0)
 
 
 def _step_error_of_mean(

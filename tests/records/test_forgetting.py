@@ -9,7 +9,7 @@ import pytest
 from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
-from jaxbridge.records import Filtered, as_record_problem, linearised, run_filters
+from jaxbridge.records import Filtered, as_record_problems, linearised, run_filters
 from jaxbridge.records.forgetting import chosen_of, confirmed, loses_least, undecided
 from jaxbridge.records.guided_record import forgetful
 
@@ -21,7 +21,7 @@ TIMES, VALUES = np.arange(6) * 0.5, np.array([0.1, 0.7, -0.2, np.nan, -0.9, 0.3]
 @pytest.mark.slow
 def test_likelihoods_are_unbiased_whatever_is_forgotten():
     """Of a linear model: all weights are equal where nothing is."""
-    problem = as_record_problem(MODEL, TIMES, VALUES, SEEN, LAW, num_steps=4)
+    problem = as_record_problems(MODEL, TIMES, VALUES, SEEN, LAW, num_steps=4).problem(0)
     guide = linearised(problem, MODEL).guide
 
     @jax.jit
@@ -92,7 +92,7 @@ def test_a_side_that_all_filters_miss_is_found():
     law, seen = jb.GaussianLaw([0.15, 0.0], np.diag([0.5, 0.01])), jb.LinearGaussian([[0, 1]], 0.01)
     given = {"observation": seen, "initial": law, "num_steps": 10}
     made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=1600, **given)
-    problem = as_record_problem(model, times, values, seen, law, num_steps=10)
+    problem = as_record_problems(model, times, values, seen, law, num_steps=10).problem(0)
     guide = linearised(problem, model).guide
     run = jax.jit(lambda key, rate, P: run_filters(
         key, problem, model, forgetful(guide, rate), (8, P)
@@ -157,7 +157,7 @@ def test_spikes_that_are_hidden_in_noise():
     assert made.forgetting > 0
     allowed = 5 * np.hypot(made.standard_error, error)
     assert abs(made.value - exact) < allowed < 1.5
-    problem = as_record_problem(model, times, values, seen, law, num_steps=20)
+    problem = as_record_problems(model, times, values, seen, law, num_steps=20).problem(0)
     guide = linearised(problem, model).guide
     sure = run_filters(jax.random.key(2), problem, model, guide, (8, 400))
     assert logsumexp(sure.log_estimate) - np.log(8) < exact - allowed

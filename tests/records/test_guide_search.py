@@ -7,7 +7,7 @@ import pytest
 from grid_filter import grid_filter
 
 import jaxbridge as jb
-from jaxbridge.records import as_record_problem, check_guide, linearised
+from jaxbridge.records import as_record_problems, check_guide, linearised
 from jaxbridge.records.linearisation import stay_inside
 
 VOLTAGE = jb.LinearGaussian([[1.0, 0.0]], 0.01)
@@ -37,7 +37,7 @@ def test_a_guide_is_found_where_the_filter_is_thrown_off(num_steps):
     a weight."""
     times, values, options = neuron_record(num_steps)
     model = jb.fitzhugh_nagumo()
-    problem = as_record_problem(model, times, values, **options)
+    problem = as_record_problems(model, times, values, **options).problem(0)
     guide = linearised(problem, model).guide
     check = check_guide(problem, model, guide)
     assert check.is_usable and check.largest_residual < 2.5
@@ -67,7 +67,7 @@ def test_a_reading_outside_of_the_state_space():
         "initial": jb.GaussianLaw([0.25], [[0.0025]]),
         "num_steps": 20,
     }
-    problem = as_record_problem(model, times, values, **options)
+    problem = as_record_problems(model, times, values, **options).problem(0)
     points, _, check = linearised(problem, model)
     assert np.all(points > 0) and check.is_usable
     made = jb.log_likelihood(jax.random.key(0), model, times, values, num_particles=500, **options)

@@ -13,7 +13,7 @@ import jaxbridge as jb
 from jaxbridge.engine.checks import nondifferentiable
 from jaxbridge.engine.diagnostics import effective_size_of_chains
 from jaxbridge.records import (
-    as_record_problem,
+    as_record_problems,
     linearised,
     noise_and_log_weight,
     path_and_log_weight,
@@ -274,7 +274,7 @@ def test_the_maximum_is_that_of_the_kalman_filter(curved):
 @pytest.mark.parametrize("law", [lambda params: [0.0], lambda params: jb.GaussianLaw([0.0], [[1]])])
 def test_beginnings_may_be_functions_of_parameters(law):
     """In programs of which no derivative is taken, as those of all who infer parameters are."""
-    problem = as_record_problem(model(), TIMES, record(), SEEN, law, num_steps=2)
+    problem = as_record_problems(model(), TIMES, record(), SEEN, law, num_steps=2).problem(0)
     same = nondifferentiable(problem)
     assert same.initial(model().params) is not None and same.initial == problem.initial
 
@@ -331,7 +331,7 @@ def test_nuts_finds_them_too():
 def test_noise_is_that_which_makes_the_path():
     """The inverse of `path_and_log_weight`, to rounding, where noise moves the path everywhere."""
     values, law = record()[:6], jb.GaussianLaw([0.0], [[0.5]])
-    problem = as_record_problem(model(), TIMES[:6], values, SEEN, law, num_steps=3)
+    problem = as_record_problems(model(), TIMES[:6], values, SEEN, law, num_steps=3).problem(0)
     points, guide, _ = jax.jit(lambda: linearised(problem, model()))()
     noise = jax.random.normal(jax.random.key(2), points.shape)
     path, log_weight = path_and_log_weight(problem, model(), guide, noise)

@@ -10,7 +10,7 @@ from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
 from jaxbridge.exact import log_mean_and_error
-from jaxbridge.records import as_record_problem, linearised, run_filters
+from jaxbridge.records import as_record_problems, linearised, run_filters
 
 MODEL = jb.fitzhugh_nagumo()
 START = jb.GaussianLaw([0.0, -0.8], jnp.eye(2))
@@ -92,7 +92,7 @@ def test_heavy_tails_are_told(noise, num_particles):
     assert made.forgetting > 0
     assert abs(made.value - exact) < 4.5 * np.hypot(error, made.standard_error)
 
-    problem = as_record_problem(MODEL, TIMES, values, **options)
+    problem = as_record_problems(MODEL, TIMES, values, **options).problem(0)
     guide = linearised(problem, MODEL).guide
     sure = run_filters(jax.random.key(0), problem, MODEL, guide, (16, num_particles))
     (value,), (standard_error,), _ = log_mean_and_error(sure.log_estimate[None])

@@ -16,7 +16,7 @@ import jaxbridge as jb
 from jaxbridge.records import guided, linearised, path_and_log_weight
 from jaxbridge.records.initial import initial_law
 from jaxbridge.records.linearisation import extended_kalman_path
-from jaxbridge.records.problem import as_record_problem
+from jaxbridge.records.several import as_record_problems
 
 KEY = jax.random.key(0)
 
@@ -131,7 +131,7 @@ def test_a_path_that_guides_worse_is_not_taken():
     """From the filter's means, with a well on either side of a gap, to the likeliest path."""
     case, values, _ = recorded("double well")
     given = case.model, case.times, values, case.observation, options(case)["initial"]
-    problem = as_record_problem(*given, num_steps=20)
+    problem = as_record_problems(*given, num_steps=20).problem(0)
 
     @jax.jit
     def log_weight(points):

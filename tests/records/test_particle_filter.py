@@ -10,7 +10,7 @@ from helpers import slow_beyond
 from scipy import stats
 
 import jaxbridge as jb
-from jaxbridge.records import as_record_problem, linearised, run_filters
+from jaxbridge.records import as_record_problems, linearised, run_filters
 
 MODEL = jb.ornstein_uhlenbeck([[1.0]])
 TIMES, COUNTS = np.arange(4) * 0.3, np.array([2.0, 1, 0, 5])[:, None]
@@ -18,10 +18,10 @@ GUESS = jb.LinearGaussian([[3.0]], 4.0)
 
 
 def filters(log_density, num_particles, num_filters=500):
-    problem = as_record_problem(
+    problem = as_record_problems(
         MODEL, TIMES, COUNTS, jb.ObservationDensity(log_density, GUESS),
         jb.GaussianLaw([0.0], [[0.5]]), num_steps=4,
-    )  # fmt: skip
+    ).problem(0)  # fmt: skip
     guide, size = linearised(problem, MODEL).guide, (num_filters, num_particles)
     run = jax.jit(lambda key: run_filters(key, problem, MODEL, guide, size))
     return run(jax.random.key(0))

@@ -9,7 +9,7 @@ import jaxbridge as jb
 from jaxbridge.inference.record_gibbs import RecordPosterior, RecordState
 from jaxbridge.records import (
     Paths,
-    as_record_problem,
+    as_record_problems,
     blocks_of_both_cuts,
     has_segments,
     linearised,
@@ -27,9 +27,9 @@ LAW = jb.GaussianLaw([0.0], [[0.5]])
 
 def problem_of_length(num, observation=POSITIVE):
     counts = np.resize(COUNTS, (num + 1, 1))
-    return as_record_problem(
+    return as_record_problems(
         MODEL, np.arange(num + 1) * 0.3, counts, observation, LAW, num_steps=4, any_constant=True
-    )
+    ).problem(0)
 
 
 @pytest.mark.slow

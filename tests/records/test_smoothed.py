@@ -7,7 +7,7 @@ import pytest
 from kalman import exact_step, kalman
 
 import jaxbridge as jb
-from jaxbridge.records.problem import as_record_problem
+from jaxbridge.records.several import as_record_problems
 from jaxbridge.records.smooth import Smoothed
 
 SEEN = jb.LinearGaussian(covariance=1.0)
@@ -18,10 +18,12 @@ def smoothed(paths, stuck=False, num_truncated=0, model=None):
     exact."""
     model = jb.Diffusion(lambda x, p: 0 * x) if model is None else model
     values, law = jnp.zeros((2, paths.shape[-1])), jnp.zeros(paths.shape[-1])
-    problem = as_record_problem(model, jnp.array([0.0, 2.0]), values, SEEN, law, num_steps=2)
+    problem = as_record_problems(
+        model, jnp.array([0.0, 2.0]), values, SEEN, law, num_steps=2
+    ).problem(0)
     flags = jnp.full(len(paths), stuck)
     truncated = jnp.int32(num_truncated)
-    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, truncated, problem)
+    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, truncated, records.problem(0))
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 import jaxbridge as jb
 from jaxbridge.records import (
-    as_record_problem,
+    as_record_problems,
     guided,
     knots_and_log_weight,
     noise_and_log_weight,
@@ -150,7 +150,7 @@ def test_knots_determine_the_noise_and_the_path(x64):
     options = {"initial": jb.GaussianLaw([0.0, 0.2], 0.1 * np.eye(2)), "num_steps": 3}
     seen = np.array([[0.1, 0.3], [0.4, np.nan], [-0.2, 0.1]])
     gaussian = jb.LinearGaussian(covariance=0.04 * np.eye(2))
-    problem = as_record_problem(plane, [0.0, 0.4, 1.0], seen, gaussian, **options)
+    problem = as_record_problems(plane, [0.0, 0.4, 1.0], seen, gaussian, **options).problem(0)
     points = jnp.full((problem.num_segments * problem.num_steps + 1, 2), 0.1)
     xi = jax.random.normal(jax.random.key(2), points.shape)
 
