@@ -605,11 +605,6 @@ RECORDS = [
     ("one and two", several([TWO], [LINE[:2]] * 2), "got 1 and 2"),
     ("columns", several([TWO] * 2, [LINE[:2], VALUES[:2]]), r"columns.*\[1, 2\]"),
     ("times go back", several([TWO, [0, -1.0]], [LINE[:2]] * 2), "in record 1: .*increasing"),
-    (
-        "path of two",
-        reads("smooth")(times=[AT] * 2, observations=[VALUES] * 2),
-        "2 records, but this function takes one",
-    ),
     # Paths between what was seen.
     ("no proposal", between(proposal=None, num_proposals=3), "`num_proposals` is for a `proposal`"),
     ("blocks", between(block_length=3), "`block_length` is for paths without"),

@@ -93,7 +93,7 @@ class Record(eqx.Module):
     @property
     def stored(self) -> Int[np.ndarray, " points"]:
         """Return the indices of the points that users see, without those of split steps."""
-        K, N = self.dt.shape
+        K, N = self.dt.shape[-2:]  # the same for all records of a stack
         begins = np.arange(K)[:, None] * N + np.arange(self.num_equal_steps)
         return np.append(begins.ravel(), K * N)
 

@@ -80,6 +80,46 @@ def test_paths_beyond_the_end_of_the_shorter_one_are_nobodys():
 
 
 @pytest.mark.slow
+def test_paths_of_several_records_are_those_of_each():
+    """The noise of a record is as long as that of the longest; the rest of it has no effect."""
+    together = jb.innovations(*both(), **LONG.options, num_steps=4)
+    noise = np.random.default_rng(0).normal(size=(2, together.size // 2)).astype(np.float32)
+    paths = together.path(LONG.model.params, jnp.array(noise.ravel()))
+    total = 0.0
+    for record, xi, path, times in zip((LONG, SHORT), noise, paths, together.times, strict=True):
+        alone = jb.innovations(*record.arguments, **record.options, num_steps=4)
+        own = jnp.array(xi[: alone.size])
+        np.testing.assert_allclose(path, alone.path(LONG.model.params, own), atol=2e-5)
+        np.testing.assert_allclose(times, alone.times, rtol=1e-6)
+        total += alone.log_weight(LONG.model.params, own)
+    log_weight = together.log_weight(LONG.model.params, jnp.array(noise.ravel()))
+    np.testing.assert_allclose(log_weight, total, atol=1e-4)
+    assert together.start_share().shape == (2,)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("density", [jb.EulerDensity(), None], ids=["Euler", "quadratic"])
+def test_each_record_is_smoothed(density):
+    """The shorter of two records has the mean and the step error that it has by itself. Steps of
+    second order are stored by their noise."""
+    model = jb.Diffusion(lambda x, p: -x, lambda x, p: 0.5 * jnp.sqrt(1 + x**2))
+    seen = jb.LinearGaussian(covariance=0.05)
+    options = {"observation": seen, "initial": [0.5], "num_steps": 4, "density": density}
+    times = [0.4 * np.arange(8), 1.0 + 0.4 * np.arange(4)]
+    values = [np.sin(t) for t in times]
+    together = jb.smooth(jax.random.key(0), model, times, values, **options)
+    (longer, made), (_, short) = together, zip(times, values, strict=True)
+    assert longer.paths.shape[2] == 29 and longer.trustworthy
+    alone = jb.smooth(jax.random.key(1), model, *short, **options)
+    assert made.paths.shape == alone.paths.shape and made.trustworthy
+    np.testing.assert_allclose(made.times, alone.times, rtol=1e-6)
+    error = np.hypot(made.standard_error(), alone.standard_error())
+    np.testing.assert_array_less(np.abs(made.mean() - alone.mean()), 5 * error + 1e-6)
+    told, doubt = (made.step_error(), alone.step_error()), made.step_uncertainty()
+    np.testing.assert_array_less(np.abs(told[0] - told[1]), 5 * doubt + 1e-6)
+
+
+@pytest.mark.slow
 def test_records_of_one_shape_may_share_their_times():
     model, times = jb.ornstein_uhlenbeck([[1.0]]), np.arange(3) * 0.5
     values = np.linspace(-0.5, 0.5, 6).reshape(2, 3, 1)

@@ -18,12 +18,11 @@ def smoothed(paths, stuck=False, num_truncated=0, model=None):
     exact."""
     model = jb.Diffusion(lambda x, p: 0 * x) if model is None else model
     values, law = jnp.zeros((2, paths.shape[-1])), jnp.zeros(paths.shape[-1])
-    problem = as_record_problems(
-        model, jnp.array([0.0, 2.0]), values, SEEN, law, num_steps=2
-    ).problem(0)
+    record = jnp.array([0.0, 2.0]), values, SEEN, law
+    problem = as_record_problems(model, *record, num_steps=2).problem(0)
     flags = jnp.full(len(paths), stuck)
     truncated = jnp.int32(num_truncated)
-    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, truncated, records.problem(0))
+    return Smoothed(jnp.arange(3.0), paths, jnp.ones((2, 1)), flags, truncated, problem)
 
 
 @pytest.mark.slow
