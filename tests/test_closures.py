@@ -94,12 +94,6 @@ def innovations(model, _, observation, initial):
     return paths.log_density(model.params, jnp.ones(paths.size) / 3)
 
 
-def innovations_path(model, observation, _, initial):
-    options = dict(observation=observation, initial=initial, num_steps=2)
-    paths = jb.innovations(model, TIMES, POINTS, **options)
-    return paths.path(model.params, jnp.ones(paths.size) / 3)[3, 0]
-
-
 def smooth(model, observation, _, initial):
     options = dict(observation=observation, initial=initial, num_draws=4, num_steps=2)
     return jb.smooth(KEY, model, TIMES, POINTS, **options).paths[0, 0, 2, 0]
@@ -129,13 +123,10 @@ FUNCTIONS = {
     "path_log_likelihood": path_log_likelihood,
     "simulate": simulate,
     "innovations": innovations,
-    "innovations.path": innovations_path,
     "log_likelihood": log_likelihood,
     "smooth": smooth,
     "couplings": density(COUPLING),
     "bridges": bridges,
-    "modified bridge": density(jb.ModifiedDiffusionBridge()),
-    "residual bridge": density(jb.ResidualBridge()),
     "gibbs": of_intervals(jb.gibbs, prior=PRIOR, num_iterations=2),
     "pmmh": of_intervals(jb.pmmh, prior=PRIOR, num_iterations=2, num_proposals=2),
     "score": of_intervals(jb.score, num_bridges=2),
@@ -147,8 +138,6 @@ NESTINGS = {
     "jit(jacfwd)": lambda f: jax.jit(jax.jacfwd(f)),
     "jit(vmap(grad))": lambda f: lambda x: jax.jit(jax.vmap(jax.grad(f)))(x[None])[0],
     "grad": jax.grad,
-    "grad(jit)": lambda f: jax.grad(jax.jit(f)),
-    "jvp": lambda f: lambda x: jax.jvp(f, (x,), (jnp.ones_like(x),))[1],
     "jit(hessian)": lambda f: jax.jit(jax.hessian(f)),
 }
 

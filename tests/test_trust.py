@@ -24,8 +24,8 @@ from jaxbridge.schemes.step_error import error_of_log_mean
 
 slow = pytest.mark.slow
 RANDOM = random_models.random_models()
-# Each dimension twice, all kinds of σ and of skew parts; by methods of all kinds the first two.
-CHOSEN = (0, 1, 5, 7, 9, 11)
+# Other dimensions, kinds of σ and of skew parts; by methods of all kinds the first one.
+CHOSEN = (1, 7, 11)
 ALL_METHODS = 2
 
 
@@ -185,7 +185,7 @@ def density_of(weighted):
 @pytest.mark.parametrize("index", CHOSEN, ids=lambda index: RANDOM[index].name)
 def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):
     """Densities and mid-points by proposals of all kinds, where none has a warning: by all for the
-    first models, and then by a coupling and one other in turn, for each takes long to compile."""
+    first model, and then by a coupling and one other in turn, for each takes long to compile."""
     random = RANDOM[index]
     model = normalised(random)
     chosen = {**methods(model, random.start), "auto": "auto"}
@@ -297,12 +297,8 @@ def test_no_scheme_is_taken_for_more_accurate_than_it_is():
 @pytest.mark.parametrize(
     "rate, speed, duration, num_steps",
     [
-        (1.0, 2 * np.pi, 2.0, 50),
         (0.1, 20.0, 2.0, 50),
-        (0.5, 3.0, 5.0, 50),
-        (1.0, 2 * np.pi, 5.0, 50),
         (0.5, 3.0, 10.0, 50),
-        (0.1, 20.0, 2.0, 200),
     ],
 )
 def test_rotation_by_auto(rate, speed, duration, num_steps):

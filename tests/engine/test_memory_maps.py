@@ -83,7 +83,7 @@ def test_many_models_survive_in_one_process():
         import jaxbridge as jb
         from jaxbridge.engine import memory_maps
 
-        limit = memory_maps.count_maps() + 2_000
+        limit = memory_maps.count_maps() + 1_000
         memory_maps._most_maps = lambda: limit
         warnings.simplefilter("always")
         most = num_dropped = 0

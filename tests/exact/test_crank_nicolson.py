@@ -22,12 +22,8 @@ def batch_means(values, num_batches=40):
     return batches.mean(), batches.std(ddof=1) / np.sqrt(num_batches)
 
 
-@pytest.mark.parametrize(
-    "proposal, step_size",
-    [pytest.param(jb.ModifiedDiffusionBridge(), 0.4, marks=pytest.mark.slow), (jb.Guided(), 0.7)],
-)
 @pytest.mark.slow
-def test_chain_has_the_law_that_weights_give(proposal, step_size):
+def test_chain_has_the_law_that_weights_give():
     """Mean and variance at a third of the time, and the share of paths that have crossed."""
     third = lambda path: path[20, 0]
     functions = [
@@ -36,11 +32,11 @@ def test_chain_has_the_law_that_weights_give(proposal, step_size):
         lambda path: jnp.where(path[30, 0] > 0, 1.0, 0.0),
     ]
     weighted = jb.sample_weighted_bridges(
-        jax.random.key(0), *HARD, num_bridges=200_000, num_steps=60, proposal=jb.Guided()
+        jax.random.key(0), *HARD, num_bridges=100_000, num_steps=60, proposal=jb.Guided()
     )
     chain = jb.sample_exact_bridges(
-        jax.random.key(1), *HARD, num_bridges=20_000, num_steps=60, proposal=proposal,
-        method="crank_nicolson", step_size=step_size,
+        jax.random.key(1), *HARD, num_bridges=20_000, num_steps=60,
+        proposal=jb.Guided(), method="crank_nicolson", step_size=0.7,
     )  # fmt: skip
     assert chain.met.all() and 0.1 < chain.acceptance_rate < 0.9
     for fn in functions:
@@ -96,13 +92,11 @@ def test_chain_is_that_of_the_kernel_and_runs_in_blackjax():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "decay, speed, duration, num_steps", [(0.1, 20, 2, 200), (1, 6.2832, 5, 100)]
-)
-def test_fast_rotation(decay, speed, duration, num_steps, x64):
+def test_fast_rotation(x64):
     """Paths of a linear process are linear in the noise, and all moves are accepted: the mid-point
     is autoregressive, of which the effective sample size is known. Mean and second moments are
     those of the closed form, up to the step error that is told."""
+    decay, speed, duration, num_steps = 0.1, 20, 2, 200
     model = jb.ornstein_uhlenbeck([[decay, speed], [-speed, decay]])
     ends, size, beta = (jnp.array([0.5, 0.2]), jnp.array([-0.4, 0.6])), 20_000, 0.9
     exact = jb.gaussian_bridge(model, *ends, float(duration), [duration / 2])

@@ -139,7 +139,7 @@ def test_linear_drift_is_guided_without_error(x64, linearisation, refinement):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("duration, num_steps", slow_beyond(1, [(0.1, 50), (0.01, 10), (1.0, 800)]))
+@pytest.mark.parametrize("duration, num_steps", slow_beyond(1, [(0.1, 50), (1.0, 400)]))
 @pytest.mark.parametrize(
     "name",
     [
@@ -226,7 +226,6 @@ def two_wells_in_numpy(barrier):
     "name, duration, num_steps",
     [
         ("modified diffusion bridge", 0.25, 200),
-        pytest.param("modified diffusion bridge", 1.0, 800, marks=pytest.mark.slow),
         pytest.param("guided", 1.0, 800, marks=pytest.mark.slow),
     ],
 )
@@ -250,9 +249,9 @@ def test_double_well_agrees_with_brownian_bridge_monte_carlo(name, duration, num
 
 
 @slow
-@pytest.mark.parametrize("duration", [1.0, 5.0])
-def test_couplings_agree(duration):
+def test_couplings_agree():
     """Two families: the Euler scheme at its step, and the diffusion up to O(δ²)."""
+    duration = 1.0
     model, ends = two_wells(), ([-1.0, 0.0], [0.8, 0.3])
     box = jb.GaussianLaw([0.0, 0.0], [[0.9, 0.0], [0.0, 0.35]])
     coupled = jb.transition_log_density(

@@ -153,7 +153,7 @@ def test_spikes_that_are_hidden_in_noise():
     seen = jb.LinearGaussian([[1.0, 0.0]], noise**2)
     law = jb.GaussianLaw([0.0, -0.8], np.eye(2))
     given = {"observation": seen, "initial": law, "num_steps": 20}
-    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=1000, **given)
+    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=500, **given)
     assert made.forgetting > 0
     allowed = 5 * np.hypot(made.standard_error, error)
     assert abs(made.value - exact) < allowed < 1.5

@@ -154,8 +154,8 @@ SPEEDS = {  # other coordinates of the speed, in which σ depends on the positio
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("of, errors", [("position", (0.08, 0.02)), ("speed", (0.1, 0.06))])
-def test_orders_where_sigma_depends_on_the_state(of, errors, x64):
+@pytest.mark.parametrize("of, most", [("position", 0.02), ("speed", 0.06)])
+def test_where_sigma_depends_on_the_state(of, most, x64):
     """The likelihood is that of other coordinates, in which the model is linear. Second order where
     noise does not change σ at once; Euler's error is twenty times as large."""
     case, start = oscillator(0.1), np.array([0.5, -0.2])
@@ -176,10 +176,9 @@ def test_orders_where_sigma_depends_on_the_state(of, errors, x64):
         "num_particles": 1000,
         "num_filters": 8,
     }
-    for num_steps, most in zip((4, 8), errors, strict=True):
-        made = jb.log_likelihood(KEY, moved, times, values, num_steps=num_steps, **options)
-        assert abs(made.value - exact) < most + 5 * made.standard_error
-        assert made.standard_error < most
+    made = jb.log_likelihood(KEY, moved, times, values, num_steps=8, **options)
+    assert abs(made.value - exact) < most + 5 * made.standard_error
+    assert made.standard_error < most
     euler = jb.EulerDensity()
     made = jb.log_likelihood(KEY, moved, times, values, num_steps=8, density=euler, **options)
     assert abs(made.value - exact) > 0.9

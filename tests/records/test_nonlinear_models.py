@@ -154,7 +154,7 @@ def test_a_path_that_guides_worse_is_not_taken():
 def test_likelihoods(name):
     case, values, exact = recorded(name)
     made = jb.log_likelihood(
-        KEY, case.model, case.times, values, **options(case), num_steps=20, num_particles=4000
+        KEY, case.model, case.times, values, **options(case), num_steps=20, num_particles=2000
     )
     assert made.standard_error < 0.1 and made.num_nonfinite == 0
     error = 4.5 * made.standard_error + abs(made.step_error) + 2 * made.step_uncertainty
@@ -217,8 +217,8 @@ def test_the_maximum_is_that_of_the_grid():
             case.times,
             values,
             **options(case),
-            num_steps=20,
-            num_bridges=500,
+            num_steps=10,
+            num_bridges=300,
             constraint=lambda p: p > 0,
         )
     error = np.hypot(estimate.monte_carlo_errors, estimate.step_uncertainty)

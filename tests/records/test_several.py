@@ -35,11 +35,6 @@ def test_likelihoods_multiply():
     assert abs(made.value - exact) < 1e-4
     assert made.effective_sample_size.shape == (15,)
     np.testing.assert_allclose(made.effective_sample_size, 5, rtol=1e-3)
-    alone = jb.log_likelihood(
-        jax.random.key(0), *SHORT.arguments, **SHORT.options, num_particles=5, num_filters=2,
-        num_steps=4, density=jb.EulerDensity(),
-    )  # fmt: skip
-    assert abs(alone.value - SHORT.kalman(4).log_likelihood) < 1e-4
 
 
 @pytest.mark.slow

@@ -76,10 +76,10 @@ def test_a_state_that_is_known_and_seen_exactly():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("size", [1.0, 3.3])
-def test_numbers_that_follow_from_others(size):
+def test_numbers_that_follow_from_others():
     """Two rows with one noise are one number, if the numbers agree: where a correlation is found to
     be one."""
+    size = 3.3
     rows, model = np.array([[0.3, 0.7], [0.3 * size, 0.7 * size]]), jb.Diffusion(drift, params=0.5)
     values = np.array([[np.nan, np.nan], [0.5, 0.5 * size], [0.2, 0.2 * size]])
     square = jnp.array([[0.49, 0.0], [0.0, 0.49 * size**2]])

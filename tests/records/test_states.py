@@ -145,8 +145,7 @@ def seen_rarely(num, gap):
 
 @pytest.mark.slow
 @pytest.mark.optimised
-@pytest.mark.parametrize("proposal", [jb.Coupling(0.0), "auto"], ids=["coupling", "auto"])
-def test_wells_that_are_seen_rarely(proposal):
+def test_wells_that_are_seen_rarely():
     """Gaps of twenty units of time, within which the diffusion changes its well or does not: the
     probability of each is known to a part in a hundred from some hundreds of draws."""
     num_steps = 100
@@ -154,7 +153,7 @@ def test_wells_that_are_seen_rarely(proposal):
     made = jb.smooth(
         KEY, WELLS, times, values, observation=jb.LinearGaussian(covariance=0.09),
         initial=jb.GaussianLaw([-1.0], [[0.25]]), num_steps=num_steps, num_draws=400,
-        num_warmup=100, proposal=proposal,
+        num_warmup=100, proposal="auto",
     )  # fmt: skip
     assert not made.stuck.any() and made.num_truncated == 0
     share = lambda path: (path[::num_steps, 0] > 0).astype(jnp.float32)
