@@ -1,6 +1,7 @@
 """Every test runs with strict promotion of dtypes and warnings as errors; those of the whole
 package that run by default, refusals and examples among them, with its annotations checked."""
 
+import gc
 import os
 import pathlib
 import platform
@@ -18,7 +19,7 @@ from packaging.version import Version  # which pytest installs
 # themselves, too, and without the optimisation that is faulty in some releases (`engine.compiler`).
 # Programs of their own (`helpers.run_program`, the command line) are as users'.
 _FLAGS = [
-    "--xla_cpu_parallel_codegen_split_count=2",
+    "--xla_cpu_parallel_codegen_split_count=1",  # workers share the cores
     "--xla_disable_hlo_passes=small-while-loop-hoisting",
 ]
 if Version(metadata.version("jaxlib")) < Version("0.11.1"):  # later ones end at unknown flags
@@ -27,6 +28,9 @@ os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
 # Workers share the cores: threads of linear algebra that wait for each other cost up to ten times
 # the time of one. NumPy and SciPy read this when they are imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Traces are millions of objects, few of which are garbage; a search for it looks at all of them.
+gc.set_threshold(200_000, 50, 50)
 
 import jax  # noqa: E402
 import pytest  # noqa: E402
