@@ -81,6 +81,7 @@ from .inference.maximum_likelihood import (
     maximum_likelihood,
 )
 from .inference.pmmh import PMMHPosterior, PMMHState, pmmh
+from .inference.population import NormalPopulation
 from .inference.posterior import AbstractPosterior
 from .inference.priors import NormalPrior
 from .inference.record_gibbs import RecordPosterior, RecordState
@@ -244,6 +245,7 @@ __all__ = [
     "Score",
     "PosteriorSummary",
     "NormalPrior",
+    "NormalPopulation",
     "path_log_likelihood",
     # Diagnostics and costs.
     "hitting_counts",

@@ -39,6 +39,7 @@ from .parameter_kernels import (
 )
 from .parameter_walk import first_root
 from .parameters import Constraint, Parameters, as_parameters, theta_of_model
+from .population import NormalPopulation, as_population
 from .posterior import (
     AbstractPosterior,
     Combination,
@@ -177,6 +178,7 @@ def gibbs(
     observation: Observation | None = None,
     initial: Initial = None,
     initial_time: Numbers | None = None,
+    population: NormalPopulation | None = None,
     num_warmup: int | None = None,
     covariance: Numbers | None = None,
     num_counts: int | None = None,
@@ -224,6 +226,8 @@ def gibbs(
     - `observation`, `initial`, `initial_time`: observation model and initial law of a noisy or
         partial record, as in `innovations`. Then parameters of σ and of the noise may be unknown,
         too.
+    - `population`: a `NormalPopulation`, for parameters that vary between records. Exact
+        observations then count as a record without noise, too.
     - `num_warmup`, `covariance`: for records only. The warm-up, by default of 500 iterations,
         adapts the sizes of moves and the guide. `covariance` is as in `pmmh`.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
@@ -267,24 +271,26 @@ def gibbs(
         check_no_record(initial=initial, initial_time=initial_time)
         problem = as_problem(key, parameters, times, observations, num_steps, step_size)
         parameters.model.check_invertible_sigma(problem.like)
-        if problem.sigma_is_unknown:
+        if problem.sigma_is_unknown or population is not None:
             # Given its complete path σ cannot move, but given its noise it can.
-            check_no_bridges(sigma_is_unknown=True, **for_bridges)
+            check_no_bridges(sigma_is_unknown=problem.sigma_is_unknown, **for_bridges)
             observation, initial = LinearGaussian(covariance=0.0), _wide_law(problem.intervals)
     if observation is not None:
         options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
         records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
         log_prior = as_log_prior(prior, parameters, unknown)
+        units = as_population(population, parameters, log_prior, records.number)
         theta, state = starting_points(
-            parameters, unknown, init, num_chains, log_prior, RecordState
+            parameters, unknown, init, num_chains, log_prior, RecordState, len(units.varies)
         )
         check_covariance_is_used(covariance, state)
-        start = (theta, first_root(covariance, log_prior, unknown)) if state is None else state
+        root = units.first_root(first_root(covariance, log_prior, unknown))
+        start = (units.joined(theta), root) if state is None else state
         num_warmup = check_count("num_warmup", 500 if num_warmup is None else num_warmup, 0)
         size = (num_warmup, num_iterations, thin)
         how = size, covariance is None, progress_meter
-        return sample_records(key, parameters, records, log_prior, start, *how)
+        return sample_records(key, units, records, start, *how)
     assert problem is not None
     check_no_record(num_warmup=num_warmup, covariance=covariance)
     check_kernel(parameter_kernel)

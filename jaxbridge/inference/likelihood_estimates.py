@@ -23,6 +23,7 @@ from ..records import (
     GuideCheck,
     guided,
     half_will_do,
+    linearisations,
     rate_for_several,
     run_filters,
     steps_are_too_long,
@@ -252,7 +253,8 @@ class RecordLikelihood(AbstractLikelihood):
 
     def near(self, key, at, theta, around):
         records, P = self.fine.records, self.num_particles
-        fine, coarse = guided_near(records, self.coarse.records, at(theta))
+        linearise = lambda records: linearisations(records, at(theta))
+        fine, coarse = guided_near(records, self.coarse.records, linearise)
         num_filters = max(_FEWEST_FILTERS, _FEWEST_PARTICLES // P)
         keys = jax.random.split(key, len(around))
         # Pilot runs only compare discount rates, so half as many steps may suffice.

@@ -47,6 +47,12 @@ class Parameters(eqx.Module):
         Examples are "alpha" and "B[0,1]", "0" and "1" for entries of a tuple, and "theta" if the
         parameters are one array without a name.
         """
+        named = self.names_of_params
+        return tuple(jax.tree.leaves(named if self.where is None else self.where(named)))
+
+    @property
+    def names_of_params(self) -> PyTree:
+        """Return the parameters of the model with lists of names in place of arrays."""
 
         def entries(path, leaf):
             name = jax.tree_util.keystr(path, simple=True, separator=".") or "theta"
@@ -54,8 +60,7 @@ class Parameters(eqx.Module):
             places = [",".join(map(str, place)) for sizes in shape for place in np.ndindex(sizes)]
             return [f"{name}[{place}]" if place else name for place in places]
 
-        named = jax.tree_util.tree_map_with_path(entries, self.model.params)
-        return tuple(jax.tree.leaves(named if self.where is None else self.where(named)))
+        return jax.tree_util.tree_map_with_path(entries, self.model.params)
 
     def vector(self, params: PyTree) -> Float[Array, " p"]:
         """Return θ, given the unknown parameters."""

@@ -21,6 +21,7 @@ from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduc
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..schemes import LEAST_UNCERTAINTY, StepError, dominates, step_faults, unknown_where
 from .parameters import Parameters, init_vectors, of_rows
+from .population import Population
 from .summary import PosteriorSummary
 
 # The discretisation error is computed for about so many draws: enough for a covariance. For all
@@ -368,8 +369,11 @@ def starting_points(
     num_chains: int | None,
     log_prior: Callable[[Array], Array],
     state_type: type,
+    num_others: int = 0,
 ) -> tuple[Float[Array, "*chains p"], Any]:
     """Return θ of each chain, and the state to continue if `init` is one, else `None`.
+
+    In a state `num_others` numbers follow θ.
 
     **Raises:** `ValueError` for an `init` that does not fit the parameters or chains, violates the
     constraint, or has a prior density that is not finite and positive.
@@ -378,11 +382,12 @@ def starting_points(
     state = init if isinstance(init, state_type) else None
     if state is not None:
         p, theta = theta.shape[0], state.theta
-        if theta.shape[-1] != p:
+        if theta.shape[-1] != p + num_others:
             raise ValueError(
-                f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are {p}: "
-                "pass the `where` of the earlier draws."
+                f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are "
+                f"{p + num_others}: pass the `where` of the earlier draws."
             )
+        theta = theta[..., :p]
         if theta.shape[:-1] != chains and num_chains is not None:
             raise ValueError(
                 f"`init` is the state of chains of shape {theta.shape[:-1]}, but `num_chains` is "
@@ -413,9 +418,12 @@ def check_covariance_is_used(covariance: Any, state: Any) -> None:
         )
 
 
-def first_chain(theta: Float[Array, "*chains p"]) -> Float[Array, " p"]:
-    """Return θ of the first chain, at which proposals are selected."""
-    return theta.reshape(-1, theta.shape[-1])[0]
+def first_chain(values: Float[Array, "..."], num_axes: int = 1) -> Float[Array, "..."]:
+    """Return the values of the first chain, such as θ, at which proposals are selected.
+
+    Those of one chain have `num_axes` axes.
+    """
+    return values if values.ndim == num_axes else values[0]
 
 
 def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
@@ -454,7 +462,7 @@ def first_states(start: Callable, key: Key[Array, ""], state: PyTree) -> Any:
 
 
 def posterior_fields(
-    parameters: Parameters, theta: Float[Array, "n *chains p"], *values: PyTree
+    parameters: Parameters | Population, theta: Float[Array, "n *chains p"], *values: PyTree
 ) -> tuple[dict[str, Any], PyTree]:
     """Return the fields `params`, `theta` and `names` of a posterior, and the other values.
 

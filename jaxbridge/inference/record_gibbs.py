@@ -11,6 +11,9 @@ The state is (θ, path). Two moves alternate:
 Hence any parameters may be unknown: those of the drift, of σ, of the noise and of the initial law.
 This holds for every step size.
 
+Parameters may vary between records (`population`). Then two moves more follow: those of each record
+given ξ, all at once, and those of the population given the parameters of the records.
+
 The guide is linearised along a path that is likely at some θ. It may be poor at a θ far away.
 Neither the law of the path given θ nor that of θ given ξ depends on the guide, so the warm-up
 replaces it (`warm_up`).
@@ -36,7 +39,7 @@ from ..engine.progress import metered_stages
 from ..exact import acceptance_rate
 from ..records import Guidance, GuideCheck, Records, tuned
 from .parameter_walk import adapt_covariance
-from .parameters import Parameters
+from .population import Population
 from .posterior import (
     AbstractPosterior,
     Combination,
@@ -48,7 +51,6 @@ from .posterior import (
     refused_moves,
     thinned_step_errors,
 )
-from .priors import GivenDensity, NormalDensity
 from .record_paths import (
     GuidedTheta,
     RecordPaths,
@@ -65,11 +67,12 @@ from .warm_up import stages
 class RecordState(NamedTuple):
     """State of a chain of `gibbs` for a record. Several chains have a leading axis.
 
-    - `theta`: θ, shape (p,).
+    - `theta`: θ, shape (p,). With a `population` the logs of its q standard deviations follow.
     - `paths`: knots of the paths of R records (`records.guided_record`).
     - `root`: S of the covariance S Sᵀ of moves of θ, shape (p, p).
     - `log_scales`: log β of the moves of the blocks.
     - `num_done`: number of iterations so far.
+    - `units`, `unit_roots`: z of each record (`population`), and S of their moves.
     """
 
     theta: Float[Array, "*chains p"]
@@ -77,6 +80,8 @@ class RecordState(NamedTuple):
     root: Float[Array, "*chains p p"]
     log_scales: Float[Array, "*chains R 2 B"]
     num_done: Int[Array, "*chains"]
+    units: Float[Array, "*chains R q"]
+    unit_roots: Float[Array, "*chains R q q"]
 
 
 class GuidedState(NamedTuple):
@@ -93,8 +98,10 @@ class RecordPosterior(AbstractPosterior):
 
     Arrays have a leading axis of chains if there are several.
 
-    - `params`: all parameters of the model, each with leading axes (*chains, n).
-    - `theta`: the unknown parameters as vectors, shape (*chains, n, p).
+    - `params`: all parameters of the model, each with leading axes (*chains, n). With a
+        `population` they are means in the population.
+    - `theta`: the unknown parameters as vectors, shape (*chains, n, p). With a `population` the
+        logs of its standard deviations follow, with names such as "log_sd(rate)".
     - `names`: names of the entries of θ, for instance "alpha" or "B[0,1]". The keys of a dictionary
         are in alphabetical order.
     - `parameters_moved`: whether θ moved, shape (*chains, n).
@@ -108,6 +115,8 @@ class RecordPosterior(AbstractPosterior):
     - `state`: last state; pass it as `init`, with `num_warmup=0`, to continue.
     - `guide`: diagnostics of the last guide of each record, from the warm-up. A poor guide is a
         fault only if chains mix poorly, too.
+    - `unit_params`: all parameters of each record, with leading axes (*chains, n, R); `None`
+        without a `population`.
     """
 
     params: PyTree
@@ -120,6 +129,7 @@ class RecordPosterior(AbstractPosterior):
     sigma_varies: bool = eqx.field(static=True)
     state: RecordState
     guide: GuideCheck | None = None
+    unit_params: PyTree = None
 
     _combinations: ClassVar[dict[str, Combination]] = {
         "stuck": lambda first, second, share: first & second,
@@ -139,22 +149,25 @@ class RecordPosterior(AbstractPosterior):
         return refused, *(() if self.guide is None else (self.guide.fault(mixes_poorly),))
 
 
+class _Weighted(NamedTuple):
+    """Parameters with their guides, paths of each record, and log w of each record."""
+
+    at: GuidedTheta
+    paths: Float[Array, "R points d"]
+    log_weights: Float[Array, " R"]
+
+
 class RecordSampler(eqx.Module):
     """Constants of the sampler, and the steps of one chain."""
 
     completion: RecordPaths
-    log_prior: NormalDensity | GivenDensity
+    population: Population
 
-    @property
-    def parameters(self) -> Parameters:
-        return self.completion.parameters
-
-    def start(
-        self, key: Key[Array, ""], start: tuple[Float[Array, " p"], Float[Array, "p p"]]
-    ) -> RecordState:
-        theta, root = start
+    def start(self, key: Key[Array, ""], state: RecordState) -> RecordState:
+        """Return the state with its first paths."""
+        theta = self.population.of_units(state.theta, state.units)
         paths, log_scales = self.completion.first(key, self.completion.at(theta))
-        return RecordState(theta, paths, root, log_scales, jnp.int32(0))
+        return state._replace(paths=paths, log_scales=log_scales)
 
     def step(
         self, key: Key[Array, ""], guided: GuidedState, learning: Bool[Array, ""]
@@ -165,39 +178,84 @@ class RecordSampler(eqx.Module):
         moved.
         """
         path_key, noise_key, walk_key, accept_key = jax.random.split(key, 4)
-        state, guides = guided
-        theta, log_scales = state.theta, state.log_scales
-        here = GuidedTheta(theta, guides)
+        (state, guides), population = guided, self.population
+        phi, units, log_scales = state.theta, state.units, state.log_scales
+        here = GuidedTheta(population.of_units(phi, units), guides)
         # This move leaves the law of the path given θ invariant, whatever the guide.
         paths, blocks_moved = self.completion.renewed(path_key, here, state.paths, log_scales)
-        noise, log_weight = self.completion.noise(noise_key, here, paths)
-        step = jax.random.normal(walk_key, theta.shape, theta.dtype)
-        proposed = theta + state.root @ step
+        noise, log_weights = self.completion.noise(noise_key, here, paths)
+        old = _Weighted(here, paths, log_weights)
+        step = jax.random.normal(walk_key, phi.shape, phi.dtype)
+        proposed = phi + state.root @ step
         # Outside the constraint the model may be invalid: evaluate at θ, and reject.
-        inside = self.parameters.allowed(proposed)
-        there = self.completion.at(jnp.where(inside, proposed, theta))
-        new_paths, new_weight = self.completion.of_noise(there, noise)
+        inside = jnp.all(population.allowed(proposed, units))
+        proposed = jnp.where(inside, proposed, phi)
+        new = self._weighted(population.of_units(proposed, units), noise)
         # Given ξ the target is π(θ) w(θ, ξ): the density of ξ cancels.
-        new = jnp.where(inside, new_weight + self.log_prior(there.theta), -jnp.inf)
         rate = acceptance_rate(
-            nan_to_neg_inf(log_weight) + self.log_prior(theta), nan_to_neg_inf(new)
+            nan_to_neg_inf(jnp.sum(log_weights)) + population.log_density(phi),
+            jnp.where(inside, nan_to_neg_inf(jnp.sum(new.log_weights)), -jnp.inf)
+            + population.log_density(proposed),
         )
         accepted = jax.random.uniform(accept_key, dtype=rate.dtype) < rate
-
+        phi, held = jax.tree.map(
+            lambda new, old: jnp.where(accepted, new, old), (proposed, new), (phi, old)
+        )
         number = state.num_done + 1
         scales = tuned(log_scales, blocks_moved, number.astype(rate.dtype))
-        (theta, guides), paths = jax.tree.map(
-            lambda new, old: jnp.where(accepted, new, old), (there, new_paths), (here, paths)
+        new_state = state._replace(
+            root=adapt_covariance(state.root, step, rate, number, learning),
+            log_scales=jnp.where(learning, scales, log_scales),
+            num_done=number,
         )
-        new_state = RecordState(
-            theta,
-            paths,
-            adapt_covariance(state.root, step, rate, number, learning),
-            jnp.where(learning, scales, log_scales),
-            number,
+        if population.varies:
+            unit_key = key_for("units", key)
+            phi, held, new_state = self._moved_units(
+                unit_key, phi, held, noise, new_state, learning
+            )
+        has_weight = nan_to_neg_inf(jnp.sum(held.log_weights)) > -jnp.inf
+        new_state = new_state._replace(theta=phi, paths=held.paths)
+        return GuidedState(new_state, held.at.guides), (accepted, has_weight, blocks_moved)
+
+    def _weighted(self, theta: Float[Array, "*R p"], noise: Float[Array, "R points d"]):
+        """Return the paths of this noise at θ, with their weights."""
+        at = self.completion.at(theta)
+        return _Weighted(at, *self.completion.of_noise(at, noise))
+
+    def _moved_units(
+        self,
+        key: Key[Array, ""],
+        phi: Float[Array, " p"],
+        old: "_Weighted",
+        noise: Float[Array, "R points d"],
+        state: RecordState,
+        learning: Bool[Array, ""],
+    ) -> tuple[Float[Array, " p"], "_Weighted", RecordState]:
+        """Move z of each record given ξ and φ, then φ given the parameters of the records."""
+        walk_key, accept_key, population_key = jax.random.split(key, 3)
+        population, z = self.population, state.units
+        step = jax.random.normal(walk_key, z.shape, z.dtype)
+        proposed = z + jnp.einsum("rij,rj->ri", state.unit_roots, step)
+        inside = population.allowed(phi, proposed)
+        proposed = jnp.where(inside[:, None], proposed, z)
+        new = self._weighted(population.of_units(phi, proposed), noise)
+        log_target = lambda weighted, z: (
+            nan_to_neg_inf(weighted.log_weights) - jnp.sum(z**2, axis=1) / 2
         )
-        has_weight = nan_to_neg_inf(jnp.where(accepted, new_weight, log_weight)) > -jnp.inf
-        return GuidedState(new_state, guides), (accepted, has_weight, blocks_moved)
+        target = jnp.where(inside, log_target(new, proposed), -jnp.inf)
+        rate = jax.vmap(acceptance_rate)(log_target(old, z), target)
+        accepted = jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate
+
+        def choose(new, old):
+            return jnp.where(accepted.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        z, held = jax.tree.map(choose, (proposed, new), (z, old))
+        adapt = lambda root, step, rate: adapt_covariance(
+            root, step, rate, state.num_done, learning
+        )
+        roots = jax.vmap(adapt)(state.unit_roots, step, rate)
+        phi, z = population.given_units(population_key, phi, z)
+        return phi, held, state._replace(units=z, unit_roots=roots)
 
     def change_by_coarse_steps(self, key: Key[Array, ""], guided: GuidedState) -> Float[Array, ""]:
         """Return the relative change of the likelihood by steps of twice the size.
@@ -205,18 +263,17 @@ class RecordSampler(eqx.Module):
         It is NaN if the path has no weight, and infinite if steps are too long for the drift.
         """
         (state, guides), completion = guided, self.completion
-        here = GuidedTheta(state.theta, guides)
-        noise, log_weight = completion.noise(key, here, state.paths)
+        here = GuidedTheta(self.population.of_units(state.theta, state.units), guides)
+        noise, log_weights = completion.noise(key, here, state.paths)
         # A path without weight, such as a placeholder, has no change.
         change = completion.change_by_coarse_steps(here, noise)
-        return jnp.where(jnp.isfinite(log_weight), change, jnp.nan)
+        return jnp.where(jnp.all(jnp.isfinite(log_weights)), change, jnp.nan)
 
 
 def sample_records(
     key: Key[Array, ""],
-    parameters: Parameters,
+    population: Population,
     records: Records,
-    log_prior: NormalDensity | GivenDensity,
     start: tuple[Float[Array, "*chains p"], Float[Array, "p p"]] | RecordState,
     size: tuple[int, int, int],
     finds_root: bool,
@@ -224,13 +281,13 @@ def sample_records(
 ) -> RecordPosterior:
     """Sample parameters and paths.
 
-    - `start`: initial θ and the root S of its first moves, or the state of earlier draws.
+    - `start`: initial φ and the root S of its first moves, or the state of earlier draws.
     - `size`: (number of warm-up iterations, number of draws, iterations per draw).
     - `finds_root`: whether S is replaced by one with the width of the likelihood.
 
     **Raises:** `ValueError` if a chain never has paths with a positive weight.
     """
-    arguments = (key, parameters, records, log_prior, start, size, finds_root, progress_meter)
+    arguments = (key, population, records, start, size, finds_root, progress_meter)
     posterior, never = _sample_records(*arguments)
     check_likelihood_was_found(never)
     return posterior
@@ -239,18 +296,16 @@ def sample_records(
 @compiled_sooner
 def _sample_records(
     key: Key[Array, ""],
-    parameters: Parameters,
+    population: Population,
     records: Records,
-    log_prior: NormalDensity | GivenDensity,
     start: tuple[Float[Array, "*chains p"], Float[Array, "p p"]] | RecordState,
     size: tuple[int, int, int],
     finds_root: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> tuple[RecordPosterior, Bool[Array, "*chains"]]:
     """Return the posterior, and whether each chain never had paths with a weight."""
-    parameters, records, log_prior, start = nondifferentiable(
-        (parameters, records, log_prior, start)
-    )
+    population, records, start = nondifferentiable((population, records, start))
+    parameters = population.parameters
     fresh = not isinstance(start, RecordState)
     num_warmup, num_iterations, thin = size
     # The warm-up is measured in draws, too, so that one loop serves both.
@@ -258,21 +313,22 @@ def _sample_records(
 
     def begin(guided, i):
         state = guided.state
-        completion = as_record_paths(parameters, records, first_chain(state.theta))
-        sampler = RecordSampler(completion, log_prior)
+        phi, root = first_chain(state.theta), first_chain(state.root, 2)
+        units = population.of_units(phi, first_chain(state.units, 2))
+        completion = as_record_paths(parameters, records, units)
+        sampler = RecordSampler(completion, population)
 
         def first(state):
-            root = state.root
             if finds_root:
-                of_chain = first_chain(state.theta), root.reshape(-1, *root.shape[-2:])[0]
-                likely = likely_root(parameters, completion.fine, log_prior, *of_chain)
-                root = jnp.broadcast_to(likely, root.shape)
-            return over_chains(sampler.start, jax.random.fold_in(key, 0), (state.theta, root))
+                log_prior = lambda phi: population.log_density(phi)
+                likely = likely_root(parameters, completion.fine, log_prior, phi, root)
+                state = state._replace(root=jnp.broadcast_to(likely, state.root.shape))
+            return over_chains(sampler.start, jax.random.fold_in(key, 0), state)
 
         if fresh:
             # Stages share one compiled loop, and only the first one creates paths.
             state = lax.cond(i == 0, first, lambda state: state, state)
-        return GuidedState(state, _guides_of(completion, state.theta)), sampler
+        return GuidedState(state, _guides_of(completion, population, state)), sampler
 
     def number(guided):
         return guided.state.num_done.reshape(-1)[0]  # key 0 is for the first paths
@@ -297,15 +353,17 @@ def _sample_records(
         theta = guided.state.theta
         share = jnp.mean(blocks_moved.astype(theta.dtype), axis=0)
         weights = jnp.any(has_weight, axis=0), changes(sampler, i, guided)
-        result = theta, jnp.any(theta_moved, axis=0), share[..., 0], *weights
+        units = guided.state.units
+        result = theta, units, jnp.any(theta_moved, axis=0), share[..., 0], *weights
         return guided, (result, sampler.completion.fine.check)
 
     bounds = stages(skipped if fresh else 0, skipped + num_iterations)
-    state = _initial_state(records, *start) if fresh else start
-    init = GuidedState(state, _no_guides(parameters, records, state.theta))
+    state = _initial_state(key, population, records, *start) if fresh else start
+    init = GuidedState(state, _no_guides(population, records, state))
     (state, _), draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
     draws, checks = draws
-    fields, (theta_moved, blocks_moved, has_weight, change) = posterior_fields(parameters, *draws)
+    fields, values = posterior_fields(population, *draws)
+    units, theta_moved, blocks_moved, has_weight, change = values
     real = movable(records)
     ever = jnp.any(blocks_moved > 0, axis=-4)  # in any draw
     posterior = RecordPosterior(
@@ -317,32 +375,51 @@ def _sample_records(
         sigma_varies=parameters.model.sigma_varies(records.stacked.like),
         state=state,
         guide=jax.tree.map(lambda leaf: leaf[-1], checks),
+        unit_params=_params_of_units(population, fields["theta"], units),
     )
     return posterior, ~jnp.any(has_weight, axis=-1)
 
 
 def _initial_state(
-    records: Records, theta: Float[Array, "*chains p"], root: Float[Array, "p p"]
+    key: Key[Array, ""],
+    population: Population,
+    records: Records,
+    theta: Float[Array, "*chains p"],
+    root: Float[Array, "p p"],
 ) -> RecordState:
     """Return the state before the first paths, with placeholders for them."""
-    chains = theta.shape[:-1]
-    paths, log_scales, root, num_done = (
-        jnp.broadcast_to(leaf, (*chains, *leaf.shape))
-        for leaf in (*no_paths(records), root, jnp.int32(0))
+    chains, q = theta.shape[:-1], len(population.varies)
+    units = jax.random.normal(
+        key_for("first units", key), (*chains, records.number, q), theta.dtype
     )
-    return RecordState(theta, paths, root, log_scales, num_done)
+    unit_root = jnp.broadcast_to(jnp.eye(q, dtype=theta.dtype), (records.number, q, q))
+    paths, log_scales, root, num_done, unit_roots = (
+        jnp.broadcast_to(leaf, (*chains, *leaf.shape))
+        for leaf in (*no_paths(records), root, jnp.int32(0), unit_root)
+    )
+    return RecordState(theta, paths, root, log_scales, num_done, units, unit_roots)
 
 
-def _guides_of(completion: RecordPaths, theta: Float[Array, "*chains p"]) -> Guidance:
+def _guides_of(completion: RecordPaths, population: Population, state: RecordState) -> Guidance:
     """Return the guides at θ of one chain, or of each of several chains."""
-    of_chain = lambda theta: completion.at(theta).guides
-    return of_chain(theta) if theta.ndim == 1 else jax.vmap(of_chain)(theta)
+    of_chain = lambda phi, units: completion.at(population.of_units(phi, units)).guides
+    each = state.theta, state.units
+    return of_chain(*each) if state.theta.ndim == 1 else jax.vmap(of_chain)(*each)
 
 
-def _no_guides(
-    parameters: Parameters, records: Records, theta: Float[Array, "*chains p"]
-) -> Guidance:
+def _no_guides(population: Population, records: Records, state: RecordState) -> Guidance:
     """Return placeholders with the shapes of the guides."""
-    completion = RecordPaths(parameters, unguided(records), unguided(records))
-    shapes = jax.eval_shape(lambda theta: _guides_of(completion, theta), theta)
+    completion = RecordPaths(population.parameters, unguided(records), unguided(records))
+    shapes = jax.eval_shape(lambda state: _guides_of(completion, population, state), state)
     return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+
+
+def _params_of_units(
+    population: Population, phi: Float[Array, "*chains n p"], units: Float[Array, "*chains n R q"]
+) -> PyTree:
+    """Return the parameters of each record, with leading axes (*chains, n, R), or `None`."""
+    if not population.varies:
+        return None
+    full = eqx.filter_vmap(population.parameters.full)
+    of_draw = eqx.filter_vmap(lambda phi, units: full(population.of_units(phi, units)))
+    return (of_draw if phi.ndim == 2 else eqx.filter_vmap(of_draw))(phi, units)

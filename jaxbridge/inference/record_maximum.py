@@ -252,8 +252,8 @@ def _approximate(
         moves = parameters.allowed(new_theta) & all_finite_leaves(new_memory)
         goal = completion.at(jnp.where(moves, new_theta, theta))
         paths, log_weights = jax.vmap(lambda noise: completion.of_noise(goal, noise))(noise)
-        # Keep the old path where the new one has no weight.
-        good = jnp.isfinite(log_weights)[:, None, None, None]
+        # Keep the old paths where one of the new ones has no weight.
+        good = jnp.all(jnp.isfinite(log_weights), axis=1)[:, None, None, None]
         chains = chains._replace(paths=jnp.where(good, paths, chains.paths))
         return (new_theta, new_memory), chains, (jnp.int32(0), jnp.int32(0))
 
@@ -269,7 +269,7 @@ def _mean_log_weight(
 ) -> Float[Array, ""]:
     """Return the mean of log w over the chains whose path has a finite log w."""
     at = completion.at(theta)
-    values = jax.vmap(lambda noise: completion.of_noise(at, noise)[1])(noise)
+    values = jax.vmap(lambda noise: jnp.sum(completion.of_noise(at, noise)[1]))(noise)
     good = jnp.isfinite(values)
     return jnp.sum(jnp.where(good, values, 0)) / jnp.maximum(jnp.sum(good.astype(values.dtype)), 1)
 

@@ -25,7 +25,6 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ..engine.averages import nan_to_neg_inf
 from ..engine.compiled import compiled_sooner
-from ..models.diffusion import Diffusion
 from ..records import (
     Guidance,
     GuideCheck,
@@ -37,11 +36,11 @@ from ..records import (
     guided,
     has_segments,
     knots_and_log_weight,
-    linearisations,
     no_check,
     noise_and_log_weight,
     pair_noise,
     path_and_log_weights,
+    points_and_check,
     stacked,
     steps_are_too_long,
     sweep,
@@ -71,9 +70,12 @@ class GuidedRecords(NamedTuple):
 
 
 class GuidedTheta(NamedTuple):
-    """Parameters θ, and the guides of the paths of each record at θ."""
+    """Parameters θ, and the guides of the paths of each record at θ.
 
-    theta: Float[Array, " p"]
+    If θ varies between records, it has a leading axis.
+    """
+
+    theta: Float[Array, "*R p"]
     guides: Guidance
 
 
@@ -93,9 +95,9 @@ class RecordPaths(eqx.Module):
         """Return N, the number of steps of each segment."""
         return self.fine.records.stacked.num_steps
 
-    def at(self, theta: Float[Array, " p"]) -> GuidedTheta:
+    def at(self, theta: Float[Array, "*R p"]) -> GuidedTheta:
         """Return θ and the guides at θ."""
-        return GuidedTheta(theta, _guides(self.fine, self.parameters.bind(theta)))
+        return GuidedTheta(theta, _guides(self.parameters, self.fine, theta))
 
     def first(
         self, key: Key[Array, ""], at: GuidedTheta
@@ -104,14 +106,15 @@ class RecordPaths(eqx.Module):
 
         The points of linearisation replace a path without weight.
         """
-        model, (records, points, _) = self.parameters.bind(at.theta), self.fine
+        records, points, _ = self.fine
 
-        def one(problem, key, points, guide):
+        def one(problem, model, key, points, guide):
             noise = jax.random.normal(key, points.shape, points.dtype)
             knots, log_weight = knots_and_log_weight(problem, model, guide, noise)
             return jnp.where(jnp.isfinite(log_weight), knots, points)
 
-        paths = records.each(one, jax.random.split(key, records.number), points, at.guides)
+        keys = jax.random.split(key, records.number)
+        paths = _each(self.parameters, records, one, at.theta, keys, points, at.guides)
         return paths, no_paths(records)[1]
 
     def renewed(
@@ -122,9 +125,9 @@ class RecordPaths(eqx.Module):
         log_scales: Float[Array, "R 2 B"],
     ) -> tuple[Float[Array, "R points d"], Bool[Array, "R 2 B 1"]]:
         """Return the paths after a sweep given θ, and whether each block moved."""
-        model, (records, points, _) = self.parameters.bind(at.theta), self.fine
+        records, points, _ = self.fine
 
-        def one(problem, key, points, guide, log_scales, path):
+        def one(problem, model, key, points, guide, log_scales, path):
             (K, N), d = problem.record.dt.shape, problem.dim
             both = blocks_of_both_cuts(problem, points, guide, _BLOCK_LENGTH)
             old = Paths(path[0][:, None], path[1:].reshape(K, N, d, 1))
@@ -132,26 +135,26 @@ class RecordPaths(eqx.Module):
             return jnp.concatenate([new.start.T, new.points.reshape(K * N, d)]), accepted
 
         keys = jax.random.split(key, records.number)
-        return records.each(one, keys, points, at.guides, log_scales, paths)
+        arguments = keys, points, at.guides, log_scales, paths
+        return _each(self.parameters, records, one, at.theta, *arguments)
 
     def noise(
         self, key: Key[Array, ""], at: GuidedTheta, paths: Float[Array, "R points d"]
-    ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
-        """Return ξ of these paths, and log w."""
-        model, records = self.parameters.bind(at.theta), self.fine.records
+    ) -> tuple[Float[Array, "R points d"], Float[Array, " R"]]:
+        """Return ξ of these paths, and log w of each record."""
+        records = self.fine.records
 
-        def one(problem, key, guide, path):
+        def one(problem, model, key, guide, path):
             return noise_and_log_weight(key, problem, model, guide, path)
 
         keys = jax.random.split(key, records.number)
-        noise, log_weight = records.each(one, keys, at.guides, paths)
-        return noise, jnp.sum(log_weight)
+        return _each(self.parameters, records, one, at.theta, keys, at.guides, paths)
 
     def of_noise(
         self, at: GuidedTheta, noise: Float[Array, "R points d"]
-    ) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
-        """Return the paths of ξ, and log w."""
-        return _paths_of_noise(self.fine.records, self.parameters.bind(at.theta), at.guides, noise)
+    ) -> tuple[Float[Array, "R points d"], Float[Array, " R"]]:
+        """Return the paths of ξ, and log w of each record."""
+        return _paths_of_noise(self.parameters, self.fine.records, at, noise)
 
     def change_by_coarse_steps(
         self, at: GuidedTheta, noise: Float[Array, "R points d"]
@@ -160,18 +163,18 @@ class RecordPaths(eqx.Module):
 
         It is infinite if steps are too long for the drift.
         """
-        model = self.parameters.bind(at.theta)
+        parameters, theta = self.parameters, at.theta
 
         def log_weights(grid, guides, noise):
-            one = lambda problem, *each: path_and_log_weights(problem, model, *each)
-            return grid.records.each(one, guides, noise)
+            one = lambda problem, model, *each: path_and_log_weights(problem, model, *each)
+            return _each(parameters, grid.records, one, theta, guides, noise)
 
         paths, log_fine = log_weights(self.fine, at.guides, noise)
-        coarse = self.coarse, _guides(self.coarse, model), self._coarsened(noise)
-        change = jnp.sum(jax.vmap(change_by_coarse_steps)(log_fine, log_weights(*coarse)[1]))
-        one = lambda problem, path: steps_are_too_long(problem, model, path)
-        too_long = jnp.any(self.fine.records.each(one, paths))
-        return jnp.where(too_long, jnp.inf, change)
+        guides = _guides(parameters, self.coarse, theta)
+        _, log_coarse = log_weights(self.coarse, guides, self._coarsened(noise))
+        change = jnp.sum(jax.vmap(change_by_coarse_steps)(log_fine, log_coarse))
+        too_long = _each(parameters, self.fine.records, steps_are_too_long, theta, paths)
+        return jnp.where(jnp.any(too_long), jnp.inf, change)
 
     def either_log_weight(
         self, theta: Float[Array, " p"], noise: Float[Array, "R points d"], coarse: Bool[Array, ""]
@@ -184,8 +187,8 @@ class RecordPaths(eqx.Module):
     def _log_weight(
         self, grid: GuidedRecords, theta: Float[Array, " p"], noise: Float[Array, "R points d"]
     ) -> Float[Array, ""]:
-        model = self.parameters.bind(theta)
-        return _paths_of_noise(grid.records, model, _guides(grid, model), noise)[1]
+        at = GuidedTheta(theta, _guides(self.parameters, grid, theta))
+        return jnp.sum(_paths_of_noise(self.parameters, grid.records, at, noise)[1])
 
     def _coarsened(self, noise: Float[Array, "R points d"]) -> Float[Array, "R points d"]:
         lengths = self.fine.records.stacked.record.lengths
@@ -251,10 +254,10 @@ def on_both_grids(function: Callable, fine: PyTree, coarse: PyTree) -> Any:
 
 
 def guided_near(
-    fine: Records, coarse: Records, model: Diffusion
+    fine: Records, coarse: Records, linearise: Callable[[Records], tuple[Array, GuideCheck]]
 ) -> tuple[GuidedRecords, GuidedRecords]:
-    """Return both records with points of linearisation at the parameters of `model`."""
-    points = on_both_grids(lambda records: linearisations(records, model), fine, coarse)
+    """Return both records with points of linearisation by `linearise`."""
+    points = on_both_grids(linearise, fine, coarse)
     of_fine, of_coarse = (jax.tree.map(lambda leaf, i=i: leaf[i], points) for i in range(2))
     return GuidedRecords(fine, *of_fine), GuidedRecords(coarse, *of_coarse)
 
@@ -268,41 +271,45 @@ def no_paths(records: Records) -> tuple[Float[Array, "R points d"], Float[Array,
 
 @compiled_sooner
 def as_record_paths(
-    parameters: Parameters, records: Records, theta: Float[Array, " p"]
+    parameters: Parameters, records: Records, theta: Float[Array, "*R p"]
 ) -> RecordPaths:
     """Return the paths of the records, linearised at θ."""
-    grids = guided_near(records, records.coarsened(), parameters.bind(theta))
-    return RecordPaths(parameters, *grids)
+
+    def linearise(records):
+        return _each(parameters, records, points_and_check, theta)
+
+    return RecordPaths(parameters, *guided_near(records, records.coarsened(), linearise))
 
 
 def likely_root(
     parameters: Parameters,
     grid: GuidedRecords,
     log_prior: Callable[[Array], Array],
-    theta: Float[Array, " p"],
-    root: Float[Array, "p p"],
-) -> Float[Array, "p p"]:
+    phi: Float[Array, " m"],
+    root: Float[Array, "m m"],
+) -> Float[Array, "m m"]:
     """Return S of first moves with the widths of each parameter's posterior given the others.
+
+    φ begins with the entries of θ; `log_prior` is a function of φ.
 
     The likelihood is that of the guided path without noise. For a linear model it is exact up to a
     constant. At the width h the mean of the log densities at θ ± h is ½ below the log density at θ.
     A few secant steps find h; they need no derivatives and any start will do. h is at most ten
     times `root`, the width of the prior. If the path has no weight, `root` is returned.
     """
-    points, p = grid.points, theta.shape[0]
+    points, p, m = grid.points, parameters.vector(parameters.params).shape[0], phi.shape[0]
 
-    def log_density(theta):
-        model = parameters.bind(theta)
-        _, log_weight = _paths_of_noise(
-            grid.records, model, _guides(grid, model), jnp.zeros_like(points)
-        )
-        allowed = parameters.allowed(theta)
-        return jnp.where(allowed, nan_to_neg_inf(log_weight) + log_prior(theta), -jnp.inf)
+    def log_density(phi):
+        theta = phi[:p]
+        at = GuidedTheta(theta, _guides(parameters, grid, theta))
+        _, log_weights = _paths_of_noise(parameters, grid.records, at, jnp.zeros_like(points))
+        log_weight, allowed = nan_to_neg_inf(jnp.sum(log_weights)), parameters.allowed(theta)
+        return jnp.where(allowed, log_weight + log_prior(phi), -jnp.inf)
 
     def turn(width, _):
         steps = jnp.diag(width)
-        values = lax.map(log_density, jnp.concatenate([theta[None], theta + steps, theta - steps]))
-        drop = values[0] - (values[1 : p + 1] + values[p + 1 :]) / 2
+        values = lax.map(log_density, jnp.concatenate([phi[None], phi + steps, phi - steps]))
+        drop = values[0] - (values[1 : m + 1] + values[m + 1 :]) / 2
         # For a quadratic the drop is proportional to h², so at h / √(2 drop) it is ½.
         factor = jnp.clip(lax.rsqrt(2 * jnp.maximum(drop, 1e-3)), *_SECANT)
         # Without weight at θ there is no drop to measure.
@@ -312,20 +319,31 @@ def likely_root(
     first = jnp.diagonal(root)
     width, values = lax.scan(turn, first, length=_NUM_SECANTS)
     # The best factor for random walks with a normal target (Roberts & Rosenthal 2001).
-    width = width * np.asarray(2.4 / np.sqrt(p), theta.dtype)
+    width = width * np.asarray(2.4 / np.sqrt(m), phi.dtype)
     return jnp.where(values[0] > -jnp.inf, jnp.diag(width), root)
 
 
-def _guides(grid: GuidedRecords, model: Diffusion) -> Guidance:
+def _each(
+    parameters: Parameters,
+    records: Records,
+    function: Callable,
+    theta: Float[Array, "*R p"],
+    *mapped: PyTree,
+) -> Any:
+    """Evaluate `function(problem, model, *mapped)` for each record, with the model at its θ."""
+    if theta.ndim == 1:  # one model for all, which is prepared once
+        model = parameters.bind(theta)
+        return records.each(lambda problem, *each: function(problem, model, *each), *mapped)
+    of_record = lambda problem, theta, *each: function(problem, parameters.bind(theta), *each)
+    return records.each(of_record, theta, *mapped)
+
+
+def _guides(parameters: Parameters, grid: GuidedRecords, theta: Float[Array, "*R p"]) -> Guidance:
     """Return the guides of the paths of each record."""
-    return grid.records.each(lambda problem, points: guided(problem, model, points), grid.points)
+    return _each(parameters, grid.records, guided, theta, grid.points)
 
 
 def _paths_of_noise(
-    records: Records, model: Diffusion, guides: Guidance, noise: Float[Array, "R points d"]
-) -> tuple[Float[Array, "R points d"], Float[Array, ""]]:
-    def one(problem, guide, noise):
-        return knots_and_log_weight(problem, model, guide, noise)
-
-    paths, log_weight = records.each(one, guides, noise)
-    return paths, jnp.sum(log_weight)
+    parameters: Parameters, records: Records, at: GuidedTheta, noise: Float[Array, "R points d"]
+) -> tuple[Float[Array, "R points d"], Float[Array, " R"]]:
+    return _each(parameters, records, knots_and_log_weight, at.theta, at.guides, noise)

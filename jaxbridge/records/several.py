@@ -187,9 +187,12 @@ def linearisations(
     records: Records, model: Diffusion
 ) -> tuple[Float[Array, "R points d"], GuideCheck]:
     """Return the points of the linearisation of each record, and checks of the guides."""
+    return records.each(lambda problem: points_and_check(problem, model))
 
-    def one(problem: RecordProblem):
-        points, _, check = linearised(problem, model)
-        return points, check
 
-    return records.each(one)
+def points_and_check(
+    problem: RecordProblem, model: Diffusion
+) -> tuple[Float[Array, "points d"], GuideCheck]:
+    """Return the points of the linearisation of one record, and the check of its guide."""
+    points, _, check = linearised(problem, model)
+    return points, check

@@ -359,7 +359,7 @@ def smooth(
         # Discretisation errors need the grid of the paths, which a `proposal` may choose.
         problem = dataclasses.replace(problem, record=draws.record, density=density)
         smoothed = Smoothed(times, paths, *diagnostics, problem, knots, linearisation.check)
-        return throw_where_untrustworthy(smoothed, "paths", model) if throw else smoothed
+        return throw_where_untrustworthy(smoothed, "_paths", model) if throw else smoothed
 
     if records.number == 1:
         return of_record(key, 0)
