@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import block_diag
-from jaxtyping import Array, Bool, Float, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.arguments import check_function, evaluated
 from ..engine.checks import as_floating, is_traced
@@ -101,6 +101,19 @@ class Population(eqx.Module):
         return jnp.concatenate(
             [theta, jnp.broadcast_to(first, (*theta.shape[:-1], len(first)))], -1
         )
+
+    def moves(self, number: Int[Array, ""]) -> Bool[Array, "p+q"]:
+        """Return the mask of the entries of φ that move in this iteration, given z.
+
+        Those of the population and those that are the same for all records take turns: given z the
+        former are known far better, and would slow the latter down.
+        """
+        p, at = len(self.parameters.names), list(self.varies)
+        of_population = np.zeros(p + len(at), bool)
+        of_population[[*at, *range(p, p + len(at))]] = True
+        if len(at) in (0, p):
+            return jnp.ones(len(of_population), bool)
+        return of_population == (number % 2 == 0)
 
     def full(self, phi: Float[Array, "p+q"]) -> PyTree:
         """Return all parameters of the model, at the means of the population."""

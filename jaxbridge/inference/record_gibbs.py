@@ -22,6 +22,7 @@ The discretisation error of the likelihood follows from E[w̃ / w] (`record_path
 steps are too few for the drift, a path may diverge; then its w̃ is zero.
 """
 
+import functools
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
@@ -185,7 +186,9 @@ class RecordSampler(eqx.Module):
         paths, blocks_moved = self.completion.renewed(path_key, here, state.paths, log_scales)
         noise, log_weights = self.completion.noise(noise_key, here, paths)
         old = _Weighted(here, paths, log_weights)
+        number = state.num_done + 1
         step = jax.random.normal(walk_key, phi.shape, phi.dtype)
+        step = jnp.where(population.moves(number), step, 0)
         proposed = phi + state.root @ step
         # Outside the constraint the model may be invalid: evaluate at θ, and reject.
         inside = jnp.all(population.allowed(proposed, units))
@@ -201,7 +204,6 @@ class RecordSampler(eqx.Module):
         phi, held = jax.tree.map(
             lambda new, old: jnp.where(accepted, new, old), (proposed, new), (phi, old)
         )
-        number = state.num_done + 1
         scales = tuned(log_scales, blocks_moved, number.astype(rate.dtype))
         new_state = state._replace(
             root=adapt_covariance(state.root, step, rate, number, learning),
@@ -314,14 +316,14 @@ def _sample_records(
     def begin(guided, i):
         state = guided.state
         phi, root = first_chain(state.theta), first_chain(state.root, 2)
-        units = population.of_units(phi, first_chain(state.units, 2))
-        completion = as_record_paths(parameters, records, units)
+        of_records = functools.partial(population.of_units, z=first_chain(state.units, 2))
+        completion = as_record_paths(parameters, records, of_records(phi))
         sampler = RecordSampler(completion, population)
 
         def first(state):
             if finds_root:
-                log_prior = lambda phi: population.log_density(phi)
-                likely = likely_root(parameters, completion.fine, log_prior, phi, root)
+                log_prior = population.log_density
+                likely = likely_root(parameters, completion.fine, log_prior, phi, root, of_records)
                 state = state._replace(root=jnp.broadcast_to(likely, state.root.shape))
             return over_chains(sampler.start, jax.random.fold_in(key, 0), state)
 

@@ -46,7 +46,7 @@ from ..records import (
     sweep,
 )
 from ..schemes import share_of_grid
-from .parameters import Parameters
+from .parameters import Parameters, of_rows
 
 # Number of intervals between observations in a block, which moves at once.
 _BLOCK_LENGTH = 10
@@ -285,31 +285,33 @@ def likely_root(
     parameters: Parameters,
     grid: GuidedRecords,
     log_prior: Callable[[Array], Array],
-    phi: Float[Array, " m"],
-    root: Float[Array, "m m"],
-) -> Float[Array, "m m"]:
+    phi: Float[Array, " p"],
+    root: Float[Array, "p p"],
+    of_records: Callable[[Array], Array] = lambda theta: theta,
+) -> Float[Array, "p p"]:
     """Return S of first moves with the widths of each parameter's posterior given the others.
 
-    φ begins with the entries of θ; `log_prior` is a function of φ.
+    φ are the parameters that move, and `of_records` returns θ of the records.
 
     The likelihood is that of the guided path without noise. For a linear model it is exact up to a
     constant. At the width h the mean of the log densities at θ ± h is ½ below the log density at θ.
     A few secant steps find h; they need no derivatives and any start will do. h is at most ten
     times `root`, the width of the prior. If the path has no weight, `root` is returned.
     """
-    points, p, m = grid.points, parameters.vector(parameters.params).shape[0], phi.shape[0]
+    points, p = grid.points, phi.shape[0]
 
     def log_density(phi):
-        theta = phi[:p]
+        theta = of_records(phi)
         at = GuidedTheta(theta, _guides(parameters, grid, theta))
         _, log_weights = _paths_of_noise(parameters, grid.records, at, jnp.zeros_like(points))
-        log_weight, allowed = nan_to_neg_inf(jnp.sum(log_weights)), parameters.allowed(theta)
-        return jnp.where(allowed, log_weight + log_prior(phi), -jnp.inf)
+        allowed = jnp.all(of_rows(parameters.allowed, theta))
+        value = nan_to_neg_inf(jnp.sum(log_weights)) + log_prior(phi)
+        return jnp.where(allowed, value, -jnp.inf)
 
     def turn(width, _):
         steps = jnp.diag(width)
         values = lax.map(log_density, jnp.concatenate([phi[None], phi + steps, phi - steps]))
-        drop = values[0] - (values[1 : m + 1] + values[m + 1 :]) / 2
+        drop = values[0] - (values[1 : p + 1] + values[p + 1 :]) / 2
         # For a quadratic the drop is proportional to h², so at h / √(2 drop) it is ½.
         factor = jnp.clip(lax.rsqrt(2 * jnp.maximum(drop, 1e-3)), *_SECANT)
         # Without weight at θ there is no drop to measure.
@@ -319,7 +321,7 @@ def likely_root(
     first = jnp.diagonal(root)
     width, values = lax.scan(turn, first, length=_NUM_SECANTS)
     # The best factor for random walks with a normal target (Roberts & Rosenthal 2001).
-    width = width * np.asarray(2.4 / np.sqrt(m), phi.dtype)
+    width = width * np.asarray(2.4 / np.sqrt(p), phi.dtype)
     return jnp.where(values[0] > -jnp.inf, jnp.diag(width), root)
 
 

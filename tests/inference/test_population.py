@@ -74,11 +74,6 @@ def test_posterior_is_that_of_the_grid():
     size = np.asarray(jb.effective_sample_size(np.asarray(made.unit_params["level"]), chains=True))
     error = of_units.std(0) / np.sqrt(size)
     np.testing.assert_array_less(np.abs(of_units.mean(0) - levels), 5 * error)
-    on = jb.gibbs(
-        jax.random.key(0), MODEL, *data, **OPTIONS, population=jb.NormalPopulation(LEVEL),
-        num_iterations=2, **made.continuation,
-    )  # fmt: skip
-    assert on.state.num_done[0] == made.state.num_done[0] + 2
 
 
 def test_what_does_not_fit_is_refused():
