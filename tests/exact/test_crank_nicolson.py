@@ -96,7 +96,7 @@ def test_fast_rotation(x64):
     """Paths of a linear process are linear in the noise, and all moves are accepted: the mid-point
     is autoregressive, of which the effective sample size is known. Mean and second moments are
     those of the closed form, up to the step error that is told."""
-    decay, speed, duration, num_steps = 0.1, 20, 2, 200
+    decay, speed, duration, num_steps = 1.0, 6.2832, 5.0, 100
     model = jb.ornstein_uhlenbeck([[decay, speed], [-speed, decay]])
     ends, size, beta = (jnp.array([0.5, 0.2]), jnp.array([-0.4, 0.6])), 20_000, 0.9
     exact = jb.gaussian_bridge(model, *ends, float(duration), [duration / 2])

@@ -153,7 +153,7 @@ def test_wells_that_are_seen_rarely():
     made = jb.smooth(
         KEY, WELLS, times, values, observation=jb.LinearGaussian(covariance=0.09),
         initial=jb.GaussianLaw([-1.0], [[0.25]]), num_steps=num_steps, num_draws=400,
-        num_warmup=100, proposal="auto",
+        num_warmup=100, proposal=jb.Coupling(0.0),
     )  # fmt: skip
     assert not made.stuck.any() and made.num_truncated == 0
     share = lambda path: (path[::num_steps, 0] > 0).astype(jnp.float32)
