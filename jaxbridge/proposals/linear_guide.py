@@ -85,14 +85,7 @@ class Guided(AbstractGuidedProposal):
             function of time such that the path ends in b. If long steps make this path diverge, it
             is replaced by a straight line;
         - a matrix F of shape (d, d), with α̃ = α(b) and σ̃ = σ(b).
-    - `density`: step density of the target. The default is the most accurate one: exact steps for
-        linear drift and constant σ, `ItoTaylorDensity()` for other constant σ, and steps of weak
-        order 2 that are not normal for a state-dependent σ. It is `EulerDensity()` for a
-        state-dependent σ above ten dimensions, and where a given path must determine its noise: in
-        `gibbs`, `score`, kernels, chains that start from a `position`, and `maximum_likelihood`
-        with a known σ.
-    - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ], between 1 (equal steps) and 4. Above 1 the steps
-        shrink towards the end, which helps if σ varies much along the path.
+    - `density`, `refinement`: as in `ModifiedDiffusionBridge`.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
