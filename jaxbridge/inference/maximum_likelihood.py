@@ -24,7 +24,7 @@ from ..engine.arguments import check_choice
 from ..engine.checks import Numbers, check_count, check_key, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
-from ..engine.verdict import AbstractResult, Verdict
+from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..models.diffusion import Diffusion
 from ..proposals import Budget
 from ..records import Initial, Observation, as_record_problems
@@ -52,6 +52,14 @@ from .stochastic_approximation import EM, Gradient, Search, SearchInfo, approxim
 
 # Created once, because optimisers are compared by identity.
 _ADAM = optax.adam(1e-2)
+# With more unknown parameters, such as those of a neural network, there is no Newton's method: the
+# information of each bridge is a p × p matrix.
+_MOST_FOR_NEWTON = 300
+_UNCHECKED = (
+    f"More than {_MOST_FOR_NEWTON} unknown parameters: the estimate is the mean of the later "
+    "iterates, and neither its errors nor its convergence are known. Repeat the fit with twice the "
+    "`num_iterations` and with another key, and compare what you use of it."
+)
 
 
 class MaximumLikelihood(AbstractResult):
@@ -78,6 +86,9 @@ class MaximumLikelihood(AbstractResult):
         definite. Moreover the Monte Carlo error in every direction is at most half a standard
         error. If false, `params` are not an estimate: use more iterations, a larger learning rate
         or more bridges, unless the maximum is outside the constraint.
+    - With more than 300 unknown parameters, such as those of a neural network, the estimate is the
+        mean of the second half of `iterates`. Then `covariance`, `score` and `fall` are `None`, and
+        errors are NaN.
     - `fall`: decrease of the log-likelihood one standard error below and above the estimate in each
         parameter, with the others optimised to second order, shape (2, p). It is 0.5 for a
         quadratic log-likelihood. Values near or below zero show that there is no maximum inside;
@@ -88,24 +99,27 @@ class MaximumLikelihood(AbstractResult):
     standard_errors: PyTree
     monte_carlo_errors: PyTree
     theta: Float[Array, " p"]
-    covariance: Float[Array, "p p"]
+    covariance: Float[Array, "p p"] | None
     step_error: Float[Array, " p"]
     step_uncertainty: Float[Array, " p"]
     iterates: Float[Array, "n p"]
-    score: Score
+    score: Score | None
     num_missing: Int[Array, ""]
     num_truncated: Int[Array, ""]
     num_refused: Int[Array, ""]
     newton: Bool[Array, ""]
-    fall: Float[Array, "2 p"]
+    fall: Float[Array, "2 p"] | None
 
     @property
     def verdict(self) -> Verdict:
         """Return the faults of the estimate, each with a remedy.
 
         They are: no maximum, or none inside; those of the weights of `score`; and a discretisation
-        error that dominates and exceeds 0.05 standard errors.
+        error that dominates and exceeds 0.05 standard errors. So many parameters that nothing of
+        this is known are a fault, too.
         """
+        if self.covariance is None or self.score is None or self.fall is None:
+            return Verdict((Fault(jnp.asarray(True), _UNCHECKED),)).with_finite(self.theta)
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
         steps = step_faults(StepError(self.step_error, self.step_uncertainty), sd, sd)
         return Verdict(
@@ -122,6 +136,8 @@ class MaximumLikelihood(AbstractResult):
 
         Shape (p,). If true, use more steps.
         """
+        if self.covariance is None:
+            return jnp.zeros(self.theta.shape, bool)
         error = StepError(self.step_error, self.step_uncertainty)
         return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
 
@@ -163,7 +179,7 @@ def maximum_likelihood(
         mean log-likelihood per interval, as a function of the unknown parameters in a vector.
         Optimisers are compared by identity: create one once to compile once.
     - `method`: "gradient", or "em", which uses no optimiser and needs fewer iterations, but a known
-        σ.
+        σ and at most 300 unknown parameters.
     - `num_iterations`: iterations of the stochastic approximation.
     - `num_bridges`: weighted bridges per interval in each pass of Newton's method after these
         iterations, and for the errors. For unknown σ: paths per interval in the simulated
@@ -227,6 +243,12 @@ def maximum_likelihood(
         options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
         records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
+        if len(unknown) > _MOST_FOR_NEWTON:
+            raise ValueError(
+                f"{len(unknown)} unknown parameters are too many for the maximum of a record, "
+                f"whose limit is {_MOST_FOR_NEWTON}: select some by `where=`, or pass the gradient "
+                "of `log_density` of `innovations` to an optimiser."
+            )
         search = Search(Gradient(optimizer), num_iterations, progress_meter)
         return maximum_of_records(key, parameters, records, unknown, search, num_bridges)
     check_no_record(initial=initial, initial_time=initial_time)
@@ -236,6 +258,11 @@ def maximum_likelihood(
     proposal = "auto" if proposal is None else proposal
     budget = Budget(num_counts, max_proposals, max_trials)
     search = Search(rule, num_iterations, progress_meter)
+    if method == "em" and len(problem.theta) > _MOST_FOR_NEWTON:
+        raise ValueError(
+            f'`method="em"` needs a matrix of {len(problem.theta)} × {len(problem.theta)} numbers '
+            'in each iteration: use `method="gradient"`.'
+        )
     if not problem.sigma_is_unknown:
         return _by_bridges(key, problem, proposal, budget, search, num_bridges)
     if method == "em":
@@ -261,6 +288,8 @@ def _by_bridges(
     iterates, info = approximate(run_key, parameters, augmentation, search, theta)
     # EM averages its statistics already. Iterates of an optimiser fluctuate around the maximum.
     rough = iterates[-1] if isinstance(search.rule, EM) else _mean_of_later(iterates)
+    if len(theta) > _MOST_FOR_NEWTON:
+        return _without_errors(parameters, rough, iterates, info)
     scorer = scorer_at(score_key, problem, rough, proposal, budget, num_bridges)
     # New bridges: those of the search depend on the iterates.
     passes = _newton_from(score_key, parameters, scorer, rough)
@@ -297,6 +326,8 @@ def _by_simulation(
     pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
     blocks = differentiable_blocks(pilot_key, parameters.bind(theta), problem, proposal)
     iterates, info = stochastic_ascent(run_key, parameters, blocks, search, theta)
+    if len(theta) > _MOST_FOR_NEWTON:
+        return _without_errors(parameters, _mean_of_later(iterates), iterates, info)
     last = iterates[-1]
     # A good proposal at the first θ may be poor at the last one.
     blocks = differentiable_blocks(last_pilot_key, parameters.bind(last), problem, proposal)
@@ -314,6 +345,32 @@ def _by_simulation(
 def _mean_of_later(iterates: Float[Array, "n p"]) -> Float[Array, " p"]:
     """Return the mean of the second half of the iterates."""
     return jnp.mean(iterates[len(iterates) // 2 :], axis=0)
+
+
+@compiled_sooner
+def _without_errors(
+    parameters: Parameters,
+    estimate: Float[Array, " p"],
+    iterates: Float[Array, "n p"],
+    info: SearchInfo,
+) -> MaximumLikelihood:
+    """Return an estimate of so many parameters that its information is not computed."""
+    unknown = jnp.full_like(estimate, jnp.nan)
+    errors = parameters.each(unknown)
+    return MaximumLikelihood(
+        parameters.full(estimate),
+        errors,
+        errors,
+        estimate,
+        None,
+        unknown,
+        unknown,
+        iterates,
+        None,
+        *info,
+        jnp.asarray(False),
+        None,
+    )
 
 
 @compiled_sooner

@@ -1,5 +1,6 @@
 """Maximum likelihood against the maximum of the closed form."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -96,3 +97,34 @@ def test_finds_the_maximum(method):
     np.testing.assert_allclose(made.standard_errors.reshape(-1), sd, rtol=0.1)
     assert np.abs(exact - model.params.B.reshape(-1)).max() > 0.3 * sd.max()
     np.testing.assert_allclose(made.params.B, made.theta.reshape(2, 2))
+
+
+def test_a_network_is_too_large_for_some():
+    model = jb.Diffusion(lambda x, p: p[:1] * x, params=jnp.zeros(301))
+    arguments = (jax.random.key(0), model, np.arange(3.0), np.zeros((3, 1)))
+    with pytest.raises(ValueError, match="a matrix of 301 × 301 numbers"):
+        jb.maximum_likelihood(*arguments, method="em")
+    noisy = dict(observation=jb.LinearGaussian(covariance=1.0), initial=[0.0])
+    with pytest.raises(ValueError, match=r"301 unknown .* `log_density` of `innovations`"):
+        jb.maximum_likelihood(*arguments, **noisy)
+
+
+@pytest.mark.slow
+def test_a_network_is_trained_without_a_hessian():
+    """Its drift is nearer to the true one than that of no motion, and the verdict says what is not
+    known."""
+    true = jb.Diffusion(lambda x, p: -2 * x, [0.5])
+    times = 0.2 * np.arange(501)
+    values = jb.simulate(jax.random.key(0), true, [0.0], times)[0]
+    network = eqx.nn.MLP(1, 1, 16, 2, activation=jnp.tanh, key=jax.random.key(1))
+    model = jb.Diffusion(lambda x, p: p(x), [0.5], params=network)
+    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
+        made = jb.maximum_likelihood(
+            jax.random.key(2), model, times, values, num_iterations=300, num_steps=4,
+            proposal=jb.ModifiedDiffusionBridge(),
+        )  # fmt: skip
+    assert made.theta.shape == (321,) and made.iterates.shape == (300, 321)
+    assert made.covariance is None and "neither its errors" in made.why()
+    points = jnp.linspace(-0.4, 0.4, 9)[:, None]  # where the process is
+    drift = jax.vmap(model.with_params(made.params).drift)(points)
+    assert jnp.sqrt(jnp.mean((drift + 2 * points) ** 2)) < 0.3 < jnp.sqrt(jnp.mean(4 * points**2))
