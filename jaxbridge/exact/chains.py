@@ -9,7 +9,7 @@ There are three methods, each of which is also a kernel of two functions, `init`
 """
 
 import functools
-from typing import Any, Literal
+from typing import Literal
 
 import diffrax
 from jaxtyping import Array, Key
@@ -20,7 +20,7 @@ from ..engine.entry import public_entry
 from ..engine.verdict import throw_where_untrustworthy
 from ..models.bridge_problem import bridge_problem
 from ..models.diffusion import Diffusion
-from ..proposals import Budget, Guided, as_guided, as_pairs, as_proposal, resolve
+from ..proposals import Budget, Guided, ProposalLike, as_guided, as_pairs, as_proposal, resolve
 from .crank_nicolson import check_step_size, run_crank_nicolson
 from .kernels import Chain, check_position
 from .pseudo_marginal import run_pseudo_marginal
@@ -38,7 +38,7 @@ def sample_exact_bridges(
     num_bridges: int = 1,
     num_steps: int = 50,
     position: Numbers | None = None,
-    proposal: Any = None,
+    proposal: ProposalLike = None,
     method: Literal["pseudo_marginal", "renewal", "crank_nicolson"] = "pseudo_marginal",
     num_counts: int | None = None,
     max_proposals: int | None = None,

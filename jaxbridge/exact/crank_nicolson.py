@@ -11,7 +11,7 @@ The acceptance does not depend on the number of steps (Beskos, Roberts, Stuart &
 Roberts, Stuart & White 2013).
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import jax
@@ -35,6 +35,7 @@ from ..models.diffusion import Diffusion
 from ..proposals import (
     AbstractGuidedProposal,
     Guided,
+    ProposalLike,
     as_guided,
     as_proposal,
     noise_of,
@@ -85,7 +86,7 @@ def crank_nicolson(
     duration: Numbers,
     *,
     num_steps: int = 50,
-    proposal: Any = None,
+    proposal: ProposalLike = None,
     step_size: Numbers | None = None,
 ) -> Kernel:
     """Return the preconditioned Crank–Nicolson kernel on (start, end, duration)-bridges.

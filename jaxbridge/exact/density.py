@@ -5,7 +5,6 @@ Metropolis–Hastings over the parameters of a model.
 """
 
 import math
-from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -30,7 +29,14 @@ from ..engine.verdict import (
 )
 from ..models.bridge_problem import BridgeProblem, bridge_problem
 from ..models.diffusion import Diffusion
-from ..proposals import AbstractProposal, AbstractWeightedProposal, Budget, as_proposal, resolve
+from ..proposals import (
+    AbstractProposal,
+    AbstractWeightedProposal,
+    Budget,
+    ProposalLike,
+    as_proposal,
+    resolve,
+)
 from ..schemes import StepError, dominates, step_faults, with_rounding
 
 
@@ -126,7 +132,7 @@ def transition_log_density(
     *,
     num_proposals: int = 1000,
     num_steps: int = 50,
-    proposal: Any = None,
+    proposal: ProposalLike = None,
     num_counts: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,

@@ -6,8 +6,6 @@ The weights belong either to approximate bridges (`weigh_bridges`), or to the pa
 proposal (`sample_weighted_bridges`).
 """
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
@@ -52,6 +50,7 @@ from ..proposals import (
     AbstractProposal,
     AbstractWeightedProposal,
     Budget,
+    ProposalLike,
     as_proposal,
     check_density,
     pair_log_weights,
@@ -318,7 +317,7 @@ def sample_weighted_bridges(
     *,
     num_bridges: int = 1000,
     num_steps: int = 50,
-    proposal: Any = None,
+    proposal: ProposalLike = None,
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,

@@ -5,7 +5,7 @@ random but unbiased, and a state keeps its weight. Proposals do not depend on th
 chain. So all of them run first, side by side, and the chain itself is a scan over numbers.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import diffrax
 import jax
@@ -20,7 +20,7 @@ from ..engine.keys import split_each
 from ..engine.pareto import pareto_k
 from ..models.bridge_problem import BridgeProblem
 from ..models.diffusion import Diffusion
-from ..proposals import AbstractProposal, Budget, WeightedPaths, as_proposal
+from ..proposals import AbstractProposal, Budget, ProposalLike, WeightedPaths, as_proposal
 from .kernels import Chain, Kernel, acceptance_rate, chain_keys, check_position, one_interval
 
 
@@ -60,7 +60,7 @@ def pseudo_marginal(
     duration: Numbers,
     *,
     num_steps: int = 50,
-    proposal: Any = None,
+    proposal: ProposalLike = None,
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,

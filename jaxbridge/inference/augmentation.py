@@ -8,7 +8,7 @@ Hessian, which then does not use θ.
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -22,7 +22,13 @@ from ..engine.checks import is_traced
 from ..engine.keys import split_each
 from ..models.diffusion import Diffusion
 from ..models.tracing import uses_argument
-from ..proposals import AbstractWeightedProposal, Budget, ModifiedDiffusionBridge, as_pairs
+from ..proposals import (
+    AbstractWeightedProposal,
+    Budget,
+    ModifiedDiffusionBridge,
+    ProposalLike,
+    as_pairs,
+)
 from ..schemes import (
     MOST_TOO_LONG,
     UNKNOWN_SHARE,
@@ -186,7 +192,7 @@ def augment(
     key: Key[Array, ""],
     problem: Problem,
     theta: Float[Array, " p"],
-    proposal: Any,
+    proposal: ProposalLike,
     bridges: Literal["exact", "approximate"],
     method: Literal["pseudo_marginal", "renewal"] | None,
     budget: Budget,

@@ -19,6 +19,7 @@ from ..proposals import (
     AbstractProposal,
     AbstractWeightedProposal,
     Budget,
+    ProposalLike,
     as_pairs,
     as_proposal,
     choice_between,
@@ -99,7 +100,7 @@ def make_blocks(
     key: Key[Array, ""],
     model: Diffusion,
     problem: Problem,
-    proposal: Any,
+    proposal: ProposalLike,
     budget: Budget,
     use: Use,
 ) -> tuple[Block, ...]:

@@ -25,7 +25,7 @@ from ..engine.verdict import Fault, lost_paths
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
-from ..proposals import Budget
+from ..proposals import Budget, ProposalLike
 from ..records import Initial, LinearGaussian, Observation, as_record_problems
 from .augmentation import Augmentation, augment
 from .checkpoint import resumable
@@ -166,7 +166,7 @@ def gibbs(
     num_iterations: int = 1000,
     num_steps: int | None = None,
     step_size: float | None = None,
-    proposal: Any = None,
+    proposal: ProposalLike = None,
     bridges: Literal["exact", "approximate"] = "exact",
     method: Literal["pseudo_marginal", "renewal"] | None = None,
     where: Callable[[PyTree], PyTree] | None = None,

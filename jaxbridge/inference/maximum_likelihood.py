@@ -12,7 +12,7 @@ Then the simulated likelihood is maximised (`simulated_likelihood`).
 """
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import diffrax
 import jax
@@ -26,7 +26,7 @@ from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..models.diffusion import Diffusion
-from ..proposals import Budget
+from ..proposals import Budget, ProposalLike
 from ..records import Initial, Observation, as_record_problems
 from ..schemes import StepError, dominates, step_faults
 from .augmentation import augment
@@ -155,7 +155,7 @@ def maximum_likelihood(
     num_bridges: int = 100,
     num_steps: int | None = None,
     step_size: float | None = None,
-    proposal: Any = "auto",
+    proposal: ProposalLike = "auto",
     where: Callable[[PyTree], PyTree] | None = None,
     constraint: Constraint | None = None,
     observation: Observation | None = None,
@@ -276,7 +276,7 @@ def maximum_likelihood(
 def _by_bridges(
     key: Key[Array, ""],
     problem: Problem,
-    proposal: Any,
+    proposal: ProposalLike,
     budget: Budget,
     search: Search,
     num_bridges: int,
@@ -315,7 +315,7 @@ def _newton_from(
 def _by_simulation(
     key: Key[Array, ""],
     problem: Problem,
-    proposal: Any,
+    proposal: ProposalLike,
     budget: Budget,
     search: Search,
     num_bridges: int,

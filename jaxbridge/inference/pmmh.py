@@ -36,7 +36,7 @@ from ..engine.progress import metered_stages
 from ..engine.verdict import Fault, lost_share
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
-from ..proposals import AbstractWeightedProposal, Budget
+from ..proposals import AbstractWeightedProposal, Budget, ProposalLike
 from ..records import GuideCheck, Initial, Observation, as_record_problems
 from .blocks import Block, block_of, make_blocks
 from .checkpoint import resumable
@@ -230,7 +230,7 @@ def pmmh(
     num_proposals: int = 50,
     num_steps: int | None = None,
     step_size: float | None = None,
-    proposal: Any = "auto",
+    proposal: ProposalLike = "auto",
     where: Callable[[PyTree], PyTree] | None = None,
     constraint: Constraint | None = None,
     covariance: Numbers | None = None,

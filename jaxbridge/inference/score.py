@@ -35,7 +35,7 @@ from ..engine.verdict import (
     truncated_weights,
 )
 from ..models.diffusion import Diffusion
-from ..proposals import Budget
+from ..proposals import Budget, ProposalLike
 from ..schemes import Form, StepError, error_of_mean, log_likelihoods, num_looked, step_faults
 from .blocks import Block, make_blocks, over_intervals, target_forms, with_keys
 from .data import Problem, as_problem
@@ -134,7 +134,7 @@ def score(
     num_bridges: int = 100,
     num_steps: int | None = None,
     step_size: float | None = None,
-    proposal: Any = "auto",
+    proposal: ProposalLike = "auto",
     where: Callable[[PyTree], PyTree] | None = None,
     num_counts: int | None = None,
     max_proposals: int | None = None,
@@ -204,7 +204,7 @@ def scorer_at(
     key: Key[Array, ""],
     problem: Problem,
     theta: Float[Array, " p"],
-    proposal: Any,
+    proposal: ProposalLike,
     budget: Budget,
     num_bridges: int,
     progress_meter: diffrax.AbstractProgressMeter | None = None,

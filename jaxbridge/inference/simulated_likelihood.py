@@ -20,7 +20,7 @@ number of steps. This takes p² derivatives for p unknown parameters.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,7 +33,14 @@ from ..engine.checks import all_finite_leaves, is_traced, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.pareto import pareto_k
 from ..models.diffusion import Diffusion
-from ..proposals import AbstractProposal, Budget, as_proposal, choice_between, guided_candidates
+from ..proposals import (
+    AbstractProposal,
+    Budget,
+    ProposalLike,
+    as_proposal,
+    choice_between,
+    guided_candidates,
+)
 from ..schemes import StepError
 from .blocks import Block, make_blocks, over_intervals, with_keys
 from .data import Problem
@@ -103,7 +110,7 @@ _NO_DERIVATIVE = (
 
 
 def as_differentiable(
-    proposal: Any, model: Diffusion, like: Float[Array, " d"], budget: Budget
+    proposal: ProposalLike, model: Diffusion, like: Float[Array, " d"], budget: Budget
 ) -> AbstractProposal:
     """Return the proposal of the user, where "auto" excludes couplings.
 

@@ -22,6 +22,7 @@ To add a proposal, add a module. To make it a candidate of "auto", name it in `a
 # The names that other folders import from this one.
 from .auto import (
     Budget as Budget,
+    ProposalLike as ProposalLike,
     as_proposal as as_proposal,
     choice_between as choice_between,
     default_candidates as default_candidates,

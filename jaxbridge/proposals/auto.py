@@ -11,7 +11,7 @@ point.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, Float, Key
@@ -158,9 +158,15 @@ class Budget(NamedTuple):
 
 _NO_BUDGET = Budget()
 
+# Type checkers find misspelled strings. At run time `as_proposal` refuses them with a sentence.
+if TYPE_CHECKING:
+    ProposalLike = AbstractProposal | AbstractCoupling | Literal["auto"] | None
+else:
+    ProposalLike = Any
+
 
 def as_proposal(
-    proposal: Any,
+    proposal: ProposalLike,
     model: Diffusion,
     like: Float[Array, " d"],
     budget: Budget = _NO_BUDGET,
@@ -187,7 +193,7 @@ def as_proposal(
     return converted.for_model(model, like, normal_steps)
 
 
-def _convert(proposal: Any, budget: Budget, name: str = "proposal") -> AbstractProposal:
+def _convert(proposal: ProposalLike, budget: Budget, name: str = "proposal") -> AbstractProposal:
     """Return a coupling as `CoupledPairs` with this budget, and a proposal unchanged."""
     if isinstance(proposal, AbstractProposal):
         if any(value is not None for value in budget):

@@ -23,7 +23,7 @@ from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
 from ..models.sigma import columns_of
-from ..proposals import AbstractProposal, as_proposal
+from ..proposals import AbstractProposal, ProposalLike, as_proposal
 from ..schemes import (
     AbstractStepDensity,
     ItoTaylorDensity,
@@ -269,7 +269,7 @@ def smooth(
     num_warmup: int = 200,
     num_chains: int = 4,
     block_length: int | None = None,
-    proposal: Any = None,
+    proposal: ProposalLike = None,
     num_proposals: int | None = None,
     num_steps: int | None = None,
     step_size: float | None = None,
