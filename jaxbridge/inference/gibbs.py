@@ -55,7 +55,12 @@ from .posterior import (
 )
 from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_gibbs import RecordPosterior, RecordState, sample_records
-from .record_paths import check_no_bridges, check_no_record
+from .record_paths import (
+    OF_POPULATION,
+    OF_UNKNOWN_SIGMA,
+    check_no_bridges,
+    check_no_record,
+)
 
 # Largest share of iterations with truncated weights.
 _MOST_TRUNCATED = 0.01
@@ -227,7 +232,8 @@ def gibbs(
         partial record, as in `innovations`. Then parameters of σ and of the noise may be unknown,
         too.
     - `population`: a `NormalPopulation`, for parameters that vary between records. Exact
-        observations then count as a record without noise, too.
+        observations then count as a record without noise, too. `init` and `covariance` are those of
+        the means.
     - `num_warmup`, `covariance`: for records only. The warm-up, by default of 500 iterations,
         adapts the sizes of moves and the guide. `covariance` is as in `pmmh`.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
@@ -273,7 +279,7 @@ def gibbs(
         parameters.model.check_invertible_sigma(problem.like)
         if problem.sigma_is_unknown or population is not None:
             # Given its complete path σ cannot move, but given its noise it can.
-            check_no_bridges(sigma_is_unknown=problem.sigma_is_unknown, **for_bridges)
+            check_no_bridges(OF_POPULATION if population else OF_UNKNOWN_SIGMA, **for_bridges)
             observation, initial = LinearGaussian(covariance=0.0), _wide_law(problem.intervals)
     if observation is not None:
         options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
@@ -285,6 +291,7 @@ def gibbs(
             parameters, unknown, init, num_chains, log_prior, RecordState, len(units.varies)
         )
         check_covariance_is_used(covariance, state)
+        units.check_state(state)
         root = units.first_root(first_root(covariance, log_prior, unknown))
         start = (units.joined(theta), root) if state is None else state
         num_warmup = check_count("num_warmup", 500 if num_warmup is None else num_warmup, 0)

@@ -58,7 +58,7 @@ _MOST_FOR_NEWTON = 300
 _UNCHECKED = (
     f"More than {_MOST_FOR_NEWTON} unknown parameters: the estimate is the mean of the later "
     "iterates, and neither its errors nor its convergence are known. Repeat the fit with twice the "
-    "`num_iterations` and with another key, and compare what you use of it."
+    "`num_iterations` and with another key, and compare the quantities that you need."
 )
 
 
@@ -115,8 +115,8 @@ class MaximumLikelihood(AbstractResult):
         """Return the faults of the estimate, each with a remedy.
 
         They are: no maximum, or none inside; those of the weights of `score`; and a discretisation
-        error that dominates and exceeds 0.05 standard errors. So many parameters that nothing of
-        this is known are a fault, too.
+        error that dominates and exceeds 0.05 standard errors. More than 300 parameters are a fault,
+        because none of these is computed.
         """
         if self.covariance is None or self.score is None or self.fall is None:
             return Verdict((Fault(jnp.asarray(True), _UNCHECKED),)).with_finite(self.theta)
@@ -137,7 +137,7 @@ class MaximumLikelihood(AbstractResult):
         Shape (p,). If true, use more steps.
         """
         if self.covariance is None:
-            return jnp.zeros(self.theta.shape, bool)
+            return jnp.ones(self.theta.shape, bool)
         error = StepError(self.step_error, self.step_uncertainty)
         return dominates(error, jnp.sqrt(jnp.diagonal(self.covariance)))
 
@@ -246,8 +246,8 @@ def maximum_likelihood(
         if len(unknown) > _MOST_FOR_NEWTON:
             raise ValueError(
                 f"{len(unknown)} unknown parameters are too many for the maximum of a record, "
-                f"whose limit is {_MOST_FOR_NEWTON}: select some by `where=`, or pass the gradient "
-                "of `log_density` of `innovations` to an optimiser."
+                f"whose limit is {_MOST_FOR_NEWTON}: select some by `where=`, or sample parameters "
+                "and noise by `log_density` of `innovations`."
             )
         search = Search(Gradient(optimizer), num_iterations, progress_meter)
         return maximum_of_records(key, parameters, records, unknown, search, num_bridges)
@@ -355,6 +355,8 @@ def _without_errors(
     info: SearchInfo,
 ) -> MaximumLikelihood:
     """Return an estimate of so many parameters that its information is not computed."""
+    # The set of allowed parameters may not be convex.
+    estimate = jnp.where(parameters.allowed(estimate), estimate, iterates[-1])
     unknown = jnp.full_like(estimate, jnp.nan)
     errors = parameters.each(unknown)
     return MaximumLikelihood(

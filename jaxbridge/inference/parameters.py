@@ -48,17 +48,24 @@ class Parameters(eqx.Module):
         parameters are one array without a name.
         """
         named = self.names_of_params
-        return tuple(jax.tree.leaves(named if self.where is None else self.where(named)))
+        leaves = jax.tree.leaves(named if self.where is None else self.where(named))
+        return tuple(name for leaf in leaves for name in np.ravel(leaf))
 
     @property
     def names_of_params(self) -> PyTree:
-        """Return the parameters of the model with lists of names in place of arrays."""
+        """Return the parameters of the model with arrays of names in place of their entries.
+
+        Parameters that cannot be unknown have no entries.
+        """
 
         def entries(path, leaf):
             name = jax.tree_util.keystr(path, simple=True, separator=".") or "theta"
-            shape = [leaf.shape] if eqx.is_inexact_array(leaf) else []
-            places = [",".join(map(str, place)) for sizes in shape for place in np.ndindex(sizes)]
-            return [f"{name}[{place}]" if place else name for place in places]
+            if not eqx.is_inexact_array(leaf):
+                return np.empty(0, object)
+            places = [",".join(map(str, place)) for place in np.ndindex(leaf.shape)]
+            names = np.empty(leaf.size, object)
+            names[:] = [f"{name}[{place}]" if place else name for place in places]
+            return names.reshape(leaf.shape)
 
         return jax.tree_util.tree_map_with_path(entries, self.model.params)
 

@@ -9,7 +9,7 @@ two ways, because each mixes poorly where the other mixes well (Papaspiliopoulos
 2007):
 
 - given z and the noise of the paths, together with all records;
-- given the parameters θ_r, of which the paths depend. Then the records do not matter.
+- given the parameters θ_r, on which the paths depend. Then the records do not matter.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.arguments import check_function, evaluated
 from ..engine.checks import as_floating, is_traced
-from .parameters import Parameters
+from .parameters import Parameters, of_rows
 
 # Standard deviations of the population start at this fraction of the scale of their prior.
 _FIRST_SPREAD = 0.3
@@ -38,13 +38,15 @@ class NormalPopulation(eqx.Module):
     **Arguments:**
 
     - `per_unit`: a function that selects these parameters from `model.params`, for instance
-        `lambda params: params["log_rate"]`. They must be unknown. The prior of `gibbs` is then that
-        of their means in the population.
+        `lambda params: params["log_rate"]` or `lambda params: params["B"][0]`. They must be
+        unknown. The prior of `gibbs` is then that of their means in the population. Its
+        `constraint` applies to the means and to the parameters of each record.
     - `spread`: scale of the half-normal prior of the standard deviations in the population; a
         number, or one for each parameter.
 
     **Raises:** `TypeError` if `per_unit` is no function; `ValueError` for a `spread` that is not
-    positive. `gibbs` raises `ValueError` if the parameters are not unknown, or for a single record.
+    positive and finite. `gibbs` raises `ValueError` if the parameters are not unknown, or for a
+    single record.
 
     **Example:**
 
@@ -61,8 +63,10 @@ class NormalPopulation(eqx.Module):
     def __init__(self, per_unit: Callable[[PyTree], PyTree], spread: Any = 1.0):
         check_function("per_unit", per_unit, "(params)")
         self.per_unit, self.spread = per_unit, as_floating("spread", spread)
-        if not is_traced(self.spread) and not np.all(np.asarray(self.spread) > 0):
-            raise ValueError(f"`spread` must be positive; got {spread}.")
+        if not is_traced(self.spread):
+            values = np.asarray(self.spread)
+            if not np.all((values > 0) & np.isfinite(values)):
+                raise ValueError(f"`spread` must be positive and finite; got {spread}.")
 
 
 class Population(eqx.Module):
@@ -86,9 +90,23 @@ class Population(eqx.Module):
         return (*names, *(f"log_sd({names[j]})" for j in self.varies))
 
     def first_root(self, root: Float[Array, "p p"]) -> Float[Array, "p+q p+q"]:
-        """Return S of the first moves of φ, given that of θ."""
+        """Return S of the first moves of φ, given that of θ.
+
+        Entries that take turns (`moves`) are independent.
+        """
         of_spreads = _FIRST_SPREAD * jnp.eye(len(self.varies), dtype=root.dtype)
-        return block_diag(root, of_spreads) if self.varies else root
+        first, second = self.moves(jnp.int32(0)), self.moves(jnp.int32(1))
+        together = (first[:, None] & first) | (second[:, None] & second)
+        return jnp.where(together, block_diag(root, of_spreads), 0) if self.varies else root
+
+    def check_state(self, state: Any) -> None:
+        """Raise `ValueError` for a state of other parameters that vary, or `None`."""
+        if state is not None and state.units.shape[-1] != len(self.varies):
+            raise ValueError(
+                f"`init` is a state of draws with {state.units.shape[-1]} parameters that vary "
+                f"between records, but here {len(self.varies)} vary: pass the `population` of the "
+                "earlier draws."
+            )
 
     def split(self, phi: Float[Array, "p+q"]) -> tuple[Float[Array, " p"], Float[Array, " q"]]:
         """Return θ and λ."""
@@ -131,10 +149,18 @@ class Population(eqx.Module):
         return units.at[:, at].add(jnp.exp(log_sd) * z)
 
     def allowed(self, phi: Float[Array, "p+q"], z: Float[Array, "R q"]) -> Bool[Array, "*R"]:
-        """Return whether θ_r satisfies the constraint, for each record if they vary."""
-        units = self.of_units(phi, z)
-        allowed = self.parameters.allowed
-        return jax.vmap(lambda theta: allowed(theta))(units) if self.varies else allowed(units)
+        """Return whether θ and θ_r satisfy the constraint, for each record if they vary."""
+        allowed = self.parameters.allowed(self.split(phi)[0])
+        if not self.varies:
+            return allowed
+        return allowed & of_rows(self.parameters.allowed, self.of_units(phi, z))
+
+    def first_units(
+        self, key: Key[Array, ""], phi: Float[Array, "p+q"], num_records: int
+    ) -> Float[Array, "R q"]:
+        """Sample z of the first θ_r. It is zero where θ_r would violate the constraint."""
+        z = jax.random.normal(key, (num_records, len(self.varies)), phi.dtype)
+        return jnp.where(self.allowed(phi, z)[:, None], z, 0) if self.varies else z
 
     def log_density(self, phi: Float[Array, "p+q"]) -> Float[Array, ""]:
         """Return the log prior density of φ, up to a constant."""
@@ -157,20 +183,25 @@ class Population(eqx.Module):
         mean_key, spread_key, mean_uniform, spread_uniform = jax.random.split(key, 4)
         theta, log_sd = self.split(phi)
         at, (R, q) = np.array(self.varies), z.shape
-        units = theta[at] + jnp.exp(log_sd) * z
+        # Deviations from the mean, because differences of θ_r and θ may lose digits.
+        deviations = jnp.exp(log_sd) * z
         noise = jax.random.normal(mean_key, (q,), z.dtype) / np.sqrt(R).astype(z.dtype)
-        proposed = theta.at[at].set(jnp.mean(units, axis=0) + jnp.exp(log_sd) * noise)
+        shift = jnp.mean(deviations, axis=0) + jnp.exp(log_sd) * noise
+        proposed = theta.at[at].add(shift)
         log_ratio = self.log_prior(proposed) - self.log_prior(theta)
+        log_ratio = jnp.where(self.parameters.allowed(proposed), log_ratio, -jnp.inf)
         uniform = jax.random.uniform(mean_uniform, dtype=z.dtype)
-        theta = jnp.where(jnp.log(uniform) < log_ratio, proposed, theta)
-        square = jnp.sum((units - theta[at]) ** 2, axis=0)
+        accepted = jnp.log(uniform) < log_ratio
+        theta = jnp.where(accepted, proposed, theta)
+        deviations = deviations - jnp.where(accepted, shift, 0)
+        square = jnp.sum(deviations**2, axis=0)
         chi_square = 2 * jax.random.gamma(spread_key, R / 2, (q,), z.dtype)
         proposed_log_sd = jnp.log(square / chi_square) / 2
         density = self._log_density_of_spread
         log_ratio = density(proposed_log_sd) - density(log_sd)
         uniform = jax.random.uniform(spread_uniform, (q,), z.dtype)
         log_sd = jnp.where(jnp.log(uniform) < log_ratio, proposed_log_sd, log_sd)
-        return jnp.concatenate([theta, log_sd]), (units - theta[at]) / jnp.exp(log_sd)
+        return jnp.concatenate([theta, log_sd]), deviations / jnp.exp(log_sd)
 
 
 def as_population(
@@ -193,12 +224,12 @@ def as_population(
             "pass lists of `times` and `observations`, or omit `population`."
         )
     names = parameters.names
-    picked = jax.tree.leaves(evaluated("per_unit", population.per_unit, parameters.names_of_params))
-    unknown = [name for name in picked if name not in names]
-    if unknown or not picked:
+    arrays = evaluated("per_unit", population.per_unit, parameters.names_of_params)
+    picked = [str(name) for leaf in jax.tree.leaves(arrays) for name in np.ravel(leaf)]
+    if not picked or not set(picked) <= set(names) or len(set(picked)) < len(picked):
         raise ValueError(
-            "`per_unit` must select unknown parameters, "
-            f"which are {', '.join(names)}; it selected {', '.join(picked) or 'nothing'}."
+            f"`per_unit` must select parameters that are unknown, {', '.join(names)}, each at most "
+            f"once; it selected {', '.join(picked) or 'nothing'}."
         )
     varies = tuple(names.index(name) for name in picked)
     if population.spread.shape not in ((), (len(varies),)):

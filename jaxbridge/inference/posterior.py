@@ -311,7 +311,12 @@ class AbstractPosterior(AbstractResult):
             for path, leaf in leaves
             if eqx.is_array(leaf)
         }
-        others = ("params", "theta", *self._combinations)
+        # Entries of θ without a parameter of the model.
+        of_entries = jnp.moveaxis(self._chains, -1, 0)
+        for name, draws in zip(self.names, of_entries, strict=True):
+            if name.startswith("log_sd("):
+                posterior[name] = jax.device_get(draws)
+        others = ("params", "theta", "unit_params", *self._combinations)
         names = [field.name for field in dataclasses.fields(self) if field.name not in others]
         stats = {name: getattr(self, name) for name in names}
         stats = {name: of_chains(value) for name, value in stats.items() if eqx.is_array(value)}
@@ -385,7 +390,7 @@ def starting_points(
         if theta.shape[-1] != p + num_others:
             raise ValueError(
                 f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are "
-                f"{p + num_others}: pass the `where` of the earlier draws."
+                f"{p + num_others}: pass the `where` and the `population` of the earlier draws."
             )
         theta = theta[..., :p]
         if theta.shape[:-1] != chains and num_chains is not None:

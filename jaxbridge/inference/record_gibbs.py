@@ -11,7 +11,7 @@ The state is (θ, path). Two moves alternate:
 Hence any parameters may be unknown: those of the drift, of σ, of the noise and of the initial law.
 This holds for every step size.
 
-Parameters may vary between records (`population`). Then two moves more follow: those of each record
+Parameters may vary between records (`population`). Two more moves follow then: those of each record
 given ξ, all at once, and those of the population given the parameters of the records.
 
 The guide is linearised along a path that is likely at some θ. It may be poor at a θ far away.
@@ -105,9 +105,10 @@ class RecordPosterior(AbstractPosterior):
         logs of its standard deviations follow, with names such as "log_sd(rate)".
     - `names`: names of the entries of θ, for instance "alpha" or "B[0,1]". The keys of a dictionary
         are in alphabetical order.
-    - `parameters_moved`: whether θ moved, shape (*chains, n).
+    - `parameters_moved`: whether θ moved given the noise of the paths, shape (*chains, n).
     - `blocks_moved`: fraction of the blocks of the path that moved, shape (*chains, n).
-    - `stuck`: whether some block never moved, shape (*chains). Then the draws do not represent the
+    - `stuck`: whether some block, or the parameters of some record, never moved, shape (*chains).
+        Then the draws do not represent the
         posterior, and `standard_error` is infinite.
     - `log_step_error`: estimated discretisation error of the log density of data and noise at each
         draw, up to a constant, shape (*chains, n). NaN at draws without an estimate. `step_error`,
@@ -172,11 +173,11 @@ class RecordSampler(eqx.Module):
 
     def step(
         self, key: Key[Array, ""], guided: GuidedState, learning: Bool[Array, ""]
-    ) -> tuple[GuidedState, tuple[Bool[Array, ""], Bool[Array, ""], Bool[Array, "R 2 B 1"]]]:
+    ) -> tuple[GuidedState, tuple[Array, ...]]:
         """Move the paths given θ, then θ given ξ; `learning` adapts the scales of both moves.
 
-        Return the state, whether θ moved, whether the paths have a weight, and whether each block
-        moved.
+        Return the state, whether θ moved, whether the paths have a weight, whether each block
+        moved, and whether the parameters of each record moved.
         """
         path_key, noise_key, walk_key, accept_key = jax.random.split(key, 4)
         (state, guides), population = guided, self.population
@@ -188,7 +189,8 @@ class RecordSampler(eqx.Module):
         old = _Weighted(here, paths, log_weights)
         number = state.num_done + 1
         step = jax.random.normal(walk_key, phi.shape, phi.dtype)
-        step = jnp.where(population.moves(number), step, 0)
+        moves = population.moves(number)
+        step = jnp.where(moves, step, 0)
         proposed = phi + state.root @ step
         # Outside the constraint the model may be invalid: evaluate at θ, and reject.
         inside = jnp.all(population.allowed(proposed, units))
@@ -205,19 +207,21 @@ class RecordSampler(eqx.Module):
             lambda new, old: jnp.where(accepted, new, old), (proposed, new), (phi, old)
         )
         scales = tuned(log_scales, blocks_moved, number.astype(rate.dtype))
+        # Entries that did not move keep their scales.
+        root = adapt_covariance(state.root, step, rate, number, learning)
         new_state = state._replace(
-            root=adapt_covariance(state.root, step, rate, number, learning),
+            root=jnp.where(moves[:, None], root, state.root),
             log_scales=jnp.where(learning, scales, log_scales),
             num_done=number,
         )
+        units_moved = jnp.ones(log_weights.shape, bool)
         if population.varies:
-            unit_key = key_for("units", key)
-            phi, held, new_state = self._moved_units(
-                unit_key, phi, held, noise, new_state, learning
-            )
+            given = phi, held, noise, new_state, learning
+            phi, held, new_state, units_moved = self._moved_units(key_for("units", key), *given)
         has_weight = nan_to_neg_inf(jnp.sum(held.log_weights)) > -jnp.inf
         new_state = new_state._replace(theta=phi, paths=held.paths)
-        return GuidedState(new_state, held.at.guides), (accepted, has_weight, blocks_moved)
+        moved = accepted, has_weight, blocks_moved, units_moved
+        return GuidedState(new_state, held.at.guides), moved
 
     def _weighted(self, theta: Float[Array, "*R p"], noise: Float[Array, "R points d"]):
         """Return the paths of this noise at θ, with their weights."""
@@ -232,8 +236,11 @@ class RecordSampler(eqx.Module):
         noise: Float[Array, "R points d"],
         state: RecordState,
         learning: Bool[Array, ""],
-    ) -> tuple[Float[Array, " p"], "_Weighted", RecordState]:
-        """Move z of each record given ξ and φ, then φ given the parameters of the records."""
+    ) -> tuple[Float[Array, " p"], "_Weighted", RecordState, Bool[Array, " R"]]:
+        """Move z of each record given ξ and φ, then φ given the parameters of the records.
+
+        Also return whether z of each record moved.
+        """
         walk_key, accept_key, population_key = jax.random.split(key, 3)
         population, z = self.population, state.units
         step = jax.random.normal(walk_key, z.shape, z.dtype)
@@ -257,7 +264,7 @@ class RecordSampler(eqx.Module):
         )
         roots = jax.vmap(adapt)(state.unit_roots, step, rate)
         phi, z = population.given_units(population_key, phi, z)
-        return phi, held, state._replace(units=z, unit_roots=roots)
+        return phi, held, state._replace(units=z, unit_roots=roots), accepted
 
     def change_by_coarse_steps(self, key: Key[Array, ""], guided: GuidedState) -> Float[Array, ""]:
         """Return the relative change of the likelihood by steps of twice the size.
@@ -351,12 +358,13 @@ def _sample_records(
             return over_chains(step, jax.random.fold_in(key, number(guided) + 1), guided)
 
         result = lax.scan(iterate, guided, i * thin + jnp.arange(thin))
-        guided, (theta_moved, has_weight, blocks_moved) = result
+        guided, (theta_moved, has_weight, blocks_moved, units_moved) = result
         theta = guided.state.theta
         share = jnp.mean(blocks_moved.astype(theta.dtype), axis=0)
         weights = jnp.any(has_weight, axis=0), changes(sampler, i, guided)
         units = guided.state.units
-        result = theta, units, jnp.any(theta_moved, axis=0), share[..., 0], *weights
+        moved = jnp.any(theta_moved, axis=0), share[..., 0], jnp.any(units_moved, axis=0)
+        result = theta, units, *moved, *weights
         return guided, (result, sampler.completion.fine.check)
 
     bounds = stages(skipped if fresh else 0, skipped + num_iterations)
@@ -365,14 +373,15 @@ def _sample_records(
     (state, _), draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
     draws, checks = draws
     fields, values = posterior_fields(population, *draws)
-    units, theta_moved, blocks_moved, has_weight, change = values
+    units, theta_moved, blocks_moved, units_moved, has_weight, change = values
     real = movable(records)
     ever = jnp.any(blocks_moved > 0, axis=-4)  # in any draw
     posterior = RecordPosterior(
         **fields,
         parameters_moved=theta_moved,
         blocks_moved=jnp.mean(blocks_moved, axis=(-3, -2, -1), where=real),
-        stuck=jnp.any(real & ~ever, axis=(-3, -2, -1)),
+        stuck=jnp.any(real & ~ever, axis=(-3, -2, -1))
+        | jnp.any(~jnp.any(units_moved, axis=-2), axis=-1),
         log_step_error=share_of_step_error(records) * change,
         sigma_varies=parameters.model.sigma_varies(records.stacked.like),
         state=state,
@@ -391,9 +400,8 @@ def _initial_state(
 ) -> RecordState:
     """Return the state before the first paths, with placeholders for them."""
     chains, q = theta.shape[:-1], len(population.varies)
-    units = jax.random.normal(
-        key_for("first units", key), (*chains, records.number, q), theta.dtype
-    )
+    first = lambda key, phi: population.first_units(key, phi, records.number)
+    units = over_chains(first, key_for("first units", key), theta)
     unit_root = jnp.broadcast_to(jnp.eye(q, dtype=theta.dtype), (records.number, q, q))
     paths, log_scales, root, num_done, unit_roots = (
         jnp.broadcast_to(leaf, (*chains, *leaf.shape))

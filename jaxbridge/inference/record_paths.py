@@ -54,6 +54,13 @@ _BLOCK_LENGTH = 10
 # Number of secant steps for the width of the likelihood, and the bounds of their factors.
 _NUM_SECANTS, _SECANT = 6, (1 / 16, 8.0)
 
+# Conditions of the arguments about bridges, with their remedies.
+_OF_NOISE = "without noise. Omit this argument, or omit `observation`."
+OF_UNKNOWN_SIGMA = (
+    "with a known σ, because a complete path determines σ. Omit this argument, use `pmmh`, or "
+    "select other parameters by `where=`."
+)
+OF_POPULATION = "of one population. Omit this argument, or omit `population`."
 # Defaults of the arguments about bridges.
 _USUAL = {"proposal": "auto", "bridges": "exact", "method": "gradient"}
 
@@ -195,10 +202,11 @@ class RecordPaths(eqx.Module):
         return jax.vmap(lambda noise: pair_noise(noise, lengths))(noise)
 
 
-def check_no_bridges(sigma_is_unknown: bool = False, **arguments: Any) -> None:
+def check_no_bridges(condition: str = _OF_NOISE, **arguments: Any) -> None:
     """Raise `ValueError` if an argument about bridges is neither `None` nor its default.
 
-    Such arguments are for complete observations without noise and a known σ only.
+    Such arguments are for complete observations without noise and a known σ that is the same for
+    all records. `condition` is the part of this that does not hold, with its remedy.
     """
     usual = lambda name, value: isinstance(value, str) and value == _USUAL.get(name)
     names = [
@@ -207,12 +215,7 @@ def check_no_bridges(sigma_is_unknown: bool = False, **arguments: Any) -> None:
     if names:
         raise ValueError(
             f"{' and '.join(f'`{name}`' for name in names)}: only for complete observations "
-            + (
-                "with a known σ, because a complete path determines σ. Omit this argument, use "
-                "`pmmh`, or select other parameters by `where=`."
-                if sigma_is_unknown
-                else "without noise. Omit this argument, or omit `observation`."
-            )
+            f"{condition}"
         )
 
 

@@ -46,7 +46,8 @@ class Innovations(NamedTuple):
     longest. Methods may be passed directly to `jax.jit` and `jax.grad`.
 
     - `records`: the model, its records and the observation model.
-    - `points`: the path of the linearisation of each record on the grid of all steps.
+    - `points`: the path of the linearisation of each record on the grid of all steps, shape
+        (R, points, d).
     - `guide`: diagnostics of the guide along this path, of each record.
     """
 
@@ -61,7 +62,7 @@ class Innovations(NamedTuple):
 
     @property
     def times(self) -> Any:
-        """Return the times of the points of paths, shape (M + 1,); a list for several records.
+        """Return the times of the points of paths, shape (M + 1,); a list for a list of records.
 
         They are a NumPy array of double precision if the precision of paths cannot resolve them.
         """
@@ -75,7 +76,7 @@ class Innovations(NamedTuple):
     def path(self, params: PyTree, xi: Float[Array, " size"]) -> Any:
         """Return the path of the noise `xi` at the parameters `params`, shape (M + 1, d).
 
-        For several records it is a list of paths.
+        For a list of records it is a list of paths.
         """
         paths, stored = self._run(params, xi)[0], self.records.stacked.record.stored
         return self._of_each(lambda i: paths[i, stored[: self.records.num_points(i)]])
@@ -97,7 +98,7 @@ class Innovations(NamedTuple):
     def start_share(self) -> Float[Array, "*R"]:
         """Return the effective fraction of the draws of x_0 by normal noise, at `model.params`.
 
-        Several records have an entry each.
+        In a list of records each has an entry.
 
         It is 1 if the initial law is normal. Near 0 the normal law in place of the stationary law
         misses a mode or has too light tails. Then means of w over ξ are unreliable, and a sampler
@@ -105,7 +106,7 @@ class Innovations(NamedTuple):
         """
         model = self.records.stacked.model
         share = lambda problem, points: start_share(problem, model, points)
-        return _single(self.records, self.records.each(share, self.points))
+        return _unlisted(self.records, self.records.each(share, self.points))
 
     @property
     def verdict(self) -> Verdict:
@@ -137,9 +138,9 @@ class Innovations(NamedTuple):
         return _paths_and_log_weight(self.records, self.points, params, xi)
 
     def _of_each(self, function: Callable[[int], Any]) -> Any:
-        """Return `function(number)` of a single record, or a list for several records."""
+        """Return `function(number)` of a record, or a list for a list of records."""
         values = list(map(function, range(self.records.number)))
-        return values if self.records.number > 1 else values[0]
+        return values if self.records.are_listed else values[0]
 
 
 @compiled
@@ -155,9 +156,9 @@ def _paths_and_log_weight(records: Records, points, params: PyTree, xi):
     return paths, jnp.where(jnp.isfinite(log_weight), log_weight, -jnp.inf)
 
 
-def _single(records: Records, tree: PyTree) -> PyTree:
-    """Remove the leading axis of a single record."""
-    return jax.tree.map(lambda leaf: leaf[0], tree) if records.number == 1 else tree
+def _unlisted(records: Records, tree: PyTree) -> PyTree:
+    """Remove the leading axis, unless the records are a list."""
+    return tree if records.are_listed else jax.tree.map(lambda leaf: leaf[0], tree)
 
 
 @public_entry
@@ -236,4 +237,4 @@ def innovations(
             "there: see `why()` of the result.",
             stacklevel=3,  # the caller of the decorated function
         )
-    return Innovations(records, points, _single(records, check))
+    return Innovations(records, points, _unlisted(records, check))

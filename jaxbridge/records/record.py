@@ -184,7 +184,7 @@ def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, 
 
     **Raises:** `ValueError` if the numbers of times and observations differ.
     """
-    if _num_axes(observations) != 3 and not _has_rows(times):
+    if not are_several(times, observations):
         return [(times, observations)]
     rows: list[Any] = list(observations)  # pyright: ignore[reportArgumentType]
     when: list[Any] = len(rows) * [times]
@@ -196,6 +196,11 @@ def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, 
             f"length, at least one; got {len(when)} and {len(rows)}."
         )
     return list(zip(when, rows, strict=True))
+
+
+def are_several(times: Numbers, observations: Numbers) -> bool:
+    """Return whether the arguments are lists of records, or have a leading axis of records."""
+    return _num_axes(observations) == 3 or _has_rows(times)
 
 
 def _has_rows(times: Numbers) -> bool:

@@ -22,19 +22,21 @@ from .guide_search import GuideCheck, linearised
 from .initial import Initial
 from .observation import Observation
 from .problem import RecordProblem, check_clock, check_domain, problem_of
-from .record import Record, as_records, split_records
+from .record import Record, are_several, as_records, split_records
 
 
 class Records(eqx.Module):
     """R records with a common model. Arrays of `stacked.record` have the axis of records first.
 
     `num_times` holds the number of times of each record, including times of missing observations,
-    and `num_segments` its number of segments before they are padded.
+    and `num_segments` its number of segments before they are padded. `are_listed` states whether
+    the caller passed a list, possibly of one record.
     """
 
     stacked: RecordProblem
     num_times: tuple[int, ...] = eqx.field(static=True)
     num_segments: tuple[int, ...] = eqx.field(static=True)
+    are_listed: bool = eqx.field(static=True)
 
     @property
     def number(self) -> int:
@@ -127,7 +129,9 @@ def as_record_problems(
     num_times = tuple(len(record.which) for record in records)
     num_segments = tuple(len(record.dt) for record in records)
     record = _stacked([problem.on_grid(record) for record in records])
-    return Records(dataclasses.replace(problem, record=record), num_times, num_segments)
+    are_listed = are_several(times, observations)
+    stacked_problem = dataclasses.replace(problem, record=record)
+    return Records(stacked_problem, num_times, num_segments, are_listed)
 
 
 # Compiled as one program, because JAX would otherwise compile one for every array.

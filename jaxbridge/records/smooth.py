@@ -83,7 +83,8 @@ class Smoothed(AbstractResult):
     - `times`: times of the points, shape (K,). It is a NumPy array of double precision if the
         precision of paths cannot resolve the times.
     - `accepted`: acceptance rate of each block in both partitions into blocks, shape (2, B); with a
-        `proposal` that of each state, shape (ends,).
+        `proposal` that of each state, shape (ends,). Of several records those that are shorter than
+        the longest one have entries of zero at the end.
     - `stuck`: whether a block never moved, shape (chains,). If so in any chain, `standard_error` is
         infinite, because the draws do not show their error.
     - `num_truncated`: number of weights of a `proposal` that were truncated at a bound on the work.
@@ -103,7 +104,7 @@ class Smoothed(AbstractResult):
     @property
     def paths(self) -> Float[Array, "chains n K d"]:
         """Return the draws, shape (chains, n, K, d)."""
-        return self._paths[:, :, : len(self.times)]
+        return self._paths[..., : self.times.shape[-1], :]
 
     def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return the mean of `fn(path)` over all draws.
@@ -250,7 +251,8 @@ class Smoothed(AbstractResult):
 
     def _values(self, fn: PathFunction, paths: Float[Array, "..."] | None = None) -> PyTree:
         """Evaluate `fn` on all draws, or on these paths, in the precision of the paths."""
-        paths = (self._paths if paths is None else paths)[:, :, : len(self.times)]
+        paths = self._paths if paths is None else paths
+        paths = paths[..., : self.times.shape[-1], :]
         like = jax.ShapeDtypeStruct(paths.shape[-2:], paths.dtype)
         values = jax.vmap(jax.vmap(as_path_function("fn", fn, like)))(paths)
         return jax.tree.map(lambda leaf: jnp.asarray(leaf, paths.dtype), values)
@@ -277,7 +279,7 @@ def smooth(
     density: AbstractStepDensity | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
-) -> Any:  # a list for several records, which a type of `times` cannot tell
+) -> Any:  # the return type depends on the shape of `times`
     """Sample paths given a whole record, by Markov chains.
 
     The law of the draws converges to the law of the path given all observations, up to the
@@ -304,7 +306,7 @@ def smooth(
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if the result is not `trustworthy`.
 
-    **Returns:** `Smoothed`, or a list of them for several records. Not differentiable; use
+    **Returns:** `Smoothed`; for a list of records a list of them. Not differentiable; use
     `innovations` for derivatives.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
@@ -361,7 +363,7 @@ def smooth(
         smoothed = Smoothed(times, paths, *diagnostics, problem, knots, linearisation.check)
         return throw_where_untrustworthy(smoothed, "_paths", model) if throw else smoothed
 
-    if records.number == 1:
+    if not records.are_listed:
         return of_record(key, 0)
     return list(map(of_record, jax.random.split(key, records.number), range(records.number)))
 

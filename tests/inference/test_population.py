@@ -6,22 +6,28 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
+from jaxbridge.inference.parameters import Parameters
+from jaxbridge.inference.population import as_population
 
 GAP, NOISE, NUM = 0.4, 0.2, 12
 LEVEL = lambda params: params["level"]
-MODEL = jb.Diffusion(lambda x, p: p["level"] - x, [0.5], params={"level": 0.0})
+MODEL = jb.Diffusion(
+    lambda x, p: jnp.exp(p["log_rate"]) * (p["level"] - x), [0.5],
+    params={"level": 0.0, "log_rate": 0.0},
+)  # fmt: skip
 OPTIONS = dict(
     observation=jb.LinearGaussian(covariance=NOISE**2), initial=jb.GaussianLaw([0.0], [[1.0]]),
-    prior=jb.NormalPrior(0.0, 4.0), num_steps=1,
+    prior=jb.NormalPrior({"level": 0.0, "log_rate": 0.0}, {"level": 4.0, "log_rate": 0.25}),
+    num_steps=1,
 )  # fmt: skip
 
 
 def panel():
-    """Times and values of records of unequal length, with levels of their own."""
+    """Times and values of records of unequal length, with levels of their own and the rate one."""
     rng, decay = np.random.default_rng(0), np.exp(-GAP)
     times, values = [], []
     for number in range(NUM):
-        level, x, seen = 0.5 + 0.7 * rng.normal(), rng.normal(), []
+        level, x, seen = 0.5 + 1.2 * rng.normal(), rng.normal(), []
         for _ in range(12 - number % 3):
             seen.append(x + NOISE * rng.normal())
             x = level + (x - level) * decay + np.sqrt((1 - decay**2) / 8) * rng.normal()
@@ -31,28 +37,40 @@ def panel():
 
 
 def exact_posterior(times, values):
-    """Means and sds of the population's mean and log sd, and the mean of each record's level.
+    """Means and sds of (level, log_rate, log_sd), and the mean of each record's level.
 
-    Given its level m a record is normal with the mean (1 - e^{-t}) m."""
-    means, log_sds = np.linspace(-2, 3, 201), np.linspace(-4, 1.5, 201)
-    variance, centre = np.exp(2 * log_sds), means[:, None]
-    log_posterior = -(centre**2) / 8 + log_sds - variance / 2
-    levels = []
-    for t, y in zip(times, values, strict=True):
-        early, late = np.minimum.outer(t, t), np.maximum.outer(t, t)
-        covariance = np.exp(-early - late) + np.exp(early - late) / 8 - np.exp(-early - late) / 8
-        a, covariance = 1 - np.exp(-t), covariance + NOISE**2 * np.eye(len(t))
-        precision, weighted = a @ np.linalg.solve(covariance, np.stack([a, y[:, 0]], axis=1))
-        spread = variance + 1 / precision
-        log_posterior = log_posterior - np.log(spread) / 2
-        log_posterior -= (weighted / precision - centre) ** 2 / (2 * spread)
-        levels.append((centre / variance + weighted) / (1 / variance + precision))
+    Given its level m and the rate a record is normal with the mean (1 - e^{-rate t}) m."""
+    grids = np.linspace(-2, 3, 81), np.linspace(-1.8, 1.5, 67), np.linspace(-2.5, 1.5, 81)
+    centre, log_sd = grids[0][:, None], grids[2]
+    variance = np.exp(2 * log_sd)
+    log_posterior = np.zeros((81, 67, 81))
+    levels = np.zeros((NUM, 81, 67, 81))
+    for i, log_rate in enumerate(grids[1]):
+        rate, logs = np.exp(log_rate), -(centre**2) / 8 + log_sd - variance / 2 - 2 * log_rate**2
+        for number, (t, y) in enumerate(zip(times, values, strict=True)):
+            ages = rate * t
+            early, late = np.minimum.outer(ages, ages), np.maximum.outer(ages, ages)
+            both = np.exp(-early - late)
+            covariance = both + (np.exp(early - late) - both) / (8 * rate)
+            covariance += NOISE**2 * np.eye(len(t))
+            a, y = 1 - np.exp(-ages), y[:, 0]
+            solved = np.linalg.solve(covariance, np.stack([a, y], axis=1))
+            precision, weighted = a @ solved
+            logs = logs - np.linalg.slogdet(covariance)[1] / 2 - y @ solved[:, 1] / 2
+            logs += weighted**2 / precision / 2 - np.log(precision) / 2
+            spread = variance + 1 / precision
+            logs = logs - np.log(spread) / 2
+            logs -= (weighted / precision - centre) ** 2 / (2 * spread)
+            shrunk = (centre / variance + weighted) / (1 / variance + precision)
+            levels[number, :, i] = shrunk
+        log_posterior[:, i] = logs
     weights = np.exp(log_posterior - log_posterior.max())
     weights /= weights.sum()
     moments = []
-    for grid, mass in ((means, weights.sum(1)), (log_sds, weights.sum(0))):
+    for axis, grid in enumerate(grids):
+        mass = weights.sum(tuple(other for other in range(3) if other != axis))
         moments.append((mass @ grid, np.sqrt(mass @ (grid - mass @ grid) ** 2)))
-    return np.array(moments).T, np.array([np.sum(weights * level) for level in levels])
+    return np.array(moments).T, np.tensordot(levels, weights, 3)
 
 
 @pytest.mark.slow
@@ -61,19 +79,49 @@ def test_posterior_is_that_of_the_grid():
     (mean, sd), levels = exact_posterior(*data)
     made = jb.gibbs(
         jax.random.key(0), MODEL, *data, **OPTIONS, population=jb.NormalPopulation(LEVEL),
-        num_iterations=1000, num_chains=4,
+        num_iterations=1000, num_chains=4, thin=5,
     )  # fmt: skip
-    assert made.names == ("level", "log_sd(level)") and made.trustworthy
-    error, theta = np.asarray(made.standard_error), np.asarray(made.theta).reshape(-1, 2)
-    np.testing.assert_array_less(error, 0.05 * sd)
+    assert made.names == ("level", "log_rate", "log_sd(level)") and made.trustworthy
+    error, theta = np.asarray(made.standard_error), np.asarray(made.theta).reshape(-1, 3)
+    np.testing.assert_array_less(error, 0.1 * sd)
     np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error)
-    np.testing.assert_allclose(theta.std(0), sd, rtol=0.1)
+    np.testing.assert_allclose(theta.std(0), sd, rtol=0.15)
     of_units = made.unit_params["level"]
     assert of_units.shape == (4, 1000, NUM) and made.params["level"].shape == (4, 1000)
+    size = np.asarray(jb.effective_sample_size(np.asarray(of_units), chains=True))
     of_units = np.asarray(of_units).reshape(-1, NUM)
-    size = np.asarray(jb.effective_sample_size(np.asarray(made.unit_params["level"]), chains=True))
     error = of_units.std(0) / np.sqrt(size)
     np.testing.assert_array_less(np.abs(of_units.mean(0) - levels), 5 * error)
+    assert "log_sd(level)" in made.to_arviz().posterior
+
+
+@pytest.mark.slow
+def test_constraints_hold_for_means_and_for_records():
+    """Records that hardly move, for which a normal law of rates would allow negative ones."""
+    model = jb.Diffusion(lambda x, p: -p["rate"] * x, [0.3], params={"rate": 0.2})
+    times, values = 4 * [np.arange(4.0)], [np.full((4, 1), y) for y in (1.0, 1.6, 2.7, 4.5)]
+    options = OPTIONS | dict(prior=jb.NormalPrior(0.5, 1.0), constraint=lambda p: p["rate"] > 0)
+    run = lambda **how: jb.gibbs(
+        jax.random.key(0), model, times, values, **options, num_iterations=50, **how,
+        population=jb.NormalPopulation(lambda params: params["rate"]),
+    )  # fmt: skip
+    made = run(num_warmup=50, num_chains=4)
+    assert np.all(made.params["rate"] > 0) and np.all(made.unit_params["rate"] > 0)
+    more = run(**made.continuation)
+    np.testing.assert_array_equal(more.state.num_done, made.state.num_done + 50)
+
+
+def test_entries_of_arrays_may_vary():
+    params = {"B": jnp.eye(2), "rates": jnp.ones(3), "count": 3}
+    parameters = Parameters(jb.Diffusion(lambda x, p: -x, params=params), None)
+    varies = lambda per_unit: (
+        as_population(jb.NormalPopulation(per_unit), parameters, jnp.sum, 2).varies
+    )
+    assert varies(lambda p: p["B"][0]) == (0, 1)
+    assert varies(lambda p: (p["B"][:, 1], p["rates"][2])) == (1, 3, 6)
+    for wrong in (lambda p: (p["rates"], p["rates"][0]), lambda p: p["count"]):
+        with pytest.raises(ValueError, match="each at most once; it selected"):
+            varies(wrong)
 
 
 def test_what_does_not_fit_is_refused():
@@ -86,11 +134,12 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="one entry for each of level"):
         two = jb.NormalPopulation(LEVEL, spread=jnp.ones(2))
         jb.gibbs(jax.random.key(0), MODEL, times, values, **OPTIONS, population=two)
-    fixed = MODEL.with_params({"level": 0.0, "other": jnp.ones(2)})
-    with pytest.raises(ValueError, match=r"are level; it selected other\[0\], other\[1\]"):
+    fixed = MODEL.with_params({"level": 0.0, "log_rate": 0.0, "other": jnp.ones(2)})
+    with pytest.raises(ValueError, match=r"unknown, level, .* it selected other\[0\], other\[1\]"):
         jb.gibbs(
-            jax.random.key(0), fixed, times, values, **OPTIONS, where=LEVEL,
+            jax.random.key(0), fixed, times, values, where=LEVEL,
+            **OPTIONS | {"prior": jb.NormalPrior(0.0, 1.0)},
             population=jb.NormalPopulation(lambda params: params["other"]),
         )  # fmt: skip
-    with pytest.raises(ValueError, match="`spread` must be positive"):
+    with pytest.raises(ValueError, match="`spread` must be positive and finite"):
         jb.NormalPopulation(LEVEL, spread=0.0)

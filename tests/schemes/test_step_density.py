@@ -407,7 +407,7 @@ def test_superlinear_rotation_is_finite_and_converges(name):
     of the chain, and tends to a limit at least as fast as its step error says. The weights are of
     heavy tails, and of fewer paths one may decide."""
     start, end, estimates = [1.0, 0.2], [-0.4, 0.6], {}
-    for num_steps in (4, 25, 100):
+    for num_steps in (4, 25, 50):
         estimates[num_steps] = estimate = jb.transition_log_density(
             jax.random.key(1), SUPERLINEAR, start, end, 1.0, num_proposals=40_000,
             num_steps=num_steps, proposal=PROPOSALS[name](jb.ItoTaylorDensity()),
@@ -418,17 +418,16 @@ def test_superlinear_rotation_is_finite_and_converges(name):
         assert not known or estimate.step_error < 2 * estimate.step_uncertainty
     if name == "mdb":
         assert not any(e.trustworthy for e in estimates.values())
-        assert all(estimates[n].pareto_k > 0.7 for n in (10, 25, 50, 100))
+        assert all(estimates[n].pareto_k > 0.7 for n in (25, 50))
         return
     with jax.enable_x64(True):
         nodes = np.linspace(-2.4, 2.4, 41)
         chain = quadrature(jb.ItoTaylorDensity(), SUPERLINEAR, start, end, 1.0, 25, nodes)
     assert abs(estimates[25].value - chain) < 5 * estimates[25].standard_error < 0.4
-    for num_steps in (25, 50):
-        coarse, fine = estimates[num_steps], estimates[2 * num_steps]
-        noise = np.hypot(coarse.standard_error, fine.standard_error) + coarse.step_uncertainty
-        limit = fine.value - coarse.value + coarse.step_error
-        assert abs(limit) < 5 * noise + 0.5 * abs(coarse.step_error)
+    coarse, fine = estimates[25], estimates[50]
+    noise = np.hypot(coarse.standard_error, fine.standard_error) + coarse.step_uncertainty
+    limit = fine.value - coarse.value + coarse.step_error
+    assert abs(limit) < 5 * noise + 0.5 * abs(coarse.step_error)
 
 
 @pytest.mark.slow
