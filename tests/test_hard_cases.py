@@ -148,7 +148,7 @@ def test_very_unlikely_bridges(precision):
     exact = lambda a, b: float(jb.ou_transition(model, a, 1.0).log_density(b))
     start, end = jnp.array([5.0, -5.0], dtype), jnp.array([6.0, -6.0], dtype)
     law = jb.fit_start_law(jax.random.key(0), model, start, end, 1.0, coupling=jb.Coupling(0.5))
-    options = dict(num_proposals=20_000, num_steps=50)
+    options = dict(num_proposals=10_000, num_steps=50)
     estimate = jb.transition_log_density(
         jax.random.key(1),
         model,
@@ -404,20 +404,19 @@ def test_rotating_sigma(precision):
     start, end = jnp.array([0.3, -0.2], dtype), jnp.array([-0.5, 0.4], dtype)
     plain = jb.ornstein_uhlenbeck(0.5 * jnp.eye(2))
     exact = jb.ou_transition(plain, start, 2.0).log_density(end)
-    for scheme in (jb.Euler(), jb.Heun()):
-        estimate = jb.transition_log_density(
-            jax.random.key(0),
-            model,
-            start,
-            end,
-            2.0,
-            num_proposals=10_000,
-            num_steps=200,
-            proposal=jb.Coupling(0.5, scheme=scheme),
-        )
-        error = float(estimate.standard_error)
-        assert error < 0.05
-        assert abs(float(estimate.value - exact)) < 5 * error + 0.05
+    estimate = jb.transition_log_density(
+        jax.random.key(0),
+        model,
+        start,
+        end,
+        2.0,
+        num_proposals=10_000,
+        num_steps=200,
+        proposal=jb.Coupling(0.5, scheme=jb.Heun()),
+    )
+    error = float(estimate.standard_error)
+    assert error < 0.05
+    assert abs(float(estimate.value - exact)) < 5 * error + 0.05
 
 
 # Stationary densities

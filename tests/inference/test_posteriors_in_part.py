@@ -90,7 +90,7 @@ def assert_posterior(made):
 def test_a_random_walk_with_a_filter_has_the_posterior():
     """All weights are equal: two particles are as good as many."""
     made = jb.pmmh(
-        KEY, MODEL, TIMES, record(), prior=PRIOR, num_iterations=2500, num_chains=4,
+        KEY, MODEL, TIMES, record(), prior=PRIOR, num_iterations=2000, num_chains=4,
         num_proposals=2, **OPTIONS,
     )  # fmt: skip
     assert_posterior(made)
@@ -109,7 +109,9 @@ def test_gibbs_has_the_posterior():
 @pytest.mark.optimised
 def test_the_maximum_is_kalmans():
     with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
-        made = jb.maximum_likelihood(KEY, MODEL, TIMES, record(), **OPTIONS)
+        made = jb.maximum_likelihood(
+            KEY, MODEL, TIMES, record(), num_iterations=300, num_bridges=40, **OPTIONS
+        )
     best = minimize(lambda theta: -log_likelihood(theta), TRUE, method="Nelder-Mead").x
     error = np.sqrt(np.diagonal(made.covariance))
     allowed = 5 * np.asarray(made.monte_carlo_errors) + 0.1 * error
@@ -121,7 +123,7 @@ def test_the_maximum_is_kalmans():
 def test_ranks_of_true_parameters_are_uniform():
     """Simulation-based calibration (Talts et al. 2018) with a force that is not linear, and data of
     short steps."""
-    num_sets, num_draws, num_fine, gap = 120, 31, 20, 0.25
+    num_sets, num_draws, num_fine, gap = 80, 31, 20, 0.25
     mean, sd = jnp.array([1.0, -0.3, -2.0]), jnp.array([0.3, 0.3, 0.4])
 
     def force(x, p):

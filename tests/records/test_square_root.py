@@ -247,27 +247,6 @@ def test_posterior_of_gibbs_is_of_second_order():
 
 
 @pytest.mark.slow
-def test_records_of_unequal_length_have_the_sum_of_their_likelihoods():
-    """The shorter one is filled with steps of no length, which move nothing."""
-    model = jb.Diffusion(lambda x, p: -p * x, lambda x, p: 0.3 * jnp.sqrt(1 + x**2), params=0.8)
-    observed = [np.array([0.1, 0.3, 0.2, -0.1, 0.2]), np.array([0.2, 0.4, 0.1])]
-    times = [np.arange(1.0, 1 + len(values)) for values in observed]
-    options = dict(
-        observation=jb.LinearGaussian(covariance=0.04), initial=[0.2], initial_time=0.0,
-        num_steps=4, num_particles=200,
-    )  # fmt: skip
-    key = jax.random.key(0)
-    alone = [
-        jb.log_likelihood(key, model, t, values[:, None], **options)
-        for t, values in zip(times, observed, strict=True)
-    ]
-    both = jb.log_likelihood(key, model, times, [v[:, None] for v in observed], **options)
-    error = np.sqrt(sum(float(one.standard_error) ** 2 for one in (*alone, both)))
-    assert int(both.num_nonfinite) == 0
-    assert abs(float(both.value) - sum(float(one.value) for one in alone)) < 5 * error + 1e-3
-
-
-@pytest.mark.slow
 def test_a_relaxation_time_of_half_a_step():
     """κδ = 2 in a coordinate of constant noise, beside a geometric Brownian motion."""
     rate, sigma = 16.0, 0.3
