@@ -30,7 +30,7 @@ os.environ.setdefault("XLA_FLAGS", " ".join(_FLAGS))
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 # Traces are millions of objects, few of which are garbage; a search for it looks at all of them.
-gc.set_threshold(100_000, 20, 20)
+gc.set_threshold(50_000, 10, 10)
 
 import jax  # noqa: E402
 import pytest  # noqa: E402

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_uniform_ranks
 from kalman import exact_step, kalman
 from scipy.optimize import minimize
 
@@ -103,57 +102,3 @@ def test_gibbs_has_the_posterior():
         KEY, MODEL, TIMES, record(), prior=PRIOR, num_iterations=2500, num_chains=4, **OPTIONS
     )
     assert_posterior(made)
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
-def test_the_maximum_is_kalmans():
-    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
-        made = jb.maximum_likelihood(
-            KEY, MODEL, TIMES, record(), num_iterations=300, num_bridges=40, **OPTIONS
-        )
-    best = minimize(lambda theta: -log_likelihood(theta), TRUE, method="Nelder-Mead").x
-    error = np.sqrt(np.diagonal(made.covariance))
-    allowed = 5 * np.asarray(made.monte_carlo_errors) + 0.1 * error
-    np.testing.assert_array_less(np.abs(made.theta - best), allowed)
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
-def test_ranks_of_true_parameters_are_uniform():
-    """Simulation-based calibration (Talts et al. 2018) with a force that is not linear, and data of
-    short steps."""
-    num_sets, num_draws, num_fine, gap = 80, 31, 20, 0.25
-    mean, sd = jnp.array([1.0, -0.3, -2.0]), jnp.array([0.3, 0.3, 0.4])
-
-    def force(x, p):
-        return jnp.stack([x[1], -jnp.exp(p[0]) * jnp.sin(x[0]) - 0.5 * x[1]])
-
-    model = jb.Diffusion(force, sigma, params=mean)
-
-    def one_set(key):
-        parameter_key, start_key, path_key, noise_key, run_key = jax.random.split(key, 5)
-        theta = mean + sd * jax.random.normal(parameter_key, (3,))
-        fine = gap / num_fine
-
-        def step(x, key):
-            velocity = x[1] + jnp.exp(theta[1]) * np.sqrt(fine) * jax.random.normal(key)
-            # The splitting of Leimkuhler & Matthews: of second order in law.
-            middle = x[0] + fine / 2 * x[1]
-            kick = -jnp.exp(theta[0]) * jnp.sin(middle) - 0.5 * x[1]
-            x = jnp.stack([middle + fine / 2 * (velocity + fine * kick), velocity + fine * kick])
-            return x, x[0]
-
-        start = jnp.sqrt(jnp.array([0.1, 0.4])) * jax.random.normal(start_key, (2,))
-        later = jax.lax.scan(step, start, jax.random.split(path_key, 20 * num_fine))[1]
-        values = jnp.concatenate([start[:1], later[num_fine - 1 :: num_fine]])[:, None]
-        values = values + jnp.exp(theta[2]) * jax.random.normal(noise_key, values.shape)
-        made = jb.gibbs(
-            run_key, model, np.arange(21) * gap, values, prior=jb.NormalPrior(mean, sd**2),
-            num_iterations=num_draws, num_warmup=300, thin=20, **OPTIONS,
-        )  # fmt: skip
-        return jnp.sum(made.theta < theta, axis=0)
-
-    keys = jax.random.split(KEY, num_sets)
-    ranks = np.asarray(jax.jit(jax.vmap(one_set))(keys)).reshape(num_sets, 3)
-    assert_uniform_ranks(ranks, num_draws)

@@ -335,35 +335,6 @@ def test_each_interval_is_differentiated_by_its_own_proposal():
     )
 
 
-@slow
-def test_the_score_by_a_choice_is_that_of_the_closed_form():
-    starts, ends, at, B = pulled_setting()
-    choice = jb.choose_proposal(
-        jax.random.key(5), at(B), starts, ends, 0.5, num_steps=40, candidates=PULLED
-    )
-    forced = pulled_choice()
-
-    def score(proposal):
-        def value(B, key):
-            return jb.transition_log_density(
-                key, at(B), starts, ends, 0.5, num_proposals=50, num_steps=40, proposal=proposal
-            ).value.sum()  # fmt: skip
-
-        keys = jax.random.split(jax.random.key(0), 60)
-        return np.asarray(jax.jit(jax.vmap(jax.grad(value), (None, 0)))(B, keys))
-
-    exact = jax.grad(
-        lambda B: jax.vmap(lambda a, b: jb.ou_transition(at(B), a, 0.5).log_density(b))(
-            jnp.asarray(starts), jnp.asarray(ends)
-        ).sum()
-    )(B)
-    for proposal in (choice, forced):
-        found = score(proposal)
-        error = found.std(0) / np.sqrt(len(found))
-        assert (error < 0.1).all()
-        np.testing.assert_array_less(np.abs(found.mean(0) - exact), 5 * error + 0.01)
-
-
 @pytest.mark.slow
 def test_what_a_proposal_makes_of_another_ones_interval_does_not_spoil_derivatives():
     """Where the explicit path of a guide overflows its derivative is not a number, times zero as
