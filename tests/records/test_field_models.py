@@ -45,14 +45,14 @@ def test_lorenz_from_parameters_that_are_far_off():
         observation=jb.LinearGaussian(matrix=[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], covariance=5.0),
         initial=start,
         prior=jb.NormalPrior(np.zeros(3), 1000.0),
-        num_iterations=700,
-        num_warmup=700,
-        num_chains=4,
+        num_iterations=600,
+        num_warmup=600,
+        num_chains=2,
         num_proposals=4,
         num_steps=2,
     )
     assert (made.log_likelihood_variance < 0.05).all()
-    assert (made.r_hat < 1.1).all() and (made.effective_sample_size > 40).all()
+    assert (made.r_hat < 1.1).all() and (made.effective_sample_size > 25).all()
     low, high = np.quantile(np.asarray(made.theta).reshape(-1, 3), [0.025, 0.975], axis=0)
     assert ((low < LORENZ) & (LORENZ < high)).all()
 
