@@ -351,7 +351,7 @@ def test_sigma_may_turn_and_a_guess_does_not_see_it(linearisation, x64):
 @pytest.mark.slow
 @pytest.mark.parametrize(("density", "order"), [(jb.EulerDensity(), 1), (jb.ItoTaylorDensity(), 2)])
 def test_both_families_converge_to_one_law(density, order):
-    """The error of log p̂ against the closed form: O(δ) for the Euler target, O(δ²) for the other."""
+    """The error of log p̂ against the closed form: O(δ) for Euler steps, O(δ²) for others."""
     model, ends = paper_model(), (jnp.array([0.785, 0.785]), jnp.array([0.5, 0.2]))
     exact = float(jb.ou_transition(model, ends[0], 1.0).log_density(ends[1]))
     sizes = np.array([10, 20, 40])
