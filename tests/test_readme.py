@@ -94,6 +94,10 @@ CLAIMS = {
         covers(page["posterior"].params, 0.8) and page["both"].theta.shape == (600, 1)
     ),
     "several_devices": lambda page: bool(page["bridges"].met.all()),
+    "random_effects": lambda page: (
+        covers(page["posterior"].params["level"], 1)
+        and abs(page["of_subjects"].mean(0) - page["levels"]).max() < 0.5
+    ),
     "several_records": lambda page: max(page["values_at"], key=page["values_at"].get) == 0.0,
     "speed": lambda page: page["costs"].cheapest() is not None,
     "trust": lambda page: page["density"].trustworthy.tolist() == [True, False],
