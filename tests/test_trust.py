@@ -25,7 +25,7 @@ from jaxbridge.schemes.step_error import error_of_log_mean
 slow = pytest.mark.slow
 RANDOM = random_models.random_models()
 # Other dimensions, kinds of σ and of skew parts; by methods of all kinds the first one.
-CHOSEN = (1, 7, 11)
+CHOSEN = (1, 11)
 ALL_METHODS = 2
 
 

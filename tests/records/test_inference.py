@@ -140,33 +140,14 @@ def test_a_single_chain_is_compiled_in_time():
 
 @pytest.mark.slow
 @pytest.mark.optimised
-def test_means_and_sds_of_the_posterior():
-    """Means within .1 sd and sds within 8 %, each of which is 4.5 standard errors or more."""
-    made = jb.gibbs(
-        jax.random.key(2), model(), TIMES, record(), observation=SEEN, prior=log_prior,
-        num_iterations=12_000, num_warmup=2000, num_chains=8, num_steps=5,
-    )  # fmt: skip
-    mean, sd = exact_posterior()
-    squares = (made.theta - mean.astype(np.float32)) ** 2
-    size = np.asarray(effective_size_of_chains(squares))
-    error = np.asarray(jnp.std(squares, axis=(0, 1))) / np.sqrt(size)
-    np.testing.assert_array_less(4.5 * np.asarray(made.standard_error), 0.1 * sd)
-    np.testing.assert_array_less(4.5 * error / (2 * sd**2), 0.08)
-    theta = np.asarray(made.theta).reshape(-1, 3)
-    np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 0.1 * sd)
-    np.testing.assert_allclose(theta.std(0), sd, rtol=0.08)
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
 def test_short_steps_mix_as_well_as_long_ones():
     """σ and the noise among the parameters: given paths instead of noise it would be N times as
     slow."""
     sizes = []
-    for num_steps in (4, 32):
+    for num_steps in (4, 20):
         made = jb.gibbs(
             jax.random.key(3), model(), TIMES, record(), observation=SEEN, prior=log_prior,
-            num_iterations=1000, num_warmup=500, num_chains=4, num_steps=num_steps,
+            num_iterations=800, num_warmup=400, num_chains=4, num_steps=num_steps,
         )  # fmt: skip
         assert not made.stuck.any() and (made.r_hat < 1.05).all()
         sizes.append(made.effective_sample_size)
@@ -216,11 +197,11 @@ def test_several_records_have_one_posterior(method):
     assert np.all(posterior.r_hat < 1.03) and not np.any(getattr(posterior, "stuck", False))
     np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error + 0.02 * sd)
     assert np.all(posterior.step_error == 0) and np.all(posterior.step_uncertainty == 0)
-    # A walk has about 500 effective draws, of which the sd is known to 4 %.
+    # A walk has about 400 effective draws, of which the sd is known to 5 %.
     squares = (posterior.theta - mean.astype(np.float32)) ** 2
     size = np.asarray(effective_size_of_chains(squares))
     error = np.asarray(jnp.std(squares, axis=(0, 1))) / np.sqrt(size) / (2 * sd**2)
-    np.testing.assert_array_less(error, 0.07)
+    np.testing.assert_array_less(error, 0.09)
     np.testing.assert_array_less(np.abs(theta.std(0) / sd - 1), 4.5 * error + 0.02)
 
 
