@@ -153,7 +153,7 @@ def cell(point: int, law: int, num_steps: int, noise: float, seed: int, filters=
         variances = _variance(made.log_estimates), _variance(rival)
     return Cell(
         point, law, num_steps, noise, seed,
-        float(np.nanmax(np.abs(values - np.asarray(paths.points)[::num_steps, 0])) / noise),
+        float(np.nanmax(np.abs(values - np.asarray(paths.points)[0, ::num_steps, 0])) / noise),
         float(np.max(np.abs(white[1:]))),
         finite[0], float(np.mean(finite[1:])), bool(paths.trustworthy), *variances,
     )  # fmt: skip

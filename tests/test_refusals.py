@@ -802,7 +802,7 @@ on_line = {"times": TIMES, "observations": LINE}
 of_free = dict(model=FREE_RATE, where=None, constraint=None)
 exactly_seen = of(jb.log_likelihood, KEY, OU, **on_line)
 CHAIN = jb.PMMHState(jnp.ones(2), 0.0, 0.0, 0.0, jnp.eye(2), 0, (), None)
-PATHS = jb.RecordState(jnp.ones(1), None, None, None, 0)
+PATHS = jb.RecordState(jnp.ones(1), None, None, None, 0, jnp.ones((1, 0)), None)
 going_on = functools.partial(pmmh, init=CHAIN)
 
 UNUSED = [

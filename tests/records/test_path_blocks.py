@@ -67,7 +67,7 @@ def test_blocks_beyond_the_record_are_not_stuck():
 def test_parameters_that_never_moved_have_no_error():
     theta = jax.random.normal(jax.random.key(0), (2, 50, 2)).at[1, :, 1].set(0.3)
     moved, share = jnp.ones((2, 50), bool), jnp.ones((2, 50))
-    state = RecordState(theta[:, 0], *4 * [share[:, :0]])
+    state = RecordState(theta[:, 0], *6 * [share[:, :0]])
 
     def error(stuck):
         draws = (theta, theta, ("a", "b"), moved, share, jnp.asarray(stuck), share, False, state)

@@ -122,7 +122,7 @@ def test_weight_is_the_density_of_a_path_by_hand(x64):
     positional, options = arguments(np.array([0.7]), gap, sd, 1)
     paths = jb.innovations(*positional, **options)
     zeta = np.array([0.4, -0.8, 0.5, 0.3, -0.2])  # of the fixed start, and of the steps
-    run = lambda zeta: paths._run(positional[0].params, jnp.array(zeta))[0]
+    run = lambda zeta: paths._run(positional[0].params, jnp.array(zeta))[0][0]
     path_of = lambda zeta: np.asarray(run(zeta))[:, 0]  # with the points of the splits
     assert len(paths.times) == len(paths.path(positional[0].params, jnp.array(zeta))) == 2
     path, lengths = path_of(zeta), gap * np.array([0.5, 0.25, 0.125, 0.125])

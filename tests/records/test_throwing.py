@@ -56,12 +56,12 @@ def test_smoothed_paths(changed, message):
     made = draws(**changed)
     assert not made.trustworthy and message in made.why()
     with pytest.raises(Exception, match=message):
-        throw_where_untrustworthy(made, "paths", MODEL)
+        throw_where_untrustworthy(made, "_paths", MODEL)
 
 
 def test_what_is_trusted_is_not_thrown():
     assert throw_where_untrustworthy(likelihood(), "value", MODEL).value == -3
     made = draws()
-    assert jnp.all(throw_where_untrustworthy(made, "paths", MODEL).paths == made.paths)
+    assert jnp.all(throw_where_untrustworthy(made, "_paths", MODEL).paths == made.paths)
     with pytest.raises(Exception, match="not finite"):
-        throw_where_untrustworthy(made, "paths", MODEL.with_params(jnp.nan))
+        throw_where_untrustworthy(made, "_paths", MODEL.with_params(jnp.nan))
