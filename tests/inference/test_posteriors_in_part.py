@@ -86,17 +86,6 @@ def assert_posterior(made):
 
 @pytest.mark.slow
 @pytest.mark.optimised
-def test_a_random_walk_with_a_filter_has_the_posterior():
-    """All weights are equal: two particles are as good as many."""
-    made = jb.pmmh(
-        KEY, MODEL, TIMES, record(), prior=PRIOR, num_iterations=2000, num_chains=4,
-        num_proposals=2, **OPTIONS,
-    )  # fmt: skip
-    assert_posterior(made)
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
 def test_gibbs_has_the_posterior():
     made = jb.gibbs(
         KEY, MODEL, TIMES, record(), prior=PRIOR, num_iterations=2500, num_chains=4, **OPTIONS
