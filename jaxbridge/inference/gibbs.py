@@ -293,7 +293,7 @@ def gibbs(
         check_covariance_is_used(covariance, state)
         units.check_state(state)
         root = units.first_root(first_root(covariance, log_prior, unknown))
-        start = (units.joined(theta), root) if state is None else state
+        start = (units.first_point(theta), root) if state is None else state
         num_warmup = check_count("num_warmup", 500 if num_warmup is None else num_warmup, 0)
         size = (num_warmup, num_iterations, thin)
         how = size, covariance is None, progress_meter

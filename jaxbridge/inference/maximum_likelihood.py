@@ -86,13 +86,14 @@ class MaximumLikelihood(AbstractResult):
         definite. Moreover the Monte Carlo error in every direction is at most half a standard
         error. If false, `params` are not an estimate: use more iterations, a larger learning rate
         or more bridges, unless the maximum is outside the constraint.
-    - With more than 300 unknown parameters, such as those of a neural network, the estimate is the
-        mean of the second half of `iterates`. Then `covariance`, `score` and `fall` are `None`, and
-        errors are NaN.
     - `fall`: decrease of the log-likelihood one standard error below and above the estimate in each
         parameter, with the others optimised to second order, shape (2, p). It is 0.5 for a
         quadratic log-likelihood. Values near or below zero show that there is no maximum inside;
         outside the constraint it is infinite.
+
+    With more than 300 unknown parameters, such as those of a neural network, the estimate is the
+    mean of the second half of `iterates`. Then `covariance`, `score` and `fall` are `None`, and
+    errors are NaN.
     """
 
     params: PyTree

@@ -54,7 +54,7 @@ class NormalPopulation(eqx.Module):
     population = jb.NormalPopulation(lambda params: params["log_rate"], spread=0.5)
     ```
 
-    **Source:** Gelman et al., Bayesian Data Analysis (2013), section 5.
+    **Source:** Gelman et al., Bayesian Data Analysis (2013), chapter 5.
     """
 
     per_unit: Callable[[PyTree], PyTree] = eqx.field(static=True)
@@ -113,7 +113,7 @@ class Population(eqx.Module):
         p = phi.shape[0] - len(self.varies)
         return phi[:p], phi[p:]
 
-    def joined(self, theta: Float[Array, "*chains p"]) -> Float[Array, "*chains p+q"]:
+    def first_point(self, theta: Float[Array, "*chains p"]) -> Float[Array, "*chains p+q"]:
         """Return φ at the start: θ, and λ from the scale of the prior."""
         first = jnp.log(_FIRST_SPREAD * self.spread).astype(theta.dtype)
         return jnp.concatenate(

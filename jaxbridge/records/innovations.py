@@ -57,7 +57,7 @@ class Innovations(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Return the number of entries of ξ: for each record d for x_0, and d for each step."""
+        """Return the number of entries of ξ: d for x_0 and d for each step of each record."""
         return self.points.size
 
     @property

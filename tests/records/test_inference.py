@@ -226,8 +226,8 @@ def maximum(**options):
 @pytest.mark.slow
 @pytest.mark.optimised
 def test_the_maximum_is_that_of_the_kalman_filter():
-    """Of linear models all paths have the same weight: nothing is left to chance but the search. By
-    steps of second order, whose error is told."""
+    """Of linear models all paths have the same weight: nothing is left to chance but the search.
+    Steps of second order report their error."""
     parts = ((0, 25), (25, 40))
     times, values = zip(*((TIMES[i:j], record()[i:j]) for i, j in parts), strict=True)
     with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
