@@ -63,6 +63,11 @@ def _programs(config: pytest.Config) -> pathlib.Path:
     return folder
 
 
+def pytest_collection_finish() -> None:
+    # What is there before the first test stays: searches for garbage need not look at it.
+    gc.freeze()
+
+
 def pytest_configure(config: pytest.Config) -> None:
     # Slow tests run without the check of annotations, and so without the hook: it takes time even
     # where nothing is checked.

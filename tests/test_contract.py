@@ -135,7 +135,7 @@ CHAINS = ("pseudo_marginal", "renewal", "crank_nicolson")
 
 # Each hands the parameters on in a way of its own.
 HANDED_ON = [
-    "sample_bridges", "transition_log_density", "crank_nicolson", "gibbs", "pmmh", "log_likelihood",
+    "sample_bridges", "transition_log_density", "crank_nicolson", "pmmh", "log_likelihood",
 ]  # fmt: skip
 
 

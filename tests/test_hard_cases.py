@@ -470,12 +470,12 @@ def test_unusual_stationary_densities(log_density, precision):
 
 
 @hard(
-    "d = 1, 10, 50",
+    "d = 1, 50",
     "matrices of d×d numbers and their O(d³) products, although σ = I needs none",
     "with σ = I memory grows as d; laws and meeting probabilities are those of the closed form",
 )
 @pytest.mark.slow
-@pytest.mark.parametrize("d", [1, 10, 50])
+@pytest.mark.parametrize("d", [1, 50])
 @in_single
 def test_dimensions(d, precision):
     model, dtype = jb.ornstein_uhlenbeck(jnp.eye(d)), jnp.dtype(precision)
@@ -574,8 +574,7 @@ def test_rotation_dominated_drift(precision):
 @hard(
     "bridges that 100,000 trials do not hit; all proposals missed; one accepted",
     "a geometric count that never ends; division by no hits",
-    "`max_trials` bounds the work and sets `truncated`; weights stay finite; with a fitted "
-    "start law all bridges are hit",
+    "`max_trials` bounds the work and sets `truncated`; weights stay finite",
 )
 @pytest.mark.slow
 def test_extreme_counts():
@@ -588,15 +587,6 @@ def test_extreme_counts():
     assert weighted.truncated.all() and all_finite(weighted.log_weights, weighted.mean())
     with pytest.raises(RuntimeError, match="max_trials"):
         jb.weigh_bridges(jax.random.key(1), model, bridges, max_trials=5, throw=True)
-    # A start law that reaches them gives the right density, and cuts nothing off.
-    law = jb.fit_start_law(jax.random.key(2), model, *ends, coupling=jb.Coupling(0.5))
-    estimate = jb.transition_log_density(
-        jax.random.key(3), model, *ends, proposal=jb.Coupling(0.5, start_law=law)
-    )
-    exact = jb.ou_transition(model, jnp.array(ends[0]), 1.0).log_density(jnp.array(ends[1]))
-    assert abs(float(estimate.value - exact)) < 5 * float(estimate.standard_error) + 0.02
-    reached = jb.weigh_bridges(jax.random.key(1), model, bridges, start_law=law)
-    assert not reached.truncated.any()
     nothing = jb.sample_bridges(
         jax.random.key(0), model, [9.0, 9.0], [-9.0, -9.0], 0.1, num_bridges=3, max_proposals=50
     )

@@ -24,9 +24,7 @@ from jaxbridge.schemes.step_error import error_of_log_mean
 
 slow = pytest.mark.slow
 RANDOM = random_models.random_models()
-# Other dimensions, kinds of σ and of skew parts; by methods of all kinds the first one.
-CHOSEN = (1, 11)
-ALL_METHODS = 2
+CHOSEN = (1,)  # each takes long to compile, by methods of all kinds
 
 
 class Told(NamedTuple):
@@ -184,15 +182,10 @@ def density_of(weighted):
 @slow
 @pytest.mark.parametrize("index", CHOSEN, ids=lambda index: RANDOM[index].name)
 def test_methods_agree_with_one_another_and_with_the_exact_numbers(index):
-    """Densities and mid-points by proposals of all kinds, where none has a warning: by all for the
-    first model, and then by a coupling and one other in turn, for each takes long to compile."""
+    """Densities and mid-points by proposals of all kinds, where none has a warning."""
     random = RANDOM[index]
     model = normalised(random)
     chosen = {**methods(model, random.start), "auto": "auto"}
-    if index >= ALL_METHODS:
-        other = ["modified", "end", "path", "auto"][index % 4]
-        coupling = "Euler" if "Euler" in chosen and index % 2 else "Heun"
-        chosen = {name: chosen[name] for name in (coupling, other)}
     told = {
         name: tell(jax.random.key(index), model, random, proposal, 52)
         for name, proposal in chosen.items()
@@ -421,8 +414,8 @@ _ITO_TAYLOR, _EULER = jb.ItoTaylorDensity(), jb.EulerDensity()
     "coordinates, proposal, which",
     [
         ("roots", jb.ModifiedDiffusionBridge(_ITO_TAYLOR), [4]),
-        pytest.param("roots", jb.ModifiedDiffusionBridge(_ITO_TAYLOR), [0, 1, 2, 3], marks=slow),
-        pytest.param("roots", jb.Guided("end", _ITO_TAYLOR), [0, 1, 2, 3], marks=slow),
+        pytest.param("roots", jb.ModifiedDiffusionBridge(_ITO_TAYLOR), [1, 3], marks=slow),
+        pytest.param("roots", jb.Guided("end", _ITO_TAYLOR), [1, 3], marks=slow),
         pytest.param(
             "roots",
             jb.Guided("end", _ITO_TAYLOR),

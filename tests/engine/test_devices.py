@@ -111,10 +111,8 @@ def everything(start):
         jb.weigh_bridges(key, model, approximate),
         jb.sample_weighted_bridges(*each, num_bridges=9, proposal=jb.Coupling(), **settings),
         density(start, jb.Coupling()),
-        jb.sample_exact_bridges(*each, num_bridges=5, proposal=jb.Coupling(), **settings),
         jax.value_and_grad(lambda start: density(start, pulled).value)(start),
         jax.grad(lambda start: at_start(start).paths.sum())(start),
-        jax.vmap(lambda shift: at_start(start + shift).paths)(jnp.arange(2.0)),
     )
 
 alone = everything(a[0])

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_uniform_ranks
 from inference_oracles import grid_moments, multivariate_ou, ou_1d, ou_data, ou_log_likelihood
 
 import jaxbridge as jb
@@ -400,51 +399,3 @@ def test_a_choice_made_before_serves_for_intervals_of_other_lengths():
         **OPTIONS,
     )
     assert np.isfinite(made.theta).all() and made.num_missing.sum() == 0
-
-
-@pytest.mark.slow
-def test_ranks_of_true_parameters_are_uniform():
-    """Simulation-based calibration (Talts et al. 2018): parameters from the prior, data given
-    them, and the rank of the truth among draws, for a drift matrix of four unknowns."""
-    stable = lambda B: (jnp.trace(B) > 0.5) & (B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0] > 0.2)
-    num_sets, num_draws, times = 400, 31, jnp.linspace(0, 5, 11)
-    mean = jnp.array([[1.0, 0.3], [-0.3, 1.0]])
-
-    def draw_parameters(key):
-        def again(state):
-            key, _ = state
-            key, mine = jax.random.split(key)
-            return key, mean + 0.4 * jax.random.normal(mine, (2, 2))
-
-        return jax.lax.while_loop(lambda s: ~stable(s[1]), again, again((key, mean)))[1]
-
-    def one_set(key):
-        parameter_key, data_key, run_key = jax.random.split(key, 3)
-        B = draw_parameters(parameter_key)
-        model = jb.ornstein_uhlenbeck(B)
-        keys = jax.random.split(data_key, len(times) - 1)
-
-        def advance(x, key):
-            x = jb.ou_transition(model, x, 0.5).sample(key)
-            return x, x
-
-        x = jnp.zeros(2)
-        _, later = jax.lax.scan(advance, x, keys)
-        made = jb.gibbs(
-            run_key,
-            jb.ornstein_uhlenbeck(mean),
-            times,
-            jnp.concatenate([x[None], later]),
-            prior=jb.NormalPrior(mean.reshape(-1), 0.16),
-            num_iterations=num_draws,
-            thin=12,
-            num_steps=8,
-            where=lambda params: params.B,
-            constraint=stable,
-            proposal=jb.Guided(density=TRAPEZOID),
-        )
-        return jnp.sum(made.params.B < B, axis=0)
-
-    keys = jax.random.split(jax.random.key(0), num_sets)
-    ranks = np.asarray(jax.jit(jax.vmap(one_set))(keys)).reshape(num_sets, 4)
-    assert_uniform_ranks(ranks, num_draws)

@@ -136,6 +136,12 @@ def test_a_linear_record_from_far_away():
         num_iterations=200, num_bridges=10, num_steps=10,
     )  # fmt: skip
     sd = np.sqrt(np.diagonal(made.covariance))
+    moves, signs = 1e-3 * np.eye(2), [(a, b) for a in (-1, 1) for b in (-1, 1)]
+    hessian = [
+        [sum(a * b * minus(exact + a * u + b * v) for a, b in signs) / 4e-6 for v in moves]
+        for u in moves
+    ]
+    np.testing.assert_allclose(sd, np.sqrt(np.diagonal(np.linalg.inv(hessian))), rtol=0.01)
     rough = np.mean(made.iterates[100:], axis=0)
     assert np.max(np.abs(rough - exact) / sd) > 1  # Newton's method has a way to go
     assert made.trustworthy, made.why()

@@ -231,7 +231,7 @@ def test_posterior_where_sigma_varies():
     made = jb.pmmh(
         jax.random.key(1), model, np.arange(len(data.values)), data.values[:, None],
         prior=jb.NormalPrior(1.0, 1.0), constraint=lambda p: (p["rate"] > 0) & (p["sigma"] > 0),
-        num_iterations=700, num_steps=10, num_proposals=30, num_chains=4,
+        num_iterations=700, num_steps=10, num_proposals=30, num_chains=2,
     )  # fmt: skip
     draws = np.asarray(made.theta).reshape(-1, 2)
     off = (draws.mean(axis=0) - exact.mean) / exact.sd

@@ -31,8 +31,7 @@ def test_a_step_that_would_leave_the_state_space_is_shortened():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_steps", [10, 20])
-def test_a_guide_is_found_where_the_filter_is_thrown_off(num_steps):
+def test_a_guide_is_found_where_the_filter_is_thrown_off(num_steps=20):
     """From the filter alone it passes six standard deviations beside the readings, and no path has
     a weight."""
     times, values, options = neuron_record(num_steps)

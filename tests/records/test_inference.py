@@ -7,7 +7,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import run_program
-from scipy.optimize import minimize
 
 import jaxbridge as jb
 from jaxbridge.engine.checks import nondifferentiable
@@ -179,17 +178,12 @@ def test_rate_sigma_and_noise_are_found(method):
 
 @pytest.mark.slow
 @pytest.mark.optimised
-@pytest.mark.parametrize("method", ["pmmh", "gibbs"])
-def test_several_records_have_one_posterior(method):
+def test_several_records_have_one_posterior():
     parts = ((0, 25), (25, 40))
     times, values = zip(*((TIMES[i:j], record()[i:j]) for i, j in parts), strict=True)
-    posterior = getattr(jb, method)(
+    posterior = jb.gibbs(
         jax.random.key(1), model(), times, values, observation=SEEN, prior=log_prior,
-        num_warmup=1000, num_chains=4, num_steps=4, thin=2,
-        **{
-            "pmmh": {"num_iterations": 2000, "num_proposals": 4},
-            "gibbs": {"num_iterations": 1500},
-        }[method],
+        num_warmup=1000, num_chains=4, num_steps=4, thin=2, num_iterations=1500,
     )  # fmt: skip
     mean, sd = exact_posterior(parts=parts)
     error = np.asarray(posterior.standard_error)
@@ -203,52 +197,6 @@ def test_several_records_have_one_posterior(method):
     error = np.asarray(jnp.std(squares, axis=(0, 1))) / np.sqrt(size) / (2 * sd**2)
     np.testing.assert_array_less(error, 0.09)
     np.testing.assert_array_less(np.abs(theta.std(0) / sd - 1), 4.5 * error + 0.02)
-
-
-@functools.cache
-def maximum(**options):
-    """Of (log_noise, log_rate, log_sigma), with standard errors, by SciPy."""
-
-    def minus(point):
-        return -kalman_log_likelihood(*point, **options)
-
-    found = minimize(minus, list(TRUE.values()), method="Nelder-Mead", options={"xatol": 1e-5})
-    moves = 1e-3 * np.eye(3)
-    signs = [(a, b) for a in (-1, 1) for b in (-1, 1)]
-    hessian = [
-        [sum(a * b * minus(found.x + a * u + b * v) for a, b in signs) / 4e-6 for v in moves]
-        for u in moves
-    ]
-    order = [2, 0, 1]
-    return found.x[order], np.sqrt(np.diagonal(np.linalg.inv(hessian)))[order]
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
-def test_the_maximum_is_that_of_the_kalman_filter():
-    """Of linear models all paths have the same weight: nothing is left to chance but the search.
-    Steps of second order report their error."""
-    parts = ((0, 25), (25, 40))
-    times, values = zip(*((TIMES[i:j], record()[i:j]) for i, j in parts), strict=True)
-    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
-        estimate = jb.maximum_likelihood(
-            jax.random.key(0),
-            model(curved=True),
-            times,
-            values,
-            observation=SEEN,
-            num_steps=2,
-            num_iterations=400,
-            num_bridges=20,
-        )
-    of_steps, error = maximum(law=ito_taylor_step, num=2, parts=parts)
-    exact, _ = maximum(parts=parts)
-    assert estimate.trustworthy and not np.any(estimate.stuck)
-    np.testing.assert_allclose(estimate.theta, of_steps, atol=2e-3)
-    told = [estimate.standard_errors[name] for name in sorted(TRUE)]
-    np.testing.assert_allclose(told, error, rtol=0.01)
-    # Of the second order that is left out of the step error.
-    np.testing.assert_allclose(estimate.step_error, of_steps - exact, atol=1e-3)
 
 
 @pytest.mark.parametrize("law", [lambda params: [0.0], lambda params: jb.GaussianLaw([0.0], [[1]])])
@@ -275,36 +223,6 @@ def test_gradients_are_those_of_differences(x64):
     value = jax.jit(density)
     differences = (value(1e-4, along) - value(-1e-4, along)) / 2e-4
     assert abs(slope - differences) < 1e-6 * abs(slope)
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
-def test_nuts_finds_them_too():
-    """The ten lines that any sampler needs: BlackJAX's, on parameters and noise."""
-    import blackjax
-
-    paths = jb.innovations(model(), TIMES, record(), observation=SEEN, num_steps=2)
-
-    def log_posterior(position):
-        params, xi = position
-        return log_prior(params) + paths.log_density(params, xi)
-
-    with jax.numpy_dtype_promotion("standard"):
-        start = (jax.tree.map(jnp.asarray, model().params), jnp.zeros(paths.size))
-        warmup = blackjax.window_adaptation(blackjax.nuts, log_posterior)
-        (state, found), _ = warmup.run(jax.random.key(0), start, 300)
-        kernel = blackjax.nuts(log_posterior, **found)
-
-        def step(state, key):
-            state, _ = kernel.step(key, state)
-            return state, state.position[0]
-
-        _, drawn = jax.lax.scan(step, state, jax.random.split(jax.random.key(1), 1000))
-    theta = np.stack([drawn[name] for name in sorted(drawn)], -1)
-    size = np.asarray(jb.effective_sample_size(theta))
-    mean, sd = exact_posterior()
-    assert np.all(size > 50)
-    np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * sd / np.sqrt(size) + 0.05 * sd)
 
 
 @pytest.mark.slow

@@ -142,17 +142,17 @@ def seen_rarely(num, gap):
 @pytest.mark.optimised
 def test_wells_that_are_seen_rarely():
     """Gaps of twenty units of time, within which the diffusion changes its well or does not: the
-    probability of each is known to a part in a hundred from some hundreds of draws."""
+    probability of each is known from some hundreds of draws."""
     num_steps = 100
     times, values, exact = seen_rarely(12, 20.0)
     made = jb.smooth(
         KEY, WELLS, times, values, observation=jb.LinearGaussian(covariance=0.09),
-        initial=jb.GaussianLaw([-1.0], [[0.25]]), num_steps=num_steps, num_draws=400,
+        initial=jb.GaussianLaw([-1.0], [[0.25]]), num_steps=num_steps, num_draws=200,
         num_warmup=100, proposal=jb.Coupling(0.0),
     )  # fmt: skip
     assert not made.stuck.any() and made.num_truncated == 0
     share = lambda path: (path[::num_steps, 0] > 0).astype(jnp.float32)
     # Where all draws agree there is no standard error: that of one in so many.
-    error = np.maximum(made.standard_error(share), 1 / 400)
+    error = np.maximum(made.standard_error(share), 1 / 200)
     assert ((0.2 < exact) & (exact < 0.8)).any() and (error < 0.1).all()
     np.testing.assert_array_less(np.abs(made.mean(share) - exact), 4.5 * error)

@@ -26,8 +26,9 @@ def test_smoothed_paths_of_steps_that_are_too_long():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", [jb.gibbs, jb.pmmh])
-@pytest.mark.parametrize("record", [{"num_steps": 10}, RECORD])
+@pytest.mark.parametrize(
+    ("method", "record"), [(jb.gibbs, {"num_steps": 10}), (jb.pmmh, RECORD)], ids=["exact", "noisy"]
+)
 def test_posteriors_of_steps_that_are_too_long(method, record):
     posterior = method(
         jax.random.key(0), MODEL, TIMES, VALUES, prior=jb.NormalPrior(1.0, 0.01),
