@@ -5,6 +5,7 @@ import functools
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import optimize
 
 import jaxbridge as jb
 
@@ -72,3 +73,23 @@ def ou_transitions_log_density(model, times, observations):
         return jb.ou_transition(model, x, dt).log_density(y)
 
     return jnp.sum(jax.vmap(one)(observations[:-1], observations[1:], jnp.diff(times)))
+
+
+def maximum_of(log_likelihood, start):
+    """The maximum and the standard errors of a function of positive parameters, by SciPy."""
+    options = dict(xatol=1e-9, fatol=1e-9, maxiter=10_000)
+    search = optimize.minimize(
+        lambda logs: -log_likelihood(np.exp(logs)),
+        np.log(start),
+        method="Nelder-Mead",
+        options=options,
+    )
+    exact, h = np.exp(search.x), 1e-3 * np.eye(len(start))
+
+    def difference(i, j):
+        corners = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
+        return sum(a * b * log_likelihood(exact + a * h[i] + b * h[j]) for a, b in corners) / 4e-6
+
+    each = range(len(start))
+    information = -np.array([[difference(i, j) for j in each] for i in each])
+    return exact, np.sqrt(np.diagonal(np.linalg.inv(information)))

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from helpers import count_compilations
-from inference_oracles import ou_1d, ou_data, ou_log_likelihood
-from scipy import optimize, stats
+from inference_oracles import maximum_of, ou_1d, ou_data, ou_log_likelihood
+from scipy import stats
 
 import jaxbridge as jb
 from jaxbridge.inference import simulated_likelihood
@@ -24,26 +24,6 @@ SHORT = dict(num_iterations=20, num_bridges=20, num_steps=10, proposal=BRIDGE, c
 def estimate(*arguments, **options):
     with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
         return jb.maximum_likelihood(*arguments, **options)
-
-
-def maximum_of(log_likelihood, start):
-    """The maximum and the standard errors of a function of positive parameters, by SciPy."""
-    options = dict(xatol=1e-9, fatol=1e-9, maxiter=10_000)
-    search = optimize.minimize(
-        lambda logs: -log_likelihood(np.exp(logs)),
-        np.log(start),
-        method="Nelder-Mead",
-        options=options,
-    )
-    exact, h = np.exp(search.x), 1e-3 * np.eye(len(start))
-
-    def difference(i, j):
-        corners = [(1, 1), (1, -1), (-1, 1), (-1, -1)]
-        return sum(a * b * log_likelihood(exact + a * h[i] + b * h[j]) for a, b in corners) / 4e-6
-
-    each = range(len(start))
-    information = -np.array([[difference(i, j) for j in each] for i in each])
-    return exact, np.sqrt(np.diagonal(np.linalg.inv(information)))
 
 
 @functools.cache

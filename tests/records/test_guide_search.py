@@ -31,10 +31,10 @@ def test_a_step_that_would_leave_the_state_space_is_shortened():
 
 
 @pytest.mark.slow
-def test_a_guide_is_found_where_the_filter_is_thrown_off(num_steps=20):
+def test_a_guide_is_found_where_the_filter_is_thrown_off():
     """From the filter alone it passes six standard deviations beside the readings, and no path has
     a weight."""
-    times, values, options = neuron_record(num_steps)
+    times, values, options = neuron_record(num_steps=20)
     model = jb.fitzhugh_nagumo()
     problem = as_record_problems(model, times, values, **options).problem(0)
     guide = linearised(problem, model).guide
