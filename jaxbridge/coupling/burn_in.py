@@ -62,7 +62,7 @@ def with_burn_in(
     duration: Float[Array, " P"],
     num_steps: int,
 ) -> AbstractCoupling:
-    """Return the coupling, with the measured burn-in in its start law where one is needed.
+    """Return the coupling; if its start law needs a burn-in, measure it and set it there.
 
     The burn-in is infinite if no time was found. `run_is_cut` recognises that value.
     """

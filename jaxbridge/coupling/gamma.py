@@ -128,10 +128,10 @@ class Coupling(AbstractCoupling):
 
     @staticmethod
     def as_published(gamma: ArrayLike) -> "Coupling":
-        """Return the paper's settings: Euler, sign test with radius 0.05, printed O and printed
-        start law.
+        """Return the coupling with the settings of the paper, for comparisons with it: `Euler()`,
+        `SignTest(0.05)`, `published_rotation` and `Reversed()`.
 
-        With them bridges are **not** corrected to their exact law.
+        With these, weights do **not** correct bridges to their exact law.
         """
         return Coupling(gamma, SignTest(0.05), Euler(), published_rotation, Reversed())
 
@@ -185,8 +185,8 @@ def describe_coupling(coupling: AbstractCoupling) -> str:
 
 
 def ingredients(coupling: AbstractCoupling) -> tuple[str, str, float]:
-    """Return the name of the scheme, the name of the meeting rule, and γ (NaN for other
-    couplings)."""
+    """Return the name of the scheme, the name of the meeting rule with its radius, and γ (NaN for
+    other couplings)."""
     meeting = coupling.meeting
     radius = meeting.radius if isinstance(meeting, SignTest) else None
     meeting_name = type(meeting).__name__ + ("" if radius is None else f"({float(radius):g})")

@@ -329,5 +329,8 @@ def coupling_of_bridges(bridges: BridgePaths, start_law: AnyStartLaw | None) -> 
 
 
 def check_max_trials(max_trials: int | None, num_counts: int) -> Int[Array, ""]:
-    """Return the bound on the trials of a bridge; by default 10,000 for each count."""
+    """Return the bound on the trials of a bridge as an array; by default 10,000 for each count.
+
+    **Raises:** as `check_bound`.
+    """
     return check_bound("max_trials", max_trials, _MAX_TRIALS_PER_COUNT * num_counts)

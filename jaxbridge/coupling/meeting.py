@@ -60,7 +60,10 @@ class PairStep(NamedTuple):
         return dot(self.frame.u, self.frame.sigma.solve(vector))
 
     def gap_next(self) -> Float[Array, ""]:
-        """Return D_{i+1}. It is negative if the two have passed each other."""
+        """Return D_{i+1}, the gap along u after the step in noise coordinates.
+
+        It is negative if X and X' have passed each other.
+        """
         return self.along_u(self.x_next - self.driven_next)
 
 
@@ -69,8 +72,8 @@ class AbstractMeeting(eqx.Module):
 
     - `draws_uniform`: whether the rule needs a uniform random number. If not, none is sampled and
         `uniform` is `None`.
-    - `looks_ahead`: whether the frame of the pair is the one after the drift of the step. If not,
-        it is the one at the beginning of the step, as in the paper.
+    - `looks_ahead`: whether the direction u of the pair is that after the drift of the step. If
+        false, it is that at the beginning of the step, as in the paper.
     """
 
     draws_uniform: ClassVar[bool]
@@ -124,10 +127,11 @@ class SignTest(AbstractMeeting):
 class ReflectionPlane(AbstractMeeting):
     """Meeting rule of equation (coupling), for γ = -1: X crosses the plane in which X' mirrors it,
 
-        uᵀσ⁻¹ (x_{i+1} - x_i - α(x_i) δ) ≤ -½ D_i.
+        uᵀσ⁻¹ (x_{i+1} - x_i - α(x_i) δ) ≤ -½ D_i,
 
-    If the drift of the two is the same, it is the same test as `SignTest()`. Results have an error
-    of O(√δ) as well.
+    where D_i is the length of σ⁻¹ (x_i - x'_i), and u its direction. If both drifts are equal, it
+    is the test of `SignTest()`. Results have an error of O(√δ), as those of `SignTest()`.
+    `Coupling` raises `ValueError` for this rule with another γ.
 
     **Example:**
 

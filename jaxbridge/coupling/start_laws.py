@@ -201,7 +201,9 @@ def log_ratio(law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]) -> Floa
 
 
 def needs_burn_in(law: AnyStartLaw, model: Diffusion) -> bool:
-    """Return whether samples from ν need a run of unknown length."""
+    """Return whether the burn-in must be measured: for `Stationary()` without `burn_in`, if the
+    model has no sampler of ν.
+    """
     return isinstance(law, Stationary) and law.burn_in is None and not model.has_sampler
 
 

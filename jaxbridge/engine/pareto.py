@@ -72,9 +72,11 @@ def is_reliable(
     effective: Float[Array, "*I"] | float = math.inf,
     number: Int[Array, "*I"] | None = None,
 ) -> Bool[Array, "*I"]:
-    """Return whether the mean of weights of shape k is reliable.
+    """Return whether the mean of weights with Pareto shape `k` is reliable.
 
-    It depends on the effective sample size and, if given, on the `number` of positive weights.
+    The effective sample size must be at least 20, and `k` below 0.7. If `number`, the number of
+    positive weights, is given, the bound of `k` depends on the effective share: it is 0.6 for a
+    share below 0.2 and 1 for a share above 0.8.
     """
     most = largest_reliable_k_of(k, effective, number)
     return (k < most) & (effective >= FEWEST_EFFECTIVE)

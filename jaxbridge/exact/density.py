@@ -60,7 +60,8 @@ class TransitionLogDensity(AbstractResult):
         error.
     - `proposal`: the proposal of the paths. If its start law `Stationary` needs runs, it contains
         their `burn_in`.
-    - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` is reliable.
+    - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` is reliable
+        (above 0.6 for very unequal weights, above 1 for nearly equal ones).
     - `step_error`: estimated discretisation bias of `value` (estimate minus limit). It is NaN if
         unknown, for one step or for couplings with a state-dependent σ(x): use two grids and
         `extrapolate`.
@@ -90,7 +91,9 @@ class TransitionLogDensity(AbstractResult):
     def step_error_dominates(self) -> Bool[Array, "*I"]:
         """Return whether the discretisation error is, or may be, larger than the standard error.
 
-        Then more steps help, and more proposals do not.
+        If true, more proposals do not help. Use more steps. If the error is unknown (`step_error`
+        is NaN), the value is true, too: for a coupling with a state-dependent σ(x) use two grids
+        and `extrapolate`.
         """
         return dominates(self._step_error, self.standard_error)
 
@@ -101,7 +104,9 @@ class TransitionLogDensity(AbstractResult):
         - no bridge;
         - truncated weights, or weights with heavy tails;
         - too many lost paths;
-        - a discretisation error that dominates and exceeds 0.05.
+        - a discretisation error that is unknown or too uncertain, or that dominates and exceeds
+            0.05;
+        - a value or standard error that is not finite.
         """
         steps = step_faults(self._step_error, self.standard_error, coupled=self.proposal.coupled)
         verdict = Verdict((*self._weight_faults, *steps))

@@ -147,8 +147,8 @@ class WeightedBridges(AbstractExactBridges):
 
     @property
     def pareto_k(self) -> Float[Array, "*I"]:
-        """Return k̂ of the weights. Above 0.7 neither means nor their standard errors are
-        reliable."""
+        """Return k̂ of the weights. Above 0.7 neither means nor their standard errors are reliable
+        (above 0.6 for very unequal weights, above 1 for nearly equal ones)."""
         return pareto_k(self.log_weights)
 
     @property

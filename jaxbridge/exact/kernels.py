@@ -112,7 +112,7 @@ class Chain(AbstractExactBridges):
 
     @property
     def log_mean_weights(self) -> Float[Array, "*I n"]:
-        """Return equal log weights (zero), -inf for a state without a path."""
+        """Return zero for each state with a path, as all weigh the same, and -inf for others."""
         return jnp.where(self.met, 0.0, -jnp.inf).astype(self.paths.dtype)
 
     @property

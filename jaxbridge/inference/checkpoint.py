@@ -63,7 +63,10 @@ def _as_path(checkpoint: Any, arguments: dict[str, Any]) -> Path:
         )
     path = Path(os.fspath(checkpoint))
     if path.is_dir() or not path.absolute().parent.is_dir():
-        raise ValueError(f"`checkpoint` must be a file in an existing folder; got {str(path)!r}.")
+        raise ValueError(
+            "`checkpoint` must be the path of a file, new or from an earlier run, in an existing "
+            f"folder; got {str(path)!r}. Create the folder, or add the name of a file."
+        )
     return path
 
 

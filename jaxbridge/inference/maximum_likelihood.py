@@ -84,16 +84,17 @@ class MaximumLikelihood(AbstractResult):
     - `newton`: whether Newton's method converged to a maximum. Then the next step is short compared
         with the standard errors or the Monte Carlo errors, and the information is positive
         definite. Moreover the Monte Carlo error in every direction is at most half a standard
-        error. If false, `params` are not an estimate: use more iterations, a larger learning rate
-        or more bridges, unless the maximum is outside the constraint.
+        error. If false, `params` are not a maximum: use more iterations, a larger learning rate or
+        more bridges, unless the maximum is outside the constraint.
     - `fall`: decrease of the log-likelihood one standard error below and above the estimate in each
-        parameter, with the others optimised to second order, shape (2, p). It is 0.5 for a
-        quadratic log-likelihood. Values near or below zero show that there is no maximum inside;
-        outside the constraint it is infinite.
+        parameter, shape (2, p), less its linear part. The other parameters move to their maximum
+        given this one, to second order. Values are scaled so that a quadratic log-likelihood gives
+        0.5. Values near or below zero show that there is no maximum inside. Points with likelihood
+        zero or outside the constraint give infinity.
 
-    With more than 300 unknown parameters, such as those of a neural network, the estimate is the
-    mean of the second half of `iterates`. Then `covariance`, `score` and `fall` are `None`, and
-    errors are NaN.
+    With more than 300 unknown parameters, such as those of a neural network, Newton's method does
+    not run. The estimate is the mean of the second half of `iterates`, `newton` is false,
+    `covariance`, `score` and `fall` are `None`, and errors are NaN.
     """
 
     params: PyTree
@@ -115,9 +116,12 @@ class MaximumLikelihood(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the estimate, each with a remedy.
 
-        They are: no maximum, or none inside; those of the weights of `score`; and a discretisation
-        error that dominates and exceeds 0.05 standard errors. More than 300 parameters are a fault,
-        because none of these is computed.
+        - no maximum, or none inside;
+        - faults of the weights of `score`;
+        - a discretisation error that is unknown or too uncertain, or that dominates and exceeds
+            0.05 standard errors;
+        - an estimate or covariance that is not finite;
+        - more than 300 unknown parameters, because none of these is computed then.
         """
         if self.covariance is None or self.score is None or self.fall is None:
             return Verdict((Fault(jnp.asarray(True), _UNCHECKED),)).with_finite(self.theta)

@@ -376,13 +376,13 @@ def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLi
 
 
 class PMMHInfo(NamedTuple):
-    """Counts of one step.
+    """Counts of one iteration, or their sums over iterations.
 
-    - `accepted`: whether the proposed θ was accepted.
-    - `num_without_estimate`: rejections for lack of an estimate.
-    - `num_truncated`: truncated weights.
-    - `acceptance`, `share_lost`: acceptance probability, and the share of lost paths times it; zero
-      in the warm-up.
+    - `accepted`: 1 if the proposed θ was accepted.
+    - `num_without_estimate`: 1 if it was rejected for lack of an estimate.
+    - `num_truncated`: number of truncated weights.
+    - `acceptance`: acceptance probability; zero in the warm-up.
+    - `share_lost`: share of lost paths times `acceptance`; zero in the warm-up.
     """
 
     accepted: Int[Array, "*chains"]

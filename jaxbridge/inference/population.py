@@ -72,7 +72,8 @@ class NormalPopulation(eqx.Module):
 class Population(eqx.Module):
     """Unknown parameters φ = (θ, λ), and those of each record.
 
-    Without parameters that vary, λ and z are empty and φ = θ.
+    Record r has the parameters θ + s z_r in the entries that vary, with z_r ~ N(0, I), λ = log s.
+    Without such entries, λ and z are empty and φ = θ.
 
     - `varies`: indices of the entries of θ that vary.
     - `spread`: scales of the priors of s.
@@ -109,7 +110,7 @@ class Population(eqx.Module):
             )
 
     def split(self, phi: Float[Array, "p+q"]) -> tuple[Float[Array, " p"], Float[Array, " q"]]:
-        """Return θ and λ."""
+        """Return θ and λ = log s, the logarithms of the standard deviations of the population."""
         p = phi.shape[0] - len(self.varies)
         return phi[:p], phi[p:]
 

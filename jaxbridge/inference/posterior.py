@@ -60,7 +60,18 @@ _Posterior = TypeVar("_Posterior", bound="AbstractPosterior")
 
 
 class AbstractPosterior(AbstractResult):
-    """Base class of posterior draws, with their Monte Carlo and discretisation errors."""
+    """Posterior draws with their Monte Carlo and discretisation errors: the common part of the
+    results of `gibbs` and `pmmh`, for annotations and `isinstance`.
+
+    - `params`: draws of the unknown parameters, a pytree with leading axes (chains, n).
+    - `theta`: the same as vectors, shape (chains, n, p). Without `num_chains` these and the
+        following have no axis of chains.
+    - `names`: names of the p entries of θ.
+    - `log_step_error`: estimated discretisation error of the log-likelihood at each draw, shape
+        (chains, n).
+    - `sigma_varies`: whether σ depends on unknown parameters.
+    - `state`: last state of the chains, to continue the run.
+    """
 
     params: eqx.AbstractVar[PyTree]
     theta: eqx.AbstractVar[Float[Array, "*chains n p"]]
@@ -88,9 +99,12 @@ class AbstractPosterior(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the draws, each with a remedy.
 
-        They are: a parameter or block that never moved, chains that disagree, few effective draws,
-        those of the sampler, and a discretisation error that dominates and exceeds 0.05 posterior
-        standard deviations.
+        - a parameter or block that never moved;
+        - chains that disagree, or few effective draws;
+        - faults of the sampler;
+        - a discretisation error that is unknown or too uncertain, or that dominates and exceeds
+            0.05 posterior standard deviations;
+        - draws that are not finite.
         """
         sd = jnp.std(self.theta, axis=tuple(range(self.theta.ndim - 1)))
         steps = step_faults(self._step_error, self.standard_error, sd)
@@ -222,9 +236,9 @@ class AbstractPosterior(AbstractResult):
             )
         if later.names != self.names or later.theta.shape[:-2] != self.theta.shape[:-2]:
             raise ValueError(
-                "both parts must have the same parameters and chains; got "
-                f"{self.names} of shape {self.theta.shape} and {later.names} of shape "
-                f"{later.theta.shape}."
+                f"`later` must have the parameters {self.names} and chains of shape "
+                f"{self.theta.shape[:-2]}, as this part; got {later.names} and "
+                f"{later.theta.shape[:-2]}. Pass the draws of a call with `**part.continuation`."
             )
         axis, num_draws = self.theta.ndim - 2, [part.theta.shape[-2] for part in (self, later)]
         share = num_draws[1] / sum(num_draws)
@@ -389,8 +403,9 @@ def starting_points(
         p, theta = theta.shape[0], state.theta
         if theta.shape[-1] != p + num_others:
             raise ValueError(
-                f"`init` is a state of {theta.shape[-1]} unknown parameters, but there are "
-                f"{p + num_others}: pass the `where` and the `population` of the earlier draws."
+                f"`init` is the state of a run with {theta.shape[-1]} unknown parameters, but this "
+                f"call has {p + num_others}. Pass the same `where` as before (and, in `gibbs`, the "
+                "same `population`)."
             )
         theta = theta[..., :p]
         if theta.shape[:-1] != chains and num_chains is not None:

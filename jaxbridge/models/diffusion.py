@@ -319,8 +319,8 @@ class Diffusion(eqx.Module):
     def unbound(self) -> "Diffusion":
         """Return the functions alone: a model without parameters, `prepare` and arrays.
 
-        It can be compared and hashed. Its `with_params` needs prepared parameters, from
-        `preparation`.
+        It can be compared and hashed. Pass prepared parameters, from `preparation`, to the
+        `with_params` of the result.
 
         **Raises:** `ValueError` for a constant σ that is traced.
         """
@@ -717,7 +717,7 @@ def check_invertible(name: str, sigma: Array | np.ndarray, alternative: str = ""
     # Above this condition number the inverse has no correct digits.
     if np.linalg.cond(matrix) > 1 / np.finfo(matrix.dtype).eps:
         raise ValueError(
-            f"`{name}` must be invertible{alternative}; got the singular matrix {matrix}."
+            f"`{name}` must be invertible{alternative}; got the numerically singular value {sigma}."
         )
 
 

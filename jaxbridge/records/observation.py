@@ -99,7 +99,10 @@ class LinearGaussian(eqx.Module):
         return takes_time(self._function, 1)
 
     def covariance_for(self, params: PyTree, m: int, time: Float[Array, ""]) -> Float[Array, "m m"]:
-        """Return R as a matrix, shape (m, m)."""
+        """Return the covariance R of the noise at these parameters and this time, shape (m, m).
+
+        **Raises:** `ValueError` for a covariance of another shape.
+        """
         value, dtype = self.covariance, time.dtype
         if self._function is not None:
             arguments = (params, time) if self.depends_on_time else (params,)
@@ -232,7 +235,7 @@ class ObservationDensity(eqx.Module):
         _check_positive(self.guess.covariance_for(params, m, time))
 
     def scalars(self, row: Row, params: PyTree, d: int) -> Scalars:
-        """Return the observations under the guess as independent scalars."""
+        """Return the observations as independent scalars, under the linear model `guess`."""
         return self.guess.scalars(row, params, d)
 
     def correction(self, row: Row, x: Float[Array, " d"], params: PyTree) -> Float[Array, ""]:

@@ -150,7 +150,9 @@ class Smoothed(AbstractResult):
     def step_error_dominates(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return whether the discretisation error exceeds the Monte Carlo error, or may do so.
 
-        Then more steps help, and more draws do not. The result is for `mean(fn)`, entry by entry.
+        The result is for `mean(fn)`, entry by entry. If true, more draws do not help. Use more
+        steps. If the error is unknown (see `step_error`), the value is true, too: for Euler steps
+        of a σ with fewer columns than rows, pass another `density`.
         """
         step_errors = map(StepError, *map(jax.tree.leaves, self._step_errors(fn)))
         errors, treedef = jax.tree.flatten(self.standard_error(fn))
@@ -171,9 +173,13 @@ class Smoothed(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the draws, each with a remedy.
 
-        They are: a block that never moved; truncated weights; chains that disagree at some points;
-        a poor guide together with one of these; and a discretisation error of the mean path that
-        dominates and exceeds 0.05 standard deviations (root mean square).
+        - a block that never moved;
+        - truncated weights;
+        - chains that disagree at some points;
+        - a poor guide, together with the first or the third of these;
+        - a discretisation error of the mean path that is unknown or too uncertain, or that
+            dominates and exceeds 0.05 standard deviations (root mean square);
+        - a mean or standard error that is not finite.
         """
         error, standard_error = self._errors_in_sds
         stuck, apart = jnp.any(self.stuck), ~self._chains_agree

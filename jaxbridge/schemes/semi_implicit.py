@@ -22,9 +22,10 @@ class SemiImplicit(AbstractScheme):
     with ∇α by automatic differentiation. A step solves one linear system. Its inverse is explicit,
     `σ⁻¹ [L (x⁺ - x) - α δ]`.
 
-    The scheme stays stable for step sizes at which explicit schemes overflow. For linear drift it
-    preserves the stationary law exactly, for every step size. For α = -x³ a step from a large x
-    leads to x/3. The strong order is ½ (1 for constant σ), the weak order 1 (2 for linear drift).
+    The scheme stays stable for step sizes at which explicit schemes overflow. For linear drift and
+    constant σ it preserves the stationary law exactly, for every step size. For α = -x³ a step from
+    a large x leads to x/3. The strong order is ½ (1 for constant σ). The weak order is 1 (2 for
+    linear drift and constant σ).
 
     The step size must be much smaller than 1/λ for each positive eigenvalue λ of ½∇α, because L is
     singular at δ = 1/λ. Positive eigenvalues occur, for instance, at the barrier of a double well.

@@ -118,16 +118,13 @@ class AbstractStepDensity(eqx.Module):
 
     @property
     def usual_order(self) -> float:
-        """Return the order of the error for usual numbers of steps.
-
-        It is for the reported errors of densities and means of bridges. Records have other
-        estimates of their errors.
-
-        Higher terms make the errors of quadratic steps shrink more slowly at first: for CIR and
-        Jacobi diffusions by factors of 2.9 to 3.1 from 4 to 8 steps, and of 3.3 to 3.8 from 16 to
-        32. Of 83 densities with 6 and 10 steps, 20 had errors clear of the noise. With 1.5, the
-        reported errors are .5 to 1.5 times these.
+        """Return the order that reported errors of densities and bridges assume: `order` if steps
+        are normal, 1.5 if they are quadratic in the noise.
         """
+        # Higher terms make the errors of quadratic steps shrink more slowly at first: for CIR and
+        # Jacobi diffusions by factors of 2.9 to 3.1 from 4 to 8 steps, and of 3.3 to 3.8 from 16 to
+        # 32. Of 83 densities with 6 and 10 steps, 20 had errors clear of the noise. With 1.5, the
+        # reported errors are .5 to 1.5 times these.
         return float(self.order) if self.is_normal else 1.5
 
     @abstractmethod

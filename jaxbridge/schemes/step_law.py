@@ -107,7 +107,7 @@ class StepLaw(NamedTuple):
         return (scaled.shape[0] - square - log_det) / 2
 
     def log_relative_of_noise(self, xi: Float[Array, " d"]) -> Float[Array, ""]:
-        """Return `log_relative` at the point with the noise `xi`."""
+        """Return `log_relative` of the point that the noise `xi` leads to."""
         return (xi.shape[0] - dot(xi, xi) - self._log_det()) / 2
 
     @property
@@ -124,9 +124,10 @@ class StepLaw(NamedTuple):
     def after(
         self, first: "StepLaw", decay: Float[Array, "d d"], x: Float[Array, " d"]
     ) -> "StepLaw":
-        """Return the law of two steps from x: `first`, then a linear step.
+        """Return the law at the end of two steps from `x`: `first`, then a linear step.
 
-        Started in x, the linear step would have the law `self`.
+        `self` is the law of that linear step if it started in `x`. `decay` is its matrix, in noise
+        coordinates.
         """
         dt = first.dt + self.dt
         if first.sigma is self.sigma:
@@ -200,9 +201,10 @@ class DegenerateLaw(NamedTuple):
     def after(
         self, first: "DegenerateLaw", decay: Float[Array, "d d"], x: Float[Array, " d"]
     ) -> "DegenerateLaw":
-        """Return the law of two steps from x: `first`, then a linear step.
+        """Return the law at the end of two steps from `x`: `first`, then a linear step.
 
-        Started in x, the linear step would have the law `self`.
+        `self` is the law of that linear step if it started in `x`. `decay` is its matrix, in noise
+        coordinates.
         """
         mean = self.mean + self.carried(decay, first.mean - x)
         # Λ Λᵀ of both steps is the sum of two squares, hence the square of the joined matrix.

@@ -7,6 +7,7 @@ time 1/2, farthest from both end points, is compared with the exact one.
 
 import itertools
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,10 +17,11 @@ from scipy.stats import kstest
 
 import jaxbridge as jb
 
-from .clock import timed
+from .clock import compile_side_by_side, timed
 from .report import Say, Study, silent, table
 
 Point = tuple[float, float]
+_B = np.array([[1.5, 1.0], [1.0, 1.5]])
 
 
 class Case(NamedTuple):
@@ -88,7 +90,12 @@ class Result(NamedTuple):
 
 def study_model() -> jb.Diffusion:
     """Return the process of section 3.2."""
-    return jb.ornstein_uhlenbeck([[1.5, 1.0], [1.0, 1.5]])
+    return jb.ornstein_uhlenbeck(_B)
+
+
+def stationary_law() -> jb.GaussianLaw:
+    """Return the stationary law ν of that process, N(0, B⁻¹/2) since B is symmetric."""
+    return jb.GaussianLaw(np.zeros(2), np.linalg.inv(_B) / 2)
 
 
 def run_study(
@@ -99,6 +106,9 @@ def run_study(
 ) -> list[Result]:
     """Run every case by every method, in the order of the table."""
     runs = list(itertools.product(cases, METHODS))
+    say("compiling")
+    kinds = {(case.gamma == -1, method): (case, method) for case, method in runs}
+    compile_side_by_side([partial(_bridges, key, *run, num_bridges, 1) for run in kinds.values()])
     results = []
     for i, (case, method) in enumerate(runs):
         say(f"[{i + 1}/{len(runs)}] {case.bridge}, gamma {case.gamma:g}, {method}")
@@ -111,25 +121,7 @@ def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> 
 
     **Raises:** `RuntimeError` if a bridge is missing or misses an end point.
     """
-    model, coupling = study_model(), METHODS[method](case.gamma)
-
-    def bridges(max_proposals: int | None) -> jb.Bridges:
-        return jb.sample_bridges(
-            key,
-            model,
-            case.start,
-            case.end,
-            1.0,
-            num_bridges=num_bridges,
-            num_steps=50,
-            coupling=coupling,
-            max_proposals=max_proposals,
-            save_at=[0.0, 0.5, 1.0],
-        )
-
-    # The bound is traced, so this compiles the same program and hardly runs it.
-    timed(lambda: bridges(1))
-    result, seconds = timed(lambda: bridges(None))
+    result, seconds = timed(lambda: _bridges(key, case, method, num_bridges, None))
     first, middle, last = np.moveaxis(np.asarray(result.paths), 1, 0)
     ends = np.array([case.start, case.end], first.dtype)
     if not (np.all(first == ends[0]) and np.all(last == ends[1])):
@@ -143,6 +135,22 @@ def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> 
         compare(middle, law),
         num_bridges / int(result.num_proposals),
         seconds,
+    )
+
+
+def _bridges(key, case: Case, method, num_bridges, max_proposals: int | None) -> jb.Bridges:
+    # The bound is traced, so one proposal compiles the same program and hardly runs it.
+    return jb.sample_bridges(
+        key,
+        study_model(),
+        case.start,
+        case.end,
+        1.0,
+        num_bridges=num_bridges,
+        num_steps=50,
+        coupling=METHODS[method](case.gamma),
+        max_proposals=max_proposals,
+        save_at=[0.0, 0.5, 1.0],
     )
 
 

@@ -237,8 +237,9 @@ def _runs(
     ]
     if not runs:
         raise ValueError(
-            f"none of `proposals` fits any of `methods`; got {tuple(methods)}. "
-            '"approximate" and "renewal" need a coupling, "crank_nicolson" a guided proposal.'
+            f"none of `proposals` fits any of `methods`; got the methods {tuple(methods)}. "
+            'Add a coupling, such as `Coupling(0.5)`, for "approximate" and "renewal", or a guided '
+            'proposal, such as `Guided()`, for "crank_nicolson".'
         )
     return runs
 

@@ -99,7 +99,7 @@ def test_paths_that_cannot_be_files_are_refused(tmp_path):
     with pytest.raises(TypeError, match="`checkpoint` must be the path of a file"):
         run("record", 3)
     for path in (tmp_path, tmp_path / "none" / "run.npz"):
-        with pytest.raises(ValueError, match="a file in an existing folder"):
+        with pytest.raises(ValueError, match="must be the path of a file"):
             run("record", path)
     with pytest.raises(ValueError, match="`num_iterations` must be"):
         run("record", tmp_path / "run.npz", num_iterations=0)

@@ -9,6 +9,13 @@ from jaxbridge.models.sigma import Constant, Diagonal, Full, Identity, Triangula
 rng = np.random.default_rng(0)
 
 
+@pytest.fixture(autouse=True)
+def same_numbers_in_any_order():
+    """Reset the random numbers, so that they do not depend on the tests before."""
+    global rng
+    rng = np.random.default_rng(0)
+
+
 def a_matrix(d):
     return jnp.asarray(rng.standard_normal((d, d)) + 3 * np.eye(d), jnp.float32)
 

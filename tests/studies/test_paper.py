@@ -22,7 +22,7 @@ def test_comparison_finds_the_bias_put_in():
 def test_study_reproduces_the_law_of_the_likely_bridge():
     started = []
     (default, published) = run_study(jax.random.key(0), 2_000, CASES[:1], started.append)
-    assert [what[:5] for what in started] == ["[1/2]", "[2/2]"]
+    assert [what[:5] for what in started] == ["compi", "[1/2]", "[2/2]"]
     due = chance(2_000)
     assert (np.abs(default.fit.mean_bias) < 5 * due.mean_error).all()
     assert (np.abs(default.fit.sd_bias) < 5 * due.sd_error).all()
