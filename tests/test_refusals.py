@@ -763,8 +763,11 @@ INFERENCE = [
         gibbs(observation=SEEN, method="renewal"),
         "`method`: only for complete observations",
     ),
-    ("σ", score(**ON_A_LINE), "σ depends on the unknown parameters"),
-    ("σ", score(ROTATING, TIMES, POINTS), "σ depends"),
+    (
+        "σ, by a coupling",
+        score(**ON_A_LINE, proposal=jb.Coupling(0.5)),
+        "σ depends on the unknown parameters",
+    ),
     ("nothing unknown", score(FREE, TIMES, LINE), "no parameters"),
     # Observations.
     (

@@ -230,15 +230,6 @@ class Problem(NamedTuple):
         like, parameters = self.like, self.parameters
         return uses_argument(lambda theta: parameters.bind(theta).diffusion(like), self.theta)
 
-    def check_sigma_known(self, instead: str) -> None:
-        """Raise `ValueError` if σ depends on the unknown parameters; `instead` is the remedy."""
-        self.parameters.model.check_invertible_sigma(self.like)
-        if self.sigma_is_unknown:
-            raise ValueError(
-                "σ depends on the unknown parameters. This method uses the likelihood of complete "
-                "paths, which determine σ: " + instead
-            )
-
 
 def as_problem(
     key: Key[Array, ""],

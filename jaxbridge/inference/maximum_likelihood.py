@@ -45,6 +45,7 @@ from .simulated_likelihood import (
     as_differentiable,
     differentiable_blocks,
     newton_ascent,
+    prefers_simulation,
     step_error_of_score,
     stochastic_ascent,
 )
@@ -177,7 +178,7 @@ def maximum_likelihood(
 
     - `key`: typed key.
     - `model`: the diffusion. The search starts from its `params`. If σ depends on the unknown
-        parameters, a simulated likelihood is maximised (see below).
+        parameters or on the state, a simulated likelihood is maximised (see below).
     - `times`, `observations`, `num_steps`, `step_size`, `proposal`, `where`, `constraint`: as in
         `gibbs`. Steps that would leave the constraint are skipped.
     - `optimizer`: an optimiser of optax, by default `optax.adam(0.01)`. Its objective is minus the
@@ -187,17 +188,18 @@ def maximum_likelihood(
         σ and at most 300 unknown parameters.
     - `num_iterations`: iterations of the stochastic approximation.
     - `num_bridges`: weighted bridges per interval in each pass of Newton's method after these
-        iterations, and for the errors. For unknown σ: paths per interval in the simulated
-        likelihood.
+        iterations, and for the errors; or paths per interval in the simulated likelihood.
     - `observation`, `initial`, `initial_time`: observation model and initial law of noisy or
         partial records, as in `innovations`. Then any parameters may be unknown, and `num_bridges`
         is the number of draws from each of eight chains of paths.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
-    **Unknown σ.** A complete path determines σ, so paths cannot be fixed while σ changes. Instead
-    the estimated transition densities are differentiated, which requires guided proposals; by
-    default the best ones are selected.
+    **Unknown or state-dependent σ.** A complete path determines σ, so paths cannot be fixed while σ
+    changes. Instead the estimated transition densities are differentiated, which requires guided
+    proposals; by default the best ones are selected (inside `jit`: `Guided()`). For a known σ(x)
+    this has the smaller discretisation error; `method="em"`, a coupling, or more than 300 unknown
+    parameters use Euler steps.
 
     - First the optimiser makes steps, each with a few new paths. Then Newton's method finds the
       maximum of the likelihood from `num_bridges` paths per interval with fixed noise. This
@@ -206,7 +208,6 @@ def maximum_likelihood(
       this bias is added. The remaining bias falls with the square of `num_bridges`. Compared with a
       standard error it is small if the root of the number of intervals is small compared with the
       square of `effective_sample_size`.
-    - For a state-dependent σ the discretisation error is of first order, so `num_steps` matters.
     - The law of the data depends on σ σᵀ only. If σ is a matrix, choose unknown entries that σ σᵀ
       determines.
 
@@ -268,14 +269,16 @@ def maximum_likelihood(
             f'`method="em"` needs a matrix of {len(problem.theta)} × {len(problem.theta)} numbers '
             'in each iteration: use `method="gradient"`.'
         )
-    if not problem.sigma_is_unknown:
-        return _by_bridges(key, problem, proposal, budget, search, num_bridges)
-    if method == "em":
+    if method == "em" and problem.sigma_is_unknown:
         raise ValueError(
             "σ depends on the unknown parameters, but a complete path determines σ, so EM would "
             'never change it: use `method="gradient"`, or select other parameters by `where=`.'
         )
-    return _by_simulation(key, problem, proposal, budget, search, num_bridges)
+    # For so many parameters only the likelihood of paths is differentiated in reverse mode.
+    few = problem.sigma_is_unknown or len(problem.theta) <= _MOST_FOR_NEWTON
+    if few and method != "em" and prefers_simulation(problem, proposal, budget):
+        return _by_simulation(key, problem, proposal, budget, search, num_bridges)
+    return _by_bridges(key, problem, proposal, budget, search, num_bridges)
 
 
 def _by_bridges(
@@ -327,7 +330,7 @@ def _by_simulation(
 ) -> MaximumLikelihood:
     """Estimate θ by the maximum of the simulated likelihood."""
     parameters, theta = problem.parameters, problem.theta
-    proposal = as_differentiable(proposal, parameters.model, problem.like, budget)
+    proposal = as_differentiable(key, proposal, problem, budget)
     pilot_key, run_key, last_pilot_key, last_key = jax.random.split(key, 4)
     blocks = differentiable_blocks(pilot_key, parameters.bind(theta), problem, proposal)
     iterates, info = stochastic_ascent(run_key, parameters, blocks, search, theta)
@@ -340,7 +343,8 @@ def _by_simulation(
     starts = jnp.stack([theta, last, _mean_of_later(iterates)])
     maximum = newton_ascent(last_key, parameters, blocks, starts, num_bridges)
     result = maximum.simulated
-    step_error = step_error_of_score(last_key, parameters, blocks, maximum, num_bridges)
+    at = maximum.theta, result.covariance
+    step_error = step_error_of_score(last_key, parameters, blocks, *at, num_bridges)
     at_maximum = as_score(parameters, result, step_error, result.num_missing, jnp.int32(0))
     is_found, fall = maximum.found, maximum.fall
     return _summary(parameters, maximum.theta, iterates, at_maximum, info, is_found, fall)

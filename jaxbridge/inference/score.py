@@ -1,5 +1,8 @@
 """Score and observed information of discrete observations, by the identities of Fisher and Louis.
 
+They are for a known σ that does not depend on the state, and for couplings. Otherwise a simulated
+likelihood is differentiated (`simulated_likelihood`).
+
 With Z the exact bridge of an interval and f_θ the density of its path,
 
     ∇ log p_T(a, b) = E[∇ log f_θ(Z)],
@@ -40,6 +43,12 @@ from ..schemes import Form, StepError, error_of_mean, log_likelihoods, num_looke
 from .blocks import Block, make_blocks, over_intervals, target_forms, with_keys
 from .data import Problem, as_problem
 from .parameters import Parameters, as_parameters
+from .simulated_likelihood import (
+    as_differentiable,
+    differentiable_blocks,
+    prefers_simulation,
+    simulated_score,
+)
 
 # Maximum number of bridges in one batch, over all intervals of a block.
 _PATHS = 8_192
@@ -149,7 +158,10 @@ def score(
     - `model`, `times`, `observations`, `num_steps`, `step_size`, `where`: as in `gibbs`.
     - `num_bridges`: weighted bridges per interval. Apart from the Monte Carlo error, means over
         weighted bridges have a bias of the order of 1 / (effective sample size).
-    - `proposal`: as in `sample_weighted_bridges`, but "auto" by default.
+    - `proposal`: as in `sample_weighted_bridges`, but "auto" by default. If σ depends on the state
+        or on unknown parameters, estimated transition densities are differentiated, as in
+        `maximum_likelihood`: the discretisation error is then of second order, and "auto" selects
+        one of the guided proposals. With a coupling and σ(x), steps are Euler's.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_weighted_bridges`.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
@@ -167,12 +179,16 @@ def score(
     num_bridges = check_count("num_bridges", num_bridges, 2)
     parameters = as_parameters(model, where)
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
-    problem.check_sigma_known(
-        "differentiate `transition_log_density` with a guided proposal, or select other parameters "
-        "by `where=`."
-    )
+    parameters.model.check_invertible_sigma(problem.like)
     budget = Budget(num_counts, max_proposals, max_trials)
     theta = problem.theta
+    proposal = "auto" if proposal is None else proposal
+    if prefers_simulation(problem, proposal, budget):
+        pilot_key, key = jax.random.split(key)
+        proposal = as_differentiable(pilot_key, proposal, problem, budget)
+        blocks = differentiable_blocks(pilot_key, parameters.bind(theta), problem, proposal)
+        made, step_error = simulated_score(key, parameters, blocks, theta, num_bridges)
+        return as_score(parameters, made, step_error, made.num_missing, jnp.int32(0))
     scorer = scorer_at(key, problem, theta, proposal, budget, num_bridges, progress_meter)
     return scorer.at(key, theta, jnp.zeros((0, len(theta)), theta.dtype))[0]
 

@@ -1,8 +1,9 @@
-"""Maximum of a simulated likelihood, for unknown parameters of σ.
+"""Score and maximum of a simulated likelihood, for an unknown or state-dependent σ.
 
-A complete path determines σ, so methods with completed paths (Fisher's identity, EM) do not apply.
-But guided paths are smooth functions of θ and of their noise, and so are their weights. With fixed
-noise of n paths per interval,
+A complete path determines σ, so for unknown σ methods with completed paths (Fisher's identity, EM)
+do not apply. For σ(x) the likelihood of a path has Euler steps, of first order. But guided paths
+are smooth functions of θ and of their noise, and so are their weights, whose steps are of second
+order. With fixed noise of n paths per interval,
 
     ℓ̂(θ) = Σ_k log p̂_k(θ),    p̂_k = (1/n) Σ_j w_kj(θ),
 
@@ -36,6 +37,7 @@ from ..models.diffusion import Diffusion
 from ..proposals import (
     AbstractProposal,
     Budget,
+    Guided,
     ProposalLike,
     as_proposal,
     choice_between,
@@ -104,20 +106,39 @@ class Maximum(NamedTuple):
 
 
 _NO_DERIVATIVE = (
-    "σ depends on the unknown parameters, so the likelihood itself is differentiated, "
-    "but with couplings its estimates have no derivative"
+    "σ depends on the unknown parameters or on the state, so the likelihood itself is "
+    "differentiated, but with couplings its estimates have no derivative"
 )
 
 
+def prefers_simulation(problem: Problem, proposal: ProposalLike, budget: Budget) -> bool:
+    """Return whether to differentiate estimated densities, not the likelihood of paths.
+
+    Only these allow an unknown σ, and for a state-dependent σ they have the smaller discretisation
+    error. Couplings have no derivatives, so with a known σ they use the likelihood of paths.
+    """
+    if problem.sigma_is_unknown:
+        return True
+    model, like = problem.parameters.model, problem.like
+    if not model.sigma_varies(like):
+        return False
+    return proposal == "auto" or not as_proposal(proposal, model, like, budget).coupled
+
+
 def as_differentiable(
-    proposal: ProposalLike, model: Diffusion, like: Float[Array, " d"], budget: Budget
+    key: Key[Array, ""], proposal: ProposalLike, problem: Problem, budget: Budget
 ) -> AbstractProposal:
     """Return the proposal of the user, where "auto" excludes couplings.
+
+    Inside `jit`, where no pilot runs can select a proposal, "auto" is `Guided()`.
 
     **Raises:** `ValueError` and `TypeError` for a proposal whose weights have no derivatives.
     """
     if isinstance(proposal, str) and proposal == "auto":
         proposal = choice_between(guided_candidates(), budget, left_out=_NO_DERIVATIVE)
+        if is_traced(key, problem):
+            proposal = Guided()
+    model, like = problem.parameters.model, problem.like
     pulled = as_proposal(proposal, model, like, budget, for_density=True)
     if pulled.coupled:
         raise ValueError(
@@ -147,11 +168,6 @@ def _with_best_candidate(block: Block) -> Block:
 
     The squared error of ℓ̂ is the sum of 1 / (effective sample size) over the intervals.
     """
-    if is_traced(block.proposal):
-        raise ValueError(
-            '`proposal="auto"` needs pilot runs, which cannot run inside `jit`: pass a guided '
-            "proposal, such as `Guided()`."
-        )
     return replace(block, proposal=block.proposal.for_all())
 
 
@@ -237,20 +253,35 @@ def simulated(
 
 
 @compiled_sooner
+def simulated_score(
+    key: Key[Array, ""],
+    parameters: Parameters,
+    blocks: tuple[Block, ...],
+    theta: Float[Array, " p"],
+    num_paths: int,
+) -> tuple[Simulated, StepError]:
+    """Return ℓ̂ at θ with its derivatives, and the discretisation error of ∇ℓ̂."""
+    parameters, blocks, theta = nondifferentiable((parameters, blocks, theta))
+    made = simulated(key, parameters, blocks, theta, num_paths)
+    return made, step_error_of_score(key, parameters, blocks, theta, made.covariance, num_paths)
+
+
+@compiled_sooner
 def step_error_of_score(
     key: Key[Array, ""],
     parameters: Parameters,
     blocks: tuple[Block, ...],
-    maximum: Maximum,
+    theta: Float[Array, " p"],
+    covariance: Float[Array, "p p"],
     num_paths: int,
 ) -> StepError:
-    """Estimate the discretisation error of ∇ℓ̂ at the maximum.
+    """Estimate the discretisation error of ∇ℓ̂ at θ, whose noise has this covariance.
 
     The estimate uses as many paths with half as many steps. It is NaN if a path has a single step.
     """
     parameters, blocks = nondifferentiable((parameters, blocks))
-    model = parameters.bind(maximum.theta)
-    error, variance = jnp.zeros_like(maximum.theta), jnp.zeros_like(maximum.theta)
+    model = parameters.bind(theta)
+    error, variance = jnp.zeros_like(theta), jnp.zeros_like(theta)
     for block_key, block in with_keys(key, blocks):
         # The block has a single proposal, so all intervals have the same order of error.
         target = block.proposal.singles[0].target
@@ -273,10 +304,10 @@ def step_error_of_score(
             fine, coarse = values
             return coarse - fine
 
-        error += share * jax.jacfwd(difference)(maximum.theta)
+        error += share * jax.jacfwd(difference)(theta)
         variance = jnp.maximum(variance, share**2)
     # The variances of both grids are added, as for independent noise.
-    noise = 2 * jnp.diagonal(maximum.simulated.covariance)
+    noise = 2 * jnp.diagonal(covariance)
     return StepError(error, jnp.sqrt(variance * noise))
 
 

@@ -40,7 +40,7 @@ _LONGEST_STEP = 1.0
 _MATTERS = 0.05
 # A smaller rounding error of log p does not matter.
 _LEAST_ROUNDING = 1e-3
-_SHORTER = "Use more steps (`num_steps`, or a smaller `step_size`)."
+_SHORTER = "Use more steps (`num_steps`; for observations also a smaller `step_size`)."
 _FOR_COUPLINGS = " For stiff drift use the scheme `SemiImplicit()` of the coupling."
 _TOO_LARGE = (
     "The discretisation error (`step_error`) exceeds the standard error and 0.05 (of a log "
@@ -167,10 +167,9 @@ def error_of_mean(
     """
     coarse_values = values if coarse_values is None else coarse_values
     weights, has_D = _known_weights(log_weights, log_halving)
-    D = jnp.where(has_D, log_halving, -jnp.inf)
-    coarse = normalise_weights(
-        jnp.where(weights > 0, jnp.log(jnp.where(weights > 0, weights, 1)) + D, D)
-    )
+    # Not from `weights`, which may underflow to zero.
+    D = jnp.where(has_D, log_halving, 0)
+    coarse = normalise_weights(jnp.where(has_D, log_weights + D, -jnp.inf))
     axis = weights.ndim - 1
     fine_mean, coarse_mean = weighted_mean(weights, values), weighted_mean(coarse, coarse_values)
     terms = align_axes(coarse, values) * (coarse_values - jnp.expand_dims(coarse_mean, axis))

@@ -53,6 +53,11 @@ _TOLERANCE = 1.1
 
 # Maximum of trials per pilot count. A law that needs more for over 1 % of the bridges is rejected.
 _PILOT_TRIALS = 1_000
+# Largest share of a density that may come from points outside of the pilot's starts, the number of
+# draws that measure it, and the number of reductions of the standard deviations, by a fifth each.
+_MOST_OUTSIDE = 0.01
+_NUM_MEASURED = 4_000
+_MOST_REDUCTIONS = 6
 
 
 class Pilot(NamedTuple):
@@ -257,7 +262,8 @@ def coupling_pilots(
     if model.has_density:
         fits = (_gaussian_fit(draws), _gaussian_fit(starts))
         gaussian: list[AnyStartLaw] = [
-            _geometric_mean(*fits, share, bridges.paths.dtype) for share in _SHARES
+            _within(starts, _geometric_mean(*fits, share, bridges.paths.dtype), *fits)
+            for share in _SHARES
         ]
         # A density needs a normalised μ, and ν is normalised only if the model says so.
         only_gaussian = for_density and not model.normalised
@@ -331,6 +337,37 @@ def _gaussian_fit(
     """Return mean and precision matrix of the finite draws."""
     draws = draws[np.all(np.isfinite(draws), axis=1)]
     return draws.mean(0), np.linalg.inv(np.atleast_2d(np.cov(draws.T)))
+
+
+def _within(starts: Float[np.ndarray, "n d"], law: GaussianLaw, stationary, reverse) -> GaussianLaw:
+    """Return the law, with a smaller covariance if much of a density comes from points that the
+    starts of the pilot did not reach.
+
+    If ν has lighter tails than a normal law, paths that start there are rare and have huge weights,
+    which neither the pilot nor k̂ sees. A start x adds μ(x) p_T(x, b), and p_T(x, b) is in
+    proportion to G(x)/ν(x), from the pairs (mean, precision) of both.
+    """
+    starts = starts[np.all(np.isfinite(starts), axis=1)]
+    n, d = starts.shape
+    axes = np.linalg.cholesky(reverse[1])
+    low, high = (starts @ axes).min(0), (starts @ axes).max(0)
+    mean, covariance = np.asarray(law.mean, float), np.asarray(law.covariance, float)
+    normal = np.random.default_rng(0).standard_normal((_NUM_MEASURED, d))
+    # Of n new starts about 2 d are outside of the box of the old ones.
+    allowed = max(_MOST_OUTSIDE, 4 * d / n)
+    for scale in 0.8 ** np.arange(_MOST_REDUCTIONS):
+        points = mean + scale * normal @ np.linalg.cholesky(covariance).T
+        log_p = _log_normal(points, *reverse) - _log_normal(points, *stationary)
+        added = np.exp(log_p - log_p.max())
+        outside = np.any((points @ axes < low) | (points @ axes > high), axis=1)
+        if added @ outside <= allowed * added.sum():
+            return GaussianLaw(law.mean, law.covariance * scale**2)
+    return law
+
+
+def _log_normal(points, mean, precision) -> Float[np.ndarray, " n"]:
+    """Return the log densities at the points, up to a constant."""
+    return -np.einsum("ni,ij,nj->n", points - mean, precision, points - mean) / 2
 
 
 def _geometric_mean(stationary, reverse, share: float, dtype) -> GaussianLaw:

@@ -196,7 +196,7 @@ def test_a_choice_is_made_once_or_kept(unchecked):
     times, data, *_ = ou_problem()
     model, key = ou_1d(), jax.random.key(0)
     problem = as_problem(key, as_parameters(model, None), times[:5], data[:5], 5, None)
-    auto = simulated_likelihood.as_differentiable("auto", model, problem.like, Budget())
+    auto = simulated_likelihood.as_differentiable(key, "auto", problem, Budget())
     (block,) = simulated_likelihood.differentiable_blocks(key, model, problem, auto)
     assert isinstance(block.proposal, jb.Guided | jb.ModifiedDiffusionBridge)
     candidates = guided_candidates()

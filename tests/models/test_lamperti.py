@@ -180,8 +180,7 @@ def test_unknown_parameters_of_the_drift_are_not_refused():
     ]:
         arguments = (TIMES, data, 4, None)
         problem = as_problem(jax.random.key(0), as_parameters(model, lambda p: p[0]), *arguments)
-        problem.check_sigma_known("")
-        assert problem.theta.shape == (1,)
+        assert not problem.sigma_is_unknown and problem.theta.shape == (1,)
         with pytest.raises(ValueError, match="coordinates of `lamperti` depend"):
             as_problem(jax.random.key(0), as_parameters(model, lambda p: p[1:]), *arguments)
 

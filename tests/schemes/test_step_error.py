@@ -140,6 +140,23 @@ def test_share_of_what_half_as_many_steps_change():
         assert share_of_order(order) * (0.2**order - 0.1**order) == pytest.approx(0.1**order)
 
 
+def test_negligible_weights_do_not_hide_the_step_error():
+    """A weight that underflows counts as little for half as many steps, unless D is as large."""
+    rng = np.random.default_rng(0)
+    log_w, h = jnp.asarray(rng.normal(size=(2, 200)), jnp.float32)
+    D = jnp.asarray(0.1 * rng.normal(size=200), jnp.float32)
+    one = jnp.asarray(1.0)
+    with_one = [jnp.append(x, value) for x, value in ((log_w, -200), (D, 0), (h, 50))]
+    for extra in (0, 199):
+        made = error_of_mean(with_one[0], with_one[1].at[-1].set(extra), one, with_one[2])
+        if extra == 0:
+            expected = error_of_mean(log_w, D, one, h)
+            np.testing.assert_allclose(made.value, expected.value, atol=1e-5)
+            np.testing.assert_allclose(made.uncertainty, expected.uncertainty, rtol=1e-4)
+        else:
+            assert abs(made.value) > 0.05  # the path has much weight for half as many steps
+
+
 def test_changes_are_those_of_weights_and_factors():
     rng = np.random.default_rng(0)
     log_w, D, h = (jnp.asarray(rng.normal(size=50)) for _ in range(3))

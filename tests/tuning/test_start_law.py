@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from fokker_planck import solve_model
 from helpers import PAPER_CASES, paper_model
 from scipy.integrate import quad
 
@@ -134,7 +135,7 @@ def test_a_choice_for_densities_may_be_used_for_them():
     # After so many relaxation times, of 5.4 by Kramers' formula, the density is the stationary one.
     constant, _ = quad(lambda x: np.exp(-2.5 * (x**2 - 1) ** 2), -4, 4)
     error = float(estimate.standard_error)
-    assert error < 0.06
+    assert error < 0.1
     assert abs(float(estimate.value) + np.log(constant)) < 5 * error + 0.02
 
 
@@ -150,3 +151,26 @@ def test_pilot_runs_that_find_nothing_are_refused():
             num_pilot=40,
             num_steps=5,
         )
+
+
+@pytest.mark.slow
+def test_fitted_laws_stay_where_paths_start():
+    """A double well, whose ν has lighter tails than any normal law. A normal law as wide as ν has a
+    tenth of its mass where no path starts, so densities would be too small by as much."""
+    model = jb.Diffusion(
+        lambda x, p: x - x**3, [[0.5]], log_stationary=lambda x, p: 4 * x[0] ** 2 - 2 * x[0] ** 4
+    )
+    exact = solve_model(model, [-1.0], [1.0], 5.0, [(-3.0, 3.0)], 201).log_density
+    z = []
+    for key in jax.random.split(jax.random.key(0), 8):
+        arguments = (key, model, [-1.0], [1.0], 5.0)
+        law = jb.fit_start_law(*arguments, num_steps=100, for_density=True)
+        made = jb.transition_log_density(
+            *arguments,
+            num_steps=100,
+            num_proposals=10_000,
+            proposal=jb.Coupling(0.0, start_law=law),
+        )
+        z.append((float(made.value) - exact) / float(made.standard_error))
+    # The error of the steps is about a quarter of a standard error.
+    assert abs(np.mean(z)) < 4 / np.sqrt(8) + 0.25 and np.sqrt(np.mean(np.square(z))) < 2
