@@ -252,17 +252,21 @@ def heavy_tails(
     )
 
 
-def heavy_tails_in_sum(k: Float[Array, " I"], effective: Float[Array, " I"]) -> Fault:
+def heavy_tails_in_sum(
+    k: Float[Array, " I"], effective: Float[Array, " I"], number: Int[Array, " I"]
+) -> Fault:
     """Return the fault of a sum over intervals, each with its own weights.
 
     Among many intervals, some look unreliable by chance. Each of them adds an error of its own
     size, while the statistical error of the sum grows as √I. Up to √I / 4 of them are therefore
-    harmless, if all intervals have at least five effective weights.
+    harmless, if all intervals have at least five effective weights. `number` counts the positive
+    weights of each.
     """
-    unreliable, most = jnp.sum(~is_reliable(k, effective)), math.isqrt(k.size) // 4
+    unreliable = jnp.sum(~is_reliable(k, effective, number))
+    most = math.isqrt(k.size) // 4
     hopeless = jnp.any(~(effective >= _FEWEST_IN_SUM))
     detail = (
-        f"{{}} of {k.size} intervals have a k̂ above 0.7 or an effective sample size below "
+        f"{{}} of {k.size} intervals have a k̂ above its bound or an effective sample size below "
         f"{FEWEST_EFFECTIVE} (at most {most} may), and the smallest effective sample size is "
         f"{{:,.1f}} (at least {_FEWEST_IN_SUM})"
     )

@@ -120,7 +120,7 @@ class Score(AbstractResult):
         return (
             missing_bridges(self.num_missing > 0),
             truncated_weights(self.num_truncated > 0),
-            heavy_tails_in_sum(self.pareto_k, self.effective_sample_size),
+            heavy_tails_in_sum(self.pareto_k, self.effective_sample_size, self.counts.found),
             self._lost,
         )
 

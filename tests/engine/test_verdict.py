@@ -109,12 +109,14 @@ def test_fault_in_any_entry_has_the_numbers_of_the_first():
 
 def test_heavy_tails_in_a_sum_are_counted():
     """Of 100 intervals two may look so by chance, unless few paths have all the weight of one."""
-    k, size = jnp.full(100, 0.2), jnp.full(100, 99.0)
-    assert not heavy_tails_in_sum(k.at[:2].set(0.9), size).present
-    assert heavy_tails_in_sum(k.at[:3].set(0.9), size).present
-    assert heavy_tails_in_sum(k, size.at[0].set(3.0)).present
-    one = heavy_tails_in_sum(k[:1].at[0].set(0.9), size[:1])
+    k, size, number = jnp.full(100, 0.2), jnp.full(100, 99.0), jnp.full(100, 200)
+    assert not heavy_tails_in_sum(k.at[:2].set(0.9), size, number).present
+    assert heavy_tails_in_sum(k.at[:3].set(0.9), size, number).present
+    assert heavy_tails_in_sum(k, size.at[0].set(3.0), number).present
+    one = heavy_tails_in_sum(k[:1].at[0].set(0.9), size[:1], number[:1])
     assert one.present and "1 of 1 intervals" in Verdict((one,)).why()
+    # Nearly equal weights have small errors whatever their tails.
+    assert not heavy_tails_in_sum(k.at[:3].set(0.9), size, jnp.full(100, 105)).present
 
 
 def test_every_result_has_a_verdict():
