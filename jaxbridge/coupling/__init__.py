@@ -24,7 +24,8 @@ normaliser. Four modules serve the estimation of π(z):
 - `burn_in` measures the time after which a run has the law ν, for a ν without sampler.
 - `smoothed_draws` builds a start law with a density from draws of ν.
 
-`effects` returns a table of the effects that such a program simulates, with reasons.
+`nearest_law` gives the step density nearest to a coupling. `effects` returns a
+table of the effects that such a program simulates, with reasons.
 """
 
 # Names for the packages that build on this one.
@@ -58,6 +59,7 @@ from .hitting import (
     search_for_hits as search_for_hits,
 )
 from .join import Inputs as Inputs
+from .nearest_law import step_law_of as step_law_of
 from .start_laws import (
     AnyStartLaw as AnyStartLaw,
     Reversed as Reversed,

@@ -17,7 +17,7 @@ from ..engine.noise import chunk_shape
 from ..models import decisions
 from ..models.decisions import Effects
 from ..models.diffusion import Diffusion, check_diffusion
-from ..schemes import Heun, HeunOrEuler, scheme_for
+from ..schemes import GaussianTransition, Heun, HeunOrEuler, scheme_for
 from .base import AbstractCoupling, check_coupling
 from .gamma import Coupling
 from .rotation import driven_through_root, root_effect, rotation_effect
@@ -92,8 +92,8 @@ def effects(
         type(eqx.filter_eval_shape(dynamics.sigma, like))
         for dynamics in (forward, driven_through_root(coupling, forward, like))
     )
-    # `HeunOrEuler` becomes one of the two for this equation.
-    scheme = scheme_for(coupling.scheme, forward)
+    # `HeunOrEuler` becomes one of its schemes for this equation.
+    scheme = scheme_for(coupling.scheme, forward, like)
     reverse_drift = model.reverse_drift_effect
     return Effects(
         reverse_drift,
@@ -136,7 +136,7 @@ def _corrector(asked_for, scheme, forward) -> decisions.Effect:
     """Return the effect of the corrector step; `scheme` is the coupling's scheme for this
     equation."""
     if isinstance(asked_for, HeunOrEuler):
-        return decisions.corrector(forward.sigma_varies)
+        return decisions.corrector(forward.sigma_varies, isinstance(scheme, GaussianTransition))
     return decisions.Effect(
         isinstance(scheme, Heun), f"the coupling's choice, `{type(scheme).__name__}`"
     )

@@ -44,9 +44,10 @@ class Coupling(AbstractCoupling):
         Only a law or a traced value can be outside [-1, 1). Such pairs never meet, and count in
         `num_nonfinite`.
     - `meeting`: `BrownianCrossing()`, `SignTest(radius)` or, for γ = -1, `ReflectionPlane()`.
-    - `scheme`: by default `HeunOrEuler()`, which is Heun's scheme for constant σ and Euler's for a
-        state-dependent σ. Others are `Heun()`, `Euler()` and `Milstein()`; `SemiImplicit()` for
-        stiff or superlinear drift; `GaussianTransition()` for linear drift.
+    - `scheme`: by default `HeunOrEuler()`, which is Heun's scheme for constant σ, Euler's for a
+        state-dependent σ, and the exact `GaussianTransition()` for linear drift and constant σ.
+        Others are `Heun()`, `Euler()` and `Milstein()`; `SemiImplicit()` for stiff or superlinear
+        drift.
     - `rotation`: O(x, x'), a function of the matrices σ(x) and σ(x'), for a full state-dependent σ.
         The default `None` drives the pair through the triangular root of V = σσᵀ, which needs no
         rotation; with `Heun()` it selects `polar_rotation`.

@@ -96,7 +96,7 @@ def quadratic_noise(invertible: bool, sigma_varies: bool, d: int) -> Effect:
 
 
 def exact_steps(linear: bool) -> Effect:
-    """Decide whether steps of guided paths are exact transitions (`LinearDensity`)."""
+    """Decide whether steps are exact transitions (`LinearDensity`, `GaussianTransition`)."""
     if not linear:
         return Effect(False, "the drift is not linear, σ varies, or a coefficient depends on time")
     return Effect(True, "the drift is linear and σ constant, so transitions are known")
@@ -177,8 +177,10 @@ def crossing_uniforms(draws_uniform: bool) -> Effect:
     return Effect(False, "the meeting rule uses the grid points only")
 
 
-def corrector(sigma_varies: bool) -> Effect:
+def corrector(sigma_varies: bool, linear: bool) -> Effect:
     """Decide whether `HeunOrEuler` evaluates α at the predicted point too."""
+    if linear:
+        return Effect(False, "the drift is linear and σ constant: steps are exact transitions")
     if sigma_varies:
         return Effect(False, "σ depends on the state: the corrector would not raise the weak order")
     return Effect(True, "σ is constant: the corrector raises the weak order from 1 to 2")

@@ -28,6 +28,7 @@ from ..coupling import (
     log_ratio,
     most_accurate,
     needs_burn_in,
+    step_law_of,
     with_start_law,
 )
 from ..engine.batch_size import default_num_lanes
@@ -37,7 +38,7 @@ from ..engine.lanes import over_points
 from ..engine.rejection import Search
 from ..models.bridge_problem import Intervals, uniform_fractions
 from ..models.diffusion import Diffusion
-from ..schemes import check_model, log_halving_of_paths, num_looked, step_law_of
+from ..schemes import check_model, log_halving_of_paths, num_looked
 from .base import AbstractProposal, AbstractSingleProposal, WeightedPaths
 from .memory_blocks import in_blocks
 
@@ -160,7 +161,7 @@ class CoupledPairs(AbstractSingleProposal):
         return uniform_fractions(num_steps)
 
     def step_share(self, model, intervals):
-        _, share = step_law_of(self.coupling.scheme, model.forward(intervals.start[0]))
+        _, share = step_law_of(self.coupling, model, intervals.start[0])
         return jnp.full_like(intervals.duration, share)
 
     def draw(
@@ -251,7 +252,7 @@ class CoupledPairs(AbstractSingleProposal):
     ) -> Float[Array, " P"]:
         """Return D of `halving` for the first of the n paths of each interval, NaN for others."""
         dynamics = model.forward(intervals.start[0])
-        density, _ = step_law_of(self.coupling.scheme, dynamics)
+        density, _ = step_law_of(self.coupling, model, intervals.start[0])
         num_rows = num_looked(_LOOKED * n, dynamics.sigma_varies)
         rows = jnp.arange(len(paths)).reshape(-1, n)[:, :num_rows].reshape(-1)
         num_steps = paths.shape[1] - 1

@@ -14,6 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
+from ..coupling import step_law_of
 from ..engine.averages import PathFunction, as_path_function
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
@@ -26,7 +27,6 @@ from ..models.sigma import columns_of
 from ..proposals import AbstractProposal, ProposalLike, as_proposal
 from ..schemes import (
     AbstractStepDensity,
-    ItoTaylorDensity,
     StepError,
     dominates,
     log_halving_of_paths,
@@ -34,7 +34,6 @@ from ..schemes import (
     share_of_grid,
     share_of_order,
     step_faults,
-    step_law_of,
     unknown_where,
 )
 from .guide_search import GuideCheck, Linearised, linearised
@@ -384,9 +383,7 @@ def _least_accurate(problem: RecordProblem, proposal: AbstractProposal) -> Abstr
         coupling = single.by_coupling
         if coupling is None:
             return single.target
-        law, _ = step_law_of(coupling.scheme, problem.model.forward(problem.like))
-        # Other meeting rules than `BrownianCrossing` have errors, even with exact steps.
-        return ItoTaylorDensity() if law.is_exact else law
+        return step_law_of(coupling, problem.model, problem.like)[0]
 
     densities = (*map(of_single, proposal.singles), problem.density)
     return min(filter(None, densities), key=lambda density: density.order)

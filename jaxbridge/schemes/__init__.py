@@ -15,8 +15,7 @@ The schemes are:
 - `gaussian_transition`, exact for linear drift and constant σ;
 - `heun_or_euler`, the default, which selects by the model.
 
-`fit` checks that scheme, model and end points fit together; `nearest_law` relates a scheme to a
-step density.
+`fit` checks that scheme, model and end points fit together.
 
 A step density (`step_density`) is a normal law N(μ(x), δ σ S σᵀ) of one step. It is singular if
 noise does not enter all coordinates (`step_law`). The sum Σ log q(x_i, x_{i+1}) is the
@@ -55,7 +54,6 @@ from .heun_or_euler import (
     HeunOrEuler as HeunOrEuler,
     scheme_for as scheme_for,
 )
-from .nearest_law import step_law_of as step_law_of
 from .path_likelihood import (
     Form as Form,
     density_of_form as density_of_form,
@@ -72,6 +70,7 @@ from .step_density import (
     EulerDensity as EulerDensity,
     HypoellipticDensity as HypoellipticDensity,
     ItoTaylorDensity as ItoTaylorDensity,
+    LinearDensity as LinearDensity,
     LocalLinearDensity as LocalLinearDensity,
     QuadraticDensity as QuadraticDensity,
     check_step_density as check_step_density,

@@ -1,16 +1,20 @@
-"""The default scheme: selection between `Heun` and `Euler` by the model."""
+"""The default scheme: selection of `GaussianTransition`, `Heun` or `Euler` by the model."""
 
 from typing import ClassVar
 
+from jaxtyping import Array, Float
+
 from ..models import decisions
-from ..models.dynamics import Dynamics
+from ..models.dynamics import Dynamics, is_linear
 from .base import AbstractScheme
 from .euler import Euler
+from .gaussian_transition import GaussianTransition
 from .heun import Heun
 
 
 class HeunOrEuler(AbstractScheme):
-    """Default scheme: `Heun` for constant σ, `Euler` for a state-dependent σ.
+    """Default scheme: `Heun` for constant σ, `Euler` for a state-dependent σ, and the exact
+    `GaussianTransition` for constant σ and linear drift.
 
     For constant σ the corrector raises the weak order from 1 to 2, at the cost of one more
     evaluation of the drift. For a state-dependent σ both schemes have weak order 1, but Heun also
@@ -26,20 +30,24 @@ class HeunOrEuler(AbstractScheme):
     stratonovich: ClassVar[bool] = False
 
     def fitted(self, dynamics, like, dt):
-        return scheme_for(self, dynamics)
+        return scheme_for(self, dynamics, like).fitted(dynamics, like, dt)
 
     def step(self, dynamics, x, dt, dw):
-        return scheme_for(self, dynamics).step(dynamics, x, dt, dw)
+        return scheme_for(self, dynamics, x).step(dynamics, x, dt, dw)
 
     def noise(self, dynamics, x, x_next, dt):
-        return scheme_for(self, dynamics).noise(dynamics, x, x_next, dt)
+        return scheme_for(self, dynamics, x).noise(dynamics, x, x_next, dt)
 
     def frame(self, dynamics, x, driven, dt):
-        return scheme_for(self, dynamics).frame(dynamics, x, driven, dt)
+        return scheme_for(self, dynamics, x).frame(dynamics, x, driven, dt)
 
 
-def scheme_for(scheme: AbstractScheme, dynamics: Dynamics) -> AbstractScheme:
+def scheme_for(
+    scheme: AbstractScheme, dynamics: Dynamics, like: Float[Array, " d"]
+) -> AbstractScheme:
     """Return the scheme, or the one that `HeunOrEuler` selects for this equation."""
     if not isinstance(scheme, HeunOrEuler):
         return scheme
-    return Heun() if decisions.corrector(dynamics.sigma_varies).simulated else Euler()
+    if is_linear(dynamics, like):
+        return GaussianTransition()
+    return Heun() if decisions.corrector(dynamics.sigma_varies, False).simulated else Euler()

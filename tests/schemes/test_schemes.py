@@ -1,5 +1,6 @@
 """Schemes: their inverses recover the noise, and they converge at their orders."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -232,15 +233,19 @@ def test_exact_transitions_tend_to_euler():
     np.testing.assert_allclose(exact, jb.Euler().step(forward, x, dt, dw), atol=1e-4)
 
 
-@pytest.mark.parametrize("varies", [False, True])
-def test_the_default_scheme_is_the_one_that_the_scene_calls_for(varies, x64):
-    """Heun's for a constant σ, Euler's for one that depends on the state."""
-    model = full_model() if varies else paper_model()
+@pytest.mark.parametrize("scene", ["constant", "varies", "linear"])
+def test_the_default_scheme_is_the_one_that_the_scene_calls_for(scene, x64):
+    """Heun's for a constant σ, Euler's for one that depends on the state, the exact transition for
+    linear drift."""
+    models = {"constant": jb.hyperbolic(1.0, 2), "varies": full_model(), "linear": paper_model()}
+    model = models[scene]
     x, dw, dt = jnp.array([0.3, -0.4]), jnp.array([0.05, 0.1]), jnp.asarray(0.02)
     dynamics = model.forward(x)
-    expected = jb.Euler() if varies else jb.Heun()
+    schemes = {"constant": jb.Heun(), "varies": jb.Euler(), "linear": jb.GaussianTransition()}
+    expected = schemes[scene]
     assert jb.Coupling().scheme == jb.HeunOrEuler()
-    assert jb.HeunOrEuler().fitted(dynamics, x, dt) == expected
+    fitted = jb.HeunOrEuler().fitted(dynamics, x, dt)
+    assert eqx.tree_equal(fitted, expected.fitted(dynamics, x, dt))
     x_next = expected.step(dynamics, x, dt, dw)
     for scheme in (jb.HeunOrEuler(), expected):
         np.testing.assert_array_equal(scheme.step(dynamics, x, dt, dw), x_next)
@@ -249,5 +254,5 @@ def test_the_default_scheme_is_the_one_that_the_scene_calls_for(varies, x64):
         )
         frame = scheme.frame(dynamics, x, x_next, dt)
         np.testing.assert_array_equal(frame.u, expected.frame(dynamics, x, x_next, dt).u)
-    assert jb.effects(model, at=x).corrector.simulated != varies
+    assert jb.effects(model, at=x).corrector.simulated == (scene == "constant")
     assert not jb.effects(model, at=x).stratonovich.simulated
