@@ -219,7 +219,11 @@ def run_effect_costs(key: Key[Array, ""], num_bridges: int, say: Say) -> list[Ef
             True,
         ),
         "+ rotation": (_not_declared(_full), jb.Coupling(0.5, scheme=jb.Euler()), True),
-        "+ Stratonovich form (Heun)": (_not_declared(_full), jb.Coupling(0.5), True),
+        "+ Stratonovich form (Heun)": (
+            _not_declared(_full),
+            jb.Coupling(0.5, scheme=jb.Heun()),
+            True,
+        ),
     }
     costs = []
     for name, (model, coupling, whole) in scenes.items():

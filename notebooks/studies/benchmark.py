@@ -267,7 +267,8 @@ def _against_numpy(key: Key[Array, ""], num_proposals: int) -> Ratio:
 def _against_published(key: Key[Array, ""], num_bridges: int) -> list[Ratio]:
     """Exact bridges by weights: Heun and the Brownian crossing against Euler and the sign test in
     radius 0.05 (from ν, without which no accuracy can be had), for some accuracies."""
-    ours, published = jb.Coupling(0.5), jb.Coupling(0.5, jb.SignTest(0.05), jb.Euler())
+    ours = jb.Coupling(0.5, scheme=jb.Heun())
+    published = jb.Coupling(0.5, jb.SignTest(0.05), jb.Euler())
     found = [
         jb.work_precision(
             key,
@@ -377,8 +378,7 @@ Calls: "ratio" is the time of the call over the time of the comparison.
 Full sigma(x): nanoseconds per path and step, with sigma = I and with a full sigma(x).
 Durations: thousands of effective samples per second, without compilation. A run has 200,000
 proposals of 50 steps (T up to 1), or 20,000 of 1,000 steps (from T = 5 on); couplings alone have
-fewer. The discretisation error is of second order for all: Heun for couplings, the Itô–Taylor
-density for the others. "auto" includes its pilot runs.
+fewer. Steps of this linear model are exact for all. "auto" includes its pilot runs.
 First calls: seconds of the first call in a process, of a second call, and of a first call with
 programs on disk; programs compiled; memory maps that they keep.""",
     lambda figures, made: {"crossover.png": figures.crossover(made.rates, LONG)},
