@@ -26,6 +26,9 @@ from ..engine.arguments import check_function, evaluated
 from ..engine.checks import as_floating, is_traced
 from .parameters import Parameters, of_rows
 
+# Log standard deviations have names such as "log_sd(rate)".
+LOG_SD = "log_sd"
+
 # Standard deviations of the population start at this fraction of the scale of their prior.
 _FIRST_SPREAD = 0.3
 
@@ -88,7 +91,7 @@ class Population(eqx.Module):
     def names(self) -> tuple[str, ...]:
         """Return the names of the entries of φ."""
         names = self.parameters.names
-        return (*names, *(f"log_sd({names[j]})" for j in self.varies))
+        return (*names, *(f"{LOG_SD}({names[j]})" for j in self.varies))
 
     def first_root(self, root: Float[Array, "p p"]) -> Float[Array, "p+q p+q"]:
         """Return S of the first moves of φ, given that of θ.

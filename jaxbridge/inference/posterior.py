@@ -21,7 +21,7 @@ from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduc
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..schemes import LEAST_UNCERTAINTY, StepError, dominates, step_faults, unknown_where
 from .parameters import Parameters, init_vectors, of_rows
-from .population import Population
+from .population import LOG_SD, Population
 from .summary import PosteriorSummary
 
 # The discretisation error is computed for about so many draws: enough for a covariance. For all
@@ -303,10 +303,11 @@ class AbstractPosterior(AbstractResult):
     def to_arviz(self) -> Any:
         """Return the draws as ArviZ's `InferenceData` (`DataTree` since its version 1).
 
-        The group `posterior` has the parameters, and `sample_stats` the other values of each draw,
-        for instance the acceptance of moves. There `log_likelihood` of `pmmh` has the name
-        `log_likelihood_estimate`, because it has no values for single observations. This needs the
-        package ArviZ.
+        The group `posterior` has the parameters, with a `population` also those of each record
+        ("unit_params.rate") and the log standard deviations ("log_sd(rate)"). `sample_stats` has
+        the other values of each draw, for instance the acceptance of moves. There `log_likelihood`
+        of `pmmh` has the name `log_likelihood_estimate`, because it has no values for single
+        observations. This needs the package ArviZ.
 
         **Example:**
 
@@ -319,16 +320,21 @@ class AbstractPosterior(AbstractResult):
         def of_chains(leaf):
             return jax.device_get(leaf if self.theta.ndim == 3 else leaf[None])
 
-        leaves = jax.tree_util.tree_leaves_with_path(self.params)
-        posterior = {
-            jax.tree_util.keystr(path, simple=True, separator=".") or "theta": of_chains(leaf)
-            for path, leaf in leaves
-            if eqx.is_array(leaf)
-        }
+        def named_leaves(params, default):
+            named = jax.tree_util.tree_leaves_with_path(params)
+            return {
+                jax.tree_util.keystr(path, simple=True, separator=".") or default: of_chains(leaf)
+                for path, leaf in named
+                if eqx.is_array(leaf)
+            }
+
+        posterior = named_leaves(self.params, "theta")
+        units = named_leaves(getattr(self, "unit_params", None), "theta")
+        posterior |= {f"unit_params.{name}": draws for name, draws in units.items()}
         # Entries of θ without a parameter of the model.
         of_entries = jnp.moveaxis(self._chains, -1, 0)
         for name, draws in zip(self.names, of_entries, strict=True):
-            if name.startswith("log_sd("):
+            if name.startswith(f"{LOG_SD}("):
                 posterior[name] = jax.device_get(draws)
         others = ("params", "theta", "unit_params", *self._combinations)
         names = [field.name for field in dataclasses.fields(self) if field.name not in others]

@@ -92,7 +92,9 @@ def test_posterior_is_that_of_the_grid():
     of_units = np.asarray(of_units).reshape(-1, NUM)
     error = of_units.std(0) / np.sqrt(size)
     np.testing.assert_array_less(np.abs(of_units.mean(0) - levels), 5 * error)
-    assert "log_sd(level)" in made.to_arviz().posterior
+    draws = made.to_arviz().posterior
+    assert "log_sd(level)" in draws
+    np.testing.assert_array_equal(draws["unit_params.level"].values.reshape(-1, NUM), of_units)
 
 
 @pytest.mark.slow
