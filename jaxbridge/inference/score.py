@@ -47,7 +47,8 @@ from .simulated_likelihood import (
     as_differentiable,
     differentiable_blocks,
     prefers_simulation,
-    simulated_score,
+    simulated,
+    step_error_of_score,
 )
 
 # Maximum number of bridges in one batch, over all intervals of a block.
@@ -163,7 +164,8 @@ def score(
         `maximum_likelihood`: the discretisation error is then of second order, and "auto" selects
         one of the guided proposals. With a coupling and σ(x), steps are Euler's.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_weighted_bridges`.
-    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
+    - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`. Not
+        used where estimated densities are differentiated.
 
     **Returns:** `Score`. Not differentiable.
 
@@ -187,10 +189,25 @@ def score(
         pilot_key, key = jax.random.split(key)
         proposal = as_differentiable(pilot_key, proposal, problem, budget)
         blocks = differentiable_blocks(pilot_key, parameters.bind(theta), problem, proposal)
-        made, step_error = simulated_score(key, parameters, blocks, theta, num_bridges)
-        return as_score(parameters, made, step_error, made.num_missing, jnp.int32(0))
+        return _by_simulation(key, parameters, blocks, theta, num_bridges)
     scorer = scorer_at(key, problem, theta, proposal, budget, num_bridges, progress_meter)
     return scorer.at(key, theta, jnp.zeros((0, len(theta)), theta.dtype))[0]
+
+
+@compiled_sooner
+def _by_simulation(
+    key: Key[Array, ""],
+    parameters: Parameters,
+    blocks: tuple[Block, ...],
+    theta: Float[Array, " p"],
+    num_bridges: int,
+) -> Score:
+    """Return the derivatives of the simulated likelihood at θ."""
+    parameters, blocks, theta = nondifferentiable((parameters, blocks, theta))
+    made = simulated(key, parameters, blocks, theta, num_bridges)
+    at = theta, made.covariance
+    step_error = step_error_of_score(key, parameters, blocks, *at, num_bridges)
+    return as_score(parameters, made, step_error, made.num_missing, jnp.int32(0))
 
 
 class Scorer(eqx.Module):
@@ -241,6 +258,14 @@ def as_score(
     num_truncated: Int[Array, ""],
 ) -> Score:
     """Return the `Score` of sums over the intervals."""
+    # An empty sum is 0 ± 0, which would look like an exact score.
+    no_bridges = jnp.all(sums.effective_sample_size == 0)
+    blank = lambda leaf, value: jnp.where(no_bridges, jnp.asarray(value, leaf.dtype), leaf)
+    sums = sums._replace(
+        gradient=blank(sums.gradient, jnp.nan),
+        covariance=blank(sums.covariance, jnp.inf),
+        information=blank(sums.information, jnp.nan),
+    )
     error = jnp.sqrt(jnp.maximum(jnp.diagonal(sums.covariance), 0))
     return Score(
         parameters.each(sums.gradient),
@@ -288,16 +313,7 @@ def _over_all(
     """Return the score of all intervals, and the rises of the log-likelihood."""
     sums = over_intervals(blocks, of_blocks)
     step_error = StepError(sums.step_error, jnp.sqrt(sums.step_variance))
-    missing = sums.effective_sample_size == 0
-    num_missing = jnp.sum(missing, dtype=jnp.int32)
-    # An empty sum is 0 ± 0, which would look like an exact score.
-    no_bridges = jnp.all(missing)
-    blank = lambda leaf, value: jnp.where(no_bridges, jnp.asarray(value, leaf.dtype), leaf)
-    sums = sums._replace(
-        gradient=blank(sums.gradient, jnp.nan),
-        covariance=blank(sums.covariance, jnp.inf),
-        information=blank(sums.information, jnp.nan),
-    )
+    num_missing = jnp.sum(sums.effective_sample_size == 0, dtype=jnp.int32)
     score = as_score(parameters, sums, step_error, num_missing, sums.num_truncated)
     return score, sums.rises
 

@@ -253,20 +253,6 @@ def simulated(
 
 
 @compiled_sooner
-def simulated_score(
-    key: Key[Array, ""],
-    parameters: Parameters,
-    blocks: tuple[Block, ...],
-    theta: Float[Array, " p"],
-    num_paths: int,
-) -> tuple[Simulated, StepError]:
-    """Return ℓ̂ at θ with its derivatives, and the discretisation error of ∇ℓ̂."""
-    parameters, blocks, theta = nondifferentiable((parameters, blocks, theta))
-    made = simulated(key, parameters, blocks, theta, num_paths)
-    return made, step_error_of_score(key, parameters, blocks, theta, made.covariance, num_paths)
-
-
-@compiled_sooner
 def step_error_of_score(
     key: Key[Array, ""],
     parameters: Parameters,
