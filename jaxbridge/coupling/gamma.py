@@ -46,8 +46,8 @@ class Coupling(AbstractCoupling):
     - `meeting`: `BrownianCrossing()`, `SignTest(radius)` or, for γ = -1, `ReflectionPlane()`.
     - `scheme`: by default `HeunOrEuler()`, which is Heun's scheme for constant σ, Euler's for a
         state-dependent σ, and the exact `GaussianTransition()` for linear drift and constant σ in
-        one or two dimensions. Others are `Heun()`, `Euler()` and `Milstein()`; `SemiImplicit()` for stiff or superlinear
-        drift.
+        one or two dimensions. Others are `Heun()`, `Euler()` and `Milstein()`; `SemiImplicit()` for
+        stiff or superlinear drift.
     - `rotation`: O(x, x'), a function of the matrices σ(x) and σ(x'), for a full state-dependent σ.
         The default `None` drives the pair through the triangular root of V = σσᵀ, which needs no
         rotation; with `Heun()` it selects `polar_rotation`.

@@ -11,8 +11,7 @@ from .euler import Euler
 from .gaussian_transition import GaussianTransition
 from .heun import Heun
 
-
-# In three dimensions exact steps take 1.2 times as long as Heun's, and four times as long to compile.
+# In three dimensions exact steps take 1.2 times as long as Heun's, and longer to compile.
 _MOST_EXACT = 2
 
 
