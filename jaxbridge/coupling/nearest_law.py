@@ -24,8 +24,9 @@ def step_law_of(
     """Return the step density nearest to a coupling, and the share for its discretisation error.
 
     The share is the discretisation error of the scheme relative to the change by half as many
-    steps, computed with that density. It is `UNKNOWN_SHARE` (infinite) for a state-dependent σ,
-    because the change then says little about the error of the scheme.
+    steps, computed with that density. It is `UNKNOWN_SHARE` (infinite) for a state-dependent σ and
+    for meeting rules other than `BrownianCrossing`, because the change then says little about the
+    error.
 
     Unknown schemes count as schemes of first order, so their error is overestimated rather than
     underestimated. So does `SemiImplicit`, whose mean has second order for linear drift only.
@@ -33,13 +34,13 @@ def step_law_of(
     dynamics = model.forward(like)
     # The default scheme may recognise a linear drift in one direction of time only.
     schemes = [scheme_for(coupling.scheme, each, like) for each in (dynamics, model.backward(like))]
+    known = (GaussianTransition, Heun)
+    if not isinstance(coupling.meeting, BrownianCrossing):
+        # Meetings that the rule overlooks have an error of order 1/2, which steps do not show.
+        return EulerDensity(), UNKNOWN_SHARE
     if all(isinstance(each, GaussianTransition) for each in schemes):
-        # Other meeting rules than `BrownianCrossing` have errors, even with exact steps.
-        if isinstance(coupling.meeting, BrownianCrossing):
-            return LinearDensity(), 0.0
-        return ItoTaylorDensity(), share_of_order(ItoTaylorDensity.order)
-    scheme = schemes[1]
-    if isinstance(scheme, Heun) and not dynamics.sigma_varies:
+        return LinearDensity(), 0.0
+    if all(isinstance(each, known) for each in schemes) and not dynamics.sigma_varies:
         return ItoTaylorDensity(), share_of_order(ItoTaylorDensity.order)
     if dynamics.sigma_varies:
         # A reversed path has σ at the other ends of its steps. In experiments the error of its

@@ -151,7 +151,7 @@ def as_differentiable(
 def differentiable_blocks(
     key: Key[Array, ""], model: Diffusion, problem: Problem, proposal: AbstractProposal
 ) -> tuple[Block, ...]:
-    """Return blocks with a single proposal each.
+    """Return blocks with a single proposal each, if the choice is known before compilation.
 
     The derivatives of a choice between proposals would run all of them for all intervals. Hence
     "auto" selects the proposal with the smallest total variance at `model`. A choice of the user
@@ -160,6 +160,8 @@ def differentiable_blocks(
     blocks = make_blocks(key, model, problem, proposal, Budget(), "density")
     if proposal.is_open:
         return tuple(_with_best_candidate(block) for block in blocks)
+    if is_traced(*(block.proposal for block in blocks)):
+        return blocks  # the intervals of a candidate are unknown: all candidates run
     return tuple(single for block in blocks for single in _split(block))
 
 

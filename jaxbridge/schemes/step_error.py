@@ -54,7 +54,8 @@ _TOO_LONG_OR_VARYING_SIGMA = (
     "The discretisation error is unknown. Either steps are longer than the relaxation time of the "
     "drift: use more `num_steps`, and for stiff drift the scheme `SemiImplicit()` of the coupling. "
     "Or σ depends on the state: then couplings have no estimate, so run two grids and "
-    "`extrapolate`."
+    "`extrapolate`. Or the meeting rule of the coupling is not `BrownianCrossing()`, and overlooks "
+    "meetings."
 )
 _NO_ESTIMATE = (
     "The discretisation error is unknown (`step_error` is NaN). There is no estimate for a single "
@@ -169,7 +170,10 @@ def error_of_mean(
     weights, has_D = _known_weights(log_weights, log_halving)
     # Not from `weights`, which may underflow to zero.
     D = jnp.where(has_D, log_halving, 0)
-    coarse = normalise_weights(jnp.where(has_D, log_weights + D, -jnp.inf))
+    # The largest weight is factored out before D, which may be tiny, is added.
+    largest = jnp.max(log_weights, axis=-1, keepdims=True, initial=-jnp.inf, where=has_D)
+    largest = jnp.where(jnp.isfinite(largest), largest, 0)
+    coarse = normalise_weights(jnp.where(has_D, (log_weights - largest) + D, -jnp.inf))
     axis = weights.ndim - 1
     fine_mean, coarse_mean = weighted_mean(weights, values), weighted_mean(coarse, coarse_values)
     terms = align_axes(coarse, values) * (coarse_values - jnp.expand_dims(coarse_mean, axis))

@@ -54,9 +54,11 @@ _TOLERANCE = 1.1
 # Maximum of trials per pilot count. A law that needs more for over 1 % of the bridges is rejected.
 _PILOT_TRIALS = 1_000
 # Largest share of a density that may come from points outside of the pilot's starts, the number of
-# draws that measure it, and the number of reductions of the standard deviations, by a fifth each.
+# draws that measure it, the fewest of them that must be effective, and the number of reductions of
+# the standard deviations, by a fifth each.
 _MOST_OUTSIDE = 0.01
 _NUM_MEASURED = 4_000
+_FEWEST_MEASURED = 400
 _MOST_REDUCTIONS = 6
 
 
@@ -359,6 +361,9 @@ def _within(starts: Float[np.ndarray, "n d"], law: GaussianLaw, stationary, reve
         points = mean + scale * normal @ np.linalg.cholesky(covariance).T
         log_p = _log_normal(points, *reverse) - _log_normal(points, *stationary)
         added = np.exp(log_p - log_p.max())
+        # In many dimensions, or for short durations, a few points have all the weight.
+        if added.sum() ** 2 < _FEWEST_MEASURED * (added @ added):
+            break
         outside = np.any((points @ axes < low) | (points @ axes > high), axis=1)
         if added @ outside <= allowed * added.sum():
             return GaussianLaw(law.mean, law.covariance * scale**2)

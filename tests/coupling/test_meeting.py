@@ -8,8 +8,10 @@ from helpers import assert_moments
 from scipy.stats import norm
 
 import jaxbridge as jb
+from jaxbridge.coupling import step_law_of
 from jaxbridge.coupling.meeting import PairStep
 from jaxbridge.coupling.pair import relative_frame
+from jaxbridge.schemes import UNKNOWN_SHARE
 from jaxbridge.schemes.relative_frame import frame
 
 NUM = 200_000
@@ -170,3 +172,13 @@ def test_joined_steps_of_a_pair_seen_before_its_drift_are_not(meeting):
     driven, points, _ = joined_steps(meeting, jb.Euler(), 0.0)
     with pytest.raises(AssertionError):
         assert_is_euler_step(driven, points)
+
+
+@pytest.mark.parametrize("meeting", [jb.SignTest(), jb.SignTest(0.5), jb.ReflectionPlane()])
+def test_rules_that_overlook_meetings_have_an_unknown_error(meeting):
+    """Their densities are too small by a tenth and more in ten steps, and steps do not show it."""
+    model, like = jb.ornstein_uhlenbeck(jnp.eye(2)), jnp.zeros(2)
+    gamma = -1.0 if isinstance(meeting, jb.ReflectionPlane) else 0.0
+    assert step_law_of(jb.Coupling(gamma, meeting), model, like)[1] == UNKNOWN_SHARE
+    density, share = step_law_of(jb.Coupling(gamma), model, like)
+    assert density.is_exact and share == 0
