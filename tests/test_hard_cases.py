@@ -241,9 +241,12 @@ def test_stiff_drift(precision):
     model = jb.ornstein_uhlenbeck([[0.5, 0.0], [0.0, 500.0]])
     start, end = jnp.array([0.3, 0.02], dtype), jnp.array([0.8, -0.03], dtype)
     exact = jb.ou_transition(model, start, 1.0).log_density(end)
-    explicit = jb.sample_bridges(
-        jax.random.key(0), model, start, end, 1.0, num_bridges=5, max_proposals=500
-    )
+    bridges = lambda scheme: jb.sample_bridges(
+        jax.random.key(0), model, start, end, 1.0,
+        num_bridges=5, max_proposals=500, coupling=jb.Coupling(scheme=scheme),
+    )  # fmt: skip
+    assert bridges(None).met.all()  # exact steps by default
+    explicit = bridges(jb.Heun())
     assert not explicit.met.any() and explicit.num_nonfinite > 0
     for scheme in (jb.SemiImplicit(), jb.GaussianTransition()):
         estimate = jb.transition_log_density(
