@@ -31,16 +31,16 @@ def step_law_of(
     Unknown schemes count as schemes of first order, so their error is overestimated rather than
     underestimated. So does `SemiImplicit`, whose mean has second order for linear drift only.
     """
-    dynamics = model.forward(like)
-    # The default scheme may recognise a linear drift in one direction of time only.
-    schemes = [scheme_for(coupling.scheme, each, like) for each in (dynamics, model.backward(like))]
-    known = (GaussianTransition, Heun)
     if not isinstance(coupling.meeting, BrownianCrossing):
         # Meetings that the rule overlooks have an error of order 1/2, which steps do not show.
         return EulerDensity(), UNKNOWN_SHARE
+    dynamics = model.forward(like)
+    # The default scheme may recognise a linear drift in one direction of time only.
+    schemes = [scheme_for(coupling.scheme, each, like) for each in (dynamics, model.backward(like))]
     if all(isinstance(each, GaussianTransition) for each in schemes):
         return LinearDensity(), 0.0
-    if all(isinstance(each, known) for each in schemes) and not dynamics.sigma_varies:
+    of_second_order = all(isinstance(each, GaussianTransition | Heun) for each in schemes)
+    if of_second_order and not dynamics.sigma_varies:
         return ItoTaylorDensity(), share_of_order(ItoTaylorDensity.order)
     if dynamics.sigma_varies:
         # A reversed path has σ at the other ends of its steps. In experiments the error of its

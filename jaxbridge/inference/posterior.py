@@ -320,16 +320,16 @@ class AbstractPosterior(AbstractResult):
         def of_chains(leaf):
             return jax.device_get(leaf if self.theta.ndim == 3 else leaf[None])
 
-        def named_leaves(params, default):
+        def named_leaves(params):
             named = jax.tree_util.tree_leaves_with_path(params)
             return {
-                jax.tree_util.keystr(path, simple=True, separator=".") or default: of_chains(leaf)
+                jax.tree_util.keystr(path, simple=True, separator=".") or "theta": of_chains(leaf)
                 for path, leaf in named
                 if eqx.is_array(leaf)
             }
 
-        posterior = named_leaves(self.params, "theta")
-        units = named_leaves(getattr(self, "unit_params", None), "theta")
+        posterior = named_leaves(self.params)
+        units = named_leaves(getattr(self, "unit_params", None))
         posterior |= {f"unit_params.{name}": draws for name, draws in units.items()}
         # Entries of θ without a parameter of the model.
         of_entries = jnp.moveaxis(self._chains, -1, 0)
