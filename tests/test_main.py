@@ -39,13 +39,16 @@ def test_quick_run_prints_a_table_and_writes_pictures(tmp_path):
 
 
 @pytest.mark.slow
-def test_quick_run_of_the_exact_part(tmp_path):
-    done = run("exact", "--quick", "--out", "pictures", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    for words in ("pseudo-marginal", "renewal", "std/mean", "per effective bridge"):
-        assert words in done.stdout
-    assert "nan" not in done.stdout
-    assert len(list((tmp_path / "pictures").glob("*.png"))) == 4
+def test_quick_run_of_the_exact_studies(tmp_path):
+    for part, words, pictures in (
+        ("exact", ("pseudo-marginal", "renewal"), 2),
+        ("cost", ("per effective bridge",), 3),
+        ("variation", ("std/mean",), 4),
+    ):
+        done = run(part, "--quick", "--out", "pictures", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert all(word in done.stdout for word in words) and "nan" not in done.stdout
+        assert len(list((tmp_path / "pictures").glob("*.png"))) == pictures
 
 
 @pytest.mark.slow
