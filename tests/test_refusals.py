@@ -695,7 +695,11 @@ INFERENCE = [
     ("steps of a record", of_noise(**TINY), "`step_size` = 1e-09 needs 2e.09 steps"),
     ("meter", gibbs(progress_meter=True), "`progress_meter` must be `None` or", TypeError),
     ("where", gibbs(where=lambda params: params[9]), "`where` raised IndexError"),
-    ("where", gibbs(where=lambda params: 2.0), "`where` must return parts of `model.params`"),
+    (
+        "where",
+        gibbs(where=lambda params: 2.0),
+        "`where` must return whole leaves or branches of `model.params`",
+    ),
     ("times", gibbs(times=[0.0, 2.0, 1.0]), r"`times\[1\]`.*Sort them"),
     ("missing time", gibbs(times=[0.0, NAN, 1.0]), r"`times\[1\]` = nan\. Remove"),
     ("two times", gibbs(times=[0.0, 1.0]), "`observations` must have shape"),

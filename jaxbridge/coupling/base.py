@@ -83,7 +83,10 @@ class AbstractCoupling(eqx.Module):
     def driving_noise(
         self, frame: Frame, driven_dw: Float[Array, " d"], du: Float[Array, ""] | None
     ) -> Float[Array, " d"]:
-        """Return ΔW, the noise of X, for ΔW', in the same joint law as `driven_noise`."""
+        """Return ΔW, the noise of X, given ΔW' of X'.
+
+        It is the other conditional law of the joint law of `driven_noise`.
+        """
 
     @abstractmethod
     def gap_variance(self, frame: Frame) -> Float[Array, ""]:

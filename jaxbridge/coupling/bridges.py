@@ -38,7 +38,7 @@ class Bridges(AbstractResult):
 
     With I intervals arrays have a leading axis I. `times` has it only if there are I durations.
 
-    - `times`: the K stored times, shape (K,), from 0 to the duration.
+    - `times`: the K stored times, shape (K,); by default the whole grid from 0 to the duration.
     - `paths`: the bridges, shape (n, K, d). A missing bridge is NaN at all times.
     - `met`: whether the bridge was found, shape (n,).
     - `meeting_step`: ρ, the first step at which the path follows the reversed path, between 1 and

@@ -240,7 +240,10 @@ def count_hits(
     active: Bool[Array, " P"],
     search: Search,
 ) -> HittingCounts:
-    """Count hits for each active bridge of P, with trials of all bridges in the same lanes."""
+    """Count trials up to each hit, for the active ones of P bridges.
+
+    Trials of all bridges share one batch.
+    """
     return over_problems(_count_hits, (keys, paths, duration, active), (model, coupling), search)
 
 
@@ -321,7 +324,8 @@ def coupling_of_bridges(bridges: BridgePaths, start_law: AnyStartLaw | None) -> 
         raise ValueError(
             "`bridges` must be whole paths, because a hit may occur at any grid point; got "
             f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points. Sample them "
-            "without `save_at`, or call `sample_exact_bridges`, which accepts it."
+            "without `save_at`. For exact bridges at some times only, `sample_exact_bridges` with "
+            "`save_at` needs no counts afterwards."
         )
     if start_law is None:
         return bridges.coupling

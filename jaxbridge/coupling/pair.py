@@ -85,10 +85,10 @@ def relative_frame(
     driven: Float[Array, " d"],
     dt: Float[Array, ""],
 ) -> Frame:
-    """Return the frame of the pair in a step from `x` and `driven`, as the meeting rule requires
-    it.
+    """Return the relative position of `x` and `driven`, the states of X and X', as a `Frame`.
 
-    `scheme` is the coupling's scheme, fitted to the step size.
+    If the meeting rule `looks_ahead`, it is the frame of the scheme, after the drift, and otherwise
+    that at the beginning of the step. `scheme` is the coupling's scheme, fitted to the step size.
     """
     # The rule decides: the gap after the drift of the step, or the gap before it as in the paper.
     if coupling.meeting.looks_ahead:

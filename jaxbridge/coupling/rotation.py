@@ -110,7 +110,7 @@ def rotation_effect(coupling: AbstractCoupling, sigma: type[AbstractSigma]) -> d
 
 
 def root_effect(coupling: AbstractCoupling, sigma: type[AbstractSigma]) -> decisions.Effect:
-    """Return the effect that states whether the triangular root of V drives the pair."""
+    """Decide whether the triangular root of V = σσᵀ drives the pair, and state the reason."""
     rotation_given, stratonovich = coupling.rotation is not None, coupling.scheme.stratonovich
     return decisions.triangular_root(sigma, rotation_given, stratonovich)
 

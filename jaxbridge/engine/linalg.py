@@ -371,7 +371,7 @@ def _looped_substitution(
 
 
 def any_solve(matrix: Float[Array, "p p"], right: Float[Array, "p *m"]) -> Float[Array, "p *m"]:
-    """Solve `matrix x = right`, with LAPACK if it is large; use it outside of lane loops."""
+    """Solve `matrix x = right`, with LAPACK beyond 16 rows. Do not call it in loops over lanes."""
     small = matrix.shape[0] <= _UNROLLED
     return solve(matrix, right) if small else jnp.linalg.solve(matrix, right)
 

@@ -91,9 +91,9 @@ class TransitionLogDensity(AbstractResult):
     def step_error_dominates(self) -> Bool[Array, "*I"]:
         """Return whether the discretisation error is, or may be, larger than the standard error.
 
-        If true, more proposals do not help. Use more steps. If the error is unknown (`step_error`
-        is NaN), the value is true, too: for a coupling with a state-dependent σ(x) use two grids
-        and `extrapolate`.
+        If true, use more steps; if only the estimate of the error is uncertain, more proposals
+        help, too (`why()`). If the error is unknown (`step_error` is NaN), the value is true, too:
+        for a coupling with a state-dependent σ(x) use two grids and `extrapolate`.
         """
         return dominates(self._step_error, self.standard_error)
 

@@ -94,8 +94,8 @@ class AbstractExactBridges(AbstractResult):
         """Return whether the discretisation error of `mean(fn)` is, or may be, larger than its
         standard error.
 
-        Then more steps help, and more bridges do not. It is false for a value that is the same for
-        all bridges.
+        If true, use more steps; if only the estimate of the error is uncertain, more bridges help,
+        too (`why()`). It is false for a value that is the same for all bridges.
         """
 
         def dominates_entry(error, standard_error):

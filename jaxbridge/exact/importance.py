@@ -147,8 +147,11 @@ class WeightedBridges(AbstractExactBridges):
 
     @property
     def pareto_k(self) -> Float[Array, "*I"]:
-        """Return k̂ of the weights. Above 0.7 neither means nor their standard errors are reliable
-        (above 0.6 for very unequal weights, above 1 for nearly equal ones)."""
+        """Return k̂ of the weights. Above 0.7 neither means nor their standard errors are reliable.
+
+        The limit is 0.6 if fewer than 20 % of the positive weights are effective, and 1 if more
+        than 80 % are.
+        """
         return pareto_k(self.log_weights)
 
     @property
@@ -341,8 +344,8 @@ def sample_weighted_bridges(
     **Gradients.** Guided proposals are `ModifiedDiffusionBridge`, `ResidualBridge` and `Guided`.
     Their paths and weights are smooth functions of `params`, `start`, `end` and `duration`. So
     derivatives of weighted means, forward and reverse, estimate the derivatives of expectations. A
-    choice between such proposals has them too. For couplings, and for a choice that may select
-    them, a derivative raises `TypeError`.
+    choice between guided proposals is differentiable, too. For couplings, the default, and for a
+    choice that may select them, a derivative raises `TypeError`.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
 

@@ -90,8 +90,9 @@ class Augmentation(eqx.Module):
                 # Traced ends cannot be compared. Ends may differ from the observations by rounding.
                 if not is_traced(end, point) and not np.allclose(point, end, atol=1e-6, rtol=1e-4):
                     raise ValueError(
-                        "`init` is a state whose paths do not join these observations: pass the "
-                        "same observations as before, or unknown parameters as `init`."
+                        "`init` is a state of other data: its paths do not start and end at these "
+                        "observations. Pass the same observations as before, or unknown "
+                        "parameters as `init`."
                     )
 
     def first(self, key: Key[Array, ""], model: Diffusion) -> tuple[Paths, Bool[Array, " I"]]:

@@ -330,7 +330,7 @@ def _wide_law(intervals: Intervals) -> GaussianLaw:
 
 
 class GibbsInfo(NamedTuple):
-    """Counts of one iteration: moves of θ, replaced bridges, and those of the posterior."""
+    """Counts of one iteration: moves of θ, replaced bridges, `num_…` of `GibbsPosterior`."""
 
     parameters_moved: Int[Array, "*chains"]
     bridges_moved: Int[Array, "*chains"]

@@ -159,9 +159,10 @@ class AbstractLikelihood(eqx.Module):
     @property
     @abstractmethod
     def proposals(self) -> tuple[AbstractWeightedProposal, ...]:
-        """Return the selected proposals of the paths, one for each group of intervals.
+        """Return the selected proposal of each group of intervals with equal numbers of steps.
 
-        The last state of a chain stores them for continued chains. Empty for particle filters.
+        The state of `pmmh` stores them, so that continued chains use the same. Empty for particle
+        filters.
         """
 
 

@@ -199,8 +199,9 @@ def pick(where: Callable[[PyTree], PyTree], params: PyTree) -> PyTree:
         eqx.tree_at(where, params, picked)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            "`where` must return parts of `model.params`, each at most once, such as "
-            f"`lambda params: params.mean`; it returned {shown(picked)}."
+            "`where` must return whole leaves or branches of `model.params`, each at most once, "
+            "such as `lambda params: params.mean`, not entries of an array; it returned "
+            f"{shown(picked)}."
         ) from error
     return picked
 

@@ -351,8 +351,8 @@ def _blocks_of_state(
     groups = problem.groups
     if len(state.proposals) != len(groups):
         raise ValueError(
-            f"`init` is a state of draws whose intervals had {len(state.proposals)} different "
-            f"numbers of steps, but here they have {len(groups)}: pass the same `times`, "
+            f"`init` continues a run with {len(state.proposals)} groups of intervals, but these "
+            f"data have {len(groups)} (0: a record). Pass the same data, `observation`, "
             "`num_steps` and `step_size` as before, or unknown parameters as `init`."
         )
     for group, proposal in zip(groups, state.proposals, strict=True):

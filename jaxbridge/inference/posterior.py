@@ -179,7 +179,8 @@ class AbstractPosterior(AbstractResult):
     def step_error_dominates(self) -> Bool[Array, " p"]:
         """Return whether the discretisation error exceeds the Monte Carlo error, or may do so.
 
-        Shape (p,). If true, more steps help, and more iterations do not.
+        Shape (p,). If true, use more steps; if only the estimate of the error is uncertain, more
+        iterations help, too (`why()`).
         """
         # `step_uncertainty` may be as large as the error itself, and would hide it.
         return dominates(self._step_error, self.standard_error)
@@ -208,9 +209,10 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def continuation(self) -> dict[str, Any]:
-        """Return the arguments of a call that continues this run, beside the original ones.
+        """Return arguments that continue this run.
 
-        Pass the same `key`. The continued chains use its subsequent random numbers.
+        Merge them into the original ones, some of which they replace, and pass the same `key`. The
+        new draws use the random numbers after those of this run.
 
         **Example:**
 

@@ -125,9 +125,10 @@ class RecordMaximumLikelihood(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the estimate, each with a remedy.
 
-        They are: no maximum, or none inside; a block of a path that never moved; chains that
-        disagree; a poor guide; and a discretisation error that dominates and exceeds 0.05 standard
-        errors.
+        They are: no maximum, or one at infinity; a block of a path that never moved; chains that
+        disagree; a poor guide together with one of these, except a maximum at infinity; a
+        discretisation error that is unknown, too uncertain, or larger than a standard error; and
+        numbers that are not finite.
         """
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
         steps = step_faults(StepError(self.step_error, self.step_uncertainty), sd, sd)

@@ -425,7 +425,10 @@ def stochastic_ascent(
     search: Search,
     theta: Float[Array, " p"],
 ) -> tuple[Float[Array, "n p"], SearchInfo]:
-    """Return the optimiser's iterates along ∇ℓ̂ with new noise in each, and counts of failures."""
+    """Return the iterates of the optimiser, which follows ∇ℓ̂ with new noise in each iteration.
+
+    Also return the numbers of intervals without a path and of skipped steps.
+    """
     rule = search.rule
     assert isinstance(rule, Gradient)
     parameters, blocks, theta = nondifferentiable((parameters, blocks, theta))

@@ -40,9 +40,9 @@ def fitzhugh_nagumo(
 
         dX = (X - X³ - Y) / ε dt,    dY = (γX - Y + β) dt + σ dW.
 
-    The model is hypoelliptic: noise enters Y only. Couplings do not apply; use records with an
-    `observation`. Time is in units of the relaxation time of Y; X and Y have no units. `params` is
-    a `FitzHughNagumoParams`.
+    The model is hypoelliptic: noise enters Y only. Bridges and transition densities do not apply;
+    use `simulate`, or records with an `observation`. Time is in units of the relaxation time of Y;
+    X and Y have no units. `params` is a `FitzHughNagumoParams`.
 
     **Arguments:** `epsilon`, ε > 0; `gamma`, γ; `beta`, β; `sigma`, σ ≥ 0: numbers, shape ().
 

@@ -43,12 +43,12 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
     - `at`: a, a number in the state space, which corresponds to Y = 0.
     - `reach`: the largest |Y|, in square roots of a unit of time. A path that goes beyond it, or
         leaves the state space, is a miss, counted in `num_nonfinite`.
-    - `num_nodes`: the number of nodes of the table of X, in either direction. Interpolation errors
+    - `num_nodes`: the number of nodes of the table of X on each side of Y = 0. Interpolation errors
         are O((`reach`/`num_nodes`)⁴).
 
     **Returns:** `Transformed`. Its `model` accepts other parameters, including those of σ, by
-    `with_params`, and compiles once. Its `forward`, `inverse` and `back` use the parameters of
-    `model`.
+    `with_params`, and compiles once. Its `forward`, `inverse` and `back` keep the parameters
+    of the argument `model`: for other ones call `lamperti` again.
 
     The coordinates depend on the parameters of σ. So these parameters cannot be inferred from
     observations in these coordinates: `gibbs`, `pmmh`, `score` and `maximum_likelihood` raise an

@@ -192,11 +192,12 @@ class AbstractWeightedProposal(AbstractProposal):
         active: Bool[Array, " I"] | None = None,
         progress_meter: diffrax.AbstractProgressMeter | None = None,
     ) -> WeightedPaths:
-        """Draw one weighted path per key; it is a function of this key and its interval only.
+        """Draw one weighted path per key. Its random numbers depend on this key only.
 
         - `stored`: indices of the grid points to store, shape (K,), or `None` for all.
-        - `misses_count`: if true, a failed attempt has weight zero, so that `E[w] = p_T(a, b)`.
-            Otherwise failed attempts are repeated, and weights are correct up to a constant factor.
+        - `misses_count`: for couplings. If true, a pair that does not meet has weight zero, so that
+            `E[w] = p_T(a, b)`. Otherwise attempts are repeated, and weights are correct up to a
+            constant factor. Guided proposals make one attempt.
         """
 
     @abstractmethod

@@ -46,10 +46,11 @@ def in_blocks(
     active: Bool[Array, " I"] | None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
 ) -> WeightedPaths:
-    """Return `function` of all keys and intervals, computed in blocks of at most `most_rows` rows.
+    """Return `function` of all keys and intervals, computed in blocks of about `most_rows` rows.
 
-    A row is one draw of one interval. Active intervals are sorted to the front, and blocks without
-    any are skipped.
+    A row is one draw of one interval. A block may be larger, to fill vectors. Intervals that are
+    not active are marked as not found. Active ones are sorted to the front, and blocks without any
+    are skipped.
     """
     num_intervals, num_draws = keys.shape
     unit = _VECTOR if num_draws >= _WORTH_FILLING else 1

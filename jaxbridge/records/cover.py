@@ -85,9 +85,9 @@ class CoveredStart(NamedTuple):
 
 
 def chosen(log_shares: Float[Array, " J"], positions: Float[Array, " n"]):
-    """Return the indices of the laws at these positions in [0, 1).
+    """Return the index of the mixture component that each uniform number in `positions` selects.
 
-    They come from inverting the cumulative shares.
+    The cumulative shares are inverted.
     """
     bounds = jnp.cumsum(normalise_weights(nan_to_neg_inf(log_shares)))
     bounds = bounds / jnp.maximum(bounds[-1], jnp.finfo(bounds.dtype).tiny)
@@ -95,7 +95,7 @@ def chosen(log_shares: Float[Array, " J"], positions: Float[Array, " n"]):
 
 
 def cover(model: Diffusion, normal: NormalStep) -> Cover:
-    """Return the cover of ν, given the normal law in place of ν."""
+    """Return the mixture q that covers ν; `normal` is the normal approximation of ν."""
     model, (d,), dtype = model.prepared(), normal.mean.shape, normal.mean.dtype
     keys = jax.random.split(jax.random.key(0), _NUM_ROUNDS + 1)
     # Fixed keys make the cover a function of the parameters only.

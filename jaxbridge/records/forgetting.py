@@ -82,8 +82,9 @@ def undecided(dtype) -> RateChoice:
 def chosen_of(
     best: RateChoice, rate: Float[Array, ""], filtered: Filtered, num_particles: int
 ) -> RateChoice:
-    """Return the better of the best rate so far and `rate`.
+    """Return the choice, with `rate` if its score is higher.
 
+    The score is the mean of log p̂ minus two standard errors.
     `filtered` holds the pilot filters of all records at `rate`.
     """
     score, variance = _score_and_variance(filtered, num_particles)

@@ -169,10 +169,10 @@ def _path_without_noise(
 
 
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
-    """Return the best path of all searches, and the guide along it.
+    """Return the best path of linearisation that the searches find, and the guide along it.
 
-    The points have no derivatives. The guide has none by the model. The searches from particles are
-    a separate program, which is compiled only if it is needed.
+    Derivatives stop at the path and at the model. The guide keeps those by the observations and the
+    initial law. Outside `jit` the searches from particles are compiled only if they are needed.
     """
     # Outside `jit` Python decides whether the second program has to be compiled at all.
     if not is_outermost():

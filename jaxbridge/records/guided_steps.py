@@ -105,7 +105,10 @@ def relative(scalars: Scalars, point: Float[Array, " d"]) -> Scalars:
 def guided_start(
     initial: NormalStep, scalars: Scalars, point: Float[Array, " d"], h: Information
 ) -> GuidedLaw:
-    """Return the law of x_0, given the observation at t_0 and tilted by h_0."""
+    """Return the law of x_0, given the observation at t_0 and weighted by h_0.
+
+    h_0 is the density of the later observations. States count from `point`.
+    """
     step = NormalStep(initial.mean - point, initial.root)
     # An exact observation of a known x_0 must agree up to rounding.
     eps, size = jnp.finfo(point.dtype).eps, jnp.abs(initial.mean) + jnp.abs(point)

@@ -95,19 +95,22 @@ class LogLikelihood(AbstractResult):
     - `value`: log p̂(y). `exp(value)` is unbiased up to the discretisation error. It is -inf if no
         particle explains the observations.
     - `standard_error`: standard error of `value`, from the spread of the filters, enlarged by
-        Student's law for few filters. Infinite for a single filter.
+        Student's law for few filters. Infinite for a single filter. Without an `observation` it is
+        that of the sum of the log densities.
     - `log_estimates`: log p̂ of each filter, shape (num_filters,).
     - `effective_sample_size`: effective number of particles at each observation, before resampling,
-        mean over the filters, shape (n,).
+        mean over the filters, shape (n,); without an `observation` that of each transition.
     - `pareto_k`: k̂ of the weights of all filters at each observation, shape (n,); without an
-        `observation` that of each transition. Above 0.7 (with fewer than 1,000 particles in total
-        above a lower limit) `value` is usually too small by more than `standard_error`. Infinite
-        for fewer than 25 particles, unless all weights are equal.
+        `observation` that of each transition. Above 0.7 `value` is usually too small by more than
+        `standard_error`; the limit is 1 - 1 / log10(n) for n < 2,155 weights. The verdict allows
+        0.1 more, and 1 for nearly equal weights. Infinite for fewer than 25 particles, unless all
+        weights are equal.
     - `num_weights`: number of weights behind each k̂.
     - `num_nonfinite`: number of particles that diverged or left the state space.
     - `step_error`: estimated discretisation bias of `value` (estimate minus limit), from a grid
         with half as many steps. NaN with one step.
-    - `step_uncertainty`: its Monte Carlo error and omitted higher-order terms, from a grid with a
+    - `step_uncertainty`: uncertainty of `step_error`: Monte Carlo error, and omitted higher-order
+        terms from a grid with a
         quarter as many steps. Infinite if changes do not shrink with the step size.
     - `forgetting`: discount rate γ of the guide, in units of 1 / time. It is zero if all later
         observations help, as for a linear model.
@@ -140,7 +143,8 @@ class LogLikelihood(AbstractResult):
     def step_error_dominates(self) -> Bool[Array, ""]:
         """Return whether the discretisation error exceeds the standard error, or may do so.
 
-        Then more steps help, and more particles do not.
+        If true, use more steps; if only the estimate of the error is uncertain, more particles
+        help, too (`why()`).
         """
         return dominates(StepError(self.step_error, self.step_uncertainty), self.standard_error)
 

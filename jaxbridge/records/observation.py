@@ -137,8 +137,9 @@ class LinearGaussian(eqx.Module):
             )
         if rows != m:
             raise ValueError(
-                f"`observations` must have {rows} components, as many as the observation model "
-                f"has; got {m}."
+                f"`observations` have {m} components, but the observation model has {rows}: as "
+                "many as `matrix` has rows, or the whole state without a `matrix`. Pass a `matrix` "
+                f"of shape ({m}, {d})."
             )
         matrix, R = self.matrix_for(d, m, like.dtype), self.covariance_for(params, m, time)
         if is_traced(matrix, R):

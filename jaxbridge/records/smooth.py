@@ -149,9 +149,10 @@ class Smoothed(AbstractResult):
     def step_error_dominates(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return whether the discretisation error exceeds the Monte Carlo error, or may do so.
 
-        The result is for `mean(fn)`, entry by entry. If true, more draws do not help. Use more
-        steps. If the error is unknown (see `step_error`), the value is true, too: for Euler steps
-        of a σ with fewer columns than rows, pass another `density`.
+        The result is for `mean(fn)`, entry by entry. If true, use more steps; if only the estimate
+        of the error is uncertain, more draws help, too (`why()`). If the error is unknown (see
+        `step_error`), the value is true, too: for Euler steps of a σ with fewer columns than rows,
+        pass another `density`.
         """
         step_errors = map(StepError, *map(jax.tree.leaves, self._step_errors(fn)))
         errors, treedef = jax.tree.flatten(self.standard_error(fn))

@@ -308,14 +308,15 @@ def _check_proposal(proposal: AbstractProposal, problem: RecordProblem, scalars:
     if not is_traced(scalars) and np.any(scalars.seen & (scalars.variances <= 0)):
         raise ValueError(
             "with a `proposal` every observed component must have noise, but `covariance` has "
-            "variances of zero: leave out `proposal`, so that paths are guided by the record."
+            "variances of zero: give these a small variance, or leave out `proposal` for the "
+            "default paths, which exact observations allow."
         )
     if isinstance(law, GaussianLaw) and not is_traced(law):
         if np.any(np.diagonal(semidefinite_cholesky(law.covariance)) == 0):
             raise ValueError(
                 "with a `proposal` the first state must be a point or have a density, but the "
-                "covariance of `initial` is singular: leave out `proposal`, so that paths are "
-                "guided by the record."
+                "covariance of `initial` is singular: leave out `proposal` for the default "
+                "paths, which allow it."
             )
 
 

@@ -63,6 +63,8 @@ def path_log_likelihood(
 ) -> Float[Array, "*batch"]:
     """Return the log-likelihood of paths, differentiable in the parameters of the drift.
 
+    With `form="euler"` it is differentiable in those of σ, too.
+
     **Arguments:**
 
     - `model`: the diffusion.
@@ -70,18 +72,16 @@ def path_log_likelihood(
     - `path`: points at these times, shape (..., K, d), or (I, ..., K, d) with times of shape
         (I, K). The paths of bridges of one or several intervals have these shapes.
     - `form`: "girsanov", "trapezoid", "ito_taylor", "ito" or "euler". The default is the most
-        accurate form for the model:
-        - "girsanov" for a state-dependent σ. The following are for constant σ:
-        - "ito" for a reversible model with a stationary density;
-        - "trapezoid" for other reversible or one-dimensional models;
-        - "ito_taylor" otherwise.
+        accurate form for the model. It is "girsanov" for a state-dependent σ. For constant σ it is
+        "ito" for a reversible model with a stationary density, "trapezoid" for other reversible or
+        one-dimensional models, and "ito_taylor" otherwise.
 
-    **Returns:** log-likelihoods of shape (...), in the dtype of `path`. They are relative to the
-    law of σW, for "euler" to Lebesgue measure.
+    **Returns:** log-likelihoods of shape (...), in the dtype of `path`. They are logs of densities,
+    relative to the law of σW, or to Lebesgue measure for "euler".
 
-    **Raises:** `ValueError` for shapes that do not fit, times that do not increase, or a form that
-    is invalid for the model. `TypeError` for a derivative in parameters of σ, except with
-    "euler".
+    **Raises:** `ValueError` for shapes that do not fit, times that do not increase, a σ with fewer
+    columns than rows, or a form that is invalid for the model. `TypeError` for a derivative in
+    parameters of σ, except with "euler".
 
     **Example:**
 

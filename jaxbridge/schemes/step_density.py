@@ -252,7 +252,8 @@ class HypoellipticDensity(AbstractStepDensity):
         if dynamics.sigma(x).invertible:
             raise ValueError(
                 "`HypoellipticDensity` needs a σ with fewer columns than rows, but σ of this model "
-                "is invertible: use `ItoTaylorDensity()` for constant σ, else `EulerDensity()`."
+                "is invertible: leave out `density` for the most accurate default, or pass "
+                "`ItoTaylorDensity()` (constant σ) or `EulerDensity()`."
             )
         return _degenerate_ito_taylor(dynamics, x)
 
@@ -488,8 +489,8 @@ def _check_constant_sigma(density: AbstractStepDensity, dynamics: Dynamics) -> N
     if dynamics.sigma_varies:
         raise ValueError(
             f"`{type(density).__name__}` is for constant σ, but σ of this model depends on the "
-            "state: use `EulerDensity()`, or `HypoellipticDensity()` for a σ with fewer columns "
-            "than rows."
+            "state: leave out `density` for the most accurate default, or pass `EulerDensity()`; "
+            "for a σ with fewer columns than rows `HypoellipticDensity()`."
         )
 
 

@@ -157,11 +157,11 @@ class StepLaw(NamedTuple):
 
 
 class DegenerateLaw(NamedTuple):
-    """Normal law N(μ, Λ Λᵀ) of one step of length δ, which may be singular.
+    """Normal law N(μ, Λ Λᵀ), possibly singular, of one step of length δ.
 
     - `mean`: μ, shape (d,).
-    - `root`: Λ, lower triangular, shape (d, d). Coordinates without noise have a zero on its
-        diagonal.
+    - `root`: Λ, lower triangular, shape (d, d). The diagonal of Λ is zero for
+        coordinates without noise.
     - `dt`: δ.
     """
 

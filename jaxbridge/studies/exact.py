@@ -79,7 +79,10 @@ class Floor(NamedTuple):
 
 
 def run_exact(key: Key[Array, ""], scale: float, say: Say) -> list[ExactResult]:
-    """Run all methods on the unlikely and the very unlikely bridge; `scale` shortens the runs."""
+    """Run all methods on `UNLIKELY` and `VERY_UNLIKELY`.
+
+    Each has `scale` times its full number of iterations. `say` reports progress.
+    """
     # ν as a Gaussian law: the very unlikely bridge has another one, and shares all programs.
     coupling = jb.Coupling(_GAMMA, start_law=stationary_law())
     published = jb.Coupling.as_published(_GAMMA)

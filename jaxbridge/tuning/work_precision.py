@@ -102,7 +102,8 @@ def work_precision(
 
     - `key`: typed key. All settings use it; the reference uses another.
     - `model`, `start`, `end`, `duration`: one interval, as in `sample_bridges`.
-    - `num_steps`: numbers of steps. The times `save_at` must be on each grid.
+    - `num_steps`: numbers of steps. The times `save_at` must be on each grid; without `save_at` the
+        numbers must be even.
     - `proposals`: couplings (with γ, scheme and meeting rule) and guided proposals. By default
         `Coupling(gamma=0.0)` with `Heun()` and with `Euler()`, and also with `GaussianTransition()`
         for linear drift and constant σ.
@@ -116,7 +117,8 @@ def work_precision(
             `extrapolate`.
     - `dtypes`: "float32", "float64". Double precision needs no configuration of JAX, but the
         model's functions must work in both precisions, because the reference is in double
-        precision. Convert constants to the dtype of the point, or put them in `params`.
+        precision. (They need not if you pass all references and omit "approximate".) Convert
+        constants to the dtype of the point, or put them in `params`.
     - `num_bridges`: samples per setting. Discretisation errors below the Monte Carlo error are not
         detected.
     - `fn`: the estimated function, from the path at `save_at`, shape (K, d), to an array. By

@@ -355,7 +355,7 @@ def test_a_state_must_fit_the_observations(unchecked):
     for times, data, num_steps, message in [
         (TIMES[:5], DATA[:5], 5, "paths of shapes"),
         (TIMES[:6], DATA[:6], 4, "paths of shapes"),
-        (TIMES[:5], DATA[1:6], 4, "do not join"),
+        (TIMES[:5], DATA[1:6], 4, "is a state of other data"),
     ]:
         with pytest.raises(ValueError, match=message):
             jb.gibbs(key, ou_1d(), times, data, num_steps=num_steps, init=state, **options)
