@@ -537,7 +537,7 @@ OF_A_RECORD = [
         dict(observations=VALUES[:, :1], initial=None),
         "`observations` have 1 components, but without a `matrix`",
     ),
-    ("other components", seen([B], 0.1), "`observations` must have 1 components"),
+    ("other components", seen([B], 0.1), "the observation model has 1"),
     ("noise of others", seen(covariance=np.eye(3)), "`covariance` must have shape"),
     ("redundant", seen([[1.0, 0.0], [2.0, 0.0]], 0.0), "have rank 1: leave out"),
     (
