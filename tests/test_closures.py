@@ -159,7 +159,8 @@ def compare(name, nesting):
         assert outcome(FUNCTIONS[name], by_closures, nesting) == pytest.approx(right, rel=1e-4)
 
 
-@pytest.mark.parametrize("name", slow_beyond(1, FUNCTIONS))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FUNCTIONS)
 def test_derivatives_in_closures_are_those_in_params(name):
     compare(name, "jit(jacfwd)")
 

@@ -283,7 +283,8 @@ def curved_model():
     )
 
 
-@pytest.mark.parametrize("name", slow_beyond(1, HANDED_ON))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HANDED_ON)
 def test_parameters_may_hold_what_is_no_array(name, monkeypatch):
     """A network with its activation, a name, a whole number: all are what they were, and the
     numbers are those of the process without them."""

@@ -34,6 +34,7 @@ def arguments(start, end, duration):
     return jnp.array(start, jnp.float32), jnp.array(end, jnp.float32), jnp.float32(duration)
 
 
+@pytest.mark.slow
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(**SCENE)
 def test_bridges_join_their_ends(rates, start, end, duration, gamma):

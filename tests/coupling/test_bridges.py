@@ -199,6 +199,7 @@ def test_precisions_agree_in_law(precision):
 # The search
 
 
+@pytest.mark.slow
 def test_unreachable_end_stops_at_the_bound():
     bridges = jb.sample_bridges(
         jax.random.key(0),
@@ -356,6 +357,7 @@ def test_numbers_written_in_a_traced_function_are_known():
     assert jax.tree.structure(jb.Coupling(-1.0)) != jax.tree.structure(jb.Coupling(0.7))
 
 
+@pytest.mark.slow
 def test_models_that_close_over_traced_values_can_be_batched():
     def paths(rate):
         model = jb.Diffusion(lambda x, p: -rate * x, reversible=True)

@@ -129,6 +129,7 @@ def test_gaussian_law_is_normalised_and_sampled():
     np.testing.assert_allclose(jax.vmap(law.log_density)(draws[:50]), expected, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_pairs_that_explode_have_not_met():
     """Explicit steps of a quartic well that are far too long: nothing stays finite."""
     quartic = jb.Diffusion(lambda x, p: -2 * x**3, None, lambda x, p: -jnp.sum(x**4))

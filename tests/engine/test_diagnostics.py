@@ -43,6 +43,7 @@ def test_chains_that_do_not_move():
     assert np.isnan(jb.effective_sample_size(np.full(100, np.nan)))
 
 
+@pytest.mark.slow
 def test_chains_that_disagree_are_worth_few_draws():
     """In two wells, two draws and not four thousand; where they agree, as those of the library
     that counts alike, and what each is worth by itself."""

@@ -54,6 +54,7 @@ def densities():
     return [density(key, n) for key, n in zip(keys, (32, 16), strict=True)]
 
 
+@pytest.mark.slow
 def test_the_leading_error_of_a_density_is_gone(densities):
     """On the natural scale, against the closed form; the finer grid alone is seen to be off."""
     fine, coarse = densities

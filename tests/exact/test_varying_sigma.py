@@ -95,6 +95,7 @@ def test_step_errors_of_means_are_those_of_separate_runs(method, num_steps):
     assert doubt < noise
 
 
+@pytest.mark.slow
 def test_stored_times_are_points_of_the_whole_paths():
     """And the parts of the split last step are no points of a path."""
     options = dict(num_steps=10, num_bridges=6, proposal=jb.Guided())
@@ -110,6 +111,7 @@ def test_stored_times_are_points_of_the_whole_paths():
     assert chain.paths.shape == chain.coarse_paths.shape == (6, 11, 1)
 
 
+@pytest.mark.slow
 def test_given_paths_need_normal_steps():
     """The noise of a path is not unique if steps are quadratic in it."""
     options = dict(num_steps=4, num_bridges=3, proposal=jb.Guided())

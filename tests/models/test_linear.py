@@ -57,6 +57,7 @@ def test_long_times_tend_to_the_stationary_covariance(x64):
     np.testing.assert_allclose(found.integral, np.linalg.inv(-A), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes(x64):
     A, t = jnp.array(CASES["stable"]), jnp.asarray(0.7)
 

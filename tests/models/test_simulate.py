@@ -186,6 +186,7 @@ def test_paths_do_not_depend_on_the_zero_of_time(precision):
     assert np.abs(correlations - np.eye(200)).max() < 0.75  # of copies it is 1
 
 
+@pytest.mark.slow
 def test_coefficients_get_the_callers_time_or_nothing():
     """Whole periods change nothing; what single precision cannot resolve is refused."""
     times = np.arange(5) / 4

@@ -70,7 +70,8 @@ def euler_bridge_1d(model, start, end, times, middle):
     return np.log(joint.sum() * width), (grid * joint).sum() / joint.sum()
 
 
-@pytest.mark.parametrize("name", slow_beyond(1, PROPOSALS))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROPOSALS)
 def test_weights_make_the_euler_scheme_exact(name):
     """Density and mean of the mid-point, state-dependent σ, five coarse steps: no step error."""
     no_density = lambda p: p.density
@@ -445,6 +446,7 @@ def test_no_stationary_law_is_called_for():
     assert chain.coupling is None and not chain.truncated.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ends", [([0.0, 0.0], [1.0, 1.0]), ([0.5, -0.3], [-0.4, 0.8])])
 def test_brownian_bridges_are_nearly_exact_for_the_hyperbolic_diffusion(ends):
     """On unit intervals, as in the paper's section 4."""
@@ -504,7 +506,8 @@ def test_thousands_of_intervals_without_compiling_again():
     assert np.median(np.abs(np.asarray(estimate.value) - exact)) < 0.05
 
 
-@pytest.mark.parametrize("proposal", slow_beyond(1, [jb.Guided(), jb.ModifiedDiffusionBridge()]))
+@pytest.mark.slow
+@pytest.mark.parametrize("proposal", [jb.Guided(), jb.ModifiedDiffusionBridge()])
 def test_what_cannot_be_a_bridge_is_flagged_where_it_is_traced(unchecked, proposal):
     key = jax.random.key(0)
     options = dict(num_bridges=4, num_steps=5, proposal=proposal)

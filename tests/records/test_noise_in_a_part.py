@@ -77,15 +77,10 @@ def oscillator(noise):
     return Case([[0.0, -1.0], [4.0, 0.5]], jb.Diffusion(drift, [[0.0], [0.8]]), noise)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "case, noise",
-    [
-        (oscillator, 3e-4),
-        pytest.param(oscillator, 0.3, marks=pytest.mark.slow),
-        pytest.param(oscillator, 0.03, marks=pytest.mark.slow),
-        pytest.param(integral, 0.3, marks=pytest.mark.slow),
-        pytest.param(integral, 3e-4, marks=pytest.mark.slow),
-    ],
+    [(oscillator, 3e-4), (oscillator, 0.3), (oscillator, 0.03), (integral, 0.3), (integral, 3e-4)],
 )
 def test_the_filter_is_kalmans(case, noise, x64):
     """Steps of a linear model have no discretisation error."""

@@ -53,6 +53,7 @@ def test_a_filter_that_lost_all_particles_knows_nothing():
     assert np.all(made.log_estimate == -np.inf) and np.all(made.variance(20) == np.inf)
 
 
+@pytest.mark.slow
 def test_states_seen_exactly():
     """The sum of the transition densities, given the first."""
     times, points = np.array([0.0, 0.4, 1.0, 1.3]), np.array([0.2, -0.3, 0.1, 0.6])

@@ -101,6 +101,7 @@ def test_times_of_paths_are_the_callers():
     np.testing.assert_array_equal(made.times[::4], milliseconds)
 
 
+@pytest.mark.slow
 def test_one_series_of_numbers_is_one_column():
     expected = log_weight(TIMES)
     missing = [0.3, None, -0.2, 0.5]

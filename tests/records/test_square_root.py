@@ -144,6 +144,7 @@ def turning(x, p):
     return jnp.array([[1 + 0.3 * jnp.sin(x[1]), 0.2 * x[0]], [0.1 * x[1], jnp.exp(0.2 * x[0])]])
 
 
+@pytest.mark.slow
 def test_knots_determine_the_noise_and_the_path(x64):
     """A path alone does not: two values of the noise of a step may lead to one point."""
     plane = jb.Diffusion(lambda x, p: -x + 0.1 * jnp.roll(x, 1) ** 2, turning)

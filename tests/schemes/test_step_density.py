@@ -468,6 +468,7 @@ def test_noise_that_grows_with_a_clock(x64):
     np.testing.assert_array_equal(each[0].root, each[1].root)
 
 
+@pytest.mark.slow
 def test_noise_that_would_turn_round_within_a_step():
     """σ = q, which at such a speed is zero after half of a step: all of the state still moves."""
     model = jb.Diffusion(

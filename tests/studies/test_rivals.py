@@ -49,6 +49,7 @@ def test_the_other_densities_integrate_to_one():
     assert abs(mean - (0.5 + (0.3 - 0.5) * np.exp(-1.0))) < 1e-6
 
 
+@pytest.mark.slow
 def test_the_grid_finds_a_normal_law():
     """Of the cells' equation with a drift that is linear."""
     end, left = (1.0, 0.9), np.exp(-3.0)
