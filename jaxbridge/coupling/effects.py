@@ -86,14 +86,16 @@ def effects(
     if depends_on_time:
         return decisions.without_pairs(of_guided_paths, "coefficients depend on time")
     model.check_reversal()
-    forward = model.forward(like)
+    forward, backward = model.forward(like), model.backward(like)
     # The types of σ before and after the change to the triangular root; nothing is computed.
     own_sigma, sigma = (
         type(eqx.filter_eval_shape(dynamics.sigma, like))
         for dynamics in (forward, driven_through_root(coupling, forward, like))
     )
-    # `HeunOrEuler` becomes one of its schemes for this equation.
-    scheme = scheme_for(coupling.scheme, forward, like)
+    # `HeunOrEuler` becomes one of its schemes for each equation. The steps of a pair are exact only
+    # if the drifts of both directions are recognised as linear.
+    both = [scheme_for(coupling.scheme, equation, like) for equation in (forward, backward)]
+    scheme = min(both, key=lambda scheme: isinstance(scheme, GaussianTransition))
     reverse_drift = model.reverse_drift_effect
     return Effects(
         reverse_drift,
@@ -133,8 +135,7 @@ def _coefficients(model: Diffusion, x: Float[Array, " d"]) -> tuple[Array, Array
 
 
 def _corrector(asked_for, scheme, forward) -> decisions.Effect:
-    """Return the effect of the corrector step; `scheme` is the coupling's scheme for this
-    equation."""
+    """Return the effect of the corrector step; `scheme` is that of this equation."""
     if isinstance(asked_for, HeunOrEuler):
         return decisions.corrector(forward.sigma_varies, isinstance(scheme, GaussianTransition))
     return decisions.Effect(

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax.extend
 import numpy as np
+from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array, Float, PyTree
 
 
@@ -81,7 +82,10 @@ def is_affine(function: Callable, like: Float[Array, " d"]) -> bool:
     A derivative that does not depend on the argument would not be enough: that of a step function
     is zero. Functions with other primitives than sums, products and rearrangements are not affine.
     """
-    return _follow(jax.make_jaxpr(function)(like).jaxpr, _keeps_affine) is not None
+    jaxpr = jax.make_jaxpr(function)(like).jaxpr
+    # Drop equations that no result uses: `grad` leaves those of the value that it differentiates.
+    jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars), instantiate=True)
+    return _follow(jaxpr, _keeps_affine) is not None
 
 
 def _keeps_affine(equation: jax.extend.core.JaxprEqn, inputs: list[bool]) -> bool:

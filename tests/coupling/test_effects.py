@@ -11,6 +11,7 @@ from helpers import slow_beyond
 from jax.scipy.special import gammaln
 
 import jaxbridge as jb
+from jaxbridge.models.dynamics import is_linear
 
 D, N = 3, 10
 
@@ -186,6 +187,21 @@ def test_the_table_reads_well():
 def test_steps_are_exact_for_linear_models():
     assert jb.effects(jb.ornstein_uhlenbeck([[1.0]])).exact_steps.simulated
     assert not jb.effects(jb.hyperbolic(0.8, 2)).exact_steps.simulated
+
+
+def normal_density(x, p):
+    return jax.scipy.stats.multivariate_normal.logpdf(x, jnp.zeros(2), jnp.eye(2) / 2)
+
+
+@pytest.mark.parametrize(
+    "log_density, exact",
+    [(lambda x, p: -jnp.sum(x**2), True), (lambda x, p: -x @ x, True), (normal_density, False)],
+)
+def test_steps_are_exact_if_both_drifts_are_seen_to_be_linear(log_density, exact):
+    """The drift of the reversed diffusion is derived from the density; the last one has a solve."""
+    model = jb.Diffusion(lambda x, p: -x, jnp.eye(2), log_density)
+    assert is_linear(model.backward(jnp.zeros(2)), jnp.zeros(2)) == exact
+    assert jb.effects(model).corrector.simulated != exact
 
 
 def test_the_dimension_is_found():
