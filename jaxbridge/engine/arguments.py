@@ -65,7 +65,8 @@ def evaluated(name: str, function: Callable, *args: Any) -> Any:
     """Return `function(*args)`, with errors that state the name of the function.
 
     **Raises:** `TypeError` if the function cannot be traced, or raises `TypeError` itself;
-    `ValueError` for its other errors.
+    `ValueError` for its other errors. `RuntimeError`, `FloatingPointError` and errors that already
+    state the name pass unchanged.
     """
     try:
         return function(*args)

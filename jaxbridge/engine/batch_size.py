@@ -49,7 +49,7 @@ def default_num_lanes(num_wanted: int, num_steps: int, points: Float[Array, "*ax
 
 
 def most_lanes(d: int) -> int:
-    """Return the largest number of lanes that may run side by side, for points in R^d."""
+    """Return the largest number of lanes that one device runs side by side, for points in R^d."""
     bounds = _bounds()
     return max(1, min(bounds.lanes, bounds.numbers // d))
 

@@ -282,8 +282,8 @@ def count_steps(durations: Array, num_steps: int | None, step_size: float) -> In
 
     A step may be longer by a factor of 1 + 1e-4, so that rounded durations do not add a step.
 
-    **Raises:** `ValueError` if `num_steps` is given too, if durations are traced, or if `step_size`
-    is not a positive number.
+    **Raises:** `ValueError` if `num_steps` is given too, if durations are traced, if `step_size` is
+    not a positive Python number, or if all intervals together need more than 2²⁶ steps.
     """
     if num_steps is not None:
         raise ValueError("Pass `num_steps` or `step_size`, not both.")
@@ -292,13 +292,13 @@ def count_steps(durations: Array, num_steps: int | None, step_size: float) -> In
             "`step_size` needs concrete `times`; got traced ones. Pass `num_steps` instead."
         )
     if isinstance(step_size, bool) or not isinstance(step_size, int | float) or not step_size > 0:
-        raise ValueError(f"`step_size` must be a positive number; got {step_size!r}.")
+        raise ValueError(f"`step_size` must be a positive Python number; got {step_size!r}.")
     counts = np.ceil(np.asarray(durations, float) / step_size * (1 - 1e-4)).clip(1)
     if not np.sum(counts) <= _MOST_STEPS:  # refuses NaN, too
         smallest = 1.01 * np.sum(np.asarray(durations, float)) / _MOST_STEPS
         raise ValueError(
             f"`step_size` = {step_size:g} needs {np.sum(counts):.3g} steps in all; the limit is "
-            f"2²⁶ = {_MOST_STEPS:,} steps. Pass {smallest:.2g} or more."
+            f"2²⁶ = {_MOST_STEPS:,} steps. Pass a `step_size` of {smallest:.2g} or more."
         )
     return counts.astype(int)
 

@@ -25,11 +25,10 @@ _Result = TypeVar("_Result")
 
 
 def replicate(array: Array) -> Array:
-    """Replicate an array on every device if its type says that devices share it.
+    """Replicate an array on every device if its type has explicit axes of a mesh.
 
-    Arrays have such types along the explicit axes of a mesh; a program cannot index single points
-    of them. Without an ambient mesh, the array goes to the first device, because all other arrays
-    are there.
+    A program cannot index single points of such an array. Without an ambient mesh, the array goes
+    to the first device, because all other arrays are there.
     """
     if not _has_explicit_axes(array):
         return array

@@ -15,9 +15,9 @@ from .entry import public_entry
 def effective_sample_size(draws: Numbers, *, chains: bool = False) -> Float[Array, "..."]:
     """Estimate the effective sample size of one chain, n / (1 + 2 Σ_t ρ_t), or of several.
 
-    The sum runs over the initial sequence of lags whose adjacent pairs of autocorrelations ρ_t have
-    positive sums, and these sums are made non-increasing (Geyer 1992). The result is NaN where a
-    draw is NaN, and 1 for a constant chain.
+    Autocorrelations ρ_t of adjacent lags are summed in pairs. The estimate uses the pairs before
+    the first sum that is not positive, with the sums made non-increasing (Geyer 1992). The result
+    is NaN where a draw is not finite, about 1 for a constant chain, and at most n log₁₀ n.
 
     With `chains=True` the result is that of all chains together. Correlations are then relative to
     the variance of all draws (Vehtari et al. 2021), so chains that disagree have a small effective
@@ -37,8 +37,8 @@ def effective_sample_size(draws: Numbers, *, chains: bool = False) -> Float[Arra
 
     **Returns:** effective sample sizes, shape (...).
 
-    **Raises:** `ValueError` for fewer than 4 draws in a chain, `TypeError` unless `chains` is true
-    or false.
+    **Raises:** `ValueError` for fewer than 4 draws in a chain; `TypeError` for draws that are not
+    real numbers, or unless `chains` is true or false.
     """
     if not isinstance(chains, bool):
         raise TypeError(f"`chains` must be `True` or `False`; got {reprlib.repr(chains)}.")
@@ -111,9 +111,9 @@ def _correlation_time(correlation: Float[Array, "n ..."]) -> Float[Array, "..."]
 
 @public_entry
 def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
-    """Compute R̂ from the halves of several chains (split version of Gelman & Rubin 1992).
+    """Compute R̂ from the halves of one or several chains (split version of Gelman & Rubin 1992).
 
-    It is close to one if the chains agree.
+    It is close to one if the halves agree. For constant draws it has no meaning.
 
     **Example:**
 

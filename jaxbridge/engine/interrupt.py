@@ -1,10 +1,10 @@
 """Ctrl-C inside of compiled loops that report their progress.
 
 Python handles a signal only between two instructions of its main thread, and the main thread waits
-until a compiled program ends. A loop with a progress meter therefore looks for Ctrl-C itself, about
-four times per second: it calls a function on the host, which reads the file of arrived signals
-(`signal.set_wakeup_fd`). The function raises an exception there, so the program ends with an error,
-and Python raises `KeyboardInterrupt` in the main thread.
+until a compiled program ends. A loop with a progress meter therefore checks for Ctrl-C itself,
+about four times per second: it calls a function on the host, which reads the file of arrived
+signals (`signal.set_wakeup_fd`). The function raises an exception there, so the program ends with
+an error, and Python raises `KeyboardInterrupt` in the main thread.
 """
 
 import contextlib
@@ -44,7 +44,7 @@ class _Listener:
         return self.is_interrupted
 
     def look(self, step: int) -> int:
-        """Return the step that looks next, or raise `KeyboardInterrupt` after Ctrl-C."""
+        """Return the step of the next check, or raise `KeyboardInterrupt` after Ctrl-C."""
         if self.hear():
             raise KeyboardInterrupt
         now = time.monotonic()
@@ -64,7 +64,7 @@ class _Watch(NamedTuple):
     """State of an `InterruptibleMeter`.
 
     - `inner`: state of the caller's meter.
-    - `step`, `look_at`: numbers of this step, and of the next step that looks.
+    - `step`, `look_at`: numbers of this step, and of the step of the next check for Ctrl-C.
     """
 
     inner: PyTree
@@ -76,8 +76,8 @@ class _Watch(NamedTuple):
 def listening() -> Iterator[None]:
     """Let loops with an `InterruptibleMeter` end after Ctrl-C.
 
-    It has no effect outside of the main thread, which alone receives signals, nor if the caller has
-    another handler of the signal.
+    It has no effect outside of the main thread, which alone receives signals. It also has none if
+    the caller has another handler of the signal.
     """
     global _listener
     is_main = threading.current_thread() is threading.main_thread()
@@ -100,7 +100,7 @@ def listening() -> Iterator[None]:
 
 
 class InterruptibleMeter(diffrax.AbstractProgressMeter):
-    """Progress meter of the caller, with looks for Ctrl-C at some of the steps."""
+    """Progress meter of the caller that also checks for Ctrl-C at some of the steps."""
 
     meter: diffrax.AbstractProgressMeter
 

@@ -103,9 +103,9 @@ def compute_once(tree: PyTree[Array]) -> PyTree[Array]:
 
 @custom_vmap
 def in_any_lane(condition: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Return the condition, under `vmap` whether it holds in any lane.
+    """Return the condition; under `vmap`, return whether it holds in any lane.
 
-    Then `lax.cond` remains a branch, where it would otherwise compute both sides.
+    A `lax.cond` on the result remains a branch under `vmap`, instead of computing both sides.
     """
     return condition
 

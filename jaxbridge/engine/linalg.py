@@ -211,10 +211,10 @@ def lower_factor(matrix: Float[Array, "d m"]) -> Float[Array, "d d"]:
 
 
 def semidefinite_factor(matrix: Float[Array, "d n"]) -> Float[Array, "d d"]:
-    """Compute `lower_factor` of a matrix with linearly dependent rows.
+    """Compute `lower_factor` of a matrix whose rows may be linearly dependent.
 
-    It may also have more rows than columns. A row that depends on the rows above, up to rounding,
-    gets a zero on the diagonal and below.
+    The matrix may have more rows than columns. A row that depends on the rows above, up to
+    rounding, gets a zero on the diagonal and below.
     """
     d = matrix.shape[0]
     if d > _UNROLLED:

@@ -103,8 +103,8 @@ def pareto_k(log_weights: Numbers) -> Float[Array, "*I"]:
 
     - -inf if the largest weights are equal up to 0.1 %: weights are bounded, as for an exact
       proposal;
-    - inf if there are too few weights: fewer than 5 of the largest are positive, or n < 25 (unless
-      all are equal);
+    - inf if there are too few weights: fewer than 5 of the largest are positive, n < 5, or n < 25
+      and the weights are not all equal;
     - inf if a weight is infinite or NaN.
 
     **Raises:** `ValueError` for a single number.

@@ -18,7 +18,7 @@ _Context = TypeVar("_Context")
 
 
 def as_meter(progress_meter: diffrax.AbstractProgressMeter | None) -> diffrax.AbstractProgressMeter:
-    """Return the progress meter with looks for Ctrl-C; for `None`, one without any effect."""
+    """Return the progress meter, with checks for Ctrl-C; for `None`, one without any effect."""
     if progress_meter is None or isinstance(progress_meter, diffrax.NoProgressMeter):
         return diffrax.NoProgressMeter()
     return InterruptibleMeter(progress_meter)

@@ -112,8 +112,10 @@ class Verdict(eqx.Module):
         return ~reduce(jnp.logical_or, (fault.present for fault in self.faults))
 
     def with_finite(self, *numbers: Float[Array, "*shape"]) -> "Verdict":
-        """Return the same faults, and the fault that one of the numbers is not finite though no
-        other fault is present. Their first axes are those of `trustworthy`."""
+        """Add the fault that one of the numbers is not finite although no other fault is present.
+
+        The first axes of the numbers are those of `trustworthy`.
+        """
         sound = self.trustworthy
         finite = [
             jnp.all(jnp.isfinite(each), axis=tuple(range(sound.ndim, each.ndim)))
@@ -122,7 +124,7 @@ class Verdict(eqx.Module):
         return Verdict((*self.faults, Fault(sound & ~reduce(jnp.logical_and, finite), _NOT_FINITE)))
 
     def why(self) -> str:
-        """Return one line for each fault that is present.
+        """Return one line for each fault that is present, or "No fault was found."
 
         **Raises:** `TypeError` inside `jit`, where the values are traced.
         """
@@ -153,6 +155,8 @@ class AbstractResult(eqx.Module):
 
     def why(self) -> str:
         """Return why the result is not trustworthy: one line for each fault, with its remedy.
+
+        Without a fault, return "No fault was found."
 
         **Raises:** `TypeError` inside `jit`, where the values are traced.
         """

@@ -16,9 +16,9 @@ For a linear model all weights are equal. This extends guided proposals of bridg
 observations (van der Meulen & Schauer 2017; Mider, Schauer & van der Meulen 2021). The functions
 are:
 
-- `log_likelihood`: an unbiased estimate by particle filters with resampling at observations
-  (`particle_filter`), for records of any length. A guide may overrate observations far ahead; then
-  it discounts them (`forgetting`);
+- `log_likelihood`: an unbiased estimate of the likelihood by particle filters with resampling at
+  observations (`particle_filter`), for records of any length. If the guide overrates observations
+  far ahead, a discount reduces their influence (`forgetting`);
 - `innovations`: path and weight as smooth functions of parameters and of normal noise;
 - `smooth`: paths given the whole record. Either the noise moves in blocks (`path_blocks`), or,
   across long gaps, the states move with new bridges on both sides (`states`).

@@ -6,10 +6,10 @@ unbounded, and an estimate may be wrong with a small reported error. The mixture
     q(x) = ½ Σ_j w_j N(x; x_j, r_j² S) + ½ Σ_c N(x; m_c, S_c) / C
 
 avoids both. The first part has kernels at draws x_j of ν with weights w_j; S is their covariance.
-The width r_j of a kernel is the distance that contains a sixteenth of the other draws. The second
-part has wide laws for the tails, up to eight times as wide as ν. Given observations, and tilted by
-h, the law is a mixture again; its weights are multiplied by the integrals. The importance ratio is
-ν/q.
+The width r_j of a kernel is the distance from x_j within which a sixteenth of the draws lie, in
+units of √S, divided by √d. The second part has wide laws for the tails, up to eight times as wide
+as ν. Given observations, and tilted by h, the law is a mixture again; its weights are multiplied by
+the integrals. The importance ratio is ν/q.
 
 The draws come from the model's sampler of ν. Without a sampler they start as points of a ladder
 around the normal law in place of ν (`initial`), weighted by ν. Two rounds of draws from the

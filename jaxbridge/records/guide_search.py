@@ -46,7 +46,7 @@ _NO_WEIGHT = 1e20
 
 _POOR = (
     "The guide of a record is poor: its path has weight zero, or its distance from an observation "
-    "exceeds √(2 log n) + 1 standard deviations of the noise, with n observations. Start from "
+    "exceeds √(2 log n) + 1 standard deviations of the noise, with n observed numbers. Start from "
     "likelier parameters (the model's `params`, or `init=`), use more `num_steps`, or check for "
     "outliers, which the noise must allow for."
 )
@@ -55,7 +55,7 @@ _POOR = (
 class GuideCheck(NamedTuple):
     """Diagnostics of the guide of a record, at the parameters for which it was found.
 
-    Several records have a leading axis.
+    For several records all fields have a leading axis.
 
     - `log_weight`: log weight of the guided path without noise. -inf if this path diverges, leaves
         the state space, or does not explain an observation.
@@ -71,24 +71,24 @@ class GuideCheck(NamedTuple):
 
     @property
     def is_usable(self) -> Bool[Array, "*R"]:
-        """Whether the guided path without noise has a positive weight.
+        """Return whether the guided path without noise has a positive weight.
 
-        If not, paths with noise rarely have one.
+        If not, paths with noise rarely have a positive weight either.
         """
         return self.log_weight > -jnp.inf
 
     @property
     def is_near(self) -> Bool[Array, "*R"]:
-        """Whether the guide is usable and its residuals are consistent with the noise."""
+        """Return whether the guide is usable and its residuals are consistent with the noise."""
         number = jnp.maximum(self.num_observed, 1).astype(self.largest_residual.dtype)
         largest = jnp.sqrt(2 * jnp.log(number)) + _BEYOND_NOISE
         return self.is_usable & (self.largest_residual < largest)
 
     @property
     def rank(self) -> Float[Array, "*R"]:
-        """Score for comparing guides: the log weight if it is finite.
+        """Return a score for comparing guides: the log weight if the guide is usable.
 
-        Otherwise a value below all log weights, which falls with the largest residual.
+        Otherwise it is a value below all log weights, lower for a larger residual.
         """
         unusable = -_NO_WEIGHT * (1 + self.largest_residual)
         return jnp.where(self.is_usable, self.log_weight, unusable)
@@ -96,8 +96,8 @@ class GuideCheck(NamedTuple):
     def fault(self, hampered: Bool[Array, ""] | bool = True) -> Fault:
         """Return the fault of a poor guide.
 
-        Weights and chains are exact with any guide. A result with other diagnostics passes as
-        `hampered` whether these show a problem; only then is a poor guide a fault.
+        `hampered` states whether other diagnostics of the result show a problem. Only then is a
+        poor guide a fault, because weights and chains are exact with any guide.
         """
         return Fault(jnp.any(~self.is_near) & hampered, _POOR)
 
@@ -171,8 +171,9 @@ def _path_without_noise(
 def linearised(problem: RecordProblem, model: Diffusion) -> Linearised:
     """Return the best path of linearisation that the searches find, and the guide along it.
 
-    Derivatives stop at the path and at the model. The guide keeps those by the observations and the
-    initial law. Outside `jit` the searches from particles are compiled only if they are needed.
+    The path has no derivatives. The guide has derivatives with respect to the observations and the
+    initial law, but not the model. Outside `jit` the searches from particles are compiled only if
+    they are needed.
     """
     # Outside `jit` Python decides whether the second program has to be compiled at all.
     if not is_outermost():

@@ -48,8 +48,8 @@ class Guidance(NamedTuple):
     - `start`: guided law of X(t_0).
     - `linear`: steps of the linear process, leading axes (K, N).
     - `steps`: guides of all steps, leading axes (K, N).
-    - `first`: scalar observations of X(t_0), relative to ξ.
-    - `scalars`: scalar observations at the ends of segments, relative to ξ, leading axis K.
+    - `first`: scalar observations of X(t_0), relative to the point ξ of the linearisation there.
+    - `scalars`: those at the ends of segments, relative to ξ in the same way, leading axis K.
     """
 
     initial: NormalStep
@@ -300,11 +300,11 @@ def change_by_coarse_steps(
 ) -> Float[Array, ""]:
     """Return the relative change of the likelihood by steps of twice the size, from one path.
 
-    The arguments are those of its start and of each segment (`path_and_log_weights`), for both step
-    sizes. The likelihoods are products over segments, so this is Σ (e^{D_k} - 1), with D_k the
-    difference for segment k, to second order. The change e^D - 1 of the whole path, D = Σ D_k, has
-    the same mean to leading order, and a variance that increases with the square of the number of
-    segments. A path that half as many steps lose counts as -1.
+    The arguments are the log weights of the start and of each segment (`path_and_log_weights`) for
+    both step sizes. With D_k the difference for segment k, the result is Σ (e^{D_k} - 1), to second
+    order. The change e^D - 1 of the whole path, D = Σ D_k, has the same mean to leading order, but
+    a variance that increases with the square of the number of segments. The result is -1 for a path
+    that has weight zero with half as many steps.
     """
     D = log_coarse - log_weights
     is_lost = ~jnp.all(jnp.isfinite(log_coarse))

@@ -82,9 +82,10 @@ class Innovations(NamedTuple):
         return self._of_each(lambda i: paths[i, stored[: self.records.num_points(i)]])
 
     def log_weight(self, params: PyTree, xi: Float[Array, " size"]) -> Float[Array, ""]:
-        """Return log w(θ, ξ), the sum over records; -inf if a path left the state space.
+        """Return log w(θ, ξ), summed over records.
 
-        The mean of w over ξ ~ N(0, I) is the likelihood.
+        It is -inf if a path diverges or leaves the state space. The mean of w over ξ ~ N(0, I) is
+        the likelihood.
         """
         return self._run(params, xi)[1]
 
@@ -98,11 +99,10 @@ class Innovations(NamedTuple):
     def start_share(self) -> Float[Array, "*R"]:
         """Return the effective fraction of the draws of x_0 by normal noise, at `model.params`.
 
-        In a list of records each has an entry.
-
-        It is 1 if the initial law is normal. Near 0 the normal law in place of the stationary law
-        misses a mode or has too light tails. Then means of w over ξ are unreliable, and a sampler
-        may miss a mode. `log_likelihood` uses a mixture of normal laws instead.
+        A list of records has one entry per record. The fraction is 1 if the initial law is normal
+        or a point. Near 0 the normal law in place of the stationary law misses a mode or has too
+        light tails. Then means of w over ξ are unreliable, and a sampler may miss a mode.
+        `log_likelihood` uses a mixture of normal laws instead.
         """
         model = self.records.stacked.model
         share = lambda problem, points: start_share(problem, model, points)
@@ -184,9 +184,9 @@ def innovations(
         parameters are exact, too, but the guide is best near these.
     - `times`: times of the observations, shape (n,), increasing, in the model's unit of time.
         - The origin of time does not matter, because differences are computed in double precision.
-        - Time-dependent coefficients receive these times. Times at which single precision cannot
-          resolve a step are refused with `ValueError`.
-        - For traced times neither is possible: subtract a constant from them.
+        - Time-dependent coefficients receive these times. Times so large that their precision
+          cannot resolve a step then raise `ValueError`.
+        - Traced times have neither this precision nor this check: subtract a constant from them.
     - `observations`: shape (n, m), or (n,) for one component. NaN or `None` marks a missing value.
     - Pass several independent records as lists of `times` and `observations`, or with a leading
         axis. They are lanes of one program.
@@ -200,11 +200,13 @@ def innovations(
     - `num_steps`, `step_size`: pass one of the two, the number of steps between two times, by
         default 10, or the maximum step size.
     - `initial_time`: time of `initial`, if it is before the first of `times`.
-    - `density`: step density. By default steps of models with linear drift and constant σ are
-        exact. For other constant σ it is `ItoTaylorDensity()`. For a state-dependent σ the steps
-        are of weak order 2 and quadratic in the noise, or `HypoellipticDensity()` if σ has fewer
-        columns than rows. Quadratic steps to observations are split, so `size` is larger: 10 steps
-        become 14, and 1 becomes 4. Paths have the points of the 10.
+    - `density`: step density. The default depends on the model:
+        - linear drift and constant σ, not time-dependent: exact steps;
+        - other models with constant σ: `ItoTaylorDensity()`;
+        - σ with fewer columns than rows, state-dependent: `HypoellipticDensity()`;
+        - invertible, state-dependent σ: steps of weak order 2, quadratic in the noise; above ten
+          dimensions `EulerDensity()`. Quadratic steps that end at observations are split, so `size`
+          is larger: 10 steps become 14, and 1 becomes 4. Paths still have the points of the 10.
 
     **Returns:** `Innovations`, differentiable in parameters and noise. Its `why()` reports faults
     of the guide. There is a warning if the likelihood at ξ = 0 is zero.

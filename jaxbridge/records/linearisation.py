@@ -110,8 +110,8 @@ def stay_inside(
 ) -> Float[Array, " d"]:
     """Return `new` if it is inside the state space, otherwise a point between `old` and `new`.
 
-    This point is about half as far from `old` as the boundary. Near a boundary the noise, and with
-    it the linear process, may vanish.
+    Its distance from `old` is a quarter to a half of that of the boundary: near a boundary the
+    noise of the linear process may vanish.
     """
     shares = jnp.asarray(_SHARES, old.dtype)
     are_inside = jax.vmap(lambda share: inside(old + share * (new - old)))(shares)

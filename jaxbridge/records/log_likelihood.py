@@ -76,8 +76,8 @@ _DISAGREE = (
 )
 _HEAVY = (
     "At some observation the weights have heavy tails: `pareto_k` is above its bound. The bound is "
-    "0.8, less for few particles, and 1 for nearly equal weights; for fewer than 25 particles "
-    "`pareto_k` is infinite. Particles of larger weight may be missing. "
+    "0.8, less for few particles, and 1 for nearly equal weights; for fewer than 25 particles of "
+    "all filters `pareto_k` is infinite. Particles of larger weight may be missing. "
     "Use more `num_particles`, and check that `value` does not change."
 )
 _LARGEST_K = "k̂ is {:.2f} at observation {}, and its bound {:.2f}"
@@ -92,6 +92,9 @@ _LOST = (
 class LogLikelihood(AbstractResult):
     """Estimated log-likelihood of a record, from `log_likelihood`.
 
+    Below, n is the number of observations. An earlier `initial_time` adds one entry in front, and
+    several records are joined one after the other.
+
     - `value`: log p̂(y). `exp(value)` is unbiased up to the discretisation error. It is -inf if no
         particle explains the observations.
     - `standard_error`: standard error of `value`, from the spread of the filters, enlarged by
@@ -102,16 +105,17 @@ class LogLikelihood(AbstractResult):
         mean over the filters, shape (n,); without an `observation` that of each transition.
     - `pareto_k`: k̂ of the weights of all filters at each observation, shape (n,); without an
         `observation` that of each transition. Above 0.7 `value` is usually too small by more than
-        `standard_error`; the limit is 1 - 1 / log10(n) for n < 2,155 weights. The verdict allows
-        0.1 more, and 1 for nearly equal weights. Infinite for fewer than 25 particles, unless all
-        weights are equal.
-    - `num_weights`: number of weights behind each k̂.
+        `standard_error`. For W < 2,155 weights the limit is 1 - 1 / log10(W). The verdict allows
+        0.1 more, and 1 for nearly equal weights. k̂ is infinite for fewer than 25 weights, unless
+        all are equal.
+    - `num_weights`: W, the number of weights behind each k̂, those of all filters.
     - `num_nonfinite`: number of particles that diverged or left the state space.
     - `step_error`: estimated discretisation bias of `value` (estimate minus limit), from a grid
-        with half as many steps. NaN with one step.
+        with half as many steps. Zero if steps are exact. NaN with one step, unless it is quadratic
+        in the noise and therefore split (`density` of `innovations`).
     - `step_uncertainty`: uncertainty of `step_error`: Monte Carlo error, and omitted higher-order
-        terms from a grid with a
-        quarter as many steps. Infinite if changes do not shrink with the step size.
+        terms, from a grid with a quarter as many steps. Infinite if changes do not shrink with the
+        step size.
     - `forgetting`: discount rate γ of the guide, in units of 1 / time. It is zero if all later
         observations help, as for a linear model.
     - `guide`: diagnostics of the guide of each record; `None` without an `observation`. A poor
@@ -132,9 +136,9 @@ class LogLikelihood(AbstractResult):
 
     @property
     def unexplained(self) -> Int[Array, ""]:
-        """Return the index of the first observation that no particle explains.
+        """Return the index of the first observation that no particle explains, or -1.
 
-        It is -1 if there is none.
+        The index is that in `effective_sample_size`, where an earlier `initial_time` has index 0.
         """
         lost = self.effective_sample_size == 0
         return jnp.where(jnp.any(lost), jnp.argmax(lost), -1)
@@ -152,9 +156,14 @@ class LogLikelihood(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the estimate, each with a remedy.
 
-        They are: an observation that no particle explains; few effective particles, or filters that
-        disagree; heavy tails of the weights; a poor guide together with one of these; lost
-        particles; and a discretisation error that dominates and exceeds 0.05.
+        - an observation that no particle explains;
+        - few effective particles, or filters that disagree;
+        - heavy tails of the weights;
+        - a poor guide, together with one of the faults above;
+        - lost particles;
+        - a discretisation error that is unknown or too uncertain, or that dominates and exceeds
+            0.05;
+        - a value that is not finite.
         """
         error = StepError(self.step_error, self.step_uncertainty)
         lost, apart, heavy = self.unexplained >= 0, ~self._filters_agree, self._is_heavy
@@ -231,12 +240,14 @@ def log_likelihood(
     - `key`: typed key.
     - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
         `initial_time`, `density`: as in `innovations`. Pass several independent records as lists of
-        `times` and `observations`, or with a leading axis. Without an `observation` the state is
-        observed exactly. Then the result is the sum of the log transition densities by
-        `transition_log_density(proposal="auto")`, given the first state.
-    - `num_particles`: particles per filter; without an `observation` weighted paths per interval.
-    - `num_filters`: number of independent filters, by default 8, whose spread gives the error. Only
-        with an `observation`.
+        `times` and `observations`, or with a leading axis.
+    - Without an `observation` the state is observed exactly. Then the result is the sum of the log
+        transition densities by `transition_log_density(proposal="auto")`, given the first state.
+        Values must not be missing, and coefficients must not depend on time. `num_steps` is 50 by
+        default. Do not pass `step_size`, `initial`, `initial_time`, `density` or `num_filters`.
+    - `num_particles`: particles per filter, by default 100; without an `observation` weighted paths
+        per interval.
+    - `num_filters`: number of independent filters, by default 8. Their spread gives the error.
     - `throw`: raise an error at run time if the result is not `trustworthy`.
 
     **Returns:** `LogLikelihood`. For a linear model all weights are equal, and `value` is that of
@@ -260,9 +271,9 @@ def log_likelihood(
         for_records = (initial, initial_time, density, num_filters)
         if any(value is not None for value in for_records):
             raise ValueError(
-                "without an `observation` the first state is fixed, and steps and errors are those "
-                "of `transition_log_density`: leave out `initial`, `initial_time`, `density` and "
-                "`num_filters`."
+                "without an `observation` the state is observed exactly, and "
+                "`transition_log_density` computes the result: leave out `initial`, "
+                "`initial_time`, `density` and `num_filters`, or pass an `observation`."
             )
         result = _exact_log_likelihood(
             key, model, times, observations, num_particles, num_steps, step_size

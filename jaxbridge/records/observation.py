@@ -52,10 +52,10 @@ class LinearGaussian(eqx.Module):
 
     **Arguments:**
 
-    - `matrix`: L, shape (m, d); `None` if the whole state is observed.
+    - `matrix`: L, shape (m, d); by default `None`, which means that the whole state is observed.
     - `covariance`: R in squared units of y, with shape (m, m), (m,) for a diagonal matrix, or ()
-        for a multiple of I. For unknown or time-dependent noise pass a function `params -> R` of
-        the model's parameters, or `(params, t) -> R`.
+        for a multiple of I. The default 0 means exact observations. For unknown or time-dependent
+        noise pass a function `params -> R` of the model's parameters, or `(params, t) -> R`.
 
     **Raises:** `ValueError` and `TypeError` for an invalid matrix or covariance.
 
@@ -192,7 +192,8 @@ class ObservationDensity(eqx.Module):
     - `guess`: a similar `LinearGaussian` with positive variances, which guides the paths. The law
         does not depend on it, but the effective sample size does.
 
-    **Raises:** `TypeError` for invalid arguments; `ValueError` for a guess without noise.
+    **Raises:** `TypeError` for invalid arguments; `ValueError` if a variance of the guess is not
+    positive.
 
     **Example:**
 
@@ -307,9 +308,10 @@ def _independent(
 def _follows(
     scalars: Scalars, sizes: tuple[Float[Array, " m"], Float[Array, " m"]]
 ) -> tuple[Bool[Array, " m"], Bool[Array, " m"]]:
-    """Return which exact scalars follow from the previous ones, and which agree with these.
+    """Return the masks of exact scalars that earlier ones determine, and of scalars that agree.
 
-    This is the Gram–Schmidt process, up to rounding errors relative to `sizes`.
+    A scalar that earlier ones do not determine always agrees. This is the Gram–Schmidt process.
+    Differences within the rounding errors of `sizes` count as zero.
     """
     eps = 100 * jnp.finfo(scalars.values.dtype).eps
     directions, follows, agrees = [], [], []

@@ -492,7 +492,7 @@ def tuned(
 ) -> Float[Array, "*moves"]:
     """Return the adapted log β after sweep `number` of a warm-up.
 
-    `taken` states which moves of this sweep were accepted. The step of this stochastic
+    `accepted` states which moves of this sweep were accepted. The step of this stochastic
     approximation falls like `number`^-0.6.
     """
     share = jnp.mean(accepted.astype(log_scales.dtype), axis=-1)

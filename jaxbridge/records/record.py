@@ -280,8 +280,8 @@ def _check_record(
         )
     if checked_times.shape[0] < 2 or values.shape[1] == 0:
         raise ValueError(
-            "a record needs at least two times and one observed component; got `observations` of "
-            f"shape {values.shape}."
+            "a record needs at least two times (an earlier `initial_time` counts as one) and one "
+            f"observed component; got `observations` of shape {values.shape}."
         )
     check_precision("`times` and `observations`", _dtype(checked_times, values))
     check_increasing(checked_times)

@@ -66,8 +66,9 @@ _LEAST_COARSE = 0.5
 _CONSTANT = 1e-3
 
 _STUCK = (
-    "A block of the path never moved. Use more `num_draws`, a shorter `block_length` or more "
-    "steps. If several ways are possible between observations, pass a `proposal`."
+    "A block or a state of the path never moved. Use more `num_draws` or more steps. Without a "
+    "`proposal`, also try a shorter `block_length`; if several ways are possible between "
+    "observations, pass a `proposal`. With a `proposal`, use more `num_proposals`."
 )
 _CUT_OFF = (
     "Some weights of the `proposal` were truncated at its bound on the work. Increase the bound, "
@@ -81,11 +82,12 @@ class Smoothed(AbstractResult):
 
     - `times`: times of the points, shape (K,). It is a NumPy array of double precision if the
         precision of paths cannot resolve the times.
-    - `accepted`: acceptance rate of each block in both partitions into blocks, shape (2, B); with a
-        `proposal` that of each state, shape (ends,). Of several records those that are shorter than
-        the longest one have entries of zero at the end.
-    - `stuck`: whether a block never moved, shape (chains,). If so in any chain, `standard_error` is
-        infinite, because the draws do not show their error.
+    - `accepted`: acceptance rate of each block in both partitions into blocks, shape (2, B).
+        Entries of blocks beyond the end of a record have no meaning. With a `proposal` it is the
+        rate of each state, shape (ends,), and 0 for a first state that is a known point.
+    - `stuck`: whether a block, or with a `proposal` a state or a bridge, never moved, shape
+        (chains,). If so in any chain, `standard_error` is infinite, because the draws do not show
+        their error.
     - `num_truncated`: number of weights of a `proposal` that were truncated at a bound on the work.
         If there are any, draws are not exact.
     - `guide`: diagnostics of the guide. A poor guide is a fault only if chains mix poorly, too.
@@ -125,24 +127,26 @@ class Smoothed(AbstractResult):
         """Estimate the discretisation bias of `mean(fn)` to leading order, entry by entry.
 
         If all steps are normal, each path is e^D times as likely with half as many steps
-        (`schemes.halving`). For steps of order 2 with a state-dependent σ, half as many steps with
-        the same noise give another path, with e^D times its weight. With a `proposal` the
-        estimate is for the least accurate of `density` and the steps of the bridges. It is zero if
-        steps are exact, and NaN in these cases:
+        (`schemes.halving`). If steps are quadratic in the noise, half as many steps with the same
+        noise give another path, with e^D times the weight. With a `proposal` the estimate is for
+        the least accurate of `density` and the steps of the bridges. It is zero if steps are
+        exact, and NaN in these cases:
 
-        - one step;
+        - one step per interval, unless it is quadratic in the noise and therefore split;
         - Euler steps of a σ with fewer columns than rows;
-        - steps so long that the variance of D exceeds 1 in some interval (for steps of order 2: on
+        - steps so long that the variance of D exceeds 1 in some interval (for quadratic steps: on
             average), or that more than half of the coarse paths are lost;
-        - steps longer than the relaxation time of the drift. Then the uncertainty is infinite.
+        - steps longer than the relaxation time of the drift on over 2 % of the intervals. In this
+            case `step_uncertainty` is infinite.
         """
         return self._step_errors(fn)[0]
 
     def step_uncertainty(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Estimate the standard error of `step_error(fn)`, entry by entry.
 
-        If σ depends on the state, or in a hypoelliptic model ∇α σ does, it is at least
-        `step_error(fn)` itself. Then this error is known only up to a factor.
+        It is at least |`step_error(fn)`| if the noise of a step depends on the state: through σ,
+        or, if σ has fewer columns than rows, through ∇α σ with the drift α. In this case only the
+        order of magnitude of the error is known.
         """
         return self._step_errors(fn)[1]
 
@@ -300,14 +304,19 @@ def smooth(
     - `num_draws`: number of draws per chain.
     - `num_warmup`: number of iterations before the draws, which adapt the size of moves.
     - `num_chains`: number of chains, which start from independent guided paths.
-    - `block_length`: number of intervals between observations that move at once, by default 10. Use
-        more if observations are so close that neighbouring states are strongly correlated, and
-        fewer if blocks are rarely accepted. Not with a `proposal`.
+    - `block_length`: number of intervals between observations that move at once, at least 2, by
+        default 10. With `step_size` a long interval counts as several. Use more if observations
+        are so close that neighbouring states are strongly correlated, and fewer if blocks are
+        rarely accepted. Not with a `proposal`.
     - `proposal`: by default paths are guided by all observations through a linear process. Pass a
         proposal of bridges, as for `sample_exact_bridges`, if several ways are possible across a
         gap (wells, many relaxation times). "auto" tries several proposals on each gap. Then the
-        states at observation times move, with new bridges on both sides. This needs a stationary
-        law, and noise in all observed components.
+        states at observation times move, with new bridges on both sides. This needs:
+        - coefficients that do not depend on time, an invertible σ and a stationary law;
+        - noise in all observed components;
+        - an `initial` that is a point or has a density.
+
+        The default `density` then has normal steps: `EulerDensity()` for a state-dependent σ.
     - `num_proposals`: number of bridges of the `proposal` for each move of each gap, by default 10.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if the result is not `trustworthy`.
@@ -471,10 +480,10 @@ def _on_both_grids(problem: RecordProblem) -> tuple[_OnGrid, _OnGrid]:
 def _coarse_paths(
     grids: tuple[_OnGrid, _OnGrid], knots: Float[Array, "chains n points d"]
 ) -> tuple[Float[Array, "chains n"], Bool[Array, "chains n"], Float[Array, "chains n points d"]]:
-    """Return the paths of half as many steps from the noise of the paths with these knots.
+    """Return paths of half as many steps, from the noise of the paths with these knots.
 
-    Between two points of the coarse grid the distance of both paths is constant, or zero where the
-    coarse path would leave the state space.
+    Between two points of the coarse grid, the difference between coarse and fine path is constant.
+    It is zero where the coarse path would leave the state space.
 
     **Returns:** the relative change of the likelihood (`change_by_coarse_steps`), whether the
     coarse path has a weight, and the coarse path, or the path itself if it has none.

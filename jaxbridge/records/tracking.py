@@ -98,7 +98,7 @@ def _misfit(scalars: Scalars, x: Float[Array, " d"]) -> Float[Array, ""]:
 
 
 def _tempered(misfits: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
-    """Return log weights for which several particles count, for any noise."""
+    """Return log weights with which several particles stay effective, however small the noise."""
     near = jnp.sort(jnp.where(jnp.isnan(misfits), jnp.inf, misfits))[_NUM_NEAR]
     return -misfits / (2 * jnp.maximum(near, 1))
 

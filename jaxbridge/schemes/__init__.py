@@ -1,6 +1,6 @@
 """Numerical schemes, densities of one step, and discretisation errors.
 
-A scheme (`base`) has three functions. With noise ΔW ~ N(0, δ I):
+The main functions of a scheme (`base`) are, with noise ΔW ~ N(0, δ I):
 
 - `step` computes the next point, x' = step(x, ΔW);
 - `noise` inverts the step, ΔW = noise(x, x');

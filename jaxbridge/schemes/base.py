@@ -36,7 +36,7 @@ class AbstractScheme(eqx.Module):
     def fitted(
         self, dynamics: Dynamics, like: Float[Array, " d"], dt: Float[Array, ""]
     ) -> "AbstractScheme":
-        """Return the scheme with all quantities computed that do not depend on the point.
+        """Return a copy of the scheme that stores all quantities that do not depend on the point.
 
         Examples are matrix functions of the equation and of `dt`. `like` is a point of the right
         shape and dtype. Schemes without such quantities return `self`.

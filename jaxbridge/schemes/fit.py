@@ -16,7 +16,7 @@ from .milstein import Milstein
 
 
 def check_model(model: Diffusion, intervals: Intervals, scheme: AbstractScheme) -> None:
-    """Raise `ValueError` if the model does not fit the end points, or the scheme the model.
+    """Raise `ValueError` if the end points or the scheme do not fit the model.
 
     Only values are checked, and traced values are skipped. Shapes are checked when the model's
     functions are traced.

@@ -24,7 +24,8 @@ class Milstein(AbstractScheme):
     power of δ. For a step without a solution, the inverse returns ΔW_i = -1/∂_iσ_i, which gives the
     nearest step.
 
-    **Raises:** `ValueError`, at the first use, if σ is a full, state-dependent matrix.
+    **Raises:** `ValueError`, at the first use, if σ is a full, state-dependent matrix, or if σ_i
+    depends on other coordinates at an end point.
 
     **Example:**
 

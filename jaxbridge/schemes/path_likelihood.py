@@ -63,7 +63,7 @@ def path_log_likelihood(
 ) -> Float[Array, "*batch"]:
     """Return the log-likelihood of paths, differentiable in the parameters of the drift.
 
-    With `form="euler"` it is differentiable in those of σ, too.
+    With `form="euler"` it is also differentiable in the parameters of σ.
 
     **Arguments:**
 
@@ -79,9 +79,10 @@ def path_log_likelihood(
     **Returns:** log-likelihoods of shape (...), in the dtype of `path`. They are logs of densities,
     relative to the law of σW, or to Lebesgue measure for "euler".
 
-    **Raises:** `ValueError` for shapes that do not fit, times that do not increase, a σ with fewer
-    columns than rows, or a form that is invalid for the model. `TypeError` for a derivative in
-    parameters of σ, except with "euler".
+    **Raises:** `ValueError` for shapes that do not fit, times that do not increase, coefficients
+    that depend on time, a σ with fewer columns than rows, or a form that is invalid for the model.
+    `TypeError` for arguments of other types, for half precision, and for a derivative in parameters
+    of σ, except with "euler".
 
     **Example:**
 

@@ -118,8 +118,9 @@ class AbstractStepDensity(eqx.Module):
 
     @property
     def usual_order(self) -> float:
-        """Return the order that reported errors of densities and bridges assume: `order` if steps
-        are normal, 1.5 if they are quadratic in the noise.
+        """Return the order that reported errors of densities and bridges assume.
+
+        It is `order` if steps are normal, and 1.5 if they are quadratic in the noise.
         """
         # Higher terms make the errors of quadratic steps shrink more slowly at first: for CIR and
         # Jacobi diffusions by factors of 2.9 to 3.1 from 4 to 8 steps, and of 3.3 to 3.8 from 16 to
@@ -242,7 +243,7 @@ class HypoellipticDensity(AbstractStepDensity):
 
     ```python
     volatility = jb.integrated(jb.Diffusion(lambda x, p: 1 - x, lambda x, p: jnp.sqrt(x)))
-    proposal = jb.HypoellipticDensity()  # the default for records of such models
+    density = jb.HypoellipticDensity()  # the default for records of such models
     ```
     """
 
@@ -412,7 +413,7 @@ class LocalLinearDensity(AbstractStepDensity):
     - A step takes two to three times as long, for the exponential of a matrix.
     - σ may have fewer columns than rows.
 
-    Steps of linear models are exact without this argument.
+    For linear models it is not needed: their default steps are exact.
 
     **Raises:** `ValueError`, at the first use, for a state-dependent σ.
 
@@ -521,7 +522,8 @@ def most_accurate_density(
 ) -> AbstractStepDensity:
     """Return the most accurate step density of a model, for points like `like`.
 
-    `normal_steps` states that paths must determine their noise, so that steps must be normal.
+    `normal_steps` requires normal steps, with which a path determines its noise. Without it, steps
+    for an invertible, state-dependent σ are quadratic in the noise, up to ten dimensions.
     """
     sigma_varies, invertible = model.sigma_varies(like), model.sigma_is_invertible(like)
     if decisions.exact_steps(model.is_linear(like)).simulated:

@@ -94,8 +94,9 @@ def error_of_log_mean(
 ) -> StepError:
     """Estimate the step error of the log of the mean of the weights.
 
-    `held` states that the weights are the state of a pseudo-marginal chain. Their law is then
-    tilted by their mean.
+    `log_halving` is D of each path, NaN for paths without D. `share` is (2^p - 1)⁻¹, infinite if
+    the error is unknown (`share_in_regime`). `held` states that the weights are the state of a
+    pseudo-marginal chain. Their law is then tilted by their mean.
     """
     weights, has_D = _known_weights(log_weights, log_halving)
     D = jnp.where(has_D, log_halving, 0)
@@ -203,7 +204,11 @@ def relative_change(D: Float[Array, "..."], typical: Float[Array, "..."]) -> Flo
 
 @jax.jit  # a single program if the caller is not compiled
 def dominates(error: StepError, standard_error: Inexact[Array, "..."]) -> Bool[Array, "..."]:
-    """Return whether the step error exceeds the standard error, or may do so undetected."""
+    """Return whether the step error exceeds the standard error, or may do so undetected.
+
+    This holds if its size exceeds both the standard error and twice its uncertainty, if the
+    uncertainty exceeds three standard errors, or if either is NaN.
+    """
     size, uncertainty = jnp.abs(error.value), error.uncertainty
     is_small = size <= jnp.maximum(standard_error, 2 * uncertainty)
     return ~(is_small & (uncertainty <= 3 * standard_error))
@@ -225,8 +230,10 @@ def with_rounding(error: StepError, num_steps: int, d: int) -> StepError:
 def root_mean_square_in_sds(
     value: Float[Array, "*I K d"], variance: Float[Array, "*I K d"]
 ) -> Float[Array, "*I"]:
-    """Return the root mean square of errors at points of a path, in standard deviations of these
-    points, over those that vary."""
+    """Return the root mean square of errors at points of a path, in their standard deviations.
+
+    Entries that do not vary are left out.
+    """
     varies = variance > 1e-6 * jnp.max(variance, axis=(-2, -1), keepdims=True)
     squares = jnp.where(varies, value**2 / jnp.where(varies, variance, 1), 0)
     number = jnp.maximum(jnp.sum(varies, axis=(-2, -1)), 1).astype(value.dtype)
@@ -242,10 +249,10 @@ def step_faults(
 ) -> tuple[Fault, ...]:
     """Return the faults of a step error that dominates and that matters.
 
-    It matters if it, or its uncertainty, exceeds 0.05 in the log of a density, or 0.05 of a
-    standard deviation `sd`. At most one fault is present in each entry: the error is large, or
-    unknown for one of three reasons, or its estimate is too uncertain. `coupled` states that the
-    paths are from a coupling, which has no estimate for a state-dependent σ.
+    The error matters if it or its uncertainty exceeds 0.05 `sd`; for the log of a density `sd` is
+    1. At most one fault is present in each entry: the error is large, or unknown for one of three
+    reasons, or its estimate is too uncertain. `coupled` states that the paths are from a coupling,
+    which has no estimate for a state-dependent σ.
     """
     size, uncertainty, floor = jnp.abs(error.value), error.uncertainty, _MATTERS * sd
     present = dominates(error, standard_error) & ~((size <= floor) & (uncertainty <= floor))
@@ -282,7 +289,7 @@ _GUESS = 3.0
 
 
 def guessed(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
-    """Return the share, with a large guess in place of an unknown one."""
+    """Return the share, with the guess 3 in place of an unknown (infinite) one."""
     return jnp.where(share == UNKNOWN_SHARE, _GUESS, share)
 
 
@@ -313,7 +320,7 @@ def unknown_where(unknown: Bool[Array, ""], error: StepError) -> StepError:
 
 
 def share_of_known_order(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
-    """Return (2^p - 1)⁻¹ from a share that may be a large guess."""
+    """Return the share, at most 1: an unknown or guessed one becomes that of order p = 1."""
     return jnp.minimum(share, 1)
 
 

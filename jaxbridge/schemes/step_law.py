@@ -44,16 +44,13 @@ class StepLaw(NamedTuple):
 
     @property
     def matrix(self) -> Float[Array, "d d"]:
-        """Covariance S in noise coordinates as a matrix, shape (d, d).
-
-        `covariance` may instead be a scalar.
-        """
+        """Return S as a matrix, shape (d, d), also if `covariance` is a scalar."""
         S, d = self.covariance, self.mean.shape[0]
         return S * jnp.eye(d, dtype=self.mean.dtype) if S.ndim == 0 else S
 
     @property
     def root(self) -> Float[Array, "d d"]:
-        """Λ of N(μ, Λ Λᵀ), shape (d, d); zero for δ = 0."""
+        """Return Λ of N(μ, Λ Λᵀ), shape (d, d); zero for δ = 0."""
         root = self.sigma.as_matrix(self.mean.shape[0], self.mean.dtype) * root_of_length(self.dt)
         S = self.covariance
         return root * jnp.sqrt(S) if S.ndim == 0 else matmul(root, cholesky(S))
@@ -88,7 +85,7 @@ class StepLaw(NamedTuple):
         return jnp.where(moving, bent, point)
 
     def noise(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
-        """Return ξ, the normalised noise of the step to `point`: the inverse of `point`."""
+        """Return the noise ξ ~ N(0, I) of the step to `point`, the inverse of `point(ξ)`."""
         S, scaled = self.covariance, self._scaled(point)
         return scaled / jnp.sqrt(S) if S.ndim == 0 else solve_lower(cholesky(S), scaled)
 
@@ -112,7 +109,7 @@ class StepLaw(NamedTuple):
 
     @property
     def log_scale(self) -> Float[Array, ""]:
-        """log |det σ|, which `log_relative` omits."""
+        """Return log |det σ|, which `log_relative` omits."""
         return self.sigma.log_abs_det()
 
     def carried(
@@ -160,8 +157,8 @@ class DegenerateLaw(NamedTuple):
     """Normal law N(μ, Λ Λᵀ), possibly singular, of one step of length δ.
 
     - `mean`: μ, shape (d,).
-    - `root`: Λ, lower triangular, shape (d, d). The diagonal of Λ is zero for
-        coordinates without noise.
+    - `root`: Λ, lower triangular, shape (d, d). The diagonal of Λ is zero for coordinates without
+        noise.
     - `dt`: δ.
     """
 
@@ -171,7 +168,7 @@ class DegenerateLaw(NamedTuple):
 
     @property
     def _moves(self):
-        """Mask of the coordinates with noise."""
+        """Return the mask of the coordinates with noise."""
         return jnp.diagonal(self.root) > 0
 
     def solve(self, displacement: Float[Array, " d"]) -> Float[Array, " d"]:
@@ -189,7 +186,7 @@ class DegenerateLaw(NamedTuple):
 
     @property
     def log_scale(self) -> Float[Array, ""]:
-        """Zero: `log_relative` omits no term that depends on the law."""
+        """Return zero: `log_relative` omits no term that depends on the law."""
         return jnp.zeros((), self.mean.dtype)
 
     def carried(
@@ -203,7 +200,7 @@ class DegenerateLaw(NamedTuple):
     ) -> "DegenerateLaw":
         """Return the law at the end of two steps from `x`: `first`, then a linear step.
 
-        `self` is the law of that linear step if it started in `x`. `decay` is its matrix, in noise
+        `self` is the law of that linear step if it started in `x`. `decay` is its matrix, in state
         coordinates.
         """
         mean = self.mean + self.carried(decay, first.mean - x)
