@@ -5,10 +5,19 @@ import reprlib
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from .checks import Numbers, as_floating
 from .entry import public_entry
+
+# A spread of at most so many units in the last place is rounding error.
+_ROUNDING = 64.0
+
+
+def vary(draws: Float[Array, "..."], axis: int | tuple[int, ...]) -> Bool[Array, "..."]:
+    """Return whether draws differ, along these axes, by more than rounding errors."""
+    spread, size = jnp.std(draws, axis=axis), jnp.max(jnp.abs(draws), axis=axis)
+    return spread > _ROUNDING * float(jnp.finfo(draws.dtype).eps) * size
 
 
 @public_entry
@@ -17,7 +26,7 @@ def effective_sample_size(draws: Numbers, *, chains: bool = False) -> Float[Arra
 
     Autocorrelations ρ_t of adjacent lags are summed in pairs. The estimate uses the pairs before
     the first sum that is not positive, with the sums made non-increasing (Geyer 1992). The result
-    is NaN where a draw is not finite, about 1 for a constant chain, and at most n log₁₀ n.
+    is NaN where a draw is not finite, 1 for a constant chain, and at most n log₁₀ n.
 
     With `chains=True` the result is that of all chains together. Correlations are then relative to
     the variance of all draws (Vehtari et al. 2021), so chains that disagree have a small effective
@@ -56,7 +65,7 @@ def effective_sample_size(draws: Numbers, *, chains: bool = False) -> Float[Arra
 def _effective_sample_size(draws):
     n = draws.shape[0]
     covariance = _autocovariance(draws)
-    varies = covariance[0] > 0
+    varies = vary(draws, 0)
     size = n / _correlation_time(covariance / jnp.where(varies, covariance[0], 1))
     # Antithetic chains can exceed n, but the excess is poorly determined: bound it.
     size = jnp.where(varies, jnp.minimum(size, n * math.log10(n)), 1)
@@ -82,7 +91,7 @@ def effective_size_of_chains(draws: Float[Array, "chains n ..."]) -> Float[Array
     covariance = jnp.mean(jax.vmap(_autocovariance)(draws), axis=0) / (n - 1)
     within = covariance[0]
     overall = within * ((n - 1) / n) + jnp.var(jnp.mean(draws, axis=1), axis=0, ddof=1)
-    varies = overall > 0
+    varies = vary(draws, (0, 1))
     correlation = 1 - (within - covariance) / jnp.where(varies, overall, 1)
     total = num_chains * n
     size = total / _correlation_time(correlation.at[0].set(1))
@@ -113,7 +122,8 @@ def _correlation_time(correlation: Float[Array, "n ..."]) -> Float[Array, "..."]
 def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
     """Compute R̂ from the halves of one or several chains (split version of Gelman & Rubin 1992).
 
-    It is close to one if the halves agree. For constant draws it has no meaning.
+    It is close to one if the halves agree. It is NaN if all draws are equal up to
+    rounding.
 
     **Example:**
 
@@ -151,4 +161,5 @@ def _potential_scale_reduction(draws):
     halves = jnp.concatenate([draws[:, :n], draws[:, -n:]])
     between = jnp.var(jnp.mean(halves, axis=1), axis=0, ddof=1)
     within = jnp.mean(jnp.var(halves, axis=1, ddof=1), axis=0)
-    return jnp.sqrt((n - 1) / n + between / within)
+    R_hat = jnp.sqrt((n - 1) / n + between / within)
+    return jnp.where(vary(draws, (0, 1)), R_hat, jnp.nan)

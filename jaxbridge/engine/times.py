@@ -85,7 +85,9 @@ class Times(NamedTuple):
         if as_floating(name, first).shape != ():
             raise ValueError(f"`{name}` must be a number, shape (); got {first!r}.")
         values, first = np.asarray(self.values), np.asarray(first, float)
-        if not np.isfinite(first) or (values.size and values.flat[0] < first):
+        if not np.isfinite(first):
+            raise ValueError(f"`{name}` must be finite; got {first}.")
+        if values.size and values.flat[0] < first:
             raise ValueError(
                 f"`times` must begin at `{name}` = {first} or later; they begin at "
                 f"{values.flat[0]}. Pass an earlier `{name}`."

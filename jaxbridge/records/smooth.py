@@ -18,7 +18,7 @@ from ..coupling import step_law_of
 from ..engine.averages import PathFunction, as_path_function
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
-from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
+from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction, vary
 from ..engine.entry import public_entry
 from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
@@ -56,8 +56,6 @@ from .step_regime import steps_are_too_long
 
 # Chains disagree if R̂ exceeds this bound.
 _MOST_R_HAT = 1.1
-# A spread of at most so many units in the last place is rounding error.
-_ROUNDING = 64.0
 # If the variance of D of a segment exceeds this bound, the second-order expansion is unreliable.
 _MOST_VARIANCE = 1.0
 # With fewer paths than this share that have a coarse path, there is no estimate of step errors.
@@ -209,8 +207,7 @@ class Smoothed(AbstractResult):
 
         Entries with exact observations do not vary.
         """
-        sd, size = jnp.std(self.paths, axis=(0, 1)), jnp.max(jnp.abs(self.paths), axis=(0, 1))
-        return sd > _ROUNDING * float(jnp.finfo(sd.dtype).eps) * size
+        return vary(self.paths, (0, 1))
 
     @property
     def _errors_in_sds(self) -> tuple[StepError, Float[Array, ""]]:

@@ -39,7 +39,11 @@ def test_chains_that_agree_have_r_hat_near_one():
 
 
 def test_chains_that_do_not_move():
-    assert jb.effective_sample_size(np.ones(100)) == 1
+    for value in (0.0, 0.1, 3.3, 1e6):  # some means of equal numbers differ from them by rounding
+        draws = np.full((4, 100), value)
+        assert jb.effective_sample_size(draws[0]) == 1
+        assert jb.effective_sample_size(draws, chains=True) == 4
+        assert np.isnan(jb.potential_scale_reduction(draws))
     assert np.isnan(jb.effective_sample_size(np.full(100, np.nan)))
 
 
