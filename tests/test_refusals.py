@@ -465,7 +465,7 @@ EXACT = [
     (
         "elsewhere",
         exact(position=np.zeros((51, 2)) + 9.0),
-        "`position` must be finite, from and to",
+        "`position` must be finite, with the end points",
     ),
     ("intervals", kernel(PAPER, [A] * 3, [B] * 3, 1.0), "for one interval"),
     ("another grid", of(renewal.init)(jnp.zeros((5, 2)), KEY), r"shape \(21, 2\), or `None`"),
@@ -848,7 +848,7 @@ UNUSED = [
     *each("σ", lambda b: maximum(proposal="auto", **{b: 5}), BUDGET, ": for couplings.*σ depends"),
     # Counts, where nothing is counted.
     *(
-        (f"{name} of {how}", gibbs(proposal=PAIRS, **how, **{name: 5}), f"`{name}`: for `method=")
+        (f"{name} of {how}", gibbs(proposal=PAIRS, **how, **{name: 5}), f"`{name}`: only weights")
         for name in ("num_counts", "max_trials")
         for how in ({}, {"method": "renewal"}, {"bridges": "approximate"})
     ),

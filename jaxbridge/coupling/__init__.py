@@ -21,11 +21,11 @@ normaliser. Four modules serve the estimation of π(z):
 
 - `hitting` counts the associated diffusions up to a hit.
 - `start_laws` holds the laws of their initial state: the stationary density ν, or another law.
-- `burn_in` measures the time after which a run has the law ν, for a ν without sampler.
+- `burn_in` measures the time after which a run nearly has the law ν, for a ν without sampler.
 - `smoothed_draws` builds a start law with a density from draws of ν.
 
-`nearest_law` gives the step density nearest to a coupling. `effects` returns a
-table of the effects that such a program simulates, with reasons.
+`nearest_law` gives the step density nearest to a coupling. `effects` returns a table of the effects
+that the program of a model and a coupling simulates, with reasons.
 """
 
 # Names for the packages that build on this one.

@@ -5,8 +5,8 @@ the other direction: Z takes the place of X' in equation (stjerne-dif),
 
     dY = α(Y) dt + σ(Y) Oᵀ [{I - (1-γ)Π} dW̃ + √(1-γ²) u dU'].
 
-Here W̃ is the noise of Z, and u, Π and O are those of the pair (Y, Z). Y hits Z where the two would
-have met as a proposed pair: the same meeting rule decides, and index 0 counts.
+Here W̃ is the noise of Z, and u, Π and O are those of the pair (Y, Z). The meeting rule of proposed
+pairs also decides whether Y hits Z. A hit may occur in any step, also in the first.
 """
 
 from typing import NamedTuple
@@ -30,7 +30,7 @@ class Associated(NamedTuple):
 
     - `hit`: whether it hit the bridge.
     - `start`: its initial state.
-    - `finite`: false where it became non-finite before a hit.
+    - `finite`: false if it became non-finite (NaN, infinite or beyond 1e18) before a hit.
     """
 
     hit: Bool[Array, " lanes"]

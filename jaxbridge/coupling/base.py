@@ -24,20 +24,23 @@ Rotation = Callable[[Float[Array, "d d"], Float[Array, "d d"]], Float[Array, "d 
 class AbstractCoupling(eqx.Module):
     """Base class of couplings: two maps of noise increments, and rules for steps and meetings.
 
-    Both maps act on one point:
+    A subclass has the fields `meeting`, `scheme`, `start_law` and `rotation`, as in `Coupling`. The
+    maps are the methods `driven_noise` and `driving_noise`. Both act on the noise of one step of
+    size δ at one point:
 
     - `dw`, shape (d,), is the noise of X after its rotation by O.
     - `driven_dw`, shape (d,), is the noise of X'.
     - `du`, shape (), is an independent N(0, δ) increment. It is `None` if `independent_noise` is
         false, and then none is sampled.
 
-    Each map must turn N(0, δ I) noise into N(0, δ I) noise. The two maps must be the two
-    conditional laws of one joint law.
+    Each map must turn N(0, δ I) noise into N(0, δ I) noise. One joint law of both noises must have
+    the two maps as its conditional laws: of ΔW' given ΔW, and of ΔW given ΔW'.
 
-    Fields must be arrays or static, because results that leave `jit` contain their coupling.
+    Fields must be arrays, modules of arrays, or static: results that leave `jit` contain their
+    coupling.
 
-    Subclass this class for another coupling. The example is synchronous while the gap is large, and
-    reflects the noise when the gap is small:
+    Example of another coupling: X and X' share their noise while the gap is large, and the noise is
+    reflected when the gap is small.
 
     ```python
     import equinox as eqx
@@ -77,20 +80,20 @@ class AbstractCoupling(eqx.Module):
     def driven_noise(
         self, frame: Frame, dw: Float[Array, " d"], du: Float[Array, ""] | None
     ) -> Float[Array, " d"]:
-        """Return ΔW', the noise of the driven X', for the noise ΔW of X."""
+        """Return ΔW', the noise of X', for the noise ΔW of X after its rotation by O."""
 
     @abstractmethod
     def driving_noise(
         self, frame: Frame, driven_dw: Float[Array, " d"], du: Float[Array, ""] | None
     ) -> Float[Array, " d"]:
-        """Return ΔW, the noise of X, given ΔW' of X'.
+        """Return ΔW, the noise of X after its rotation by O, for the noise ΔW' of X'.
 
-        It is the other conditional law of the joint law of `driven_noise`.
+        The map is the conditional law of ΔW given ΔW', under the joint law of `driven_noise`.
         """
 
     @abstractmethod
     def gap_variance(self, frame: Frame) -> Float[Array, ""]:
-        """Return the variance of `uᵀ(dW - dW')` per unit of time."""
+        """Return the variance of `uᵀ(dW - dW')` per unit of time, with dW after its rotation."""
 
     @abstractmethod
     def realise(self, keys: Key[Array, " lanes"]) -> "AbstractCoupling":

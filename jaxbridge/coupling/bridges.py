@@ -1,7 +1,7 @@
 """Approximate bridges by rejection sampling (section 2.2): propose until the pair meets.
 
-The proposals of an interval are numbered attempts (`rejection`). Its j-th success is its j-th
-bridge.
+The proposals of an interval are numbered attempts (`rejection`). The j-th attempt whose pair meets
+is the j-th bridge of the interval.
 """
 
 import functools
@@ -34,20 +34,21 @@ from .join import Inputs, Proposals, propose
 
 
 class Bridges(AbstractResult):
-    """Result of `sample_bridges`: approximate bridges.
+    """Result of `sample_bridges`: n approximate bridges in R^d.
 
     With I intervals arrays have a leading axis I. `times` has it only if there are I durations.
 
-    - `times`: the K stored times, shape (K,); by default the whole grid from 0 to the duration.
+    - `times`: the K stored times, shape (K,). `save_at` selects them; by default they are the whole
+        grid from 0 to the duration.
     - `paths`: the bridges, shape (n, K, d). A missing bridge is NaN at all times.
     - `met`: whether the bridge was found, shape (n,).
     - `meeting_step`: ρ, the first step at which the path follows the reversed path, between 1 and
         N; -1 for a missing bridge. Shape (n,).
     - `reverse_start`: the reversed path at time 0, shape (n, d); NaN for a missing bridge.
-    - `num_proposals`: number of proposals up to the last bridge, or up to the bound. The number of
-        `met` divided by it estimates the acceptance probability.
+    - `num_proposals`: number of proposals up to the last bridge, or `max_proposals`, shape (). The
+        number of bridges found divided by it estimates the acceptance probability.
     - `num_nonfinite`: number of these proposals that became non-finite (NaN, infinite or beyond
-        1e18). They are rejected.
+        1e18), shape (). They are rejected.
     - `coupling`, `num_steps`: the coupling and the number N of steps of the proposals.
     """
 
@@ -93,7 +94,7 @@ def sample_bridges(
     **Arguments:**
 
     - `key`: a typed key, `jax.random.key(...)`.
-    - `model`: the diffusion. Its time reversal must be known.
+    - `model`: the diffusion. Its time reversal must be known, and σ must be invertible.
     - `start`, `end`: points, shape (d,), or shape (I, d) for I intervals. The paths have the widest
         floating point type of `start`, `end` and `duration`.
     - `duration`: the length of the interval, in units of time, shape () or (I,).
@@ -105,20 +106,20 @@ def sample_bridges(
     - `save_at`: the stored times, shape (K,): increasing grid points in [0, duration]. With several
         durations these are fractions of the duration. By default the whole grid is stored.
     - `batch_size`: number of proposals that run side by side. It bounds memory, and changes results
-        by rounding only. The default is the number of useful proposals, as far as they fit in 16
-        MiB (at least 256 if these fit in 512 MiB); on an accelerator in 1 GiB.
+        by rounding only. The default is one for each bridge, at least 64, as far as their paths fit
+        in 16 MiB of each CPU device, or 1 GiB of each accelerator. Up to 256 may take 512 MiB.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if a bridge is missing or a parameter is not finite.
 
     **Returns:** `Bridges`.
 
     **Gradients** of the paths with respect to `params`, `start`, `end` and `duration` exist in
-    forward and reverse mode, at fixed noise and fixed meeting step. Accepted paths are then
-    replayed from their keys, all side by side, only if a derivative is requested. They are *not*
-    derivatives of expectations over bridges, because the parameters also decide whether a pair
-    meets.
+    forward and reverse mode, at fixed noise and fixed meeting step. If a derivative is requested,
+    the accepted paths are simulated again from their keys. These gradients are *not* derivatives of
+    expectations over bridges, because the parameters also decide whether a pair meets.
 
-    **Raises:** `ValueError` and `TypeError` for invalid arguments. Traced values are not checked.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments, and `ValueError` for a model
+    without time reversal. Traced values are not checked.
 
     **Example:**
 
@@ -256,11 +257,11 @@ def _propose_numbered(
     meeting_step: Int[Array, " lanes"] | None = None,
     time_scale: Float[Array, " lanes"] | float = 1.0,
 ) -> Proposals:
-    """Return one proposal in each lane: the one with this `number` among those of this `interval`.
+    """Return one proposal in each lane: proposal `number` of `interval`.
 
-    Its random numbers depend only on the key of the interval and on `number`. So the same call
-    reproduces a proposal. With `meeting_step` the pair is joined at that step, and the meeting rule
-    is ignored (see `propose`). `time_scale` multiplies the durations.
+    Its random numbers depend only on the key of the interval and on `number`, so the same call
+    reproduces it. With `meeting_step` the pair is joined at that step, and the meeting rule is
+    ignored (see `propose`). `time_scale` multiplies the durations.
     """
     start, end, duration = inputs.intervals
     lanes = Intervals(start[interval].T, end[interval].T, duration[interval] * time_scale)

@@ -5,9 +5,9 @@ reversed diffusion by reflection. One copy starts from b, the other from the end
 length s from b. Let τ be the time when they meet. By the coupling inequality, the total variation
 distance between the laws of the copies at time t is at most P(τ > t).
 
-The method doubles s until all of 512 pairs meet within s. Then a distance that a run of length s
-can open is also closed within s. A very small s does not pass, because pairs at distance √s do not
-all meet within s. The burn-in is 2s.
+The method doubles s until all of 512 pairs meet within s. Then a time s closes every distance that
+a run of length s opens. A very small s does not pass, because pairs at a distance of order √s do
+not all meet within s. The burn-in is 2s.
 
 The result has these limits:
 
@@ -62,7 +62,7 @@ def with_burn_in(
     duration: Float[Array, " P"],
     num_steps: int,
 ) -> AbstractCoupling:
-    """Return the coupling; if its start law needs a burn-in, measure it and set it there.
+    """Return the coupling, with a measured burn-in in its start law if that needs one.
 
     The burn-in is infinite if no time was found. `run_is_cut` recognises that value.
     """
@@ -84,7 +84,8 @@ def with_start_law(
 ) -> AbstractCoupling:
     """Return the coupling for weights, where the start law may be any law with a density.
 
-    Where ν would need a run for each trial, the start law becomes that of smoothed draws.
+    For `Stationary()` without `burn_in`, and a model with a density but no sampler of ν, smoothed
+    draws replace ν as the start law. Otherwise the result is that of `with_burn_in`.
     """
     measured = with_burn_in(key, model, coupling, end, duration, num_steps)
     if not (needs_burn_in(coupling.start_law, model) and model.has_density):
@@ -126,10 +127,10 @@ def measure_burn_in(
 ) -> Float[Array, ""]:
     """Estimate a time after which the reversed diffusion from `end` is nearly stationary.
 
-    Pass it to `Stationary(burn_in=...)`. It is a multiple of `duration`: twice a time within which
-    all of 512 coupled pairs meet.
+    Pass this time to `Stationary(burn_in=...)`. It is a multiple of the (longest) `duration`: twice
+    a time within which all of 512 coupled pairs meet. Pairs that become non-finite do not count.
 
-    The remaining distance to ν, in total variation, depends on the drift:
+    The remaining distance to the stationary density ν, in total variation, depends on the drift:
 
     - It is about 1e-5 under exponential mixing, for instance if the drift pulls back however far
         out.
@@ -140,12 +141,12 @@ def measure_burn_in(
 
     **Arguments:** as in `sample_bridges`. Of `coupling` only the scheme and the rotation matter.
 
-    **Returns:** the time, shape (). Inside `jit` it is infinite where this function would raise an
-    error. Functions that measure the burn-in themselves do the same, and mark their results as
-    `truncated`.
+    **Returns:** one time for all intervals, shape (). Inside `jit` it is infinite if no time was
+    found. Functions that measure the burn-in themselves also use infinity, and mark results of
+    runs that are too short as `truncated` (see `Stationary`).
 
-    **Raises:** `ValueError` for invalid arguments, if some pairs have not met after 2¹⁷ steps, or
-    if most paths become non-finite.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments. `ValueError` if some pairs have
+    not met after at most 2¹⁷ steps, or if most pairs become non-finite.
 
     **Example:**
 
@@ -190,7 +191,8 @@ def _measure_time(
 ) -> Float[Array, ""]:
     """Return 2s for the first s = 1, 2, 4, ... times `num_steps` steps within which all pairs meet.
 
-    Return infinity if there is no such s.
+    Pairs that become non-finite are ignored. Return infinity if there is no such s, or if more than
+    half of the pairs become non-finite.
     """
     key = key_for("burn-in", key)
     interval = jnp.arange(_NUM_PAIRS) * len(end) // _NUM_PAIRS

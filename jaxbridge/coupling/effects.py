@@ -1,7 +1,6 @@
 """The function `effects`: the effects that the compiled program of a model contains, with reasons.
 
-It is a module of its own because it calls all the decisions that couplings, schemes and models
-make.
+It calls all the decisions that couplings, schemes and models make.
 """
 
 import functools
@@ -36,23 +35,23 @@ def effects(
     num_steps: int = 50,
     save_at: Numbers | None = None,
 ) -> Effects:
-    """Return which effects the proposals of a model simulate, which they omit, and why.
+    """Return a table of the effects that the program of a model simulates or omits, with reasons.
 
-    The table comes from the same decisions as the program itself.
+    The program itself makes the same decisions.
 
     **Arguments:**
 
     - `model`, `coupling`: as in `sample_bridges`.
     - `at`: any point of the state space, shape (d,). The default is zero, in the first of the
-        dimensions 2, 1, 3, 4, ... that the functions of the model accept.
+        dimensions 2, 1, 3, ..., 64 that the functions of the model accept.
     - `num_steps`, `save_at`: as in `sample_bridges`.
 
-    **Returns:** `Effects`, which prints as a table. Couplings do not apply if σ has fewer columns
-    than rows, or if coefficients depend on time. Then the last three rows state what guided paths
-    simulate.
+    **Returns:** `Effects`, which prints as a table. The last four rows are for guided paths, the
+    others for couplings. Couplings do not apply if σ has fewer columns than rows, or if
+    coefficients depend on time. Then all rows for couplings are left out.
 
-    **Raises:** `ValueError` if no dimension fits, or if the time reversal is unknown; `TypeError`
-    if `model` is not a `Diffusion` or `coupling` is not a `Coupling`.
+    **Raises:** `ValueError` if `at` is not a point, if no dimension fits, or if the time reversal
+    is unknown; `TypeError` if `model` is not a `Diffusion` or `coupling` is not a `Coupling`.
 
     **Example:**
 

@@ -33,31 +33,34 @@ from .start_laws import AnyStartLaw, Reversed, Stationary, as_start_law
 class Coupling(AbstractCoupling):
     """The γ-coupling of section 2.1 of the paper.
 
-    γ = -1 is reflection (Lindvall & Rogers 1986). γ = 0 is projection (Chen & Li 1989): in one
-    dimension X' is then independent of X, which is the method of Bladt & Sørensen (2014). As γ → 1
-    the two share more of their noise and meet more rarely, but the joined path is closer to a
-    bridge.
+    A bridge is joined from two paths: X, simulated backwards from the end, and X', simulated
+    forwards from the start. γ = -1 is reflection (Lindvall & Rogers 1986). γ = 0 is projection
+    (Chen & Li 1989): in one dimension X' is then independent of X, as in Bladt & Sørensen (2014).
+    As γ → 1 the two share more of their noise and meet more rarely, but the joined path is closer
+    to a bridge.
 
     **Arguments:**
 
     - `gamma`: γ in [-1, 1); or a law, a function `key -> γ` that samples a γ for each proposal.
-        Only a law or a traced value can be outside [-1, 1). Such pairs never meet, and count in
-        `num_nonfinite`.
+        A value of a law, or a traced one, may be outside [-1, 1). Pairs with such a γ never meet,
+        and count in `num_nonfinite`.
     - `meeting`: `BrownianCrossing()`, `SignTest(radius)` or, for γ = -1, `ReflectionPlane()`.
     - `scheme`: by default `HeunOrEuler()`, which is Heun's scheme for constant σ, Euler's for a
         state-dependent σ, and the exact `GaussianTransition()` for linear drift and constant σ in
         one or two dimensions. Others are `Heun()`, `Euler()` and `Milstein()`; `SemiImplicit()` for
         stiff or superlinear drift.
-    - `rotation`: O(x, x'), a function of the matrices σ(x) and σ(x'), for a full state-dependent σ.
-        The default `None` drives the pair through the triangular root of V = σσᵀ, which needs no
-        rotation; with `Heun()` it selects `polar_rotation`.
+    - `rotation`: for a full state-dependent σ, a function of the matrices σ(x) and σ(x') that
+        returns an orthogonal matrix O, such that σ(x')O is close to σ(x). The default `None` drives
+        the pair through the triangular root of V = σσᵀ, which needs no rotation; with `Heun()` it
+        selects `polar_rotation`.
     - `start_law`: μ, the law of the initial state of the associated diffusion: `Stationary()`,
         `GaussianLaw(mean, covariance)`, or any object with `sample(key, model)` and a normalised
-        `log_density(x)`; see `fit_start_law`. Only functions that correct bridges to their exact
-        law use it.
+        `log_density(x)`; see `fit_start_law`. Only functions that count hits of bridges use it,
+        such as those that weight bridges; `sample_bridges` does not.
 
-    **Raises:** `ValueError` for γ outside [-1, 1), or for `ReflectionPlane` with γ ≠ -1;
-    `TypeError` for an invalid meeting rule, scheme or start law.
+    **Raises:** `ValueError` for γ that is not a number in [-1, 1), for `ReflectionPlane` with γ ≠
+    -1, or for a `GaussianLaw` without a density; `TypeError` for an invalid meeting rule, scheme,
+    rotation or start law.
 
     **Example:**
 

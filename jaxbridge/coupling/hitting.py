@@ -1,5 +1,4 @@
-"""Hitting counts: the number of associated diffusions up to the first hit of a bridge (section
-2.3).
+"""Hitting counts: numbers of associated diffusions up to the first hit of a bridge (section 2.3).
 
 The count
 
@@ -61,9 +60,9 @@ class HittingCounts(AbstractResult):
         ended before that count was complete, or if the bridge is missing.
     - `truncated`: whether the trials ended early, shape (n,). It is also true if the run that
         replaces a sampler of ν was cut off, so that trials do not start from ν: see `Stationary`.
-    - `num_trials`: number of trials, shape (n,).
+    - `num_trials`: number of trials up to the last hit, or up to `max_trials`, shape (n,).
     - `num_nonfinite`: number of these trials that became non-finite, which is no hit. Shape (n,).
-    - `start`: initial state of the last trial that hit, shape (n, d).
+    - `start`: initial state of the last trial that hit, shape (n, d); NaN without a hit.
     """
 
     counts: Int[Array, "*I n N"]
@@ -74,16 +73,16 @@ class HittingCounts(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the faults of each bridge: the bridge is missing, or its trials ended early."""
+        """Return the faults of each bridge: it is missing, or its counts are `truncated`."""
         return Verdict((missing_bridges(self.num_trials == 0), truncated_weights(self.truncated)))
 
     @property
     def mean(self) -> Float[Array, "*I n"]:
         """Return ρ̂, the mean of the counts: an unbiased estimate of 1/π(x), shape (n,).
 
-        If the trials ended early, it is their number divided by the number of hits, or their number
-        if there was no hit. It is then finite, and too small on average. It is NaN for a missing
-        bridge.
+        If the trials ended early, ρ̂ is their number divided by the number of hits, or their number
+        if there was no hit. It is then finite and biased: too small on average if the bridge is
+        rarely hit within `max_trials`, and always for N = 1. It is NaN for a missing bridge.
         """
         # Complete counts add up to `num_trials`, so both cases are one formula.
         hits = jnp.maximum(self._num_hits, 1).astype(self.start.dtype)
@@ -94,8 +93,9 @@ class HittingCounts(AbstractResult):
     def probability(self) -> Float[Array, "*I n"]:
         """Return an unbiased estimate of the hitting probability π(x), shape (n,).
 
-        It is (N - 1)/(Σ_j T_j - 1) for N counts (Haldane 1945). For N = 1 it is 1 if the first
-        trial hit, else 0. It is NaN for a missing bridge.
+        It is (N - 1)/(Σ_j T_j - 1) for N counts T_j (Haldane 1945). For N = 1 it is 1 if the first
+        trial hit, else 0. If the trials ended early, it is the share of hits among them. It is NaN
+        for a missing bridge.
         """
         hits, trials = self._num_hits, self.num_trials
         # If the trials ended early, their number was fixed: a binomial sample, with estimate
@@ -114,8 +114,8 @@ class HittingCounts(AbstractResult):
     def standard_error(self) -> Float[Array, "*I n"]:
         """Return the standard error of `probability`, shape (n,): about π √((1-π)/N).
 
-        If no trial missed, it is about 1/N, because N hits in N trials cannot distinguish π from 1
-        any better. It is infinite for fewer than three hits, which are too few for an estimate.
+        If all N trials hit, it is about 1/N: they do not exclude a π that is smaller than 1 by 1/N.
+        It is infinite for fewer than three hits, which are too few for an estimate.
         """
         hits, trials, probability = self._num_hits, self.num_trials, self.probability
         # One miss in all trials is the smallest share of misses that is visible.
@@ -145,21 +145,22 @@ def hitting_counts(
 ) -> HittingCounts:
     """Count the associated diffusions up to a hit, N times for each bridge.
 
-    The counts T(x) are independent, and estimate the hitting probabilities π(x).
+    π(x) is the probability that the diffusion associated with the bridge x hits x. The counts T(x)
+    are independent, have the mean 1/π(x), and give estimates of π(x).
 
     **Arguments:**
 
     - `key`: a typed key.
     - `model`: the model of the bridges.
-    - `bridges`: the result of `sample_bridges`, `weigh_bridges` or `sample_exact_bridges`, with
-        whole paths (no `save_at`).
+    - `bridges`: the result of `sample_bridges`, `weigh_bridges`, `sample_weighted_bridges` or
+        `sample_exact_bridges`, for a `Coupling` and with whole paths (no `save_at`).
     - `num_counts`: N, the number of counts for each bridge.
     - `start_law`: μ; by default the start law of the bridges' coupling.
     - `max_trials`: bound on the trials of each bridge. The default is 10,000 for each count.
     - `batch_size`: number of trials that run side by side. It changes results by rounding only.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
-    **Returns:** `HittingCounts`.
+    **Returns:** `HittingCounts`. It is not differentiable.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
@@ -240,9 +241,9 @@ def count_hits(
     active: Bool[Array, " P"],
     search: Search,
 ) -> HittingCounts:
-    """Count trials up to each hit, for the active ones of P bridges.
+    """Count trials up to each hit, for each active one of P bridges.
 
-    Trials of all bridges share one batch.
+    Trials of all bridges run in one batch.
     """
     return over_problems(_count_hits, (keys, paths, duration, active), (model, coupling), search)
 
@@ -313,7 +314,8 @@ def coupling_of_bridges(bridges: BridgePaths, start_law: AnyStartLaw | None) -> 
     if not isinstance(bridges, BridgePaths):
         raise TypeError(
             f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}. Pass the "
-            "result of `sample_bridges`, `weigh_bridges` or `sample_exact_bridges`."
+            "result of `sample_bridges`, `weigh_bridges`, `sample_weighted_bridges` or "
+            "`sample_exact_bridges`."
         )
     if bridges.coupling is None:
         raise ValueError(
@@ -324,8 +326,8 @@ def coupling_of_bridges(bridges: BridgePaths, start_law: AnyStartLaw | None) -> 
         raise ValueError(
             "`bridges` must be whole paths, because a hit may occur at any grid point; got "
             f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points. Sample them "
-            "without `save_at`. For exact bridges at some times only, `sample_exact_bridges` with "
-            "`save_at` needs no counts afterwards."
+            "without `save_at`. If you need exact bridges at some times only, use "
+            "`sample_exact_bridges` with `save_at`: it needs no counts afterwards."
         )
     if start_law is None:
         return bridges.coupling

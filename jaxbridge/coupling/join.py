@@ -36,7 +36,7 @@ from .rotation import driven_through_root
 
 
 class Inputs(NamedTuple):
-    """The arguments in which a path may be differentiated."""
+    """Arguments of proposals with respect to which a path has derivatives."""
 
     model: Diffusion
     coupling: AbstractCoupling
@@ -44,9 +44,9 @@ class Inputs(NamedTuple):
 
 
 class Proposals(NamedTuple):
-    """Joined paths, lanes in the last axis.
+    """Proposed bridges, with lanes in the last axis.
 
-    - `paths`: the joined paths at the K stored steps.
+    - `paths`: the joined paths at the K stored grid points.
     - `reverse_start`: X_0, the value of the reversed path at time 0.
     - `meeting_step`: ρ, between 1 and N, or N + 1 if the pair does not meet.
     - `finite`: false if one of the two paths became non-finite before the pair met.
@@ -68,8 +68,8 @@ def propose(
     """Propose one bridge in each lane.
 
     The random numbers of a lane depend on the key of that lane only. The intervals of `inputs` have
-    lanes in the last axis. `stored` are the steps among 0, ..., N at which the joined path is
-    stored; by default all are. With `meeting_step` the function replays proposals: it joins each
+    lanes in the last axis. `stored` are the indices, among 0, ..., N, of the grid points to store;
+    by default all are stored. With `meeting_step` the function replays proposals: it joins each
     pair at that step, and ignores the meeting rule.
     """
     model, coupling, (start, end, duration) = inputs
@@ -104,7 +104,7 @@ def reverse_path(
     dt: Float[Array, " lanes"],
     num_steps: int,
 ) -> tuple[Float[Array, "d lanes"], Float[Array, "N d lanes"]]:
-    """Simulate the reversed path X_N = b, ..., X_0. Return X_0, and X_1, ..., X_N as one array."""
+    """Simulate X_N = b, ..., X_0 backwards in time. Return X_0, and X_1, ..., X_N as one array."""
     step = steps_in_lanes(scheme, backward, end[:, 0], dt)
     return noisy_scan(
         lambda x, inputs: (step(x, inputs[0]), x),

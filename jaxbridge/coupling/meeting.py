@@ -42,7 +42,7 @@ class PairStep(NamedTuple):
 
     - `frame`: the frame in which the noise of the step is coupled.
     - `x`, `x_next`: the states of X before and after the step, shape (d,).
-    - `driven`, `driven_next`: those of X', shape (d,).
+    - `driven`, `driven_next`: the states of X' before and after the step, shape (d,).
     - `dt`: the step size, shape ().
     - `gap_variance`: variance of the gap along `frame.u` per unit of time, shape ().
     """
@@ -70,10 +70,12 @@ class PairStep(NamedTuple):
 class AbstractMeeting(eqx.Module):
     """Base class of meeting rules, which decide whether a pair meets during a step.
 
+    Class attributes:
+
     - `draws_uniform`: whether the rule needs a uniform random number. If not, none is sampled and
         `uniform` is `None`.
-    - `looks_ahead`: whether the direction u of the pair is that after the drift of the step. If
-        false, it is that at the beginning of the step, as in the paper.
+    - `looks_ahead`: if true, the direction u of the gap is taken after the drift of the step. If
+        false, it is taken at the beginning of the step, as in the paper.
     """
 
     draws_uniform: ClassVar[bool]
@@ -83,7 +85,7 @@ class AbstractMeeting(eqx.Module):
     def met(
         self, step: PairStep, forward: Dynamics, uniform: Float[Array, ""] | None
     ) -> Bool[Array, ""]:
-        """Return whether the pair meets in this step."""
+        """Return whether the pair meets in this step. `forward` has the drift and σ of X and X'."""
 
 
 class SignTest(AbstractMeeting):
@@ -129,9 +131,9 @@ class ReflectionPlane(AbstractMeeting):
 
         uᵀσ⁻¹ (x_{i+1} - x_i - α(x_i) δ) ≤ -½ D_i,
 
-    where D_i is the length of σ⁻¹ (x_i - x'_i), and u its direction. If both drifts are equal, it
-    is the test of `SignTest()`. Results have an error of O(√δ), as those of `SignTest()`.
-    `Coupling` raises `ValueError` for this rule with another γ.
+    where D_i is the length of σ⁻¹ (x_i - x'_i), and u its direction. If the drifts at x_i and x'_i
+    are equal, this is the rule of `SignTest()`. Results have an error of O(√δ), as for
+    `SignTest()`. `Coupling` raises `ValueError` for this rule with another γ.
 
     **Example:**
 
@@ -150,7 +152,7 @@ class ReflectionPlane(AbstractMeeting):
 
 
 class BrownianCrossing(AbstractMeeting):
-    """Random meeting rule: whether a Brownian gap reaches zero between its two known ends,
+    """Random meeting rule: the gap is a Brownian bridge within a step, and reaches zero with
 
         P(met | D_i, D_{i+1}) = min(1, exp(-2 D_i D_{i+1} / (s δ))).
 

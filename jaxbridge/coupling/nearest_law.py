@@ -23,10 +23,10 @@ def step_law_of(
 ) -> tuple[AbstractStepDensity, float]:
     """Return the step density nearest to a coupling, and the share for its discretisation error.
 
-    The share is the discretisation error of the scheme relative to the change by half as many
-    steps, computed with that density. It is `UNKNOWN_SHARE` (infinite) for a state-dependent σ and
-    for meeting rules other than `BrownianCrossing`, because the change then says little about the
-    error.
+    Half as many steps change the estimate; this change is computed with the step density. The share
+    is the discretisation error of the scheme divided by the change. It is `UNKNOWN_SHARE`
+    (infinite) for a state-dependent σ and for meeting rules other than `BrownianCrossing`, because
+    the change then has little information about the error.
 
     Unknown schemes count as schemes of first order, so their error is overestimated rather than
     underestimated. So does `SemiImplicit`, whose mean has second order for linear drift only.

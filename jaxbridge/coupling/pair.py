@@ -54,7 +54,10 @@ def in_lanes(
     keys: Key[Array, " lanes"],
     dt: Float[Array, " lanes"],
 ) -> tuple[Lane, Lane]:
-    """Return the settings of all lanes, and their `vmap` axes. Arrays have the dtype of `like`."""
+    """Return the settings of all lanes, and their `vmap` axes.
+
+    Floating point arrays of the coupling get the dtype of `like`.
+    """
     coupling = cast_floats(coupling, like.dtype)
     realised = coupling.realise(keys)
     # Only arrays that `realise` replaced have an axis of lanes.
@@ -87,7 +90,7 @@ def relative_frame(
 ) -> Frame:
     """Return the relative position of `x` and `driven`, the states of X and X', as a `Frame`.
 
-    If the meeting rule `looks_ahead`, it is the frame of the scheme, after the drift, and otherwise
+    If the meeting rule `looks_ahead`, this is the position after the drift of the step, otherwise
     that at the beginning of the step. `scheme` is the coupling's scheme, fitted to the step size.
     """
     # The rule decides: the gap after the drift of the step, or the gap before it as in the paper.

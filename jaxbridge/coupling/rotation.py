@@ -1,7 +1,7 @@
 """The rotation O(x, x') of a pair (section 2.1): it aligns σ(x')O with σ(x).
 
 Any O is exact if both directions share it. Let σ = L Q, with L lower triangular and Q orthogonal.
-The cheapest choice is O(x, x') = Q(x')ᵀQ(x). Then W̃ = Q W drives X through L
+The cheapest choice is O(x, x') = Q(x')ᵀQ(x). It is equivalent to L in place of σ, and no rotation
 (`driven_through_root`): L(x) tends to L(x') as x tends to x', and linear systems with L need only
 substitution.
 """
@@ -23,6 +23,8 @@ def polar_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d d"]
 
     `sigma` is σ(x) and `driven_sigma` is σ(x'), both of shape (d, d). The paper prints the
     transpose, which is `published_rotation`.
+
+    **Raises:** `ValueError` for other shapes, `TypeError` for less than single precision.
 
     **Example:**
 
@@ -55,6 +57,8 @@ def published_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d
     It is the transpose of the rotation that aligns σ(x) with σ(x'), so it turns the wrong way.
     `sigma` is σ(x) and `driven_sigma` is σ(x'), both of shape (d, d).
 
+    **Raises:** `ValueError` for other shapes, `TypeError` for less than single precision.
+
     **Example:**
 
     ```python
@@ -68,7 +72,7 @@ def published_rotation(sigma: Float[Array, "d d"], driven_sigma: Float[Array, "d
 def _as_matrices(sigma: Numbers, driven_sigma: Numbers) -> tuple[Array, Array]:
     """Return both arguments as square matrices of the same shape.
 
-    **Raises:** `ValueError` for other shapes.
+    **Raises:** `ValueError` for other shapes, `TypeError` for less than single precision.
     """
     first, second = as_floating("sigma", sigma), as_floating("driven_sigma", driven_sigma)
     if first.ndim != 2 or first.shape[0] != first.shape[1] or second.shape != first.shape:
@@ -118,9 +122,9 @@ def root_effect(coupling: AbstractCoupling, sigma: type[AbstractSigma]) -> decis
 def driven_through_root(
     coupling: AbstractCoupling, dynamics: Dynamics, like: Float[Array, " d"]
 ) -> Dynamics:
-    """Return the same diffusion, driven through the triangular root where that helps the pair.
+    """Return dynamics of the same law, with the triangular root L of V = σσᵀ where that helps.
 
-    With σ = L Q it is the diffusion that Q W drives through L. Its law is the same.
+    With σ = L Q the result is the diffusion that Q W drives through L.
     """
     # Abstract evaluation gives the type of σ without any computation.
     if not root_effect(coupling, type(eqx.filter_eval_shape(dynamics.sigma, like))).simulated:

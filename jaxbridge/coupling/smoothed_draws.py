@@ -5,9 +5,10 @@ start law μ with a density (`start_laws`), so M runs suffice. Their end points 
 
     μ(x) = λ E(x) + (1 - λ) M⁻¹ Σ_j Π_k K((x_k - x_jk) / h_k) / h_k,    K(u) = (1 - |u|)⁺.
 
-- E has elliptical contours and the mean and covariance of the x_j: E ∝ (1 - |L⁻¹(x - m)|²/ρ²)^α. It
-    is close to a normal law, and serves in many dimensions, where kernels are far apart.
-- The kernels serve laws with several modes.
+- E has elliptical contours and the mean and covariance of the x_j: E ∝ (1 - |L⁻¹(x - m)|²/ρ²)^α
+    where this is positive. It is close to a normal law, and is useful in many dimensions, where
+    kernels are far apart.
+- The kernels are useful for laws with several modes.
 - λ and the widths h maximise, over a few candidates, the effective share of weights μ/ν under ν:
 
     (∫ μ)² / ∫ μ²/ν.
@@ -92,7 +93,7 @@ def smoothed_draws(
     otherwise: Float[Array, " d"],
     model: Diffusion,
 ) -> SmoothedDraws:
-    """Return the start law of these draws of ν.
+    """Return the start law of these draws of ν, with the best of the candidate λ and widths.
 
     The finite point `otherwise` replaces draws that are not finite.
     """

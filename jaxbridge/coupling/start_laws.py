@@ -62,23 +62,24 @@ class Stationary(eqx.Module):
     It is the best start law for likely end points. The way to sample from ν depends on the model:
 
     - A model with a sampler of ν: draws come from the sampler.
-    - A model with a density but without sampler: weights and chains use 512 smoothed draws as the
-        start law. That law has a density of its own, near ν, and the bridges are as exact. The
-        `proposal` of a result contains it.
-    - A model without sampler, if `burn_in` is set, or if ν itself is needed, as in
+    - A model with a density but without sampler, and no `burn_in`: weights and chains replace ν by
+        a start law fitted to 512 draws. This law has a density of its own, near ν, and the bridges
+        are as exact. The `proposal` of a result contains it. Kernels such as `pseudo_marginal` need
+        a `burn_in` instead.
+    - Other models without sampler; also if `burn_in` is set, or if ν itself is needed, as in
         `hitting_counts`: each draw is the end of a new run of the reversed diffusion, from b and of
         length `burn_in`.
 
     By default the burn-in is measured as in `measure_burn_in`, and is infinite if no time is found.
-    A run takes at most 2¹⁸ steps. If that is shorter than the burn-in, results are marked as
-    `truncated`. The remaining distance to ν, in total variation, is below 1e-5 under exponential
-    mixing, but may be 2e-3 for heavy-tailed laws.
+    A run takes at most 2¹⁸ steps. If a run for each draw would be shorter than the burn-in, results
+    are marked as `truncated`. The remaining distance to ν, in total variation, is about 1e-5 under
+    exponential mixing, but may be 2e-3 for heavy-tailed laws.
 
     **Arguments:**
 
     - `burn_in`: length of a run in units of time, shape (), or `None` (default).
 
-    **Raises:** `ValueError` for a `burn_in` that is not a positive time, shape ().
+    **Raises:** `ValueError` for a `burn_in` that is not a positive finite time, shape ().
 
     **Example:**
 
@@ -95,14 +96,14 @@ class Stationary(eqx.Module):
             return
         value = np.asarray(self.burn_in)
         if value.shape != () or not value > 0 or not np.isfinite(value):
-            raise ValueError(f"`burn_in` must be a positive time, shape (); got {burn_in}.")
+            raise ValueError(f"`burn_in` must be a positive finite time, shape (); got {burn_in}.")
 
 
 class Reversed(eqx.Module):
     """The start law p*_T(b, ·) as printed in the paper. For comparisons only.
 
-    It is the law of the time-reversed diffusion from b after the whole duration. Weights with it do
-    **not** give the exact law.
+    It is the law of the time-reversed diffusion, started at b, after the whole duration. Weights
+    with this start law do **not** give the exact law.
 
     **Example:**
 
@@ -192,7 +193,7 @@ def as_start_law(law: Any) -> AnyStartLaw:
 def log_ratio(law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]) -> Float[Array, ""]:
     """Return log (μ/ν)(x), shape (), up to the constant of ν.
 
-    It is zero for `Stationary`. For `Reversed` it is set to zero, as in the printed algorithm.
+    It is zero for `Stationary`. For `Reversed` it is set to zero, as in the paper's algorithm.
     """
     if isinstance(law, Stationary | Reversed):
         return jnp.zeros((), x.dtype)
@@ -201,8 +202,9 @@ def log_ratio(law: AnyStartLaw, model: Diffusion, x: Float[Array, " d"]) -> Floa
 
 
 def needs_burn_in(law: AnyStartLaw, model: Diffusion) -> bool:
-    """Return whether the burn-in must be measured: for `Stationary()` without `burn_in`, if the
-    model has no sampler of ν.
+    """Return whether the burn-in must be measured.
+
+    It must for `Stationary()` without `burn_in`, if the model has no sampler of ν.
     """
     return isinstance(law, Stationary) and law.burn_in is None and not model.has_sampler
 
@@ -210,10 +212,9 @@ def needs_burn_in(law: AnyStartLaw, model: Diffusion) -> bool:
 def run_is_cut(
     law: AnyStartLaw, model: Diffusion, dt: Float[Array, " lanes"], num_steps: int
 ) -> Bool[Array, " lanes"]:
-    """Return, for each lane, whether the run that replaces a sampler of ν is shorter than its
-    burn-in.
+    """Return, for each lane, whether the run that replaces a sampler of ν ends before the burn-in.
 
-    Then the end of the run does not have the law ν. It is always true for an infinite burn-in,
+    Then the end of the run does not have the law ν. The result is true for an infinite burn-in,
     which stands for an unknown one.
     """
     if not isinstance(law, Stationary) or law.burn_in is None or model.has_sampler:

@@ -6,8 +6,8 @@
 - `importance` weights independent bridges (importance sampling).
 - `chains` runs Markov chains of bridges. Their kernels are `pseudo_marginal`, `renewal` and
     `crank_nicolson`, one module each, with common parts in `kernels`.
-- `density` estimates transition densities by means of weights.
-- `expectation` has correct derivatives of means over bridges.
+- `density` estimates transition densities, as means of weights.
+- `expectation` estimates means over bridges, with correct derivatives.
 - `extrapolation` combines two grids into an estimate without the leading discretisation error.
 """
 

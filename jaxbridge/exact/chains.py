@@ -50,45 +50,46 @@ def sample_exact_bridges(
 ) -> Chain:
     """Sample a Markov chain of bridges with the exact law: section 2.3 of the paper.
 
-    The law is exact up to the discretisation error, which `num_steps` controls. Proposals do not
-    depend on the state of the chain. So thousands of proposals and their counts run at a time,
-    before the chain. The renewal chain runs in segments, which are joined where they agree.
+    The stationary law of the chain is exact up to the discretisation error, which `num_steps`
+    controls. Proposals of the pseudo-marginal chain do not depend on its state, so thousands of
+    them and their counts run at a time, before the chain. The renewal chain runs in segments side
+    by side, which are joined where they agree.
 
-    Up to rounding the result is the chain of the kernel, if that has the same step density: kernels
-    have Euler steps for a state-dependent σ. The chain of the kernel starts from `init(position,
-    init_key)`, and its steps have the keys `jax.random.split(run_key, num_bridges)`. Here `run_key`
-    and `init_key` are the two keys of `jax.random.split(key)`.
+    The kernel of the same name as `method` gives the same chain, up to rounding, if it starts from
+    `init(position, init_key)` and its steps have the keys `jax.random.split(run_key, num_bridges)`.
+    Here `run_key, init_key = jax.random.split(key)`. Exception: for guided proposals and a
+    state-dependent σ, kernels have Euler steps.
 
     **Arguments:**
 
     - `key`: a typed key. With I intervals the i-th chain has the key `jax.random.fold_in(key, i)`.
     - `model`, `start`, `end`, `duration`, `num_steps`, `save_at`: as in `sample_bridges`.
     - `num_bridges`: n, the number of iterations.
-    - `position`: the path from which the chain starts, shape (N+1, d), for instance the last one of
-        another chain; shape (I, N+1, d) for I intervals. By default the chain proposes its first
-        path. With a `position` and a state-dependent σ, guided proposals have Euler steps, because
-        a given path must determine its noise. Do not pool such draws with those of a chain that
-        proposed its first path.
+    - `position`: the path from which the chain starts, for instance the last one of another chain,
+        shape (N+1, d) with N = `num_steps`; shape (I, N+1, d) for I intervals. By default the chain
+        proposes its first path. With a `position` and a state-dependent σ, guided proposals have
+        Euler steps, because a given path must determine its noise. Do not pool such draws with
+        those of a chain that proposed its first path.
     - `proposal`: a `Coupling`, with its start law; a guided proposal (`ModifiedDiffusionBridge()`,
         `ResidualBridge()` or `Guided()`), whose target is a product of step densities; "auto",
         which selects the best one for each interval by a pilot run; or a result of
         `choose_proposal`. The default is `Coupling(gamma=0.0)`, and `Guided()` for
-        "crank_nicolson".
-    - `method`: "pseudo_marginal", "renewal" or "crank_nicolson". "renewal" is for couplings: an
-        iteration costs less, but a good sample takes many more iterations. "crank_nicolson" is for
-        guided proposals with low acceptance: it moves the noise of the current path a little in
-        each iteration.
-    - `num_counts`: N, the number of hitting counts for each proposal of the pseudo-marginal chain;
-        by default one. Not for the renewal chain.
-    - `max_proposals`: bound on the attempts for each new path; by default 10,000.
+        "crank_nicolson". "renewal" needs a coupling, "crank_nicolson" a guided proposal.
+    - `method`: "pseudo_marginal", "renewal" or "crank_nicolson". An iteration of "renewal" costs
+        less, but a good sample takes many more iterations. "crank_nicolson" is for guided proposals
+        with low acceptance: it moves the noise of the current path a little in each iteration.
+    - `num_counts`: number of hitting counts for each proposal of the pseudo-marginal chain; by
+        default one. Only for couplings, and not for the renewal chain.
+    - `max_proposals`: bound on the attempts for each new path; by default 10,000. Only for
+        couplings.
     - `max_trials`: bound on the trials for the counts of each path; by default 10,000 for each
-        count. See `Chain.truncated`. Not for the renewal chain.
+        count. See `Chain.truncated`. Only for couplings, and not for the renewal chain.
     - `step_size`: β in (0, 1] of "crank_nicolson", by default 0.5; see `crank_nicolson`.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
         not finite.
 
-    **Returns:** `Chain`. It is not differentiable.
+    **Returns:** `Chain`. It is not differentiable: derivatives raise `TypeError`.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
@@ -122,7 +123,7 @@ def sample_exact_bridges(
         # Silently ignored arguments would mislead, so they are refused.
         if not (num_counts is None and max_trials is None):
             raise ValueError(
-                "`num_counts` and `max_trials` are for the pseudo-marginal chain; got "
+                "`num_counts` and `max_trials` are for the pseudo-marginal chain only; got "
                 f"num_counts={num_counts} and max_trials={max_trials} for the renewal chain, which "
                 "counts nothing. Omit both."
             )

@@ -7,8 +7,8 @@ weighted by w(ξ). The move
 
 leaves N(0, I) invariant. So the chain accepts ξ' with probability min(1, w(ξ')/w(ξ)). It suits long
 or hard bridges, where independent proposals are rarely accepted. β = 1 gives independent proposals.
-The acceptance does not depend on the number of steps (Beskos, Roberts, Stuart & Voss 2008; Cotter,
-Roberts, Stuart & White 2013).
+The acceptance rate does not fall to zero as the number of steps grows (Beskos, Roberts, Stuart &
+Voss 2008; Cotter, Roberts, Stuart & White 2013).
 """
 
 from typing import NamedTuple
@@ -54,8 +54,8 @@ class CrankNicolsonState(NamedTuple):
     - `log_weight`: its log weight, -inf for a path that became non-finite.
     - `log_halving`: log of the factor by which half as many steps would change the weight
         (`halving`).
-    - `coarse_path`: path of half as many steps from the same noise, shape (N+1, d); `None` if the
-        path itself serves as such a path.
+    - `coarse_path`: the path that the same noise gives with half as many steps, shape (N+1, d);
+        `None` if the path itself is used for this, as for normal steps.
     """
 
     position: Float[Array, "*I points d"]
@@ -97,8 +97,10 @@ def crank_nicolson(
 
     **Arguments:** as in `sample_exact_bridges`, with these differences:
 
-    - `proposal`: by default `Guided()`.
-    - `step_size`: β in (0, 1], by default 0.5. Choose it for an acceptance of 25 to 50 %.
+    - `proposal`: a guided proposal, by default `Guided()`. For a state-dependent σ it has Euler
+        steps.
+    - `step_size`: β in (0, 1], by default 0.5. A smaller β gives smaller moves, which are accepted
+        more often. Choose it for an acceptance rate of 25 to 50 %.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
@@ -158,7 +160,7 @@ def _state_of(
     noise: Float[Array, "I steps d"],
     num_steps: int,
 ) -> CrankNicolsonState:
-    """Return the states with this noise."""
+    """Return the states whose paths have this noise."""
     paths, log_weights, log_change, coarse_paths = path_of(
         proposal, dynamics, intervals, noise, num_steps
     )

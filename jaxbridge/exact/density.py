@@ -44,32 +44,35 @@ class TransitionLogDensity(AbstractResult):
     """Result of `transition_log_density`: estimates for one pair of points, shape (), or for I
     pairs.
 
-    - `value`: log p̂_T(a, b); `exp(value)` is unbiased. It is -inf if no proposal became a bridge.
+    - `value`: log p̂_T(a, b); `exp(value)` is unbiased up to the discretisation error. It is -inf if
+        no proposal became a bridge.
     - `standard_error`: standard error of `value`, by the delta method. It is infinite if the
         weights do not determine it, or if weights were truncated (`num_truncated`), because it does
         not include the bias of the truncation. It is reliable only for a large
         `effective_sample_size`.
     - `effective_sample_size`: (Σw)²/Σw² over the proposals.
     - `num_met`: number of proposals that became bridges.
-    - `num_truncated`: number of weights that `max_trials` truncated. Each makes the estimate too
-        small on average. More trials, or a start law that hits sooner, avoid it.
-    - `num_simulated`: number of simulated paths.
+    - `num_truncated`: number of truncated weights (see `WeightedBridges.truncated`). They bias the
+        estimate; with one count for each proposal it is too small on average. More `max_trials`, or
+        a start law that hits sooner, avoid this.
+    - `num_simulated`: number of simulated paths, proposals and trials.
     - `num_nonfinite`: number of these that left the state space or became non-finite. Their mass is
-        missing from `value`: about `-log(1-s)`, s being the share of lost paths, and more where
-        weights are unequal. The result is not `trustworthy` if that may exceed 5 % and the standard
+        missing from `value`: about `-log(1-s)` for a share s of lost paths, and more if weights are
+        unequal. The result is not `trustworthy` if the missing mass may exceed 5 % and the standard
         error.
-    - `proposal`: the proposal of the paths. If its start law `Stationary` needs runs, it contains
-        their `burn_in`.
+    - `proposal`: the proposal of the paths, with the start law of the weights. If this law is
+        `Stationary` and needs runs, it contains their `burn_in`.
     - `pareto_k`: k̂ of the weights. Above 0.7 neither `value` nor `standard_error` is reliable
         (above 0.6 for very unequal weights, above 1 for nearly equal ones).
     - `step_error`: estimated discretisation bias of `value` (estimate minus limit). It is NaN if
-        unknown, for one step or for couplings with a state-dependent σ(x): use two grids and
-        `extrapolate`.
-    - `step_uncertainty`: standard error of `step_error`. For very many steps (about ten thousand in
-        single precision) it includes the rounding error, N d ε/2.
+        unknown: for one step, for steps longer than the relaxation time of the drift, and for
+        couplings with a state-dependent σ(x) (use two grids and `extrapolate`) or with another
+        meeting rule than `BrownianCrossing()`.
+    - `step_uncertainty`: standard error of `step_error`. For guided proposals with very many steps
+        (N d above about 17,000 in single precision) it includes the rounding error, N d ε/2.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
-        many steps. It is infinite if that change is uninformative (couplings with a state-dependent
-        σ(x)).
+        many steps. It is infinite if this change has no information about the error, as in the
+        last three cases above.
     - `num_steps`: N.
     """
 
@@ -91,9 +94,10 @@ class TransitionLogDensity(AbstractResult):
     def step_error_dominates(self) -> Bool[Array, "*I"]:
         """Return whether the discretisation error is, or may be, larger than the standard error.
 
-        If true, use more steps; if only the estimate of the error is uncertain, more proposals
-        help, too (`why()`). If the error is unknown (`step_error` is NaN), the value is true, too:
-        for a coupling with a state-dependent σ(x) use two grids and `extrapolate`.
+        If true, use more steps. If only the estimate of the error is uncertain, more proposals
+        help, too; `why()` reports the reason. The result is also true if the error is unknown
+        (`step_error` is NaN): for a coupling with a state-dependent σ(x) use two grids and
+        `extrapolate`.
         """
         return dominates(self._step_error, self.standard_error)
 
@@ -102,7 +106,7 @@ class TransitionLogDensity(AbstractResult):
         """Return the possible faults, as a `Verdict`:
 
         - no bridge;
-        - truncated weights, or weights with heavy tails;
+        - truncated weights, weights with heavy tails, or an effective sample size below 20;
         - too many lost paths;
         - a discretisation error that is unknown or too uncertain, or that dominates and exceeds
             0.05;
@@ -153,19 +157,22 @@ def transition_log_density(
         as zero.
     - `proposal`: a `Coupling`, with its start law; a guided proposal (`ModifiedDiffusionBridge()`,
         `ResidualBridge()` or `Guided()`), which needs no stationary law; "auto", which tries
-        couplings only if the model is declared `normalised`; or a result of `choose_proposal`. The
-        default is `Coupling(gamma=0.0)`, for a model that is declared `normalised`.
-    - `num_counts`: N, the number of hitting counts for each proposal; by default one.
-    - `max_trials`: bound on the trials of each proposal; by default 10,000 for each count.
+        couplings only if the model has a time reversal and is declared `normalised`; or a result of
+        `choose_proposal`. The default is `Coupling(gamma=0.0)`; see **Start laws** below.
+    - `num_counts`: number of hitting counts for each proposal; by default one. Only for couplings.
+    - `max_trials`: bound on the trials of each proposal; by default 10,000 for each count. Only for
+        couplings.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
         not finite.
 
     **Start laws.** A coupling with `Stationary()` or `Reversed()` needs a model that is declared
-    `normalised`, as `ornstein_uhlenbeck` and `hyperbolic` are. Two cases do not, because the
-    constant of `log_stationary` cancels: a start law with a density, such as one from
-    `fit_start_law(..., for_density=True)`, and `Stationary()` for a model without sampler, where a
-    law with a density replaces it.
+    `normalised`, as `ornstein_uhlenbeck` and `hyperbolic` are. In two cases any `log_stationary`
+    will do, because its constant cancels:
+
+    - a start law with a density, such as one from `fit_start_law(..., for_density=True)`;
+    - `Stationary()` without `burn_in` for a model without sampler, where a start law with a density
+        replaces it.
 
     **Returns:** `TransitionLogDensity`. `value` is differentiable, in forward and reverse mode, for
     guided proposals; the derivative estimates the score. The same holds for a choice between such
@@ -208,8 +215,8 @@ def estimate_log_density(
 ) -> TransitionLogDensity:
     """Estimate log densities, for arguments that are already checked.
 
-    `held` states that the estimate is the state of a pseudo-marginal chain, which changes the law
-    of its weights.
+    `held` states that the estimate is the state of a pseudo-marginal chain. Such a chain prefers
+    large estimates, so the weights have another law.
     """
     model, intervals, num_steps = model.prepared(), problem.intervals, problem.num_steps
     proposal = proposal.prepared(key, model, intervals, num_steps)

@@ -35,16 +35,18 @@ class AbstractExactBridges(AbstractResult):
 
     With I intervals arrays have a leading axis I.
 
-    - `paths`, `met`: shapes (n, K, d) and (n,).
+    - `paths`, `met`: the bridges, shape (n, K, d), and whether each was found, shape (n,).
     - `log_halving`: log of the factor by which half as many steps would change the weight of a
         path, shape (n,); NaN where it was not computed.
-    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d), and the
-        bridge itself where none was simulated; `None` if the bridges themselves serve as such
-        paths. Between the points of the coarse grid the distance to the bridge is constant.
+    - `coarse_paths`: the paths that the same noise gives with half as many steps, shape (n, K, d).
+        Where none was simulated, the entry is the bridge itself. `None` if no coarse paths are
+        needed. Between the points of the coarse grid the distance to the bridge is constant.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
-        many steps, shape (). It is infinite if that change is uninformative, for couplings with a
-        state-dependent σ(x). The uncertainty of the error is then infinite too.
-    - `proposal`: the proposal of the paths.
+        many steps, shape (). It is infinite if this change has no information about the error:
+        for steps longer than the relaxation time of the drift, and for couplings with a
+        state-dependent σ(x) or with another meeting rule than `BrownianCrossing()`. Then the
+        uncertainty of the error is infinite, too.
+    - `proposal`, `num_steps`: the proposal and the number N of steps of the paths.
     """
 
     paths: eqx.AbstractVar[Float[Array, "*I n K d"]]
@@ -81,7 +83,7 @@ class AbstractExactBridges(AbstractResult):
         """Return the estimated discretisation bias of `mean(fn)` (estimate minus limit), entry by
         entry.
 
-        It is NaN if unknown, for one step or for couplings with a state-dependent σ(x).
+        It is NaN if unknown: for one step, or if `step_share` is infinite.
         """
         return jax.tree.map(lambda error: error.value, self._step_errors(fn), is_leaf=_is_error)
 
@@ -94,8 +96,9 @@ class AbstractExactBridges(AbstractResult):
         """Return whether the discretisation error of `mean(fn)` is, or may be, larger than its
         standard error.
 
-        If true, use more steps; if only the estimate of the error is uncertain, more bridges help,
-        too (`why()`). It is false for a value that is the same for all bridges.
+        If true, use more steps. If only the estimate of the error is uncertain, more bridges help,
+        too; `why()` reports the reason. The result is false for an entry of `fn` that is the same
+        for all bridges, such as an end point.
         """
 
         def dominates_entry(error, standard_error):

@@ -1,7 +1,7 @@
 """Expectations over exact bridges with correct derivatives in the parameters.
 
-Let the bridges Z with weights w come from parameters θ. Let f_θ be the density of a path relative
-to that of σW. At fixed paths the estimate is a function of θ':
+Let bridges Z with weights w be sampled with the parameters θ. Let f_θ be the density of a path with
+respect to the law of σW. With the paths fixed, the estimate is a function of θ':
 
     E_θ'[h_θ'] ≈ Σ w (f_θ'/f_θ)(Z) h_θ'(Z) / Σ w (f_θ'/f_θ)(Z).
 
@@ -36,17 +36,17 @@ def expectation(fn: PathFunction, bridges: WeightedBridges | Chain, model: Diffu
     **Arguments:**
 
     - `fn`: a function of one path, shape (N+1, d). It may depend on parameters itself.
-    - `bridges`: weighted bridges or a chain, with whole paths (no `save_at`) and the same
-        parameters. The paths stay fixed, and so does σ. So σ must not depend on the parameters of a
-        derivative.
+    - `bridges`: weighted bridges or a chain, sampled with the same parameter values, with whole
+        paths (no `save_at`). Derivatives are taken at fixed paths. A path determines σ, so σ must
+        not depend on the parameters of the derivative.
     - `model`: the model, with the parameters of the derivative.
 
     **Returns:** the mean of the values of `fn`, with a leading axis I for I intervals. Missing
     bridges have no weight. The mean is NaN if all bridges of an interval are missing. For guided
-    proposals with a state-dependent σ the derivative has a discretisation error of first order, and
-    the mean one of second order.
+    proposals with a state-dependent σ the derivative has a discretisation error of first order,
+    also where that of the mean is of second order.
 
-    **Raises:** `TypeError` for other bridges; `ValueError` if their paths are not whole.
+    **Raises:** `TypeError` for arguments of other types; `ValueError` if the paths are not whole.
 
     **Example:**
 

@@ -8,9 +8,9 @@ has an error of O(δ^{p+1}). Densities are combined on the natural scale, where 
 so their combination, are unbiased up to the discretisation error. The price is variance: for p = 1
 it is four times the variance of E_N plus the variance of E_{N/2}.
 
-`step_error` estimates the same error from the paths of one grid, which are weighted for both step
-sizes. That assumes normal steps, which couplings do not have. Extrapolation assumes the order p
-only.
+`step_error` estimates the same error from the paths of one grid, weighted for both step sizes. It
+assumes a known density of the steps, which proposals by couplings with a state-dependent σ lack.
+Extrapolation assumes the order p only.
 """
 
 from typing import Any, overload
@@ -40,9 +40,10 @@ class ExtrapolatedLogDensity(AbstractResult):
     """Result of `extrapolate` for two `TransitionLogDensity`.
 
     - `value`: log of the combination, which is unbiased on the natural scale up to an error of
-        higher order. It is -inf if noise makes the combination negative.
-    - `standard_error`: standard error of `value`, by the delta method.
-    - `removed`: the value of the finer grid minus `value`, an estimate of its discretisation bias.
+        higher order. It is -inf if noise makes the combination negative or zero.
+    - `standard_error`: standard error of `value`, by the delta method; infinite if `value` is -inf.
+    - `removed`: the value of the finer grid minus `value`: the estimated discretisation bias of the
+        finer grid.
     - `fine`, `coarse`: the two estimates.
     """
 
@@ -63,10 +64,12 @@ class ExtrapolatedLogDensity(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the possible faults, as a `Verdict`.
+        """Return the possible faults, as a `Verdict`:
 
-        These are the faults of both estimates, as in `TransitionLogDensity`. The remaining
-        discretisation error replaces that of each estimate.
+        - the faults of the weights of both estimates, as in `TransitionLogDensity`;
+        - a combination that is negative or zero;
+        - a bound on the remaining discretisation error, half of `removed`, that exceeds three
+            standard errors and 0.05.
         """
         weights = (*self.fine._weight_faults, *self.coarse._weight_faults)
         steps = Verdict(step_faults(self._remaining_error, self.standard_error))
@@ -100,7 +103,7 @@ class ExtrapolatedBridges(AbstractResult):
         return self._combined(fn, *errors, _richardson_error)
 
     def removed(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """Return the mean of the finer grid minus `mean(fn)`: its estimated discretisation bias."""
+        """Return the mean of the finer grid minus `mean(fn)`: the estimated bias of that grid."""
         return jax.tree.map(jnp.subtract, self.fine.mean(fn), self.mean(fn))
 
     @property
@@ -147,13 +150,15 @@ def extrapolate(fine: Any, coarse: Any):
 
     - `fine`, `coarse`: two results of `transition_log_density`, or two results of
         `sample_weighted_bridges` or `weigh_bridges`. They must differ in two things only: `coarse`
-        has half as many steps, and another key.
+        has half as many steps, and another key. Both need the same single proposal.
 
     **Returns:** `ExtrapolatedLogDensity`, with `value` and `standard_error`, or
     `ExtrapolatedBridges`, with `mean(fn)` and `standard_error(fn)`.
 
-    **Raises:** `TypeError` for other results; `ValueError` if `coarse` does not have half as many
-    steps, or if the proposals differ, because their errors do not cancel.
+    **Raises:** `TypeError` for other results. `ValueError` if `coarse` does not have half as many
+    steps, or if the proposals differ or are a choice between several, because discretisation errors
+    of different proposals do not cancel. Types and static settings of the proposals are compared,
+    but not numbers such as γ.
 
     **Example:**
 
@@ -182,8 +187,8 @@ def _check_pair(fine: Any, coarse: Any) -> None:
     """Raise `ValueError` if the numbers of steps or the proposals do not fit together."""
     if fine.num_steps != 2 * coarse.num_steps:
         raise ValueError(
-            f"`coarse` must have half as many steps as `fine`; got {fine.num_steps} "
-            f"(`fine`) and {coarse.num_steps} (`coarse`)."
+            f"`coarse` must have half as many steps as `fine`; got {fine.num_steps} steps "
+            f"(`fine`) and {coarse.num_steps} steps (`coarse`)."
         )
     # The structure includes the types and static settings of a proposal, not its numbers.
     structures = [jax.tree.structure(estimate.proposal) for estimate in (fine, coarse)]
@@ -198,7 +203,8 @@ def _check_pair(fine: Any, coarse: Any) -> None:
 def leading_share(fine: TransitionLogDensity | WeightedBridges) -> Float[Array, "*I"]:
     """Return (2^p - 1)⁻¹ with the order p of the leading error of a single proposal.
 
-    It does not depend on whether the steps are short enough for an estimate of the error.
+    For guided proposals p is the order of the target, also if steps are too long for an estimate of
+    the error. For couplings an unknown share counts as that of p = 1.
     """
     target = fine.proposal.singles[0].target
     share = share_of_known_order(fine.step_share)
@@ -206,8 +212,10 @@ def leading_share(fine: TransitionLogDensity | WeightedBridges) -> Float[Array, 
 
 
 def _log_density(fine: TransitionLogDensity, coarse: TransitionLogDensity):
-    """Return the combination. It uses values relative to the finer grid, which keeps their
-    digits."""
+    """Return the combination of two log densities.
+
+    It is computed relative to the density of the finer grid, so that no digits are lost.
+    """
     share = leading_share(fine)
     is_finite = jnp.isfinite(fine.value) & (coarse.value < jnp.inf)
     ratio = jnp.where(

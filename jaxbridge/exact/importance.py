@@ -70,21 +70,22 @@ class WeightedBridges(AbstractExactBridges):
     - `log_weights`: log weights up to a common constant, shape (n,); -inf for a missing bridge.
     - `met`: whether the bridge was found, shape (n,).
     - `truncated`: whether `max_trials` truncated the counts of the bridge, shape (n,). The weight
-        is then finite, and too small on average: paths that are hard to hit get too little weight.
-        It is also true if the density of the start law is NaN; then the weight is zero.
+        is then finite but biased: paths that are hard to hit get too little weight. It is also true
+        in two other cases: if the run that replaces a sampler of ν is too short (see `Stationary`),
+        and if the weight was NaN or infinite, and became zero.
     - `num_simulated`: number of simulated paths, proposals and trials.
-    - `num_nonfinite`: number of these that left the state space or became non-finite. It is a
-        fault if more than 5 % of the mass may be missing with them.
+    - `num_nonfinite`: number of these that left the state space or became non-finite. It is a fault
+        if the mass that may be missing with them exceeds 5 % and the relative standard error.
     - `proposal`, `num_steps`: the proposal and the number N of steps of the paths. The coupling of
-        a proposal has the start law of the weights. If it is `Stationary` and needs runs, it
+        a proposal has the start law of the weights. If this law is `Stationary` and needs runs, it
         contains their `burn_in`.
     - `log_halving`: log of the factor by which half as many steps would change a weight, shape
         (n,); NaN where it was not computed.
-    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d), and the
-        bridge itself where none was simulated; `None` if the bridges themselves serve as such
-        paths. Between the points of the coarse grid the distance to the bridge is constant.
+    - `coarse_paths`: the paths that the same noise gives with half as many steps, shape (n, K, d).
+        Where none was simulated, the entry is the bridge itself. `None` if no coarse paths are
+        needed. Between the points of the coarse grid the distance to the bridge is constant.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
-        many steps.
+        many steps; infinite if this change has no information about the error.
     """
 
     times: Float[Array, "*durations K"]
@@ -108,7 +109,7 @@ class WeightedBridges(AbstractExactBridges):
 
     @property
     def effective_sample_size(self) -> Float[Array, "*I"]:
-        """Return (Σw)²/Σw²: the equivalent number of unweighted exact bridges, between 0 and n."""
+        """Return (Σw)²/Σw²: the equivalent number of independent exact bridges, between 0 and n."""
         return effective_size(self.weights)
 
     @property
@@ -159,10 +160,11 @@ class WeightedBridges(AbstractExactBridges):
         """Return the possible faults, as a `Verdict`:
 
         - missing bridges;
-        - truncated weights, or weights with heavy tails;
+        - truncated weights, weights with heavy tails, or an effective sample size below 20;
         - too many lost paths;
-        - a discretisation error of the mean path that dominates and exceeds 0.05 standard
-            deviations.
+        - a discretisation error of the mean path that is unknown or too uncertain, or that
+            dominates and exceeds 0.05 standard deviations;
+        - a mean path or standard error that is not finite.
         """
         # In standard deviations, as is the discretisation error of the mean path.
         error = 1 / jnp.sqrt(jnp.maximum(self.effective_sample_size, 1))
@@ -186,8 +188,8 @@ class WeightedBridges(AbstractExactBridges):
     def resample(self, key: Key[Array, ""], num_bridges: int) -> Float[Array, "*I m K d"]:
         """Sample m = `num_bridges` equally weighted paths by systematic resampling.
 
-        The result has shape (m, K, d). The effective sample size should be large compared to m,
-        otherwise many paths are repeated. The paths are NaN if there is no bridge.
+        The result has shape (m, K, d). The effective sample size should be large compared to m;
+        otherwise many paths occur several times. The paths are NaN if there is no bridge.
         """
         num_bridges = check_count("num_bridges", num_bridges)
 
@@ -222,15 +224,15 @@ def weigh_bridges(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
 ) -> WeightedBridges:
-    """Estimate weights that correct approximate bridges to the exact law: importance sampling.
+    """Estimate weights that correct approximate bridges to the exact law (importance sampling).
 
     **Arguments:**
 
     - `key`: a typed key.
     - `model`: the model of the bridges.
     - `bridges`: the result of `sample_bridges`, with whole paths (no `save_at`).
-    - `num_counts`: N, the number of hitting counts for each bridge. More counts make a weight less
-        noisy; one is often the most efficient.
+    - `num_counts`: number of hitting counts for each bridge. More counts make a weight less noisy;
+        one is often the most efficient.
     - `start_law`: μ; by default the start law of the bridges' coupling.
     - `max_trials`: bound on the trials of each bridge; by default 10,000 for each count. See
         `WeightedBridges.truncated`.
@@ -255,7 +257,8 @@ def weigh_bridges(
     if not isinstance(bridges, Bridges):
         raise TypeError(
             f"`bridges` must come from `sample_bridges`; got {type(bridges).__name__}. "
-            "Results of `sample_exact_bridges` and `weigh_bridges` need no weights: they are exact."
+            "Results of `sample_exact_bridges`, `weigh_bridges` and `sample_weighted_bridges` are "
+            "exact already."
         )
     coupling = coupling_of_bridges(bridges, start_law)
     search = search_for_hits(bridges, num_counts, max_trials, batch_size, progress_meter)
@@ -328,7 +331,7 @@ def sample_weighted_bridges(
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
 ) -> WeightedBridges:
-    """Sample independent weighted bridges from any proposal: importance sampling.
+    """Sample independent weighted bridges from any proposal (importance sampling).
 
     **Arguments:**
 

@@ -45,7 +45,7 @@ _TOO_FEW_MOVES = (
 class Kernel(NamedTuple):
     """Markov kernel on bridges, from `pseudo_marginal`, `renewal` or `crank_nicolson`.
 
-    Programs that run any pair of such functions, such as BlackJAX, accept it as it is.
+    It has the interface of the sampling algorithms of BlackJAX, so code for these can run it.
 
     - `init`: a function `(position, rng_key) -> state`.
     - `step`: a function `(rng_key, state) -> (state, info)`.
@@ -66,26 +66,27 @@ class Chain(AbstractExactBridges):
     - `log_weights`: log weights of the states, shape (n,); `None` for the renewal chain, which has
         none.
     - `met`: whether there is a path, shape (n,).
-    - `truncated`: whether `max_trials` truncated the counts of the state, shape (n,). Then its
-        weight is too small on average, and the law of the chain is not exact. `None` for the
+    - `truncated`: whether the weight of the state is truncated, as in `WeightedBridges`, shape
+        (n,). Then this weight is biased, and the law of the chain is not exact. `None` for the
         renewal chain.
     - `num_simulated`: number of simulated paths, shape ().
-    - `num_nonfinite`: number of these that left the state space or became non-finite. More than 2 %
-        are a fault, because their mass is missing.
-    - `num_truncated`: number of proposals, accepted or not, with truncated counts. For the renewal
-        chain it is the number of steps if the run that replaces a sampler of ν is too short (see
-        `Stationary`), else 0.
+    - `num_nonfinite`: number of these that left the state space or became non-finite, shape ().
+        More than 2 % are a fault, because their mass is missing.
+    - `num_truncated`: number of proposals, accepted or not, with truncated weights, shape (). The
+        renewal chain has no weights. If its run that replaces a sampler of ν is too short (see
+        `Stationary`), the number is n, else 0.
     - `proposal`: the proposal of the chain. If its start law `Stationary` needs runs, it contains
         their `burn_in`.
-    - `pareto_k`: k̂ of the weights of all proposals. Above 0.7 states with large weights stay too
-        long, and no error is reliable. `None` for renewal and Crank–Nicolson chains, which propose
-        no independent weights.
+    - `pareto_k`: k̂ of the weights of all proposals, shape (). Above 0.7 the chain stays too long in
+        states with large weights, and no error is reliable. `None` for renewal and Crank–Nicolson
+        chains, which propose no independent weights.
     - `log_halving`: log of the factor by which half as many steps would change the weight of a
         state, shape (n,); NaN where it was not computed.
-    - `coarse_paths`: paths of half as many steps from the same noise, shape (n, K, d), and the
-        state itself where none was simulated; `None` if the states themselves serve as such paths.
+    - `coarse_paths`: the paths that the same noise gives with half as many steps, shape (n, K, d).
+        Where none was simulated, the entry is the state itself. `None` if no coarse paths are
+        needed.
     - `step_share`: the discretisation error divided by the change of the estimate under half as
-        many steps.
+        many steps; infinite if this change has no information about the error.
     - `num_steps`: N.
     """
 
@@ -112,7 +113,7 @@ class Chain(AbstractExactBridges):
 
     @property
     def log_mean_weights(self) -> Float[Array, "*I n"]:
-        """Return zero for each state with a path, as all weigh the same, and -inf for others."""
+        """Return zero for each state with a path, because all have the same weight; else -inf."""
         return jnp.where(self.met, 0.0, -jnp.inf).astype(self.paths.dtype)
 
     @property
@@ -122,9 +123,10 @@ class Chain(AbstractExactBridges):
         - missing bridges;
         - truncated weights, or weights with heavy tails;
         - more than 2 % of the paths lost;
-        - a chain that hardly moves;
-        - a discretisation error of the mean path that dominates and exceeds 0.05 standard
-            deviations.
+        - a chain with fewer than five accepted paths (fewer still if it has less than nine steps);
+        - a discretisation error of the mean path that is unknown or too uncertain, or that
+            dominates and exceeds 0.05 standard deviations;
+        - a mean path that is not finite.
         """
         moves = jnp.sum(self.accepted, axis=-1)
         # The renewal chain has no weights, but its trials may start from a wrong law.
@@ -175,8 +177,7 @@ def acceptance_rate(
 ) -> Float[Array, "*I"]:
     """Return min(1, ratio of the weights), shape (I,).
 
-    It is zero for a missing candidate, and one for a missing state with a candidate that is not
-    missing.
+    It is zero if the candidate is missing (log weight -inf), and one if only the state is missing.
     """
     # Both weights may be zero: -inf - (-inf) would be NaN.
     ratio = jnp.where(candidate > -jnp.inf, candidate - log_weight, -jnp.inf)
@@ -204,8 +205,8 @@ def one_interval(
     if problem.batched:
         raise ValueError(
             "a kernel is for one interval: `start` and `end` of shape (d,), `duration` of shape "
-            f"(); got {problem.num_intervals} intervals with an axis I. Use `jax.vmap`, or "
-            "`sample_exact_bridges`, for several."
+            f"(); got arguments with an axis I = {problem.num_intervals}. Use `jax.vmap`, or "
+            "`sample_exact_bridges`, for several intervals."
         )
     return problem
 
@@ -237,8 +238,8 @@ def check_position(
         values = np.asarray(paths)
         if not (np.all(np.isfinite(values)) and np.allclose(values[:, [0, -1]], ends, atol=1e-3)):
             raise ValueError(
-                f"`position` must be finite, from and to {problem.result(ends)}; got from and to "
-                f"{problem.result(values[:, [0, -1]])}, or a value that is not finite. Pass a path "
-                "of this bridge."
+                f"`position` must be finite, with the end points {problem.result(ends)}; got the "
+                f"end points {problem.result(values[:, [0, -1]])}, or a value that is not finite. "
+                "Pass a path of this bridge."
             )
     return paths.astype(intervals.start.dtype)

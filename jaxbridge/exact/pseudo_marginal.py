@@ -67,12 +67,15 @@ def pseudo_marginal(
 ) -> Kernel:
     """Return the pseudo-marginal Metropolis–Hastings kernel on (start, end, duration)-bridges.
 
-    `init(position, rng_key)` takes a path of shape (N+1, d), and samples its weight from the law of
-    that weight in the chain. So the kernel can be a block of a Gibbs sampler. With `None` it
+    `init(position, rng_key)` takes a path of shape (N+1, d). It samples a weight of this path from
+    its stationary law in the chain, so the kernel can be a block of a Gibbs sampler. With `None` it
     proposes a first path. `step(rng_key, state)` returns a `PseudoMarginalState` and a
     `PseudoMarginalInfo`.
 
-    **Arguments:** as in `sample_exact_bridges`.
+    **Arguments:** as in `sample_exact_bridges`. A kernel makes no pilot run and measures no
+    burn-in: pass a result of `choose_proposal` instead of "auto", and for a model without sampler
+    `Stationary(burn_in=...)` or a start law with a density. For a state-dependent σ guided
+    proposals have Euler steps.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
 

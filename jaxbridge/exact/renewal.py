@@ -55,7 +55,7 @@ class RenewalInfo(NamedTuple):
 
     - `is_hit`: whether the associated diffusion hit.
     - `is_accepted`: whether a new path replaced the old one.
-    - `is_missing`: whether a new path was needed and not found.
+    - `is_missing`: whether a new path was needed but not found within `max_proposals`.
     - `num_simulated`: number of simulated paths.
     - `num_nonfinite`: number of these that became non-finite.
     """
@@ -83,7 +83,9 @@ def renewal(
     `init(position, rng_key)` takes a path of shape (N+1, d). With `None` it proposes a first path.
     `step(rng_key, state)` returns a `RenewalState` and a `RenewalInfo`.
 
-    **Arguments:** as in `sample_exact_bridges`.
+    **Arguments:** as in `sample_exact_bridges`. `proposal` is a `Coupling`. A kernel measures no
+    burn-in: for a model without sampler pass `Stationary(burn_in=...)` or a start law with a
+    density.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
@@ -202,8 +204,8 @@ class _SegmentRunner(NamedTuple):
     ) -> _Segments:
         """Run the chosen segments, from the ends of the segments before them.
 
-        A run stops where it rejoins the recorded trajectory. Indices beyond the last segment only
-        fill the width W.
+        The run of a segment stops where it rejoins the recorded trajectory. Indices beyond the last
+        segment have no effect: they pad `chosen` to the length W.
         """
         num, length = self.keys.shape
         index = jnp.minimum(chosen, num - 1)
@@ -272,12 +274,12 @@ def run_renewal(
 ) -> Chain:
     """Run the renewal chain of each interval, in segments side by side.
 
-    Segments start from guesses. A segment runs again, from the end of the segment before it, until
-    all segments fit. The result is that of one long run.
+    Segments start from guesses. Then segments run again, each from the end of the segment before
+    it, until every segment starts where the one before it ends. The result is that of one long run.
 
-    A repair is short, because a proposal depends only on the key of its step. If two trajectories
-    accept a new path in the same step, it is the same path. From there on the trajectories agree,
-    and the recorded steps that follow remain valid.
+    Such a repeated run is short, because a proposal depends only on the key of its step. If two
+    trajectories accept a new path in the same step, it is the same path. From there on the
+    trajectories agree, and the recorded steps that follow remain valid.
     """
     arguments = (model.prepared(), pairs, problem, first)
     model, pairs, problem, first = nondifferentiable(arguments)
@@ -397,7 +399,7 @@ def propose_paths(
 ) -> Accepted:
     """Propose a bridge for each active interval; `None` makes all of them active.
 
-    Otherwise few intervals are expected to be active, so the default number of lanes is smaller.
+    With a mask, few intervals are expected to be active, so fewer lanes are used.
     """
     # Few chains need a path in the same step: a quarter of them sets the number of lanes.
     num_wanted = len(keys) if active is None else len(keys) // 4

@@ -16,11 +16,14 @@ by number of steps, and `blocks` selects a proposal for each group. The methods 
 - `pmmh`: Metropolis–Hastings on θ alone, with unbiased estimates of L(θ) (`likelihood_estimates`).
 - `score`: Fisher's identity, ∇ log L(θ) = E[∇ log f_θ(Z) | x], and Louis's identity for the second
   derivatives.
-- `maximum_likelihood`: for known σ, an optimiser along the score, or EM with the step
+- `maximum_likelihood`: an optimiser along the score, or EM with the step
   θ ← argmax E[log f_θ(Z) | x]. Both use new bridges in each iteration (`stochastic_approximation`).
-  A complete path determines σ, so for unknown σ the function maximises Σ_k log p̂_θ(x_{k-1}, x_k)
-  with fixed noise. This sum is smooth in θ for guided proposals (`simulated_likelihood`). In both
-  cases Newton's method follows (`newton`).
+  Newton's method follows (`newton`).
+
+A complete path determines σ, so these methods do not apply to an unknown σ. For an unknown σ, and
+by default for σ(x), `score` and `maximum_likelihood` differentiate Σ_k log p̂_θ(x_{k-1}, x_k) with
+fixed noise. This sum is smooth in θ for guided proposals (`simulated_likelihood`). For an unknown σ
+`gibbs` treats the observations as a record without noise.
 
 *Records* with noisy, partial or missing observations. The likelihood is E[w(θ, ξ)], the mean weight
 of paths that are functions of normal noise ξ (`record_paths`). `gibbs` samples from
@@ -29,5 +32,6 @@ particle filters (`likelihood_estimates`), and `maximum_likelihood` uses chains 
 (`record_maximum`).
 
 `posterior` contains the common parts of `gibbs` and `pmmh`: start, continuation and diagnostics of
-chains. `parameter_walk` contains the random walks of θ.
+chains. `parameter_walk` contains the random walks of θ, `population` parameters that vary between
+records, and `checkpoint` runs that continue from a file.
 """

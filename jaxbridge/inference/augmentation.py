@@ -2,8 +2,8 @@
 
 Given θ the bridges of all intervals are independent, and a separate Markov kernel renews each of
 them (`bridge_kernels`). Given the bridges the log-likelihood of θ is that of the completed path. It
-is quadratic if the drift is linear in θ. The module detects this from the traced program of the
-Hessian, which then does not use θ.
+is quadratic in θ if the drift is linear in θ. The module detects this case by tracing the Hessian:
+the traced program then does not use θ.
 """
 
 import math
@@ -98,9 +98,9 @@ class Augmentation(eqx.Module):
     def first(self, key: Key[Array, ""], model: Diffusion) -> tuple[Paths, Bool[Array, " I"]]:
         """Sample initial paths; return them, and whether the proposal found each, in block order.
 
-        An interval without a bridge gets a placeholder, because a chain may start anywhere. It is a
-        modified diffusion bridge if the proposal may use couplings, which includes any choice of
-        proposals inside `jit`. Otherwise, or if that bridge is not finite, it is a straight line.
+        An interval without a bridge gets a placeholder, because a chain may start from any path. If
+        a proposal of the block is a coupling (inside `jit`: if a candidate is one), the placeholder
+        is a modified diffusion bridge. Otherwise, or if that is not finite, it is a straight line.
         """
         model = model.prepared()
 
@@ -216,8 +216,8 @@ def augment(
     by_pairs = method is None and isinstance(proposal, AbstractCoupling)
     if use != "weights" or by_pairs:
         reason = (
-            'for `method="pseudo_marginal"`: the renewal chain and approximate bridges use no '
-            "hitting counts"
+            "only weights use hitting counts, but here bridges are approximate, or come from the "
+            'renewal chain of a coupling (`gibbs` also has `method="pseudo_marginal"`)'
         )
         budget._replace(max_proposals=None).refuse(reason)
     model = problem.parameters.bind(theta)

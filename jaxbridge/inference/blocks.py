@@ -89,8 +89,8 @@ class Block(eqx.Module):
     def step_shares(self, model: Diffusion, form: Form) -> Float[Array, " I"]:
         """Return the discretisation error of each interval, as a fraction of a change.
 
-        The change is that from half as many steps. The fraction is the larger one of those for the
-        bridges and for this form of the likelihood.
+        The change is the difference that half as many steps make. The fraction is the larger one of
+        two: that for the bridges, and that for this form of the likelihood.
         """
         share = share_of_order(density_of_form(form).order)
         return jnp.maximum(guessed(self.proposal.step_share(model, self.intervals)), share)
@@ -180,7 +180,7 @@ def _check_for_moving(proposal: AbstractProposal, model: Diffusion) -> None:
     if any(single.must_measure(model) for single in proposal.singles) and not model.has_density:
         raise ValueError(
             "this model has no sampler of its stationary law, and the length of a burn-in depends "
-            "on the parameters: pass `sample_stationary=` or `log_stationary=` to `Diffusion`, "
+            "on the parameters. Pass `sample_stationary=` or `log_stationary=` to `Diffusion`. Or "
             "give the coupling a `Stationary(burn_in=...)` that is long enough for all "
             "parameters, or use guided proposals."
         )

@@ -1,7 +1,7 @@
 """Long runs in parts, with a file from which an interrupted run continues.
 
-A run has ten parts. Each one continues the state of the previous one with the same key, so the
-draws depend on the parts but not on interruptions. After each part a file receives all draws so
+A run has at most ten parts. Each one continues the state of the previous one with the same key, so
+the draws depend on the parts but not on interruptions. After each part a file receives all draws so
 far; it is replaced as a whole, so it is complete whenever the process ends. A resumed run repeats
 the first part. This restores the parts of a result that no file can hold, such as functions, and
 shows that the model, the data and the key are those of the file.

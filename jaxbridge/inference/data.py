@@ -30,8 +30,8 @@ from .parameters import Parameters, theta_of_model
 
 # Numbers of steps are rounded to so many levels per factor of two.
 _LEVELS_PER_OCTAVE = 2
-# Cost of a further number of steps, in steps of paths. Its compilation takes seconds, as long as so
-# many steps take in a thousand sweeps.
+# Cost of one more group, in steps of paths. Its compilation takes some seconds, about the time of
+# so many steps in a thousand sweeps.
 _STEPS_PER_GROUP = 2**15
 
 
@@ -156,8 +156,9 @@ def step_groups(
 ) -> tuple[Group, ...]:
     """Group the intervals by number of steps.
 
-    With `num_steps` there is one group. With `step_size` the steps are at most about that long, and
-    intervals with similar numbers of steps share a group, because each group is compiled.
+    With `num_steps`, by default 50, there is one group. With `step_size` no step is longer than
+    about that. Intervals with similar numbers of steps then share a group, because each group is
+    compiled separately.
     """
 
     def group(which: Int[np.ndarray, " I"], num_steps: int) -> Group:

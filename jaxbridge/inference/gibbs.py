@@ -70,8 +70,8 @@ _MISSING = (
     "`max_proposals`."
 )
 _CUT_OFF = (
-    "`max_trials` truncated weights in more than 1 % of the iterations, so the law is not exact. "
-    "Increase `max_trials`, or use another `proposal`."
+    "In more than 1 % of the draws `max_trials` truncated weights, or a burn-in of the coupling "
+    "was cut short, so the law is not exact. Increase `max_trials`, or use another `proposal`."
 )
 
 
@@ -108,8 +108,8 @@ class GibbsPosterior(AbstractPosterior):
         (*chains, n). They remain unchanged: the law is exact, but the chain moves less. The number
         includes placeholders from the start that no proposal has replaced. If it does not fall to
         zero, the posterior is conditional on these placeholders; then use another proposal.
-    - `num_truncated`: number of weights that `max_trials` truncated, shape (*chains, n). With many
-        of them the law is not exact.
+    - `num_truncated`: number of weights that `max_trials` truncated, or, for the renewal chain, of
+        burn-ins that were cut short, shape (*chains, n). With many of them the law is not exact.
     - `num_nonfinite`: number of paths that diverged or left the state space, shape (*chains, n).
     - `log_step_error`: estimated discretisation error of the log density of the completed data at
         each draw, up to a constant, shape (*chains, n). NaN at draws without an estimate.
@@ -212,18 +212,19 @@ def gibbs(
         50, or 10 for a record. `step_size` is the maximum step size, from which the number
         of steps of each interval follows.
     - `proposal`: a `Coupling`, `ModifiedDiffusionBridge()`, `ResidualBridge()`, `Guided()`, or
-        "auto", the default, which selects the best one for each interval by pilot runs. Approximate
-        bridges and `method` need a `Coupling`, by default `Coupling(gamma=0.0)`.
+        "auto", the default, which selects the best one for each interval by pilot runs. With
+        `bridges="approximate"` or a `method` the default is `Coupling(gamma=0.0)`. Approximate
+        bridges and `method="renewal"` need a `Coupling`.
     - `bridges`: "exact", or "approximate" as in the paper.
-    - `method`: method for exact bridges by a coupling: "renewal" (the default if `proposal` is a
-        coupling) or "pseudo_marginal".
+    - `method`: Markov chain for exact bridges: "renewal" (the default if `proposal` is a coupling)
+        or "pseudo_marginal" (used for all other proposals).
     - `where`: a function that selects the unknown parameters from `model.params`, for instance
         `lambda params: params.B`; by default all. `prior` and `constraint` take these parameters.
     - `constraint`: a function from the unknown parameters to whether they are allowed, for instance
         `lambda alpha: alpha > 0` if the model is ergodic only then.
-    - `parameter_kernel`: a function from a log density of the unknown parameters to a kernel
-        `(init, step)`, as in BlackJAX. By default θ is drawn from its normal law given the path if
-        the log-likelihood is quadratic and the prior normal. Otherwise it moves by
+    - `parameter_kernel`: a function from a log density of the unknown parameters to a kernel with
+        functions `init` and `step`, as in BlackJAX. By default θ is drawn from its normal law given
+        the path if the log-likelihood is quadratic in θ and the prior normal. Otherwise it moves by
         Metropolis–Hastings with Newton steps.
     - `num_chains`: number of parallel chains, which are a leading axis in all results.
     - `init`: unknown parameters to start from, with a leading axis if chains have different ones;
@@ -232,21 +233,23 @@ def gibbs(
         partial record, as in `innovations`. Then parameters of σ and of the noise may be unknown,
         too.
     - `population`: a `NormalPopulation`, for parameters that vary between records. Exact
-        observations then count as a record without noise, too. `init` and `covariance` are those of
-        the means.
+        observations then count as a record without noise, too. In `init` and `covariance`,
+        parameters that vary are represented by their population means.
     - `num_warmup`, `covariance`: for records only. The warm-up, by default of 500 iterations,
         adapts the sizes of moves and the guide. `covariance` is as in `pmmh`.
-    - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
+    - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`. The renewal chain
+        and approximate bridges take only `max_proposals`.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
-    - `checkpoint`: path of a file, for runs that may be interrupted. The run has ten parts, after
-        each of which the file is replaced. The same call continues from the file, to the same
+    - `checkpoint`: path of a file, for runs that may be interrupted. The run has at most ten parts,
+        after each of which the file is replaced. The same call continues from the file, to the same
         draws. R̂ and the remaining time are logged (`logging.getLogger("jaxbridge")`).
 
     Arguments that are functions are compared by identity: define them once to compile once.
 
     **Returns:** `GibbsPosterior`; for a record `RecordPosterior`. Not differentiable.
 
-    **Raises:** `ValueError` and `TypeError` for invalid arguments.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments; `ValueError` if a chain for a
+    record never reaches a positive likelihood.
 
     **Example:**
 
@@ -319,9 +322,10 @@ def gibbs(
 
 
 def _wide_law(intervals: Intervals) -> GaussianLaw:
-    """Return a normal law that covers all observations, as `initial` of exact records.
+    """Return a wide normal law of the first state, with the spread of the observations.
 
-    x_0 is observed exactly, so the law adds a constant to the log-likelihood.
+    It serves as `initial` of records without noise. The first state is observed exactly, so the law
+    only adds a constant to the log-likelihood.
     """
     points = intervals.start
     variance = jnp.var(points, axis=0)
@@ -330,7 +334,7 @@ def _wide_law(intervals: Intervals) -> GaussianLaw:
 
 
 class GibbsInfo(NamedTuple):
-    """Counts of one iteration: moves of θ, replaced bridges, `num_…` of `GibbsPosterior`."""
+    """Counts of one iteration, or their sums; the names are those of `GibbsPosterior`."""
 
     parameters_moved: Int[Array, "*chains"]
     bridges_moved: Int[Array, "*chains"]

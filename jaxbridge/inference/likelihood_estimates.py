@@ -56,8 +56,8 @@ class Estimate(NamedTuple):
     """Unbiased estimate of a likelihood.
 
     - `log_likelihood`: its log, -inf if it is zero; `variance`: variance of the log.
-    - `log_step_error`: discretisation error of the log, infinite if steps are too long to estimate
-        it.
+    - `log_step_error`: discretisation error of the log. It is infinite if steps are too long to
+        estimate it, and NaN if it was not computed.
     - `num_truncated`: number of truncated weights.
     - `share_lost`: share of paths, or particles, that left the state space or diverged.
     """
@@ -89,13 +89,13 @@ def _share(
 class AbstractLikelihood(eqx.Module):
     """Base class of estimators of the likelihood L(θ) of the observations.
 
-    exp(`estimate`) has the mean L(θ).
+    The exponential of an estimated log-likelihood has the mean L(θ).
 
-    - A chain calls `estimate` once in each iteration, at the proposed θ. It stores the estimate
-      until a proposal is accepted.
-    - During the warm-up it replaces the estimator by `near`, if there is a `guide`.
-    - For some draws it needs the discretisation error. If `tells_step_error`, the stored estimate
-      contains the error; otherwise `log_step_error` computes it.
+    - A chain calls `estimate` once in each iteration, at the proposed θ. It stores the estimate of
+      its current θ until it accepts another θ.
+    - During the warm-up the chain replaces the estimator by that of `near`, if there is a `guide`.
+    - For some draws the chain needs the discretisation error. The stored estimate contains this
+      error if `tells_step_error` is true; otherwise `log_step_error` computes it.
 
     All methods are traced inside one compiled loop, and under `vmap` over chains.
     """
@@ -104,8 +104,8 @@ class AbstractLikelihood(eqx.Module):
     def estimate(self, key: Key[Array, ""], model: Diffusion) -> Estimate:
         """Estimate the likelihood of this model, with random numbers that depend on the key only.
 
-        The log-likelihood is never NaN. It is -inf without an estimate; then the chain rejects the
-        parameters, and counts this.
+        The log-likelihood is never NaN. If there is no estimate it is -inf, so the chain rejects
+        the parameters, and counts this.
         """
 
     @abstractmethod
@@ -122,8 +122,8 @@ class AbstractLikelihood(eqx.Module):
     ) -> "AbstractLikelihood":
         """Return an estimator of the same likelihood with a smaller variance near θ.
 
-        `around` are θ that the chains may visit, and `at` returns the model at a θ. All shapes must
-        remain, because both estimators are states of one loop.
+        `around` contains n vectors θ that the chains may visit, and `at` returns the model at a θ.
+        All arrays must keep their shapes, because both estimators are states of one loop.
         """
 
     @abstractmethod
@@ -291,8 +291,8 @@ class RecordLikelihood(AbstractLikelihood):
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         """Estimate log p with one filter of each record.
 
-        Return the estimate, its variance, and the mass that may be missing: the number of lost
-        particles divided by that of all particles of a filter.
+        Return the estimate, its variance, and the mass that may be missing: the number of particles
+        lost in all filters, divided by the number of particles of one filter.
         """
         filtered = self._filtered(key, model, grid, self.rate, 1, skips)
         # Records are independent, so variances add.

@@ -1,12 +1,13 @@
 """Maximum likelihood by stochastic approximation over bridges, or by a simulated likelihood.
 
-For known σ, `stochastic_approximation` searches with random bridges. With an optimiser the result
-is the average of the second half of the iterates; with EM it is the last iterate. From there
-Newton's method (`newton`) continues with scores and information from new, independent bridges in
-each pass.
+For a known, constant σ `stochastic_approximation` searches with random bridges. With an optimiser
+its result is the average of the second half of the iterates; with EM it is the last iterate. From
+there Newton's method (`newton`) continues with scores and information from new, independent bridges
+in each pass.
 
 If σ depends on the unknown parameters, a complete path determines them, so bridges cannot be used.
-Then the simulated likelihood is maximised (`simulated_likelihood`).
+Then the simulated likelihood is maximised (`simulated_likelihood`). By default this also holds for
+a known σ(x), where the simulated likelihood has the smaller discretisation error.
 
 `record_maximum` is the method for noisy or partial records.
 """
@@ -75,9 +76,10 @@ class MaximumLikelihood(AbstractResult):
     - `step_error`, `step_uncertainty`: estimated discretisation bias of `theta` (estimate minus
         limit), shape (p,), and its standard error. NaN if it cannot be estimated.
     - `iterates`: iterates of the stochastic approximation, shape (n, p).
-    - `score`: score at the last pass of Newton's method, before its step. For unknown σ it is at
-        the estimate; then its gradient is about zero, and its covariance shows the Monte Carlo
-        error. Its errors are reliable if its `effective_sample_size` is large in all intervals.
+    - `score`: score at the last pass of Newton's method, before its step. For a simulated
+        likelihood it is at the estimate; then its gradient is about zero, and its covariance shows
+        the Monte Carlo error. Errors are reliable if its `effective_sample_size` is large in all
+        intervals.
     - `num_missing`: total number of bridges that were not found in the iterations.
     - `num_truncated`: number of weights that `max_trials` truncated.
     - `num_refused`: number of iterations without a step, because it would have left the constraint
@@ -119,10 +121,9 @@ class MaximumLikelihood(AbstractResult):
 
         - no maximum, or none inside;
         - faults of the weights of `score`;
-        - a discretisation error that is unknown or too uncertain, or that dominates and exceeds
-            0.05 standard errors;
+        - a discretisation error that is unknown, too uncertain, or larger than a standard error;
         - an estimate or covariance that is not finite;
-        - more than 300 unknown parameters, because none of these is computed then.
+        - more than 300 unknown parameters: then there are no errors to examine.
         """
         if self.covariance is None or self.score is None or self.fall is None:
             return Verdict((Fault(jnp.asarray(True), _UNCHECKED),)).with_finite(self.theta)
@@ -182,17 +183,18 @@ def maximum_likelihood(
     - `times`, `observations`, `num_steps`, `step_size`, `proposal`, `where`, `constraint`: as in
         `gibbs`. Steps that would leave the constraint are skipped.
     - `optimizer`: an optimiser of optax, by default `optax.adam(0.01)`. Its objective is minus the
-        mean log-likelihood per interval, as a function of the unknown parameters in a vector.
-        Optimisers are compared by identity: create one once to compile once.
-    - `method`: "gradient", or "em", which uses no optimiser and needs fewer iterations, but a known
-        σ and at most 300 unknown parameters.
+        mean log-likelihood per interval (for records, per observation), as a function of the vector
+        of unknown parameters. Optimisers are compared by identity: create one once to compile once.
+    - `method`: "gradient", or "em", which uses no optimiser and needs fewer iterations. "em" needs
+        exact observations, a known σ and at most 300 unknown parameters.
     - `num_iterations`: iterations of the stochastic approximation.
     - `num_bridges`: weighted bridges per interval in each pass of Newton's method after these
         iterations, and for the errors; or paths per interval in the simulated likelihood.
     - `observation`, `initial`, `initial_time`: observation model and initial law of noisy or
         partial records, as in `innovations`. Then any parameters may be unknown, and `num_bridges`
         is the number of draws from each of eight chains of paths.
-    - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`.
+    - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`. If `proposal` is a
+        coupling, only `max_proposals` is available.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
     **Unknown or state-dependent σ.** A complete path determines σ, so paths cannot be fixed while σ

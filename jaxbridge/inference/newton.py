@@ -5,13 +5,12 @@ observed information I. The method has converged if the next step I⁻¹g is sho
 
     gᵀI⁻¹g ≤ max(10⁻³, 4 tr I⁻¹S),
 
-in squares of standard errors. The point is a maximum if I is positive definite and much larger
-than S.
+in squares of standard errors. The point counts as a maximum if I - 4 S is positive definite.
 
-A likelihood whose maximum is at infinity needs a further check: far out, steps are short, too, and
-I is small and positive. But there log L does not fall as its curvature predicts. Hence each pass
-also measures log L at θ ± d_j, with d_j = I⁻¹e_j / √(I⁻¹)_jj. This moves entry j by one standard
-error and the others to their conditional optimum. The pass compares
+A likelihood whose maximum is at infinity needs a further check. Far out, steps are short, too, and
+I is small and positive, but log L does not fall as its curvature predicts. Hence each pass also
+measures log L at θ ± d_j, with d_j = I⁻¹e_j / √(I⁻¹)_jj. This moves entry j by one standard error,
+and the other entries to their optimum given entry j. The pass compares
 
     log L(θ) + gᵀd - log L(θ + d)   with   ½ dᵀId.
 """
@@ -68,9 +67,10 @@ class Passes(NamedTuple):
     """State of Newton's method after `number` passes.
 
     - `theta`, `step`: θ of the next pass, and the step to it.
-    - `longest`, `gain`: the longest step that was allowed, in standard errors, and the squared
-      length of the full Newton step.
-    - `offsets`, `slope`, `details`: points of the last pass around its θ, and its results.
+    - `longest`: bound on the length of this step, in standard errors.
+    - `gain`: squared length of the full Newton step, in standard errors.
+    - `offsets`: moves of θ at which the last pass evaluated log L.
+    - `slope`, `details`: results of the last pass.
     - `memory`: values for the next pass.
     - `converged`: whether the method has converged.
     """
@@ -93,7 +93,7 @@ def newton_passes(
     theta: Float[Array, " p"],
     memory: PyTree,
 ) -> Passes:
-    """Iterate Newton's method from θ until it has converged, for a bounded number of passes.
+    """Iterate Newton's method from θ until it has converged, for at most 15 passes.
 
     `evaluate(i, θ, offsets, memory)` returns the `Slope` at θ with the rises at θ + offsets, any
     details, and the memory for the next pass.
@@ -132,10 +132,10 @@ def is_maximum(slope: Slope) -> Bool[Array, ""]:
 
 
 def falls(slope: Slope, offsets: Float[Array, "2 p p"]) -> Float[Array, "2 p"]:
-    """Return the fall of log L at each offset, without the linear part of log L.
+    """Return the fall of log L from θ to each θ + offset, without the linear part of log L.
 
-    It is scaled such that a quadratic function falls by ½. It is infinite at a point with zero
-    likelihood or outside the constraint.
+    It is scaled such that a quadratic function falls by ½. It is infinite if the likelihood is zero
+    at that point, or if the constraint excludes the point.
     """
     linear = offsets @ slope.gradient
     quadratic = jnp.einsum("spi,ij,spj->sp", offsets, slope.information, offsets)
@@ -190,9 +190,9 @@ def ascent_direction(
 def longest_fraction(
     gain: Float[Array, ""], longest: Float[Array, ""] | float = _LONGEST
 ) -> Float[Array, ""]:
-    """Return the fraction of a step that is at most `longest`.
+    """Return the factor at most 1 that shortens a step to the length `longest`.
 
-    `gain` is the squared length of the step in standard errors.
+    `gain` is the squared length of the step, in standard errors.
     """
     return longest / jnp.sqrt(jnp.maximum(gain, longest**2))
 
@@ -200,10 +200,10 @@ def longest_fraction(
 def _next_step(
     parameters: Parameters, state: Passes, slope: Slope
 ) -> tuple[Float[Array, " p"], Float[Array, ""], Bool[Array, ""]]:
-    """Return the next step, the longest step allowed after it, and whether the search converged.
+    """Return the next step, the bound on its length, and whether the search has converged.
 
-    The longest step doubles while steps do not pass a maximum. If the last step led far beyond a
-    maximum, or to a point without usable information, three quarters of it are taken back.
+    The bound doubles while steps do not pass a maximum. If the last step led far beyond a maximum,
+    or to a point without usable information, the next step takes three quarters of it back.
     """
     theta, (gradient, covariance, information, _) = state.theta, slope
     step = ascent_direction(gradient, information)

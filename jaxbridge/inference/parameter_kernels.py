@@ -6,14 +6,15 @@ drift is linear in θ. Then θ given the paths is normal,
     N(θ_0 + P⁻¹ g, P⁻¹),    g = ∇(ℓ + log π)(θ_0),    P = -∇²(ℓ + log π),
 
 with derivatives by automatic differentiation at any θ_0. The kernel repeats the draw until it
-satisfies the constraint.
+satisfies the constraint, at most 100 times.
 
-*Metropolis–Hastings.* Otherwise the proposals are normal. They would be exact for a quadratic:
+*Metropolis–Hastings.* In all other cases the kernel proposes a normal draw,
 
     θ' ~ N(θ + (1 - √(1-τ²)) G⁻¹ g, τ² G⁻¹),    G = ∫ Jᵀ J dt + (prior precision),  J = ∂_θ σ⁻¹α.
 
-Here g is the gradient and G the information of the paths at θ. The factor τ is random: 1 (a Newton
-step) or smaller. With τ = 1 and constant G the proposal is the exact draw and always accepted.
+Here g is the gradient of ℓ + log π at θ, and G the information of the paths. The factor τ is
+random: 1 (a Newton step) or 0.3. If ℓ + log π is quadratic with the Hessian -G, the proposal with
+τ = 1 is the exact draw, and is always accepted.
 """
 
 from abc import abstractmethod
@@ -196,7 +197,7 @@ def choose_kernel(
 ) -> AbstractParameterKernel:
     """Return the kernel of the user if there is one, else the exact draw if it is available.
 
-    The exact draw needs a quadratic log-likelihood and a normal prior. The last resort is
+    The exact draw needs a quadratic log-likelihood and a normal prior. Otherwise θ moves by
     Metropolis–Hastings.
     """
     if kernel is not None:

@@ -1,8 +1,8 @@
 """The unknown parameters as a vector θ in R^p.
 
 All parameters of the model are unknown, or those that a function `where(params)` selects, as for
-`equinox.tree_at`. If paths are part of the state of a chain, σ must not depend on θ. Two different
-σ give mutually singular laws of paths, so a path would determine θ and the chain would not move.
+`equinox.tree_at`. If θ is drawn given a complete path, σ must not depend on θ. Two different σ give
+mutually singular laws of paths, so a path would determine θ and the chain would not move.
 """
 
 import warnings
@@ -245,10 +245,9 @@ def theta_of_model(parameters: Parameters, dtype: jnp.dtype) -> Float[Array, " p
     if uses_argument(lambda theta: parameters.bind(theta).coordinate_values(), theta):
         raise ValueError(
             "the coordinates of `lamperti` depend on the unknown parameters of σ, but the "
-            "observations were transformed with fixed parameters. Infer by `pmmh` or "
-            "`maximum_likelihood` in the original coordinates, or in coordinates without "
-            "parameters, as of `jb.transform(model, jnp.log, jnp.exp)`; or fix the parameters of "
-            "σ by `where=`."
+            "observations were transformed with fixed parameters. Infer these parameters in the "
+            "original coordinates, or in coordinates without parameters, such as those of "
+            "`jb.transform(model, jnp.log, jnp.exp)`. Or fix the parameters of σ by `where=`."
         )
     return theta
 

@@ -69,15 +69,15 @@ from .priors import GivenDensity, NormalDensity, Prior, as_log_prior
 from .record_paths import check_no_bridges, check_no_record, unguided
 from .warm_up import stages
 
-# Limits of the variance of the log-likelihood estimates, and of the share of truncated iterations.
+# Limits of the variance of the log-likelihood estimates, and of the truncated weights per draw.
 _MOST_VARIANCE, _MOST_TRUNCATED = 5.0, 0.01
 _NOISY = (
     "The variance of the log-likelihood estimates (`log_likelihood_variance`) is above 5, so the "
     "chain stays long at large estimates. Use more `num_proposals`, or a better `proposal`."
 )
 _TRUNCATED = (
-    "`max_trials` truncated weights in more than 1 % of the iterations, so the law is not exact. "
-    "Increase `max_trials`, or use another `proposal`."
+    "`max_trials` truncated more than one weight in 100 draws, so the law is not exact. Increase "
+    "`max_trials`, or use another `proposal`."
 )
 _NOISY_IN_PART = (
     "For 10 % of the draws the variance of the log-likelihood estimates is above 5. A chain rarely "
@@ -133,12 +133,12 @@ class PMMHPosterior(AbstractPosterior):
         are in alphabetical order.
     - `log_likelihood`: the likelihood estimates of the chain's states, shape (*chains, n).
     - `log_likelihood_variance`: variance of these estimates given θ, median over the draws, shape
-        (*chains,). It is the sum over the intervals of the variances of log p̂ by the delta method,
+        (*chains,). It is the sum over intervals (or records) of the estimated variances of log p̂,
         and too small if weights have heavy tails. It should be about 1.
         - Above 3 the chain stays long at large estimates: increase `num_proposals` in proportion,
           or use a better `proposal`.
         - Far below 1 fewer proposals make iterations cheaper.
-        - It is infinite if weights were truncated (`num_truncated`), and with a single proposal.
+        - It is infinite with a single proposal, or if weights were truncated in most draws.
     - `variance_in_part`: 90 % quantile of this variance over the draws, shape (*chains,).
     - `log_step_error`: estimated discretisation error of each estimate, shape (*chains, n). NaN at
         draws where it was not computed. `step_error`, that of the posterior mean, is computed from
@@ -149,14 +149,15 @@ class PMMHPosterior(AbstractPosterior):
         parameters for lack of an estimate, shape (*chains,). Couplings count iterations in which no
         pair met, too; this is an estimate of zero, and the law remains exact.
     - `num_truncated`: number of weights that `max_trials` truncated in all iterations, shape
-        (*chains,). With many of them the law is not exact.
+        (*chains,), with those of the warm-up. With many of them the law is not exact.
     - `state`: last state; pass it as `init`, with `num_warmup=0`, to continue.
     - `guide`: diagnostics of the last guide of each record, from the warm-up; `None` without an
         `observation`. A poor guide is a fault only if the chain mixes poorly, too.
     - `share_lost`: fraction of the paths that diverged or left the state space, shape (*chains,):
         the mean over intervals and over the estimates after the warm-up, weighted by their
         acceptance probabilities. With an `observation` it is the total number of lost particles
-        divided by `num_proposals`. It is a fault if more than 5 % of the mass may be missing.
+        divided by `num_proposals`. Above 2 % it is a fault, because 5 % of the probability mass may
+        then be missing.
     """
 
     params: PyTree
@@ -263,18 +264,21 @@ def pmmh(
         the stationary law need a normalised `log_stationary`, because its constant depends on the
         parameters.
     - `covariance`: covariance of the first proposals of θ, shape (p,) for a diagonal or (p, p), in
-        the order of the result's `names`, which is that of `jax.tree.leaves(params)`. The default
-        has a tenth of the prior's standard deviations, or of θ if the prior is not normal. With an
-        `observation` it has the width of the likelihood.
+        the order of the result's `names`, which is that of `jax.tree.leaves(params)`. By default
+        their standard deviations are a tenth of those of the prior, or a tenth of |θ| (at least
+        0.01) if the prior is not normal. With an `observation` the default follows the width of the
+        likelihood.
     - `init`: unknown parameters to start from, or the `state` of earlier draws. A continued chain
-        uses the proposals of paths, their bounds and the guide of the state. A `proposal` other
-        than "auto" replaces these proposals, except in the stored estimate of the state.
+        uses the proposals of paths and the guide that the state stores. The proposals keep their
+        bounds, so omit `num_counts` and `max_trials`. A `proposal` other than "auto" replaces the
+        stored proposals, except in the stored estimate.
     - `observation`, `initial`, `initial_time`: observation model and initial law of a noisy or
         partial record, as in `innovations`. By default observations are exact and complete.
-        `num_proposals` is then the number of particles, and a small one suffices. The warm-up finds
-        the guide and its discount rate by pilot runs. For unknown parameters of the noise make them
-        parameters of the model, and `covariance` of `LinearGaussian` a function of them.
-    - `num_counts`, `max_trials`: as in `transition_log_density`.
+        `num_proposals` is then the number of particles, and a small number suffices. The warm-up
+        finds the guide, and its discount rate by pilot runs. If parameters of the noise are
+        unknown, make them parameters of the model, and `covariance` of `LinearGaussian` a function
+        of them.
+    - `num_counts`, `max_trials`: as in `transition_log_density`; not with an `observation`.
     - `progress_meter`, `checkpoint`: as in `gibbs`.
 
     **Returns:** `PMMHPosterior`. Not differentiable.

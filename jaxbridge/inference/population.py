@@ -4,12 +4,12 @@ The entries j of θ that vary are the means of the population. Record r has the 
 
     θ_rj = θ_j + s_j z_rj,    z_rj ~ N(0, 1),    s_j = e^{λ_j},
 
-and θ_r = θ in all other entries. The parameters of the population are φ = (θ, λ). They are moved in
-two ways, because each mixes poorly where the other mixes well (Papaspiliopoulos, Roberts & Sköld
-2007):
+and θ_r = θ in all other entries. The parameters of the population are φ = (θ, λ). Each iteration
+moves φ in two ways, because each way mixes poorly where the other mixes well (Papaspiliopoulos,
+Roberts & Sköld 2007):
 
-- given z and the noise of the paths, together with all records;
-- given the parameters θ_r, on which the paths depend. Then the records do not matter.
+- with z and the noise of the paths fixed: then all θ_r and all paths change with φ;
+- with the θ_r and the paths fixed: then z changes with φ, and the data do not matter.
 """
 
 from collections.abc import Callable
@@ -36,7 +36,7 @@ _FIRST_SPREAD = 0.3
 class NormalPopulation(eqx.Module):
     """Normal law of parameters that vary between records, with unknown mean and variance.
 
-    Give positive parameters by their logarithms: they are then log-normal.
+    Use the logarithms of positive parameters as parameters of the model: they are then log-normal.
 
     **Arguments:**
 
@@ -44,12 +44,12 @@ class NormalPopulation(eqx.Module):
         `lambda params: params["log_rate"]` or `lambda params: params["B"][0]`. They must be
         unknown. The prior of `gibbs` is then that of their means in the population. Its
         `constraint` applies to the means and to the parameters of each record.
-    - `spread`: scale of the half-normal prior of the standard deviations in the population; a
-        number, or one for each parameter.
+    - `spread`: scale of the half-normal prior of the standard deviations in the population, by
+        default 1; a number, or one for each parameter.
 
     **Raises:** `TypeError` if `per_unit` is no function; `ValueError` for a `spread` that is not
-    positive and finite. `gibbs` raises `ValueError` if the parameters are not unknown, or for a
-    single record.
+    positive and finite. `gibbs` raises `ValueError` if `per_unit` selects anything but unknown
+    parameters, for a `spread` of another shape, or for a single record.
 
     **Example:**
 
@@ -96,7 +96,7 @@ class Population(eqx.Module):
     def first_root(self, root: Float[Array, "p p"]) -> Float[Array, "p+q p+q"]:
         """Return S of the first moves of φ, given that of θ.
 
-        Entries that take turns (`moves`) are independent.
+        Entries that do not move in the same iteration (`moves`) are independent.
         """
         of_spreads = _FIRST_SPREAD * jnp.eye(len(self.varies), dtype=root.dtype)
         first, second = self.moves(jnp.int32(0)), self.moves(jnp.int32(1))
@@ -104,7 +104,10 @@ class Population(eqx.Module):
         return jnp.where(together, block_diag(root, of_spreads), 0) if self.varies else root
 
     def check_state(self, state: Any) -> None:
-        """Raise `ValueError` for a state of other parameters that vary, or `None`."""
+        """Raise `ValueError` if a state has another number of entries that vary.
+
+        `None` is allowed: it stands for a new start.
+        """
         if state is not None and state.units.shape[-1] != len(self.varies):
             raise ValueError(
                 f"`init` is a state of draws with {state.units.shape[-1]} parameters that vary "
@@ -127,8 +130,9 @@ class Population(eqx.Module):
     def moves(self, number: Int[Array, ""]) -> Bool[Array, "p+q"]:
         """Return the mask of the entries of φ that move in this iteration, given z.
 
-        Those of the population and those that are the same for all records take turns: given z the
-        former are known far better, and would slow the latter down.
+        Entries of the population law and entries that are the same for all records move in
+        alternate iterations. Given z the former are known far better; in a joint move they would
+        allow only small steps.
         """
         p, at = len(self.parameters.names), list(self.varies)
         of_population = np.zeros(p + len(at), bool)
@@ -181,8 +185,9 @@ class Population(eqx.Module):
     ) -> tuple[Float[Array, "p+q"], Float[Array, "R q"]]:
         """Move means and variances of the population given the parameters of the records.
 
-        Proposals are the posteriors for flat priors, N(mean, s²/R) and SS / χ²_R, so only the
-        priors decide about their acceptance.
+        The proposals have the posterior laws for flat priors of θ and λ: N(mean of θ_r, s²/R) for
+        the mean, SS / χ²_R for the variance, with the sum of squares SS. So the acceptance
+        probability depends on the priors only.
         """
         mean_key, spread_key, mean_uniform, spread_uniform = jax.random.split(key, 4)
         theta, log_sd = self.split(phi)

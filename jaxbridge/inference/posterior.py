@@ -24,8 +24,9 @@ from .parameters import Parameters, init_vectors, of_rows
 from .population import LOG_SD, Population
 from .summary import PosteriorSummary
 
-# The discretisation error is computed for about so many draws: enough for a covariance. For all
-# draws it would take a large part of the run time.
+# The discretisation error is computed for at least so many draws (if there are as many), and for
+# fewer than twice as many: enough for a covariance. For all draws it would take a large part of the
+# run time.
 _STEP_ERRORS = 256
 # No covariance is estimated from fewer draws, nor if steps are too long for the drift in a larger
 # share of the draws.
@@ -34,8 +35,8 @@ _FEWEST, _MOST_INFINITE = 10, 0.1
 _MOST_R_HAT, _FEWEST_EFFECTIVE = 1.1, 25
 _APART = (
     "Chains, or halves of a chain, disagree (R̂ above 1.1 for some parameter): they have not "
-    "converged. Use more `num_iterations` and `num_warmup`, or start from likelier parameters by "
-    "`init=`."
+    "converged. Use more `num_iterations` (and `num_warmup`, where chains have a warm-up), or "
+    "start from likelier parameters by `init=`."
 )
 _FEW = (
     "The effective sample size of some parameter is below 25: its mean and its error are "
@@ -60,16 +61,17 @@ _Posterior = TypeVar("_Posterior", bound="AbstractPosterior")
 
 
 class AbstractPosterior(AbstractResult):
-    """Posterior draws with their Monte Carlo and discretisation errors: the common part of the
-    results of `gibbs` and `pmmh`, for annotations and `isinstance`.
+    """Posterior draws with their Monte Carlo and discretisation errors.
 
-    - `params`: draws of the unknown parameters, a pytree with leading axes (chains, n).
-    - `theta`: the same as vectors, shape (chains, n, p). Without `num_chains` these and the
-        following have no axis of chains.
+    Base class of the results of `gibbs` and `pmmh`, for annotations and `isinstance`. Without
+    `num_chains` arrays have no axis of chains.
+
+    - `params`: draws of all parameters of the model, a pytree with leading axes (chains, n).
+    - `theta`: draws of the unknown parameters as vectors, shape (chains, n, p).
     - `names`: names of the p entries of θ.
     - `log_step_error`: estimated discretisation error of the log-likelihood at each draw, shape
-        (chains, n).
-    - `sigma_varies`: whether σ depends on unknown parameters.
+        (chains, n). NaN at draws where it was not computed.
+    - `sigma_varies`: whether σ depends on the state.
     - `state`: last state of the chains, to continue the run.
     """
 
@@ -147,9 +149,10 @@ class AbstractPosterior(AbstractResult):
         """Return the estimated discretisation bias of the posterior means, shape (p,).
 
         The bias is the estimate minus its limit. To first order it is the covariance of θ and
-        `log_step_error`. NaN if that is not available, for instance with one step. It is also NaN,
-        with an infinite uncertainty, if the steps are too long for the drift (`log_step_error` is
-        infinite) in more than a tenth of the draws.
+        `log_step_error`. It is NaN if `log_step_error` is known for fewer than ten draws, as with a
+        single step. It is also NaN, with an infinite uncertainty, if `log_step_error` is infinite
+        in more than a tenth of the draws for which it was computed. (Steps are then too long for
+        the drift.)
         """
         return self._step_error.value
 
@@ -211,8 +214,8 @@ class AbstractPosterior(AbstractResult):
     def continuation(self) -> dict[str, Any]:
         """Return arguments that continue this run.
 
-        Merge them into the original ones, some of which they replace, and pass the same `key`. The
-        new draws use the random numbers after those of this run.
+        Merge them into the arguments of this run, some of which they replace, and pass the same
+        `key`. The new draws use the random numbers after those of this run.
 
         **Example:**
 
@@ -305,11 +308,11 @@ class AbstractPosterior(AbstractResult):
     def to_arviz(self) -> Any:
         """Return the draws as ArviZ's `InferenceData` (`DataTree` since its version 1).
 
-        The group `posterior` has the parameters, with a `population` also those of each record
-        ("unit_params.rate") and the log standard deviations ("log_sd(rate)"). `sample_stats` has
-        the other values of each draw, for instance the acceptance of moves. There `log_likelihood`
-        of `pmmh` has the name `log_likelihood_estimate`, because it has no values for single
-        observations. This needs the package ArviZ.
+        The group `posterior` contains the parameters. With a `population` it also contains those of
+        each record ("unit_params.rate") and the log standard deviations ("log_sd(rate)"). The group
+        `sample_stats` contains the other values of each draw, for instance whether moves were
+        accepted. There `log_likelihood` of `pmmh` has the name `log_likelihood_estimate`, because
+        ArviZ expects one log-likelihood for each observation. This needs the package ArviZ.
 
         **Example:**
 
@@ -382,10 +385,10 @@ def check_likelihood_was_found(never: Bool[Array, "*chains"]) -> None:
     """
     if not is_traced(never) and (stuck := np.flatnonzero(np.asarray(never))).size:
         raise ValueError(
-            f"the likelihood at the start parameters is zero, also with paths guided by all "
-            f"observations, and none of the moves found a positive one (chain {stuck[0]} of "
-            f"{never.size}). Start from likelier parameters by `init=` or the model's `params`, "
-            "use more `num_steps`, or allow for outliers in the noise of the observations."
+            f"the estimated likelihood at the start parameters is zero, and none of the moves "
+            f"found a positive one (chain {stuck[0]} of {never.size}). Start from likelier "
+            "parameters by `init=` or the model's `params`, use more `num_steps`, or allow for "
+            "outliers in the noise of the observations."
         )
 
 
@@ -400,7 +403,7 @@ def starting_points(
 ) -> tuple[Float[Array, "*chains p"], Any]:
     """Return θ of each chain, and the state to continue if `init` is one, else `None`.
 
-    In a state `num_others` numbers follow θ.
+    `num_others` is the number of further entries that follow θ in a state.
 
     **Raises:** `ValueError` for an `init` that does not fit the parameters or chains, violates the
     constraint, or has a prior density that is not finite and positive.
@@ -449,7 +452,7 @@ def check_covariance_is_used(covariance: Any, state: Any) -> None:
 def first_chain(values: Float[Array, "..."], num_axes: int = 1) -> Float[Array, "..."]:
     """Return the values of the first chain, such as θ, at which proposals are selected.
 
-    Those of one chain have `num_axes` axes.
+    The values of one chain have `num_axes` axes; those of several chains have one more.
     """
     return values if values.ndim == num_axes else values[0]
 
@@ -472,9 +475,10 @@ def thinned_step_errors(
     number: Int[Array, ""],
     num_draws: int,
 ) -> Float[Array, "*chains"]:
-    """Return `function(state)` for about 256 of `num_draws` evenly spaced draws, NaN for others.
+    """Return `function(state)` if the draw with this number is selected, else NaN.
 
-    `number` counts the draws from zero. It is negative in the warm-up.
+    Of `num_draws` draws 256 to 511 are selected, evenly spaced, or all if there are fewer than 512.
+    `number` counts the draws from zero. It is negative in the warm-up, where none is selected.
     """
     every = max(1, num_draws // _STEP_ERRORS)
     shape = jax.eval_shape(function, state)

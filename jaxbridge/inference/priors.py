@@ -27,8 +27,8 @@ class NormalPrior(eqx.Module):
 
     Vectors and matrices have the order of `jax.flatten_util.ravel_pytree`.
 
-    **Raises:** `ValueError` if shapes do not fit the parameters; the function that takes the prior
-    raises it.
+    **Raises:** nothing itself. The function that takes the prior raises `ValueError` if shapes do
+    not fit the parameters, the mean is not finite, or the variance is not positive (definite).
 
     **Example:**
 

@@ -1,6 +1,7 @@
 """Gibbs sampling of parameters and paths, given noisy or partial records.
 
-Exact observations are a record without noise. They belong here if σ is unknown.
+Exact observations are a record without noise. They are treated here if σ is unknown, or if
+parameters vary between records.
 
 The state is (θ, path). Two moves alternate:
 
@@ -14,9 +15,9 @@ This holds for every step size.
 Parameters may vary between records (`population`). Two more moves follow then: those of each record
 given ξ, all at once, and those of the population given the parameters of the records.
 
-The guide is linearised along a path that is likely at some θ. It may be poor at a θ far away.
-Neither the law of the path given θ nor that of θ given ξ depends on the guide, so the warm-up
-replaces it (`warm_up`).
+The guide is linearised along a path that is likely at some θ. It may be poor at a θ far away. Both
+moves leave the posterior law of θ and path invariant for every guide, so the warm-up may replace
+the guide (`warm_up`).
 
 The discretisation error of the likelihood follows from E[w̃ / w] (`record_paths`). If half as many
 steps are too few for the drift, a path may diverge; then its w̃ is zero.
@@ -70,8 +71,9 @@ class RecordState(NamedTuple):
 
     - `theta`: θ, shape (p,). With a `population` the logs of its q standard deviations follow.
     - `paths`: knots of the paths of R records (`records.guided_record`).
-    - `root`: S of the covariance S Sᵀ of moves of θ, shape (p, p).
-    - `log_scales`: log β of the moves of the blocks.
+    - `root`: S of the covariance S Sᵀ of moves of θ; a square matrix with a row for each entry of
+        `theta`.
+    - `log_scales`: log β of each block of the paths, where β is the size of its moves.
     - `num_done`: number of iterations so far.
     - `units`, `unit_roots`: z of each record (`population`), and S of their moves.
     """
@@ -95,7 +97,8 @@ class GuidedState(NamedTuple):
 class RecordPosterior(AbstractPosterior):
     """Posterior draws of the unknown parameters, from `gibbs` for a record.
 
-    A record has an `observation`, or exact observations and an unknown σ.
+    The records have an `observation`. Exact observations count as records, too, if σ is unknown or
+    with a `population`.
 
     Arrays have a leading axis of chains if there are several.
 
@@ -108,8 +111,7 @@ class RecordPosterior(AbstractPosterior):
     - `parameters_moved`: whether θ moved given the noise of the paths, shape (*chains, n).
     - `blocks_moved`: fraction of the blocks of the path that moved, shape (*chains, n).
     - `stuck`: whether some block, or the parameters of some record, never moved, shape (*chains).
-        Then the draws do not represent the
-        posterior, and `standard_error` is infinite.
+        Then the draws do not represent the posterior, and `standard_error` is infinite.
     - `log_step_error`: estimated discretisation error of the log density of data and noise at each
         draw, up to a constant, shape (*chains, n). NaN at draws without an estimate. `step_error`,
         that of the posterior mean, is computed from it.

@@ -15,11 +15,11 @@ Newton's method continues from the average of the second half of the iterates (`
 passes the chains run with fixed θ.
 
 *Differences of log L.* log L(θ + d) - log L(θ) is the log of the mean of w(θ + d) / w(θ) given the
-data. The first two cumulants of the log ratio estimate it.
+data. It is estimated by the mean of the log ratio plus half its variance.
 
 *Second derivatives.* ∇² log w is approximated by differences of ∇ log w at θ ± h e_j. Exact second
-derivatives take three times as long to compile. h is a fraction of 1 / √D_j, where D_j is the mean
-of -∂²_j log w. 1 / √D_j would be the standard error of θ_j if ξ were observed.
+derivatives take three times as long to compile. The step h is a fraction of 1 / √D_j, where D_j is
+the mean of -∂²_j log w. If ξ were observed, 1 / √D_j would be the standard error of θ_j.
 
 *Discretisation error.* The error of the log-likelihood, e = log L_N - log L, is about a fixed
 fraction of log L_{N/2} - log L_N. The error moves the maximum by I⁻¹ ∇e. Let w̃ be the weight with
@@ -85,7 +85,7 @@ class RecordMaximumLikelihood(AbstractResult):
     - `theta`, `covariance`: the estimate as a vector, shape (p,), and the inverse of the observed
         information, shape (p, p).
     - `step_error`, `step_uncertainty`: estimated discretisation bias of `theta` (estimate minus
-        limit), shape (p,), and its standard error. NaN with one step.
+        limit), shape (p,), and its standard error. NaN with one step, and if steps are too long.
     - `iterates`: iterates of the stochastic approximation, shape (n, p).
     - `gradient`: gradient of the log-likelihood at the last pass of Newton's method, before its
         step, shape (p,).
@@ -125,10 +125,12 @@ class RecordMaximumLikelihood(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the estimate, each with a remedy.
 
-        They are: no maximum, or one at infinity; a block of a path that never moved; chains that
-        disagree; a poor guide together with one of these, except a maximum at infinity; a
-        discretisation error that is unknown, too uncertain, or larger than a standard error; and
-        numbers that are not finite.
+        - no maximum, or one at infinity;
+        - a block of a path that never moved;
+        - chains that disagree;
+        - a poor guide, if also no maximum was found, a block never moved or chains disagree;
+        - a discretisation error that is unknown, too uncertain, or larger than a standard error;
+        - an estimate or covariance that is not finite.
         """
         sd = jnp.sqrt(jnp.diagonal(self.covariance))
         steps = step_faults(StepError(self.step_error, self.step_uncertainty), sd, sd)
@@ -342,9 +344,9 @@ def _draws_at(
 
 
 def _adapt_difference(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> Float[Array, " p"]:
-    """Return the h for this curvature, changed by at most a factor of 8.
+    """Return the step h for this curvature. It changes by at most a factor of 8.
 
-    If the curvature is zero or NaN, h is divided by 8.
+    If the curvature is zero or not finite, h is divided by 8.
     """
     target = _DIFFERENCE * lax.rsqrt(jnp.abs(curvature))
     return jnp.where(jnp.isfinite(target), jnp.clip(target, h / 8, h * 8), h / 8)
@@ -353,8 +355,8 @@ def _adapt_difference(h: Float[Array, " p"], curvature: Float[Array, " p"]) -> F
 def _slope(draws: _Draw, h: Float[Array, " p"]) -> Slope:
     """Return log L near θ by the identities of Fisher and Louis.
 
-    The information is NaN, and Newton's method does not use it, if h is off by more than a factor
-    of 2.
+    If h is off by more than a factor of 2, the information is NaN, and Newton's method does not use
+    it.
     """
     p = len(h)
     gradients = draws.gradient.reshape(-1, p)
@@ -371,9 +373,9 @@ def _slope(draws: _Draw, h: Float[Array, " p"]) -> Slope:
 
 
 def _rises(exponents: Float[Array, "chains n 2 p"]) -> Float[Array, "2 p"]:
-    """Return the log of the mean of exponentials by two cumulants, at most the largest exponent.
+    """Estimate the log of the mean of e^x by the mean of x plus half its variance.
 
-    It is -inf if no exponent is finite.
+    The result is at most the largest x. It is -inf if no x is finite.
     """
     finite = jnp.isfinite(exponents)
     number = jnp.sum(finite, axis=(0, 1)).astype(exponents.dtype)

@@ -60,7 +60,9 @@ OF_UNKNOWN_SIGMA = (
     "with a known σ, because a complete path determines σ. Omit this argument, use `pmmh`, or "
     "select other parameters by `where=`."
 )
-OF_POPULATION = "of one population. Omit this argument, or omit `population`."
+OF_POPULATION = (
+    "whose parameters do not vary between records. Omit this argument, or omit `population`."
+)
 # Defaults of the arguments about bridges.
 _USUAL = {"proposal": "auto", "bridges": "exact", "method": "gradient"}
 
@@ -292,14 +294,15 @@ def likely_root(
     root: Float[Array, "p p"],
     of_records: Callable[[Array], Array] = lambda theta: theta,
 ) -> Float[Array, "p p"]:
-    """Return S of first moves with the widths of each parameter's posterior given the others.
+    """Return a diagonal S of first moves, from the width of each parameter's conditional posterior.
 
     φ are the parameters that move, and `of_records` returns θ of the records.
 
     The likelihood is that of the guided path without noise. For a linear model it is exact up to a
-    constant. At the width h the mean of the log densities at θ ± h is ½ below the log density at θ.
-    A few secant steps find h; they need no derivatives and any start will do. h is at most ten
-    times `root`, the width of the prior. If the path has no weight, `root` is returned.
+    constant. The width h of an entry is such that the mean of the log densities at φ ± h is ½ below
+    the log density at φ. A few secant steps find h; they need no derivatives, and every start will
+    do. h is at most ten times the diagonal of `root`. S has the entries 2.4 h / √p. If the path has
+    no weight, `root` is returned.
     """
     points, p = grid.points, phi.shape[0]
 

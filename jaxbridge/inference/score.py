@@ -1,7 +1,7 @@
 """Score and observed information of discrete observations, by the identities of Fisher and Louis.
 
-They are for a known σ that does not depend on the state, and for couplings. Otherwise a simulated
-likelihood is differentiated (`simulated_likelihood`).
+The identities are used for a known, constant σ, and with couplings also for a known σ(x). Otherwise
+a simulated likelihood is differentiated (`simulated_likelihood`).
 
 With Z the exact bridge of an interval and f_θ the density of its path,
 
@@ -106,9 +106,12 @@ class Score(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the score, each with a remedy.
 
-        They are: intervals without a bridge; weights that are truncated or have heavy tails; too
-        many lost paths in an interval; and a discretisation error that dominates and exceeds 0.05
-        standard deviations of the score.
+        - intervals without a bridge;
+        - weights that are truncated or have heavy tails;
+        - too many lost paths in an interval;
+        - a discretisation error that is unknown or too uncertain, or that dominates and exceeds
+            0.05 standard deviations of the score;
+        - a score or covariance that is not finite.
         """
         error = jnp.sqrt(jnp.maximum(jnp.diagonal(self.covariance), 0))
         sd = jnp.sqrt(jnp.maximum(jnp.diagonal(self.information), 0))
@@ -162,7 +165,8 @@ def score(
     - `proposal`: as in `sample_weighted_bridges`, but "auto" by default. If σ depends on the state
         or on unknown parameters, estimated transition densities are differentiated, as in
         `maximum_likelihood`: the discretisation error is then of second order, and "auto" selects
-        one of the guided proposals. With a coupling and σ(x), steps are Euler's.
+        one of the guided proposals. A coupling is possible only for a known σ; with σ(x) its steps
+        are Euler's.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_weighted_bridges`.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`. Not
         used where estimated densities are differentiated.
@@ -310,7 +314,7 @@ class _Sums(NamedTuple):
 def _over_all(
     parameters: Parameters, blocks: tuple[Block, ...], of_blocks: Sequence[_Sums]
 ) -> tuple[Score, Float[Array, "*shape"]]:
-    """Return the score of all intervals, and the rises of the log-likelihood."""
+    """Return the score of all intervals, and the log-likelihoods around θ minus that at θ."""
     sums = over_intervals(blocks, of_blocks)
     step_error = StepError(sums.step_error, jnp.sqrt(sums.step_variance))
     num_missing = jnp.sum(sums.effective_sample_size == 0, dtype=jnp.int32)

@@ -1,9 +1,9 @@
 """Score and maximum of a simulated likelihood, for an unknown or state-dependent σ.
 
 A complete path determines σ, so for unknown σ methods with completed paths (Fisher's identity, EM)
-do not apply. For σ(x) the likelihood of a path has Euler steps, of first order. But guided paths
-are smooth functions of θ and of their noise, and so are their weights, whose steps are of second
-order. With fixed noise of n paths per interval,
+do not apply. For σ(x) the likelihood of a path has Euler steps, with an error of first order. But
+guided paths are smooth functions of θ and of their noise, and so are their weights. The weights
+have steps of second order. With fixed noise of n paths per interval,
 
     ℓ̂(θ) = Σ_k log p̂_k(θ),    p̂_k = (1/n) Σ_j w_kj(θ),
 
@@ -114,8 +114,9 @@ _NO_DERIVATIVE = (
 def prefers_simulation(problem: Problem, proposal: ProposalLike, budget: Budget) -> bool:
     """Return whether to differentiate estimated densities, not the likelihood of paths.
 
-    Only these allow an unknown σ, and for a state-dependent σ they have the smaller discretisation
-    error. Couplings have no derivatives, so with a known σ they use the likelihood of paths.
+    Only estimated densities allow an unknown σ, and for a state-dependent σ they have the smaller
+    discretisation error. Weights of couplings have no derivatives, so couplings with a known σ use
+    the likelihood of paths.
     """
     if problem.sigma_is_unknown:
         return True
@@ -265,7 +266,7 @@ def step_error_of_score(
 ) -> StepError:
     """Estimate the discretisation error of ∇ℓ̂ at θ, whose noise has this covariance.
 
-    The estimate uses as many paths with half as many steps. It is NaN if a path has a single step.
+    The estimate uses as many further paths, each with half as many steps. It is NaN for one step.
     """
     parameters, blocks = nondifferentiable((parameters, blocks))
     model = parameters.bind(theta)

@@ -4,7 +4,7 @@ In each iteration the exact kernel at the current θ moves the bridges once (Gu 
 moves by the completed path:
 
 - "gradient": an optimiser makes a step along ∇ log f_θ(Z), whose mean over bridges is the score.
-- "em": let log f = cᵀθ - ½ θᵀPθ be the expansion at θ, with c and P averaged over iterations. The
+- "em": log f is expanded at θ as cᵀθ - ½ θᵀPθ, and c and P are averaged over the iterations. The
   new θ is P⁻¹c. For a drift linear in θ this is the EM algorithm with averaged statistics (Delyon,
   Lavielle & Moulines 1999). In every case a fixed point has score zero.
 """

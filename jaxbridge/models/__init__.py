@@ -6,7 +6,7 @@ Parts of a model:
 
 - `sigma`: σ at one point, as one of six linear operators.
 - `dynamics`: the drift and σ of one equation, ready for compiled loops.
-- `tracing`: traces of a model's functions, and the arguments that these functions use.
+- `tracing`: traces of a model's functions, and tests of which arguments they use.
 - `decisions`: the rules that select the effects to simulate.
 - `diffusion`: the model, which combines functions and parameters.
 

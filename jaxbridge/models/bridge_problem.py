@@ -67,10 +67,10 @@ class BridgeProblem(eqx.Module):
     def keep(
         self, save_at: Numbers | None, duration: Numbers, fractions: Float[np.ndarray, " points"]
     ) -> "BridgeProblem":
-        """Return the same problem with paths stored at the times `save_at` only.
+        """Return the same problem with paths stored at the times `save_at` only; `None` stores all.
 
-        `fractions` is the grid, divided by the duration. For several durations `save_at` has to be
-        divided by them, too.
+        `fractions` is the grid, divided by the duration. For several durations `save_at` are also
+        fractions of the duration.
 
         **Raises:** `ValueError` for times that do not increase, or are not on the grid.
         """
@@ -127,7 +127,8 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
     **Returns:** the intervals; whether any argument has an axis I; whether the duration has one.
 
     **Raises:** `ValueError` for shapes that do not fit, values that are not finite, and durations
-    that are not positive or too short for the dtype.
+    that are not positive or too short for the dtype. `TypeError` for values that are not real
+    numbers, or have less than single precision.
     """
     points = {"start": as_points("start", start), "end": as_points("end", end)}
     duration = as_real("duration", duration)
@@ -207,7 +208,9 @@ def _stored_steps(
         return None
     save_at = as_floating("save_at", save_at)
     if save_at.ndim != 1 or save_at.shape[0] == 0:
-        raise ValueError(f"`save_at` must be an array of times, shape (K,); got {save_at.shape}.")
+        raise ValueError(
+            f"`save_at` must be an array of times, shape (K,); got shape {save_at.shape}."
+        )
     # The index of the nearest grid point is the number of midpoints below the time.
     midpoints = (fractions[1:] + fractions[:-1]) / 2
     if is_traced(save_at, duration):
@@ -223,8 +226,8 @@ def _stored_steps(
         raise ValueError(f"`save_at` must lie in [0, {duration}]; got {save_at}.")
     if np.any(np.abs(fractions[nearest] - targets) > tolerance):
         raise ValueError(
-            "`save_at` must lie on the grid of `num_steps` steps: the nearest grid times "
-            f"are {fractions[nearest] * length}."
+            f"`save_at` must lie on the grid of `num_steps` steps; got {save_at}. The nearest grid "
+            f"times are {fractions[nearest] * length}."
         )
     if np.any(np.diff(nearest) <= 0):
         raise ValueError(f"`save_at` must increase by at least one grid step; got {save_at}.")

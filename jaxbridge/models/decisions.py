@@ -1,9 +1,9 @@
 """Rules that select the effects which a compiled program simulates.
 
 The effects depend on the model and the coupling. While a program is traced, the model, the scheme
-and the coupled pair apply these rules and no others. `coupling.effects` prints the same decisions,
-so the table describes the program exactly. Exception: the class of σ determines whether a step
-solves a linear system; `solves` only describes it.
+and the coupled pair apply these rules and no others. `coupling.effects` returns the same decisions,
+so its table describes the program exactly. Exception: the class of σ determines whether a step
+solves a linear system; `solves` only describes this.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ class Effect(NamedTuple):
 
 
 class Effects(NamedTuple):
-    """Decisions about all effects for one model and coupling.
+    """Decisions about all effects for one model and coupling, from `effects`. Prints as a table.
 
     - `reverse_drift`: α* by automatic differentiation of log ν, in each step of the reversed path.
     - `divergence`: div V in α*.
@@ -32,13 +32,15 @@ class Effects(NamedTuple):
     - `stratonovich`: the difference between the Itô drift and the Stratonovich drift.
     - `stored_times`: storage of all grid points, not only of the requested times.
     - `early_stop`: a loop over associated paths that stops once all of them have hit.
-    - `noise_by_drift`: noise that the drift transports, within a step, to coordinates that σ does
-        not reach. For guided paths.
-    - `quadratic_noise`: the part of a step that is quadratic in its noise, by derivatives of V. For
-        guided paths.
-    - `exact_steps`: steps by the exponential of the drift matrix, without discretisation error. For
-        guided paths. (`path_log_likelihood` has an error of its own.)
-    - `time`: coefficients evaluated at the middle of each step. For guided paths of records.
+
+    The other effects are those of guided paths:
+
+    - `noise_by_drift`: noise that the drift carries, within a step, to coordinates that σ does not
+        reach.
+    - `quadratic_noise`: the part of a step that is quadratic in its noise, by derivatives of V.
+    - `exact_steps`: steps by the exponential of the drift matrix, without discretisation error.
+        (`path_log_likelihood` has an error of its own.)
+    - `time`: coefficients evaluated at the middle of each step, for records.
     """
 
     reverse_drift: Effect
@@ -67,13 +69,13 @@ class Effects(NamedTuple):
 
 
 def without_pairs(of_guided_paths: dict[str, Effect], why: str) -> Effects:
-    """Return the effects for a model without couplings; `why` is the reason for their absence."""
+    """Return the effects for a model to which couplings do not apply, for the reason `why`."""
     no_pair = Effect(False, f"no coupling applies: {why}")
     return Effects(**{name: of_guided_paths.get(name, no_pair) for name in Effects._fields})
 
 
 def noise_by_drift(invertible: bool) -> Effect:
-    """Decide whether to simulate ∫ (δ - s) ∇α σ dW, the noise that the drift transports."""
+    """Decide whether to simulate ∫ (δ - s) ∇α σ dW, the noise that the drift carries."""
     if invertible:
         return Effect(False, "σ reaches all coordinates")
     return Effect(True, "σ has fewer columns than rows: the drift transports the noise")

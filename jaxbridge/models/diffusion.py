@@ -9,11 +9,11 @@ drift:
 The normaliser of ν cancels. The diffusion is reversible if and only if α* = α, equation
 (timereversible).
 
-Couplings need this reversal and an inverse of σ. Two kinds of models lack them, and can be used
-with noisy or partial observations (`records`) only:
+Couplings need this reversal and an inverse of σ; guided bridges need the inverse. Two kinds of
+models are only for simulation and for noisy or partial observations (`simulate`, `records`):
 
 - Hypoelliptic models: σ has fewer columns than rows, so noise enters only some coordinates.
-- Time-dependent models: coefficients α(x, t) and σ(x, t).
+- Time-dependent models: coefficients α(x, t) and σ(x, t), so there is no stationary density.
 """
 
 import copy
@@ -75,8 +75,8 @@ class Diffusion(eqx.Module):
         identity. An array of shape (d, m), or (d,) for a diagonal, is a constant σ. A function
         `(x, params)` or `(x, params, t)` returns such an array. If tracing shows that it does not
         use `x`, σ is constant too. For m > d the model uses the triangular root of V = σσᵀ instead
-        of σ. For m < d noise enters only some coordinates; V has no inverse, and couplings do not
-        apply.
+        of σ. For m < d noise enters only some coordinates. Then V has no inverse, and bridges
+        between exact states and transition densities do not apply.
     - `log_stationary`: log ν up to a constant, `(x, params) -> ()`.
     - `params`: any pytree. Floating point numbers in it become JAX arrays. Leaves that are not
         arrays are static: integers, booleans, strings, the activation function of a neural network.
@@ -90,15 +90,16 @@ class Diffusion(eqx.Module):
     - `normalised`: declare that `log_stationary` is the logarithm of a normalised density.
         Transition densities from couplings that start in the stationary law need it.
     - `domain`: the state space, if it is not all of R^d. A function `(x, params) -> ()` that is
-        true inside. A path that leaves it is a miss, counted in `num_nonfinite`. If paths come near
-        the boundary, use `transform`, which loses no paths there.
+        true inside. A path that leaves the state space is lost, and counts in `num_nonfinite`. If
+        paths come near the boundary, use `transform`, which loses no paths there.
     - `prepare`: a function `(params)`. The functions above receive its result instead of `params`.
         Use it for quantities that depend on the parameters only. It runs once per call, outside
         every loop.
 
-    **Raises:** `TypeError` for functions that cannot be called with these arguments. `ValueError`
-    for a constant σ that is singular, not finite or of a wrong shape; for stationary functions of a
-    model that depends on time; for declarations that contradict the functions.
+    **Raises:** `TypeError` for functions that cannot be called with these arguments, and for flags
+    that are not Booleans. `ValueError` for a constant σ that is singular, not finite or of a wrong
+    shape; for stationary functions of a model that depends on time; for declarations that
+    contradict the functions.
 
     **Example:**
 
@@ -233,7 +234,7 @@ class Diffusion(eqx.Module):
         """Return α*(x), shape (d,): equation (reversedrift) of the paper.
 
         **Raises:** `ValueError` for a model that is not declared reversible and has neither
-        `log_stationary` nor `reverse_drift`.
+        `log_stationary` nor `reverse_drift`, and if the coefficients depend on time.
         """
         x = _as_point(x)
         return self.backward(x).drift(x)
@@ -284,8 +285,8 @@ class Diffusion(eqx.Module):
     def reversibility_residual(self, points: Numbers) -> Float[Array, "n d"]:
         """Return α - ½ (V ∇log ν + div V) at each of the `points`, shape (n, d).
 
-        It is zero everywhere if and only if the diffusion is reversible: equation (timereversible)
-        of the paper, divided by ν.
+        It is zero everywhere if and only if the diffusion is reversible. This is equation
+        (timereversible) of the paper, divided by ν.
 
         **Raises:** `ValueError` for points of another shape and for a model without a stationary
         density.
@@ -362,10 +363,10 @@ class Diffusion(eqx.Module):
 
     @property
     def coordinates(self) -> Callable[[PyTree], PyTree] | None:
-        """Return a function that shows the parameters on which the coordinates depend; else `None`.
+        """Return a function of the prepared parameters; `None` if coordinates depend on none.
 
-        It maps prepared parameters to values, which depend on the same parameters as the
-        coordinates do. Coordinates from `lamperti` depend on the parameters of σ, others on none.
+        Its values depend on the same parameters as the coordinates of the state. Coordinates from
+        `lamperti` depend on the parameters of σ, others on none.
         """
         return self._coordinates
 
@@ -418,9 +419,9 @@ class Diffusion(eqx.Module):
         return self.forward_at(like)(None)
 
     def forward_at(self, like: Float[Array, " d"]) -> DynamicsAt:
-        """Return a function of time whose values are the coefficients, as from `forward`.
+        """Return a function that maps a time to the coefficients at this time, as `Dynamics`.
 
-        The time is ignored, and may be `None`, if no coefficient depends on it.
+        If no coefficient depends on time, it ignores its argument, which may be `None`.
         """
         params = self._prepared_params()
         drift_at = self._drift_at(params)
@@ -428,7 +429,7 @@ class Diffusion(eqx.Module):
         return lambda time: Dynamics(drift_at(time), sigma_at(time), varies)
 
     def _dynamics_at(self, x: Float[Array, " d"], time: Numbers | None) -> Dynamics:
-        """Return the coefficients at a `time`, or those of all times for `None`."""
+        """Return the coefficients at a `time`; `None` is for coefficients without time."""
         if time is None:  # raises if a coefficient depends on time
             return self.forward(x)
         return self.forward_at(x)(as_numbers({"time": time})["time"].astype(x.dtype))

@@ -36,7 +36,7 @@ class GaussianBridge(eqx.Module):
     - `mean`: the mean at each time, (K, d).
     - `covariance`: the covariance at each time, (K, d, d).
 
-    `sample` samples whole paths.
+    `sample` samples paths at all K times jointly.
     """
 
     times: Float[Array, " K"]
@@ -51,8 +51,8 @@ class GaussianBridge(eqx.Module):
     def sample(self, key: Key[Array, ""], num_paths: int) -> Float[Array, "n K d"]:
         """Sample `num_paths` independent paths at `times`, exact in law.
 
-        Each is an unconditional path X with the correction `Z_t = X_t + K_t (b - X_T)`, as in the
-        paper's lemma on the bridge.
+        A path is Z_t = X_t + K_t (b - X_T) for an unconditional path X, as in the paper's lemma on
+        the bridge. The gain K_t is defined in the docstring of the module.
         """
         return _paths(self, key, num_paths)
 
@@ -100,7 +100,7 @@ def gaussian_bridge(
     - `model`: from `ornstein_uhlenbeck`, reversible or not.
     - `start`, `end`: points, shape (d,).
     - `duration`: in units of time, shape ().
-    - `times`: in increasing order within [0, duration], shape (K,). Equal times are allowed.
+    - `times`: within [0, duration], in non-decreasing order, shape (K,).
 
     **Returns:** `GaussianBridge`.
 
@@ -122,7 +122,8 @@ def gaussian_bridge(
         np.all(np.diff(times, prepend=0, append=horizon) >= 0) and times.size
     ):
         raise ValueError(
-            f"`times` must increase within [0, {horizon}], with at least one entry; got {times}."
+            f"`times` must increase within [0, {horizon}], with at least one entry; got {times}. "
+            "Equal times are allowed."
         )
     mean, covariance, gain = _moments(params, a, b, horizon, times)
     return GaussianBridge(times, mean, covariance, model, a, b, horizon, gain)

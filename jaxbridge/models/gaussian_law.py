@@ -21,9 +21,9 @@ class GaussianLaw(eqx.Module):
     **Arguments:** `mean`, shape (d,); `covariance`, shape (d, d), symmetric and positive
     semidefinite. For a singular covariance `sample` and `log_density` return NaN.
 
-    **Raises:** `ValueError` for shapes that do not fit and a mean that is not finite. Also for a
-    covariance that is not symmetric or has a negative eigenvalue, beyond rounding errors. Traced
-    values are not checked.
+    **Raises:** `ValueError` for shapes that do not fit, for a mean that is not finite, and for a
+    covariance that is not symmetric or has a negative eigenvalue, beyond rounding errors.
+    `TypeError` for less than single precision. Traced values are not checked.
 
     **Example:**
 

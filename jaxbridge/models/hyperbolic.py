@@ -28,7 +28,8 @@ def hyperbolic(alpha: Numbers, dim: int) -> Diffusion:
 
     **Arguments:** `alpha`, α > 0, per unit of time, shape (); `dim`, the dimension d ≥ 1.
 
-    **Raises:** `ValueError` for α ≤ 0, α that is not finite, and dim < 1.
+    **Raises:** `ValueError` for α that is not one positive finite number, and for dim < 1;
+    `TypeError` for a `dim` that is not an integer.
 
     **Example:**
 

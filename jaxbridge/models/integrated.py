@@ -22,12 +22,13 @@ def integrated(model: Diffusion) -> Diffusion:
     - Averages of X over intervals, which are differences of Z divided by the length of the
         interval.
 
-    The model is hypoelliptic: noise enters X only. Couplings do not apply; use records with an
-    `observation`. `params` belong to `model`. Z has no stationary law, so records need `initial=`.
+    The model is hypoelliptic: noise enters X only. Bridges and transition densities do not apply;
+    use `simulate`, or records with an `observation`. Z has no stationary law, so records need
+    `initial=`. `params` belong to `model`.
 
     **Arguments:** `model`, the model of X. If its σ is a constant array, that must not be traced.
 
-    **Raises:** `TypeError` unless `model` is a `Diffusion`.
+    **Raises:** `TypeError` unless `model` is a `Diffusion`, `ValueError` for a traced constant σ.
 
     **Example:**
 

@@ -42,20 +42,21 @@ def lamperti(model: Diffusion, at: Numbers, reach: Numbers, *, num_nodes: int = 
     - `model`: a one-dimensional model with σ(x) > 0.
     - `at`: a, a number in the state space, which corresponds to Y = 0.
     - `reach`: the largest |Y|, in square roots of a unit of time. A path that goes beyond it, or
-        leaves the state space, is a miss, counted in `num_nonfinite`.
-    - `num_nodes`: the number of nodes of the table of X on each side of Y = 0. Interpolation errors
-        are O((`reach`/`num_nodes`)⁴).
+        leaves the state space, is lost, and counts in `num_nonfinite`.
+    - `num_nodes`: the number of nodes, on each side of Y = 0, of the table that gives X as a
+        function of Y. Interpolation errors are O((`reach`/`num_nodes`)⁴).
 
     **Returns:** `Transformed`. Its `model` accepts other parameters, including those of σ, by
-    `with_params`, and compiles once. Its `forward`, `inverse` and `back` keep the parameters
-    of the argument `model`: for other ones call `lamperti` again.
+    `with_params`, without a new compilation. Its `forward`, `inverse` and `back` keep the
+    parameters of the argument `model`: for other parameters call `lamperti` again.
 
     The coordinates depend on the parameters of σ. So these parameters cannot be inferred from
     observations in these coordinates: `gibbs`, `pmmh`, `score` and `maximum_likelihood` raise an
-    error.
+    error if they are unknown.
 
-    **Raises:** `ValueError` for numbers out of range, and unless σ(a) is positive and finite.
-    `TypeError` for traced numbers, and unless `model` is a `Diffusion`.
+    **Raises:** `ValueError` for numbers out of range, unless σ(a) is positive and finite, and for
+    coefficients that depend on time. `TypeError` for traced numbers, and unless `model` is a
+    `Diffusion`.
 
     **Example:**
 
@@ -239,7 +240,10 @@ class _LampertiFunctions:
 
 @compiled_sooner
 def _tabulated(functions: _LampertiFunctions, params: PyTree) -> _Table:
-    """Return the table of both directions. Compiled once per object and shape of the parameters."""
+    """Return the table for these parameters, from both directions.
+
+    It is compiled once per object and shape of the parameters.
+    """
     params = params if functions.preparation is None else functions.preparation(params)
     below, above = (functions.solve(side, params) for side in (-1, 1))
     x = jnp.concatenate([below[::-1], jnp.asarray([functions.origin], float), above])

@@ -28,15 +28,16 @@ def stationary_diffusion(
 
         α = ½ ν⁻¹ div(ν (V + Q)),    σ = the Cholesky factor of V.
 
-    Every diffusion with stationary density ν and matrix V has this form (Ma, Chen & Fox 2015). Its
+    Every diffusion with stationary density ν and V = σσᵀ has this form (Ma, Chen & Fox 2015). Its
     time reversal has -Q instead of Q, so it is reversible if Q = 0.
 
     **Arguments:**
 
     - `log_density`: log ν up to a constant, `(x, params) -> ()` of one point `x` of shape (d,).
-    - `V`: a function `(x, params)` to a positive definite matrix, shape (d, d), or to a diagonal,
-        (d,). By default the identity.
-    - `Q`: a function `(x, params)` to a skew-symmetric matrix, shape (d, d). By default zero.
+    - `V`: a function `(x, params)` that returns a positive definite matrix: shape (d, d), or (d,)
+        for a diagonal one. By default the identity.
+    - `Q`: a function `(x, params)` that returns a skew-symmetric matrix, shape (d, d). By default
+        zero.
     - `params`: any pytree; the functions receive it.
     - `normalised`: as in `Diffusion`.
 
@@ -75,9 +76,9 @@ def langevin(
 
         dX = kT ∇log ν(X) dt + √(2kT) dW.
 
-    The second form is dX = -∇V dt + √(2kT) dW for ν ∝ exp(-V / kT). Both are reversible with
-    stationary density ν and differ in the unit of time only. A process in a potential V runs 2kT
-    times as fast with a `temperature` as without.
+    The second form is dX = -∇V dt + √(2kT) dW for ν ∝ exp(-V / kT). Both forms are reversible with
+    stationary density ν, and differ in the unit of time only: with a `temperature` the process runs
+    2kT times as fast as without.
 
     **Arguments:**
 
@@ -87,7 +88,7 @@ def langevin(
     - `normalised`: as in `Diffusion`.
 
     **Raises:** `TypeError` for a `log_density` that is not a function, and for a traced number as
-    `temperature`. `ValueError` for a `temperature` that is not positive.
+    `temperature` (pass a function). `ValueError` for a `temperature` that is not positive.
 
     **Example:**
 

@@ -35,8 +35,10 @@ _USUAL_DOUBLINGS = 4
 
 
 class LinearTransition(NamedTuple):
-    """Transition in a time t: `decay` e^{tA}, `integral` M_t and `covariance` Γ_t, shape (d, d)
-    each."""
+    """Transition in a time t: `decay` = e^{tA}, `integral` = M_t and `covariance` = Γ_t.
+
+    All three have shape (d, d).
+    """
 
     decay: Float[Array, "d d"]
     integral: Float[Array, "d d"]

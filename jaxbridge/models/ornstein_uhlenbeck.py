@@ -6,9 +6,9 @@ plane. The stationary law is N(m, Γ), and X_t given X_0 = x is N(m + e^{-tB}(x 
     Γ solves B Γ + Γ Bᵀ = V;
     Γ_t = ∫_0^t e^{-sB} V e^{-sBᵀ} ds = Γ - e^{-tB} Γ e^{-tBᵀ}.
 
-Γ is computed, factored and inverted in the coordinates x or σ⁻¹x, whichever give the smaller B.
-With nearly singular noise, B can have huge entries that cancel, and Γ can exceed floating point
-precision, in one of the two but not in the other.
+Γ is computed, factored and inverted in the coordinates x or σ⁻¹x, whichever give the smaller B. If
+σ is nearly singular, one of the two may be inaccurate: there B has huge entries that cancel, or the
+condition number of Γ exceeds floating point precision.
 """
 
 import functools
@@ -82,7 +82,8 @@ def ornstein_uhlenbeck(
     `sigma`, shape (d, d) or (d,), by default the identity.
 
     **Raises:** `ValueError` if an eigenvalue of B has a real part that is not positive, because the
-    process is not ergodic then; for a singular σ; for shapes that do not fit.
+    process is not ergodic then; for a singular σ; for shapes that do not fit; for values that are
+    not finite.
 
     **Example:**
 

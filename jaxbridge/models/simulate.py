@@ -39,8 +39,9 @@ def simulate(
     - `model`: the diffusion. It needs neither a time reversal nor a stationary law.
     - `x0`: the start, shape (d,), or one start per path, (num_paths, d). `None` samples the starts
         from the stationary law, with the model's sampler.
-    - `times`: increasing, shape (K,), in units of time, with any origin: differences are computed
-        in double precision. Coefficients that depend on time receive these times.
+    - `times`: increasing, shape (K,) with K ≥ 2, in units of time. Their origin is arbitrary,
+        because differences are computed in double precision. Coefficients that depend on time
+        receive these times.
     - `num_paths`: the number of paths.
     - `num_steps`: the number of solver steps between two successive times.
     - `solver`: a diffrax solver that takes fixed steps; by default `diffrax.Heun()`. A Stratonovich
@@ -49,9 +50,10 @@ def simulate(
     **Returns:** paths, shape (num_paths, K, d), differentiable in forward mode. A path that
     explodes is NaN or infinite from there on.
 
-    **Raises:** `ValueError` for shapes that do not fit, and for times that do not increase. For
-    coefficients that depend on time, also if single precision cannot resolve a step at these times.
-    Traced times are not checked for it. `TypeError` for a solver of other equations.
+    **Raises:** `ValueError` for shapes that do not fit, for times that do not increase, and without
+    `x0` for a model without sampler. If coefficients depend on time, `ValueError` also for times so
+    far from zero that single precision cannot resolve a step. Traced times are not checked.
+    `TypeError` for a solver that is not for all stochastic differential equations.
 
     **Example:**
 

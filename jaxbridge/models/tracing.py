@@ -47,8 +47,8 @@ def _call_flat(function, structure, static_leaves, arrays):
 def takes_time(function: Any, num_before_time: int = 2) -> bool:
     """Return whether `function` requires more than `num_before_time` positional arguments.
 
-    The next argument is the time. An argument with a default value does not count, nor does a
-    function without a signature.
+    The next argument is the time. Arguments with default values do not count. The result is false
+    for a function without a signature.
     """
     try:
         parameters = inspect.signature(function).parameters.values()
@@ -79,8 +79,8 @@ _LINEAR_IN_FIRST = {"div": 1, "dynamic_slice": 1, "gather": 1, "dynamic_update_s
 def is_affine(function: Callable, like: Float[Array, " d"]) -> bool:
     """Return whether `function` is an affine function of its argument, according to its jaxpr.
 
-    A derivative that does not depend on the argument would not be enough: that of a step function
-    is zero. Functions with other primitives than sums, products and rearrangements are not affine.
+    A constant derivative would not be enough: that of a step function is zero. A function counts as
+    affine only if its primitives are sums, rearrangements, and products with constants.
     """
     jaxpr = jax.make_jaxpr(function)(like).jaxpr
     # Drop equations that no result uses: `grad` leaves those of the value that it differentiates.
@@ -89,7 +89,10 @@ def is_affine(function: Callable, like: Float[Array, " d"]) -> bool:
 
 
 def _keeps_affine(equation: jax.extend.core.JaxprEqn, inputs: list[bool]) -> bool:
-    """Return whether results are affine in the `inputs` that depend on the argument."""
+    """Return whether the results of an equation are affine in its inputs that depend on x.
+
+    `inputs` states which inputs depend on x, the argument of the function.
+    """
     name = equation.primitive.name
     if name == "select_n":
         return not inputs[0]
@@ -105,10 +108,11 @@ def _follow(
     allows: Callable[[jax.extend.core.JaxprEqn, list[bool]], bool],
     marked: list[bool] | None = None,
 ) -> list[bool] | None:
-    """Return for each result of a jaxpr whether it depends on a `marked` argument, by default any.
+    """Return, for each result of a jaxpr, whether it depends on a marked argument.
 
-    Return `None` if `allows(equation, inputs)` is false for an equation on the way. `inputs` states
-    which of its inputs depend on a marked argument.
+    `marked` has one entry per argument; by default all are marked. Return `None` if
+    `allows(equation, inputs)` is false for an equation that depends on a marked argument. `inputs`
+    states which inputs of the equation depend on one.
     """
     marked = [True] * len(jaxpr.invars) if marked is None else marked
     reached = {var for var, is_marked in zip(jaxpr.invars, marked, strict=True) if is_marked}

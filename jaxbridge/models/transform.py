@@ -6,8 +6,8 @@ Let f be a smooth bijection with inverse g. Then Y = f(X) has, at x = g(y), the 
 
 Here σ_k are the columns of σ. The stationary density of Y is ν(g(y)) |det ∇g(y)|.
 
-The map takes a state space with a boundary to all of R^d, which no step leaves. Bridges are sampled
-and weighted there, and their paths are mapped back.
+For a state space with a boundary, f maps it onto all of R^d, which no step leaves. Bridges are
+sampled and weighted there, and their paths are mapped back.
 """
 
 import dataclasses
@@ -57,8 +57,8 @@ class Transformed(eqx.Module):
         """Return `bridges` with paths in the coordinates of X.
 
         `bridges` is a result of `sample_bridges`, `sample_weighted_bridges`, `weigh_bridges` or
-        `sample_exact_bridges`. Compute weights first: the returned bridges no longer belong to this
-        model.
+        `sample_exact_bridges`. Compute weights before: the returned bridges no longer belong to
+        `model`.
 
         **Raises:** `TypeError` for an object without `paths`.
         """
@@ -119,7 +119,7 @@ def transform(model: Diffusion, forward: Map, inverse: Map) -> Transformed:
     **Returns:** `Transformed`. Calls with the same functions compile once.
 
     **Raises:** `TypeError` unless `model` is a `Diffusion`, and for arguments that are not
-    functions. `ValueError` for a model that depends on time.
+    functions. `ValueError` for a model that depends on time, and for a traced constant σ.
 
     **Example:**
 

@@ -43,14 +43,15 @@ def underdamped_langevin(
 
         dQ = P dt,    dP = (-∇U(Q) - γP) dt + √(2γτ) dW,    log ν = -(U(q) + ½|p|²) / τ + constant.
 
-    The model is hypoelliptic: noise enters P only. Couplings do not apply; use records with an
-    `observation`. `params` of the model is an `UnderdampedLangevinParams`.
+    The model is hypoelliptic: noise enters P only. Bridges and transition densities do not apply;
+    use `simulate`, or records with an `observation`. `params` of the model is an
+    `UnderdampedLangevinParams`.
 
     **Arguments:**
 
     - `potential`: U, a function `(q, params) -> ()` of positions, shape (n,).
-    - `friction`: γ ≥ 0, shape ().
-    - `temperature`: τ > 0, shape ().
+    - `friction`: γ ≥ 0, per unit of time, shape ().
+    - `temperature`: τ > 0, in units of the potential, shape ().
     - `params`: any pytree; the potential receives it.
 
     **Raises:** `TypeError` for a potential that is not a function. `ValueError` for other shapes or

@@ -45,7 +45,7 @@ def paths_in_space(
 
     - `times`, `paths`: shapes (K,) and (n, K, 2), as returned by `sample_bridges`. Bridges that
         were not found (NaN) are left out.
-    - `ax`: axes; by default new ones. With `times` they need `projection="3d"`.
+    - `ax`: axes to draw in; by default new ones. With `times` they need `projection="3d"`.
     - `num_paths`: number of paths to draw, the first ones.
 
     **Returns:** the axes.
@@ -288,12 +288,12 @@ def copula_levels(
 
 
 def work_precision(result: jb.WorkPrecision, ax: Axes | None = None) -> Axes:
-    """Plot error against computing time, one curve per proposal and method.
+    """Plot error against computing time, one curve per method, proposal and precision.
 
-    The vertical axis has the error that does not shrink with the number of bridges, ± its
-    uncertainty. The horizontal axis has the seconds for 1,000 effective samples. Labels show the
-    number of steps. The dotted line is the Monte Carlo error of 1,000 effective samples, the dashed
-    line the required accuracy.
+    The vertical axis has the distance from the reference, ± its uncertainty. More bridges reduce
+    the uncertainty, but not the bias. The horizontal axis has the seconds for 1,000 effective
+    samples. Labels show the number of steps. The dotted line is the Monte Carlo error of 1,000
+    effective samples. If there is a target, a dashed line shows it.
 
     **Arguments:**
 

@@ -4,7 +4,8 @@ A proposal (`base`) draws paths with weights w such that, for every function h,
 
     E[w h(path)] = p_T(a, b) E_bridge[h].
 
-It also reports its cost, its target law and the quantities to measure before use.
+It also reports its cost and its target law, and measures before use what its paths need, such as a
+burn-in.
 
 - `coupled`: coupled pairs, with random weights from hitting counts.
 - `guided`: guided proposals. Their steps are normal and lead to the end point; the weight is the
@@ -12,9 +13,9 @@ It also reports its cost, its target law and the quantities to measure before us
     - `modified_bridge` keeps drift and σ fixed at the current point;
     - `residual_bridge` subtracts a deterministic path first;
     - `linear_guide` uses the transition density of a linear process.
-- `choice`: a separate proposal for each interval. `auto` collects the candidates for it, and
-  `pilots` compares them by pilot runs.
-- `memory_blocks`: draw paths in blocks that fit in memory.
+- `choice`: a separate proposal for each interval. `auto` collects the candidates, and `pilots`
+  compares them by pilot runs.
+- `memory_blocks`: paths drawn in blocks that fit in memory.
 
 To add a proposal, add a module. To make it a candidate of "auto", name it in `auto`.
 """

@@ -101,9 +101,9 @@ class Auto(AbstractProposal):
     ) -> Choice:
         """Return the choice for these intervals.
 
-        Seconds per path follow a rule; if `timed`, they are measured. The choice itself has no
-        derivatives. Paths and weights of the chosen proposal may have derivatives in the model,
-        except if a candidate is a coupling.
+        Seconds per path follow a rule; if `timed`, they are measured where this could change the
+        choice. The choice itself has no derivatives. Paths and weights of the chosen proposal have
+        derivatives with respect to the model, unless a candidate is a coupling.
         """
         if self.coupled:
             model, intervals = nondifferentiable_choice((model, intervals))
@@ -124,9 +124,9 @@ def resolve(
     intervals: Intervals,
     num_steps: int,
 ) -> AbstractProposal:
-    """Return the proposal, with an open choice decided if its arguments are not traced.
+    """Return the proposal; make an open choice first, unless its arguments are traced.
 
-    Then only the chosen candidates are compiled.
+    After the choice, only the chosen candidates are compiled.
     """
     if not isinstance(proposal, Auto):
         return proposal
@@ -140,9 +140,9 @@ def resolve(
 class Budget(NamedTuple):
     """Arguments that bound the work of a coupling; `None` for the default.
 
-    - `num_counts`: N, the number of hitting counts per path.
-    - `max_proposals`: maximum of attempts for a pair that meets.
-    - `max_trials`: maximum of trials for the counts of one path.
+    - `num_counts`: number of hitting counts per path.
+    - `max_proposals`: maximum number of attempts for a pair that meets.
+    - `max_trials`: maximum number of trials for the counts of one path.
     """
 
     num_counts: int | None = None
@@ -174,15 +174,17 @@ def as_proposal(
     normal_steps: bool = True,
     name: str = "proposal",
 ) -> AbstractProposal:
-    """Return the argument `proposal` as a proposal with all defaults of this model set.
+    """Convert the argument `proposal`, and set all defaults that depend on the model.
 
-    `None` stands for `Coupling()`. `like` is a point of the right shape and dtype. `for_density`
-    states that the weights estimate densities, so a constant factor matters. `normal_steps` states
-    that paths must determine their noise; it has no effect `for_density`. `name` is the argument in
-    messages.
+    - `proposal`: `None` stands for `Coupling()`.
+    - `like`: a point of the right shape and dtype.
+    - `for_density`: whether the weights estimate densities, so that a constant factor matters.
+    - `normal_steps`: whether paths must determine their noise, so that steps must be normal. It has
+        no effect if `for_density` is true.
+    - `name`: name of the argument in messages.
 
     **Raises:** `TypeError` for anything but a coupling, a proposal or "auto". `ValueError` for a
-    budget if the proposal has no use for one.
+    budget if the proposal has no use for one, or if σ has no inverse and the proposal is guided.
     """
     normal_steps = normal_steps and not for_density
     if isinstance(proposal, str) and proposal == "auto":
@@ -194,12 +196,15 @@ def as_proposal(
 
 
 def _convert(proposal: ProposalLike, budget: Budget, name: str = "proposal") -> AbstractProposal:
-    """Return a coupling as `CoupledPairs` with this budget, and a proposal unchanged."""
+    """Return a coupling as `CoupledPairs` with this budget, and a proposal unchanged.
+
+    **Raises:** `ValueError` for a budget of another proposal, `TypeError` for other types.
+    """
     if isinstance(proposal, AbstractProposal):
         if any(value is not None for value in budget):
             raise ValueError(
-                "`num_counts`, `max_proposals` and `max_trials` are for a `Coupling`; this "
-                "`proposal` has its own values, or needs none: omit these arguments."
+                "`num_counts`, `max_proposals` and `max_trials` are for a `Coupling` only; this "
+                "`proposal` has its own values, or needs none. Omit these arguments."
             )
         return proposal
     if not isinstance(proposal, AbstractCoupling):
@@ -225,8 +230,8 @@ def choice_between(
     """Return an open choice between these candidates, with the budget for couplings among them.
 
     **Raises:** `ValueError` for no candidates, for candidates on different grids, for a candidate
-    that is itself a choice, and for a budget without couplings. `left_out` is the reason in the
-    last message.
+    that is itself a choice, and for a budget without couplings. The message of this last error
+    states the reason `left_out`. `TypeError` for candidates of other types.
     """
     if len(candidates) == 0:
         raise ValueError("`candidates` must contain at least one proposal; got none.")
@@ -242,7 +247,8 @@ def choice_between(
     )
     if not all(isinstance(proposal, AbstractSingleProposal) for proposal in proposals):
         raise ValueError(
-            "`candidates` must be single proposals; got a result of `choose_proposal`."
+            "`candidates` must be single proposals; got a result of `choose_proposal`. Pass its "
+            "`candidates` instead."
         )
     # Any number of steps shows whether the grids differ.
     grids = {tuple(proposal.fractions(8)) for proposal in proposals}
@@ -254,7 +260,8 @@ def choice_between(
 def guided_candidates() -> list[AbstractSingleProposal]:
     """Return the guided candidates of "auto".
 
-    Their default targets have the same order of discretisation error as couplings, if possible.
+    Their default targets are the most accurate step densities. For constant σ these have the same
+    order of discretisation error as couplings; for a state-dependent σ, usually a higher one.
     """
     return [ModifiedDiffusionBridge(), Guided("end"), Guided("path")]
 
@@ -262,7 +269,8 @@ def guided_candidates() -> list[AbstractSingleProposal]:
 def default_candidates(model: Diffusion, for_density: bool = False) -> list[Any]:
     """Return the candidates of "auto", with couplings if the model is suitable.
 
-    Couplings need a time reversal. For a density they also need a normalised ν.
+    Couplings need a time reversal. For a density they also need a model that is declared
+    `normalised`.
     """
     coupled = model.has_reversal and (model.normalised or not for_density)
     # Guided candidates come first: couplings then have pilot runs only where they could be better.

@@ -34,15 +34,16 @@ class WeightedPaths(NamedTuple):
 
     - `paths`, `log_weights`: NaN and -inf for paths that were not found.
     - `found`: whether a path was found.
-    - `truncated`: whether the weight is inexact because a bound on the work was reached.
+    - `truncated`: whether the weight is inexact, because a bound on the work was reached or because
+        the weight itself was NaN or infinite.
     - `num_simulated`: number of simulated paths.
-    - `num_nonfinite`: number of simulated paths with NaN or infinity.
+    - `num_nonfinite`: number of simulated paths that became non-finite.
     - `log_halving`: D of `halving`, NaN if it was not computed.
-    - `log_coarse`: log weight of the path of half as many steps from the same noise
-        (`coupled_grids`); -inf if that path was lost, NaN if it was not computed.
-    - `coarse_paths`: those paths, or the path itself if its `log_coarse` is NaN; `None` if none
-        were stored. Between two points of the coarse grid their distance to the fine path is
-        constant.
+    - `log_coarse`: log weight of the coarse path, which the same noise gives with half as many
+        steps (`guided`); -inf if the coarse path was lost, NaN if it was not computed.
+    - `coarse_paths`: the coarse paths; the path itself where there is no coarse path. `None` if
+        none were stored. Between two points of the coarse grid, the distance of a coarse path to
+        the fine path is constant.
     """
 
     paths: Float[Array, "I n K d"]
@@ -59,7 +60,7 @@ class WeightedPaths(NamedTuple):
     def log_change(self) -> Float[Array, "I n"]:
         """Return the log of the factor by which half as many steps change each weight.
 
-        It is the weight of the coarse path over that of the path, or D without coarse paths.
+        It is the log weight of the coarse path minus that of the path, or D without coarse path.
         """
         # A path that was not found has no ratio.
         log_weights = jnp.where(self.found, self.log_weights, 0)
@@ -73,10 +74,10 @@ class WeightedPaths(NamedTuple):
 
         For a state-dependent σ it needs `log_coarse`.
 
-        - `share`: the result of `step_share`.
+        - `share`: the result of `step_share` or `share_in_regime`.
         - `held`: whether the weights belong to the current state of a pseudo-marginal chain. The
-            chain prefers states with a large p̂, so the density of such weights is the usual one
-            times p̂, up to a constant.
+            chain prefers states with a large p̂: the density of their weights is that of fresh
+            weights times p̂, up to a constant.
         """
         # For constant σ, D varies little, so e^D compares the two grids more precisely.
         if not sigma_varies:
@@ -90,17 +91,17 @@ class AbstractProposal(eqx.Module):
     @property
     @abstractmethod
     def singles(self) -> tuple["AbstractSingleProposal", ...]:
-        """The single proposals that may be used."""
+        """Return the single proposals that may be used."""
 
     @property
     def coupled(self) -> bool:
-        """Whether any interval may have a coupling; couplings have no derivatives."""
+        """Return whether any interval may have a coupling; couplings have no derivatives."""
         return any(single.by_coupling is not None for single in self.singles)
 
     @property
     @abstractmethod
     def by_coupling(self) -> AbstractCoupling | None:
-        """The coupling, if this is a single proposal by a coupling; otherwise `None`."""
+        """Return the coupling of a single proposal by a coupling; `None` for other proposals."""
 
     @abstractmethod
     def describe(self) -> str:
@@ -114,15 +115,18 @@ class AbstractProposal(eqx.Module):
     def for_model(
         self, model: Diffusion, like: Float[Array, " d"], normal_steps: bool = True
     ) -> "AbstractProposal":
-        """Return the proposal with all defaults that depend on the model set.
+        """Set all defaults that depend on the model; return the proposal.
 
         `like` is a point of the right shape and dtype. `normal_steps` states that paths must
-        determine their noise.
+        determine their noise, so that the steps of guided proposals must be normal.
         """
 
     @abstractmethod
     def check(self, model: Diffusion, intervals: Intervals) -> None:
-        """Raise `ValueError` if the model or the end points do not fit; skip traced values."""
+        """Raise `ValueError` if the proposal does not fit the model or the end points.
+
+        Traced values are not checked.
+        """
 
     @abstractmethod
     def check_prepared(self, model: Diffusion) -> None:
@@ -136,7 +140,7 @@ class AbstractProposal(eqx.Module):
     @property
     @abstractmethod
     def is_open(self) -> bool:
-        """Whether a choice between several proposals is still open."""
+        """Return whether a choice between several proposals is still open."""
 
     @abstractmethod
     def of(self, which: Int[np.ndarray, " J"]) -> "AbstractProposal":
@@ -152,26 +156,29 @@ class AbstractProposal(eqx.Module):
 class AbstractWeightedProposal(AbstractProposal):
     """Base class of proposals that are ready to draw paths, each with an unbiased weight.
 
-    The methods `draw` and `reweigh` take an optional mask `active` of shape (I,). Other intervals
-    cost no work and have no paths.
+    The methods `draw` and `reweigh` take an optional mask `active` of shape (I,). Where the mask is
+    false, the result has no paths, and almost no work is done.
     """
 
     @abstractmethod
     def for_all(self) -> "AbstractSingleProposal":
-        """Return one single proposal for all intervals; not inside `jit` if there are several."""
+        """Return one single proposal for all intervals.
+
+        A choice between several needs concrete values, so call it outside `jit`.
+        """
 
     @abstractmethod
     def split(self) -> Sequence[tuple[Int[np.ndarray, " J"] | slice, "AbstractSingleProposal"]]:
         """Return pairs of interval indices and their single proposal.
 
-        Not inside `jit` if there are several proposals.
+        A choice between several needs concrete values, so call it outside `jit`.
         """
 
     @abstractmethod
     def step_share(self, model: Diffusion, intervals: Intervals) -> Float[Array, " I"]:
-        """Return the ratio of the discretisation error to the change by half as many steps.
+        """Return the ratio of the discretisation error to the change by half as many steps, (I,).
 
-        See `schemes.step_error`; shape (I,).
+        See `schemes.step_error`.
         """
 
     def share_in_regime(
@@ -195,9 +202,10 @@ class AbstractWeightedProposal(AbstractProposal):
         """Draw one weighted path per key. Its random numbers depend on this key only.
 
         - `stored`: indices of the grid points to store, shape (K,), or `None` for all.
-        - `misses_count`: for couplings. If true, a pair that does not meet has weight zero, so that
-            `E[w] = p_T(a, b)`. Otherwise attempts are repeated, and weights are correct up to a
-            constant factor. Guided proposals make one attempt.
+        - `misses_count`: for couplings. If true, one attempt is made for each path, and a pair that
+            does not meet has weight zero, so that `E[w] = p_T(a, b)`. Otherwise attempts are
+            repeated until a pair meets, and weights are correct up to a constant factor. Guided
+            proposals always make one attempt.
         """
 
     @abstractmethod
@@ -211,8 +219,8 @@ class AbstractWeightedProposal(AbstractProposal):
     ) -> WeightedPaths:
         """Return the given paths, one per interval, with new weights.
 
-        The weights have their conditional law, given the path, under the target of a
-        pseudo-marginal chain.
+        In the stationary law of a pseudo-marginal chain, a state is a path with a random weight.
+        The new weights have the conditional law of this weight given the path.
         """
 
 
@@ -231,10 +239,10 @@ class AbstractSingleProposal(AbstractWeightedProposal):
     def for_model(
         self, model: Diffusion, like: Float[Array, " d"], normal_steps: bool = True
     ) -> "AbstractSingleProposal":
-        """Return the proposal with all defaults that depend on the model set.
+        """Set all defaults that depend on the model; return the proposal.
 
         `like` is a point of the right shape and dtype. `normal_steps` states that paths must
-        determine their noise.
+        determine their noise, so that the steps of guided proposals must be normal.
         """
 
     def of(self, which):
@@ -249,26 +257,26 @@ class AbstractSingleProposal(AbstractWeightedProposal):
     @property
     @abstractmethod
     def target(self) -> AbstractStepDensity | None:
-        """The step density of the target chain.
+        """Return the step density of the target chain.
 
-        `None` for couplings: their target is the diffusion, up to the error of the scheme.
+        It is `None` for couplings: their target is the diffusion, up to the error of the scheme.
         """
 
     @property
     @abstractmethod
     def efficiency_bound(self) -> float:
-        """Upper bound of the effective samples per simulated path."""
+        """Return an upper bound of the effective samples per simulated path."""
 
     @abstractmethod
     def relative_seconds(self, model: Diffusion, intervals: Intervals) -> Float[Array, " I"]:
-        """Return the seconds per simulated path relative to a modified diffusion bridge.
+        """Return the seconds per simulated path relative to a modified diffusion bridge, (I,).
 
-        The values were measured for models with cheap functions; shape (I,).
+        The values were measured for models with cheap functions.
         """
 
     @abstractmethod
     def ingredients(self) -> tuple[str, str, float]:
-        """Return the names of scheme (or target step density) and meeting rule, and γ."""
+        """Return the names of the scheme (or step density) and of the meeting rule, and γ."""
 
     @abstractmethod
     def most_accurate(self, model: Diffusion, like: Float[Array, " d"]) -> "AbstractSingleProposal":

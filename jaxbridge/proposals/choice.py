@@ -39,19 +39,20 @@ class Choice(AbstractWeightedProposal):
     `choose_proposal` returns it, and functions with `proposal="auto"` use it. It prints as a table.
 
     - `candidates`: tuple of C proposals.
-    - `seconds`: seconds per simulated path, shape (C, I). They are estimated by a rule, relative to
-        a modified diffusion bridge, or measured if a measurement could change the choice.
+    - `seconds`: seconds per simulated path, shape (C, I). `choose_proposal` measures them if this
+        could change the choice. Otherwise they follow a rule, in units of the seconds of a modified
+        diffusion bridge.
     - `efficiency`: effective samples per simulated path, shape (C, I), extrapolated from the pilot
         run to a larger sample. NaN without a pilot run: the candidate could not be the best, or its
         gain over all intervals would be negligible.
-    - `step_error`: discretisation error of log p̂ in the pilot run, shape (C, I), reduced by twice
-        its uncertainty.
+    - `step_error`: size of the discretisation error of log p̂ in the pilot run, minus twice its
+        uncertainty, and at least zero; shape (C, I).
     - `pareto_k`: k̂ of the weights in the pilot run, shape (C, I). NaN if there were too few paths.
     - `chosen`: index of the candidate of each interval, shape (I,).
-    - `used`: indices of the candidates that are chosen for any interval; inside `jit`, of all
-        candidates. Only these are compiled, so another set compiles again.
-    - `left_out`: the reason why "auto" does not try couplings, empty if it does. Without a time
-        reversal there are no couplings. Densities need a normalised `log_stationary`.
+    - `used`: indices of the candidates that are chosen for at least one interval; inside `jit`, of
+        all candidates. Only these are compiled, so another set compiles again.
+    - `left_out`: the reason why "auto" does not try couplings, empty if it does. Couplings need a
+        time reversal, and for densities a normalised `log_stationary`.
 
     If all used candidates are guided proposals, paths and weights are differentiable, in forward
     and reverse mode. Couplings have no derivatives.
@@ -281,10 +282,10 @@ def _join(mask: Bool[Array, " I"], new: WeightedPaths, old: WeightedPaths) -> We
 
 
 def best_at_worst(choice: Choice, num: int) -> Choice:
-    """Return one candidate for each group of `num` successive intervals, by its worst rate.
+    """Choose one candidate for each group of `num` successive intervals, by its worst rate in it.
 
-    Chains with moving end points use it: a group has the pilot runs of several end points of one
-    interval. The result has one interval per group.
+    Chains with moving end points use it: a group consists of one interval with several pairs of end
+    points, each with pilot runs. The result has one interval per group.
     """
     worst = jnp.min(_presumed_rates(choice).reshape(len(choice.candidates), -1, num), axis=2)
     chosen = jnp.repeat(best_of_few(worst), num)
@@ -294,10 +295,10 @@ def best_at_worst(choice: Choice, num: int) -> Choice:
 
 
 def worth_a_pilot(potential: Float[Array, " I"], best: Float[Array, " I"]) -> Bool[Array, " I"]:
-    """Return the mask of the intervals on which a candidate with these maximal rates needs a pilot.
+    """Return the mask of the intervals on which a candidate needs a pilot run.
 
-    The mask is empty if the candidate cannot reduce the work on all intervals by more than a small
-    share.
+    `potential` are the highest possible rates of the candidate, `best` the best rates so far. No
+    interval needs a run if the candidate cannot reduce the work by more than a small share.
     """
     gain = _loss(best, jnp.maximum(best, potential))
     return (potential > best) & (gain > 1 + _TOLERATED_LOSS)
@@ -306,8 +307,8 @@ def worth_a_pilot(potential: Float[Array, " I"], best: Float[Array, " I"]) -> Bo
 def best_of_few(rates: Float[Array, "C I"]) -> Int[Array, " I"]:
     """Return the best candidate of each interval, from a small set of candidates.
 
-    Starting from all candidates, the one with the smallest loss is removed, the last one of equals.
-    This repeats while the loss of the remaining set is tolerable.
+    The set begins as that of all candidates. As long as the loss remains tolerable, the candidate
+    whose removal costs least is removed; of several such candidates, the last one.
     """
     rates = jnp.where(jnp.isnan(rates), 0, rates)
     best, num = jnp.max(rates, axis=0), len(rates)

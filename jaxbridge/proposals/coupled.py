@@ -60,10 +60,10 @@ class CoupledPairs(AbstractSingleProposal):
 
     `sample_exact_bridges` and other functions return it as `proposal` if they receive a `Coupling`.
 
-    - `coupling`: the coupling with its start law.
-    - `max_proposals`: maximum of attempts for a pair that meets.
-    - `max_trials`: maximum of trials for the counts of one path.
-    - `num_counts`: N, the number of hitting counts per path.
+    - `coupling`: the coupling, with the start law of the weights.
+    - `max_proposals`: maximum number of attempts for a pair that meets.
+    - `max_trials`: maximum number of trials for the counts of one path.
+    - `num_counts`: number of hitting counts per path.
     """
 
     coupling: AbstractCoupling
@@ -128,8 +128,8 @@ class CoupledPairs(AbstractSingleProposal):
         """Raise `ValueError` if the weights are known only up to a constant.
 
         The weights have the factor ν(b)/ν(x_0) · μ(x_0). If μ has a normalised density, the
-        constant of ν cancels. If μ is ν or `Reversed`, whose weights are treated like those of ν,
-        the factor is ν(b), which needs a normalised `log_stationary`.
+        constant of ν cancels. If μ is ν, the factor is ν(b), which needs a normalised
+        `log_stationary`. `Reversed` has the same weights as ν.
         """
         if not model.has_density:
             raise ValueError(
@@ -250,7 +250,7 @@ class CoupledPairs(AbstractSingleProposal):
     def log_halving(
         self, model: Diffusion, intervals: Intervals, paths: Float[Array, "P points d"], n: int
     ) -> Float[Array, " P"]:
-        """Return D of `halving` for the first of the n paths of each interval, NaN for others."""
+        """Return D of `halving` for the first few of the n paths of each interval, else NaN."""
         dynamics = model.forward(intervals.start[0])
         density, _ = step_law_of(self.coupling, model, intervals.start[0])
         num_rows = num_looked(_LOOKED * n, dynamics.sigma_varies)
@@ -290,10 +290,10 @@ def pair_log_weights(
 def usable(
     log_weights: Float[Array, "*rows"], is_found: Bool[Array, "*rows"]
 ) -> tuple[Float[Array, "*rows"], Bool[Array, "*rows"]]:
-    """Return log weights without NaN and +inf, and the mask of the paths that had one.
+    """Return log weights with -inf in place of NaN and +inf, and the mask of the replaced ones.
 
-    These weights become -inf, as do those of paths that were not found. Otherwise one such weight
-    would make every weighted mean NaN.
+    Paths that were not found also get -inf, and are not in the mask. A single NaN would make every
+    weighted mean NaN.
     """
     is_number = log_weights < jnp.inf  # false for NaN, which densities of start laws may return
     return jnp.where(is_found & is_number, log_weights, -jnp.inf), is_found & ~is_number

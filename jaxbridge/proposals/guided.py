@@ -4,9 +4,9 @@ On a grid 0 = t_0 < ... < t_N = T with steps δ_i, the target is a chain (`step_
 
     x_{i+1} ~ N(μ_i, δ_i σ(x_i) S_i σ(x_i)ᵀ).
 
-The Euler scheme has μ_i = x_i + α(x_i) δ_i and S = I. A proposal has steps of another normal law
-q_i(x_{i+1}| x_i) with the same σ, and x_N = b. Its weight is the density of the path under the
-target over its density under the proposal,
+The Euler scheme has μ_i = x_i + α(x_i) δ_i and S = I. Let p_i(x_{i+1}| x_i) be the densities of
+these steps. A proposal has steps of another normal law q_i(x_{i+1}| x_i) with the same σ, and
+x_N = b. Its weight is the density of the path under the target over its density under the proposal,
 
     w = p_{N-1}(b| x_{N-1}) Π_{i<N-1} p_i(x_{i+1}| x_i) / q_i(x_{i+1}| x_i).
 
@@ -18,7 +18,7 @@ discretisation error of the target remains: O(δ), or O(δ²) with `ItoTaylorDen
 maps of normal noise (`QuadraticDensity`). Then p_i and q_i are the laws of the normal part of a
 step, and x_{i+1} is a function of that part (`StepLaw.bent`). The weight is a ratio of densities of
 the noise, so this function needs no inverse. If the noise of a given path is needed, the target is
-the Euler scheme instead. The end b needs a density of x_N itself. There the last step is split, and
+the Euler scheme instead. The end b requires a density of x_N itself. So the last step is split, and
 its last part is an Euler step of about T/N². Points within the last step are not part of a path.
 
 *Discretisation error.* A path is a function of the noise ξ_i of its steps. Half as many steps with
@@ -117,7 +117,7 @@ class AbstractGuidedProposal(AbstractSingleProposal):
 
     @property
     def target_cost(self) -> float:
-        """Seconds of a step of the target relative to an Euler step."""
+        """Return the seconds of a step of the target relative to an Euler step."""
         return self.target.cost
 
     @property
@@ -160,9 +160,9 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         end: Float[Array, " d"],
         dt: Float[Array, " N"],
     ) -> PyTree:
-        """Return quantities for the steps, with leading axis N - 1, or `None`.
+        """Return quantities for the first N - 1 steps, with leading axis N - 1, or `None`.
 
-        `step_law` receives one entry per step as `step.guide`. `dt` has shape (N,).
+        `step_law` receives one entry per step as `step.guide`. `dt` are the lengths of all N steps.
         """
 
     @abstractmethod
@@ -224,7 +224,7 @@ class AbstractGuidedProposal(AbstractSingleProposal):
 
 
 class _CoarseSteps(NamedTuple):
-    """Coarse steps, one entry per fine step: each entry belongs to the coarse step around it.
+    """Coarse steps: for each fine step, the coarse step that contains it.
 
     - `guide`, `dt`, `remaining`: the fields of `Step` for the coarse step.
     - `share`: c, the coefficient of the earlier noise ξ_i (module docstring).
@@ -242,7 +242,7 @@ class _Steps(NamedTuple):
     """Inputs of a scan over steps.
 
     - `guide`, `dt`, `remaining`: the fields of `Step`.
-    - `transition`: that of the target's step if it is known, otherwise `None`.
+    - `transition`: the known transition of the target's step; `None` if it is unknown.
     - `before`: the length of the previous step.
     - `ends_pair`: whether the previous step and this one are a pair of `halving`.
     - `coarse`: the coarse steps; `None` if none are simulated.
@@ -277,7 +277,8 @@ class _PathWeights(NamedTuple):
 class _LaneState(NamedTuple):
     """State of all lanes.
 
-    The first paths of each interval have a second part, for the estimate of discretisation errors.
+    The fields after `path` are for the estimate of discretisation errors. They have lanes for the
+    first few paths of each interval only.
 
     - `path`: the paths.
     - `before`: the previous point, or the previous noise if there are coarse paths.
@@ -371,8 +372,8 @@ class _GuidedLanes:
     def points(self, state: _LaneState) -> Float[Array, "d points"]:
         """Return the current points of all paths, followed by those of stored coarse paths.
 
-        Between two points of the coarse grid, the distance between both is constant, or zero where
-        it would lead out of the state space.
+        Between two points of the coarse grid, a coarse path keeps its distance to the fine path.
+        The distance is zero where it would lead out of the state space.
         """
         if state.gap is None:
             return state.x
@@ -473,7 +474,7 @@ class _GuidedLanes:
         ), xi
 
     def finish(self, state: _LaneState) -> tuple[Float[Array, " lanes"], Float[Array, "I m"]]:
-        """Return log weights after the last step, which ends in b, and values for step errors.
+        """Take the last step, which ends in b. Return log weights, and values for step errors.
 
         These values are D, or the log weights of the coarse paths, for the first m paths of each
         interval.
@@ -560,7 +561,8 @@ def noise_of(
 ) -> tuple[Float[Array, "I steps d"], Float[Array, " I"], Float[Array, " I"]]:
     """Return the noise of given paths, one per interval, with their log weights and D.
 
-    The noise ξ_0, ..., ξ_{N-2} generates these paths by steps of the proposal.
+    The steps of the proposal with the noise ξ_0, ..., ξ_{N-2} give these paths. The target must
+    have normal steps.
     """
     lanes = _GuidedLanes(proposal, dynamics, intervals, paths.shape[1] - 1)
 
@@ -815,7 +817,8 @@ def _fractions(
 
     The coarse grid has half as many steps. The last step needs a normal law. If other steps are not
     normal, it is an Euler step, which adds an error of the square of its length. Hence it is split
-    into steps of ½, ¼, ..., 2^-k of its length, and the last of these is about T / N².
+    into parts of ½, ¼, ..., 2^-k and again 2^-k of its length. Only the last part, of a length of
+    about T / N², is an Euler step.
     """
     fractions = proposal.remaining(num_steps)
     coarse = [*range(0, num_steps, 2)]
@@ -862,7 +865,7 @@ def deterministic_path(
     start: Float[Array, " d"],
     dt: Float[Array, " N"],
 ) -> tuple[Float[Array, "N d"], Float[Array, " d"]]:
-    """Return ξ_0, ..., ξ_{N-1}, shape (N, d), and ξ_N of the target's steps without noise."""
+    """Return the path ξ of the target without noise: ξ_0, ..., ξ_{N-1}, shape (N, d), and ξ_N."""
 
     def step(xi, dt):
         return density.steps_from(dynamics, xi).law(dt).mean, xi
@@ -872,13 +875,16 @@ def deterministic_path(
 
 
 def bridge_law(step: Step, target: StepLaw, mean: Float[Array, " d"]) -> StepLaw:
-    """Return the law with this mean and the covariance V δ (T - t_{i+1}) / (T - t_i)."""
+    """Return the normal law with this mean and the covariance V δ (T - t_{i+1}) / (T - t_i)."""
     shrunk = (step.remaining - step.dt) / step.remaining
     return target._replace(mean=mean, covariance=shrunk)
 
 
 def check_refinement(refinement: float) -> float:
-    """Return `refinement` as a float; raise for anything but a number between 1 and 4."""
+    """Return `refinement` as a float.
+
+    **Raises:** `TypeError` unless it is a Python number, `ValueError` unless it is in [1, 4].
+    """
     if isinstance(refinement, bool) or not isinstance(refinement, int | float):
         raise TypeError(
             f"`refinement` must be a Python number, because it is static under `jit`; got "

@@ -73,17 +73,17 @@ class Guided(AbstractGuidedProposal):
         dX̃ = [α̃ + F (X̃ - b)] dt + σ̃ dW
 
     in the steps of the target. For an Ornstein–Uhlenbeck process all weights are equal. For a
-    state-dependent σ the deviations from b are scaled to the mean of V(x) and Ṽ = σ̃σ̃ᵀ. This is not
-    in that paper; without it the weights have heavy tails, and the effective sample size is
-    overestimated.
+    state-dependent σ the deviations from b are scaled to the mean of V(x) = σσᵀ and Ṽ = σ̃σ̃ᵀ. The
+    scaling is not in that paper. Without it the weights have heavy tails, and the effective sample
+    size is overestimated.
 
     **Arguments:**
 
     - `linearisation`: one of
         - "end": linearised at b, F = ∇α(b), α̃ = α(b), σ̃ = σ(b);
         - "path": linearised along the deterministic path dξ = α(ξ) dt from the start, plus a linear
-            function of time such that the path ends in b. If long steps make this path diverge, it
-            is replaced by a straight line;
+            function of time such that the path ends in b. Where long steps make this path diverge,
+            its points are replaced by those of a straight line;
         - a matrix F of shape (d, d), with α̃ = α(b) and σ̃ = σ(b).
     - `density`, `refinement`: as in `ModifiedDiffusionBridge`.
 
@@ -127,7 +127,7 @@ class Guided(AbstractGuidedProposal):
 
     @property
     def linearisation(self) -> str:
-        """The kind of linearisation: '"end"', '"path"' or 'matrix'."""
+        """Return the kind of linearisation: '"end"', '"path"' or 'matrix'."""
         return f'"{self._along}"' if self._matrix is None else "matrix"
 
     def describe(self):

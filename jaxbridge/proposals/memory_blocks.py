@@ -1,6 +1,6 @@
 """Evaluation of weighted paths in blocks that fit in memory, over devices, for active intervals.
 
-All proposals use it for their draws. It is separate because it depends on shapes only.
+All proposals use it for their draws.
 """
 
 import math
@@ -22,8 +22,8 @@ Block = Callable[[Key[Array, "I n"], Intervals, Bool[Array, " I"] | None], Weigh
 def block_over_devices(function: Block) -> Block:
     """Return `function` with its draws split over devices.
 
-    Either each device takes some of the intervals, or some of the draws of each interval. The
-    function selects the split with the smaller number of rows per device.
+    Each device gets either some of the intervals, or some of the draws of every interval. The split
+    with the smaller number of rows per device is used; a row is one draw of one interval.
     """
 
     def split(keys, intervals, active):
@@ -48,9 +48,9 @@ def in_blocks(
 ) -> WeightedPaths:
     """Return `function` of all keys and intervals, computed in blocks of about `most_rows` rows.
 
-    A row is one draw of one interval. A block may be larger, to fill vectors. Intervals that are
-    not active are marked as not found. Active ones are sorted to the front, and blocks without any
-    are skipped.
+    A row is one draw of one interval. A block may be larger, to fill vector registers. Paths of
+    intervals that are not active are marked as not found. Active intervals are sorted to the front,
+    and blocks without active intervals are skipped.
     """
     num_intervals, num_draws = keys.shape
     unit = _VECTOR if num_draws >= _WORTH_FILLING else 1

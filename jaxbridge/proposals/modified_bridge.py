@@ -20,12 +20,14 @@ class ModifiedDiffusionBridge(AbstractGuidedProposal):
 
     - `density`: step density of the target. The default is the most accurate one: exact steps for
         linear drift and constant σ, `ItoTaylorDensity()` for other constant σ, and steps of weak
-        order 2 that are not normal for a state-dependent σ. It is `EulerDensity()` for a
-        state-dependent σ above ten dimensions, and where a given path must determine its noise: in
-        `gibbs`, `score`, kernels, chains that start from a `position`, and `maximum_likelihood`
-        with a known σ.
+        order 2 that are not normal for a state-dependent σ. For a state-dependent σ it is
+        `EulerDensity()` above ten dimensions, and where a given path must determine its noise: in
+        `gibbs`, `smooth`, kernels, chains that start from a `position`, and `maximum_likelihood`
+        with `method="em"` or more than 300 unknown parameters.
     - `refinement`: ρ in t_i = T [1 - (1 - i/N)^ρ], between 1 (equal steps) and 4. Above 1 the steps
         shrink towards the end, which helps if σ varies much along the path.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 

@@ -4,7 +4,7 @@ Each candidate draws a few weighted paths of each interval. The criterion is
 
     rate = effective samples / (simulated paths × seconds per path),
 
-extrapolated to a larger sample, with two corrections.
+where the effective samples are extrapolated to a larger sample. It has two corrections.
 
 *Discretisation error.* Candidates have different targets and so different discretisation errors
 (`step_error`), which more paths do not reduce. With W seconds the mean square error of log p̂ is
@@ -21,13 +21,11 @@ estimate of k̂ and they are not nearly equal.
 Some candidates need no pilot run on an interval:
 
 - a candidate that cannot be the best. For a coupling at most one in 1 + N simulated paths is an
-  effective sample, because each proposal needs N hitting counts;
-- a candidate with a negligible gain over all intervals, because each candidate in use has to be
-  compiled.
+  effective sample, because each proposal needs N hitting counts, of at least one trial each;
+- a candidate whose gain over all intervals is negligible: each candidate in use has to be compiled.
 
-If no candidate has five effective paths with light tails, pilot runs of couplings whose pairs
-rarely met are repeated up to 16 times. (Inside `jit` they are not repeated, because the results are
-not yet available.)
+If no candidate has five effective paths with light tails, the pilot runs of couplings are repeated
+up to 16 times. (Inside `jit` they are not repeated, because the results are not yet available.)
 
 Seconds are estimated by a rule, so that a key determines the choice. Only `choose_proposal`
 measures them.
@@ -91,8 +89,9 @@ def _rate(result: _PilotResult, seconds: Float[Array, "..."]) -> Float[Array, ".
 class _Pilot(NamedTuple):
     """Candidate with its pilot run.
 
-    - `candidate`: the candidate, prepared if a pilot run is useful on any interval.
-    - `run`: function of a key and a mask of intervals that runs the pilot; `None` if it is useless.
+    - `candidate`: the candidate, prepared if at least one interval needs a pilot run.
+    - `run`: function of a key and a mask of intervals that runs the pilot; `None` if no interval
+        needs it.
     - `seen`: results of the pilot run; NaN without one.
     - `active`: mask of the intervals of the pilot run.
     - `seconds`: seconds per path by the rule.
@@ -116,8 +115,9 @@ def run_pilots(
 ) -> Choice:
     """Return the choice, from pilot runs of the candidates that could be the best.
 
-    `num_pilot` is the number of paths per interval, by default chosen by the number of intervals.
-    `timed` states that seconds are measured, where this could change the choice.
+    `num_pilot` is the number of paths per interval. By default it is about 4,000 divided by the
+    number of intervals, between 32 and 512. `timed` states that seconds are measured where this
+    could change the choice.
     """
     num_intervals = len(intervals.duration)
     default_num = int(np.clip(_PILOT_PATHS // num_intervals, *_PILOT_RANGE))

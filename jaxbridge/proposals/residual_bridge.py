@@ -19,12 +19,15 @@ class ResidualBridge(AbstractGuidedProposal):
 
         x_{i+1} = x_i + Δξ_i + (b - ξ_N - (x_i - ξ_i)) δ_i/(T - t_i) + noise.
 
-    Compared with `ModifiedDiffusionBridge` it is better if the drift moves all paths in the same
-    direction. The interval must be short compared with the relaxation time of the drift.
+    The noise is that of `ModifiedDiffusionBridge`. The residual bridge is better if the drift moves
+    all paths in the same direction. The interval must be short compared with the relaxation time of
+    the drift.
 
     **Arguments:**
 
     - `density`, `refinement`: as in `ModifiedDiffusionBridge`.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
 
     **Example:**
 

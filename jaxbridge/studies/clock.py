@@ -43,7 +43,7 @@ def _seconds_compiled() -> list[float]:
 
 
 def timed_once_compiled(function: Callable[[], T]) -> tuple[T, float]:
-    """Do as `timed`, and subtract the seconds of compilation: for calls that always compile."""
+    """Time a call that always compiles, like `timed`, without the seconds of compilation."""
     total = _seconds_compiled()
     before = total[0]
     result, seconds = timed(function)
@@ -58,7 +58,7 @@ def fastest(function: Callable[[], T], repeats: int = 3) -> tuple[T, float]:
 def in_turns(
     first: Callable[[], Any], second: Callable[[], Any], repeats: int = 9
 ) -> tuple[float, float]:
-    """Return the median seconds of two functions, run in turns, compilation apart."""
+    """Return the median seconds of two functions, run in turns, without a first run of each."""
     seconds = [[timed(function)[1] for function in (first, second)] for _ in range(repeats + 1)]
     medians = np.median(seconds[1:], axis=0)
     return float(medians[0]), float(medians[1])

@@ -26,7 +26,7 @@ class Command(NamedTuple):
     - `groups`: names for several parts.
     - `part`: the default, one of the names.
     - `figures`: name of the module of figures, imported only to draw: it needs matplotlib.
-    - `keeps_programs`: whether compiled programs are stored in the output folder. Not for studies
+    - `keeps_programs`: whether compiled programs are stored in the output folder. False for studies
         that measure the time of compilation.
     - `next_steps`: printed at the end: further reading.
     """
@@ -69,7 +69,7 @@ class Command(NamedTuple):
                 for name, studies in self.parts.items()
             ),
         )
-        parser.add_argument("--quick", action="store_true", help="run a twenty-fifth of the paths")
+        parser.add_argument("--quick", action="store_true", help="simulate far fewer paths")
         parser.add_argument("--seed", type=_seed, default=0, help="random seed (default 0)")
         parser.add_argument(
             "--out",

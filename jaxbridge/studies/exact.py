@@ -395,10 +395,11 @@ EXACT = Study(
     lambda results: f"{format_exact(results[0])}\n\n{format_floor(results[0][0], results[1])}",
     """\
 "paths/n" is the number of simulated paths per bridge, "worth" the effective sample size. "as
-published" is the paper's pseudo-marginal chain with the start law that it prints, which leaves most
-of the bias. The stationary law, or any other with the right weights, removes it. The very unlikely
-bridge has a start law fitted by a pilot run. The paper's seconds are from its authors' computer and
-program, for the same bridge and number of iterations: compare only their order of magnitude.""",
+published" is the paper's pseudo-marginal chain with the start law that it prints. It leaves a part
+of the bias, and most of it for the very unlikely bridge. The stationary law, or any other with the
+right weights, removes the bias. The very unlikely bridge has a start law fitted by a pilot run. The
+paper's seconds are from its authors' computer and program, for the same bridge and number of
+iterations: compare only their order of magnitude.""",
     lambda figures, results: draw(figures, results[0]),
 )
 VARIATION = Study(
@@ -407,8 +408,8 @@ VARIATION = Study(
     format_variation,
     """\
 An approximate bridge is exact if the probability pi that its associated diffusion hits it does
-not vary. std/mean of 1/pi shrinks as gamma -> 1 with either start law, while 1/pi grows:
-approximate bridges become exact as they become rare.""",
+not vary. std/mean of 1/pi shrinks as gamma -> 1 with either start law, while 1/pi grows.
+So approximate bridges become exact as they become rare.""",
     lambda figures, results: {"variation.png": figures.variation(results)},
 )
 COST = Study(

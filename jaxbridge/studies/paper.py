@@ -233,11 +233,11 @@ APPROXIMATE = Study(
     lambda results: format_table(results[0]),
     """\
 Approximate bridges have the law of the bridge given that an associated diffusion hits it. For
-the likely bridge that changes the law by about 1 % of a standard deviation; for the unlikely
-ones it pulls the mid-point towards the stationary law, by the bias shown: the error of the
-method itself, which more bridges do not remove. It shrinks as gamma -> 1, at the price of fewer
-pairs that meet. "default" has exact steps and the Brownian crossing; "as published" is Euler with
-the sign test in radius 0.05, which has a step error of its own and overlooks about half of the
-meetings.""",
+the likely bridge this changes the mean by at most about 1 % of a standard deviation. For the
+unlikely ones it pulls the mid-point towards the stationary law, by the bias shown. This is the
+error of the method itself, which more bridges do not remove. It shrinks as gamma -> 1, at the
+price of fewer pairs that meet. "default" has exact steps and the Brownian crossing. "as
+published" has Euler steps and the sign test in radius 0.05. These have a step error of their own,
+and the test overlooks about half of the meetings.""",
     lambda figures, results: draw(figures, *results),
 )

@@ -42,10 +42,10 @@ def choose_proposal(
 ) -> Choice:
     """Choose the proposal with the most effective samples per second for each interval.
 
-    Pilot runs measure effective samples and seconds; compilation is not counted. In contrast,
+    Pilot runs measure effective samples and seconds, without compilation. In contrast,
     `proposal="auto"` chooses in each call and estimates the seconds by a rule. Use this function
-    for models with slow functions, or to choose once for many calls. Pass the result as `proposal=`
-    for the same intervals.
+    for models whose drift or σ takes long to compute, or to choose once for many calls. Pass the
+    result as `proposal=` for the same intervals.
 
     Call it outside `jit`. The choice between two proposals of similar speed may differ from run to
     run.
@@ -61,9 +61,9 @@ def choose_proposal(
     - `num_pilot`: pilot paths per candidate and interval. By default about 4,000 over all
         intervals, at least 32 and at most 512 per interval.
     - `for_density`: true if the choice is for `transition_log_density` or `pmmh`. Then the default
-        couplings from the stationary law need a model that is declared `normalised`. On a single
-        interval where all other candidates are inefficient, a coupling with a fitted start law is
-        added.
+        couplings, which start from the stationary law, need a model that is declared `normalised`.
+        Without it a coupling with a fitted start law is added, for a single interval, if all guided
+        candidates are inefficient.
 
     **Returns:** `Choice`, which prints as a table.
 

@@ -2,7 +2,7 @@
 
 π_T(z) is the probability that the associated diffusion hits the path z. By equation (z-density) the
 approximate bridge has the density `f_bridge(z) π_T(z) / π_T`. Hence approximate bridges are exact
-if π_T(z) is constant. Let ρ̂_N be the mean of N counts, and B an exact bridge. By equation
+if π_T(z) is constant in z. Let ρ̂_N be the mean of N counts, and B an exact bridge. By equation
 (regression)
 
     V(ρ̂_N) = V(1/π_T(B)) + E[(1 - π_T(B)) / π_T(B)²] / N,
@@ -77,8 +77,8 @@ def hitting_variation(
     - `bridges`: exact bridges of one interval with complete paths, paths of shape (n, N+1, d).
         Pass a result of `weigh_bridges`, whose weights are used, or of `sample_exact_bridges`. Thin
         the chain first, because repeated states need new counts but add little information.
-    - `num_counts`: the values of N, at least two and increasing. The largest is the number of
-        simulated counts per bridge.
+    - `num_counts`: two or more increasing values of N. The largest is the number of simulated
+        counts per bridge.
     - `start_law`: law of the associated diffusion at time zero, by default that of the bridges'
         coupling.
 

@@ -247,8 +247,9 @@ def closed_form(
 def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
     """Return the reference: a run with many steps by the most accurate scheme of its proposal.
 
-    The error includes the change between half the steps and all steps, as a bound of the
-    discretisation error.
+    Its error includes the change from half as many steps, as a bound of the discretisation error.
+
+    **Raises:** `ValueError` if a run found no bridges.
     """
     # The limit does not depend on the scheme, so the most accurate one serves for all settings.
     model, like, *_ = scene.interval("float64")

@@ -24,9 +24,9 @@ class Setting(NamedTuple):
     - `step_error`, `step_uncertainty`: discretisation error, and its standard error.
     - `method_error`: distance of the method's limit from the exact law. Zero except for approximate
         bridges.
-    - `monte_carlo_error`: standard error of the estimate by the number of samples.
+    - `monte_carlo_error`: standard error of the estimate because of the finite number of samples.
     - `seconds`: median duration of one run, without compilation.
-    - `compile_seconds`: additional duration of the first run.
+    - `compile_seconds`: additional duration of the first run, mostly compilation.
     - `num_simulated`: number of simulated paths.
     - `effective_samples`: number of independent exact bridges with the same Monte Carlo error.
     - `per_second`: effective samples per second.
@@ -111,7 +111,8 @@ class WorkPrecision(NamedTuple):
         """Return the setting that reaches an accuracy (by default `self.target`) in the least time.
 
         Return `None` if no setting reaches it, or if the uncertainties are too large to decide.
-        Raise `ValueError` if there is no target.
+
+        **Raises:** `ValueError` if there is no target.
         """
         target = self.target if target is None else target
         if target is None:
@@ -122,7 +123,10 @@ class WorkPrecision(NamedTuple):
         return best if np.isfinite(best.seconds_for(target)) else None
 
     def statement(self, target: float | None = None) -> str:
-        """Return one sentence with the cheapest setting for an accuracy, or with advice."""
+        """Return one sentence with the cheapest setting for an accuracy, or with advice.
+
+        **Raises:** `ValueError` if there is no target.
+        """
         target = self.target if target is None else target
         best = self.cheapest(target)
         if target is None or best is None:

@@ -4,8 +4,9 @@ The criterion is the number of effective samples per simulated path, where propo
 count as simulated paths. The end of section 3 of the paper leaves this choice open.
 
 The candidates lie between two laws. The stationary law ν is the best one for likely end points. The
-Gaussian fit G to the time-0 values of the reversed paths that met hits an unlikely bridge far more
-often. With N_ν the Gaussian fit to ν, the candidates are
+other law, G, is a Gaussian fit to the time-0 values of the reversed paths that met. Associated
+diffusions that start from G hit an unlikely bridge far more often. With N_ν the Gaussian fit to ν,
+the candidates are
 
     μ ∝ N_ν^{1-λ} G^λ,
 
@@ -122,21 +123,22 @@ def fit_start_law(
     The candidates lie between the stationary law ν and a Gaussian fit to the time-0 values of the
     reversed paths that met. The criterion is the number of effective samples per simulated path in
     a pilot run. Among laws within 10 % of the best, the one closest to ν is chosen, because the
-    ratio μ/ν in its weights is bounded more safely. Call it outside `jit`.
+    ratio μ/ν in its weights is bounded more safely. Without a stationary density, ν is the only
+    candidate. Call this function outside `jit`.
 
     **Arguments:** as in `sample_bridges`, and:
 
-    - `num_pilot`: number of bridges in the pilot run.
-    - `for_density`: true if the coupling is for transition densities. With ν itself a density
-        needs a normalised `log_stationary`. If the model is not declared `normalised`, only
-        Gaussian laws are tried. Their weights vary much if ν is far from Gaussian (much lighter
-        tails, or curved contours); then use a guided proposal.
+    - `num_pilot`: number of bridges in the pilot run, at least 20 d.
+    - `for_density`: true if the coupling is for transition densities. With the start law ν a
+        density needs a normalised `log_stationary`. So if the model is not declared `normalised`,
+        only Gaussian laws are tried. Their weights vary much if ν is far from Gaussian (much
+        lighter tails, or curved contours); then use a guided proposal.
 
     **Returns:** `Stationary()` or a `GaussianLaw`. With `for_density` it is a `GaussianLaw`, unless
     the model is declared `normalised`.
 
-    **Raises:** `ValueError` if too few pilot bridges are found, or for invalid arguments;
-    `TypeError` inside `jit`.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments; `ValueError` if too few pilot
+    bridges are found or hit; `TypeError` inside `jit`.
 
     **Example:**
 
@@ -168,13 +170,13 @@ def tune_coupling(
 
     The criterion is the number of effective samples per simulated path in pilot runs. Among
     candidates within 10 % of the best, the law closest to ν is chosen, as in `fit_start_law`. Call
-    it outside `jit`.
+    this function outside `jit`.
 
     **Arguments:** as in `sample_bridges`, and:
 
     - `couplings`: candidates, by default those with γ = -1, 0, 0.5 and 0.9. Each is tried with
         several start laws between ν and a Gaussian fit.
-    - `num_pilot`: number of bridges in each pilot run.
+    - `num_pilot`: number of bridges in each pilot run, at least 20 d.
     - `for_density`: as in `fit_start_law`.
 
     **Returns:** `Tuning`, which prints as a table.
@@ -217,6 +219,8 @@ def coupling_pilots(
     """Run one pilot per start law for this coupling; all use the same bridges.
 
     If too few pairs met, return a single pilot with an efficiency of NaN.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments; `TypeError` inside `jit`.
     """
     check_key(key)
     if for_density and not model.has_density:
@@ -286,7 +290,7 @@ def coupling_pilots(
 def best_pilot(pilots: list[Pilot]) -> Pilot:
     """Return the pilot closest to ν among those whose efficiency is within 10 % of the largest.
 
-    Raise `ValueError` if no pilot run succeeded.
+    **Raises:** `ValueError` if no pilot run succeeded.
     """
     if all(np.isnan(pilot.efficiency) for pilot in pilots):
         raise ValueError(
@@ -342,12 +346,13 @@ def _gaussian_fit(
 
 
 def _within(starts: Float[np.ndarray, "n d"], law: GaussianLaw, stationary, reverse) -> GaussianLaw:
-    """Return the law, with a smaller covariance if much of a density comes from points that the
-    starts of the pilot did not reach.
+    """Return the law, with a smaller covariance if it reaches beyond the starts of the pilot run.
 
-    If ν has lighter tails than a normal law, paths that start there are rare and have huge weights,
-    which neither the pilot nor k̂ sees. A start x adds μ(x) p_T(x, b), and p_T(x, b) is in
-    proportion to G(x)/ν(x), from the pairs (mean, precision) of both.
+    If ν has lighter tails than a normal law μ, paths that start in the tails of μ are rare and have
+    huge weights. Neither the pilot run nor k̂ shows these weights. The part of a density that comes
+    from the start x is in proportion to μ(x) p_T(x, b), and p_T(x, b) to G(x)/ν(x). `stationary`
+    and `reverse` are the pairs (mean, precision) of ν and G. The covariance shrinks until at most
+    about 1 % of the density comes from points outside of the box of the pilot's starts.
     """
     starts = starts[np.all(np.isfinite(starts), axis=1)]
     n, d = starts.shape

@@ -11,8 +11,8 @@ of each estimate has three parts, which are reported separately:
 
 The unit is the standard deviation of the estimated variable. For several variables the error is the
 root mean square. Hence n independent exact bridges have a Monte Carlo error of n^{-1/2}. The
-reference is a closed form if there is one. Otherwise it is a separate run with more steps and more
-bridges.
+reference is given by the user, or a closed form if there is one. Otherwise it is a separate run
+with more steps and more bridges.
 """
 
 import itertools
@@ -103,7 +103,8 @@ def work_precision(
     - `key`: typed key. All settings use it; the reference uses another.
     - `model`, `start`, `end`, `duration`: one interval, as in `sample_bridges`.
     - `num_steps`: numbers of steps. The times `save_at` must be on each grid; without `save_at` the
-        numbers must be even.
+        numbers must be even. Extrapolation requires even numbers, and times that are also on the
+        grids of half as many steps.
     - `proposals`: couplings (with γ, scheme and meeting rule) and guided proposals. By default
         `Coupling(gamma=0.0)` with `Heun()` and with `Euler()`, and also with `GaussianTransition()`
         for linear drift and constant σ.
@@ -117,8 +118,8 @@ def work_precision(
             `extrapolate`.
     - `dtypes`: "float32", "float64". Double precision needs no configuration of JAX, but the
         model's functions must work in both precisions, because the reference is in double
-        precision. (They need not if you pass all references and omit "approximate".) Convert
-        constants to the dtype of the point, or put them in `params`.
+        precision. (If you pass all references and omit "approximate", they need to work only in
+        these `dtypes`.) Convert constants to the dtype of the point, or put them in `params`.
     - `num_bridges`: samples per setting. Discretisation errors below the Monte Carlo error are not
         detected.
     - `fn`: the estimated function, from the path at `save_at`, shape (K, d), to an array. By
@@ -128,14 +129,16 @@ def work_precision(
         cheapest setting that reaches it.
     - `reference`, `log_density`: the exact mean and standard deviation of `fn` as a pair, and
         log p_T(a, b), if you know them. For Ornstein–Uhlenbeck processes they are computed.
-    - `reference_steps`, `reference_bridges`: size of the reference run if there is no closed form.
-        By default four times the largest number of steps, and 4 × `num_bridges`.
+    - `reference_steps`, `reference_bridges`: size of reference runs, for exact values without a
+        closed form and for the limits of approximate bridges. By default four times the largest
+        number of steps, and 4 × `num_bridges`.
     - `repeats`: number of timed runs; their median is reported.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
 
     **Returns:** `WorkPrecision`, which prints as a table.
 
-    **Raises:** `ValueError` and `TypeError` for invalid arguments.
+    **Raises:** `ValueError` and `TypeError` for invalid arguments; `ValueError` if a reference run
+    finds no bridges; `TypeError` if the model does not work in the required precisions.
 
     **Example:**
 
