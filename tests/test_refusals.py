@@ -17,8 +17,8 @@ from inference_oracles import ou_1d
 import jaxbridge as jb
 from jaxbridge import plot
 from jaxbridge.coupling.start_laws import as_start_law
-from jaxbridge.inference.data import as_observations
 from jaxbridge.proposals.auto import as_proposal, choice_between
+from jaxbridge.records import as_observations
 
 KEY, A, B, X, NAN = jax.random.key(0), [0.0, 0.0], [1.0, 0.0], jnp.ones(2), np.nan
 TIMES, POINTS, LINE = [0.0, 1.0, 2.0], [[0.0, 0.0], [0.5, 0.2], [0.1, 0.3]], [[0.0], [0.5], [1.0]]
@@ -292,7 +292,7 @@ COUPLING = [
     ("sign test", of(jb.SignTest)(-1.0), "`"),
     ("start law", of(as_start_law)(3.0), "`start_law` must be", TypeError),
     ("class", coupling(0.5, start_law=jb.Reversed), "not a class", TypeError),
-    ("burn-in", of(jb.Stationary)(-1.0), "positive time"),
+    ("burn-in", of(jb.Stationary)(-1.0), "positive finite time"),
     ("mean", of(jb.GaussianLaw)([0.0], jnp.eye(2)), "must have shape"),
     ("covariance", of(jb.GaussianLaw)(A, jnp.eye(3)), "must have shape"),
     *each("law", of(jb.GaussianLaw, A), [-np.eye(2), np.eye(2)[::-1]], "positive semidef"),
@@ -552,6 +552,8 @@ OF_A_RECORD = [
     ("one time", dict(times=AT[:1], observations=VALUES[:1]), "at least two times"),
     ("infinite", dict(observations=VALUES + np.inf), r"`observations\[0, 0\]` is infinite"),
     ("before the beginning", dict(initial_time=1.0), "`times` must begin at `initial_time`"),
+    ("no beginning", dict(initial_time=NAN), "`initial_time` must be finite"),
+    ("lengths", dict(observations=VALUES[:3], initial_time=-1.0), r"got \(4,\) and \(3, 2\)"),
     ("two kinds of steps", dict(num_steps=4, step_size=0.1), "not both"),
     ("no steps", dict(num_steps=0), "`num_steps` must be at least 1"),
     ("backward steps", dict(step_size=-1.0), "`step_size` must be a positive"),
@@ -690,7 +692,12 @@ TINY, MANY = dict(step_size=1e-9), dict(num_steps=2**26)
 
 INFERENCE = [
     # Too much.
-    *each("steps", lambda call: call(**TINY), [gibbs, pmmh, maximum], "`step_size` = .* Pass 3"),
+    *each(
+        "steps",
+        lambda call: call(**TINY),
+        [gibbs, pmmh, maximum],
+        "`step_size` = .* of 3",
+    ),
     *each("steps", lambda call: call(**MANY), [gibbs, pmmh, maximum], "`num_steps` = 67,108,864"),
     ("steps of a record", of_noise(**TINY), "`step_size` = 1e-09 needs 2e.09 steps"),
     ("meter", gibbs(progress_meter=True), "`progress_meter` must be `None` or", TypeError),
@@ -817,6 +824,8 @@ UNUSED = [
         "initial", lambda call: call(**INITIAL), [gibbs, pmmh, maximum], "`initial`: only for rec"
     ),
     ("num_warmup", gibbs(num_warmup=3), "`num_warmup`: only for records"),
+    ("one state", exactly_seen(times=TIMES[:1], observations=LINE[:1]), "at least two entries"),
+    ("a gap", exactly_seen(observations=[NAN, 0.5, 1.0]), "leave out observations that are miss"),
     *(
         (name, exactly_seen(**{name: value}), f"without an `observation` .*leave out .*`{name}`")
         for name, value in [

@@ -283,7 +283,7 @@ def count_steps(durations: Array, num_steps: int | None, step_size: float) -> In
     A step may be longer by a factor of 1 + 1e-4, so that rounded durations do not add a step.
 
     **Raises:** `ValueError` if `num_steps` is given too, if durations are traced, if `step_size` is
-    not a positive Python number, or if all intervals together need more than 2²⁶ steps.
+    not a positive number, or if all intervals together need more than 2²⁶ steps.
     """
     if num_steps is not None:
         raise ValueError("Pass `num_steps` or `step_size`, not both.")
@@ -291,8 +291,11 @@ def count_steps(durations: Array, num_steps: int | None, step_size: float) -> In
         raise ValueError(
             "`step_size` needs concrete `times`; got traced ones. Pass `num_steps` instead."
         )
-    if isinstance(step_size, bool) or not isinstance(step_size, int | float) or not step_size > 0:
-        raise ValueError(f"`step_size` must be a positive Python number; got {step_size!r}.")
+    if is_traced(step_size) or as_floating("step_size", step_size).shape != ():
+        raise ValueError(f"`step_size` must be a concrete number; got {step_size!r}.")
+    step_size = float(step_size)
+    if not step_size > 0:
+        raise ValueError(f"`step_size` must be a positive number; got {step_size!r}.")
     counts = np.ceil(np.asarray(durations, float) / step_size * (1 - 1e-4)).clip(1)
     if not np.sum(counts) <= _MOST_STEPS:  # refuses NaN, too
         smallest = 1.01 * np.sum(np.asarray(durations, float)) / _MOST_STEPS

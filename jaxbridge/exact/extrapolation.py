@@ -190,9 +190,13 @@ def _check_pair(fine: Any, coarse: Any) -> None:
             f"`coarse` must have half as many steps as `fine`; got {fine.num_steps} steps "
             f"(`fine`) and {coarse.num_steps} steps (`coarse`)."
         )
-    # The structure includes the types and static settings of a proposal, not its numbers.
-    structures = [jax.tree.structure(estimate.proposal) for estimate in (fine, coarse)]
-    if structures[0] != structures[1] or len(fine.proposal.singles) > 1:
+    # The structure includes the types and static settings of a proposal, the description its γ.
+    # Other numbers, such as a burn-in, may depend on the number of steps.
+    both = [
+        (jax.tree.structure(estimate.proposal), estimate.proposal.describe())
+        for estimate in (fine, coarse)
+    ]
+    if both[0] != both[1] or len(fine.proposal.singles) > 1:
         raise ValueError(
             "`fine` and `coarse` must come from the same single proposal, because "
             "the discretisation errors of different ones do not cancel; "

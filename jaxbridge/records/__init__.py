@@ -25,6 +25,7 @@ are:
 """
 
 # The names that other folders import from this one.
+from .exact_observations import as_observations as as_observations
 from .forgetting import half_will_do as half_will_do, rate_for_several as rate_for_several
 from .guide_search import (
     GuideCheck as GuideCheck,
@@ -53,7 +54,6 @@ from .path_blocks import (
     sweep as sweep,
     tuned as tuned,
 )
-from .record import as_rows as as_rows, of_each as of_each, split_records as split_records
 from .several import (
     Records as Records,
     as_record_problems as as_record_problems,

@@ -27,7 +27,6 @@ from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..engine.pareto import NEARLY_EQUAL, largest_reliable_k
-from ..engine.times import as_times, check_increasing
 from ..engine.verdict import (
     AbstractResult,
     Fault,
@@ -45,13 +44,13 @@ from ..schemes import (
     num_coarse_grids,
     step_faults,
 )
+from .exact_observations import as_observations
 from .forgetting import chosen_of, confirmed, half_will_do, rates_for, undecided
 from .guide_search import GuideCheck, linearised
 from .guided_record import Guidance, forgetful
 from .initial import Initial
 from .observation import Observation
 from .particle_filter import Filtered, run_filters
-from .record import as_rows, of_each, split_records
 from .several import Records, as_record_problems, stacked
 
 # An estimate is unreliable with fewer effective particles, or with a larger standard error. The
@@ -365,14 +364,10 @@ def _exact_log_likelihood(
     """Estimate the log-likelihood of exact observations of the whole state."""
     if step_size is not None:
         raise ValueError("`step_size` is for records with an `observation`: pass `num_steps`.")
-    intervals = of_each(_intervals, split_records(times, observations))
-    start, end, duration = (jnp.concatenate(parts) for parts in zip(*intervals, strict=True))
     density = transition_log_density(
         key,
         model,
-        start,
-        end,
-        duration,
+        *as_observations(model, times, observations),
         num_proposals=num_proposals,
         num_steps=50 if num_steps is None else num_steps,
         proposal="auto",
@@ -390,22 +385,6 @@ def _exact_log_likelihood(
         jnp.sqrt(jnp.sum(density.step_uncertainty**2)),
         jnp.zeros_like(value),
     )
-
-
-def _intervals(times: Numbers, observations: Numbers) -> tuple[Array, Array, Array]:
-    """Return start, end and duration of each interval between observations."""
-    checked_times, points = as_times("times", times), as_rows(observations)
-    if (
-        len(checked_times.shape) != 1
-        or points.ndim != 2
-        or points.shape[0] != checked_times.shape[0]
-    ):
-        raise ValueError(
-            "`times` must have shape (n,) and `observations` (n, d), one row per time; got "
-            f"{checked_times.shape} and {points.shape}."
-        )
-    check_increasing(checked_times)
-    return points[:-1], points[1:], checked_times.gaps
 
 
 # Kinds of stages, in this order: a pilot run per rate, a confirmation of the best, and final runs.

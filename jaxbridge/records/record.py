@@ -261,6 +261,12 @@ def _check_record(
     """
     values = as_rows(observations)
     checked_times = as_times("times", _unmask("times", times))
+    shape = checked_times.shape
+    if len(shape) != 1 or values.ndim != 2 or values.shape[0] != shape[0]:
+        raise ValueError(
+            "`times` must have shape (n,) and `observations` (n, m), one row per time; got "
+            f"{shape} and {values.shape}."
+        )
     if initial_time is not None:
         observed_times = checked_times
         checked_times = observed_times.preceded("initial_time", initial_time)
@@ -269,15 +275,6 @@ def _check_record(
             (len(checked_times.gaps) - len(observed_times.gaps), *values.shape[1:]), jnp.nan
         )
         values = jnp.concatenate([missing.astype(values.dtype), values])
-    if (
-        len(checked_times.shape) != 1
-        or values.ndim != 2
-        or values.shape[0] != checked_times.shape[0]
-    ):
-        raise ValueError(
-            "`times` must have shape (n,) and `observations` (n, m), one row per time; got "
-            f"{checked_times.shape} and {values.shape}."
-        )
     if checked_times.shape[0] < 2 or values.shape[1] == 0:
         raise ValueError(
             "a record needs at least two times (an earlier `initial_time` counts as one) and one "

@@ -168,7 +168,10 @@ class Smoothed(AbstractResult):
         return jax.tree.map(effective_size_of_chains, self._values(fn))
 
     def r_hat(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """Return R̂ of `fn(path)`, from the halves of all chains: near 1 if they agree."""
+        """Return R̂ of `fn(path)`, from the halves of all chains: near 1 if they agree.
+
+        It is NaN for values that do not vary, such as coordinates that are observed exactly.
+        """
         return jax.tree.map(potential_scale_reduction, self._values(fn))
 
     @property

@@ -288,7 +288,9 @@ def _candidates(
             proposals.append(Coupling(scheme=GaussianTransition()))
     proposals = as_sequence("proposals", proposals, "proposals")
     candidates = [
-        as_proposal(proposal, model, like, name="proposals", for_density=for_density)
+        as_proposal(
+            proposal, model, like, name="proposals", for_density=for_density, normal_steps=False
+        )
         for proposal in proposals
     ]
     if any(len(candidate.singles) > 1 for candidate in candidates):

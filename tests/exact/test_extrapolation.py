@@ -1,5 +1,6 @@
 """Two grids against closed forms: what is left of the step error, and how its noise is told."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 from helpers import turning_model
 
 import jaxbridge as jb
+from jaxbridge.proposals.coupled import CoupledPairs
 
 # An Ornstein–Uhlenbeck process seen through sinh: σ(x) = √(1 + x²).
 OU = jb.ornstein_uhlenbeck([[1.0]], [0.0], [[1.0]])
@@ -64,6 +66,15 @@ def test_the_leading_error_of_a_density_is_gone(densities):
     assert errors[0] > 8 * noise[0] and errors[1] > 5 * noise[1]
     assert abs(errors[2]) < abs(errors[1]) / 2
     assert float(both.removed) == pytest.approx(float(fine.value - both.value), abs=1e-6)
+
+
+def test_pairs_of_two_gammas_are_two_proposals(densities):
+    both = [
+        eqx.tree_at(lambda one: one.proposal, density, CoupledPairs(jb.Coupling(gamma)))
+        for density, gamma in zip(densities, (0.0, 0.5), strict=True)
+    ]
+    with pytest.raises(ValueError, match="the same single proposal"):
+        jb.extrapolate(*both)
 
 
 def test_its_noise_is_that_of_a_sum(densities):

@@ -6,8 +6,9 @@ import pytest
 
 import jaxbridge as jb
 from jaxbridge.inference import data
-from jaxbridge.inference.data import _cheapest_groups, as_observations, step_groups
+from jaxbridge.inference.data import _cheapest_groups, step_groups
 from jaxbridge.models.bridge_problem import as_intervals
+from jaxbridge.records import as_observations
 
 
 def groups_of(durations, step_size):
