@@ -70,7 +70,9 @@ def test_the_leading_error_of_a_density_is_gone(densities):
 
 def test_pairs_of_two_gammas_are_two_proposals(densities):
     both = [
-        eqx.tree_at(lambda one: one.proposal, density, CoupledPairs(jb.Coupling(gamma)))
+        eqx.tree_at(
+            lambda one: one.proposal, density, CoupledPairs(jb.Coupling(gamma), 100, 100, 1)
+        )
         for density, gamma in zip(densities, (0.0, 0.5), strict=True)
     ]
     with pytest.raises(ValueError, match="the same single proposal"):
