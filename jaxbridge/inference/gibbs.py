@@ -71,7 +71,8 @@ _MISSING = (
 )
 _CUT_OFF = (
     "In more than 1 % of the draws `max_trials` truncated weights, or a burn-in of the coupling "
-    "was cut short, so the law is not exact. Increase `max_trials`, or use another `proposal`."
+    "was cut short, so the law is not exact. Use another `proposal`, or a larger `max_trials` (not "
+    "for renewals)."
 )
 
 
