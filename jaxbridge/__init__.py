@@ -115,7 +115,19 @@ from .proposals.modified_bridge import ModifiedDiffusionBridge
 from .proposals.residual_bridge import ResidualBridge
 from .records.innovations import Innovations, innovations
 from .records.log_likelihood import LogLikelihood, log_likelihood
-from .records.observation import LinearGaussian, ObservationDensity
+from .records.observations import (
+    AbstractComponents,
+    AbstractObservation,
+    Censored,
+    LinearGaussian,
+    LogNormal,
+    NegativeBinomialCounts,
+    ObservationDensity,
+    PoissonCounts,
+    Quantity,
+    Rounded,
+    StudentT,
+)
 from .records.smooth import Smoothed, smooth
 from .schemes.base import AbstractScheme
 from .schemes.euler import Euler
@@ -222,7 +234,16 @@ __all__ = [
     "Pilot",
     # Records: noisy, partial or missing observations.
     "LinearGaussian",
+    "PoissonCounts",
+    "NegativeBinomialCounts",
+    "StudentT",
+    "LogNormal",
+    "Censored",
+    "Rounded",
     "ObservationDensity",
+    "AbstractObservation",
+    "AbstractComponents",
+    "Quantity",
     "log_likelihood",
     "LogLikelihood",
     "smooth",

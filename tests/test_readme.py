@@ -51,6 +51,11 @@ CLAIMS = {
         and page["chain"].paths.shape == (1000, 101, 2)
         and page["short"].acceptance_rate > 0.95
     ),
+    "counts_and_outliers": lambda page: (
+        covers(page["posterior"].params["log_sigma"], -0.7)
+        and covers(page["posterior"].params["log_size"], 2)
+        and page["inside"] > 0.75
+    ),
     "debugging": lambda page: not page["density"].trustworthy,
     "densities": lambda page: (
         page["densities"].value.shape == (100,)
@@ -153,7 +158,7 @@ def test_every_task_has_code():
     assert len(SHAPES) == len(CODE[README])
     assert {page.stem for page, blocks in CODE.items() if blocks} == set(CLAIMS)
     tasks = [page for page in PAGES if page.parent.name == "howto" and page.stem != "index"]
-    assert len(tasks) >= 21 and all(CODE[page] for page in tasks)
+    assert len(tasks) >= 22 and all(CODE[page] for page in tasks)
 
 
 def test_readme_is_short_and_names_the_two_commands():

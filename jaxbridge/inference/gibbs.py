@@ -26,7 +26,7 @@ from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
 from ..proposals import Budget, ProposalLike
-from ..records import Initial, LinearGaussian, Observation, as_record_problems
+from ..records import AbstractObservation, Initial, LinearGaussian, as_record_problems
 from .augmentation import Augmentation, augment
 from .checkpoint import resumable
 from .data import as_problem
@@ -181,7 +181,7 @@ def gibbs(
     num_chains: int | None = None,
     thin: int = 1,
     init: PyTree | GibbsState | RecordState = None,
-    observation: Observation | None = None,
+    observation: AbstractObservation | None = None,
     initial: Initial = None,
     initial_time: Numbers | None = None,
     population: NormalPopulation | None = None,

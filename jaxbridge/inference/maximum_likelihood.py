@@ -28,7 +28,7 @@ from ..engine.entry import public_entry
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..models.diffusion import Diffusion
 from ..proposals import Budget, ProposalLike
-from ..records import Initial, Observation, as_record_problems
+from ..records import AbstractObservation, Initial, as_record_problems
 from ..schemes import StepError, dominates, step_faults
 from .augmentation import augment
 from .data import Problem, as_problem
@@ -165,7 +165,7 @@ def maximum_likelihood(
     proposal: ProposalLike = "auto",
     where: Callable[[PyTree], PyTree] | None = None,
     constraint: Constraint | None = None,
-    observation: Observation | None = None,
+    observation: AbstractObservation | None = None,
     initial: Initial = None,
     initial_time: Numbers | None = None,
     num_counts: int | None = None,

@@ -37,7 +37,7 @@ from ..engine.verdict import Fault, lost_share
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..proposals import AbstractWeightedProposal, Budget, ProposalLike
-from ..records import GuideCheck, Initial, Observation, as_record_problems
+from ..records import AbstractObservation, GuideCheck, Initial, as_record_problems
 from .blocks import Block, block_of, make_blocks
 from .checkpoint import resumable
 from .data import Problem, as_problem
@@ -238,7 +238,7 @@ def pmmh(
     num_chains: int | None = None,
     thin: int = 1,
     init: PyTree | PMMHState = None,
-    observation: Observation | None = None,
+    observation: AbstractObservation | None = None,
     initial: Initial = None,
     initial_time: Numbers | None = None,
     num_counts: int | None = None,

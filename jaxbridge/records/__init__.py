@@ -44,7 +44,10 @@ from .guided_record import (
     path_and_log_weights as path_and_log_weights,
 )
 from .initial import Initial as Initial
-from .observation import LinearGaussian as LinearGaussian, Observation as Observation
+from .observations import (
+    AbstractObservation as AbstractObservation,
+    LinearGaussian as LinearGaussian,
+)
 from .particle_filter import Filtered as Filtered, run_filters as run_filters
 from .path_blocks import (
     Paths as Paths,

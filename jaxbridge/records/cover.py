@@ -31,7 +31,7 @@ from ..engine.linalg import cholesky, is_finite, matmul, matvec, solve_lower
 from ..models.diffusion import Diffusion
 from .guided_steps import GuidedLaw, guided_start
 from .initial import ladder, log_normal
-from .observation import Scalars
+from .observations import Scalars
 from .tilted_step import Information, NormalStep
 
 # Number of kernels, and of rounds of draws without a sampler.

@@ -29,7 +29,7 @@ from .guided_record import Guidance, guided, path_and_log_weight
 from .initial import calls_for_cover, initial_law, likeliest
 from .likely_path import likely_path
 from .linearisation import extended_kalman_path, stay_inside
-from .observation import Scalars
+from .observations import Scalars
 from .problem import RecordProblem
 from .segments import split_first
 from .tracking import tracking_path

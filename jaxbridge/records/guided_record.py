@@ -34,7 +34,7 @@ from .guided_steps import (
 from .information_filter import information_filter
 from .initial import initial_law, log_ratio
 from .linearisation import LinearisedStep, linear_step
-from .observation import Row, Scalars
+from .observations import Row, Scalars
 from .problem import RecordProblem
 from .record import Steps
 from .segments import at_every_step, flat, following, split_first, split_last

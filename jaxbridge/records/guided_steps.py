@@ -33,7 +33,7 @@ from ..engine.lanes import compute_once
 from ..engine.linalg import dot
 from ..models.dynamics import DynamicsAt
 from ..schemes import AbstractStepDensity, DegenerateLaw, StepLaw, with_transition
-from .observation import Scalars
+from .observations import Scalars
 from .record import Steps
 from .tilted_step import Information, NormalStep, Seen, Tilted, coordinates, given, tilted
 

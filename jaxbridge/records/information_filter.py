@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from ..engine.linalg import dot, matmul, matvec, solve_lower, solve_lower_transposed
 from ..engine.recursion import StateDerivative, recursion
 from .linearisation import LinearisedStep
-from .observation import Scalars
+from .observations import Scalars
 from .segments import at_every_step, flat
 from .tilted_step import Information, root_after, seen_of, tilt_factor
 

@@ -38,7 +38,7 @@ from ..engine.linalg import (
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
 from ..models.tracing import uses_argument
-from .observation import Scalars, log_density_of
+from .observations import Scalars, log_density_of
 from .tilted_step import NormalStep
 
 # Number of iterations of Newton's method for the mode of ν, from the origin.

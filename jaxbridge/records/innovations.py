@@ -26,7 +26,7 @@ from ..schemes import AbstractStepDensity
 from .guide_search import GuideCheck
 from .guided_record import guided, path_and_log_weight
 from .initial import Initial
-from .observation import Observation
+from .observations import AbstractObservation
 from .several import Records, as_record_problems, linearisations
 from .start_share import start_share
 
@@ -167,7 +167,7 @@ def innovations(
     times: Numbers,
     observations: Numbers,
     *,
-    observation: Observation,
+    observation: AbstractObservation,
     initial: Initial = None,
     num_steps: int | None = None,
     step_size: float | None = None,

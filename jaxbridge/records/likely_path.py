@@ -25,7 +25,7 @@ from .guided_steps import guided_start, relative, target_law
 from .information_filter import information_filter
 from .initial import initial_law
 from .linearisation import LinearisedStep, linear_step
-from .observation import Scalars
+from .observations import Scalars
 from .problem import RecordProblem
 from .segments import at_every_step, flat, following, split_first
 from .tilted_step import NormalStep, given, tilted

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 from ..engine.linalg import matmul, matvec
 from ..models.dynamics import DynamicsAt
 from ..schemes import AbstractStepDensity, with_transition
-from .observation import Scalars
+from .observations import Scalars
 from .record import Steps
 from .segments import at_every_step, flat, split_first
 from .tilted_step import NormalStep

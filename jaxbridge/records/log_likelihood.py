@@ -49,7 +49,7 @@ from .forgetting import chosen_of, confirmed, half_will_do, rates_for, undecided
 from .guide_search import GuideCheck, linearised
 from .guided_record import Guidance, forgetful
 from .initial import Initial
-from .observation import Observation
+from .observations import AbstractObservation
 from .particle_filter import Filtered, run_filters
 from .several import Records, as_record_problems, stacked
 
@@ -220,7 +220,7 @@ def log_likelihood(
     times: Numbers,
     observations: Numbers,
     *,
-    observation: Observation | None = None,
+    observation: AbstractObservation | None = None,
     initial: Initial = None,
     num_particles: int = 100,
     num_filters: int | None = None,

@@ -39,7 +39,7 @@ from .guided_steps import Guide, end_of_step, guided_law, guided_start, target_l
 from .information_filter import information_filter
 from .initial import log_ratio
 from .linearisation import LinearisedStep
-from .observation import Row, Scalars
+from .observations import Row, Scalars
 from .problem import RecordProblem
 from .record import Steps
 from .segments import flat, following, split_last

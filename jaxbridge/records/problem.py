@@ -20,7 +20,14 @@ from ..schemes import (
     most_accurate_density,
 )
 from .initial import Initial, as_initial, bound, check_initial
-from .observation import LinearGaussian, Observation, Row, Scalars, check_observation
+from .observations import (
+    AbstractObservation,
+    LinearGaussian,
+    Row,
+    Scalars,
+    check_observation,
+    matrix_for,
+)
 from .record import Record, Steps
 
 # Dimensions up to 2 d plus this number are tried, to name the right one in the error message.
@@ -35,7 +42,7 @@ class RecordProblem(eqx.Module):
 
     model: Diffusion
     record: Record
-    observation: Observation
+    observation: AbstractObservation
     initial: Initial
     density: AbstractStepDensity
     dim: int = eqx.field(static=True)
@@ -86,7 +93,7 @@ class RecordProblem(eqx.Module):
 def problem_of(
     model: Diffusion,
     record: Record,
-    observation: Observation,
+    observation: AbstractObservation,
     initial: Initial,
     density: AbstractStepDensity | None = None,
     any_constant: bool = False,
@@ -103,12 +110,11 @@ def problem_of(
     check_diffusion(model)
     check_observation(observation)
     m = record.values.shape[1]
-    guess = observation.linear
     # Without a matrix the whole state is observed.
-    dim = m if guess.matrix is None else guess.matrix.shape[1]
+    dim = m if observation.matrix is None else observation.matrix.shape[1]
     like = jnp.zeros(dim, record.values.dtype)
-    _check_dimension(model, guess, like)
-    observation.check(m, like, record.times[0], model.params)
+    _check_dimension(model, observation, like)
+    observation.check(record.values, like, record.times[0], model.params)
     if initial is None:
         if not model.has_density:
             raise ValueError(
@@ -133,7 +139,9 @@ def problem_of(
     return RecordProblem(model, record, observation, initial, density, dim)
 
 
-def _check_dimension(model: Diffusion, guess: LinearGaussian, like: Float[Array, " d"]) -> None:
+def _check_dimension(
+    model: Diffusion, observation: AbstractObservation, like: Float[Array, " d"]
+) -> None:
     """Raise `ValueError` if the dimensions of the model and of the observation model differ."""
     if _has_dimension(model, like):
         return
@@ -141,16 +149,16 @@ def _check_dimension(model: Diffusion, guess: LinearGaussian, like: Float[Array,
     fits = [n for n in range(1, most) if _has_dimension(model, jnp.zeros(n, like.dtype))]
     if not fits:  # the error is in the model, and its evaluation reports it
         return
-    if guess.matrix is None:
+    if observation.matrix is None:
         raise ValueError(
             f"`observations` have {d} components, but without a `matrix` the whole state of "
-            f"{fits[0]} components is observed: pass the `matrix` of the observation model to "
-            f"`LinearGaussian`, shape ({d}, {fits[0]})."
+            f"{fits[0]} components is observed: pass the `matrix` of the observation model, shape "
+            f"({d}, {fits[0]})."
         )
-    rows = guess.matrix.shape[0]
+    rows = observation.matrix.shape[0]
     raise ValueError(
         f"`matrix` must have shape ({rows}, {fits[0]}) for a state of {fits[0]} dimensions; got "
-        f"shape {guess.matrix.shape}."
+        f"shape {observation.matrix.shape}."
     )
 
 
@@ -169,7 +177,7 @@ def _has_dimension(model: Diffusion, like: Float[Array, " d"]) -> bool:
     return sigma.shape[0] == like.shape[0]
 
 
-def check_clock(model: Diffusion, observation: Observation, record: Record) -> None:
+def check_clock(model: Diffusion, observation: AbstractObservation, record: Record) -> None:
     """Raise `ValueError` if large times are too imprecise for time-dependent functions."""
     if model.depends_on_time:
         check_resolved(record.clock, record.since, record.dt)
@@ -177,7 +185,7 @@ def check_clock(model: Diffusion, observation: Observation, record: Record) -> N
         check_resolved(record.clock, record.since, record.durations)
 
 
-def check_domain(model: Diffusion, observation: Observation, record: Record) -> None:
+def check_domain(model: Diffusion, observation: AbstractObservation, record: Record) -> None:
     """Raise `ValueError` if a complete exact observation is outside the state space."""
     is_inside = model.state_space()
     if is_inside is None or not isinstance(observation, LinearGaussian):
@@ -187,14 +195,20 @@ def check_domain(model: Diffusion, observation: Observation, record: Record) -> 
     d, values = record.values.shape[-1], record.values[record.which]
     if is_traced(model, observation, values):
         return
-    matrix = np.asarray(observation.matrix_for(d, d, values.dtype), float)
-    first_time = record.times[0]
-    R = np.asarray(observation.covariance_for(model.params, d, first_time))
+    matrix, first_time = matrix_for(observation.matrix, d, values.dtype), record.times[0]
+    matrix, R, offset = (
+        np.asarray(part, float)
+        for part in (
+            matrix,
+            observation.covariance_for(model.params, d, first_time),
+            observation.offset_for(model.params, d, first_time),
+        )
+    )
     # Only complete observations without noise determine the state.
     if matrix.shape != (d, d) or np.any(R):
         return
     complete = np.all(np.isfinite(np.asarray(values)), axis=1)
-    states = np.linalg.solve(matrix, np.where(complete[:, None], values, 0).T).T
+    states = np.linalg.solve(matrix, np.where(complete[:, None], values - offset, 0).T).T
     inside = jax.vmap(is_inside)(jnp.asarray(states, values.dtype))
     outside = np.flatnonzero(complete & ~np.asarray(inside))
     if outside.size:

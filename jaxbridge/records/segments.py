@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from .observation import Scalars
+from .observations import Scalars
 
 
 def flat(tree: PyTree) -> PyTree:

@@ -20,7 +20,7 @@ from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
 from .guide_search import GuideCheck, linearised
 from .initial import Initial
-from .observation import Observation
+from .observations import AbstractObservation
 from .problem import RecordProblem, check_clock, check_domain, problem_of
 from .record import Record, are_several, as_records, split_records
 
@@ -105,7 +105,7 @@ def as_record_problems(
     model: Diffusion,
     times: Numbers,
     observations: Numbers,
-    observation: Observation,
+    observation: AbstractObservation,
     initial: Initial,
     *,
     num_steps: int | None = None,

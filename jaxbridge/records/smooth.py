@@ -47,7 +47,7 @@ from .guided_record import (
     path_of_knots,
 )
 from .initial import Initial
-from .observation import Observation
+from .observations import AbstractObservation
 from .path_blocks import Paths, blocks_of_both_cuts, has_length, has_segments, sweep, tuned
 from .problem import RecordProblem
 from .several import as_record_problems
@@ -275,7 +275,7 @@ def smooth(
     times: Numbers,
     observations: Numbers,
     *,
-    observation: Observation,
+    observation: AbstractObservation,
     initial: Initial = None,
     num_draws: int = 1000,
     num_warmup: int = 200,

@@ -52,7 +52,7 @@ from ..proposals import (
 )
 from .guided_record import correction
 from .initial import bound
-from .observation import Scalars, log_density_of
+from .observations import Scalars, log_density_of
 from .path_blocks import tuned
 from .problem import RecordProblem
 from .record import Record

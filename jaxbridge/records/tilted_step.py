@@ -33,7 +33,7 @@ from ..engine.linalg import (
     solve_lower,
     solve_lower_transposed,
 )
-from .observation import Scalars
+from .observations import Scalars
 
 
 class Information(NamedTuple):

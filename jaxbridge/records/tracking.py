@@ -18,7 +18,7 @@ from ..engine.linalg import dot, matvec
 from ..models.diffusion import Diffusion
 from .guided_steps import target_law
 from .initial import initial_law, log_ratio
-from .observation import Scalars
+from .observations import Scalars
 from .problem import RecordProblem
 from .segments import split_first
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from jaxbridge.records.cover import Cover, covered_start
-from jaxbridge.records.observation import Scalars
+from jaxbridge.records.observations import Scalars
 from jaxbridge.records.tilted_step import Information, NormalStep
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from jaxbridge.records.information_filter import information_filter
 from jaxbridge.records.linearisation import LinearisedStep
-from jaxbridge.records.observation import Scalars
+from jaxbridge.records.observations import Scalars
 
 K, N, D, SEEN = 3, 2, 2, 2
 

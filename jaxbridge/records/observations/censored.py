@@ -1,0 +1,80 @@
+"""Readings beyond a limit of detection, and rounded readings."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import log_ndtr
+from jaxtyping import Array, Float
+
+from ...engine.checks import Numbers
+from .base import Quantity, as_matrix
+from .components import AbstractComponents, check_positive
+
+
+class Censored(AbstractComponents):
+    """Observation model with limits: y_j = η_j + s ε_j, seen only between `lower` and `upper`.
+
+    η = L x + offset, and the ε_j are normal. A reading at `lower` or below says that the value was
+    at most `lower`; one at `upper` or above, that it was at least `upper`. Such readings do not
+    guide the paths. They weight them by the probability of what was seen.
+
+    **Arguments:**
+
+    - `matrix`: L, shape (m, d); by default `None`: each component of the state is observed.
+    - `scale`: s in units of y, shape () or (m,), or a function `params -> s` or `(params, t) -> s`.
+    - `lower`, `upper`: limits in units of y, shape () or (m,); infinite by default.
+    - `offset`: in units of y, shape () or (m,), or such a function.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments.
+
+    **Example:**
+
+    ```python
+    model = jb.ornstein_uhlenbeck([[1.0]])
+    seen = jb.Censored(scale=0.2, lower=-0.5)  # the second reading is -0.5 or less
+    jb.log_likelihood(key, model, [0.0, 1.0], [0.1, -0.5], observation=seen)
+    ```
+    """
+
+    matrix: Float[Array, "m d"] | None
+    scale: Quantity
+    lower: Quantity
+    upper: Quantity
+    offset: Quantity
+
+    def __init__(
+        self,
+        matrix: Numbers | None = None,
+        *,
+        scale: Numbers | Callable[..., Array],
+        lower: Numbers = -np.inf,
+        upper: Numbers = np.inf,
+        offset: Numbers | Callable[..., Array] = 0.0,
+    ):
+        self.matrix = as_matrix(matrix)
+        self.scale, self.offset = Quantity("scale", scale), Quantity("offset", offset)
+        self.lower, self.upper = Quantity("lower", lower), Quantity("upper", upper)
+        check_positive(self.scale)
+
+    @property
+    def quantities(self):
+        return (self.scale, self.lower, self.upper, self.offset)
+
+    def log_density(self, y, eta, params, time):
+        s, lower, upper = self._numbers(y, params, time)
+        z = (y - eta) / s
+        between = -(z**2) / 2 - jnp.log(s) - np.log(2 * np.pi) / 2
+        below, above = log_ndtr((lower - eta) / s), log_ndtr((eta - upper) / s)
+        return jnp.where(y <= lower, below, jnp.where(y >= upper, above, between))
+
+    def guide(self, y, params, time):
+        s, lower, upper = self._numbers(y, params, time)
+        return y, jnp.where((y > lower) & (y < upper), s**2, jnp.inf)
+
+    def check_data(self, data):
+        pass
+
+    def _numbers(self, y, params, time):
+        quantities = (self.scale, self.lower, self.upper)
+        return [quantity.for_components(params, time, len(y)) for quantity in quantities]

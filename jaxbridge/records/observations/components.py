@@ -1,0 +1,155 @@
+"""Observation models of independent components, with a derived guide.
+
+Component y_j depends on the state through η_j = (L x + offset)_j alone. A model gives
+log g(y_j | η_j), and the normal law that guides paths: that of η_j given y_j, under a flat prior or
+Jeffreys' prior.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import digamma, polygamma
+from jaxtyping import Array, Float, PyTree
+
+from ...engine.checks import is_traced
+from ...engine.linalg import dot
+from .base import AbstractObservation, Quantity, Row, Scalars, check_matrix, matrix_for
+
+Normal = tuple[Float[Array, " m"], Float[Array, " m"]]
+
+
+class AbstractComponents(AbstractObservation):
+    """Base class of observation models with independent components.
+
+    With η = L x + offset, component y_j depends on the state through η_j alone. Subclasses define
+    `log_density` and `guide`, which act on all components at once, and `check_data`.
+
+    - `matrix`: L, shape (m, d), or `None` for the identity.
+    - `offset`: the `Quantity` of the offset.
+
+    **Example:** 0 or 1, with the logit η of the probability of 1.
+
+    ```python
+    class Binary(jb.AbstractComponents):
+        matrix: jax.Array | None = None
+        offset: jb.Quantity = jb.Quantity("offset", 0.0)
+
+        @property
+        def quantities(self):
+            return (self.offset,)
+
+        def log_density(self, y, eta, params, time):
+            return y * eta - jnp.logaddexp(0.0, eta)
+
+        def guide(self, y, params, time):
+            return 2 * y - 1, jnp.full_like(y, 4.0)
+
+        def check_data(self, data):
+            pass
+    ```
+    """
+
+    offset: eqx.AbstractVar[Quantity]
+
+    @property
+    @abstractmethod
+    def quantities(self) -> tuple[Quantity, ...]:
+        """The offset and all other numbers that may be functions of the parameters."""
+
+    @abstractmethod
+    def log_density(
+        self,
+        y: Float[Array, " m"],
+        eta: Float[Array, " m"],
+        params: PyTree,
+        time: Float[Array, ""],
+    ) -> Float[Array, " m"]:
+        """Return log g(y_j | η_j) of all components; -inf where y_j is impossible."""
+
+    @abstractmethod
+    def guide(self, y: Float[Array, " m"], params: PyTree, time: Float[Array, ""]) -> Normal:
+        """Return mean and variance of a normal law of each η_j, given y_j.
+
+        An infinite variance says that y_j does not guide the paths.
+        """
+
+    @abstractmethod
+    def check_data(self, data: Float[np.ndarray, " n"]) -> None:
+        """Raise `ValueError` for data that are impossible; `data` are all finite entries."""
+
+    @property
+    def depends_on_time(self):
+        return any(quantity.depends_on_time for quantity in self.quantities)
+
+    def check(self, values, like, time, params):
+        m = values.shape[1]
+        check_matrix(self.matrix, m, like)
+        for quantity in self.quantities:
+            quantity.for_components(params, time, m)
+        if not is_traced(values):
+            data = np.asarray(values)
+            self.check_data(data[np.isfinite(data)])
+
+    def scalars(self, row, params, d):
+        value, variance, guides = self._guide_of(row, params)
+        rows = matrix_for(self.matrix, d, row.y.dtype)
+        offset = self.offset.for_components(params, row.time, len(row.y))
+        return Scalars(
+            jnp.where(guides[:, None], rows, 0),
+            jnp.where(guides, value - offset, 0),
+            jnp.where(guides, variance, 1),
+            guides,
+        )
+
+    def correction(self, row, x, params):
+        m, present = len(row.y), jnp.isfinite(row.y)
+        offset = self.offset.for_components(params, row.time, m)
+        rows = matrix_for(self.matrix, x.shape[0], x.dtype)
+        eta = jnp.stack([dot(row, x) for row in rows]) + offset
+        true = self.log_density(_filled(row.y), eta, params, row.time)
+        value, variance, guides = self._guide_of(row, params)
+        safe = jnp.where(guides, variance, 1)
+        normal = -((value - eta) ** 2 / safe + jnp.log(2 * np.pi * safe)) / 2
+        return jnp.sum(jnp.where(present, true - jnp.where(guides, normal, 0), 0))
+
+    def _guide_of(self, row: Row, params: PyTree):
+        """Return mean, variance and whether it guides, of each component."""
+        value, variance = self.guide(_filled(row.y), params, row.time)
+        return value, variance, jnp.isfinite(row.y) & jnp.isfinite(variance)
+
+
+def _filled(y: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Return 1 in place of missing components, a value that all models allow."""
+    return jnp.where(jnp.isfinite(y), y, 1)
+
+
+def moments_of_log_gamma(shape: Float[Array, " m"]) -> Normal:
+    """Return mean and variance of the log of a Gamma(shape, 1) variable."""
+    return digamma(shape), polygamma(1, shape)
+
+
+def log_where_positive(value: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Return log(value), and -inf with derivative zero where the value is not positive."""
+    positive = value > 0
+    return jnp.where(positive, jnp.log(jnp.where(positive, value, 1)), -jnp.inf)
+
+
+def check_counts(data: Float[np.ndarray, " n"]) -> None:
+    """Raise `ValueError` unless all data are whole numbers from 0 on."""
+    wrong = data[(data < 0) | (data != np.round(data))]
+    if wrong.size:
+        raise ValueError(
+            f"`observations` must be counts, whole numbers from 0 on; got {wrong[0]:g}. Pass NaN "
+            "for a missing count."
+        )
+
+
+def check_positive(quantity: Quantity, least: float = 0.0) -> None:
+    """Raise `ValueError` unless the numbers, as far as they are known, exceed `least`."""
+    value = quantity.value
+    if value is None or is_traced(value) or np.all(np.asarray(value) > least):
+        return
+    raise ValueError(f"`{quantity.name}` must be above {least:g}; got {jax.device_get(value)}.")

@@ -1,0 +1,79 @@
+"""Poisson counts."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.scipy.special import gammaln
+from jaxtyping import Array, Float
+
+from ...engine.arguments import check_choice
+from ...engine.checks import Numbers
+from .base import Quantity, as_matrix
+from .components import (
+    AbstractComponents,
+    check_counts,
+    log_where_positive,
+    moments_of_log_gamma,
+)
+
+Link = Literal["log", "identity"]
+
+
+class PoissonCounts(AbstractComponents):
+    """Observation model of Poisson counts with means μ_j, independent given the state.
+
+    With η = L x + offset the means are e^η (`link="log"`) or η (`link="identity"`). Paths are
+    guided by the law of η given y under Jeffreys' prior, for which μ is Gamma(y + ½)-distributed.
+
+    **Arguments:**
+
+    - `matrix`: L, shape (m, d); by default `None`: each component of the state has counts.
+    - `offset`: shape () or (m,), or a function `params -> offset` or `(params, t) -> offset`; for
+        instance the log of an exposure.
+    - `link`: "log" for a state that is a logarithm, "identity" for a positive state.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments; `ValueError` for observations
+    that are not whole numbers from 0 on.
+
+    **Example:**
+
+    ```python
+    model = jb.ornstein_uhlenbeck([[1.0]])
+    seen = jb.PoissonCounts(offset=jnp.log(20.0))
+    jb.log_likelihood(key, model, [0.0, 1.0], [17, 25], observation=seen)
+    ```
+    """
+
+    matrix: Float[Array, "m d"] | None
+    offset: Quantity
+    link: Link = eqx.field(static=True)
+
+    def __init__(
+        self,
+        matrix: Numbers | None = None,
+        *,
+        offset: Numbers | Callable[..., Array] = 0.0,
+        link: Link = "log",
+    ):
+        check_choice("link", link, ("log", "identity"))
+        self.matrix, self.offset, self.link = as_matrix(matrix), Quantity("offset", offset), link
+
+    @property
+    def quantities(self):
+        return (self.offset,)
+
+    def log_density(self, y, eta, params, time):
+        log_mean = eta if self.link == "log" else log_where_positive(eta)
+        mean = jnp.exp(eta) if self.link == "log" else eta
+        # 0 log 0 = 0: without mean the count is zero.
+        terms = jnp.where(y > 0, y * jnp.where(y > 0, log_mean, 0), 0)
+        log_g = terms - mean - gammaln(y + 1)
+        return log_g if self.link == "log" else jnp.where(eta >= 0, log_g, -jnp.inf)
+
+    def guide(self, y, params, time):
+        return moments_of_log_gamma(y + 0.5) if self.link == "log" else (y + 0.5, y + 0.5)
+
+    def check_data(self, data):
+        check_counts(data)
