@@ -113,6 +113,7 @@ from .proposals.guided import AbstractGuidedProposal, Step
 from .proposals.linear_guide import Guided
 from .proposals.modified_bridge import ModifiedDiffusionBridge
 from .proposals.residual_bridge import ResidualBridge
+from .records.forecast import Forecast, forecast
 from .records.innovations import Innovations, innovations
 from .records.log_likelihood import LogLikelihood, log_likelihood
 from .records.observations import (
@@ -233,6 +234,8 @@ __all__ = [
     "Tuning",
     "Pilot",
     # Records: noisy, partial or missing observations.
+    "forecast",
+    "Forecast",
     "LinearGaussian",
     "PoissonCounts",
     "NegativeBinomialCounts",

@@ -12,7 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..engine.checks import Numbers
 from ..engine.compiled import compiled_sooner
@@ -151,7 +151,7 @@ def _coarsened(stacked: Record, level: int) -> Record:
 
 
 @compiled_sooner
-def _entry(tree: PyTree, number: int) -> PyTree:
+def _entry(tree: PyTree, number: Int[Array, ""]) -> PyTree:
     """Return the entries of one record, without the leading axis."""
     return jax.tree.map(lambda leaf: leaf[number], tree)
 

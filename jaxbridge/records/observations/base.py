@@ -11,7 +11,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ...engine.arguments import as_returned, check_function, named
 from ...engine.captured import Captured
@@ -78,6 +78,23 @@ class AbstractObservation(eqx.Module):
     @abstractmethod
     def scalars(self, row: Row, params: PyTree, d: int) -> Scalars:
         """Return independent normal scalars, linear in x, whose law is like that of y given x."""
+
+    @abstractmethod
+    def sample(
+        self,
+        key: Key[Array, ""],
+        x: Float[Array, " d"],
+        params: PyTree = None,
+        time: Numbers = 0.0,
+    ) -> Float[Array, " m"]:
+        """Draw an observation, given the state x and the model's parameters.
+
+        **Raises:** `TypeError` if the model cannot (`check_sample`).
+        """
+
+    @abstractmethod
+    def check_sample(self) -> None:
+        """Raise `TypeError` if `sample` is not available."""
 
     @abstractmethod
     def correction(self, row: Row, x: Float[Array, " d"], params: PyTree) -> Float[Array, ""]:

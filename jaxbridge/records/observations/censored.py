@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr
@@ -71,6 +72,10 @@ class Censored(AbstractComponents):
     def guide(self, y, params, time):
         s, lower, upper = self._numbers(y, params, time)
         return y, jnp.where((y > lower) & (y < upper), s**2, jnp.inf)
+
+    def draw(self, key, eta, params, time):
+        s, lower, upper = self._numbers(eta, params, time)
+        return jnp.clip(eta + s * jax.random.normal(key, eta.shape, eta.dtype), lower, upper)
 
     def check_data(self, data):
         pass

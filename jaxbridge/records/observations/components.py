@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import digamma, polygamma
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, Key, PyTree
 
-from ...engine.checks import is_traced
+from ...engine.checks import as_floating, is_traced
 from ...engine.linalg import dot
 from .base import AbstractObservation, Quantity, Row, Scalars, check_matrix, matrix_for
 
@@ -25,7 +25,7 @@ class AbstractComponents(AbstractObservation):
     """Base class of observation models with independent components.
 
     With η = L x + offset, component y_j depends on the state through η_j alone. Subclasses define
-    `log_density` and `guide`, which act on all components at once, and `check_data`.
+    `log_density`, `guide` and `draw`, which act on all components at once, and `check_data`.
 
     - `matrix`: L, shape (m, d), or `None` for the identity.
     - `offset`: the `Quantity` of the offset.
@@ -46,6 +46,9 @@ class AbstractComponents(AbstractObservation):
 
         def guide(self, y, params, time):
             return 2 * y - 1, jnp.full_like(y, 4.0)
+
+        def draw(self, key, eta, params, time):
+            return jax.random.bernoulli(key, jax.nn.sigmoid(eta)).astype(eta.dtype)
 
         def check_data(self, data):
             pass
@@ -77,6 +80,12 @@ class AbstractComponents(AbstractObservation):
         """
 
     @abstractmethod
+    def draw(
+        self, key: Key[Array, ""], eta: Float[Array, " m"], params: PyTree, time: Float[Array, ""]
+    ) -> Float[Array, " m"]:
+        """Draw all components y_j, given η_j."""
+
+    @abstractmethod
     def check_data(self, data: Float[np.ndarray, " n"]) -> None:
         """Raise `ValueError` for data that are impossible; `data` are all finite entries."""
 
@@ -104,16 +113,27 @@ class AbstractComponents(AbstractObservation):
             guides,
         )
 
+    def sample(self, key, x, params=None, time=0.0):
+        x = as_floating("x", x)
+        time = jnp.asarray(time, x.dtype)
+        return self.draw(key, self._predictor(x, params, time), params, time)
+
+    def check_sample(self):
+        pass
+
     def correction(self, row, x, params):
-        m, present = len(row.y), jnp.isfinite(row.y)
-        offset = self.offset.for_components(params, row.time, m)
-        rows = matrix_for(self.matrix, x.shape[0], x.dtype)
-        eta = jnp.stack([dot(row, x) for row in rows]) + offset
+        present, eta = jnp.isfinite(row.y), self._predictor(x, params, row.time)
         true = self.log_density(_filled(row.y), eta, params, row.time)
         value, variance, guides = self._guide_of(row, params)
         safe = jnp.where(guides, variance, 1)
         normal = -((value - eta) ** 2 / safe + jnp.log(2 * np.pi * safe)) / 2
         return jnp.sum(jnp.where(present, true - jnp.where(guides, normal, 0), 0))
+
+    def _predictor(self, x, params, time) -> Float[Array, " m"]:
+        """Return η = L x + offset."""
+        rows = matrix_for(self.matrix, x.shape[0], x.dtype)
+        offset = self.offset.for_components(params, time, len(rows))
+        return jnp.stack([dot(row, x) for row in rows]) + offset
 
     def _guide_of(self, row: Row, params: PyTree):
         """Return mean, variance and whether it guides, of each component."""

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...engine.arguments import check_function, named
+from ...engine.arguments import as_returned, check_function, named
 from ...engine.captured import Captured
-from ...engine.checks import is_traced
+from ...engine.checks import as_floating, is_traced
 from ...models.diffusion import check_value
 from ...models.tracing import takes_time
 from .base import AbstractObservation, log_density_of
@@ -30,6 +30,8 @@ class ObservationDensity(AbstractObservation):
         unchanged.
     - `guess`: a similar `LinearGaussian` with positive variances, which guides the paths. The law
         does not depend on it, but the effective sample size does.
+    - `sample`: a function `(key, x, params) -> y` or `(key, x, params, t) -> y` that draws an
+        observation, shape (m,). Only `forecast` needs it.
 
     **Raises:** `TypeError` for invalid arguments; `ValueError` if a variance of the guess is not
     positive.
@@ -47,20 +49,25 @@ class ObservationDensity(AbstractObservation):
     guess: LinearGaussian
     matrix: Float[Array, "m d"] | None
     _log_density: Callable = eqx.field(static=True)
+    _sample: Callable | None = eqx.field(static=True)
     _captured: Captured
 
-    def __init__(self, log_density: Callable, guess: LinearGaussian):
+    def __init__(
+        self, log_density: Callable, guess: LinearGaussian, *, sample: Callable | None = None
+    ):
         check_function("log_density", log_density, "(y, x, params)", "(y, x, params, t)")
+        check_function("sample", sample, "(key, x, params)", "(key, x, params, t)", optional=True)
         if not isinstance(guess, LinearGaussian):
             raise TypeError(f"`guess` must be a `LinearGaussian`; got {guess!r}.")
         if guess.covariance is not None:
             _check_positive(guess.covariance)
         self._log_density, self.guess, self.matrix = log_density, guess, guess.matrix
-        self._captured = Captured(log_density)
+        self._sample, self._captured = sample, Captured(log_density, sample)
 
     @property
     def depends_on_time(self):
-        return takes_time(self._log_density, 3) or self.guess.depends_on_time
+        functions = (self._log_density, self._sample)
+        return any(takes_time(fn, 3) for fn in functions) or self.guess.depends_on_time
 
     def check(self, values, like, time, params):
         self.guess.check(values, like, time, params)
@@ -68,6 +75,22 @@ class ObservationDensity(AbstractObservation):
 
     def scalars(self, row, params, d):
         return self.guess.scalars(row, params, d)
+
+    def sample(self, key, x, params=None, time=0.0):
+        self.check_sample()
+        x = as_floating("x", x)
+        arguments = (key, x, params)
+        if takes_time(self._sample, 3):
+            arguments = (*arguments, jnp.asarray(time, x.dtype))
+        y = as_returned("sample", named("sample", self._captured.call)(self._sample, *arguments))
+        return y.astype(x.dtype)
+
+    def check_sample(self):
+        if self._sample is None:
+            raise TypeError(
+                "`observation` cannot draw observations: pass `sample`, a function `(key, x, "
+                "params) -> y`, to `ObservationDensity`."
+            )
 
     def correction(self, row, x, params):
         y, time = row

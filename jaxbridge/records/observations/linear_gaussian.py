@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from ...engine.checks import Numbers, is_traced
-from ...engine.linalg import dot, safe_norm
+from ...engine.checks import Numbers, as_floating, is_traced
+from ...engine.linalg import dot, matvec, safe_norm, semidefinite_cholesky
 from .base import AbstractObservation, Quantity, Scalars, as_matrix, check_matrix, matrix_for
 
 
@@ -124,6 +124,17 @@ class LinearGaussian(AbstractObservation):
         never = Scalars(jnp.zeros_like(rows), jnp.full_like(y, beyond), jnp.ones_like(y), present)
         explained = possible & jnp.all(agrees)
         return jax.tree.map(lambda a, b: jnp.where(explained, a, b), scalars, never)
+
+    def sample(self, key, x, params=None, time=0.0):
+        x = as_floating("x", x)
+        rows = matrix_for(self.matrix, len(x), x.dtype)
+        m, time = len(rows), jnp.asarray(time, x.dtype)
+        root = semidefinite_cholesky(self.covariance_for(params, m, time))
+        noise = matvec(root, jax.random.normal(key, (m,), x.dtype))
+        return matvec(rows, x) + self.offset_for(params, m, time) + noise
+
+    def check_sample(self):
+        pass
 
     def correction(self, row, x, params):
         return jnp.zeros((), x.dtype)

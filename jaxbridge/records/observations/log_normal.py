@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -76,6 +77,11 @@ class LogNormal(AbstractComponents):
             return jnp.log(y), variance
         mean = y * jnp.exp(variance / 2)
         return mean, mean**2 * jnp.expm1(variance)
+
+    def draw(self, key, eta, params, time):
+        s = self.scale.for_components(params, time, len(eta))
+        median = jnp.exp(eta) if self.link == "log" else jnp.maximum(eta, 0)
+        return median * jnp.exp(s * jax.random.normal(key, eta.shape, eta.dtype))
 
     def check_data(self, data):
         if np.any(data <= 0):

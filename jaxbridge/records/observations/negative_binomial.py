@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
@@ -84,6 +85,14 @@ class NegativeBinomialCounts(AbstractComponents):
         # The logit of a Beta(a, b) variable is the difference of two logs of Gamma variables.
         (upper, var_upper), (lower, var_lower) = map(moments_of_log_gamma, (count, r))
         return jnp.log(r) + upper - lower, var_upper + var_lower
+
+    def draw(self, key, eta, params, time):
+        r = self.size.for_components(params, time, len(eta))
+        mean_key, count_key = jax.random.split(key)
+        mean = jnp.exp(eta) if self.link == "log" else jnp.maximum(eta, 0)
+        # A Poisson law whose mean has a Gamma law.
+        mean = mean * jax.random.gamma(mean_key, r) / r
+        return jax.random.poisson(count_key, mean).astype(eta.dtype)
 
     def check_data(self, data):
         check_counts(data)

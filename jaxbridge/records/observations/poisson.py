@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
@@ -74,6 +75,10 @@ class PoissonCounts(AbstractComponents):
 
     def guide(self, y, params, time):
         return moments_of_log_gamma(y + 0.5) if self.link == "log" else (y + 0.5, y + 0.5)
+
+    def draw(self, key, eta, params, time):
+        mean = jnp.exp(eta) if self.link == "log" else jnp.maximum(eta, 0)
+        return jax.random.poisson(key, mean).astype(eta.dtype)
 
     def check_data(self, data):
         check_counts(data)

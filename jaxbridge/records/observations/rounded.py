@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float
@@ -68,6 +69,11 @@ class Rounded(AbstractComponents):
     def guide(self, y, params, time):
         s, width = self._numbers(y, params, time)
         return y, s**2 + width**2 / 12
+
+    def draw(self, key, eta, params, time):
+        s, width = self._numbers(eta, params, time)
+        value = eta + s * jax.random.normal(key, eta.shape, eta.dtype)
+        return width * jnp.round(value / width)
 
     def check_data(self, data):
         pass

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import gammaln
@@ -68,6 +69,10 @@ class StudentT(AbstractComponents):
         # Narrower guides follow outliers, and their weights have heavier tails.
         has_less = nu > 2.5
         return y, s**2 * jnp.where(has_less, nu / jnp.where(has_less, nu - 2, 1), 5)
+
+    def draw(self, key, eta, params, time):
+        s, nu = (part.for_components(params, time, len(eta)) for part in (self.scale, self.df))
+        return eta + s * jax.random.t(key, nu, eta.shape, eta.dtype)
 
     def check_data(self, data):
         pass

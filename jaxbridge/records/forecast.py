@@ -1,0 +1,355 @@
+"""Forecasts of a record: the law of each reading given the earlier ones, and of later states.
+
+Particles take the model's own steps, without a guide, to the next reading. There they are a sample
+of the predictive law of the state, and readings drawn from them one of the predictive law of the
+reading. Then each repeats its last step, conditioned on what was read. Its weight is the density of
+the reading at the beginning of that step: exact readings have positive weights, too. Systematic
+resampling gives particles with equal weights.
+
+If the model is right, the rank of a reading among draws of its predictive law is uniform, and
+independent of the others (Rosenblatt 1952; Diebold, Gunther & Tay 1998).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.scipy.special import gammaincc, logsumexp, ndtri
+from jaxtyping import Array, Float, Int, Key
+
+from ..engine.averages import effective_size, normalise_weights
+from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
+from ..engine.compiled import compiled
+from ..engine.entry import public_entry
+from ..engine.lanes import over_lanes
+from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
+from ..models.diffusion import Diffusion
+from ..schemes import AbstractStepDensity
+from .cover import cover
+from .guided_record import correction
+from .guided_steps import Guide, end_of_step, guided_law, guided_start, target_law
+from .initial import Initial, calls_for_cover, initial_law
+from .observations import AbstractObservation, Scalars, log_density_of
+from .problem import RecordProblem
+from .record import are_several, as_rows
+from .segments import split_first, split_last
+from .several import as_record_problems
+from .tilted_step import Information
+
+# Draws from fewer effective particles are too much alike.
+_FEWEST_PARTICLES = 20
+_MOST_LAGS = 10
+_POOR = (
+    "Few particles explain some reading: `effective_sample_size` is below 20. Later draws, scores "
+    "and ranks depend on few paths. Use more `num_particles`; a reading that the model hardly "
+    "allows may be an outlier, or the model may be wrong."
+)
+
+
+class Forecast(AbstractResult):
+    """Predictive laws of a record of n readings and at F later times, from `forecast`.
+
+    All draws have equal weights. P is the number of particles.
+
+    - `times`: those of the readings and the later ones, shape (n + F,).
+    - `states`: draws of the state at each time, given the readings *before* it, shape
+        (P, n + F, d).
+    - `readings`: draws of the reading at each time, given those before it, shape (P, n + F, m).
+    - `filtered`: draws of the state at each time, given the readings up to this time, shape
+        (P, n + F, d).
+    - `uniforms`: rank of each component of a reading among its predictive draws, in (0, 1), shape
+        (n, m). Ties are broken at random. NaN where nothing was read.
+    - `log_scores`: log of the predictive density of each reading, shape (n,). Their sum estimates
+        the log-likelihood.
+    - `crps`: continuous ranked probability score of each component, in its unit; smaller is better.
+        Shape (n, m).
+    - `effective_sample_size`: effective number of particles at each reading, shape (n,).
+    """
+
+    times: Float[np.ndarray, " times"] | Float[Array, " times"]
+    states: Float[Array, "P times d"]
+    readings: Float[Array, "P times m"]
+    filtered: Float[Array, "P times d"]
+    uniforms: Float[Array, "n m"]
+    log_scores: Float[Array, " n"]
+    crps: Float[Array, "n m"]
+    effective_sample_size: Float[Array, " n"]
+
+    @property
+    def residuals(self) -> Float[Array, "n m"]:
+        """Return the quantiles of N(0, 1) at `uniforms`.
+
+        They are independent and normal if the model is right.
+        """
+        return ndtri(self.uniforms)
+
+    @property
+    def p_uniform(self) -> Float[Array, " m"]:
+        """Return the p-value of Neyman's smooth test (1937) that `uniforms` are uniform.
+
+        Shape (m,). It compares four moments, those of the first Legendre polynomials. A wrong
+        level, σ or law of the noise makes it small.
+        """
+        seen, u = ~jnp.isnan(self.uniforms), 2 * self.uniforms - 1
+        legendre = (u, (3 * u**2 - 1) / 2, (5 * u**3 - 3 * u) / 2, (35 * u**4 - 30 * u**2 + 3) / 8)
+        number = jnp.sum(seen, axis=0).astype(u.dtype)
+        # P_j has the variance 1 / (2 j + 1) under the uniform law.
+        statistic = sum(
+            (2 * j + 1) * jnp.sum(jnp.where(seen, P, 0), axis=0) ** 2 / number
+            for j, P in enumerate(legendre, start=1)
+        )
+        return gammaincc(jnp.full_like(number, 2.0), statistic / 2)
+
+    @property
+    def p_independent(self) -> Float[Array, " m"]:
+        """Return the p-value of Ljung and Box's test that `residuals` are not correlated.
+
+        Shape (m,). It has 10 lags, or a fifth of the readings. A wrong drift makes it small.
+        """
+        n_all, lags = len(self.uniforms), max(1, min(_MOST_LAGS, len(self.uniforms) // 5))
+        z, seen = self.residuals, ~jnp.isnan(self.uniforms)
+        n = jnp.sum(seen, axis=0).astype(z.dtype)
+        centred = jnp.where(seen, z - jnp.nanmean(z, axis=0), 0)
+        variance = jnp.sum(centred**2, axis=0)
+
+        def term(lag):
+            product = jnp.sum(centred[lag:] * centred[: n_all - lag], axis=0)
+            return (product / variance) ** 2 / (n - lag)
+
+        statistic = n * (n + 2) * sum(term(lag) for lag in range(1, lags + 1))
+        return gammaincc(jnp.full_like(statistic, lags / 2), statistic / 2)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the possible faults: few effective particles, or a score that is not finite.
+
+        The tests of the model, `p_uniform` and `p_independent`, are no part of it.
+        """
+        poor = jnp.any(self.effective_sample_size < _FEWEST_PARTICLES)
+        return Verdict((Fault(poor, _POOR),)).with_finite(self.states, jnp.nansum(self.log_scores))
+
+
+@public_entry
+def forecast(
+    key: Key[Array, ""],
+    model: Diffusion,
+    times: Numbers,
+    observations: Numbers,
+    *,
+    observation: AbstractObservation,
+    initial: Initial = None,
+    at: Numbers = (),
+    num_particles: int = 1000,
+    num_steps: int | None = None,
+    step_size: float | None = None,
+    initial_time: Numbers | None = None,
+    density: AbstractStepDensity | None = None,
+    throw: bool = False,
+) -> Forecast:
+    """Forecast each reading of a record from the earlier ones, and states and readings after it.
+
+    The ranks of the readings among their forecasts check the model: see `Forecast`. If the model
+    was fitted to the same record, the tests are somewhat too kind.
+
+    **Arguments:**
+
+    - `key`: a typed key.
+    - `model`: the diffusion at fixed parameters. For forecasts with uncertain parameters, call this
+        function under `jax.vmap` over draws of a posterior.
+    - `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`, `initial_time`,
+        `density`: as in `innovations`, for one record. The observation model must have `sample`;
+        for exact readings pass `LinearGaussian(covariance=0.0)`.
+    - `at`: later times, increasing, shape (F,); by default none.
+    - `num_particles`: P.
+    - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
+        not finite.
+
+    **Returns:** `Forecast`.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments, for several records, and for an
+    `ObservationDensity` without `sample`.
+
+    **Example:**
+
+    ```python
+    model, seen = jb.ornstein_uhlenbeck([[1.0]]), jb.LinearGaussian(covariance=0.1)
+    readings = [0.3, 0.1, 0.6]
+    made = jb.forecast(key, model, [0.0, 1.0, 2.0], readings, observation=seen, at=[3.0, 4.0])
+    jnp.quantile(made.readings[:, -2:, 0], jnp.array([0.05, 0.95]), axis=0)  # bands, shape (2, 2)
+    ```
+
+    **Source:** bootstrap filter of Gordon, Salmond & Smith (1993), with a conditioned last step.
+    """
+    check_key(key)
+    num_particles = check_count("num_particles", num_particles, 2)
+    if are_several(times, observations):
+        raise ValueError("`forecast` takes one record: call it for each of several records.")
+    later = as_floating("at", np.asarray(at, float) if isinstance(at, list | tuple) else at)
+    if later.ndim != 1:
+        raise ValueError(f"`at` must have shape (F,); got shape {later.shape}.")
+    all_times, all_values = _with_later(times, observations, later if len(later) else at)
+    records = as_record_problems(
+        model,
+        all_times,
+        all_values,
+        observation,
+        initial,
+        num_steps=num_steps,
+        step_size=step_size,
+        initial_time=initial_time,
+        density=density,
+        any_constant=True,
+    )
+    observation.check_sample()
+    problem = records.problem(0)
+    since, which = problem.record.since, problem.record.which
+    states, readings, filtered, scores = _run(key, problem, num_particles)
+    num_read = len(which) - len(later)
+    of_times = lambda draws: jnp.swapaxes(draws[which], 0, 1)
+    made = Forecast(
+        problem.record.clock.exactly(since[which]),
+        of_times(states),
+        of_times(readings),
+        of_times(filtered),
+        *(score[which[:num_read]] for score in scores),
+    )
+    return throw_where_untrustworthy(made, "states", model) if throw else made
+
+
+class _Scores(NamedTuple):
+    """Scores of one reading by its predictive draws, with the names of `Forecast`."""
+
+    uniforms: Float[Array, " m"]
+    log_scores: Float[Array, ""]
+    crps: Float[Array, " m"]
+    effective_sample_size: Float[Array, ""]
+
+
+@compiled
+def _run(key: Key[Array, ""], problem: RecordProblem, P: int):
+    """Return predicted states, readings, filtered states and scores at all ends of segments."""
+    model, d, dtype = problem.model, problem.dim, problem.like.dtype
+    dynamics_at, observation = model.forward_at(problem.like), problem.observation
+    corrected = over_lanes(None, -1)(correction(problem, model))
+    zeros = jnp.zeros(d, dtype)
+    nothing = Information(zeros, jnp.zeros((d, d), dtype))
+
+    def take(x, zeta, step, scalars):
+        """Take the model's own step, conditioned on `scalars` at its end if they are given."""
+
+        def of_particle(x, zeta):
+            law = target_law(problem.density, dynamics_at, x, step)
+            guide = Guide(zeros, nothing, zeros, nothing, step)
+            knot, log_weight = guided_law(law, guide, scalars).point_and_log_weight(zeta)
+            return end_of_step(law, knot, is_last=scalars is not None), log_weight
+
+        return over_lanes(-1, -1)(of_particle)(x, zeta)
+
+    def read(key, x, after, log_weight, row):
+        """Predict and score a reading; return the particles after it with equal weights."""
+        sample_key, tie_key, resampling_key = jax.random.split(key, 3)
+        keys, is_read = jax.random.split(sample_key, P), jnp.any(jnp.isfinite(row.y))
+        draw = lambda key, x: observation.sample(key, x, model.params, row.time)
+        readings = jax.vmap(draw)(keys, x.T)
+        log_weight = log_weight + corrected(row, after)
+        log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
+        weights = normalise_weights(log_weight)
+        order = _systematic(resampling_key, weights)
+        filtered = after[:, jnp.where(is_read, order, jnp.arange(P))]
+        log_score = logsumexp(log_weight) - jnp.log(jnp.asarray(P, dtype))
+        scores = _Scores(
+            _rank(tie_key, row.y, readings),
+            jnp.where(is_read, log_score, jnp.nan),
+            _crps(row.y, readings),
+            jnp.where(is_read, effective_size(weights), P),
+        )
+        return filtered, (x.T, readings, filtered.T, scores)
+
+    def segment(x, inputs):
+        number, steps, scalars, row = inputs
+        noise_key, read_key = jax.random.split(jax.random.fold_in(key, number))
+        noise = jax.random.normal(noise_key, (problem.num_steps + 1, d, P), dtype)
+        before, last = split_last(steps)
+        one = lambda x, inputs: (take(x, *inputs, None)[0], None)
+        x, _ = lax.scan(one, x, (noise[:-2], before))
+        # Without a reading both are the same step, so that later draws are paths.
+        repeated = jnp.where(jnp.any(scalars.seen), noise[-1], noise[-2])
+        predicted, _ = take(x, noise[-2], last, _missing(scalars))
+        after, log_weight = take(x, repeated, last, scalars)
+        return read(read_key, predicted, after, log_weight, row)
+
+    (first_row, rows) = split_first(problem.rows)
+    first, scalars = split_first(problem.scalars(model))
+    start_key, read_key = jax.random.split(jax.random.fold_in(key, 0))
+    x, made_first = read(read_key, *_starts(start_key, problem, first, nothing, P), first_row)
+    inputs = (1 + jnp.arange(problem.num_segments), problem.steps(model), scalars, rows)
+    _, later = lax.scan(segment, x, inputs)
+    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), made_first, later)
+
+
+def _starts(key, problem: RecordProblem, first: Scalars, nothing: Information, P: int):
+    """Return first states, the same given their reading, and the log weights of the latter."""
+    model, d, dtype = problem.model, problem.dim, problem.like.dtype
+    noise_key, position_key, resampling_key = jax.random.split(key, 3)
+    zeta, repeated = jax.random.normal(noise_key, (2, d, P), dtype)
+    repeated = jnp.where(jnp.any(first.seen), repeated, zeta)
+    normal = initial_law(problem.initial, model, problem.like)
+    zeros = jnp.zeros(d, dtype)
+    if not calls_for_cover(problem.initial, model, problem.like):
+        law = lambda scalars: guided_start(normal, scalars, zeros, nothing)
+        x, _ = over_lanes(-1)(law(_missing(first)).point_and_log_weight)(zeta)
+        return x, *over_lanes(-1)(law(first).point_and_log_weight)(repeated)
+    law = cover(model, normal)
+    positions = (jax.random.uniform(position_key, (), dtype) + jnp.arange(P, dtype=dtype)) / P
+    x = law.points(positions, zeta.T)
+    log_nu = model.prepared().log_stationary
+    ratio = jax.vmap(lambda x: log_nu(x) - law.log_density(x))(x)
+    weights = normalise_weights(jnp.where(jnp.isnan(ratio), -jnp.inf, ratio))
+    x = x[_systematic(resampling_key, weights)]
+    return x.T, x.T, jax.vmap(lambda x: log_density_of(first, x))(x)
+
+
+def _missing(scalars: Scalars) -> Scalars:
+    """Return the same scalars as if all were missing."""
+    zeros = [jnp.zeros_like(leaf) for leaf in scalars]
+    return Scalars(*zeros)._replace(variances=jnp.ones_like(scalars.variances))
+
+
+def _systematic(key: Key[Array, ""], weights: Float[Array, " P"]) -> Int[Array, " P"]:
+    """Return the particles that systematic resampling selects."""
+    P, dtype = len(weights), weights.dtype
+    positions = (jax.random.uniform(key, (), dtype) + jnp.arange(P, dtype=dtype)) / P
+    bounds = jnp.cumsum(weights)
+    bounds = bounds / jnp.maximum(bounds[-1], jnp.finfo(dtype).tiny)
+    return jnp.minimum(jnp.searchsorted(bounds, positions), P - 1)
+
+
+def _rank(key, y: Float[Array, " m"], draws: Float[Array, "P m"]) -> Float[Array, " m"]:
+    """Return the rank of y among the draws, in (0, 1); uniform if y has the law of the draws."""
+    below, ties = jnp.sum(draws < y, axis=0), jnp.sum(draws == y, axis=0)
+    position = jax.random.uniform(key, y.shape, y.dtype, minval=jnp.finfo(y.dtype).eps)
+    rank = (below.astype(y.dtype) + position * (1 + ties.astype(y.dtype))) / (len(draws) + 1)
+    return jnp.where(jnp.isnan(y), jnp.nan, rank)
+
+
+def _crps(y: Float[Array, " m"], draws: Float[Array, "P m"]) -> Float[Array, " m"]:
+    """Return E|Y - y| - E|Y - Y'|/2 for independent draws Y, Y' (Gneiting & Raftery 2007)."""
+    P, ordered = len(draws), jnp.sort(draws, axis=0)
+    factors = jnp.asarray(2 * np.arange(P) - P + 1, y.dtype)[:, None]
+    return jnp.mean(jnp.abs(draws - y), axis=0) - jnp.sum(factors * ordered, axis=0) / P**2
+
+
+def _with_later(times: Numbers, observations: Numbers, later: Numbers):
+    """Return the record with empty readings at the later times.
+
+    Times are joined in double precision, unless they are traced.
+    """
+    if not np.size(later):
+        return times, observations
+    xp = jnp if is_traced(times, later) else np
+    values = as_rows(observations)
+    empty = jnp.full((len(later), values.shape[1]), jnp.nan, values.dtype)
+    joined = xp.concatenate([xp.asarray(times, float), xp.asarray(later, float)])
+    return joined, jnp.concatenate([values, empty])
