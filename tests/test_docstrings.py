@@ -22,6 +22,7 @@ RESULTS = {
     "CoupledPairs": ["sample_exact_bridges"],
     "ExtrapolatedBridges": ["extrapolate"],
     "ExtrapolatedLogDensity": ["extrapolate"],
+    "Forecast": ["forecast"],
     "GaussianBridge": ["gaussian_bridge"],
     "GibbsPosterior": ["gibbs"],
     "GibbsState": ["gibbs"],

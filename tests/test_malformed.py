@@ -140,6 +140,7 @@ CALLS = {
         jb.path_log_likelihood, model=MODEL, times=[0.0, 1.0], path=[[0.0, 0.0], [1.0, 0.0]]
     ),
     "log_likelihood": small(jb.log_likelihood, key=KEY, **NOISY, num_particles=4),
+    "forecast": small(jb.forecast, key=KEY, **NOISY, num_particles=4),
     "smooth": small(jb.smooth, key=KEY, **NOISY, num_draws=4, num_warmup=2),
     "innovations": small(jb.innovations, **NOISY),
     "gibbs": small(jb.gibbs, key=KEY, **RECORD, **RATE, num_iterations=2, proposal=GUIDED),

@@ -63,6 +63,12 @@ CLAIMS = {
         and page["density"].standard_error < 0.2
         and abs(page["better"].value - page["fine"].value) < 0.5
     ),
+    "forecasts": lambda page: (
+        page["made"].trustworthy
+        and page["inside"] > 0.5
+        and page["made"].p_uniform[0] > 0.001
+        and page["without"].p_independent[0] < 0.01
+    ),
     "gpu": lambda page: page["bridges"].paths.shape == (20_000, 3, 2),
     "hypoelliptic": lambda page: 2 < page["posterior"].theta.mean() < 7,
     "missing_data": lambda page: page["inside"] > 0.75,
@@ -158,7 +164,7 @@ def test_every_task_has_code():
     assert len(SHAPES) == len(CODE[README])
     assert {page.stem for page, blocks in CODE.items() if blocks} == set(CLAIMS)
     tasks = [page for page in PAGES if page.parent.name == "howto" and page.stem != "index"]
-    assert len(tasks) >= 22 and all(CODE[page] for page in tasks)
+    assert len(tasks) >= 23 and all(CODE[page] for page in tasks)
 
 
 def test_readme_is_short_and_names_the_two_commands():

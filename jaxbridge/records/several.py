@@ -151,7 +151,7 @@ def _coarsened(stacked: Record, level: int) -> Record:
 
 
 @compiled_sooner
-def _entry(tree: PyTree, number: Int[Array, ""]) -> PyTree:
+def _entry(tree: PyTree, number: int | Int[Array, ""]) -> PyTree:
     """Return the entries of one record, without the leading axis."""
     return jax.tree.map(lambda leaf: leaf[number], tree)
 
