@@ -17,13 +17,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.special import gammaincc, logsumexp, ndtri
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Key
 
 from ..engine.averages import effective_size, normalise_weights
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
 from ..engine.compiled import compiled
 from ..engine.entry import public_entry
 from ..engine.lanes import over_lanes
+from ..engine.resampling import systematic
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
@@ -186,14 +187,16 @@ def forecast(
     num_particles = check_count("num_particles", num_particles, 2)
     if are_several(times, observations):
         raise ValueError("`forecast` takes one record: call it for each of several records.")
-    later = as_floating("at", np.asarray(at, float) if isinstance(at, list | tuple) else at)
+    later = as_floating("at", at)
     if later.ndim != 1:
         raise ValueError(f"`at` must have shape (F,); got shape {later.shape}.")
-    all_times, all_values = _with_later(times, observations, later if len(later) else at)
+    num_times = len(as_rows(observations)) + len(later)
+    if later.size:
+        times, observations = _with_later(times, observations, at, len(later))
     records = as_record_problems(
         model,
-        all_times,
-        all_values,
+        times,
+        observations,
         observation,
         initial,
         num_steps=num_steps,
@@ -204,9 +207,10 @@ def forecast(
     )
     observation.check_sample()
     problem = records.problem(0)
-    since, which = problem.record.since, problem.record.which
+    # An earlier `initial_time` has an entry in front, which is left out.
+    since, which = problem.record.since, problem.record.which[-num_times:]
     states, readings, filtered, scores = _run(key, problem, num_particles)
-    num_read = len(which) - len(later)
+    num_read = num_times - len(later)
     of_times = lambda draws: jnp.swapaxes(draws[which], 0, 1)
     made = Forecast(
         problem.record.clock.exactly(since[which]),
@@ -256,7 +260,7 @@ def _run(key: Key[Array, ""], problem: RecordProblem, P: int):
         log_weight = log_weight + corrected(row, after)
         log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
         weights = normalise_weights(log_weight)
-        order = _systematic(resampling_key, weights)
+        order = systematic(jax.random.uniform(resampling_key, (), dtype), weights)
         filtered = after[:, jnp.where(is_read, order, jnp.arange(P))]
         log_score = logsumexp(log_weight) - jnp.log(jnp.asarray(P, dtype))
         scores = _Scores(
@@ -272,7 +276,11 @@ def _run(key: Key[Array, ""], problem: RecordProblem, P: int):
         noise_key, read_key = jax.random.split(jax.random.fold_in(key, number))
         noise = jax.random.normal(noise_key, (problem.num_steps + 1, d, P), dtype)
         before, last = split_last(steps)
-        one = lambda x, inputs: (take(x, *inputs, None)[0], None)
+
+        def one(x, inputs):
+            zeta, step = inputs
+            return take(x, zeta, step, None)[0], None
+
         x, _ = lax.scan(one, x, (noise[:-2], before))
         # Without a reading both are the same step, so that later draws are paths.
         repeated = jnp.where(jnp.any(scalars.seen), noise[-1], noise[-2])
@@ -283,7 +291,8 @@ def _run(key: Key[Array, ""], problem: RecordProblem, P: int):
     (first_row, rows) = split_first(problem.rows)
     first, scalars = split_first(problem.scalars(model))
     start_key, read_key = jax.random.split(jax.random.fold_in(key, 0))
-    x, made_first = read(read_key, *_starts(start_key, problem, first, nothing, P), first_row)
+    predicted, after, log_weight = _starts(start_key, problem, first, nothing, P)
+    x, made_first = read(read_key, predicted, after, log_weight, first_row)
     inputs = (1 + jnp.arange(problem.num_segments), problem.steps(model), scalars, rows)
     _, later = lax.scan(segment, x, inputs)
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), made_first, later)
@@ -300,14 +309,15 @@ def _starts(key, problem: RecordProblem, first: Scalars, nothing: Information, P
     if not calls_for_cover(problem.initial, model, problem.like):
         law = lambda scalars: guided_start(normal, scalars, zeros, nothing)
         x, _ = over_lanes(-1)(law(_missing(first)).point_and_log_weight)(zeta)
-        return x, *over_lanes(-1)(law(first).point_and_log_weight)(repeated)
+        after, log_weight = over_lanes(-1)(law(first).point_and_log_weight)(repeated)
+        return x, after, log_weight
     law = cover(model, normal)
     positions = (jax.random.uniform(position_key, (), dtype) + jnp.arange(P, dtype=dtype)) / P
     x = law.points(positions, zeta.T)
     log_nu = model.prepared().log_stationary
     ratio = jax.vmap(lambda x: log_nu(x) - law.log_density(x))(x)
     weights = normalise_weights(jnp.where(jnp.isnan(ratio), -jnp.inf, ratio))
-    x = x[_systematic(resampling_key, weights)]
+    x = x[systematic(jax.random.uniform(resampling_key, (), dtype), weights)]
     return x.T, x.T, jax.vmap(lambda x: log_density_of(first, x))(x)
 
 
@@ -315,15 +325,6 @@ def _missing(scalars: Scalars) -> Scalars:
     """Return the same scalars as if all were missing."""
     zeros = [jnp.zeros_like(leaf) for leaf in scalars]
     return Scalars(*zeros)._replace(variances=jnp.ones_like(scalars.variances))
-
-
-def _systematic(key: Key[Array, ""], weights: Float[Array, " P"]) -> Int[Array, " P"]:
-    """Return the particles that systematic resampling selects."""
-    P, dtype = len(weights), weights.dtype
-    positions = (jax.random.uniform(key, (), dtype) + jnp.arange(P, dtype=dtype)) / P
-    bounds = jnp.cumsum(weights)
-    bounds = bounds / jnp.maximum(bounds[-1], jnp.finfo(dtype).tiny)
-    return jnp.minimum(jnp.searchsorted(bounds, positions), P - 1)
 
 
 def _rank(key, y: Float[Array, " m"], draws: Float[Array, "P m"]) -> Float[Array, " m"]:
@@ -341,15 +342,13 @@ def _crps(y: Float[Array, " m"], draws: Float[Array, "P m"]) -> Float[Array, " m
     return jnp.mean(jnp.abs(draws - y), axis=0) - jnp.sum(factors * ordered, axis=0) / P**2
 
 
-def _with_later(times: Numbers, observations: Numbers, later: Numbers):
-    """Return the record with empty readings at the later times.
+def _with_later(times: Numbers, observations: Numbers, at: Numbers, num_later: int):
+    """Return the record with missing readings at `num_later` later times.
 
     Times are joined in double precision, unless they are traced.
     """
-    if not np.size(later):
-        return times, observations
-    xp = jnp if is_traced(times, later) else np
+    xp = jnp if is_traced(times, at) else np
+    joined = xp.concatenate([xp.asarray(part, float) for part in (times, at)])
     values = as_rows(observations)
-    empty = jnp.full((len(later), values.shape[1]), jnp.nan, values.dtype)
-    joined = xp.concatenate([xp.asarray(times, float), xp.asarray(later, float)])
-    return joined, jnp.concatenate([values, empty])
+    missing = jnp.full((num_later, values.shape[1]), jnp.nan, values.dtype)
+    return joined, jnp.concatenate([values, missing])

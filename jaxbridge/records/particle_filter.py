@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.averages import effective_size, normalise_weights
 from ..engine.lanes import over_lanes
 from ..engine.pareto import pareto_k
+from ..engine.resampling import systematic
 from ..models.diffusion import Diffusion
 from .cover import cover, covered_start
 from .guided_record import Guidance, correction
@@ -196,14 +197,9 @@ def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) 
     """Resample the filters whose effective sample size is `poor`; the new weights are equal."""
     R, P = state.log_weight.shape
     dtype = state.log_weight.dtype
-    weights = normalise_weights(state.log_weight)
     uniform = jax.random.uniform(key, (R, 1), dtype)
-    # Systematic resampling: one uniform number per filter.
-    positions = (uniform + jnp.arange(P, dtype=dtype)) / P
-    bounds = jnp.cumsum(weights, axis=1)
-    bounds = bounds / jnp.maximum(bounds[:, -1:], jnp.finfo(dtype).tiny)
-    chosen = jax.vmap(jnp.searchsorted)(bounds, positions)
-    chosen = jnp.where(poor[:, None], jnp.minimum(chosen, P - 1), jnp.arange(P, dtype=chosen.dtype))
+    chosen = jax.vmap(systematic)(uniform[:, 0], normalise_weights(state.log_weight))
+    chosen = jnp.where(poor[:, None], chosen, jnp.arange(P, dtype=chosen.dtype))
     lanes = (jnp.arange(R, dtype=chosen.dtype)[:, None] * P + chosen).ravel()
     log_mean = logsumexp(state.log_weight, axis=1) - jnp.log(jnp.asarray(P, dtype))
     # If no particle is left, the estimate is zero and all weights stay zero.

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int, Key
 from ..engine.averages import nan_to_neg_inf, normalise_weights
 from ..engine.lanes import over_lanes
 from ..engine.linalg import dot, matvec
+from ..engine.resampling import systematic
 from ..models.diffusion import Diffusion
 from .guided_steps import target_law
 from .initial import initial_law, log_ratio
@@ -105,8 +106,5 @@ def _tempered(misfits: Float[Array, " lanes"]) -> Float[Array, " lanes"]:
 
 def _parents(key: Key[Array, ""], log_weights: Float[Array, " lanes"]) -> Int[Array, " lanes"]:
     """Return the lanes of the parents, by systematic resampling."""
-    P, dtype = len(log_weights), log_weights.dtype
-    bounds = jnp.cumsum(normalise_weights(nan_to_neg_inf(log_weights)))
-    positions = (jax.random.uniform(key, (), dtype) + jnp.arange(P, dtype=dtype)) / P
-    lanes = jnp.searchsorted(bounds / jnp.maximum(bounds[-1], jnp.finfo(dtype).tiny), positions)
-    return jnp.minimum(lanes, P - 1).astype(jnp.int32)
+    weights = normalise_weights(nan_to_neg_inf(log_weights))
+    return systematic(jax.random.uniform(key, (), weights.dtype), weights).astype(jnp.int32)
