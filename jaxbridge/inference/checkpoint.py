@@ -11,7 +11,6 @@ import functools
 import inspect
 import logging
 import os
-import tempfile
 import time
 import zipfile
 from collections.abc import Callable
@@ -108,14 +107,15 @@ def _save(path: Path, posterior: AbstractPosterior, num_done: int) -> None:
     leaves = jax.tree.leaves(eqx.filter(posterior, eqx.is_array))
     arrays: dict[str, Any] = {_name(number): np.asarray(leaf) for number, leaf in enumerate(leaves)}
     arrays["num_done"] = np.asarray(num_done)
-    # In the same folder, because a file can be replaced at once only within a file system.
-    descriptor, name = tempfile.mkstemp(dir=path.absolute().parent, prefix=path.name, suffix=".tmp")
+    # In the same folder, because a file can be replaced at once only within a file system. Always
+    # the same name: what a killed process leaves is overwritten.
+    partial = path.with_name(f"{path.name}.tmp")
     try:
-        with os.fdopen(descriptor, "wb") as file:
+        with partial.open("wb") as file:
             np.savez(file, **arrays)
-        os.replace(name, path)
+        os.replace(partial, path)
     except BaseException:
-        os.unlink(name)
+        partial.unlink(missing_ok=True)
         raise
 
 

@@ -79,7 +79,8 @@ class Score(AbstractResult):
     - `effective_sample_size`: that of the bridges of each interval, shape (I,). Errors are reliable
         if it is large.
     - `pareto_k`: k̂ of the weights of each interval, shape (I,). Above 0.7 neither the contribution
-        of the interval nor its error is reliable.
+        of the interval nor its error is reliable (above 0.6 for very unequal weights, above 1 for
+        nearly equal ones).
     - `step_error`, `step_uncertainty`: estimated discretisation bias of `gradient` (estimate minus
         limit), shape (p,), and its standard error. NaN if it cannot be estimated.
     - `num_missing`: number of intervals without a bridge. They are left out. If all are missing,
@@ -87,6 +88,7 @@ class Score(AbstractResult):
     - `num_truncated`: number of weights that `max_trials` truncated.
     - `counts`: numbers of bridges, of simulated paths, and of paths that diverged or left the state
         space, for each interval.
+    - `coupled`: whether bridges may be from couplings.
     """
 
     value: PyTree
@@ -101,6 +103,7 @@ class Score(AbstractResult):
     num_missing: Int[Array, ""]
     num_truncated: Int[Array, ""]
     counts: PathCounts
+    coupled: bool = eqx.field(static=True)
 
     @property
     def verdict(self) -> Verdict:
@@ -122,7 +125,7 @@ class Score(AbstractResult):
     @property
     def _weight_faults(self) -> tuple[Fault, ...]:
         return (
-            missing_bridges(self.num_missing > 0),
+            missing_bridges(self.num_missing > 0, self.coupled),
             truncated_weights(self.num_truncated > 0),
             heavy_tails_in_sum(self.pareto_k, self.effective_sample_size, self.counts.found),
             self._lost,
@@ -260,6 +263,7 @@ def as_score(
     step_error: StepError,
     num_missing: Int[Array, ""],
     num_truncated: Int[Array, ""],
+    coupled: bool = False,
 ) -> Score:
     """Return the `Score` of sums over the intervals."""
     # An empty sum is 0 ± 0, which would look like an exact score.
@@ -270,6 +274,7 @@ def as_score(
         covariance=blank(sums.covariance, jnp.inf),
         information=blank(sums.information, jnp.nan),
     )
+    step_error = StepError(*(blank(leaf, jnp.nan) for leaf in step_error))
     error = jnp.sqrt(jnp.maximum(jnp.diagonal(sums.covariance), 0))
     return Score(
         parameters.each(sums.gradient),
@@ -283,6 +288,7 @@ def as_score(
         num_missing,
         num_truncated,
         PathCounts(sums.num_found, sums.num_simulated, sums.num_nonfinite),
+        coupled,
     )
 
 
@@ -318,7 +324,8 @@ def _over_all(
     sums = over_intervals(blocks, of_blocks)
     step_error = StepError(sums.step_error, jnp.sqrt(sums.step_variance))
     num_missing = jnp.sum(sums.effective_sample_size == 0, dtype=jnp.int32)
-    score = as_score(parameters, sums, step_error, num_missing, sums.num_truncated)
+    coupled = any(block.proposal.coupled for block in blocks)
+    score = as_score(parameters, sums, step_error, num_missing, sums.num_truncated, coupled)
     return score, sums.rises
 
 

@@ -286,15 +286,18 @@ def step_error_of_score(
         share = block.proposal.step_share(model, block.intervals)[0]
 
         def difference(theta, key=block_key, block=block, half=half):
-            values = (
-                jnp.sum(_log_densities(*_log_weights(key, parameters, grid, num_paths, theta)[:2]))
-                for grid in (block, half)
-            )
-            fine, coarse = values
-            return coarse - fine
+            log_weights = [
+                _log_weights(key, parameters, grid, num_paths, theta)[:2] for grid in (block, half)
+            ]
+            fine, coarse = (_log_densities(*of_grid) for of_grid in log_weights)
+            in_fine, in_half = (jnp.any(active, axis=1) for _, active in log_weights)
+            both = jnp.where(in_fine & in_half, coarse - fine, 0)
+            return jnp.sum(both), jnp.any(in_fine & ~in_half)
 
-        error += share * jax.jacfwd(difference)(theta)
-        variance = jnp.maximum(variance, share**2)
+        of_block, is_unknown = jax.jacfwd(difference, has_aux=True)(theta)
+        error += share * of_block
+        # Half as many steps have no path in some interval.
+        variance = jnp.maximum(variance, jnp.where(is_unknown, jnp.inf, share**2))
     # The variances of both grids are added, as for independent noise.
     noise = 2 * jnp.diagonal(covariance)
     return StepError(error, jnp.sqrt(variance * noise))
