@@ -194,6 +194,9 @@ class Binary(jb.AbstractComponents):
     def guide(self, y, params, time):
         return 2 * y - 1, jnp.full_like(y, 4.0)
 
+    def draw(self, key, eta, params, time):
+        return jax.random.bernoulli(key, jax.nn.sigmoid(eta)).astype(eta.dtype)
+
     def check_data(self, data):
         if not np.all(np.isin(data, (0, 1))):
             raise ValueError("`observations` must be 0 or 1.")
