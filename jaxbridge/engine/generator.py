@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend.random import define_prng_impl
-from jaxtyping import Array, PyTree, UInt32
+from jaxtyping import Array, Key, PyTree, UInt32
 
 Words = tuple[UInt32[Array, "*shape"], UInt32[Array, "*shape"]]
 
@@ -104,6 +104,16 @@ _UNROLLED = define_prng_impl(
 def with_unrolled_keys(tree: PyTree) -> PyTree:
     """Replace JAX's own threefry keys in the tree by keys of the unrolled generator."""
     return jax.tree.map(_unrolled, tree)
+
+
+def with_plain_key(key: Key[Array, ""]) -> Key[Array, ""]:
+    """Return a key of JAX's own generator in place of one of the unrolled generator.
+
+    Some functions of `jax.random`, such as `poisson`, refuse all other generators.
+    """
+    if key.dtype != _unrolled(jax.random.key(0, impl="threefry2x32")).dtype:
+        return key
+    return jax.random.wrap_key_data(jax.random.key_data(key), impl="threefry2x32")
 
 
 def _unrolled(leaf):

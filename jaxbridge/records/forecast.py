@@ -28,11 +28,11 @@ from ..engine.resampling import systematic
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
 from ..schemes import AbstractStepDensity
-from .cover import cover
+from .cover import cover, covered_start
 from .guided_record import correction
 from .guided_steps import Guide, end_of_step, guided_law, guided_start, target_law
 from .initial import Initial, calls_for_cover, initial_law
-from .observations import AbstractObservation, Scalars, log_density_of
+from .observations import AbstractObservation, Scalars
 from .problem import RecordProblem
 from .record import are_several, as_rows
 from .segments import split_first, split_last
@@ -42,6 +42,12 @@ from .tilted_step import Information
 # Draws from fewer effective particles are too much alike.
 _FEWEST_PARTICLES = 20
 _MOST_LAGS = 10
+_MOST_LOST = 0.01
+_LOST = (
+    "More than 1 % of the particles left the state space or the finite numbers before some time. "
+    "Their draws are NaN, and ranks and scores leave them out. Use shorter steps (`num_steps`, "
+    "`step_size`), or coordinates without a boundary (`transform`)."
+)
 _POOR = (
     "Few particles explain some reading: `effective_sample_size` is below 20. Later draws, scores "
     "and ranks depend on few paths. Use more `num_particles`; a reading that the model hardly "
@@ -61,7 +67,8 @@ class Forecast(AbstractResult):
     - `filtered`: draws of the state at each time, given the readings up to this time, shape
         (P, n + F, d).
     - `uniforms`: rank of each component of a reading among its predictive draws, in (0, 1), shape
-        (n, m). Ties are broken at random. NaN where nothing was read.
+        (n, m). Ties are broken at random. NaN where nothing was read. A reading beyond all draws
+        has a rank of about 1/P, so residuals of outliers are at most about 3.3 for P = 1,000.
     - `log_scores`: log of the predictive density of each reading, shape (n,). Their sum estimates
         the log-likelihood.
     - `crps`: continuous ranked probability score of each component, in its unit; smaller is better.
@@ -91,7 +98,7 @@ class Forecast(AbstractResult):
         """Return the p-value of Neyman's smooth test (1937) that `uniforms` are uniform.
 
         Shape (m,). It compares four moments, those of the first Legendre polynomials. A wrong
-        level, σ or law of the noise makes it small.
+        level, σ or law of the noise usually makes it small.
         """
         seen, u = ~jnp.isnan(self.uniforms), 2 * self.uniforms - 1
         legendre = (u, (3 * u**2 - 1) / 2, (5 * u**3 - 3 * u) / 2, (35 * u**4 - 30 * u**2 + 3) / 8)
@@ -107,29 +114,38 @@ class Forecast(AbstractResult):
     def p_independent(self) -> Float[Array, " m"]:
         """Return the p-value of Ljung and Box's test that `residuals` are not correlated.
 
-        Shape (m,). It has 10 lags, or a fifth of the readings. A wrong drift makes it small.
+        Shape (m,). It has 10 lags, or a fifth of the readings. A wrong drift usually makes it
+        small.
         """
-        n_all, lags = len(self.uniforms), max(1, min(_MOST_LAGS, len(self.uniforms) // 5))
-        z, seen = self.residuals, ~jnp.isnan(self.uniforms)
-        n = jnp.sum(seen, axis=0).astype(z.dtype)
-        centred = jnp.where(seen, z - jnp.nanmean(z, axis=0), 0)
+        # Missing readings are left out: the others follow each other.
+        order = jnp.argsort(jnp.isnan(self.uniforms), axis=0, stable=True)
+        z = jnp.take_along_axis(self.residuals, order, axis=0)
+        n = jnp.sum(~jnp.isnan(z), axis=0).astype(z.dtype)
+        lags = jnp.clip(n // 5, 1, _MOST_LAGS)
+        centred = jnp.nan_to_num(z - jnp.nanmean(z, axis=0))
         variance = jnp.sum(centred**2, axis=0)
 
         def term(lag):
-            product = jnp.sum(centred[lag:] * centred[: n_all - lag], axis=0)
-            return (product / variance) ** 2 / (n - lag)
+            product = jnp.sum(centred[lag:] * centred[: len(z) - lag], axis=0)
+            counts = (lag <= lags) & (lag < n)
+            return jnp.where(counts, (product / variance) ** 2 / jnp.maximum(n - lag, 1), 0)
 
-        statistic = n * (n + 2) * sum(term(lag) for lag in range(1, lags + 1))
-        return gammaincc(jnp.full_like(statistic, lags / 2), statistic / 2)
+        statistic = (
+            n * (n + 2) * sum(term(lag) for lag in range(1, min(_MOST_LAGS, len(z) - 1) + 1))
+        )
+        return gammaincc(lags / 2, statistic / 2)
 
     @property
     def verdict(self) -> Verdict:
-        """Return the possible faults: few effective particles, or a score that is not finite.
+        """Return the possible faults: few effective particles, lost ones, or a score that is not
+        finite.
 
         The tests of the model, `p_uniform` and `p_independent`, are no part of it.
         """
         poor = jnp.any(self.effective_sample_size < _FEWEST_PARTICLES)
-        return Verdict((Fault(poor, _POOR),)).with_finite(self.states, jnp.nansum(self.log_scores))
+        lost = jnp.mean(~jnp.all(jnp.isfinite(self.states), axis=-1), axis=0)
+        faults = Fault(poor, _POOR), Fault(jnp.any(lost > _MOST_LOST), _LOST)
+        return Verdict(faults).with_finite(jnp.nansum(self.log_scores))
 
 
 @public_entry
@@ -141,7 +157,7 @@ def forecast(
     *,
     observation: AbstractObservation,
     initial: Initial = None,
-    at: Numbers = (),
+    at: Numbers | None = None,
     num_particles: int = 1000,
     num_steps: int | None = None,
     step_size: float | None = None,
@@ -187,9 +203,17 @@ def forecast(
     num_particles = check_count("num_particles", num_particles, 2)
     if are_several(times, observations):
         raise ValueError("`forecast` takes one record: call it for each of several records.")
+    at = () if at is None else at
     later = as_floating("at", at)
     if later.ndim != 1:
         raise ValueError(f"`at` must have shape (F,); got shape {later.shape}.")
+    if later.size and not is_traced(times, at):
+        all_times = np.append(np.asarray(times, float)[-1:], np.asarray(at, float))
+        if not np.all(np.diff(all_times) > 0):
+            raise ValueError(
+                f"`at` must increase, and begin after the last of `times`, {all_times[0]:g}; got "
+                f"{all_times[1:]}."
+            )
     num_times = len(as_rows(observations)) + len(later)
     if later.size:
         times, observations = _with_later(times, observations, at, len(later))
@@ -317,8 +341,12 @@ def _starts(key, problem: RecordProblem, first: Scalars, nothing: Information, P
     log_nu = model.prepared().log_stationary
     ratio = jax.vmap(lambda x: log_nu(x) - law.log_density(x))(x)
     weights = normalise_weights(jnp.where(jnp.isnan(ratio), -jnp.inf, ratio))
-    x = x[systematic(jax.random.uniform(resampling_key, (), dtype), weights)]
-    return x.T, x.T, jax.vmap(lambda x: log_density_of(first, x))(x)
+    predicted = x[systematic(jax.random.uniform(resampling_key, (), dtype), weights)].T
+    given = covered_start(law, first, zeros, nothing)
+    x = given.points(positions, repeated)
+    log_weight = given.log_integral + over_lanes(-1)(lambda x: log_nu(x) - law.log_density(x))(x)
+    is_read = jnp.any(first.seen)
+    return predicted, jnp.where(is_read, x, predicted), jnp.where(is_read, log_weight, 0)
 
 
 def _missing(scalars: Scalars) -> Scalars:
@@ -329,17 +357,22 @@ def _missing(scalars: Scalars) -> Scalars:
 
 def _rank(key, y: Float[Array, " m"], draws: Float[Array, "P m"]) -> Float[Array, " m"]:
     """Return the rank of y among the draws, in (0, 1); uniform if y has the law of the draws."""
-    below, ties = jnp.sum(draws < y, axis=0), jnp.sum(draws == y, axis=0)
-    position = jax.random.uniform(key, y.shape, y.dtype, minval=jnp.finfo(y.dtype).eps)
-    rank = (below.astype(y.dtype) + position * (1 + ties.astype(y.dtype))) / (len(draws) + 1)
+    counts = (jnp.sum(which, axis=0) for which in (draws < y, draws == y, jnp.isfinite(draws)))
+    below, ties, number = (count.astype(y.dtype) for count in counts)
+    position = jax.random.uniform(key, y.shape, y.dtype)
+    # Inside of (0, 1), so that residuals are finite.
+    least = float(jnp.finfo(y.dtype).eps)
+    rank = jnp.clip((below + position * (1 + ties)) / (number + 1), least, 1 - least)
     return jnp.where(jnp.isnan(y), jnp.nan, rank)
 
 
 def _crps(y: Float[Array, " m"], draws: Float[Array, "P m"]) -> Float[Array, " m"]:
     """Return E|Y - y| - E|Y - Y'|/2 for independent draws Y, Y' (Gneiting & Raftery 2007)."""
-    P, ordered = len(draws), jnp.sort(draws, axis=0)
-    factors = jnp.asarray(2 * np.arange(P) - P + 1, y.dtype)[:, None]
-    return jnp.mean(jnp.abs(draws - y), axis=0) - jnp.sum(factors * ordered, axis=0) / P**2
+    draws = jnp.sort(jnp.where(jnp.isfinite(draws), draws, jnp.nan), axis=0)  # NaN last
+    exists = ~jnp.isnan(draws)
+    P, i = jnp.sum(exists, axis=0).astype(y.dtype), jnp.arange(len(draws), dtype=y.dtype)[:, None]
+    terms = jnp.abs(draws - y) - (2 * i - P + 1) * draws / P
+    return jnp.sum(jnp.where(exists, terms, 0), axis=0) / P
 
 
 def _with_later(times: Numbers, observations: Numbers, at: Numbers, num_later: int):

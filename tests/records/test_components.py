@@ -122,6 +122,55 @@ def test_the_guide_of_student_noise_has_its_variance(x64):
     np.testing.assert_allclose(variance(1.0), 5 * 0.25)
 
 
+@pytest.mark.parametrize(
+    "model, y, eta, law",
+    [
+        (jb.PoissonCounts(), 2e5, np.log(2e5) + 2e-3, lambda e: stats.poisson(np.exp(e))),
+        (jb.PoissonCounts(link="identity"), 2e5, 2.01e5, stats.poisson),
+        (
+            jb.NegativeBinomialCounts(size=1e6),
+            3.0,
+            1.0,
+            lambda e: stats.nbinom(1e6, 1e6 / (1e6 + np.exp(e))),
+        ),
+        (jb.NegativeBinomialCounts(size=np.inf), 3.0, 1.0, lambda e: stats.poisson(np.exp(e))),
+        (
+            jb.NegativeBinomialCounts(size=0.5),
+            0.0,
+            9.0,
+            lambda e: stats.nbinom(0.5, 0.5 / (0.5 + np.exp(e))),
+        ),
+        (
+            jb.NegativeBinomialCounts(size=2.0),
+            9e4,
+            11.0,
+            lambda e: stats.nbinom(2, 2 / (2 + np.exp(e))),
+        ),
+        (jb.StudentT(scale=0.5, df=1e5), 0.7, 0.2, lambda e: stats.t(1e5, e, 0.5)),
+        (jb.StudentT(scale=0.5, df=np.inf), 0.7, 0.2, lambda e: stats.norm(e, 0.5)),
+    ],
+)
+def test_no_digits_are_lost_in_single_precision(model, y, eta, law):
+    """The large terms of log Γ cancel."""
+    y, eta = jnp.array([y], jnp.float32), jnp.array([eta], jnp.float32)
+    made = model.log_density(y, eta, None, jnp.zeros(()))
+    rounded, y = law(float(eta[0])), float(y[0])
+    exact = (rounded.logpmf if hasattr(rounded.dist, "pmf") else rounded.logpdf)(y)
+    np.testing.assert_allclose(made[0], exact, atol=3e-3)
+
+
+def test_limits_that_are_not_there_have_finite_derivatives():
+    for limits in ({"lower": 0.0}, {"upper": 0.0}):
+        model = jb.Censored(scale=0.5, **limits)
+        of = lambda x, y, model=model: model.correction(at_zero([y]), x, None)
+        for y in (-0.1, 0.0, 0.1):
+            assert np.isfinite(jax.grad(of)(jnp.array([0.3]), y)).all()
+    with pytest.raises(ValueError, match="`lower` must be below"):
+        jb.Censored(scale=0.5, lower=2.0, upper=1.0)
+    with pytest.raises(ValueError, match="`offset` must be a number"):
+        jb.PoissonCounts(offset=np.nan)
+
+
 def test_missing_components_and_offsets():
     """A missing component has no scalar and no part in the correction, and its gradient is zero."""
     model = jb.PoissonCounts([[1.0, 0.0], [0.5, 1.0]], offset=lambda p: jnp.stack([p, 0.0]))

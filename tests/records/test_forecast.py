@@ -80,6 +80,51 @@ def test_later_draws_have_kalmans_law_and_are_paths(noisy):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "observation",
+    [jb.PoissonCounts(), jb.NegativeBinomialCounts(size=3.0), jb.Rounded(scale=0.3, width=1.0)],
+)
+def test_scores_add_up_to_the_log_likelihood(observation):
+    y = np.array([1.0, 0.0, 2.0, np.nan, 3.0, 1.0, 0.0, 1.0])
+    options = dict(observation=observation, num_steps=2)
+    made = jb.forecast(jax.random.key(0), OU, TIMES[:8], y, num_particles=4000, **options)
+    other = jb.log_likelihood(jax.random.key(1), OU, TIMES[:8], y, num_particles=400, **options)
+    assert made.trustworthy and made.readings.shape == (4000, 8, 1)
+    noise = np.hypot(other.standard_error, np.sqrt(np.sum(1 / made.effective_sample_size)))
+    assert abs(np.nansum(made.log_scores) - other.value) < 5 * noise
+
+
+@pytest.mark.slow
+def test_an_exact_first_reading_of_a_law_that_is_not_normal():
+    log_nu = lambda x, p: (2 / 0.49) * jnp.sum(x**2 / 2 - x**4 / 4)
+    model = jb.Diffusion(lambda x, p: x - x**3, lambda x, p: 0.7 * jnp.ones(1), log_nu)
+    made = jb.forecast(
+        jax.random.key(0), model, TIMES[:3], [1.0, 0.8, 0.9], num_particles=4000,
+        observation=jb.LinearGaussian(covariance=0.0),
+    )  # fmt: skip
+    np.testing.assert_allclose(made.filtered[:, 0], 1, atol=1e-5)
+    nodes = np.linspace(-4, 4, 4001)
+    weights = np.exp((2 / 0.49) * (nodes**2 / 2 - nodes**4 / 4))
+    exact = np.log(np.interp(1.0, nodes, weights) / (weights.sum() * (nodes[1] - nodes[0])))
+    # log ν of the model is not normalised: the score is, up to its constant.
+    constant = np.log(weights.sum() * (nodes[1] - nodes[0]))
+    assert abs(made.log_scores[0] - constant - exact) < 0.05
+
+
+@pytest.mark.slow
+def test_particles_that_leave_the_state_space_are_told():
+    model = jb.Diffusion(
+        lambda x, p: 0.3 - x, lambda x, p: jnp.sqrt(x), domain=lambda x, p: x[0] > 0
+    )
+    made = jb.forecast(
+        jax.random.key(0), model, TIMES[:5], [0.3, 0.2, 0.1, 0.1, 0.2], initial=[0.3],
+        observation=jb.LinearGaussian(covariance=0.01),
+    )  # fmt: skip
+    assert np.isfinite(made.crps).all() and np.isfinite(made.residuals).all()
+    assert "left the state space" in made.why()
+
+
+@pytest.mark.slow
 def test_exact_readings():
     """Each rank is that in the transition from the reading before."""
     y = readings(0.0)
@@ -114,8 +159,15 @@ def test_missing_readings_do_not_count():
     u = np.random.default_rng(1).uniform(size=(100, 1))
     gaps = np.full((130, 1), np.nan)
     gaps[:100] = u
-    np.testing.assert_allclose(with_ranks(gaps).p_uniform, with_ranks(u).p_uniform, rtol=1e-4)
-    assert np.isfinite(with_ranks(gaps).p_independent)
+    alternate = np.full((200, 1), np.nan)
+    alternate[::2] = u
+    for other in (gaps, alternate):
+        for name in ("p_uniform", "p_independent"):
+            made, exact = (getattr(with_ranks(ranks), name) for ranks in (other, u))
+            np.testing.assert_allclose(made, exact, rtol=1e-4)
+    few = np.full((60, 1), np.nan)
+    few[:8] = u[:8]
+    assert np.isfinite(with_ranks(few).p_independent)
 
 
 WELLS = jb.Diffusion(
@@ -170,7 +222,17 @@ def test_ranks_are_uniform_under_the_model_and_find_what_is_wrong():
         assert np.mean(uniform < 0.05) > 0.9, (params, heavy)
 
 
+def test_large_counts_can_be_drawn():
+    draws = jb.PoissonCounts([[1.0], [1.0]]).sample(jax.random.key(0), jnp.array([22.0]))
+    assert np.all(np.abs(draws / np.exp(22) - 1) < 1e-3)
+    assert np.isnan(jb.PoissonCounts().sample(jax.random.key(0), jnp.array([np.nan]))).all()
+
+
 def test_refusals():
+    exact = jb.LinearGaussian(covariance=0.1)
+    for at in ([10.0, 9.0], [0.1]):
+        with pytest.raises(ValueError, match="`at` must increase"):
+            jb.forecast(jax.random.key(0), OU, TIMES[:3], np.zeros(3), observation=exact, at=at)
     seen = jb.ObservationDensity(
         lambda y, x, p: -((y - x) @ (y - x)), jb.LinearGaussian([[1.0]], 0.5)
     )

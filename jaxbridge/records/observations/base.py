@@ -130,6 +130,8 @@ class Quantity(eqx.Module):
         self._function = value if callable(value) else None
         self._captured = Captured(self._function)
         self.value = None if callable(value) else as_floating(name, value)
+        if self.value is not None and not is_traced(self.value) and np.any(np.isnan(self.value)):
+            raise ValueError(f"`{name}` must be a number; got {np.asarray(self.value)}.")
 
     @property
     def depends_on_time(self) -> bool:
@@ -155,7 +157,7 @@ class Quantity(eqx.Module):
         if value.shape not in ((), (m,)):
             raise ValueError(
                 f"`{self.name}` must have shape () or ({m},) for observations of {m} components; "
-                f"got shape {value.shape}."
+                f"got shape {value.shape}. For one value per time pass a function `(params, t)`."
             )
         return jnp.broadcast_to(value, (m,))
 

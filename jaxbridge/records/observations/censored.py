@@ -8,7 +8,7 @@ import numpy as np
 from jax.scipy.special import log_ndtr
 from jaxtyping import Array, Float
 
-from ...engine.checks import Numbers
+from ...engine.checks import Numbers, is_traced
 from .base import Quantity, as_matrix
 from .components import AbstractComponents, check_positive
 
@@ -24,7 +24,8 @@ class Censored(AbstractComponents):
 
     - `matrix`: L, shape (m, d); by default `None`: each component of the state is observed.
     - `scale`: s in units of y, shape () or (m,), or a function `params -> s` or `(params, t) -> s`.
-    - `lower`, `upper`: limits in units of y, shape () or (m,); infinite by default.
+    - `lower`, `upper`: limits in units of y, shape () or (m,), or such functions; infinite by
+        default.
     - `offset`: in units of y, shape () or (m,), or such a function.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
@@ -57,6 +58,9 @@ class Censored(AbstractComponents):
         self.scale, self.offset = Quantity("scale", scale), Quantity("offset", offset)
         self.lower, self.upper = Quantity("lower", lower), Quantity("upper", upper)
         check_positive(self.scale)
+        limits = self.lower.value, self.upper.value
+        if None not in limits and not is_traced(limits) and not np.all(limits[0] < limits[1]):
+            raise ValueError(f"`lower` must be below `upper`; got {limits[0]} and {limits[1]}.")
 
     @property
     def quantities(self):
@@ -64,10 +68,12 @@ class Censored(AbstractComponents):
 
     def log_density(self, y, eta, params, time):
         s, lower, upper = self._numbers(y, params, time)
+        is_below, is_above = y <= lower, y >= upper
+        # Limits may be infinite: differences to them would have no derivative.
         z = (y - eta) / s
+        to_limit = jnp.where(is_below, lower - eta, jnp.where(is_above, eta - upper, 0)) / s
         between = -(z**2) / 2 - jnp.log(s) - np.log(2 * np.pi) / 2
-        below, above = log_ndtr((lower - eta) / s), log_ndtr((eta - upper) / s)
-        return jnp.where(y <= lower, below, jnp.where(y >= upper, above, between))
+        return jnp.where(is_below | is_above, log_ndtr(to_limit), between)
 
     def guide(self, y, params, time):
         s, lower, upper = self._numbers(y, params, time)

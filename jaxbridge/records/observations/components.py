@@ -11,12 +11,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import digamma, polygamma
+from jax.scipy.special import digamma, gammaln, polygamma
 from jaxtyping import Array, Float, Key, PyTree
 
 from ...engine.checks import as_floating, is_traced
+from ...engine.generator import with_plain_key
 from ...engine.linalg import dot
 from .base import AbstractObservation, Quantity, Row, Scalars, check_matrix, matrix_for
+
+# Sizes and degrees of freedom beyond this bound have the limit law in all digits.
+MOST = 1e12
 
 Normal = tuple[Float[Array, " m"], Float[Array, " m"]]
 
@@ -146,6 +150,40 @@ def _filled(y: Float[Array, " m"]) -> Float[Array, " m"]:
     return jnp.where(jnp.isfinite(y), y, 1)
 
 
+def stirling(x: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Return log Γ(x) - (x - ½) log x + x - ½ log 2π, without loss of digits for large x > 0."""
+    is_large = x > 8
+    inverse = 1 / jnp.where(is_large, x, 8)
+    series = inverse * (1 / 12 - inverse**2 * (1 / 360 - inverse**2 / 1260))
+    small = jnp.where(is_large, 1, x)
+    exact = gammaln(small) - (small - 0.5) * jnp.log(small) + small - np.log(2 * np.pi) / 2
+    return jnp.where(is_large, series, exact)
+
+
+def expm1_remainder(t: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Return e^t - 1 - t, without loss of digits near zero."""
+    near = jnp.abs(t) < 0.03
+    small = jnp.where(near, t, 0)
+    series = small**2 * (1 / 2 + small * (1 / 6 + small * (1 / 24 + small / 120)))
+    return jnp.where(near, series, jnp.expm1(t) - t)
+
+
+def log_counting(y: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Return log y! - y log y + y of counts, zero for y = 0."""
+    safe = jnp.where(y > 0, y, 1)
+    return jnp.where(y > 0, stirling(safe) + jnp.log(2 * np.pi * safe) / 2, 0)
+
+
+def draw_poisson(key: Key[Array, ""], mean: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Draw Poisson counts; beyond a million rounded normal variables, which no integer limits."""
+    is_large = mean > 1e6
+    normal = jnp.round(mean + jnp.sqrt(mean) * jax.random.normal(key, mean.shape, mean.dtype))
+    is_number = mean >= 0
+    moderate = jax.random.poisson(with_plain_key(key), jnp.where(is_large | ~is_number, 1, mean))
+    counts = jnp.where(is_large, normal, moderate.astype(mean.dtype))
+    return jnp.where(is_number, counts, jnp.nan)
+
+
 def moments_of_log_gamma(shape: Float[Array, " m"]) -> Normal:
     """Return mean and variance of the log of a Gamma(shape, 1) variable."""
     return digamma(shape), polygamma(1, shape)
@@ -167,9 +205,14 @@ def check_counts(data: Float[np.ndarray, " n"]) -> None:
         )
 
 
-def check_positive(quantity: Quantity, least: float = 0.0) -> None:
-    """Raise `ValueError` unless the numbers, as far as they are known, exceed `least`."""
+def check_positive(quantity: Quantity, finite: bool = True) -> None:
+    """Raise `ValueError` unless the numbers, as far as they are known, are positive."""
     value = quantity.value
-    if value is None or is_traced(value) or np.all(np.asarray(value) > least):
+    if value is None or is_traced(value):
         return
-    raise ValueError(f"`{quantity.name}` must be above {least:g}; got {jax.device_get(value)}.")
+    numbers = np.asarray(value)
+    if np.all(numbers > 0) and (not finite or np.all(np.isfinite(numbers))):
+        return
+    raise ValueError(
+        f"`{quantity.name}` must be positive{' and finite' if finite else ''}; got {numbers}."
+    )

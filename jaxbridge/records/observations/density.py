@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from ...engine.arguments import as_returned, check_function, named
 from ...engine.captured import Captured
 from ...engine.checks import as_floating, is_traced
+from ...engine.generator import with_plain_key
 from ...models.diffusion import check_value
 from ...models.tracing import takes_time
 from .base import AbstractObservation, log_density_of
@@ -79,10 +80,12 @@ class ObservationDensity(AbstractObservation):
     def sample(self, key, x, params=None, time=0.0):
         self.check_sample()
         x = as_floating("x", x)
-        arguments = (key, x, params)
+        arguments = (with_plain_key(key), x, params)
         if takes_time(self._sample, 3):
             arguments = (*arguments, jnp.asarray(time, x.dtype))
         y = as_returned("sample", named("sample", self._captured.call)(self._sample, *arguments))
+        if y.ndim != 1:
+            raise ValueError(f"`sample` must return an observation, shape (m,); got {y.shape}.")
         return y.astype(x.dtype)
 
     def check_sample(self):

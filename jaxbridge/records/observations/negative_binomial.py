@@ -5,18 +5,20 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
 
 from ...engine.arguments import check_choice
 from ...engine.checks import Numbers
 from .base import Quantity, as_matrix
 from .components import (
+    MOST,
     AbstractComponents,
     check_counts,
     check_positive,
-    log_where_positive,
+    draw_poisson,
+    log_counting,
     moments_of_log_gamma,
+    stirling,
 )
 from .poisson import Link
 
@@ -63,23 +65,30 @@ class NegativeBinomialCounts(AbstractComponents):
         check_choice("link", link, ("log", "identity"))
         self.matrix, self.link = as_matrix(matrix), link
         self.size, self.offset = Quantity("size", size), Quantity("offset", offset)
-        check_positive(self.size)
+        check_positive(self.size, finite=False)
 
     @property
     def quantities(self):
         return (self.size, self.offset)
 
     def log_density(self, y, eta, params, time):
-        r = self.size.for_components(params, time, len(y))
-        log_mean = eta if self.link == "log" else log_where_positive(eta)
-        # log of 1 + μ/r; for a mean of zero the count is zero.
-        log_sum = jnp.logaddexp(0.0, log_mean - jnp.log(r))
-        terms = jnp.where(y > 0, y * jnp.where(y > 0, log_mean - jnp.log(r) - log_sum, 0), 0)
-        log_g = gammaln(y + r) - gammaln(r) - gammaln(y + 1) + terms - r * log_sum
-        return log_g if self.link == "log" else jnp.where(eta >= 0, log_g, -jnp.inf)
+        r, is_positive = self._size(y, params, time), y > 0
+        possible = jnp.ones_like(is_positive) if self.link == "log" else eta > 0
+        safe = jnp.where(is_positive, y, 1)
+        log_mean = eta if self.link == "log" else jnp.log(jnp.where(possible, eta, safe))
+        # y log(μ/y) + (y + r) log((y + r)/(μ + r)) with μ = y e^τ. Large terms cancel, in one of
+        # two ways, and are not computed.
+        tau = log_mean - jnp.log(safe)
+        growth = jnp.log1p(safe * jnp.expm1(tau) / (safe + r))
+        share = jnp.log1p(r / safe) - jnp.log1p(r / safe * jnp.exp(-tau))
+        some = jnp.where(r > safe, safe * (tau - growth), safe * share) - r * growth
+        # Stirling's formula for log Γ(y + r) - log Γ(r) - log y!
+        some += stirling(safe + r) - stirling(r) - jnp.log1p(safe / r) / 2 - log_counting(safe)
+        log_g = jnp.where(is_positive, some, -r * jnp.logaddexp(0.0, log_mean - jnp.log(r)))
+        return jnp.where(possible, log_g, jnp.where((eta == 0) & ~is_positive, 0, -jnp.inf))
 
     def guide(self, y, params, time):
-        r, count = self.size.for_components(params, time, len(y)), y + 0.5
+        r, count = self._size(y, params, time), y + 0.5
         if self.link == "identity":
             return count, count + count**2 / r
         # The logit of a Beta(a, b) variable is the difference of two logs of Gamma variables.
@@ -87,12 +96,16 @@ class NegativeBinomialCounts(AbstractComponents):
         return jnp.log(r) + upper - lower, var_upper + var_lower
 
     def draw(self, key, eta, params, time):
-        r = self.size.for_components(params, time, len(eta))
+        r = self._size(eta, params, time)
         mean_key, count_key = jax.random.split(key)
         mean = jnp.exp(eta) if self.link == "log" else jnp.maximum(eta, 0)
         # A Poisson law whose mean has a Gamma law.
         mean = mean * jax.random.gamma(mean_key, r) / r
-        return jax.random.poisson(count_key, mean).astype(eta.dtype)
+        return draw_poisson(count_key, mean)
 
     def check_data(self, data):
         check_counts(data)
+
+    def _size(self, y, params, time):
+        """Return r; beyond a bound the counts are Poisson counts in all digits."""
+        return jnp.minimum(self.size.for_components(params, time, len(y)), MOST)

@@ -4,9 +4,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jax.scipy.special import gammaln
 from jaxtyping import Array, Float
 
 from ...engine.arguments import check_choice
@@ -15,7 +13,9 @@ from .base import Quantity, as_matrix
 from .components import (
     AbstractComponents,
     check_counts,
-    log_where_positive,
+    draw_poisson,
+    expm1_remainder,
+    log_counting,
     moments_of_log_gamma,
 )
 
@@ -66,19 +66,25 @@ class PoissonCounts(AbstractComponents):
         return (self.offset,)
 
     def log_density(self, y, eta, params, time):
-        log_mean = eta if self.link == "log" else log_where_positive(eta)
-        mean = jnp.exp(eta) if self.link == "log" else eta
-        # 0 log 0 = 0: without mean the count is zero.
-        terms = jnp.where(y > 0, y * jnp.where(y > 0, log_mean, 0), 0)
-        log_g = terms - mean - gammaln(y + 1)
-        return log_g if self.link == "log" else jnp.where(eta >= 0, log_g, -jnp.inf)
+        # y log μ - μ - log y! with μ = y e^τ. Its large terms cancel, so they are not computed.
+        is_positive, safe = y > 0, jnp.where(y > 0, y, 1)
+        if self.link == "log":
+            tau = eta - jnp.log(safe)
+            some, none = -safe * expm1_remainder(tau), -jnp.exp(eta)
+        else:
+            possible = eta > 0
+            mean = jnp.where(possible, eta, safe)
+            some = -safe * expm1_remainder(jnp.log(mean) - jnp.log(safe))
+            some = jnp.where(possible, some, -jnp.inf)
+            none = jnp.where(eta >= 0, -eta, -jnp.inf)
+        return jnp.where(is_positive, some - log_counting(y), none)
 
     def guide(self, y, params, time):
         return moments_of_log_gamma(y + 0.5) if self.link == "log" else (y + 0.5, y + 0.5)
 
     def draw(self, key, eta, params, time):
         mean = jnp.exp(eta) if self.link == "log" else jnp.maximum(eta, 0)
-        return jax.random.poisson(key, mean).astype(eta.dtype)
+        return draw_poisson(key, mean)
 
     def check_data(self, data):
         check_counts(data)
