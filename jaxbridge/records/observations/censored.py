@@ -58,9 +58,10 @@ class Censored(AbstractComponents):
         self.scale, self.offset = Quantity("scale", scale), Quantity("offset", offset)
         self.lower, self.upper = Quantity("lower", lower), Quantity("upper", upper)
         check_positive(self.scale)
-        limits = self.lower.value, self.upper.value
-        if None not in limits and not is_traced(limits) and not np.all(limits[0] < limits[1]):
-            raise ValueError(f"`lower` must be below `upper`; got {limits[0]} and {limits[1]}.")
+        low, high = self.lower.value, self.upper.value
+        is_known = low is not None and high is not None and not is_traced(low, high)
+        if is_known and not np.all(np.less(low, high)):
+            raise ValueError(f"`lower` must be below `upper`; got {low} and {high}.")
 
     @property
     def quantities(self):
