@@ -59,9 +59,9 @@ class Censored(AbstractComponents):
         self.lower, self.upper = Quantity("lower", lower), Quantity("upper", upper)
         check_positive(self.scale)
         low, high = self.lower.value, self.upper.value
-        is_known = low is not None and high is not None and not is_traced(low, high)
-        if is_known and not np.all(np.less(low, high)):
-            raise ValueError(f"`lower` must be below `upper`; got {low} and {high}.")
+        if low is not None and high is not None and not is_traced(low, high):
+            if not np.all(np.asarray(low) < np.asarray(high)):
+                raise ValueError(f"`lower` must be below `upper`; got {low} and {high}.")
 
     @property
     def quantities(self):
