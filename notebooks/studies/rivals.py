@@ -381,8 +381,8 @@ _DETAILS = """\
 - `gibbs` takes as many steps, of second order. It is not visibly off, with more draws per second.
 - For CIR in raw coordinates `pmmh` and numpyro are level at equal steps in the stored run. It had
   Euler steps. Now `pmmh` has steps of second order with σ(x). At 10 steps and
-  30,000 draws its means are off by 0.02 ± 0.04 (rate) and 0.02 ± 0.04 (σ), by another key -0.02 ± 0.03
-  and -0.02 ± 0.03. The ratios of sds are 0.96 to 1.03. It takes about twice the time.
+  30,000 draws its means are off by 0.02 ± 0.04 (rate) and 0.02 ± 0.04 (σ), by another key
+  -0.02 ± 0.03 and -0.02 ± 0.03. The ratios of sds are 0.96 to 1.03. It takes about twice the time.
 - In logarithms, with four times as many steps, most of the error of `pmmh` is gone, at half as many
   draws per second. The result reports the remaining part as `step_error`.
 """
