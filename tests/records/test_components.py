@@ -159,6 +159,16 @@ def test_no_digits_are_lost_in_single_precision(model, y, eta, law):
     np.testing.assert_allclose(made[0], exact, atol=3e-3)
 
 
+@pytest.mark.parametrize("size", [0.5, 4.0])
+def test_counts_far_from_their_mean_have_finite_derivatives(size):
+    model = jb.NegativeBinomialCounts(size=size)
+    of = lambda eta, y: model.log_density(jnp.array([y]), eta, None, jnp.zeros(()))[0]
+    for y in (0.0, 2.0):
+        for eta in (-100.0, 100.0):
+            assert np.isfinite(of(jnp.array([eta]), y))
+            assert np.isfinite(jax.grad(of)(jnp.array([eta]), y)).all()
+
+
 def test_limits_that_are_not_there_have_finite_derivatives():
     for limits in ({"lower": 0.0}, {"upper": 0.0}):
         model = jb.Censored(scale=0.5, **limits)

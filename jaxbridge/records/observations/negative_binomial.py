@@ -79,8 +79,13 @@ class NegativeBinomialCounts(AbstractComponents):
         # y log(μ/y) + (y + r) log((y + r)/(μ + r)) with μ = y e^τ. Large terms cancel, in one of
         # two ways, and are not computed.
         tau = log_mean - jnp.log(safe)
-        growth = jnp.log1p(safe * jnp.expm1(tau) / (safe + r))
-        share = jnp.log1p(r / safe) - jnp.log1p(r / safe * jnp.exp(-tau))
+        is_far = tau > 20  # e^τ would overflow
+        growth = jnp.where(
+            is_far,
+            jnp.logaddexp(jnp.log(r), log_mean) - jnp.log(safe + r),
+            jnp.log1p(safe * jnp.expm1(jnp.where(is_far, 0, tau)) / (safe + r)),
+        )
+        share = jnp.log1p(r / safe) - jnp.logaddexp(0.0, jnp.log(r) - log_mean)
         some = jnp.where(r > safe, safe * (tau - growth), safe * share) - r * growth
         # Stirling's formula for log Γ(y + r) - log Γ(r) - log y!
         some += stirling(safe + r) - stirling(r) - jnp.log1p(safe / r) / 2 - log_counting(safe)
