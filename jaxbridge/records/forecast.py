@@ -19,7 +19,7 @@ from jax import lax
 from jax.scipy.special import gammaincc, logsumexp, ndtri
 from jaxtyping import Array, Float, Key
 
-from ..engine.averages import effective_size, normalise_weights
+from ..engine.averages import effective_size, nan_to_neg_inf, normalise_weights
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
 from ..engine.compiled import compiled
 from ..engine.entry import public_entry
@@ -58,7 +58,8 @@ _POOR = (
 class Forecast(AbstractResult):
     """Predictive laws of a record of n readings and at F later times, from `forecast`.
 
-    All draws have equal weights. P is the number of particles.
+    All draws have equal weights. P is the number of particles. Draws of a particle that left the
+    state space are NaN; more than 1 % of them are a fault.
 
     - `times`: those of the readings and the later ones, shape (n + F,).
     - `states`: draws of the state at each time, given the readings *before* it, shape
@@ -282,7 +283,7 @@ def _run(key: Key[Array, ""], problem: RecordProblem, P: int):
         draw = lambda key, x: observation.sample(key, x, model.params, row.time)
         readings = jax.vmap(draw)(keys, x.T)
         log_weight = log_weight + corrected(row, after)
-        log_weight = jnp.where(jnp.isnan(log_weight), -jnp.inf, log_weight)
+        log_weight = nan_to_neg_inf(log_weight)
         weights = normalise_weights(log_weight)
         order = systematic(jax.random.uniform(resampling_key, (), dtype), weights)
         filtered = after[:, jnp.where(is_read, order, jnp.arange(P))]
@@ -340,7 +341,7 @@ def _starts(key, problem: RecordProblem, first: Scalars, nothing: Information, P
     x = law.points(positions, zeta.T)
     log_nu = model.prepared().log_stationary
     ratio = jax.vmap(lambda x: log_nu(x) - law.log_density(x))(x)
-    weights = normalise_weights(jnp.where(jnp.isnan(ratio), -jnp.inf, ratio))
+    weights = normalise_weights(nan_to_neg_inf(ratio))
     predicted = x[systematic(jax.random.uniform(resampling_key, (), dtype), weights)].T
     given = covered_start(law, first, zeros, nothing)
     x = given.points(positions, repeated)

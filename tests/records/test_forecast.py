@@ -112,7 +112,7 @@ def test_an_exact_first_reading_of_a_law_that_is_not_normal():
 
 
 @pytest.mark.slow
-def test_particles_that_leave_the_state_space_are_told():
+def test_particles_that_leave_the_state_space_are_a_fault():
     model = jb.Diffusion(
         lambda x, p: 0.3 - x, lambda x, p: jnp.sqrt(x), domain=lambda x, p: x[0] > 0
     )

@@ -6,6 +6,7 @@ Jeffreys' prior.
 """
 
 from abc import abstractmethod
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -22,6 +23,8 @@ from .base import AbstractObservation, Quantity, Row, Scalars, check_matrix, mat
 # Sizes and degrees of freedom beyond this bound have the limit law in all digits.
 MOST = 1e12
 
+# The mean (or median) of a reading is e^η or η.
+Link = Literal["log", "identity"]
 Normal = tuple[Float[Array, " m"], Float[Array, " m"]]
 
 

@@ -11,8 +11,7 @@ from jaxtyping import Array, Float
 from ...engine.arguments import check_choice
 from ...engine.checks import Numbers
 from .base import Quantity, as_matrix
-from .components import AbstractComponents, check_positive, log_where_positive
-from .poisson import Link
+from .components import AbstractComponents, Link, check_positive, log_where_positive
 
 
 class LogNormal(AbstractComponents):

@@ -13,6 +13,7 @@ from .base import Quantity, as_matrix
 from .components import (
     MOST,
     AbstractComponents,
+    Link,
     check_counts,
     check_positive,
     draw_poisson,
@@ -20,7 +21,6 @@ from .components import (
     moments_of_log_gamma,
     stirling,
 )
-from .poisson import Link
 
 
 class NegativeBinomialCounts(AbstractComponents):

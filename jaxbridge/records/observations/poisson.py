@@ -1,7 +1,6 @@
 """Poisson counts."""
 
 from collections.abc import Callable
-from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,14 +11,13 @@ from ...engine.checks import Numbers
 from .base import Quantity, as_matrix
 from .components import (
     AbstractComponents,
+    Link,
     check_counts,
     draw_poisson,
     expm1_remainder,
     log_counting,
     moments_of_log_gamma,
 )
-
-Link = Literal["log", "identity"]
 
 
 class PoissonCounts(AbstractComponents):
