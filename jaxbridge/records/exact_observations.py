@@ -7,10 +7,10 @@ from jaxtyping import Array, Bool, Float
 
 from ..engine.checks import Numbers, check_precision, index_without_compiling, is_traced
 from ..engine.compiled import compiled_sooner
-from ..engine.times import as_times, check_increasing
+from ..engine.times import check_increasing
 from ..models.bridge_problem import Intervals, as_intervals
 from ..models.diffusion import Diffusion
-from .record import as_rows, of_each, split_records
+from .record import as_times_and_rows, of_each, split_records
 
 
 def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> Intervals:
@@ -26,15 +26,9 @@ def as_observations(model: Diffusion, times: Numbers, observations: Numbers) -> 
 
 def _intervals(model: Diffusion, times: Numbers, observations: Numbers) -> Intervals:
     """Return the intervals of one record, after all checks."""
-    grid = as_times("times", _unmasked("times", times))
-    observations = as_rows(_unmasked("observations", observations))
-    if len(grid.shape) != 1:
-        raise ValueError(f"`times` must have shape (n + 1,); got shape {grid.shape}.")
-    if observations.ndim != 2 or observations.shape[0] != grid.shape[0]:
-        raise ValueError(
-            f"`observations` must have shape ({grid.shape[0]}, d), one row per entry of `times`; "
-            f"got shape {observations.shape}."
-        )
+    grid, observations = as_times_and_rows(
+        _unmasked("times", times), _unmasked("observations", observations)
+    )
     if grid.shape[0] < 2:
         raise ValueError(
             f"`times` and `observations` need at least two entries; got {grid.shape[0]}."

@@ -34,7 +34,7 @@ from .guided_steps import Guide, end_of_step, guided_law, guided_start, target_l
 from .initial import Initial, calls_for_cover, initial_law
 from .observations import AbstractObservation, Scalars
 from .problem import RecordProblem
-from .record import are_several, as_rows
+from .record import are_several, as_times_and_rows
 from .segments import split_first, split_last
 from .several import as_record_problems
 from .tilted_step import Information
@@ -203,7 +203,10 @@ def forecast(
     check_key(key)
     num_particles = check_count("num_particles", num_particles, 2)
     if are_several(times, observations):
-        raise ValueError("`forecast` takes one record: call it for each of several records.")
+        raise ValueError(
+            "`forecast` takes one record, with `times` of shape (n,) and `observations` of shape "
+            "(n, m): call it for each of several records."
+        )
     at = () if at is None else at
     later = as_floating("at", at)
     if later.ndim != 1:
@@ -215,9 +218,10 @@ def forecast(
                 f"`at` must increase, and begin after the last of `times`, {all_times[0]:g}; got "
                 f"{all_times[1:]}."
             )
-    num_times = len(as_rows(observations)) + len(later)
+    _, rows = as_times_and_rows(times, observations)
+    num_times = len(rows) + len(later)
     if later.size:
-        times, observations = _with_later(times, observations, at, len(later))
+        times, observations = _with_later(times, rows, at, len(later))
     records = as_record_problems(
         model,
         times,
@@ -376,13 +380,12 @@ def _crps(y: Float[Array, " m"], draws: Float[Array, "P m"]) -> Float[Array, " m
     return jnp.sum(jnp.where(exists, terms, 0), axis=0) / P
 
 
-def _with_later(times: Numbers, observations: Numbers, at: Numbers, num_later: int):
+def _with_later(times: Numbers, rows: Float[Array, "n m"], at: Numbers, num_later: int):
     """Return the record with missing readings at `num_later` later times.
 
     Times are joined in double precision, unless they are traced.
     """
     xp = jnp if is_traced(times, at) else np
     joined = xp.concatenate([xp.asarray(part, float) for part in (times, at)])
-    values = as_rows(observations)
-    missing = jnp.full((num_later, values.shape[1]), jnp.nan, values.dtype)
-    return joined, jnp.concatenate([values, missing])
+    missing = jnp.full((num_later, rows.shape[1]), jnp.nan, rows.dtype)
+    return joined, jnp.concatenate([rows, missing])

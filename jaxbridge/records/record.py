@@ -244,6 +244,22 @@ def as_rows(observations: Numbers) -> Float[Array, "n m"]:
     return values[:, None] if values.ndim == 1 else values
 
 
+def as_times_and_rows(times: Numbers, observations: Numbers) -> tuple[Times, Float[Array, "n m"]]:
+    """Return the times of one record, and its observations with one row per time.
+
+    **Raises:** `ValueError` for other shapes.
+    """
+    values = as_rows(observations)
+    checked_times = as_times("times", _unmask("times", times))
+    shape = checked_times.shape
+    if len(shape) != 1 or values.ndim != 2 or values.shape[0] != shape[0]:
+        raise ValueError(
+            "`times` must have shape (n,) and `observations` (n, m), one row per time; got "
+            f"{shape} and {values.shape}."
+        )
+    return checked_times, values
+
+
 def _dtype(times: Times, values: Array) -> jnp.dtype:
     """Return the dtype of paths."""
     return jnp.promote_types(times.dtype, values.dtype)
@@ -259,14 +275,7 @@ def _check_record(
 
     **Raises:** `ValueError` that names the invalid time or observation.
     """
-    values = as_rows(observations)
-    checked_times = as_times("times", _unmask("times", times))
-    shape = checked_times.shape
-    if len(shape) != 1 or values.ndim != 2 or values.shape[0] != shape[0]:
-        raise ValueError(
-            "`times` must have shape (n,) and `observations` (n, m), one row per time; got "
-            f"{shape} and {values.shape}."
-        )
+    checked_times, values = as_times_and_rows(times, observations)
     if initial_time is not None:
         observed_times = checked_times
         checked_times = observed_times.preceded("initial_time", initial_time)
