@@ -94,6 +94,7 @@ from .models.gaussian_bridge import GaussianBridge, gaussian_bridge
 from .models.gaussian_law import GaussianLaw
 from .models.hyperbolic import hyperbolic
 from .models.integrated import integrated
+from .models.jumps import Jumps
 from .models.lamperti import lamperti
 from .models.langevin import langevin, stationary_diffusion
 from .models.ornstein_uhlenbeck import (
@@ -169,6 +170,7 @@ __all__ = [
     "lamperti",
     "Transformed",
     "simulate",
+    "Jumps",
     # Hypoelliptic and time-dependent models.
     "fitzhugh_nagumo",
     "FitzHughNagumoParams",

@@ -30,8 +30,10 @@ def exact_step(A, V):
     return step
 
 
-def kalman(step, times, values, matrix, noise, mean, covariance, num_steps) -> Smoothed:
-    """For values (n, m), NaN where nothing was seen, `num_steps` between two times."""
+def kalman(step, times, values, matrix, noise, mean, covariance, num_steps, jumps=None) -> Smoothed:
+    """For values (n, m), NaN where nothing was seen, `num_steps` between two times; after each
+    reading the state jumps by a row of `jumps`."""
+    jumps = np.zeros((len(times), len(mean))) if jumps is None else jumps
     log_likelihood = 0.0
     filtered, predicted, decays = [], [], []
 
@@ -49,9 +51,10 @@ def kalman(step, times, values, matrix, noise, mean, covariance, num_steps) -> S
 
     mean, covariance = update(mean, covariance, values[0])
     filtered.append((mean, covariance))
-    for dt, y in zip(np.diff(times) / num_steps, values[1:], strict=True):
+    for dt, y, jump in zip(np.diff(times) / num_steps, values[1:], jumps[:-1], strict=True):
         decay, spread = step(round(dt, 12))
         for i in range(num_steps):
+            mean = mean + (jump if i == 0 else 0)
             mean, covariance = decay @ mean, decay @ covariance @ decay.T + spread
             predicted.append((mean, covariance))
             decays.append(decay)

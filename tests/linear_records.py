@@ -35,11 +35,11 @@ class LinearRecord(NamedTuple):
             "initial": jb.GaussianLaw(self.mean, self.covariance),
         }
 
-    def kalman(self, num_steps, exact=False) -> Smoothed:
+    def kalman(self, num_steps, exact=False, jumps=None) -> Smoothed:
         V = self.sigma @ self.sigma.T
         step = (exact_step if exact else euler_step)(self.A, V)
         seen = (self.times, self.values, self.matrix, self.noise)
-        return kalman(step, *seen, self.mean, self.covariance, num_steps)
+        return kalman(step, *seen, self.mean, self.covariance, num_steps, jumps)
 
 
 def plane(num=30, exact_part=False) -> LinearRecord:

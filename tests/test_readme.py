@@ -56,6 +56,11 @@ CLAIMS = {
         and covers(page["posterior"].params["log_size"], 2)
         and page["inside"] > 0.75
     ),
+    "doses": lambda page: (
+        covers(page["posterior"].params["log_sigma"], -1.6)
+        and covers(page["posterior"].params["log_k"], -1.2)
+        and covers(page["posterior"].params["log_V"], 1.5)
+    ),
     "debugging": lambda page: not page["density"].trustworthy,
     "densities": lambda page: (
         page["densities"].value.shape == (100,)

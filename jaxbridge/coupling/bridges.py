@@ -106,8 +106,9 @@ def sample_bridges(
     - `save_at`: the stored times, shape (K,): increasing grid points in [0, duration]. With several
         durations these are fractions of the duration. By default the whole grid is stored.
     - `batch_size`: number of proposals that run side by side. It bounds memory, and changes results
-        by rounding only. The default is one for each bridge, at least 64, as far as their paths fit
-        in 16 MiB of each CPU device, or 1 GiB of each accelerator. Up to 256 may take 512 MiB.
+        by rounding only. The default is one for each bridge, at least 64, and fewer if their paths
+        would take more than 16 MiB on a CPU device or 1 GiB on an accelerator. (The paths of up to
+        256 proposals may take 512 MiB.)
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
     - `throw`: raise an error at run time if a bridge is missing or a parameter is not finite.
 

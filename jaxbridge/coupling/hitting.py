@@ -112,10 +112,10 @@ class HittingCounts(AbstractResult):
 
     @property
     def standard_error(self) -> Float[Array, "*I n"]:
-        """Return the standard error of `probability`, shape (n,): about π √((1-π)/N).
+        """Return the standard error of `probability`, shape (n,): about π √((1-π)/N) for N hits.
 
-        If all N trials hit, it is about 1/N: they do not exclude a π that is smaller than 1 by 1/N.
-        It is infinite for fewer than three hits, which are too few for an estimate.
+        If all trials hit, it is about 1/N, because π may be that far below 1. It is infinite for
+        fewer than three hits, which are too few for an estimate.
         """
         hits, trials, probability = self._num_hits, self.num_trials, self.probability
         # One miss in all trials is the smallest share of misses that is visible.
@@ -327,7 +327,7 @@ def coupling_of_bridges(bridges: BridgePaths, start_law: AnyStartLaw | None) -> 
             "`bridges` must be whole paths, because a hit may occur at any grid point; got "
             f"{bridges.paths.shape[-2]} of {bridges.num_steps + 1} grid points. Sample them "
             "without `save_at`. If you need exact bridges at some times only, use "
-            "`sample_exact_bridges` with `save_at`: it needs no counts afterwards."
+            "`sample_exact_bridges` with `save_at`: it corrects the bridges itself."
         )
     if start_law is None:
         return bridges.coupling

@@ -120,9 +120,11 @@ def _save(path: Path, posterior: AbstractPosterior, num_done: int) -> None:
 
 
 def _load(path: Path, first: _Posterior, sizes: list[int]) -> tuple[_Posterior, int]:
-    """Return the draws in the file, and the number of its parts.
+    """Return the draws in the file, and the number of its completed parts.
 
-    `first` holds the draws of the first part.
+    `first` holds the draws of the first part, and `sizes` the numbers of draws of all parts.
+
+    **Raises:** `ValueError` for a damaged file, or one that does not begin with `first`.
     """
     arrays, others = eqx.partition(first, eqx.is_array)
     leaves, treedef = jax.tree.flatten(arrays)

@@ -25,6 +25,7 @@ from ..engine.verdict import Fault, lost_paths
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..models.gaussian_law import GaussianLaw
+from ..models.jumps import JumpsLike
 from ..proposals import Budget, ProposalLike
 from ..records import AbstractObservation, Initial, LinearGaussian, as_record_problems
 from .augmentation import Augmentation, augment
@@ -184,6 +185,7 @@ def gibbs(
     observation: AbstractObservation | None = None,
     initial: Initial = None,
     initial_time: Numbers | None = None,
+    jumps: JumpsLike = None,
     population: NormalPopulation | None = None,
     num_warmup: int | None = None,
     covariance: Numbers | None = None,
@@ -230,9 +232,9 @@ def gibbs(
     - `num_chains`: number of parallel chains, which are a leading axis in all results.
     - `init`: unknown parameters to start from, with a leading axis if chains have different ones;
         or the `state` of earlier draws, to continue them.
-    - `observation`, `initial`, `initial_time`: observation model and initial law of a noisy or
-        partial record, as in `innovations`. Then parameters of σ and of the noise may be unknown,
-        too.
+    - `observation`, `initial`, `initial_time`, `jumps`: observation model, initial law and jumps of
+        a noisy or partial record, as in `innovations`. Then parameters of σ and of the noise may
+        be unknown, too.
     - `population`: a `NormalPopulation`, for parameters that vary between records. Exact
         observations then count as a record without noise, too. In `init` and `covariance`,
         parameters that vary are represented by their population means.
@@ -278,7 +280,7 @@ def gibbs(
         check_key(key)
         check_no_bridges(**for_bridges)
     else:
-        check_no_record(initial=initial, initial_time=initial_time)
+        check_no_record(initial=initial, initial_time=initial_time, jumps=jumps)
         problem = as_problem(key, parameters, times, observations, num_steps, step_size)
         parameters.model.check_invertible_sigma(problem.like)
         if problem.sigma_is_unknown or population is not None:
@@ -286,7 +288,12 @@ def gibbs(
             check_no_bridges(OF_POPULATION if population else OF_UNKNOWN_SIGMA, **for_bridges)
             observation, initial = LinearGaussian(covariance=0.0), _wide_law(problem.intervals)
     if observation is not None:
-        options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
+        options = {
+            "num_steps": num_steps,
+            "step_size": step_size,
+            "initial_time": initial_time,
+            "jumps": jumps,
+        }
         records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
         log_prior = as_log_prior(prior, parameters, unknown)

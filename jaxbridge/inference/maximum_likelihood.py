@@ -27,6 +27,7 @@ from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..models.diffusion import Diffusion
+from ..models.jumps import JumpsLike
 from ..proposals import Budget, ProposalLike
 from ..records import AbstractObservation, Initial, as_record_problems
 from ..schemes import StepError, dominates, step_faults
@@ -168,6 +169,7 @@ def maximum_likelihood(
     observation: AbstractObservation | None = None,
     initial: Initial = None,
     initial_time: Numbers | None = None,
+    jumps: JumpsLike = None,
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
@@ -190,9 +192,9 @@ def maximum_likelihood(
     - `num_iterations`: iterations of the stochastic approximation.
     - `num_bridges`: weighted bridges per interval in each pass of Newton's method after these
         iterations, and for the errors; or paths per interval in the simulated likelihood.
-    - `observation`, `initial`, `initial_time`: observation model and initial law of noisy or
-        partial records, as in `innovations`. Then any parameters may be unknown, and `num_bridges`
-        is the number of draws from each of eight chains of paths.
+    - `observation`, `initial`, `initial_time`, `jumps`: observation model, initial law and jumps of
+        noisy or partial records, as in `innovations`. Then any parameters may be unknown, and
+        `num_bridges` is the number of draws from each of eight chains of paths.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`. If `proposal` is a
         coupling, only `max_proposals` is available.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
@@ -248,7 +250,12 @@ def maximum_likelihood(
             max_proposals=max_proposals,
             max_trials=max_trials,
         )
-        options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
+        options = {
+            "num_steps": num_steps,
+            "step_size": step_size,
+            "initial_time": initial_time,
+            "jumps": jumps,
+        }
         records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
         if len(unknown) > _MOST_FOR_NEWTON:
@@ -259,7 +266,7 @@ def maximum_likelihood(
             )
         search = Search(Gradient(optimizer), num_iterations, progress_meter)
         return maximum_of_records(key, parameters, records, unknown, search, num_bridges)
-    check_no_record(initial=initial, initial_time=initial_time)
+    check_no_record(initial=initial, initial_time=initial_time, jumps=jumps)
     problem = as_problem(key, parameters, times, observations, num_steps, step_size)
     parameters.check_allowed(problem.theta)
     rule = EM() if method == "em" else Gradient(optimizer)

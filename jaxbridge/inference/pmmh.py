@@ -36,6 +36,7 @@ from ..engine.progress import metered_stages
 from ..engine.verdict import Fault, lost_share
 from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
+from ..models.jumps import JumpsLike
 from ..proposals import AbstractWeightedProposal, Budget, ProposalLike
 from ..records import AbstractObservation, GuideCheck, Initial, as_record_problems
 from .blocks import Block, block_of, make_blocks
@@ -241,6 +242,7 @@ def pmmh(
     observation: AbstractObservation | None = None,
     initial: Initial = None,
     initial_time: Numbers | None = None,
+    jumps: JumpsLike = None,
     num_counts: int | None = None,
     max_trials: int | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
@@ -272,10 +274,10 @@ def pmmh(
         uses the proposals of paths and the guide that the state stores. The proposals keep their
         bounds, so omit `num_counts` and `max_trials`. A `proposal` other than "auto" replaces the
         stored proposals, except in the stored estimate.
-    - `observation`, `initial`, `initial_time`: observation model and initial law of a noisy or
-        partial record, as in `innovations`. By default observations are exact and complete.
-        `num_proposals` is then the number of particles, and a small number suffices. The warm-up
-        finds the guide, and its discount rate by pilot runs. If parameters of the noise are
+    - `observation`, `initial`, `initial_time`, `jumps`: observation model, initial law and jumps of
+        a noisy or partial record, as in `innovations`. By default observations are exact and
+        complete. `num_proposals` is then the number of particles, and a small number suffices. The
+        warm-up finds the guide, and its discount rate by pilot runs. If parameters of the noise are
         unknown, make them parameters of the model, and `covariance` of `LinearGaussian` a function
         of them.
     - `num_counts`, `max_trials`: as in `transition_log_density`; not with an `observation`.
@@ -305,7 +307,7 @@ def pmmh(
     check_key(key)
     pilot_key, run_key = jax.random.split(key)
     if observation is None:
-        check_no_record(initial=initial, initial_time=initial_time)
+        check_no_record(initial=initial, initial_time=initial_time, jumps=jumps)
         problem = as_problem(key, parameters, times, observations, num_steps, step_size)
         unknown = problem.theta
 
@@ -322,7 +324,12 @@ def pmmh(
 
     else:
         check_no_bridges(proposal=proposal, num_counts=num_counts, max_trials=max_trials)
-        options = {"num_steps": num_steps, "step_size": step_size, "initial_time": initial_time}
+        options = {
+            "num_steps": num_steps,
+            "step_size": step_size,
+            "initial_time": initial_time,
+            "jumps": jumps,
+        }
         records = as_record_problems(model, times, observations, observation, initial, **options)
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
 
@@ -355,9 +362,10 @@ def _blocks_of_state(
     groups = problem.groups
     if len(state.proposals) != len(groups):
         raise ValueError(
-            f"`init` continues a run with {len(state.proposals)} groups of intervals, but these "
-            f"data have {len(groups)} (0: a record). Pass the same data, `observation`, "
-            "`num_steps` and `step_size` as before, or unknown parameters as `init`."
+            f"`init` is a state of other data: that run had {len(state.proposals)} groups of "
+            f"intervals (0: it had an `observation`), and these data have {len(groups)}. Pass the "
+            "data, `observation`, `num_steps` and `step_size` of that run, or start values of the "
+            "unknown parameters as `init`."
         )
     for group, proposal in zip(groups, state.proposals, strict=True):
         proposal.check(pilot_model, group.intervals)
@@ -373,8 +381,9 @@ def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLi
     shapes = [jax.tree.map(jnp.shape, guide) for guide in (state.guide, likelihood.guide)]
     if state.guide is None or shapes[0] != shapes[1]:
         raise ValueError(
-            "`init` is a state of draws from other records: pass the same `times`, `num_steps` "
-            "and `step_size` as before, or unknown parameters as `init`."
+            "`init` is a state of other records: pass the data, `observation`, `initial_time`, "
+            "`num_steps` and `step_size` of that run, or start values of the unknown parameters as "
+            "`init`."
         )
     return likelihood.guided_by(state.guide)
 

@@ -28,5 +28,6 @@ Changes of coordinates Y = f(X):
 Paths:
 
 - `simulate`: unconditional paths.
+- `jumps`: jumps of the state at known times.
 - `bridge_problem`: the end points, durations and time grid of bridges.
 """

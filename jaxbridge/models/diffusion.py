@@ -223,7 +223,7 @@ class Diffusion(eqx.Module):
 
     def diffusion(self, x: Numbers, time: Numbers | None = None) -> Float[Array, "d m"]:
         """Return σ(x), or σ(x, `time`) if σ depends on time, as a dense matrix: shape (d, d), or
-        (d, m) for m < d.
+        (d, m) for m < d. For m > d return the triangular root of V = σσᵀ, shape (d, d).
 
         **Raises:** `ValueError` without a `time` if the coefficients depend on time.
         """

@@ -240,9 +240,9 @@ class _LampertiFunctions:
 
 @compiled_sooner
 def _tabulated(functions: _LampertiFunctions, params: PyTree) -> _Table:
-    """Return the table for these parameters, from both directions.
+    """Return the table for these parameters, solved from the origin down and up.
 
-    It is compiled once per object and shape of the parameters.
+    One program is compiled for each `functions` and each structure of the parameters.
     """
     params = params if functions.preparation is None else functions.preparation(params)
     below, above = (functions.solve(side, params) for side in (-1, 1))

@@ -17,6 +17,7 @@ from ..engine.entry import public_entry
 from ..engine.times import as_times, check_increasing, check_resolved
 from .diffusion import Diffusion, check_diffusion
 from .dynamics import Dynamics, ito_correction
+from .jumps import Jumps
 from .sigma import AbstractSigma, Diagonal
 
 
@@ -30,6 +31,7 @@ def simulate(
     num_paths: int = 1,
     num_steps: int = 50,
     solver: diffrax.AbstractSolver | None = None,
+    jumps: Jumps | None = None,
 ) -> Float[Array, "num_paths K d"]:
     """Simulate unconditional paths from `times[0]` on.
 
@@ -46,6 +48,8 @@ def simulate(
     - `num_steps`: the number of solver steps between two successive times.
     - `solver`: a diffrax solver that takes fixed steps; by default `diffrax.Heun()`. A Stratonovich
         solver receives the Stratonovich drift. A solver that needs a Lévy area receives it.
+    - `jumps`: known jumps of the state, such as doses. A path has the state before a jump at its
+        time. A jump between two times splits the interval, and each part has `num_steps` steps.
 
     **Returns:** paths, shape (num_paths, K, d), differentiable in forward mode. A path that
     explodes is NaN or infinite from there on.
@@ -69,6 +73,11 @@ def simulate(
     if len(time_axis.shape) != 1 or time_axis.shape[0] < 2:
         raise ValueError(f"`times` must have shape (K,) with K ≥ 2; got {time_axis.shape}.")
     check_increasing(time_axis)
+    jump = jump_map = which = None
+    if jumps is not None:
+        check_instance("jumps", jumps, Jumps, "a `Jumps`")
+        time_axis, is_asked, jump = jumps.split(time_axis)
+        jump_map, which = jumps.map, np.flatnonzero(is_asked)
     num_steps = check_num_steps(num_steps, time_axis.shape[0] - 1)
     start_key, path_key = jax.random.split(key)
     if x0 is None:
@@ -85,7 +94,11 @@ def simulate(
     gaps = time_axis.gaps.astype(x0.dtype)
     if model.depends_on_time:
         check_resolved(clock, elapsed, gaps / num_steps)
-    return _simulate(path_key, model, x0, clock, elapsed[:-1], gaps, num_steps, solver)
+    if jumps is not None:
+        jumps.map.check(x0[0], jumps.inputs[0], model.params)
+    intervals = elapsed[:-1], gaps, jump
+    paths = _simulate(path_key, model, x0, clock, intervals, jump_map, num_steps, solver)
+    return paths if which is None else paths[:, which]
 
 
 def _check_solver(solver: Any) -> None:
@@ -104,13 +117,13 @@ def _check_solver(solver: Any) -> None:
 
 
 @compiled
-def _simulate(key, model, x0, clock, starts, gaps, num_steps, solver):
+def _simulate(key, model, x0, clock, intervals, jump_map, num_steps, solver):
     """Return the paths, from one solution per interval.
 
     Each interval has its own clock, which starts at zero. The noise is a function of the times of
     the steps, which must be distinct in floating point, and scales with their differences.
     """
-    dynamics_at = model.forward_at(x0[0])
+    dynamics_at, (starts, gaps, jumps) = model.forward_at(x0[0]), intervals
     fractions = np.arange(1 + num_steps) / num_steps
     stratonovich = isinstance(solver, diffrax.AbstractStratonovichSolver)
 
@@ -128,7 +141,9 @@ def _simulate(key, model, x0, clock, starts, gaps, num_steps, solver):
     shape = jax.ShapeDtypeStruct((noise_dim,), x0.dtype)
 
     def solve_interval(x, interval):
-        key, start, gap = interval
+        key, (start, gap, jump) = interval
+        if jump is not None:
+            x = jump_map(x, jump, model.params)
         # Unsafe only for steps that are rejected and repeated; here steps are fixed.
         noise = diffrax.UnsafeBrownianPath(shape, key, _levy_area(solver))
         solution = diffrax.diffeqsolve(
@@ -150,7 +165,7 @@ def _simulate(key, model, x0, clock, starts, gaps, num_steps, solver):
 
     def one_path(key, x0):
         keys = jax.random.split(key, len(gaps))
-        _, path = lax.scan(solve_interval, x0, (keys, starts, gaps))
+        _, path = lax.scan(solve_interval, x0, (keys, (starts, gaps, jumps)))
         return jnp.concatenate([x0[None], path])
 
     return jax.vmap(one_path)(jax.random.split(key, len(x0)), x0)

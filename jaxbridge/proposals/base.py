@@ -58,9 +58,9 @@ class WeightedPaths(NamedTuple):
 
     @property
     def log_change(self) -> Float[Array, "I n"]:
-        """Return the log of the factor by which half as many steps change each weight.
+        """Return log(weight with half as many steps / weight) of each path.
 
-        It is the log weight of the coarse path minus that of the path, or D without coarse path.
+        It is `log_coarse - log_weights`, or `log_halving` without coarse paths.
         """
         # A path that was not found has no ratio.
         log_weights = jnp.where(self.found, self.log_weights, 0)

@@ -140,8 +140,8 @@ class Guided(AbstractGuidedProposal):
         d = end.shape[0]
         if self._matrix is not None and self._matrix.shape != (d, d):
             raise ValueError(
-                f"the matrix of `Guided` must have shape ({d}, {d}) for points of {d} dimensions; "
-                f"got shape {self._matrix.shape}."
+                f"`linearisation` of `Guided` must have shape ({d}, {d}) for points of {d} "
+                f"dimensions; got shape {self._matrix.shape}."
             )
         points = end[None]
         if self._along == "path":

@@ -27,10 +27,11 @@ from ..engine.lanes import over_lanes
 from ..engine.resampling import systematic
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
+from ..models.jumps import JumpsLike
 from ..schemes import AbstractStepDensity
 from .cover import cover, covered_start
 from .guided_record import correction
-from .guided_steps import Guide, end_of_step, guided_law, guided_start, target_law
+from .guided_steps import Guide, end_of_step, guided_law, guided_start
 from .initial import Initial, calls_for_cover, initial_law
 from .observations import AbstractObservation, Scalars
 from .problem import RecordProblem
@@ -163,6 +164,7 @@ def forecast(
     num_steps: int | None = None,
     step_size: float | None = None,
     initial_time: Numbers | None = None,
+    jumps: JumpsLike = None,
     density: AbstractStepDensity | None = None,
     throw: bool = False,
 ) -> Forecast:
@@ -177,8 +179,9 @@ def forecast(
     - `model`: the diffusion at fixed parameters. For forecasts with uncertain parameters, call this
         function under `jax.vmap` over draws of a posterior.
     - `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`, `initial_time`,
-        `density`: as in `innovations`, for one record. The observation model must have `sample`;
-        for exact readings pass `LinearGaussian(covariance=0.0)`.
+        `jumps`, `density`: as in `innovations`, for one record. Jumps may be later, too. The
+        observation model must have `sample`; for exact readings pass
+        `LinearGaussian(covariance=0.0)`.
     - `at`: later times, increasing, shape (F,); by default none.
     - `num_particles`: P.
     - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
@@ -231,6 +234,7 @@ def forecast(
         num_steps=num_steps,
         step_size=step_size,
         initial_time=initial_time,
+        jumps=jumps,
         density=density,
         any_constant=True,
     )
@@ -264,7 +268,7 @@ class _Scores(NamedTuple):
 def _run(key: Key[Array, ""], problem: RecordProblem, P: int):
     """Return predicted states, readings, filtered states and scores at all ends of segments."""
     model, d, dtype = problem.model, problem.dim, problem.like.dtype
-    dynamics_at, observation = model.forward_at(problem.like), problem.observation
+    motion, observation = problem.motion(model), problem.observation
     corrected = over_lanes(None, -1)(correction(problem, model))
     zeros = jnp.zeros(d, dtype)
     nothing = Information(zeros, jnp.zeros((d, d), dtype))
@@ -273,7 +277,7 @@ def _run(key: Key[Array, ""], problem: RecordProblem, P: int):
         """Take the model's own step, conditioned on `scalars` at its end if they are given."""
 
         def of_particle(x, zeta):
-            law = target_law(problem.density, dynamics_at, x, step)
+            law = motion.law(x, step)
             guide = Guide(zeros, nothing, zeros, nothing, step)
             knot, log_weight = guided_law(law, guide, scalars).point_and_log_weight(zeta)
             return end_of_step(law, knot, is_last=scalars is not None), log_weight

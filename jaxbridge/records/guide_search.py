@@ -62,7 +62,7 @@ class GuideCheck(NamedTuple):
     - `largest_residual`: largest distance of an observation from the path of the linearisation, in
         standard deviations of the noise. Exact observations do not count. Infinite if the guide is
         not finite.
-    - `num_observed`: number of observed components.
+    - `num_observed`: number of observed numbers at all times, without missing ones.
     """
 
     log_weight: Float[Array, "*R"]
@@ -207,7 +207,7 @@ def _is_linear(problem: RecordProblem, model: Diffusion) -> bool:
     """Return whether the guide is the same along any path."""
     dynamics = model.forward_at(problem.like)(problem.record.times[0])
     cover = calls_for_cover(problem.initial, model, problem.like)
-    return is_linear(dynamics, problem.like) and not cover
+    return is_linear(dynamics, problem.like) and not cover and problem.jumps_are_affine(model)
 
 
 def _best_of_loop(problem: RecordProblem, model: Diffusion, best: Linearised) -> Linearised:
@@ -251,8 +251,7 @@ def _filter_start(problem: RecordProblem, model: Diffusion) -> _SearchStart:
     initial, scalars = initial_law(problem.initial, model, problem.like), problem.scalars(model)
     begin = likeliest(problem.initial, model, initial, split_first(scalars)[0])
     points = extended_kalman_path(
-        problem.density,
-        model.forward_at(problem.like),
+        problem.motion(model),
         initial._replace(mean=begin),
         problem.steps(model),
         scalars,

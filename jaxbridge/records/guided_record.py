@@ -29,7 +29,6 @@ from .guided_steps import (
     guided_law,
     guided_start,
     relative,
-    target_law,
 )
 from .information_filter import information_filter
 from .initial import initial_law, log_ratio
@@ -70,14 +69,14 @@ def guided(
 
     `rate` is the discount rate (`forgetting`), by default none.
     """
-    dynamics_at, record = model.forward_at(problem.like), problem.steps(model)
+    motion, record = problem.motion(model), problem.steps(model)
     initial = initial_law(problem.initial, model, problem.like)
     K, N = problem.num_segments, problem.num_steps
     of_segments = lambda leaf: leaf.reshape(K, N, *leaf.shape[1:])
     here, next_here = of_segments(points[:-1]), of_segments(points[1:])
 
     def linear(point, next_point, step):
-        return linear_step(problem.density, dynamics_at, point, next_point, step)
+        return linear_step(motion, point, next_point, step)
 
     steps = jax.vmap(over_points(linear))(here, next_here, record)
     # Observations are at the ends of segments, which are N points apart.
@@ -167,14 +166,14 @@ def _guided_path(
     problem: RecordProblem, model: Diffusion, guide: Guidance, noise: Float[Array, "points d"]
 ) -> _GuidedPath:
     """Return the path of this noise."""
-    dynamics_at, is_normal = model.forward_at(problem.like), problem.density.is_normal
+    motion, is_normal = problem.motion(model), problem.density.is_normal
     start, log_start = guide.start.point_and_log_weight(noise[0])
     steps = flat(guide.steps), at_every_step(guide.scalars, problem.num_steps)
     is_last = np.arange(1, len(noise)) % problem.num_steps == 0
 
     def one(x, inputs):
         zeta, step, scalars, is_last = inputs
-        law = target_law(problem.density, dynamics_at, x, step.step)
+        law = motion.law(x, step.step)
         knot, log_weight = guided_law(law, step, scalars).point_and_log_weight(zeta)
         point = end_of_step(law, knot, is_last)
         return point, (None if is_normal else knot, log_weight)
@@ -201,15 +200,13 @@ def path_of_knots(
     if problem.density.is_normal:
         return knots
     K, N = problem.num_segments, problem.num_steps
-    dynamics_at = model.forward_at(problem.like)
+    motion = problem.motion(model)
     # Segments begin at known points, so they are lanes.
     of_segments = lambda leaf: jnp.moveaxis(leaf.reshape(K, N, *leaf.shape[1:]), 0, -1)
     inner, steps = jax.tree.map(of_segments, (knots[1:], flat(problem.steps(model))))
 
     def one(x, inputs):
-        of_lane = lambda x, knot, step: end_of_step(
-            target_law(problem.density, dynamics_at, x, step), knot
-        )
+        of_lane = lambda x, knot, step: end_of_step(motion.law(x, step), knot)
         x = over_lanes(-1, -1, -1)(of_lane)(x, *inputs)
         return x, x
 
@@ -260,7 +257,7 @@ def noise_and_log_weight(
     are drawn afresh.
     """
     path = path_of_knots(problem, model, knots)
-    dynamics_at = model.forward_at(problem.like)
+    motion = problem.motion(model)
     scalars = at_every_step(guide.scalars, problem.num_steps)
     hidden = jax.random.normal(key, (len(path), scalars.values.shape[1]), path.dtype)
     solve = functools.partial(solve_root, guide.initial.root)
@@ -270,7 +267,7 @@ def noise_and_log_weight(
     fresh = jax.random.normal(jax.random.fold_in(key, 1), first.shape, path.dtype)
 
     def of_step(x, knot, step, scalars, hidden):
-        law = target_law(problem.density, dynamics_at, x, step.step)
+        law = motion.law(x, step.step)
         step_law = guided_law(law, step, scalars)
         return step_law.noise_and_log_weight(knot, law.solve, hidden)
 

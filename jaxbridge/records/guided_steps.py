@@ -31,8 +31,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..engine.lanes import compute_once
 from ..engine.linalg import dot
-from ..models.dynamics import DynamicsAt
-from ..schemes import AbstractStepDensity, DegenerateLaw, StepLaw, with_transition
+from ..schemes import DegenerateLaw, StepLaw
 from .observations import Scalars
 from .record import Steps
 from .tilted_step import Information, NormalStep, Seen, Tilted, coordinates, given, tilted
@@ -116,14 +115,6 @@ def guided_start(
     step, log_seen, factors = given(step, scalars, 100 * eps * (of_rows + jnp.abs(scalars.values)))
     bent = tilted(step, h)
     return GuidedLaw(point, bent, log_seen, factors)
-
-
-def target_law(
-    density: AbstractStepDensity, dynamics_at: DynamicsAt, x: Float[Array, " d"], step: Steps
-) -> StepLaw | DegenerateLaw:
-    """Return the law of the target's step from x."""
-    density = with_transition(density, step.transition)
-    return density.steps_from(dynamics_at(step.time), x).law(step.dt)
 
 
 def guided_law(law: StepLaw | DegenerateLaw, guide: Guide, scalars: Scalars | None) -> GuidedLaw:

@@ -22,6 +22,7 @@ from ..engine.compiled import compiled
 from ..engine.entry import public_entry
 from ..engine.verdict import Fault, Verdict
 from ..models.diffusion import Diffusion
+from ..models.jumps import JumpsLike
 from ..schemes import AbstractStepDensity
 from .guide_search import GuideCheck
 from .guided_record import guided, path_and_log_weight
@@ -172,6 +173,7 @@ def innovations(
     num_steps: int | None = None,
     step_size: float | None = None,
     initial_time: Numbers | None = None,
+    jumps: JumpsLike = None,
     density: AbstractStepDensity | None = None,
 ) -> Innovations:
     """Return the paths of one or several records as smooth functions of parameters and noise.
@@ -200,6 +202,9 @@ def innovations(
     - `num_steps`, `step_size`: pass one of the two, the number of steps between two times, by
         default 10, or the maximum step size.
     - `initial_time`: time of `initial`, if it is before the first of `times`.
+    - `jumps`: known jumps of the state, such as doses, as a `Jumps`; for several records also a
+        list with one entry per record. An observation at the time of a jump is taken before it. A
+        jump between two times splits the interval, and each part has `num_steps` steps.
     - `density`: step density. The default depends on the model:
         - linear drift and constant σ, not time-dependent: exact steps;
         - other models with constant σ: `ItoTaylorDensity()`;
@@ -230,6 +235,7 @@ def innovations(
         num_steps=num_steps,
         step_size=step_size,
         initial_time=initial_time,
+        jumps=jumps,
         density=density,
     )
     points, check = linearisations(records, model)

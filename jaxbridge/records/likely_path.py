@@ -21,7 +21,7 @@ from ..engine.lanes import over_points
 from ..engine.linalg import dot, matvec
 from ..models.diffusion import Diffusion
 from ..schemes import solve_root
-from .guided_steps import guided_start, relative, target_law
+from .guided_steps import guided_start, relative
 from .information_filter import information_filter
 from .initial import initial_law
 from .linearisation import LinearisedStep, linear_step
@@ -79,10 +79,10 @@ def _cost(
     problem: RecordProblem, model: Diffusion, path: Float[Array, "points d"]
 ) -> Float[Array, ""]:
     """Return J. It is infinite for a path that is not finite or leaves the state space."""
-    dynamics_at, N = model.forward_at(problem.like), problem.num_steps
+    motion, N = problem.motion(model), problem.num_steps
 
     def of_step(x, x_next, step):
-        law = target_law(problem.density, dynamics_at, x, step)
+        law = motion.law(x, step)
         noise = law.solve(x_next - law.mean)
         return dot(noise, noise)
 
@@ -114,13 +114,13 @@ def _next_path(
     damping: Float[Array, ""],
 ) -> Float[Array, "points d"]:
     """Return the path of the next iteration, from the present one."""
-    dynamics_at, steps = model.forward_at(problem.like), problem.steps(model)
+    motion, steps = problem.motion(model), problem.steps(model)
     K, N = problem.num_segments, problem.num_steps
     # Mean, relative to u_last, and standard deviation of the noise with the penalty.
     mean_share, scale = damping / (1 + damping), 1 / jnp.sqrt(1 + damping)
 
     def linear(point, next_point, step):
-        return linear_step(problem.density, dynamics_at, point, next_point, step)
+        return linear_step(motion, point, next_point, step)
 
     linearised = over_points(linear)(path[:-1], path[1:], flat(steps))
     away = -linearised.shift  # Λ u, for the noise u of the last path
@@ -137,7 +137,7 @@ def _next_path(
 
     def one(x, inputs):
         next_point, away, step, next_h, scalars = inputs
-        law = target_law(problem.density, dynamics_at, x, step)
+        law = motion.law(x, step)
         pushed = NormalStep(law.mean + mean_share * away - next_point, scale * law.root)
         pushed, _, _ = given(pushed, scalars)
         bent = tilted(pushed, next_h)

@@ -16,8 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..engine.linalg import matmul, matvec
-from ..models.dynamics import DynamicsAt
-from ..schemes import AbstractStepDensity, with_transition
+from .motion import Motion
 from .observations import Scalars
 from .record import Steps
 from .segments import at_every_step, flat, split_first
@@ -36,19 +35,14 @@ class LinearisedStep(NamedTuple):
 
 
 def linear_step(
-    density: AbstractStepDensity,
-    dynamics_at: DynamicsAt,
+    motion: Motion,
     point: Float[Array, " d"],
     next_point: Float[Array, " d"],
     step: Steps,
 ) -> LinearisedStep:
-    """Return the step from `point`, linearised there, relative to both points."""
-    dynamics = dynamics_at(step.time)
-    density = with_transition(density, step.transition)
-    law = density.steps_from(dynamics, point).law(step.dt)
-    F = jax.jacfwd(dynamics.drift)(point)
-    decay = density.linear_step(F, jnp.zeros_like(F), step.dt).decay
-    return LinearisedStep(decay, law.mean - next_point, law.root)
+    """Return the step linearised at `point`, from u = x - `point` to u' = x' - `next_point`."""
+    law = motion.law(point, step)
+    return LinearisedStep(motion.decay(point, step), law.mean - next_point, law.root)
 
 
 def filtered(
@@ -69,8 +63,7 @@ def filtered(
 
 
 def extended_kalman_path(
-    density: AbstractStepDensity,
-    dynamics_at: DynamicsAt,
+    motion: Motion,
     initial: NormalStep,
     steps: Steps,
     scalars: Scalars,
@@ -88,7 +81,7 @@ def extended_kalman_path(
 
     def step(state, inputs):
         (mean, covariance), (of_step, step_scalars) = state, inputs
-        law = linear_step(density, dynamics_at, mean, jnp.zeros_like(mean), of_step)
+        law = linear_step(motion, mean, jnp.zeros_like(mean), of_step)
         spread = matmul(law.root, law.root.T)
         predicted = matmul(matmul(law.decay, covariance), law.decay.T) + spread
         before = checked((law.shift, predicted), state)

@@ -36,6 +36,7 @@ from ..engine.verdict import (
 )
 from ..exact import log_mean_and_error, transition_log_density
 from ..models.diffusion import Diffusion
+from ..models.jumps import JumpsLike
 from ..schemes import (
     AbstractStepDensity,
     StepError,
@@ -135,9 +136,10 @@ class LogLikelihood(AbstractResult):
 
     @property
     def unexplained(self) -> Int[Array, ""]:
-        """Return the index of the first observation that no particle explains, or -1.
+        """Return the first index at which `effective_sample_size` is 0, or -1.
 
-        The index is that in `effective_sample_size`, where an earlier `initial_time` has index 0.
+        No particle explains the observation there. An earlier `initial_time` has index 0. Without
+        an `observation`, index k is the transition to observation k + 1.
         """
         lost = self.effective_sample_size == 0
         return jnp.where(jnp.any(lost), jnp.argmax(lost), -1)
@@ -156,10 +158,10 @@ class LogLikelihood(AbstractResult):
         """Return the faults of the estimate, each with a remedy.
 
         - an observation that no particle explains;
-        - few effective particles, or filters that disagree;
+        - few effective particles, filters that disagree, or a single filter;
         - heavy tails of the weights;
         - a poor guide, together with one of the faults above;
-        - lost particles;
+        - lost particles, if they may change `value` by more than 0.05 and the standard error;
         - a discretisation error that is unknown or too uncertain, or that dominates and exceeds
             0.05;
         - a value that is not finite.
@@ -227,6 +229,7 @@ def log_likelihood(
     num_steps: int | None = None,
     step_size: float | None = None,
     initial_time: Numbers | None = None,
+    jumps: JumpsLike = None,
     density: AbstractStepDensity | None = None,
     throw: bool = False,
 ) -> LogLikelihood:
@@ -238,12 +241,13 @@ def log_likelihood(
 
     - `key`: typed key.
     - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
-        `initial_time`, `density`: as in `innovations`. Pass several independent records as lists of
-        `times` and `observations`, or with a leading axis.
+        `initial_time`, `jumps`, `density`: as in `innovations`. Pass several independent records as
+        lists of `times` and `observations`, or with a leading axis.
     - Without an `observation` the state is observed exactly. Then the result is the sum of the log
         transition densities by `transition_log_density(proposal="auto")`, given the first state.
         Values must not be missing, and coefficients must not depend on time. `num_steps` is 50 by
-        default. Do not pass `step_size`, `initial`, `initial_time`, `density` or `num_filters`.
+        default. Do not pass `step_size`, `initial`, `initial_time`, `jumps`, `density` or
+        `num_filters`.
     - `num_particles`: particles per filter, by default 100; without an `observation` weighted paths
         per interval.
     - `num_filters`: number of independent filters, by default 8. Their spread gives the error.
@@ -267,12 +271,12 @@ def log_likelihood(
     check_key(key)
     num_particles = check_count("num_particles", num_particles)
     if observation is None:
-        for_records = (initial, initial_time, density, num_filters)
+        for_records = (initial, initial_time, jumps, density, num_filters)
         if any(value is not None for value in for_records):
             raise ValueError(
                 "without an `observation` the state is observed exactly, and "
                 "`transition_log_density` computes the result: leave out `initial`, "
-                "`initial_time`, `density` and `num_filters`, or pass an `observation`."
+                "`initial_time`, `jumps`, `density` and `num_filters`, or pass an `observation`."
             )
         result = _exact_log_likelihood(
             key, model, times, observations, num_particles, num_steps, step_size
@@ -280,7 +284,12 @@ def log_likelihood(
         return throw_where_untrustworthy(result, "value", model) if throw else result
     num_filters = check_count("num_filters", 8 if num_filters is None else num_filters)
     arguments = (model, times, observations, observation, initial)
-    options = {"step_size": step_size, "initial_time": initial_time, "density": density}
+    options = {
+        "step_size": step_size,
+        "initial_time": initial_time,
+        "density": density,
+        "jumps": jumps,
+    }
     records = as_record_problems(*arguments, num_steps=num_steps, **options)
     size = num_filters, num_particles
     problem = records.stacked

@@ -24,7 +24,7 @@ from ..engine.resampling import systematic
 from ..models.diffusion import Diffusion
 from .cover import cover, covered_start
 from .guided_record import Guidance, correction
-from .guided_steps import end_of_step, guided_law, target_law
+from .guided_steps import end_of_step, guided_law
 from .initial import calls_for_cover, log_ratio
 from .problem import RecordProblem
 from .segments import split_first, split_last
@@ -98,7 +98,7 @@ def run_filters(
     """
     R, P = size
     d, dtype = problem.dim, problem.like.dtype
-    (first_row, rows), dynamics_at = split_first(problem.rows), model.forward_at(problem.like)
+    (first_row, rows), motion = split_first(problem.rows), problem.motion(model)
     corrected = over_lanes(None, -1)(correction(problem, model))
     most = 0.01 / jnp.finfo(dtype).eps
 
@@ -119,7 +119,7 @@ def run_filters(
 
     def step_particles(x, zeta, step, scalars):
         def of_particle(x, zeta):
-            law = target_law(problem.density, dynamics_at, x, step.step)
+            law = motion.law(x, step.step)
             knot, log_weight = guided_law(law, step, scalars).point_and_log_weight(zeta)
             return end_of_step(law, knot, is_last=scalars is not None), log_weight
 

@@ -35,7 +35,7 @@ from ..exact import acceptance_rate
 from ..models.diffusion import Diffusion
 from ..schemes import solve_root
 from .guided_record import Guidance, correction
-from .guided_steps import Guide, end_of_step, guided_law, guided_start, target_law
+from .guided_steps import Guide, end_of_step, guided_law, guided_start
 from .information_filter import information_filter
 from .initial import log_ratio
 from .linearisation import LinearisedStep
@@ -150,6 +150,10 @@ def blocks_of(
     next_here = points[np.where(outside[:, None], edge, number + 1)]
     lengths = jax.tree.map(lambda leaf: leaf[number], flat(guide.steps.step))
     lengths = lengths._replace(dt=jnp.where(outside[:, None], 0, lengths.dt))
+    if lengths.jump is not None:
+        jump = lengths.jump
+        jump = jump._replace(exists=jump.exists & ~outside[:, None])
+        lengths = lengths._replace(jump=jump)
     dtype = points.dtype
     no_step = LinearisedStep(jnp.eye(d, dtype=dtype), *2 * [jnp.zeros((), dtype)])
     steps = jax.tree.map(
@@ -383,16 +387,16 @@ def _new_points(
 ) -> tuple[_PathPair, Float[Array, "J N d lanes"]]:
     """Sample the knots of the new paths; compute the log weights of the old and new paths."""
     spread = functools.partial(_for_chains, lanes.start.shape[-1] // blocks.segment.shape[1])
-    dynamics_at = model.forward_at(problem.like)
+    motion = problem.motion(model)
     hidden, corrected = _no_noise(blocks), _corrections(problem, model, spread)
 
     def step_of(old, new, old_knot, eta, step, end, scalars, rho, beta):
         guide, is_last = step.to(end), scalars is not None
-        law = target_law(problem.density, dynamics_at, old, guide.step)
+        law = motion.law(old, guide.step)
         here = guided_law(law, guide, scalars)
         zeta, log_old = here.noise_and_log_weight(old_knot, law.solve, hidden)
         old = end_of_step(law, old_knot, is_last)
-        law = target_law(problem.density, dynamics_at, new, guide.step)
+        law = motion.law(new, guide.step)
         there = guided_law(law, guide, scalars)
         knot, log_new = there.point_and_log_weight(_new_noise(zeta, eta, rho, beta))
         return _PathPair(old, end_of_step(law, knot, is_last), log_old, log_new), knot

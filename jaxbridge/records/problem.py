@@ -13,6 +13,7 @@ from ..coupling import Stationary
 from ..engine.checks import is_traced
 from ..engine.times import check_resolved
 from ..models.diffusion import Diffusion, check_diffusion
+from ..models.jumps import JumpMap
 from ..schemes import (
     AbstractStepDensity,
     check_step_density,
@@ -20,6 +21,7 @@ from ..schemes import (
     most_accurate_density,
 )
 from .initial import Initial, as_initial, bound, check_initial
+from .motion import Motion
 from .observations import (
     AbstractObservation,
     LinearGaussian,
@@ -37,7 +39,7 @@ _MOST_TRIED = 8
 class RecordProblem(eqx.Module):
     """Record of a model, with the observation model and the law of the first state.
 
-    `density` is the density of the steps.
+    `density` is the density of the steps, and `jump_map` the map of the jumps, if there are any.
     """
 
     model: Diffusion
@@ -45,6 +47,7 @@ class RecordProblem(eqx.Module):
     observation: AbstractObservation
     initial: Initial
     density: AbstractStepDensity
+    jump_map: JumpMap | None
     dim: int = eqx.field(static=True)
 
     @property
@@ -82,7 +85,18 @@ class RecordProblem(eqx.Module):
             dynamics = model.forward_at(self.like)(time)
             return known_transition(self.density, dynamics, self.like, dt)
 
-        return Steps(dt, times, jax.vmap(jax.vmap(transition))(dt, times))
+        jumps = self.record.jumps_of_steps()
+        return Steps(dt, times, jax.vmap(jax.vmap(transition))(dt, times), jumps)
+
+    def jumps_are_affine(self, model: Diffusion) -> bool:
+        """Return whether each jump is an affine function of the state."""
+        if self.jump_map is None or self.record.jump is None:
+            return True
+        return self.jump_map.is_affine(self.like, self.record.jump, model.params)
+
+    def motion(self, model: Diffusion) -> Motion:
+        """Return the law of the steps at these parameters."""
+        return Motion(self.density, model.forward_at(self.like), self.jump_map, model.params)
 
     def scalars(self, model: Diffusion) -> Scalars:
         """Return the observations as independent scalars, leading axis K + 1."""
@@ -96,6 +110,7 @@ def problem_of(
     observation: AbstractObservation,
     initial: Initial,
     density: AbstractStepDensity | None = None,
+    jump_map: JumpMap | None = None,
     any_constant: bool = False,
     normal_steps: bool = False,
 ) -> RecordProblem:
@@ -133,10 +148,13 @@ def problem_of(
     check_initial(initial, model, like)
     check_domain(model, observation, record)
     check_clock(model, observation, record)
+    if jump_map is not None:
+        assert record.jump is not None
+        jump_map.check(like, record.jump.inputs[0], model.params)
     density = check_step_density(density)
     if density is None:
         density = most_accurate_density(model, like, normal_steps)
-    return RecordProblem(model, record, observation, initial, density, dim)
+    return RecordProblem(model, record, observation, initial, density, jump_map, dim)
 
 
 def _check_dimension(

@@ -25,6 +25,7 @@ from ..engine.checks import (
 )
 from ..engine.compiled import compiled_sooner
 from ..engine.times import Clock, Times, as_times, check_increasing
+from ..models.jumps import Jump, Jumps
 from ..models.linear import LinearTransition
 from ..schemes import num_splits, remaining_after_splits
 
@@ -37,12 +38,14 @@ _FEWEST_SPLITS = 3
 class Steps(NamedTuple):
     """Lengths δ of steps, the times at their middles, and their transitions if these are known.
 
-    Time-dependent coefficients are evaluated at the middles.
+    Time-dependent coefficients are evaluated at the middles. `jump` is the possible jump at the
+    beginning of a step, `None` without `jumps`.
     """
 
     dt: Float[Array, "*steps"]
     time: Float[Array, "*steps"]
     transition: LinearTransition | None
+    jump: Jump | None
 
 
 class Record(eqx.Module):
@@ -53,6 +56,7 @@ class Record(eqx.Module):
     - `dt`: lengths of the steps, shape (K, N). A path does not move in a step of length zero.
     - `values`: observations at the ends of segments, shape (K + 1, m), NaN for missing values.
     - `which`: index of the end of a segment for each observation.
+    - `jump`: possible jump at the beginning of each segment, leading axis K; `None` without jumps.
     - `lengths`: lengths of the steps of a segment, before any coarsening, in units of equal steps.
     """
 
@@ -61,6 +65,7 @@ class Record(eqx.Module):
     dt: Float[Array, "K N"]
     values: Float[Array, "ends m"]
     which: Int[Array, " n"]
+    jump: Jump | None
     lengths: tuple[float, ...] = eqx.field(static=True)
 
     @property
@@ -101,6 +106,20 @@ class Record(eqx.Module):
         """Return the times at the middles of all steps."""
         return self.clock(self._beginnings() + self.dt / 2)
 
+    def jumps_of_steps(self) -> Jump | None:
+        """Return the possible jumps at the beginnings of all steps, leading axes (K, N).
+
+        The jump of a segment is in its first step of positive length.
+        """
+        if self.jump is None:
+            return None
+        moves = self.dt > 0
+        is_first = moves & (jnp.cumsum(moves, axis=1) == 1)
+        inputs = jnp.broadcast_to(
+            self.jump.inputs[:, None], (*self.dt.shape, self.jump.inputs.shape[-1])
+        )
+        return Jump(inputs, self.jump.exists[:, None] & is_first)
+
     def _beginnings(self) -> Float[Array, "K N"]:
         """Return the times at which steps begin, since the first time."""
         within = jnp.cumsum(self.dt, axis=1) - self.dt  # begins with exactly zero
@@ -139,6 +158,7 @@ def as_records(
     num_steps: int | None,
     step_size: float | None,
     initial_time: Numbers | None = None,
+    jumps: list[Jumps | None] | None = None,
 ) -> list[Record]:
     """Validate times and observations; split the intervals of each record into segments and steps.
 
@@ -148,6 +168,7 @@ def as_records(
     - `num_steps`, `step_size`: number of steps between two times, or their maximum length. N is the
         same for all records.
     - `initial_time`: time of the initial law, if it is before the first time.
+    - `jumps`: those of each record, in a list.
 
     **Raises:** `ValueError` that names the invalid time or observation.
     """
@@ -159,21 +180,49 @@ def as_records(
             "several records must have the same number of observed components (columns of "
             f"`observations`); got {widths}."
         )
+    all_times, observed, at_gaps = zip(*_with_jumps(checked, jumps), strict=True)
     with jax.ensure_compile_time_eval():  # so that concrete intervals stay concrete inside `jit`
-        gaps = jnp.concatenate([times.gaps for times, _ in checked])
+        gaps = jnp.concatenate([times.gaps for times in all_times])
     num_steps, segments = _segments(gaps, num_steps, step_size)
-    ends = np.cumsum([len(times.gaps) for times, _ in checked])[:-1]
+    ends = np.cumsum([len(times.gaps) for times in all_times])[:-1]
     counts = np.split(segments, ends)
     return [
         _split_into_segments(
             *times.clock(_dtype(times, values)),
             times.gaps,
             values,
+            jump,
             num_steps,
             tuple(segment_counts.tolist()),
+            is_observed,
         )
-        for (times, values), segment_counts in zip(checked, counts, strict=True)
+        for times, (_, values), is_observed, jump, segment_counts in zip(
+            all_times, checked, observed, at_gaps, counts, strict=True
+        )
     ]
+
+
+def _with_jumps(
+    checked: list[tuple[Times, Array]], jumps: list[Jumps | None] | None
+) -> list[tuple[Times, tuple[bool, ...], Jump | None]]:
+    """Add the times of the jumps of each record to its times.
+
+    **Returns:** for each record all times, whether each is one of the record, and the possible jump
+    at the beginning of each interval between them.
+    """
+    if jumps is None:
+        return [(times, times.shape[0] * (True,), None) for times, _ in checked]
+    example = next(entry for entry in jumps if entry is not None)
+    results = []
+    for (times, _), entry in zip(checked, jumps, strict=True):
+        if entry is not None:
+            all_times, is_observed, jump = entry.split(times)
+        else:
+            all_times, is_observed = times, np.ones(times.shape[0], bool)
+            none = jnp.zeros(len(times.gaps), bool)
+            jump = Jump(jnp.repeat(example.inputs[:1], len(none), axis=0), none)
+        results.append((all_times, tuple(is_observed.tolist()), jump))
+    return results
 
 
 def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, Numbers]]:
@@ -304,21 +353,33 @@ def _split_into_segments(
     clock: Clock,
     since: Float[Array, " n"],
     gaps: Float[Array, " gaps"],
-    values: Float[Array, "n m"],
+    values: Float[Array, "observed m"],
+    jump: Jump | None,
     num_steps: int,
     segments: tuple[int, ...],
+    is_observed: tuple[bool, ...],
 ) -> Record:
-    """Return the record with the given number of segments in each interval between two times."""
+    """Return the record with the given number of segments in each interval between two times.
+
+    `is_observed` states which of the times have a row of `values`; `jump` has the intervals first.
+    """
     dtype = since.dtype
     which = np.concatenate([[0], np.cumsum(segments)])
-    ends = jnp.full((which[-1] + 1, values.shape[1]), jnp.nan, dtype).at[which].set(values)
+    num_ends, begins = which[-1] + 1, which[:-1]
+    which = which[np.asarray(is_observed)]
+    if jump is not None:
+        # Other segments than the first of an interval have arbitrary inputs.
+        gap = np.repeat(np.arange(len(segments)), segments)
+        is_first = np.isin(np.arange(num_ends - 1), begins)
+        jump = Jump(jump.inputs[gap].astype(dtype), jump.exists[gap] & is_first)
+    ends = jnp.full((num_ends, values.shape[1]), jnp.nan, dtype).at[which].set(values)
     gap = np.repeat(np.arange(len(segments)), segments)
     within = np.concatenate([np.arange(n) for n in segments])
     dt = (gaps / jnp.asarray(np.array(segments) * num_steps, gaps.dtype))[gap].astype(dtype)
     start = since[gap] + jnp.asarray(within * num_steps, dtype) * dt
     dt = jnp.broadcast_to(dt[:, None], (len(dt), num_steps))
     since = jnp.append(start, since[-1])
-    return Record(clock, since, dt, ends, jnp.asarray(which), num_steps * (1.0,))
+    return Record(clock, since, dt, ends, jnp.asarray(which), jump, num_steps * (1.0,))
 
 
 def _unmask(name: str, values: Numbers) -> Numbers:

@@ -14,9 +14,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from ..engine.arguments import as_sequence, check_instance
 from ..engine.checks import Numbers
 from ..engine.compiled import compiled_sooner
 from ..models.diffusion import Diffusion
+from ..models.jumps import JumpMap, Jumps, JumpsLike
 from ..schemes import AbstractStepDensity
 from .guide_search import GuideCheck, linearised
 from .initial import Initial
@@ -54,6 +56,7 @@ class Records(eqx.Module):
                 dt=record.dt[:K],
                 values=record.values[: K + 1],
                 which=record.which[:num_times],
+                jump=jax.tree.map(lambda leaf: leaf[:K], record.jump),
             )
         return dataclasses.replace(self.stacked, record=record)
 
@@ -112,6 +115,7 @@ def as_record_problems(
     step_size: float | None = None,
     initial_time: Numbers | None = None,
     density: AbstractStepDensity | None = None,
+    jumps: JumpsLike = None,
     **limits: bool,
 ) -> Records:
     """Validate the arguments common to all functions that take one or several records.
@@ -121,8 +125,9 @@ def as_record_problems(
     **Raises:** `ValueError` and `TypeError` for invalid arguments.
     """
     pairs = split_records(times, observations)
-    records = as_records(pairs, num_steps, step_size, initial_time)
-    problem = problem_of(model, records[0], observation, initial, density, **limits)
+    jump_map, of_records = _as_jumps(jumps, len(pairs))
+    records = as_records(pairs, num_steps, step_size, initial_time, of_records)
+    problem = problem_of(model, records[0], observation, initial, density, jump_map, **limits)
     for record in records[1:]:
         check_domain(model, observation, record)
         check_clock(model, observation, record)
@@ -132,6 +137,36 @@ def as_record_problems(
     are_listed = are_several(times, observations)
     stacked_problem = dataclasses.replace(problem, record=record)
     return Records(stacked_problem, num_times, num_segments, are_listed)
+
+
+def _as_jumps(
+    jumps: JumpsLike, num_records: int
+) -> tuple[JumpMap | None, list[Jumps | None] | None]:
+    """Return the map of the jumps, and the jumps of each record.
+
+    **Raises:** `ValueError` and `TypeError` for an invalid argument.
+    """
+    if jumps is None:
+        return None, None
+    if isinstance(jumps, Jumps):
+        return jumps.map, num_records * [jumps]
+    entries = as_sequence("jumps", jumps, "a `Jumps`, or a list with one entry per record")
+    given = [entry for entry in entries if entry is not None]
+    for entry in given:
+        check_instance("jumps", entry, Jumps, "a `Jumps`, or a list of them and of `None`")
+    if len(entries) != num_records or not given:
+        raise ValueError(
+            f"`jumps` must be a `Jumps`, or a list with one entry for each of {num_records} "
+            "records: a `Jumps`, or `None` for a record without them. Got "
+            f"{len(entries)} entries, {len(given)} of them `Jumps`."
+        )
+    first = given[0]
+    if any(entry.map != first.map for entry in given):
+        raise ValueError("all `jumps` must have the same function `apply`: define it once.")
+    widths = [entry.inputs.shape[1] for entry in given]
+    if len(set(widths)) > 1:
+        raise ValueError(f"the `inputs` of all `jumps` must have as many columns; got {widths}.")
+    return first.map, list(entries)
 
 
 # Compiled as one program, because JAX would otherwise compile one for every array.
@@ -171,6 +206,9 @@ def _padded(record: Record, num_segments: int, num_times: int) -> Record:
         jnp.pad(record.dt, ((0, more), (0, 0))),
         jnp.pad(record.values, ((0, more), (0, 0)), constant_values=jnp.nan),
         jnp.pad(record.which, (0, num_times - len(record.which))),
+        jax.tree.map(
+            lambda leaf: jnp.pad(leaf, ((0, more), *(leaf.ndim - 1) * [(0, 0)])), record.jump
+        ),
         record.lengths,
     )
 

@@ -23,6 +23,7 @@ from ..engine.entry import public_entry
 from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
+from ..models.jumps import JumpsLike
 from ..models.sigma import columns_of
 from ..proposals import AbstractProposal, ProposalLike, as_proposal
 from ..schemes import (
@@ -286,6 +287,7 @@ def smooth(
     num_steps: int | None = None,
     step_size: float | None = None,
     initial_time: Numbers | None = None,
+    jumps: JumpsLike = None,
     density: AbstractStepDensity | None = None,
     progress_meter: diffrax.AbstractProgressMeter | None = None,
     throw: bool = False,
@@ -299,8 +301,8 @@ def smooth(
 
     - `key`: typed key.
     - `model`, `times`, `observations`, `observation`, `initial`, `num_steps`, `step_size`,
-        `initial_time`, `density`: as in `innovations`. Several records run one after the other, by
-        one compiled program unless there is a `proposal`.
+        `initial_time`, `jumps`, `density`: as in `innovations`. Several records run one after the
+        other, by one compiled program unless there is a `proposal`.
     - `num_draws`: number of draws per chain.
     - `num_warmup`: number of iterations before the draws, which adapt the size of moves.
     - `num_chains`: number of chains, which start from independent guided paths.
@@ -339,11 +341,21 @@ def smooth(
     num_chains = check_count("num_chains", num_chains)
     if proposal is None and num_proposals is not None:
         raise ValueError("`num_proposals` is for a `proposal`: pass one, or omit `num_proposals`.")
+    if proposal is not None and jumps is not None:
+        raise ValueError(
+            "bridges of a `proposal` have no jumps: leave out `proposal`, so that paths are guided "
+            "by the whole record, or leave out `jumps`."
+        )
     if proposal is not None and block_length is not None:
         raise ValueError("`block_length` is for paths without a `proposal`: omit one of the two.")
     block_length = check_count("block_length", 10 if block_length is None else block_length, 2)
     arguments = (model, times, observations, observation, initial)
-    options = {"step_size": step_size, "initial_time": initial_time, "density": density}
+    options = {
+        "step_size": step_size,
+        "initial_time": initial_time,
+        "density": density,
+        "jumps": jumps,
+    }
     records = as_record_problems(
         *arguments,
         num_steps=num_steps,
@@ -554,13 +566,25 @@ def _log_halving(
     place = jnp.arange(K)[:, None] * N + jnp.arange(N + 1)
 
     def of_draw(path):
-        segments = path[:, place].reshape(chains * K, N + 1, d)
+        segments = path[:, place]
+        if problem.jump_map is not None:  # the diffusion begins after the jump
+            segments = segments.at[:, :, 0].set(_after_jumps(problem, segments[:, :, 0]))
+        segments = segments.reshape(chains * K, N + 1, d)
         of_segments = log_halving_of_paths(problem.density, dynamics, dt, segments, time)
         return of_segments.reshape(chains, K)
 
     # One draw of all chains at a time, to save memory.
     D = jnp.moveaxis(lax.map(of_draw, jnp.moveaxis(paths, 1, 0)), 0, 1)
     return jnp.where(has_length(problem), D, 0)
+
+
+def _after_jumps(
+    problem: RecordProblem, starts: Float[Array, "chains K d"]
+) -> Float[Array, "chains K d"]:
+    """Return the states after the jumps at the beginnings of all segments."""
+    motion = problem.motion(problem.model)
+    of_segments = jax.vmap(lambda x, jump: motion.jump_map(x, jump, motion.params))
+    return jax.vmap(of_segments, (0, None))(starts, problem.record.jump)
 
 
 def _step_error_of_mean(

@@ -17,7 +17,6 @@ from ..engine.lanes import over_lanes
 from ..engine.linalg import dot, matvec
 from ..engine.resampling import systematic
 from ..models.diffusion import Diffusion
-from .guided_steps import target_law
 from .initial import initial_law, log_ratio
 from .observations import Scalars
 from .problem import RecordProblem
@@ -37,7 +36,7 @@ def tracking_path(
     particles are lost.
     """
     P, N, (d,), dtype = _NUM_PARTICLES, problem.num_steps, problem.like.shape, problem.like.dtype
-    dynamics_at, inside = model.forward_at(problem.like), model.state_space()
+    motion, inside = problem.motion(model), model.state_space()
     first, later_scalars = split_first(problem.scalars(model))
     initial = initial_law(problem.initial, model, problem.like)
 
@@ -52,7 +51,7 @@ def tracking_path(
         zeta, step = inputs
 
         def of_particle(x, zeta):
-            law = target_law(problem.density, dynamics_at, x, step)
+            law = motion.law(x, step)
             return law.mean + matvec(law.root, zeta)
 
         x = over_lanes(-1, -1)(of_particle)(x, zeta)

@@ -77,8 +77,8 @@ class Milstein(AbstractScheme):
             if y.shape[0] == 1:
                 return sigma.as_matrix(1, y.dtype)[0]
             raise ValueError(
-                "`Milstein` needs scalar or diagonal noise, but `diffusion` returns a matrix: "
-                "return the diagonal of σ, shape (d,), or use `Heun` or `Euler`."
+                "`Milstein` needs scalar or diagonal noise, but `diffusion` returns a matrix: if σ "
+                "is diagonal, return its diagonal, shape (d,); otherwise use `Heun` or `Euler`."
             )
 
         # σ_i depends on x_i alone, so one derivative along (1, ..., 1) gives all ∂_iσ_i.

@@ -320,7 +320,10 @@ def unknown_where(unknown: Bool[Array, ""], error: StepError) -> StepError:
 
 
 def share_of_known_order(share: Float[Array, "*I"]) -> Float[Array, "*I"]:
-    """Return the share, at most 1: an unknown or guessed one becomes that of order p = 1."""
+    """Return the error divided by its change under half as many steps, at most 1.
+
+    An unknown or guessed share is above 1. It becomes 1, that of order p = 1.
+    """
     return jnp.minimum(share, 1)
 
 

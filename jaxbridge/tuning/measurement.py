@@ -261,8 +261,9 @@ def finest(key: Key[Array, ""], scene: Scene, run: Run) -> Estimate:
     words = limit.proposal.describe()
     if not np.all(np.isfinite(fine.mean) & np.isfinite(coarse.mean)):
         raise ValueError(
-            f"the reference run ({words}, {run.num_steps} steps) found no bridges: choose other "
-            "`proposals`, or pass known values as `reference` or `log_density`."
+            f"the reference runs ({words}, {run.num_steps} and {half.num_steps} steps) gave a mean "
+            "that is not finite: no bridges were found, or `fn` is not finite. Choose other "
+            "`proposals`, check `fn`, or pass known values as `reference` or `log_density`."
         )
     # The squared difference minus its expectation under pure Monte Carlo noise.
     noise = fine.error**2 + coarse.error**2

@@ -240,7 +240,8 @@ def coupling_pilots(
         )
     if problem.batched:
         raise ValueError(
-            "a start law is chosen for one interval: pass `start` and `end` of shape (d,)."
+            "a start law is chosen for one interval: pass `start` and `end` of shape (d,), and "
+            f"`duration` of shape (); got {len(problem.intervals.duration)} intervals in an axis."
         )
     (start,), (end,), (duration,) = problem.intervals
     intervals, num_steps, d = problem.intervals, problem.num_steps, start.shape[0]

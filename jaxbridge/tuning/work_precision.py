@@ -155,7 +155,8 @@ def work_precision(
     problem = bridge_problem(model, start, end, duration, 1)
     if problem.batched:
         raise ValueError(
-            "`work_precision` takes one interval: pass `start` and `end` of shape (d,)."
+            "`work_precision` takes one interval: pass `start` and `end` of shape (d,), and "
+            f"`duration` of shape (); got {len(problem.intervals.duration)} intervals in an axis."
         )
     num_steps = as_sequence("num_steps", num_steps, "numbers of steps")
     methods = as_sequence("methods", methods, "methods")

@@ -109,7 +109,7 @@ class Quantity(eqx.Module):
     - `name`: the name in errors.
     - `value`: numbers, or a function `params -> numbers` or `(params, t) -> numbers`.
 
-    **Raises:** `TypeError` for other values.
+    **Raises:** `TypeError` for anything but numbers or such a function; `ValueError` for NaN.
 
     **Example:**
 

@@ -112,5 +112,8 @@ class NegativeBinomialCounts(AbstractComponents):
         check_counts(data)
 
     def _size(self, y, params, time):
-        """Return r; beyond a bound the counts are Poisson counts in all digits."""
+        """Return r of each component, at most `MOST`.
+
+        With a larger r the counts equal Poisson counts in all digits.
+        """
         return jnp.minimum(self.size.for_components(params, time, len(y)), MOST)
