@@ -107,6 +107,7 @@ from .models.seasonal import SeasonalParams, seasonal_ornstein_uhlenbeck
 from .models.simulate import simulate
 from .models.transform import Transformed, transform
 from .models.underdamped_langevin import UnderdampedLangevinParams, underdamped_langevin
+from .models.windings import windings
 from .proposals.base import AbstractWeightedProposal
 from .proposals.choice import Choice
 from .proposals.coupled import CoupledPairs
@@ -171,6 +172,7 @@ __all__ = [
     "Transformed",
     "simulate",
     "Jumps",
+    "windings",
     # Hypoelliptic and time-dependent models.
     "fitzhugh_nagumo",
     "FitzHughNagumoParams",

@@ -72,6 +72,7 @@ CALLS = {
         jb.simulate, key=KEY, model=MODEL, x0=[0.0, 0.0], times=[0.0, 1.0], num_steps=2
     ),
     "Jumps": small(jb.Jumps, times=[0.0, 0.5], inputs=[1.0, 2.0]),
+    "windings": small(jb.windings, point=[0.0, 1.0], periods=6.0),
     "fitzhugh_nagumo": small(jb.fitzhugh_nagumo),
     "underdamped_langevin": small(jb.underdamped_langevin, potential=lambda q, p: q @ q),
     "integrated": small(jb.integrated, model=LINE),

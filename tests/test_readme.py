@@ -51,6 +51,11 @@ CLAIMS = {
         and page["chain"].paths.shape == (1000, 101, 2)
         and page["short"].acceptance_rate > 0.95
     ),
+    "circles": lambda page: (
+        page["density"].trustworthy
+        and abs(page["density"].value + 5.69) < 0.15
+        and page["angles"].shape == (500, 51)
+    ),
     "counts_and_outliers": lambda page: (
         covers(page["posterior"].params["log_sigma"], -0.7)
         and covers(page["posterior"].params["log_size"], 2)

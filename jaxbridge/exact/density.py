@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_for
 from ..engine.entry import public_entry
+from ..engine.linalg import safe_norm
 from ..engine.pareto import pareto_k
 from ..engine.verdict import (
     AbstractResult,
@@ -38,6 +39,9 @@ from ..proposals import (
     resolve,
 )
 from ..schemes import StepError, dominates, step_faults, with_rounding
+
+# Smallest share of a sum of densities that counts in its diagnostics.
+_NO_SHARE = 1e-3
 
 
 class TransitionLogDensity(AbstractResult):
@@ -100,6 +104,43 @@ class TransitionLogDensity(AbstractResult):
         `extrapolate`.
         """
         return dominates(self._step_error, self.standard_error)
+
+    def total(self) -> "TransitionLogDensity":
+        """Return log Σ p̂ over the I pairs of points, with its errors, as a result of shape ().
+
+        On a circle this is the log density, if the end points are all `windings` of one point.
+        Diagnostics of pairs with less than a thousandth of the sum do not count.
+
+        **Example:**
+
+        ```python
+        ends = jnp.array([[1.0, 0.0], [0.0, 1.0]])
+        either = jb.transition_log_density(key, model, start, ends, 1.0, proposal=jb.Guided())
+        either.total().value
+        ```
+        """
+        shares = jnp.exp(self.value - logsumexp(self.value))
+        counts = shares > _NO_SHARE
+
+        def weighted(values):
+            return jnp.where(counts, shares * values, 0)
+
+        size = 1 / jnp.sum(weighted(shares / jnp.where(counts, self.effective_sample_size, 1)))
+        return TransitionLogDensity(
+            logsumexp(self.value),
+            safe_norm(weighted(self.standard_error)),
+            size,
+            jnp.sum(self.num_met),
+            jnp.sum(self.num_truncated),
+            jnp.sum(self.num_simulated),
+            jnp.sum(self.num_nonfinite),
+            self.proposal,
+            jnp.max(self.pareto_k, initial=-jnp.inf, where=counts),
+            jnp.sum(weighted(self.step_error)),
+            jnp.sum(weighted(self.step_uncertainty)),
+            jnp.max(self.step_share, initial=0.0, where=counts),
+            self.num_steps,
+        )
 
     @property
     def verdict(self) -> Verdict:

@@ -29,5 +29,6 @@ Paths:
 
 - `simulate`: unconditional paths.
 - `jumps`: jumps of the state at known times.
+- `windings`: points with the same angles, for circles and tori.
 - `bridge_problem`: the end points, durations and time grid of bridges.
 """

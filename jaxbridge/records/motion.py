@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..engine.linalg import matmul
 from ..models.dynamics import DynamicsAt
-from ..models.jumps import JumpMap
+from ..models.jumps import Jump, JumpMap
 from ..schemes import AbstractStepDensity, DegenerateLaw, StepLaw, with_transition
 from .record import Steps
 
@@ -24,20 +24,20 @@ class Motion(NamedTuple):
     def law(self, x: Float[Array, " d"], step: Steps) -> StepLaw | DegenerateLaw:
         """Return the law of the step from x."""
         density = with_transition(self.density, step.transition)
-        x = self.after_jump(x, step)
+        x = self.after_jump(x, step.jump)
         return density.steps_from(self.dynamics_at(step.time), x).law(step.dt)
 
     def decay(self, x: Float[Array, " d"], step: Steps) -> Float[Array, "d d"]:
         """Return the derivative of the mean of the step from x."""
-        after = self.after_jump(x, step)
+        after = self.after_jump(x, step.jump)
         drift = self.dynamics_at(step.time).drift
         F = jax.jacfwd(drift)(after)
         density = with_transition(self.density, step.transition)
         decay = density.linear_step(F, jnp.zeros_like(F), step.dt).decay
         if self.jump_map is None or self.jump_map.adds:
             return decay
-        return matmul(decay, jax.jacfwd(self.after_jump)(x, step))
+        return matmul(decay, jax.jacfwd(self.after_jump)(x, step.jump))
 
-    def after_jump(self, x: Float[Array, " d"], step: Steps) -> Float[Array, " d"]:
-        """Return the state after the jump at the beginning of the step."""
-        return x if self.jump_map is None else self.jump_map(x, step.jump, self.params)
+    def after_jump(self, x: Float[Array, " d"], jump: Jump | None) -> Float[Array, " d"]:
+        """Return the state after the jump."""
+        return x if self.jump_map is None else self.jump_map(x, jump, self.params)

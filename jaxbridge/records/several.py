@@ -149,7 +149,7 @@ def _as_jumps(
     if jumps is None:
         return None, None
     if isinstance(jumps, Jumps):
-        return jumps.map, num_records * [jumps]
+        return jumps.map, [jumps for _ in range(num_records)]
     entries = as_sequence("jumps", jumps, "a `Jumps`, or a list with one entry per record")
     given = [entry for entry in entries if entry is not None]
     for entry in given:

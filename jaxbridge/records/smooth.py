@@ -583,7 +583,7 @@ def _after_jumps(
 ) -> Float[Array, "chains K d"]:
     """Return the states after the jumps at the beginnings of all segments."""
     motion = problem.motion(problem.model)
-    of_segments = jax.vmap(lambda x, jump: motion.jump_map(x, jump, motion.params))
+    of_segments = jax.vmap(motion.after_jump)
     return jax.vmap(of_segments, (0, None))(starts, problem.record.jump)
 
 

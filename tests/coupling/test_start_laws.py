@@ -150,14 +150,16 @@ def short_runs(monkeypatch):
 def slow_model(with_density=False):
     """An Ornstein–Uhlenbeck process that takes hundreds of units of time to forget, N(0, 50), known
     to be reversible, or by its density."""
-    log_nu = lambda x, p: jnp.sum(-0.01 * x**2 - jnp.log(100 * jnp.pi) / 2)
-    return jb.Diffusion(
-        lambda x, p: -0.01 * x,
-        None,
-        log_nu if with_density else None,
-        reversible=True,
-        normalised=with_density,
-    )
+    log_nu = slow_log_nu if with_density else None
+    return jb.Diffusion(slow_drift, None, log_nu, reversible=True, normalised=with_density)
+
+
+def slow_drift(x, p):
+    return -0.01 * x
+
+
+def slow_log_nu(x, p):
+    return jnp.sum(-0.01 * x**2 - jnp.log(100 * jnp.pi) / 2)
 
 
 LAWS = {

@@ -110,7 +110,8 @@ def test_smoothed_paths_are_kalmans(paths):
     """The path at a jump is the state before it; blocks of both cuts have their jumps."""
     euler = WHOLE.kalman(4, jumps=ROWS)
     error = np.asarray(paths.standard_error())
-    np.testing.assert_allclose(paths.times, np.interp(np.arange(41) / 4, np.arange(11), WHOLE.times), rtol=1e-5)  # fmt: skip
+    grid = np.interp(np.arange(41) / 4, np.arange(11), WHOLE.times)
+    np.testing.assert_allclose(paths.times, grid, rtol=1e-5)
     np.testing.assert_array_less(np.abs(paths.mean() - euler.mean), 5 * error + 1e-5)
     sd = np.sqrt(np.diagonal(euler.covariance, axis1=1, axis2=2))
     draws = np.asarray(paths.paths).reshape(-1, 41, 2)

@@ -79,27 +79,28 @@ def test_paths_of_several_records_are_those_of_each():
     """The noise of a record is as long as that of the longest; the rest of it has no effect."""
     together = jb.innovations(*both(), **LONG.options, num_steps=4)
     noise = np.random.default_rng(0).normal(size=(2, together.size // 2)).astype(np.float32)
-    paths = together.path(LONG.model.params, jnp.array(noise.ravel()))
-    total = 0.0
-    for record, xi, path, times in zip((LONG, SHORT), noise, paths, together.times, strict=True):
-        alone = jb.innovations(*record.arguments, **record.options, num_steps=4)
-        own = jnp.array(xi[: alone.size])
-        np.testing.assert_allclose(path, alone.path(LONG.model.params, own), atol=2e-5)
-        np.testing.assert_allclose(times, alone.times, rtol=1e-6)
-        total += alone.log_weight(LONG.model.params, own)
-    log_weight = together.log_weight(LONG.model.params, jnp.array(noise.ravel()))
-    np.testing.assert_allclose(log_weight, total, atol=1e-4)
+    params, other = LONG.model.params, noise * np.array([[1.0], [0.5]], np.float32)
+    long, short = together.path(params, jnp.array(noise.ravel()))
+    alone = jb.innovations(*SHORT.arguments, **SHORT.options, num_steps=4)
+    own, halved = (jnp.array(xi[1, : alone.size]) for xi in (noise, other))
+    np.testing.assert_allclose(short, alone.path(params, own), atol=2e-5)
+    np.testing.assert_allclose(together.times[1], alone.times, rtol=1e-6)
+    np.testing.assert_array_equal(long, together.path(params, jnp.array(other.ravel()))[0])
+    # Log weights add, so that the other record does not matter.
+    change = together.log_weight(params, jnp.array(noise.ravel()))
+    change -= together.log_weight(params, jnp.array(other.ravel()))
+    expected = alone.log_weight(params, own) - alone.log_weight(params, halved)
+    np.testing.assert_allclose(change, expected, atol=1e-4)
     assert together.start_share().shape == (2,)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("density", [jb.EulerDensity(), None], ids=["Euler", "quadratic"])
-def test_each_record_is_smoothed(density):
+def test_each_record_is_smoothed():
     """The shorter of two records has the mean and the step error that it has by itself. Steps of
     second order are stored by their noise."""
     model = jb.Diffusion(lambda x, p: -x, lambda x, p: 0.5 * jnp.sqrt(1 + x**2))
     seen = jb.LinearGaussian(covariance=0.05)
-    options = {"observation": seen, "initial": [0.5], "num_steps": 4, "density": density}
+    options = {"observation": seen, "initial": [0.5], "num_steps": 4}
     times = [0.4 * np.arange(8), 1.0 + 0.4 * np.arange(4)]
     values = [np.sin(t) for t in times]
     together = jb.smooth(jax.random.key(0), model, times, values, **options)
