@@ -71,6 +71,7 @@ from .exact.importance import (
 from .exact.kernels import Chain, Kernel
 from .exact.pseudo_marginal import pseudo_marginal
 from .exact.renewal import renewal
+from .inference.calibration import Calibration, simulation_based_calibration
 from .inference.gibbs import (
     GibbsPosterior,
     GibbsState,
@@ -272,6 +273,8 @@ __all__ = [
     "score",
     "Score",
     "PosteriorSummary",
+    "simulation_based_calibration",
+    "Calibration",
     "NormalPrior",
     "NormalPopulation",
     "path_log_likelihood",

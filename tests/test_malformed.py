@@ -161,6 +161,16 @@ CALLS = {
     "maximum_likelihood of a record": small(
         jb.maximum_likelihood, key=KEY, **NOISY, where=RATE["where"], num_iterations=2
     ),
+    "simulation_based_calibration": small(
+        jb.simulation_based_calibration,
+        key=KEY,
+        **RECORD,
+        sampler=jb.gibbs,
+        prior=RATE["prior"],
+        where=RATE["where"],
+        observation=SEEN,
+        num_simulations=2,
+    ),
     "score": small(
         jb.score, key=KEY, **RECORD, where=RATE["where"], num_bridges=4, proposal=GUIDED
     ),

@@ -5,6 +5,7 @@ import reprlib
 
 import jax
 import jax.numpy as jnp
+from jax.scipy.special import gammaincc
 from jaxtyping import Array, Bool, Float
 
 from .checks import Numbers, as_floating
@@ -18,6 +19,22 @@ def vary(draws: Float[Array, "..."], axis: int | tuple[int, ...]) -> Bool[Array,
     """Return whether draws differ, along these axes, by more than rounding errors."""
     spread, size = jnp.std(draws, axis=axis), jnp.max(jnp.abs(draws), axis=axis)
     return spread > _ROUNDING * float(jnp.finfo(draws.dtype).eps) * size
+
+
+def p_uniform(uniforms: Float[Array, "n m"]) -> Float[Array, " m"]:
+    """Return the p-value of Neyman's smooth test (1937) that each column is uniform on (0, 1).
+
+    It compares four moments, those of the first Legendre polynomials. NaN entries are left out.
+    """
+    exist, u = ~jnp.isnan(uniforms), 2 * uniforms - 1
+    legendre = (u, (3 * u**2 - 1) / 2, (5 * u**3 - 3 * u) / 2, (35 * u**4 - 30 * u**2 + 3) / 8)
+    number = jnp.sum(exist, axis=0).astype(u.dtype)
+    # P_j has the variance 1 / (2 j + 1) under the uniform law.
+    statistic = sum(
+        (2 * j + 1) * jnp.sum(jnp.where(exist, P, 0), axis=0) ** 2 / number
+        for j, P in enumerate(legendre, start=1)
+    )
+    return gammaincc(jnp.full_like(number, 2.0), statistic / 2)
 
 
 @public_entry

@@ -1,7 +1,7 @@
 """Compiled loops that report their progress to one of diffrax's progress meters."""
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import diffrax
@@ -15,6 +15,7 @@ from .interrupt import InterruptibleMeter
 
 _State = TypeVar("_State")
 _Context = TypeVar("_Context")
+_Item = TypeVar("_Item")
 
 
 def as_meter(progress_meter: diffrax.AbstractProgressMeter | None) -> diffrax.AbstractProgressMeter:
@@ -22,6 +23,18 @@ def as_meter(progress_meter: diffrax.AbstractProgressMeter | None) -> diffrax.Ab
     if progress_meter is None or isinstance(progress_meter, diffrax.NoProgressMeter):
         return diffrax.NoProgressMeter()
     return InterruptibleMeter(progress_meter)
+
+
+def metered(
+    items: Sequence[_Item], progress_meter: diffrax.AbstractProgressMeter | None
+) -> Iterator[_Item]:
+    """Iterate over items in Python, with a progress meter."""
+    meter = as_meter(progress_meter)
+    state = meter.init()
+    for number, item in enumerate(items, start=1):
+        yield item
+        state = meter.step(state, jnp.asarray(number / len(items)))
+    meter.close(state)
 
 
 def metered_scan(

@@ -26,6 +26,7 @@ are:
 
 # The names that other folders import from this one.
 from .exact_observations import as_observations as as_observations
+from .forecast import forecast as forecast
 from .forgetting import half_will_do as half_will_do, rate_for_several as rate_for_several
 from .guide_search import (
     GuideCheck as GuideCheck,

@@ -19,9 +19,11 @@ from jax import lax
 from jax.scipy.special import gammaincc, logsumexp, ndtri
 from jaxtyping import Array, Float, Key
 
+from ..engine.arguments import check_instance
 from ..engine.averages import effective_size, nan_to_neg_inf, normalise_weights
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
 from ..engine.compiled import compiled
+from ..engine.diagnostics import p_uniform
 from ..engine.entry import public_entry
 from ..engine.lanes import over_lanes
 from ..engine.resampling import systematic
@@ -102,15 +104,7 @@ class Forecast(AbstractResult):
         Shape (m,). It compares four moments, those of the first Legendre polynomials. A wrong
         level, σ or law of the noise usually makes it small.
         """
-        seen, u = ~jnp.isnan(self.uniforms), 2 * self.uniforms - 1
-        legendre = (u, (3 * u**2 - 1) / 2, (5 * u**3 - 3 * u) / 2, (35 * u**4 - 30 * u**2 + 3) / 8)
-        number = jnp.sum(seen, axis=0).astype(u.dtype)
-        # P_j has the variance 1 / (2 j + 1) under the uniform law.
-        statistic = sum(
-            (2 * j + 1) * jnp.sum(jnp.where(seen, P, 0), axis=0) ** 2 / number
-            for j, P in enumerate(legendre, start=1)
-        )
-        return gammaincc(jnp.full_like(number, 2.0), statistic / 2)
+        return p_uniform(self.uniforms)
 
     @property
     def p_independent(self) -> Float[Array, " m"]:
@@ -160,12 +154,13 @@ def forecast(
     observation: AbstractObservation,
     initial: Initial = None,
     at: Numbers | None = None,
-    num_particles: int = 1000,
+    num_particles: int | None = None,
     num_steps: int | None = None,
     step_size: float | None = None,
     initial_time: Numbers | None = None,
     jumps: JumpsLike = None,
     density: AbstractStepDensity | None = None,
+    after: Forecast | None = None,
     throw: bool = False,
 ) -> Forecast:
     """Forecast each reading of a record from the earlier ones, and states and readings after it.
@@ -183,7 +178,10 @@ def forecast(
         observation model must have `sample`; for exact readings pass
         `LinearGaussian(covariance=0.0)`.
     - `at`: later times, increasing, shape (F,); by default none.
-    - `num_particles`: P.
+    - `num_particles`: P, by default 1,000.
+    - `after`: an earlier result, to continue its record. `times` and `observations` are then the
+        later ones only, so the cost does not grow with the record. The particles go on from the
+        last reading of `after`: omit `initial`, `initial_time` and `num_particles`.
     - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
         not finite.
 
@@ -204,6 +202,18 @@ def forecast(
     **Source:** bootstrap filter of Gordon, Salmond & Smith (1993), with a conditioned last step.
     """
     check_key(key)
+    particles = None
+    if after is not None:
+        check_instance("after", after, Forecast, "a result of `forecast`")
+        if not (initial is None and initial_time is None and num_particles is None):
+            raise ValueError(
+                "with `after` the start is its last particles: omit `initial`, `initial_time` and "
+                "`num_particles`."
+            )
+        last = len(after.log_scores) - 1
+        particles, initial_time = after.filtered[:, last], after.times[last]
+        initial, num_particles = jnp.nanmean(particles, axis=0), len(particles)
+    num_particles = 1000 if num_particles is None else num_particles
     num_particles = check_count("num_particles", num_particles, 2)
     if are_several(times, observations):
         raise ValueError(
@@ -221,7 +231,12 @@ def forecast(
                 f"`at` must increase, and begin after the last of `times`, {all_times[0]:g}; got "
                 f"{all_times[1:]}."
             )
-    _, rows = as_times_and_rows(times, observations)
+    checked_times, rows = as_times_and_rows(times, observations)
+    if after is not None and not is_traced(times) and checked_times.values[0] <= initial_time:
+        raise ValueError(
+            f"`times` must begin after the last reading of `after`, at {initial_time:g}; they "
+            f"begin at {checked_times.values[0]:g}."
+        )
     num_times = len(rows) + len(later)
     if later.size:
         times, observations = _with_later(times, rows, at, len(later))
@@ -242,7 +257,7 @@ def forecast(
     problem = records.problem(0)
     # An earlier `initial_time` has an entry in front, which is left out.
     since, which = problem.record.since, problem.record.which[-num_times:]
-    states, readings, filtered, scores = _run(key, problem, num_particles)
+    states, readings, filtered, scores = _run(key, problem, num_particles, particles)
     num_read = num_times - len(later)
     of_times = lambda draws: jnp.swapaxes(draws[which], 0, 1)
     made = Forecast(
@@ -265,8 +280,13 @@ class _Scores(NamedTuple):
 
 
 @compiled
-def _run(key: Key[Array, ""], problem: RecordProblem, P: int):
-    """Return predicted states, readings, filtered states and scores at all ends of segments."""
+def _run(
+    key: Key[Array, ""], problem: RecordProblem, P: int, particles: Float[Array, "P d"] | None
+):
+    """Return predicted states, readings, filtered states and scores at all ends of segments.
+
+    The first states are `particles`, or draws of the initial law.
+    """
     model, d, dtype = problem.model, problem.dim, problem.like.dtype
     motion, observation = problem.motion(model), problem.observation
     corrected = over_lanes(None, -1)(correction(problem, model))
@@ -324,7 +344,11 @@ def _run(key: Key[Array, ""], problem: RecordProblem, P: int):
     (first_row, rows) = split_first(problem.rows)
     first, scalars = split_first(problem.scalars(model))
     start_key, read_key = jax.random.split(jax.random.fold_in(key, 0))
-    predicted, after, log_weight = _starts(start_key, problem, first, nothing, P)
+    if particles is None:
+        predicted, after, log_weight = _starts(start_key, problem, first, nothing, P)
+    else:
+        predicted = after = particles.astype(dtype).T
+        log_weight = jnp.zeros(P, dtype)  # their last reading is already in them
     x, made_first = read(read_key, predicted, after, log_weight, first_row)
     inputs = (1 + jnp.arange(problem.num_segments), problem.steps(model), scalars, rows)
     _, later = lax.scan(segment, x, inputs)

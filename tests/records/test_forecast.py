@@ -9,6 +9,7 @@ from scipy import stats
 import jaxbridge as jb
 
 P, N, GAP, NOISE = 2000, 40, 0.3, 0.1
+KEY = jax.random.key(1)
 OU = jb.ornstein_uhlenbeck([[1.0]])
 TIMES = GAP * np.arange(N)
 DECAY, SPREAD = np.exp(-GAP), (1 - np.exp(-2 * GAP)) / 2
@@ -281,3 +282,39 @@ def test_samples_beyond_limits_and_rounded():
     assert abs(np.mean(censored == 1.5) - stats.norm.sf(1.6)) < 0.03
     rounded = of(jb.Rounded(scale=0.5, width=1.0))
     assert abs(np.mean(rounded == 1) - (stats.norm.cdf(1.6) - stats.norm.cdf(-0.4))) < 0.04
+
+
+def test_appended_readings_continue_the_record(noisy):
+    """In two parts as in one: scores and laws are Kalman's, and no program depends on the past."""
+    y, _, laws = noisy
+    options = dict(observation=jb.LinearGaussian(covariance=NOISE), num_steps=1)
+    first = jb.forecast(
+        jax.random.key(1), OU, TIMES[:30], y[:30], num_particles=P, at=TIMES[30:33], **options
+    )
+    later = jb.forecast(jax.random.key(2), OU, TIMES[30:], y[30:], after=first, **options)
+    assert later.states.shape == (P, N - 30, 1) and later.trustworthy
+    np.testing.assert_allclose(later.times, TIMES[30:], rtol=1e-6)
+    mean, sd = laws[30:N, 0], np.sqrt(laws[30:N, 1])
+    exact = stats.norm.logpdf(y[30:], mean, sd)
+    np.testing.assert_allclose(later.log_scores, exact, atol=0.15)
+    error = 5 * sd / np.sqrt(np.append(P / 4, later.effective_sample_size[:-1]))
+    np.testing.assert_array_less(np.abs(later.readings[..., 0].mean(0) - mean), error)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"initial": [0.0]}, "omit `initial`"),
+        ({"num_particles": 5}, "omit `initial`"),
+        ({"times": TIMES[:3]}, "must begin after the last reading"),
+        ({"after": 3.0}, "a result of `forecast`"),
+    ],
+)
+def test_what_cannot_be_appended(noisy, change, words):
+    y, made, _ = noisy
+    arguments = {"times": TIMES[-1] + GAP * np.arange(1, 4), "after": made} | change
+    with pytest.raises((ValueError, TypeError), match=words):
+        jb.forecast(
+            KEY, OU, observations=y[:3], observation=jb.LinearGaussian(covariance=NOISE),
+            num_steps=1, **arguments,
+        )  # fmt: skip
