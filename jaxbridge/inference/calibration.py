@@ -5,7 +5,7 @@ If parameters are drawn from the prior, and a record given them, the rank of the
 the draws of their posterior is uniform.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -194,7 +194,7 @@ def _draw(key, parameters, mean: Float[Array, " p"], root: np.ndarray) -> Float[
     )
 
 
-def _ranks(key, truth: np.ndarray, draws: np.ndarray, sizes: Sequence[float]) -> np.ndarray:
+def _ranks(key, truth: np.ndarray, draws: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Return the rank of each parameter among draws that are nearly independent, in (0, 1)."""
     position = np.asarray(jax.random.uniform(key, truth.shape))
     ranks = np.empty(len(truth))

@@ -232,11 +232,13 @@ def forecast(
                 f"{all_times[1:]}."
             )
     checked_times, rows = as_times_and_rows(times, observations)
-    if after is not None and not is_traced(times) and checked_times.values[0] <= initial_time:
-        raise ValueError(
-            f"`times` must begin after the last reading of `after`, at {initial_time:g}; they "
-            f"begin at {checked_times.values[0]:g}."
-        )
+    if after is not None and not is_traced(times):
+        begin, end = float(checked_times.values[0]), float(np.asarray(initial_time))
+        if begin <= end:
+            raise ValueError(
+                f"`times` must begin after the last reading of `after`, at {end:g}; they begin at "
+                f"{begin:g}."
+            )
     num_times = len(rows) + len(later)
     if later.size:
         times, observations = _with_later(times, rows, at, len(later))
