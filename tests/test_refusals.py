@@ -709,10 +709,10 @@ INFERENCE = [
     ),
     ("times", gibbs(times=[0.0, 2.0, 1.0]), r"`times\[1\]`.*Sort them"),
     ("missing time", gibbs(times=[0.0, NAN, 1.0]), r"`times\[1\]` = nan\. Remove"),
-    ("two times", gibbs(times=[0.0, 1.0]), "`observations` must have shape"),
+    ("two times", gibbs(times=[0.0, 1.0]), "one row per time; got"),
     ("one time", gibbs(times=[0.0], observations=[[1.0]]), "need at least two entries"),
     ("missing", gibbs(observations=[[0.0], [NAN], [1.0]]), r"`observations\[1\]`.*leave out"),
-    ("no shape", gibbs(observations=1.0), "`observations` must have shape"),
+    ("no shape", gibbs(observations=1.0), "one row per time; got"),
     ("twice", gibbs(times=[0.0, 1.0, 1.0]), r"equal `times\[1\]` = 1.0 .*Merge the observations"),
     (
         "a start",

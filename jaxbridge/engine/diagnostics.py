@@ -9,6 +9,7 @@ from jax.scipy.special import gammaincc
 from jaxtyping import Array, Bool, Float
 
 from .checks import Numbers, as_floating
+from .compiled import compiled_sooner
 from .entry import public_entry
 
 # A spread of at most so many units in the last place is rounding error.
@@ -21,6 +22,7 @@ def vary(draws: Float[Array, "..."], axis: int | tuple[int, ...]) -> Bool[Array,
     return spread > _ROUNDING * float(jnp.finfo(draws.dtype).eps) * size
 
 
+@compiled_sooner
 def p_uniform(uniforms: Float[Array, "n m"]) -> Float[Array, " m"]:
     """Return the p-value of Neyman's smooth test (1937) that each column is uniform on (0, 1).
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Key
 from ..engine.arguments import check_instance
 from ..engine.averages import effective_size, nan_to_neg_inf, normalise_weights
 from ..engine.checks import Numbers, as_floating, check_count, check_key, is_traced
-from ..engine.compiled import compiled
+from ..engine.compiled import compiled, compiled_sooner
 from ..engine.diagnostics import p_uniform
 from ..engine.entry import public_entry
 from ..engine.lanes import over_lanes
@@ -113,23 +113,7 @@ class Forecast(AbstractResult):
         Shape (m,). It has 10 lags, or a fifth of the readings. A wrong drift usually makes it
         small.
         """
-        # Missing readings are left out: the others follow each other.
-        order = jnp.argsort(jnp.isnan(self.uniforms), axis=0, stable=True)
-        z = jnp.take_along_axis(self.residuals, order, axis=0)
-        n = jnp.sum(~jnp.isnan(z), axis=0).astype(z.dtype)
-        lags = jnp.clip(n // 5, 1, _MOST_LAGS)
-        centred = jnp.nan_to_num(z - jnp.nanmean(z, axis=0))
-        variance = jnp.sum(centred**2, axis=0)
-
-        def term(lag):
-            product = jnp.sum(centred[lag:] * centred[: len(z) - lag], axis=0)
-            counts = (lag <= lags) & (lag < n)
-            return jnp.where(counts, (product / variance) ** 2 / jnp.maximum(n - lag, 1), 0)
-
-        statistic = (
-            n * (n + 2) * sum(term(lag) for lag in range(1, min(_MOST_LAGS, len(z) - 1) + 1))
-        )
-        return gammaincc(lags / 2, statistic / 2)
+        return _p_independent(self.residuals)
 
     @property
     def verdict(self) -> Verdict:
@@ -142,6 +126,27 @@ class Forecast(AbstractResult):
         lost = jnp.mean(~jnp.all(jnp.isfinite(self.states), axis=-1), axis=0)
         faults = Fault(poor, _POOR), Fault(jnp.any(lost > _MOST_LOST), _LOST)
         return Verdict(faults).with_finite(jnp.nansum(self.log_scores))
+
+
+@compiled_sooner
+def _p_independent(residuals: Float[Array, "n m"]) -> Float[Array, " m"]:
+    """Return the p-value of the test of Ljung & Box (1978) that the columns are not correlated."""
+    # Missing readings are left out: the others follow each other.
+    order = jnp.argsort(jnp.isnan(residuals), axis=0, stable=True)
+    z = jnp.take_along_axis(residuals, order, axis=0)
+    n = jnp.sum(~jnp.isnan(z), axis=0).astype(z.dtype)
+    lags = jnp.clip(n // 5, 1, _MOST_LAGS)
+    centred = jnp.nan_to_num(z - jnp.nanmean(z, axis=0))
+    variance = jnp.sum(centred**2, axis=0)
+
+    def term(lag):
+        product = jnp.sum(centred[lag:] * centred[: len(z) - lag], axis=0)
+        counts = (lag <= lags) & (lag < n)
+        return jnp.where(counts, (product / variance) ** 2 / jnp.maximum(n - lag, 1), 0)
+
+    most = min(_MOST_LAGS, len(z) - 1)
+    statistic = n * (n + 2) * sum(term(lag) for lag in range(1, most + 1))
+    return gammaincc(lags / 2, statistic / 2)
 
 
 @public_entry

@@ -52,7 +52,7 @@ from .observations import AbstractObservation
 from .path_blocks import Paths, blocks_of_both_cuts, has_length, has_segments, sweep, tuned
 from .problem import RecordProblem
 from .several import as_record_problems
-from .states import Draws, sample_states
+from .states import Draws, check_states, sample_states
 from .step_regime import steps_are_too_long
 
 # Chains disagree if R̂ exceeds this bound.
@@ -367,14 +367,16 @@ def smooth(
 
     def of_record(key: Key[Array, ""], number: int) -> Smoothed:
         # Paths of one shape need one program. The pilots of a `proposal` need real gaps.
-        problem = records.problem(number, padded=proposal is None)
+        problem, bridges = records.problem(number, padded=proposal is None), None
+        if proposal is not None:  # checked before the search for a guide, which takes time
+            bridges = as_proposal(proposal, model, problem.like)
+            check_states(bridges, problem)
         linearisation, density = linearised(problem, model), problem.density
-        if proposal is None:
+        if bridges is None:
             sizes = counts, num_chains, block_length
             draws = _run_block_chains(key, problem, linearisation, *sizes, progress_meter)
             num_points = records.num_points(number)
         else:
-            bridges = as_proposal(proposal, model, problem.like)
             start_key, key = jax.random.split(key)
             firsts = _guided_paths(start_key, problem, linearisation, num_chains)
             sizes = (*counts, num_proposals)

@@ -251,12 +251,10 @@ def sample_states(
 
     `counts` holds the number of draws, of iterations of the warm-up, and of paths in each ŵ.
 
-    **Raises:** `ValueError` for an unsuitable proposal, a model without a stationary law, or exact
-    observations.
+    The arguments satisfy `check_states`.
     """
     model, K = problem.model, problem.num_segments
     scalars = problem.scalars(model)
-    _check_proposal(proposal, problem, scalars)
     first = guided[:, :: problem.num_steps]
     durations = problem.record.durations
     intervals = Intervals(first[0, :-1], first[0, 1:], durations)
@@ -285,9 +283,13 @@ def sample_states(
     return Draws(grid, paths, accepted, ~all_moved, num_truncated, record)
 
 
-def _check_proposal(proposal: AbstractProposal, problem: RecordProblem, scalars: Scalars) -> None:
-    """Raise `ValueError` if states cannot move with this proposal."""
+def check_states(proposal: AbstractProposal, problem: RecordProblem) -> None:
+    """Raise `ValueError` if states cannot move with this proposal.
+
+    It must suit the model, the model needs a stationary law, and all observations need noise.
+    """
     model, law = problem.model, bound(problem.initial, problem.model)
+    scalars = problem.scalars(model)
     if model.depends_on_time or not model.sigma_is_invertible(problem.like):
         raise ValueError(
             "bridges of a `proposal` need coefficients that do not depend on time, and an "

@@ -68,6 +68,7 @@ def test_the_leading_error_of_a_density_is_gone(densities):
     assert float(both.removed) == pytest.approx(float(fine.value - both.value), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_pairs_of_two_gammas_are_two_proposals(densities):
     both = [
         eqx.tree_at(

@@ -220,7 +220,7 @@ def record_of(name, rng):
 
 
 @pytest.mark.parametrize(
-    "name", slow_beyond(1, ["negative binomial", "Poisson", "Student", "censored", "rounded"])
+    "name", slow_beyond(0, ["negative binomial", "Poisson", "Student", "censored", "rounded"])
 )
 def test_likelihood_is_that_of_the_grid(name):
     observation, readings, logs = record_of(name, np.random.default_rng(3))

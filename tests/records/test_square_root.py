@@ -115,6 +115,7 @@ def noise_by_hand(x, x_next, dt, is_last):
     return np.sort(np.roots([bent, np.sqrt(dt) * b, mean - x_next - bent * S])) / np.sqrt(S)
 
 
+@pytest.mark.slow
 def test_weight_is_the_density_of_a_path_by_hand(x64):
     """N(z; 0, I) / N(ζ; 0, I) / det ℛ times g(y| x'): of one step, which is split three times, so
     that three are quadratic in their noise z and the last one is not."""

@@ -33,9 +33,8 @@ class Censored(AbstractComponents):
     **Example:**
 
     ```python
-    model = jb.ornstein_uhlenbeck([[1.0]])
-    seen = jb.Censored(scale=0.2, lower=-0.5)  # the second reading is -0.5 or less
-    jb.log_likelihood(key, model, [0.0, 1.0], [0.1, -0.5], observation=seen)
+    seen = jb.Censored(scale=0.2, lower=-0.5)
+    seen.sample(key, jnp.array([-0.4]))  # a reading of this state: -0.5 or more
     ```
     """
 

@@ -34,9 +34,8 @@ class LogNormal(AbstractComponents):
     **Example:**
 
     ```python
-    model = jb.ornstein_uhlenbeck([[1.0]])
     seen = jb.LogNormal(scale=0.1)
-    jb.log_likelihood(key, model, [0.0, 1.0], [1.1, 2.3], observation=seen)
+    seen.sample(key, jnp.array([0.7]))  # a reading of this state
     ```
     """
 

@@ -43,9 +43,8 @@ class NegativeBinomialCounts(AbstractComponents):
     **Example:**
 
     ```python
-    model = jb.ornstein_uhlenbeck([[1.0]])
     seen = jb.NegativeBinomialCounts(size=5.0, offset=3.0)
-    jb.log_likelihood(key, model, [0.0, 1.0], [17, 25], observation=seen)
+    seen.sample(key, jnp.array([0.2]))  # a count in this state
     ```
     """
 

@@ -30,9 +30,8 @@ class Rounded(AbstractComponents):
     **Example:**
 
     ```python
-    model = jb.ornstein_uhlenbeck([[1.0]])
     seen = jb.Rounded(scale=0.2, width=1.0)
-    jb.log_likelihood(key, model, [0.0, 1.0], [0, 1], observation=seen)
+    seen.sample(key, jnp.array([0.7]))  # a reading of this state, a whole number
     ```
     """
 

@@ -30,9 +30,8 @@ class StudentT(AbstractComponents):
     **Example:**
 
     ```python
-    model = jb.ornstein_uhlenbeck([[1.0]])
     seen = jb.StudentT(scale=0.2, df=4.0)
-    jb.log_likelihood(key, model, [0.0, 1.0], [0.1, 7.5], observation=seen)
+    seen.sample(key, jnp.array([0.7]))  # a reading of this state
     ```
     """
 
