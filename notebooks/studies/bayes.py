@@ -241,6 +241,12 @@ SAMPLERS: dict[str, dict[str, Any]] = {
 # On data sets after the first, for the shift alone.
 _AGAIN = ("approximate, gamma = 0.5, Euler", "exact, coupling, N = 12", 'exact, "auto", N = 12')
 
+# Of distant observations.
+DISTANT = {
+    "exact, coupling": dict(proposal=jb.Coupling(0.0)),
+    'exact, "auto"': dict(proposal="auto"),
+}
+
 
 def run_bayes(
     key: Key[Array, ""],
@@ -276,10 +282,7 @@ def _distant(key, num_iterations, scale, say) -> Example:
     data = hyperbolic_data(data_key, num_intervals, duration)
     num_iterations = num_iterations // 5
     sampled = []
-    for name, options in {
-        "exact, coupling": dict(proposal=jb.Coupling(0.0)),
-        'exact, "auto"': dict(proposal="auto"),
-    }.items():
+    for name, options in DISTANT.items():
         say(f"far apart: {name}")
         options = dict(options, num_steps=num_steps)
         sampled.append(run_sampler(run_key, name, data, num_iterations, **options))
