@@ -27,6 +27,7 @@ from jax.scipy.special import logsumexp
 from jaxtyping import Array, Float
 
 from ..engine.averages import nan_to_neg_inf, normalise_weights
+from ..engine.lanes import over_lanes
 from ..engine.linalg import cholesky, is_finite, matmul, matvec, solve_lower
 from ..models.diffusion import Diffusion
 from .guided_steps import GuidedLaw, guided_start
@@ -59,6 +60,11 @@ class Cover(NamedTuple):
             return self.laws.mean[j] + matvec(self.laws.root[j], zeta)
 
         return jax.vmap(one)(chosen(self.log_shares, positions), zeta)
+
+    def log_ratio(self, model: Diffusion, x: Float[Array, "d n"]) -> Float[Array, " n"]:
+        """Return log ν - log q at each point, up to the constant of ν."""
+        log_nu = model.prepared().log_stationary
+        return over_lanes(-1)(lambda x: log_nu(x) - self.log_density(x))(x)
 
 
 class CoveredStart(NamedTuple):

@@ -377,14 +377,12 @@ def _starts(key, problem: RecordProblem, first: Scalars, nothing: Information, P
         return x, after, log_weight
     law = cover(model, normal)
     positions = (jax.random.uniform(position_key, (), dtype) + jnp.arange(P, dtype=dtype)) / P
-    x = law.points(positions, zeta.T)
-    log_nu = model.prepared().log_stationary
-    ratio = jax.vmap(lambda x: log_nu(x) - law.log_density(x))(x)
-    weights = normalise_weights(nan_to_neg_inf(ratio))
-    predicted = x[systematic(jax.random.uniform(resampling_key, (), dtype), weights)].T
+    x = law.points(positions, zeta.T).T
+    weights = normalise_weights(nan_to_neg_inf(law.log_ratio(model, x)))
+    predicted = x[:, systematic(jax.random.uniform(resampling_key, (), dtype), weights)]
     given = covered_start(law, first, zeros, nothing)
     x = given.points(positions, repeated)
-    log_weight = given.log_integral + over_lanes(-1)(lambda x: log_nu(x) - law.log_density(x))(x)
+    log_weight = given.log_integral + law.log_ratio(model, x)
     is_read = jnp.any(first.seen)
     return predicted, jnp.where(is_read, x, predicted), jnp.where(is_read, log_weight, 0)
 

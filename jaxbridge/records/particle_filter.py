@@ -188,9 +188,7 @@ def _starts(
     # Stratified positions, as in systematic resampling.
     positions = (uniform + jnp.arange(P, dtype=dtype)) / P
     x = start.points(positions.ravel(), zeta)
-    log_nu = model.prepared().log_stationary
-    ratio = lambda x: log_nu(x) - law.log_density(x)
-    return x, start.log_integral + over_lanes(-1)(ratio)(x)
+    return x, start.log_integral + law.log_ratio(model, x)
 
 
 def _resampled(key: Key[Array, ""], state: _Particles, poor: Bool[Array, " R"]) -> _Particles:
