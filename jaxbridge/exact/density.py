@@ -109,7 +109,7 @@ class TransitionLogDensity(AbstractResult):
         """Return log Σ p̂ over the I pairs of points, with its errors, as a result of shape ().
 
         On a circle this is the log density, if the end points are all `windings` of one point.
-        Diagnostics of pairs with less than a thousandth of the sum do not count.
+        Diagnostics and counts leave out pairs with less than a thousandth of the sum.
 
         **Example:**
 
@@ -119,21 +119,26 @@ class TransitionLogDensity(AbstractResult):
         either.total().value
         ```
         """
-        shares = jnp.exp(self.value - logsumexp(self.value))
+        value = logsumexp(self.value)
+        some = value > -jnp.inf
+        shares = jnp.where(some, jnp.exp(self.value - jnp.where(some, value, 0)), 0)
         counts = shares > _NO_SHARE
 
         def weighted(values):
             return jnp.where(counts, shares * values, 0)
 
-        size = 1 / jnp.sum(weighted(shares / jnp.where(counts, self.effective_sample_size, 1)))
+        def number(counted):
+            return jnp.sum(jnp.where(counts, counted, 0))
+
+        inverse_size = jnp.sum(weighted(shares / jnp.where(counts, self.effective_sample_size, 1)))
         return TransitionLogDensity(
-            logsumexp(self.value),
-            safe_norm(weighted(self.standard_error)),
-            size,
-            jnp.sum(self.num_met),
-            jnp.sum(self.num_truncated),
-            jnp.sum(self.num_simulated),
-            jnp.sum(self.num_nonfinite),
+            value,
+            jnp.where(some, safe_norm(weighted(self.standard_error)), jnp.inf),
+            jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0),
+            number(self.num_met),
+            number(self.num_truncated),
+            number(self.num_simulated),
+            number(self.num_nonfinite),
             self.proposal,
             jnp.max(self.pareto_k, initial=-jnp.inf, where=counts),
             jnp.sum(weighted(self.step_error)),

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Key, PyTree
 from ..engine.arguments import check_instance, shown
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.diagnostics import p_uniform
+from ..engine.entry import public_entry
 from ..engine.progress import metered
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..models.diffusion import Diffusion
@@ -33,6 +34,15 @@ _UNTRUSTED = (
     "sampler in place of faults of the model. Use longer chains; `why()` of a posterior names its "
     "fault."
 )
+_MOST_LOST = 0.01
+_LOST = (
+    "More than 1 % of the simulated records left the state space or the finite numbers, and have "
+    "no ranks, so that the others are a selection. Use more `num_steps`, or coordinates without a "
+    "boundary (`transform`)."
+)
+# Number of particles from which a simulated record is drawn. If the stationary law is not normal,
+# their first states are a sample of it by importance resampling.
+_NUM_PARTICLES = 500
 # Number of attempts to draw parameters that satisfy the constraint.
 _MOST_ATTEMPTS = 1000
 
@@ -42,7 +52,8 @@ class Calibration(AbstractResult):
 
     - `names`: names of the parameters.
     - `truth`: parameters of each record, draws of the prior, shape (S, p).
-    - `uniforms`: rank of the truth among draws of the posterior, in (0, 1), shape (S, p).
+    - `uniforms`: rank of the truth among draws of the posterior, in (0, 1), shape (S, p). NaN for a
+        simulated record that left the state space.
     - `effective_sample_size`: that of each posterior, shape (S, p). Draws are thinned to about this
         number before ranks are taken.
     - `trusted`: whether each posterior is `trustworthy`, shape (S,).
@@ -64,14 +75,17 @@ class Calibration(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the only possible fault: many posteriors that are not `trustworthy`.
+        """Return the possible faults: many posteriors that are not `trustworthy`, or lost records.
 
         A small `p_uniform` is a result, and no fault.
         """
-        share = jnp.mean(~self.trusted)
-        return Verdict((Fault(share > _MOST_UNTRUSTED, _UNTRUSTED),))
+        lost = jnp.isnan(self.uniforms[:, 0])
+        untrusted = jnp.mean(~self.trusted & ~lost) > _MOST_UNTRUSTED
+        faults = Fault(untrusted, _UNTRUSTED), Fault(jnp.mean(lost) > _MOST_LOST, _LOST)
+        return Verdict(faults)
 
 
+@public_entry
 def simulation_based_calibration(
     key: Key[Array, ""],
     model: Diffusion,
@@ -155,21 +169,25 @@ def simulation_based_calibration(
         given["constraint"] = constraint
 
     def one(number: int):
-        prior_key, record_key, run_key, rank_key = jax.random.split(
-            jax.random.fold_in(key, number), 4
+        prior_key, record_key, pick_key, run_key, rank_key = jax.random.split(
+            jax.random.fold_in(key, number), 5
         )
         truth = _draw(prior_key, parameters, law.mean, root)
-        # Without readings the first particle is a path of the model, with readings.
+        # Without readings each particle is a path of the model, with readings.
         drawn = forecast(
             record_key,
             parameters.bind(truth),
             times,
             unread,
-            num_particles=2,
+            num_particles=_NUM_PARTICLES,
             num_steps=num_steps,
             **options,
         )
-        record = jnp.where(is_read, drawn.readings[0], jnp.nan)
+        picked = jax.random.randint(pick_key, (), 0, _NUM_PARTICLES)
+        record = jnp.where(is_read, drawn.readings[picked], jnp.nan)
+        if np.any(np.isnan(record[is_read])):
+            unknown = np.full(len(truth), np.nan)
+            return truth, unknown, unknown, False
         posterior = sampler(run_key, model, times, record, **given)
         draws = np.asarray(posterior.theta).reshape(-1, len(truth))
         sizes = np.asarray(posterior.effective_sample_size)

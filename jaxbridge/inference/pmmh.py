@@ -382,8 +382,8 @@ def _guided_by_state(likelihood: RecordLikelihood, state: PMMHState) -> RecordLi
     if state.guide is None or shapes[0] != shapes[1]:
         raise ValueError(
             "`init` is a state of other records: pass the data, `observation`, `initial_time`, "
-            "`num_steps` and `step_size` of that run, or start values of the unknown parameters as "
-            "`init`."
+            "`jumps`, `num_steps` and `step_size` of that run, or start values of the unknown "
+            "parameters as `init`."
         )
     return likelihood.guided_by(state.guide)
 

@@ -5,6 +5,7 @@ process is the diffusion. An observation at τ is taken before the jump, and so 
 a path.
 """
 
+import copy
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -12,16 +13,17 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
 from ..engine.arguments import as_returned, check_function, evaluated
 from ..engine.captured import Captured
 from ..engine.checks import Numbers, as_floating, is_traced
-from ..engine.times import Times, as_times, check_increasing
+from ..engine.times import Times
 from .tracing import is_affine
 
-# A jump that is nearer to a time than this share of the smallest gap is at this time.
-_SAME = 1e-3
+# Jumps within two rounding errors of a time are at this time, but at most this share of a gap away.
+_MOST_MOVED = 1e-4
 
 
 class Jump(NamedTuple):
@@ -51,8 +53,11 @@ class JumpMap(eqx.Module):
         """Return the state after the jump; x itself if there is none."""
         if jump is None:
             return x
-        after = self._after(x, jump.inputs.astype(x.dtype), params)
-        return jnp.where(jump.exists, after, x)
+        u = jump.inputs.astype(x.dtype)
+        if self.adds:
+            return jnp.where(jump.exists, x + u, x)
+        # Elsewhere the function may have no derivative.
+        return lax.cond(jump.exists, lambda x: self._after(x, u, params), lambda x: x, x)
 
     @property
     def adds(self) -> bool:
@@ -94,10 +99,12 @@ class Jumps(eqx.Module):
     **Arguments:**
 
     - `times`: increasing times of the jumps, shape (J,), in the unit and with the origin of the
-        times of the observations.
+        times of the observations. A jump that differs from one of these by rounding errors only is
+        at this time.
     - `inputs`: u of each jump, shape (J, q), or (J,) for q = 1.
     - `apply`: the state after a jump, `(x, u, params) -> (d,)`. `x` is the state before it, and
-        `params` are the parameters of the model. By default `x + u`, with q = d.
+        `params` are the parameters of the model. By default `x + u`, with q = d. For several
+        records it is evaluated at other states, too: there it needs finite derivatives.
 
     **Raises:** `ValueError` and `TypeError` for times that do not increase or are traced, and for
     inputs of another shape or that are not finite.
@@ -117,11 +124,16 @@ class Jumps(eqx.Module):
     def __init__(self, times: Numbers, inputs: Numbers, apply: Callable | None = None):
         if is_traced(times):
             raise ValueError("`times` of `Jumps` must be concrete; got traced values.")
-        at = as_times("times", times)
-        if len(at.shape) != 1 or not at.shape[0]:
-            raise ValueError(f"`times` of `Jumps` must have shape (J,), J ≥ 1; got {at.shape}.")
-        check_increasing(at)
-        self.times = tuple(np.asarray(at.values).tolist())
+        shape, at = as_floating("times", times).shape, np.asarray(times)
+        if len(shape) != 1 or not shape[0]:
+            raise ValueError(f"`times` of `Jumps` must have shape (J,), J ≥ 1; got {shape}.")
+        at = at.astype(float)
+        if not (np.all(np.isfinite(at)) and np.all(np.diff(at) > 0)):
+            raise ValueError(
+                f"`times` of `Jumps` must be finite and increase; got {at}. Sort them with their "
+                "`inputs`, and add the inputs of equal times."
+            )
+        self.times = tuple(at.tolist())
         numbers = as_floating("inputs", inputs)
         columns = numbers[:, None] if numbers.ndim == 1 else numbers
         if columns.ndim != 2 or len(columns) != len(self.times):
@@ -140,12 +152,13 @@ class Jumps(eqx.Module):
         **Returns:** all times, which of them are those of `times`, and the possible jump at the
         beginning of each interval between them.
 
-        **Raises:** `ValueError` for a jump before the first of `times`, or if `times` are traced.
+        **Raises:** `ValueError` for a jump before the first of `times`, for two jumps at the same
+        time, and if `times` are traced.
         """
         if is_traced(times.values):
             raise ValueError("`times` must be concrete where there are `jumps`; got traced values.")
         old, at = np.asarray(times.values), np.asarray(self.times)
-        tolerance = _SAME * np.min(np.diff(old))
+        tolerance = _rounding(old)
         if at[0] < old[0] - tolerance:
             raise ValueError(
                 f"`jumps` must not begin before the first time, {old[0]:g}; got a jump at "
@@ -157,6 +170,12 @@ class Jumps(eqx.Module):
         nearest = np.argmin(np.abs(old[:, None] - at), axis=0)
         same = np.abs(old[nearest] - at) <= tolerance
         at = np.where(same, old[nearest], at)
+        if np.any(np.diff(at) <= 0):
+            i = int(np.argmin(np.diff(at)))
+            raise ValueError(
+                f"`jumps` at {self.times[i]} and {self.times[i + 1]} are both at the time {at[i]}, "
+                "up to rounding: pass one jump there, with the sum of the inputs."
+            )
         values = np.union1d(old, at)
         begins = np.searchsorted(values, at)
         which = np.zeros(len(values) - 1, int)
@@ -169,6 +188,30 @@ class Jumps(eqx.Module):
                 gaps = jnp.asarray(np.diff(values), times.dtype)
             jump = Jump(self.inputs[which], jnp.asarray(exists))
         return Times(values, gaps), np.isin(values, old), jump
+
+    def since(self, time: float) -> "Jumps | None":
+        """Return the jumps at this time and later; `None` if there are none."""
+        later = np.asarray(self.times) >= time - _rounding(np.asarray([time, self.times[-1]]))
+        if not np.any(later):
+            return None
+        first = int(np.argmax(later))
+        changed = copy.copy(self)
+        object.__setattr__(changed, "times", self.times[first:])
+        object.__setattr__(changed, "inputs", self.inputs[first:])
+        return changed
+
+
+def _rounding(times: np.ndarray) -> float:
+    """Return two rounding errors of the largest time, in the precision that the times have."""
+    largest = np.max(np.abs(times))
+    if np.all(times == np.round(times)):  # whole numbers are exact
+        return 0.0
+    if np.all(times == times.astype(np.float32)):
+        gaps = np.diff(np.unique(times))
+        return min(
+            2 * float(np.spacing(np.float32(largest))), _MOST_MOVED * np.min(gaps, initial=np.inf)
+        )
+    return 2 * float(np.spacing(largest))
 
 
 # Jumps of all records, or those of each of several records.

@@ -22,7 +22,8 @@ def windings(point: Numbers, periods: Numbers, most: int = 2) -> Float[Array, "W
 
     **Arguments:**
 
-    - `point`: a point, shape (d,).
+    - `point`: a point, shape (d,). Choose it within half a turn of the start, so that the likely
+        windings are among the results.
     - `periods`: circumference of each coordinate, shape (d,), or one number for all; infinite for a
         coordinate that is no angle.
     - `most`: maximum number of turns in each direction. More are needed if the noise spreads over

@@ -29,7 +29,7 @@ from ..engine.lanes import over_lanes
 from ..engine.resampling import systematic
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
-from ..models.jumps import JumpsLike
+from ..models.jumps import Jumps, JumpsLike
 from ..schemes import AbstractStepDensity
 from .cover import cover, covered_start
 from .guided_record import correction
@@ -186,7 +186,8 @@ def forecast(
     - `num_particles`: P, by default 1,000.
     - `after`: an earlier result, to continue its record. `times` and `observations` are then the
         later ones only, so the cost does not grow with the record. The particles go on from the
-        last reading of `after`: omit `initial`, `initial_time` and `num_particles`.
+        last reading of `after`: omit `initial` and `num_particles`. Earlier `jumps` do not count.
+        Inside `jit` and `vmap` pass the time of this reading as `initial_time`.
     - `throw`: raise an error at run time if the result is not `trustworthy`, or if a parameter is
         not finite.
 
@@ -210,14 +211,22 @@ def forecast(
     particles = None
     if after is not None:
         check_instance("after", after, Forecast, "a result of `forecast`")
-        if not (initial is None and initial_time is None and num_particles is None):
+        if initial is not None or num_particles is not None:
             raise ValueError(
-                "with `after` the start is its last particles: omit `initial`, `initial_time` and "
-                "`num_particles`."
+                "with `after` the start is its last particles: omit `initial` and `num_particles`."
             )
         last = len(after.log_scores) - 1
-        particles, initial_time = after.filtered[:, last], after.times[last]
+        particles = after.filtered[:, last]
         initial, num_particles = jnp.nanmean(particles, axis=0), len(particles)
+        if initial_time is None:
+            if is_traced(after.times):
+                raise ValueError(
+                    "inside `jit` and `vmap` the times of `after` are unknown: pass the time of "
+                    "its last reading as `initial_time`."
+                )
+            initial_time = float(after.times[last])
+        if isinstance(jumps, Jumps):
+            jumps = jumps.since(float(np.asarray(initial_time)))
     num_particles = 1000 if num_particles is None else num_particles
     num_particles = check_count("num_particles", num_particles, 2)
     if are_several(times, observations):
@@ -267,8 +276,11 @@ def forecast(
     states, readings, filtered, scores = _run(key, problem, num_particles, particles)
     num_read = num_times - len(later)
     of_times = lambda draws: jnp.swapaxes(draws[which], 0, 1)
+    all_times = problem.record.clock.exactly(since[which])
+    if not is_traced(times, at):  # `after` needs them without rounding errors
+        all_times = np.append(np.asarray(checked_times.values), np.asarray(at, float))
     made = Forecast(
-        problem.record.clock.exactly(since[which]),
+        all_times,
         of_times(states),
         of_times(readings),
         of_times(filtered),

@@ -94,6 +94,12 @@ class RecordProblem(eqx.Module):
             return True
         return self.jump_map.is_affine(self.like, self.record.jump, model.params)
 
+    def after_jumps(self, model: Diffusion, begins: Float[Array, "K d"]) -> Float[Array, "K d"]:
+        """Return the states after the jumps at the beginnings of all segments."""
+        if self.jump_map is None:
+            return begins
+        return jax.vmap(self.motion(model).after_jump)(begins, self.record.jump)
+
     def motion(self, model: Diffusion) -> Motion:
         """Return the law of the steps at these parameters."""
         return Motion(self.density, model.forward_at(self.like), self.jump_map, model.params)

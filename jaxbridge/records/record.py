@@ -5,7 +5,7 @@ ends. Hence every record has K segments of N steps, for any times, and needs one
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -213,16 +213,18 @@ def _with_jumps(
     if jumps is None:
         return [(times, times.shape[0] * (True,), None) for times, _ in checked]
     example = next(entry for entry in jumps if entry is not None)
-    results = []
-    for (times, _), entry in zip(checked, jumps, strict=True):
+
+    def split(times: Times, entry: Jumps | None):
         if entry is not None:
             all_times, is_observed, jump = entry.split(times)
-        else:
-            all_times, is_observed = times, np.ones(times.shape[0], bool)
-            none = jnp.zeros(len(times.gaps), bool)
-            jump = Jump(jnp.repeat(example.inputs[:1], len(none), axis=0), none)
-        results.append((all_times, tuple(is_observed.tolist()), jump))
-    return results
+            return all_times, tuple(is_observed.tolist()), jump
+        none = jnp.zeros(len(times.gaps), bool)
+        jump = Jump(jnp.repeat(example.inputs[:1], len(none), axis=0), none)
+        return times, times.shape[0] * (True,), jump
+
+    return of_each(
+        split, [(times, entry) for (times, _), entry in zip(checked, jumps, strict=True)]
+    )
 
 
 def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, Numbers]]:
@@ -259,8 +261,8 @@ def _has_rows(times: Numbers) -> bool:
     return several and len(times) > 0 and len(times[0]) > 1  # pyright: ignore
 
 
-def of_each(function: Callable[..., Any], pairs: list[tuple[Numbers, Numbers]]) -> list[Any]:
-    """Evaluate `function(times, observations)` for each record.
+def of_each(function: Callable[..., Any], pairs: Sequence[tuple[Any, Any]]) -> list[Any]:
+    """Evaluate `function(times, observations)` for each record, or another function of two values.
 
     **Raises:** the errors of `function`. If there are several records, the message begins with the
     number of the record.
@@ -367,13 +369,12 @@ def _split_into_segments(
     which = np.concatenate([[0], np.cumsum(segments)])
     num_ends, begins = which[-1] + 1, which[:-1]
     which = which[np.asarray(is_observed)]
+    gap = np.repeat(np.arange(len(segments)), segments)
     if jump is not None:
         # Other segments than the first of an interval have arbitrary inputs.
-        gap = np.repeat(np.arange(len(segments)), segments)
         is_first = np.isin(np.arange(num_ends - 1), begins)
         jump = Jump(jump.inputs[gap].astype(dtype), jump.exists[gap] & is_first)
     ends = jnp.full((num_ends, values.shape[1]), jnp.nan, dtype).at[which].set(values)
-    gap = np.repeat(np.arange(len(segments)), segments)
     within = np.concatenate([np.arange(n) for n in segments])
     dt = (gaps / jnp.asarray(np.array(segments) * num_steps, gaps.dtype))[gap].astype(dtype)
     start = since[gap] + jnp.asarray(within * num_steps, dtype) * dt

@@ -570,7 +570,8 @@ def _log_halving(
     def of_draw(path):
         segments = path[:, place]
         if problem.jump_map is not None:  # the diffusion begins after the jump
-            segments = segments.at[:, :, 0].set(_after_jumps(problem, segments[:, :, 0]))
+            begins = jax.vmap(lambda begins: problem.after_jumps(problem.model, begins))
+            segments = segments.at[:, :, 0].set(begins(segments[:, :, 0]))
         segments = segments.reshape(chains * K, N + 1, d)
         of_segments = log_halving_of_paths(problem.density, dynamics, dt, segments, time)
         return of_segments.reshape(chains, K)
@@ -578,15 +579,6 @@ def _log_halving(
     # One draw of all chains at a time, to save memory.
     D = jnp.moveaxis(lax.map(of_draw, jnp.moveaxis(paths, 1, 0)), 0, 1)
     return jnp.where(has_length(problem), D, 0)
-
-
-def _after_jumps(
-    problem: RecordProblem, starts: Float[Array, "chains K d"]
-) -> Float[Array, "chains K d"]:
-    """Return the states after the jumps at the beginnings of all segments."""
-    motion = problem.motion(problem.model)
-    of_segments = jax.vmap(motion.after_jump)
-    return jax.vmap(of_segments, (0, None))(starts, problem.record.jump)
 
 
 def _step_error_of_mean(

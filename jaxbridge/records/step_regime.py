@@ -20,7 +20,8 @@ def steps_are_too_long(
     if model.depends_on_time or problem.density.is_exact:
         return jnp.zeros((), bool)
     ends, durations = path[:: problem.num_steps], problem.record.durations
-    intervals, record = Intervals(ends[:-1], ends[1:], durations), problem.record
+    begins = problem.after_jumps(model, ends[:-1])
+    intervals, record = Intervals(begins, ends[1:], durations), problem.record
     num_longest = record.num_equal_steps / max(record.lengths)
     share = share_in_regime(jnp.ones_like(durations), model, intervals, num_longest)
     moving = durations > 0  # segments of length zero lie beyond the record

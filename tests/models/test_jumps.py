@@ -14,14 +14,40 @@ LINE = jb.ornstein_uhlenbeck([[1.0]])
 
 
 def test_times_are_split_where_the_state_jumps():
-    jumps = jb.Jumps([0.0, 0.7, 1.00000001, 2.0, 9.0], [1.0, 2.0, 3.0, 4.0, 5.0])
-    times, is_time, jump = jumps.split(as_times("times", [0.0, 1.0, 2.0]))
-    np.testing.assert_array_equal(times.values, [0.0, 0.7, 1.0, 2.0])
-    np.testing.assert_allclose(times.gaps, [0.7, 0.3, 1.0], rtol=1e-6)
+    jumps = jb.Jumps([0.0, 0.7, 1.1, 2.0, 9.0], [1.0, 2.0, 3.0, 4.0, 5.0])
+    single = np.array([0.0, 1.1, 2.0], np.float32)  # in which 1.1 is another number
+    times, is_time, jump = jumps.split(as_times("times", single))
+    np.testing.assert_allclose(times.values, [0.0, 0.7, 1.1, 2.0], rtol=1e-6)
+    np.testing.assert_allclose(times.gaps, [0.7, 0.4, 0.9], rtol=1e-6)
     np.testing.assert_array_equal(is_time, [True, False, True, True])
     # The last two jumps come at the end or after it.
     np.testing.assert_array_equal(jump.exists, [True, True, True])
     np.testing.assert_array_equal(jump.inputs[:, 0], [1, 2, 3])
+
+
+@pytest.mark.parametrize("scale", [1, 2_460_000])
+def test_a_jump_shortly_before_a_time_is_before_it(scale):
+    """However short the gap, if it is no rounding error; also in days of a Julian date."""
+    times, is_time, jump = jb.Jumps([scale + 0.4999], [1.0]).split(
+        as_times("times", np.array([0.0, 0.5, 1.0]) + scale)
+    )
+    np.testing.assert_array_equal(is_time, [True, False, True, True])
+    np.testing.assert_array_equal(jump.exists, [False, True, False])
+    np.testing.assert_allclose(times.gaps[1], 1e-4, rtol=1e-4)
+
+
+def test_jumps_of_one_time_are_one():
+    near = np.float32(1.1)
+    with pytest.raises(ValueError, match="pass one jump there, with the sum"):
+        jb.Jumps([1.1, np.nextafter(near, 2)], [1.0, 2.0]).split(
+            as_times("times", np.array([0.0, near, 2.0], np.float32))
+        )
+
+
+def test_jumps_since_a_time():
+    jumps = jb.Jumps([0.0, 1.5, 2.0], [1.0, 2.0, 3.0])
+    assert jumps.since(1.5).times == (1.5, 2.0) and jumps.since(2.1) is None
+    np.testing.assert_array_equal(jumps.since(1.6).inputs, [[3.0]])
 
 
 def test_an_interval_without_a_jump():
@@ -66,7 +92,10 @@ def test_a_map_sees_inputs_and_parameters():
     [
         (([[0.0, 1.0]], [1.0]), "shape (J,)"),
         (([], []), "J ≥ 1"),
-        (([1.0, 0.0], [1.0, 1.0]), "must be increasing"),
+        ((1.0, 2.0), "shape (J,)"),
+        (([1.0, 0.0], [1.0, 1.0]), "Sort them with their `inputs`"),
+        (([1.0, 1.0], [1.0, 1.0]), "add the inputs of equal times"),
+        (([np.nan], [1.0]), "must be finite"),
         (([0.0, 1.0], [1.0]), "one row per time"),
         (([0.0], [np.nan]), "finite"),
         (([0.0], [1.0], 3), "`apply`"),

@@ -301,6 +301,36 @@ def test_appended_readings_continue_the_record(noisy):
     np.testing.assert_array_less(np.abs(later.readings[..., 0].mean(0) - mean), error)
 
 
+@pytest.mark.slow
+def test_short_gaps_after_a_large_time():
+    """Brownian motion, read exactly: the variance of the next reading is the gap."""
+    line, begin = jb.Diffusion(lambda x, p: 0 * x), 1e5 + 0.3
+    exact = {"observation": jb.LinearGaussian(covariance=0.0), "num_steps": 1}
+    first = jb.forecast(KEY, line, begin + np.arange(3), np.zeros(3), initial=[0.0], **exact)
+    later = jb.forecast(KEY, line, [begin + 2.01, begin + 3], np.zeros(2), after=first, **exact)
+    np.testing.assert_allclose(later.states[:, 0].var(), 0.01, rtol=0.3)
+
+
+@pytest.mark.slow
+def test_jumps_and_transformations_of_a_continued_forecast():
+    """Jumps of the past are left out; inside `jit` the time of the last reading is given."""
+    doses, options = jb.Jumps([0.5, 1.0, 1.5], [9.0, 2.0, 3.0]), {"num_steps": 1}
+    options["observation"] = jb.LinearGaussian(covariance=NOISE)
+    first = jb.forecast(KEY, OU, [0.0, 1.0], [0.1, 3.2], jumps=doses, **options)
+
+    def mean(after, **time):
+        made = jb.forecast(KEY, OU, [2.0], [np.nan], after=after, jumps=doses, **options, **time)
+        return made.states[:, 0, 0].mean()
+
+    start = first.filtered[:, 1, 0].mean() + 2.0
+    exact = start * np.exp(-1.0) + 3 * np.exp(-0.5)
+    assert abs(mean(first) - exact) < 0.1
+    inside = jax.jit(lambda after: mean(after, initial_time=1.0))(first)
+    np.testing.assert_allclose(inside, mean(first), rtol=1e-5)
+    with pytest.raises(ValueError, match="pass the time of its last reading"):
+        jax.jit(mean)(first)
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [
