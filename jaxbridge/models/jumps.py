@@ -5,7 +5,6 @@ process is the diffusion. An observation at τ is taken before the jump, and so 
 a path.
 """
 
-import copy
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -39,12 +38,12 @@ class Jump(NamedTuple):
 class JumpMap(eqx.Module):
     """Map J of a jump, from the state before it to the state after it."""
 
-    _function: Callable | None = eqx.field(static=True)
+    function: Callable | None = eqx.field(static=True)
     _captured: Captured
 
     def __init__(self, function: Callable | None):
         check_function("apply", function, "(x, u, params)", optional=True)
-        self._function = function
+        self.function = function
         self._captured = Captured(function)
 
     def __call__(
@@ -62,7 +61,7 @@ class JumpMap(eqx.Module):
     @property
     def adds(self) -> bool:
         """Return whether J(x, u) = x + u, with derivative I."""
-        return self._function is None
+        return self.function is None
 
     def is_affine(self, like: Float[Array, " d"], jump: Jump, params: PyTree) -> bool:
         """Return whether J(x, u) is affine in x."""
@@ -70,9 +69,9 @@ class JumpMap(eqx.Module):
         return self.adds or is_affine(lambda x: self._after(x, u, params), like)
 
     def _after(self, x: Float[Array, " d"], u: Float[Array, " q"], params: PyTree):
-        if self._function is None:
+        if self.function is None:
             return x + u
-        value = evaluated("apply", self._captured.call, self._function, x, u, params)
+        value = evaluated("apply", self._captured.call, self.function, x, u, params)
         return as_returned("apply", value).astype(x.dtype)
 
     def check(self, like: Float[Array, " d"], u: Float[Array, " q"], params: PyTree) -> None:
@@ -167,9 +166,7 @@ class Jumps(eqx.Module):
         # Jumps at or after the last time have no effect.
         before_end = at < old[-1] - tolerance
         at = at[before_end]
-        nearest = np.argmin(np.abs(old[:, None] - at), axis=0)
-        same = np.abs(old[nearest] - at) <= tolerance
-        at = np.where(same, old[nearest], at)
+        at = _moved(at, old, tolerance)
         if np.any(np.diff(at) <= 0):
             i = int(np.argmin(np.diff(at)))
             raise ValueError(
@@ -195,10 +192,15 @@ class Jumps(eqx.Module):
         if not np.any(later):
             return None
         first = int(np.argmax(later))
-        changed = copy.copy(self)
-        object.__setattr__(changed, "times", self.times[first:])
-        object.__setattr__(changed, "inputs", self.inputs[first:])
-        return changed
+        return Jumps(self.times[first:], self.inputs[first:], self.map.function)
+
+
+def _moved(at: np.ndarray, times: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return times of jumps, moved to the nearest of `times` if it is within the tolerance."""
+    next_one = np.searchsorted(times, at).clip(1, len(times) - 1)
+    before, after = times[next_one - 1], times[next_one]
+    nearest = np.where(at - before < after - at, before, after)
+    return np.where(np.abs(nearest - at) <= tolerance, nearest, at)
 
 
 def _rounding(times: np.ndarray) -> float:
