@@ -252,7 +252,12 @@ VALUES = {
 
 OF_FUNCTIONS = [name for name in VALUES if name.startswith(("a function", "a model", "a number's"))]
 # Choices that look at numbers.
-NOT_TRACED = {"fit_start_law", "choose_proposal", "tune_coupling"}
+NOT_TRACED = {
+    "fit_start_law",
+    "choose_proposal",
+    "tune_coupling",
+    "simulation_based_calibration",
+}
 # Names that a sentence may blame in the place of the argument.
 OF_A_MODEL = {"drift", "diffusion", "log_stationary", "x"}
 
