@@ -137,9 +137,9 @@ def simulation_based_calibration(
     import functools
 
     made = jb.simulation_based_calibration(
-        key, model, times, observations, functools.partial(jb.gibbs, num_iterations=1000),
-        prior=jb.NormalPrior(1.0, 0.1), where=lambda p: p.B[0, 0],
-        observation=jb.LinearGaussian(covariance=0.1), num_simulations=50,
+        key, model, times, observations, functools.partial(jb.gibbs, num_iterations=300),
+        prior=jb.NormalPrior(model.params.B, 0.01), where=lambda p: p.B,
+        observation=jb.LinearGaussian(covariance=0.1), num_simulations=5,
     )  # fmt: skip
     made.p_uniform  # small if posteriors are wrong
     ```

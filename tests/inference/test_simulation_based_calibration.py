@@ -49,17 +49,17 @@ def calibrate(sampler, num=200, **options):
 
 
 def test_a_right_sampler_passes():
-    made = calibrate(conjugate, 100)
-    assert made.names == ("level",) and made.truth.shape == made.uniforms.shape == (100, 1)
+    made = calibrate(conjugate, 60)
+    assert made.names == ("level",) and made.truth.shape == made.uniforms.shape == (60, 1)
     assert made.p_uniform[0] > 0.01 and made.trustworthy
     # The truth is from the prior, and missing readings stay missing.
-    assert abs(made.truth.mean() - 1) < 5 * 2 / np.sqrt(100)
-    assert abs(made.truth.std() / 2 - 1) < 5 / np.sqrt(200)
+    assert abs(made.truth.mean() - 1) < 5 * 2 / np.sqrt(60)
+    assert abs(made.truth.std() / 2 - 1) < 5 / np.sqrt(120)
 
 
 @pytest.mark.parametrize("fault", [{"shift": 0.8}, {"stretch": 0.5}, {"stretch": 2.0}])
 def test_a_wrong_one_is_found(fault):
-    assert calibrate(functools.partial(conjugate, **fault), 80).p_uniform[0] < 1e-3
+    assert calibrate(functools.partial(conjugate, **fault), 60).p_uniform[0] < 1e-3
 
 
 def test_posteriors_that_are_not_trusted_are_a_fault():

@@ -32,6 +32,7 @@ AT, WHOLE, ROWS = with_jumps(RECORD)
 EXACT = WHOLE.kalman(1, exact=True, jumps=ROWS).log_likelihood
 
 
+@pytest.mark.slow
 def test_the_likelihood_is_kalmans():
     """By particles, and by any noise: all weights are equal."""
     jumps = jb.Jumps(AT, INPUTS)
@@ -42,6 +43,7 @@ def test_the_likelihood_is_kalmans():
     assert abs(EXACT - RECORD.kalman(1, exact=True).log_likelihood) > 1  # without jumps
 
 
+@pytest.mark.slow
 def test_maps_of_jumps_see_parameters():
     """Doses of which an unknown part acts, beside a pull, at two values of both."""
 
@@ -158,6 +160,7 @@ GROWTH = jb.Diffusion(
 )
 
 
+@pytest.mark.slow
 def test_harvests_of_a_geometric_brownian_motion():
     """Exact readings; each harvest leaves a part: the ratios of readings are log-normal."""
     times, y = np.arange(6.0), np.array([1.0, 1.4, 0.9, 1.1, 0.8, 1.3])
