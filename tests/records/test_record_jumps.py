@@ -111,6 +111,7 @@ def paths():
 def test_smoothed_paths_are_kalmans(paths):
     """The path at a jump is the state before it; blocks of both cuts have their jumps."""
     euler = WHOLE.kalman(4, jumps=ROWS)
+    assert np.all(paths.accepted > 0.99)  # guiding is exact here
     error = np.asarray(paths.standard_error())
     grid = np.interp(np.arange(41) / 4, np.arange(11), WHOLE.times)
     np.testing.assert_allclose(paths.times, grid, rtol=1e-5)
