@@ -109,7 +109,8 @@ class TransitionLogDensity(AbstractResult):
         """Return log Σ p̂ over the I pairs of points, with its errors, as a result of shape ().
 
         On a circle this is the log density, if the end points are all `windings` of one point.
-        Diagnostics and counts leave out pairs with less than a thousandth of the sum.
+        Diagnostics and counts leave out pairs with less than a thousandth of the sum. The standard
+        error is infinite if no proposal became a bridge for some pair.
 
         **Example:**
 
@@ -133,7 +134,8 @@ class TransitionLogDensity(AbstractResult):
         inverse_size = jnp.sum(weighted(shares / jnp.where(counts, self.effective_sample_size, 1)))
         return TransitionLogDensity(
             value,
-            jnp.where(some, safe_norm(weighted(self.standard_error)), jnp.inf),
+            # The share of a pair without a bridge is unknown.
+            jnp.where(jnp.all(self.num_met > 0), safe_norm(weighted(self.standard_error)), jnp.inf),
             jnp.where(some, 1 / jnp.where(some, inverse_size, 1), 0),
             number(self.num_met),
             number(self.num_truncated),

@@ -207,7 +207,7 @@ def _draw(key, parameters, mean: Float[Array, " p"], root: np.ndarray) -> Float[
         if parameters.allowed(theta):
             return theta
     raise ValueError(
-        f"no one of {_MOST_ATTEMPTS:,} draws of `prior` satisfies `constraint`: pass a prior with "
+        f"none of {_MOST_ATTEMPTS:,} draws of `prior` satisfies `constraint`: pass a prior with "
         "more mass there."
     )
 

@@ -288,13 +288,17 @@ def gibbs(
             check_no_bridges(OF_POPULATION if population else OF_UNKNOWN_SIGMA, **for_bridges)
             observation, initial = LinearGaussian(covariance=0.0), _wide_law(problem.intervals)
     if observation is not None:
-        options = {
-            "num_steps": num_steps,
-            "step_size": step_size,
-            "initial_time": initial_time,
-            "jumps": jumps,
-        }
-        records = as_record_problems(model, times, observations, observation, initial, **options)
+        records = as_record_problems(
+            model,
+            times,
+            observations,
+            observation,
+            initial,
+            num_steps=num_steps,
+            step_size=step_size,
+            initial_time=initial_time,
+            jumps=jumps,
+        )
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
         log_prior = as_log_prior(prior, parameters, unknown)
         units = as_population(population, parameters, log_prior, records.number)

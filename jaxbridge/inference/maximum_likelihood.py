@@ -250,13 +250,17 @@ def maximum_likelihood(
             max_proposals=max_proposals,
             max_trials=max_trials,
         )
-        options = {
-            "num_steps": num_steps,
-            "step_size": step_size,
-            "initial_time": initial_time,
-            "jumps": jumps,
-        }
-        records = as_record_problems(model, times, observations, observation, initial, **options)
+        records = as_record_problems(
+            model,
+            times,
+            observations,
+            observation,
+            initial,
+            num_steps=num_steps,
+            step_size=step_size,
+            initial_time=initial_time,
+            jumps=jumps,
+        )
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
         if len(unknown) > _MOST_FOR_NEWTON:
             raise ValueError(

@@ -324,13 +324,17 @@ def pmmh(
 
     else:
         check_no_bridges(proposal=proposal, num_counts=num_counts, max_trials=max_trials)
-        options = {
-            "num_steps": num_steps,
-            "step_size": step_size,
-            "initial_time": initial_time,
-            "jumps": jumps,
-        }
-        records = as_record_problems(model, times, observations, observation, initial, **options)
+        records = as_record_problems(
+            model,
+            times,
+            observations,
+            observation,
+            initial,
+            num_steps=num_steps,
+            step_size=step_size,
+            initial_time=initial_time,
+            jumps=jumps,
+        )
         unknown = theta_of_model(parameters, records.stacked.like.dtype)
 
         def first_likelihood(model: Diffusion, state: PMMHState | None) -> AbstractLikelihood:

@@ -46,12 +46,8 @@ class JumpMap(eqx.Module):
         self.function = function
         self._captured = Captured(function)
 
-    def __call__(
-        self, x: Float[Array, " d"], jump: Jump | None, params: PyTree
-    ) -> Float[Array, " d"]:
+    def __call__(self, x: Float[Array, " d"], jump: Jump, params: PyTree) -> Float[Array, " d"]:
         """Return the state after the jump; x itself if there is none."""
-        if jump is None:
-            return x
         u = jump.inputs.astype(x.dtype)
         if self.adds:
             return jnp.where(jump.exists, x + u, x)

@@ -40,4 +40,6 @@ class Motion(NamedTuple):
 
     def after_jump(self, x: Float[Array, " d"], jump: Jump | None) -> Float[Array, " d"]:
         """Return the state after the jump."""
-        return x if self.jump_map is None else self.jump_map(x, jump, self.params)
+        if self.jump_map is None or jump is None:
+            return x
+        return self.jump_map(x, jump, self.params)

@@ -1,5 +1,7 @@
 """Densities and bridges on a circle, against the generator in Fourier series."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -117,6 +119,16 @@ def test_a_sum_ignores_what_has_no_share():
     assert total.trustworthy and np.isfinite(total.standard_error)
     np.testing.assert_allclose(total.value, estimate.value[2], atol=1e-6)
     np.testing.assert_allclose(total.effective_sample_size, estimate.effective_sample_size[2])
+
+
+def test_a_pair_without_a_bridge_has_an_unknown_share():
+    estimate = on_circle(0.0, 0.3, 0.1)
+    lost = dataclasses.replace(
+        estimate,
+        value=estimate.value.at[1].set(-jnp.inf),
+        num_met=estimate.num_met.at[1].set(0),
+    ).total()
+    assert np.isinf(lost.standard_error) and not lost.trustworthy
 
 
 @pytest.mark.parametrize(
