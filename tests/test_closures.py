@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import slow_beyond
 
 import jaxbridge as jb
 
@@ -65,12 +64,6 @@ def density(proposal):
     return value
 
 
-def weighted_bridges(model, *_):
-    options = dict(num_bridges=4, num_steps=4, proposal=GUIDED)
-    bridges = jb.sample_weighted_bridges(KEY, model, [0.3], [0.5], 1.0, **options)
-    return bridges.mean(lambda path: path[2, 0])
-
-
 def expectation(model, *_):
     fixed = jb.Diffusion(drift, None, log_nu, 0.7)
     options = dict(num_bridges=4, num_steps=4, proposal=GUIDED)
@@ -78,20 +71,9 @@ def expectation(model, *_):
     return jb.expectation(lambda path: path[2, 0], bridges, model)
 
 
-def bridges(model, *_):
-    options = dict(num_bridges=2, num_steps=4, coupling=COUPLING)
-    return jb.sample_bridges(KEY, model, [0.3], [0.5], 1.0, **options).paths[0, 2, 0]
-
-
 def log_likelihood(model, observation, _, initial):
     options = dict(observation=observation, initial=initial, num_particles=8, num_steps=2)
     return jb.log_likelihood(KEY, model, TIMES, POINTS, **options).value
-
-
-def innovations(model, _, observation, initial):
-    options = dict(observation=observation, initial=initial, num_steps=2)
-    paths = jb.innovations(model, TIMES, POINTS, **options)
-    return paths.log_density(model.params, jnp.ones(paths.size) / 3)
 
 
 def smooth(model, observation, _, initial):
@@ -118,26 +100,19 @@ def of_intervals(function, **options):
 PRIOR = jb.NormalPrior(1.0, 1.0)
 FUNCTIONS = {
     "transition_log_density": density(GUIDED),
-    "weighted bridges": weighted_bridges,
     "expectation": expectation,
     "path_log_likelihood": path_log_likelihood,
     "simulate": simulate,
-    "innovations": innovations,
     "log_likelihood": log_likelihood,
     "smooth": smooth,
     "couplings": density(COUPLING),
-    "bridges": bridges,
     "gibbs": of_intervals(jb.gibbs, prior=PRIOR, num_iterations=2),
-    "pmmh": of_intervals(jb.pmmh, prior=PRIOR, num_iterations=2, num_proposals=2),
-    "score": of_intervals(jb.score, num_bridges=2),
     "maximum_likelihood": of_intervals(jb.maximum_likelihood, num_iterations=2),
 }
 
 NESTINGS = {
-    "jit(grad)": lambda f: jax.jit(jax.grad(f)),
     "jit(jacfwd)": lambda f: jax.jit(jax.jacfwd(f)),
     "jit(vmap(grad))": lambda f: lambda x: jax.jit(jax.vmap(jax.grad(f)))(x[None])[0],
-    "grad": jax.grad,
     "jit(hessian)": lambda f: jax.jit(jax.hessian(f)),
 }
 
@@ -165,6 +140,7 @@ def test_derivatives_in_closures_are_those_in_params(name):
     compare(name, "jit(jacfwd)")
 
 
-@pytest.mark.parametrize("nesting", slow_beyond(0, NESTINGS))
+@pytest.mark.slow
+@pytest.mark.parametrize("nesting", list(NESTINGS)[1:])
 def test_under_every_nesting(nesting):
     compare("transition_log_density", nesting)

@@ -320,15 +320,19 @@ def test_some_malformed_arguments(call, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("call", CALLS)
 def test_malformed_arguments(call, monkeypatch):
-    assert not faults(call, lambda i: VALUES, monkeypatch)
+    """Of each argument every third value, each time others."""
+    shift = list(CALLS).index(call)
+    assert not faults(call, lambda i: list(VALUES)[(shift + i) % 3 :: 3], monkeypatch)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("call", [call for call in CALLS if call not in NOT_TRACED])
 def test_malformed_functions_and_models(call, monkeypatch):
-    """Which are seen when programs are traced."""
+    """Which are seen when programs are traced: of each argument every third, each time others."""
+    shift = list(CALLS).index(call)
+    values_of = lambda i: OF_FUNCTIONS[(shift + i) % 3 :: 3]
     with jax.numpy_dtype_promotion("standard"):  # as optax asks for
-        assert not faults(call, lambda i: OF_FUNCTIONS, monkeypatch, traced=True)
+        assert not faults(call, values_of, monkeypatch, traced=True)
 
 
 # Calls that return estimates: what is malformed and taken all the same is run.
@@ -380,11 +384,13 @@ def main_number(result):
 @pytest.mark.slow
 @pytest.mark.parametrize("call", ESTIMATES)
 def test_outcomes_of_malformed_numbers(call):
-    """An estimate that is not finite is not trustworthy, and what is refused is named."""
+    """An estimate that is not finite is not trustworthy, and what is refused is named. Each number
+    stands in every third place, each in others."""
+    shift = list(ESTIMATES).index(call)
     call, arguments = ESTIMATES[call]()
     wrong = []
-    for value in NUMBERS:
-        for name, changed in with_number(arguments, value):
+    for i, value in enumerate(NUMBERS):
+        for name, changed in list(with_number(arguments, value))[(shift + i) % 3 :: 3]:
             try:
                 made = {k: each() if callable(each) else each for k, each in changed.items()}
                 with jax.numpy_dtype_promotion("standard"):  # as optax asks for

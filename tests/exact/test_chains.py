@@ -15,7 +15,6 @@ from helpers import (
     exact_case,
     exact_cases,
     paper_model,
-    slow_beyond,
 )
 
 import jaxbridge as jb
@@ -44,7 +43,7 @@ def test_chain_midpoints_have_the_exact_law(method, name):
         case.start,
         case.end,
         case.duration,
-        num_bridges=30_000,
+        num_bridges=15_000,
         num_steps=case.num_steps,
         proposal=case.coupling,
         method=method,
@@ -84,39 +83,26 @@ def run_kernel(kernel, key, num_bridges):
 ARGUMENTS = (paper_model(), [0.785, 0.785], [1.091, 1.091], 1.0)
 
 
-@pytest.mark.parametrize(
-    "method, law",
-    [
-        pytest.param("pseudo_marginal", None, id="pseudo_marginal-nu"),
-        pytest.param("renewal", FITTED, id="renewal-mu"),
-    ],
-)
 @pytest.mark.slow
-def test_batched_chain_is_the_kernel_stepped(method, law):
-    """Also where the renewal chain runs in several segments."""
+def test_batched_chain_is_the_kernel_stepped():
+    """Where the renewal chain runs in several segments."""
     key, num_bridges = jax.random.key(5), 300
-    options = dict(num_steps=20, proposal=jb.Coupling(0.5, start_law=law))
-    if method == "pseudo_marginal":
-        options |= {"num_counts": 2}
-    kernel = getattr(jb, method)(*ARGUMENTS, **options)
+    options = dict(num_steps=20, proposal=jb.Coupling(0.5, start_law=FITTED))
+    kernel = jb.renewal(*ARGUMENTS, **options)
     states, infos = jax.jit(functools.partial(run_kernel, kernel), static_argnums=1)(
         key, num_bridges
     )
     chain = jb.sample_exact_bridges(
-        key, *ARGUMENTS, num_bridges=num_bridges, method=method, **options
+        key, *ARGUMENTS, num_bridges=num_bridges, method="renewal", **options
     )
     np.testing.assert_array_equal(chain.accepted, infos.is_accepted)
     np.testing.assert_allclose(chain.paths, states.position, atol=1e-5)
-    if method == "pseudo_marginal":
-        np.testing.assert_allclose(chain.log_weights, states.log_weight, atol=1e-4)
-        assert 0.3 < chain.acceptance_rate < 0.95
-    else:
-        assert chain.log_weights is None
-        assert (infos.is_accepted <= infos.is_hit).all() and infos.is_accepted.any()
+    assert chain.log_weights is None
+    assert (infos.is_accepted <= infos.is_hit).all() and infos.is_accepted.any()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", slow_beyond(1, ["crank_nicolson", "pseudo_marginal", "renewal"]))
+@pytest.mark.parametrize("method", ["crank_nicolson", "pseudo_marginal"])
 def test_a_chain_goes_on_from_a_path(method):
     """As the kernel does from the same position; of several intervals each from its own."""
     coupled = method != "crank_nicolson"
@@ -148,10 +134,9 @@ def test_a_chain_goes_on_from_a_path(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", slow_beyond(1, ["renewal", "pseudo_marginal"]))
-def test_chains_under_vmap_share_their_lanes(method):
+def test_chains_under_vmap_share_their_lanes():
     """As many lanes as chains, in place of 64 or more for each; and the numbers of each alone."""
-    kernel = getattr(jb, method)(*ARGUMENTS, num_steps=7, proposal=jb.Coupling(0.5))
+    kernel = jb.renewal(*ARGUMENTS, num_steps=7, proposal=jb.Coupling(0.5))
     chains = jax.vmap(lambda key: run_kernel(kernel, key, 3)[0].position)
     keys = jax.random.split(jax.random.key(1), 70)
     text = jax.jit(chains).lower(keys).as_text()
@@ -180,11 +165,11 @@ def test_chains_of_several_models_under_vmap():
 
 
 @slow
-@pytest.mark.parametrize("width, num_bridges", [(128, 1500), (8, 1400)])
-def test_segments_of_hard_bridges_are_mended_to_one_chain(width, num_bridges, monkeypatch):
+def test_segments_of_hard_bridges_are_mended_to_one_chain(monkeypatch):
     """Few renewals: trajectories seldom rejoin within their segment. All segments are run and
-    mended by one body, or, where there are more than are mended at a time, by two."""
-    monkeypatch.setattr(sys.modules["jaxbridge.exact.renewal"], "_REPAIR_WIDTH", width)
+    mended by one body, and those beyond as many as are mended at a time by another."""
+    monkeypatch.setattr(sys.modules["jaxbridge.exact.renewal"], "_REPAIR_WIDTH", 8)
+    num_bridges = 1400
     arguments = (paper_model(), *PAPER_CASES["very unlikely"], 1.0)
     options = dict(num_steps=10, proposal=jb.Coupling(0.5))
     kernel = jb.renewal(*arguments, **options)

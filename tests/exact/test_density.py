@@ -211,7 +211,6 @@ def test_what_the_refusal_recommends_is_right():
         (model, None),  # which has no sampler, and so a start law with a density
         (model, jb.Coupling(0.0, start_law=law)),
         (model, "auto"),
-        (model, jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())),
     ]:
         estimate = jb.transition_log_density(
             jax.random.key(0), case, *ends, num_proposals=10_000, num_steps=20, proposal=proposal

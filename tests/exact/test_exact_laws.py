@@ -13,7 +13,6 @@ from jaxbridge.exact.density import log_mean_and_error
 from jaxbridge.exact.pseudo_marginal import accept_reject
 
 CASES = exact_cases()
-SIZES = {"very unlikely": 30_000, "swirled": 20_000}
 
 
 @pytest.mark.parametrize("name", slow_cases(CASES, {"one dimension"}))
@@ -25,12 +24,12 @@ def test_weighted_proposals_have_the_exact_law(name):
     case = CASES[name]()
     weighted = jb.sample_weighted_bridges(
         jax.random.key(1), case.model, case.start, case.end, case.duration,
-        num_bridges=SIZES.get(name, 60_000), num_steps=case.num_steps,
+        num_bridges=20_000, num_steps=case.num_steps,
         proposal=case.coupling, save_at=[case.duration / 2], max_proposals=1,
     )  # fmt: skip
     assert not weighted.truncated.any()
     log_mean, error, _ = (leaf[0] for leaf in log_mean_and_error(weighted.log_weights[None]))
-    assert error < 0.03
+    assert error < 0.05
     assert abs(log_mean - case.log_density) < 5 * error + case.allowance
 
     found = np.asarray(weighted.met)
@@ -38,7 +37,7 @@ def test_weighted_proposals_have_the_exact_law(name):
     log_weights = weighted.log_weights[found]
     size = assert_weighted_moments(middle, np.exp(log_weights), case.mean, case.covariance)
     assert size == pytest.approx(float(weighted.effective_sample_size), rel=1e-3)
-    assert size > 800
+    assert size > 400
     assert case.start_law is None or np.ptp(log_weights) > 0
 
     uniform = jax.random.uniform(jax.random.key(2), (1, len(log_weights) - 1))

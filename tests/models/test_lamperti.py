@@ -69,12 +69,12 @@ def test_densities_are_those_of_cir(proposal):
         moved.forward(jnp.array([start])),
         moved.forward(jnp.array([end])),
         1.0,
-        num_proposals=40_000,
+        num_proposals=15_000,
         num_steps=40,
         proposal=proposal,
     )
     value, error = float(estimate.value + moved.log_jacobian([end])), estimate.standard_error
-    assert error < 0.02 and estimate.num_nonfinite < 400
+    assert error < 0.03 and estimate.num_nonfinite < 150
     assert abs(value - np.log(cir_density(start, end, 1.0))) < 5 * float(error) + 0.005
     # In the coordinates of X again.
     bridges = jb.sample_weighted_bridges(
@@ -141,8 +141,9 @@ def shifted(model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", INFERENCE)
-@pytest.mark.parametrize("where", [None, lambda p: p[2]], ids=["all", "noise"])
+@pytest.mark.parametrize(
+    ("name", "where"), [*((name, None) for name in INFERENCE), ("gibbs", lambda p: p[2])]
+)
 def test_unknown_parameters_of_sigma_are_refused(name, where):
     """The coordinates would move with them, and the observations would not."""
     moved = jb.lamperti(cir(), at=AT, reach=8.0)
@@ -201,10 +202,10 @@ def test_the_rate_is_inferred_as_in_other_fixed_coordinates():
                 moved.forward(OBSERVATIONS),
                 where=lambda p: p[0],
                 num_steps=40,
-                num_bridges=4_000,
+                num_bridges=1_500,
                 proposal=jb.ModifiedDiffusionBridge(),
             )
         )
     error = np.hypot(*(float(each.standard_error) for each in values))
-    assert error < 0.05
+    assert error < 0.08
     assert abs(values[0].value - values[1].value) < 5 * error + 0.02  # the step errors

@@ -6,7 +6,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from grid_filter import grid_filter
-from helpers import slow_beyond
 from scipy import stats
 
 import jaxbridge as jb
@@ -219,9 +218,8 @@ def record_of(name, rng):
     return model, readings, logs
 
 
-@pytest.mark.parametrize(
-    "name", slow_beyond(0, ["negative binomial", "Poisson", "Student", "censored", "rounded"])
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["negative binomial", "censored"])
 def test_likelihood_is_that_of_the_grid(name):
     observation, readings, logs = record_of(name, np.random.default_rng(3))
     initial = np.exp(-((NODES - 1) ** 2))  # the stationary law, N(1, 1/2)

@@ -55,7 +55,7 @@ def counts(seed, rate, sigma):
 
 @pytest.mark.slow
 def test_errors_of_counts():
-    """Of 96 keys, against a filter on a grid. The root of the mean square of n standard normal
+    """Of 48 keys, against a filter on a grid. The root of the mean square of n standard normal
     errors has a standard deviation of about 1 / √(2n)."""
     seed, rate, sigma = 1, 0.5, 1.0
     times, values = counts(seed, rate, sigma)
@@ -71,7 +71,7 @@ def test_errors_of_counts():
         jb.log_likelihood(
             jax.random.key(i), model, times, values, observation=COUNTS, initial=law, num_steps=10
         )
-        for i in range(96)
+        for i in range(48)
     ]
     z = np.array([float((each.value - exact) / each.standard_error) for each in made])
     lowest = 1 - 5 / np.sqrt(2 * len(z))

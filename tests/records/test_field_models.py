@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import assert_uniform_ranks
 from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
@@ -31,10 +30,10 @@ def test_lorenz_from_parameters_that_are_far_off():
     """The first coordinate is not seen, the others every hundredth with variance 5. Where the
     chains start the process cannot follow the data: with a guide from there, of four particles,
     the variance of log p̂ was 1.3, and R̂ 2."""
-    start, times = jnp.array([1.5, -1.5, 25.0]), np.arange(201) * 0.01
-    fine = np.linspace(0, 2, 20_001)
+    start, times = jnp.array([1.5, -1.5, 25.0]), np.arange(101) * 0.01
+    fine = np.linspace(0, 1, 10_001)
     hidden = np.asarray(jb.simulate(jax.random.key(1), lorenz(LORENZ), start, fine)[0], float)
-    noise = np.random.default_rng(0).normal(size=(201, 2))
+    noise = np.random.default_rng(0).normal(size=(101, 2))
     observations = hidden[::100, 1:] + np.sqrt(5) * noise
     observations[0] = np.nan
     made = jb.pmmh(
@@ -45,8 +44,8 @@ def test_lorenz_from_parameters_that_are_far_off():
         observation=jb.LinearGaussian(matrix=[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], covariance=5.0),
         initial=start,
         prior=jb.NormalPrior(np.zeros(3), 1000.0),
-        num_iterations=600,
-        num_warmup=600,
+        num_iterations=500,
+        num_warmup=500,
         num_chains=2,
         num_proposals=4,
         num_steps=2,
@@ -148,65 +147,3 @@ def test_the_likelihood_of_populations_is_that_of_a_bootstrap_filter():
     assert error < 0.1
     assert abs(float(made.value) - log_mean) < 4.5 * error
     assert made.effective_sample_size.min() > 50  # of a hundred
-
-
-@pytest.mark.slow
-def test_paths_of_populations_are_positive():
-    (model, times, observations), options = populations()
-    made = jb.smooth(
-        jax.random.key(2), model, times, observations, num_draws=200, num_warmup=100, **options
-    )
-    assert not made.stuck.any() and bool(jnp.all(made.paths > 0))
-    at_times = np.asarray(made.paths, float)[..., ::NUM_STEPS, :].reshape(-1, 31, 2)
-    error = at_times.mean(0)[1:] - observations[1:]
-    assert np.abs(error).max() < 4 * NOISE and 0.5 * NOISE < error.std() < 1.2 * NOISE
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
-def test_ranks_of_true_parameters_are_uniform():
-    """Simulation-based calibration (Talts et al. 2018) of `gibbs`: drift, σ and noise unknown, of a
-    process that is not linear. The data are of short steps; those of the sampler are of second
-    order."""
-    num_sets, num_draws, num_fine = 120, 31, 40
-    times = np.arange(16) * 0.5
-    mean, sd = jnp.array([0.3, -0.2, -1.2]), jnp.array([0.4, 0.3, 0.4])
-    seen = jb.LinearGaussian(covariance=lambda p: jnp.exp(2 * p[2]))
-    model = jb.Diffusion(
-        lambda x, p: -jnp.exp(p[0]) * x / jnp.sqrt(1 + x**2),
-        lambda x, p: jnp.exp(p[1]) * jnp.ones(1),
-        params=mean,
-    )
-
-    def one_set(key):
-        parameter_key, path_key, noise_key, run_key = jax.random.split(key, 4)
-        theta = mean + sd * jax.random.normal(parameter_key, (3,))
-
-        def step(x, key):
-            drift = -jnp.exp(theta[0]) * x / jnp.sqrt(1 + x**2)
-            noise = jnp.exp(theta[1]) * jax.random.normal(key, (1,))
-            x = x + drift * (0.5 / num_fine) + noise * np.sqrt(0.5 / num_fine)
-            return x, x
-
-        keys = jax.random.split(path_key, 15 * num_fine)
-        later = jax.lax.scan(step, jnp.zeros(1), keys)[1][num_fine - 1 :: num_fine]
-        values = jnp.concatenate([jnp.zeros((1, 1)), later])
-        values = values + jnp.exp(theta[2]) * jax.random.normal(noise_key, values.shape)
-        made = jb.gibbs(
-            run_key,
-            model,
-            times,
-            values,
-            prior=jb.NormalPrior(mean, sd**2),
-            num_iterations=num_draws,
-            num_warmup=400,
-            thin=30,
-            num_steps=4,
-            observation=seen,
-            initial=jnp.zeros(1),
-        )
-        return jnp.sum(made.theta < theta, axis=0)
-
-    keys = jax.random.split(jax.random.key(0), num_sets)
-    ranks = np.asarray(jax.jit(jax.vmap(one_set))(keys)).reshape(num_sets, 3)
-    assert_uniform_ranks(ranks, num_draws)

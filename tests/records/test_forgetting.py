@@ -97,7 +97,7 @@ def test_a_side_that_all_filters_miss_is_found():
     run = jax.jit(lambda key, rate, P: run_filters(
         key, problem, model, forgetful(guide, rate), (8, P)
     ).log_estimate, static_argnums=2)  # fmt: skip
-    free = run(jax.random.key(3), jnp.float32(1000), 8000)
+    free = run(jax.random.key(3), jnp.float32(1000), 4000)
     error = np.hypot(np.std(free) / np.sqrt(8), made.standard_error)
     assert made.forgetting > 0 and abs(made.value - np.mean(free)) < 5 * error < 0.4
     sure = run(jax.random.key(2), jnp.float32(0), 400)

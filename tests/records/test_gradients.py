@@ -25,10 +25,6 @@ def sigma(x, p):
 CONSTANT = lambda x, p: p["scale"] * jnp.array([[1.0, 0.0], [0.3, 0.8]])
 NOISE = lambda p: p["noise"] ** 2
 SEEN = {
-    "partly": jb.LinearGaussian([[1.0, 0.5]], lambda p: jnp.array([NOISE(p)])),
-    "with correlation": jb.LinearGaussian(
-        [[1.0, 0.5], [0.0, 1.0]], lambda p: NOISE(p) * jnp.array([[1.0, 0.4], [0.4, 1.0]])
-    ),
     "partly exactly": jb.LinearGaussian(
         [[1.0, 0.5], [0.0, 1.0]], lambda p: jnp.array([0.0, NOISE(p)])
     ),
@@ -36,9 +32,7 @@ SEEN = {
 }
 CASES = [
     ("partly exactly", sigma),
-    ("with correlation", sigma),
-    ("exactly", sigma),
-    ("partly", CONSTANT),
+    ("exactly", CONSTANT),
 ]
 
 
@@ -83,7 +77,7 @@ def test_what_was_seen_has_derivatives_too(x64):
     """Of the likelihood and of the weights by the noise of observations, which the guide follows:
     in reverse mode, against differences."""
     model = jb.Diffusion(lambda x, p: -jnp.sinh(x), params=1.0)
-    times, values = np.arange(4) * 0.5, np.array([[0.3], [0.1], [-0.4], [0.2]])
+    times, values = np.arange(3) * 0.5, np.array([[0.3], [0.1], [-0.4]])
 
     def estimate(covariance):
         made = jb.log_likelihood(

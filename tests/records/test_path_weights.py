@@ -52,8 +52,7 @@ def log_likelihood_of_steps(a, values):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [2, 0])
-@pytest.mark.parametrize("precision", [32, 64])
+@pytest.mark.parametrize(("seed", "precision"), [(2, 32), (0, 64)])
 def test_no_weight_is_larger_than_that_of_a_real_path(seed, precision, request):
     """log w ≤ ½|ξ|² + the largest log densities of what was seen. Sums that telescope over h break
     it by 1e12 and more (at a = 2.55 to 4.5 in single, 2.95 to 5 in double precision)."""

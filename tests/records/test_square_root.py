@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import slow_beyond
 from scipy.stats import norm
 
 import jaxbridge as jb
@@ -66,7 +65,7 @@ def arguments(values, gap, sd, num_steps):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("gap", "sd", "num_steps"),
-    slow_beyond(1, [(2.0, 0.3, 10), (0.5, 0.02, 10), (1.0, 0.1, 20), (0.5, 0.0, 10)]),
+    [(2.0, 0.3, 10), (0.5, 0.0, 10)],
 )
 def test_likelihood_is_of_second_order(gap, sd, num_steps):
     """Within errors of the exact value, and nearer than by the Euler scheme."""
@@ -175,16 +174,16 @@ def test_knots_determine_the_noise_and_the_path(x64):
 
 @pytest.mark.slow
 @pytest.mark.optimised
-@pytest.mark.parametrize(("gap", "sd", "num_steps"), [(1.0, 0.3, 5), (0.5, 0.1, 5)])
-def test_smoothed_states_are_of_second_order(gap, sd, num_steps):
+def test_smoothed_states_are_of_second_order():
     """Means in exact standard deviations; with normal steps they are off by .05 to .15."""
+    gap, sd, num_steps = 1.0, 0.3, 5
     values, _ = record(gap, sd)
     mean, deviation = smoothed_by_quadrature(values, gap, sd)
     positional, options = arguments(values, gap, sd, num_steps)
     at = lambda value: np.asarray(value, float)[num_steps::num_steps, 0]  # without points of splits
 
     def error_and_noise(density):
-        size = {"num_draws": 2000, "num_chains": 4}
+        size = {"num_draws": 1000, "num_chains": 4}
         made = jb.smooth(jax.random.key(0), *positional, **options, **size, density=density)
         off = (at(made.mean()) - mean) / deviation
         return made, off, at(made.standard_error()) / deviation
@@ -196,8 +195,8 @@ def test_smoothed_states_are_of_second_order(gap, sd, num_steps):
     assert np.all(np.abs(told) < 0.1) and np.all(doubt < 0.1)
     rms = lambda value: np.sqrt(np.mean(value**2))
     assert rms(off) < 0.02 + 1.5 * rms(noise)
-    if sd > 0.1:  # Euler steps are not good enough
-        assert rms(error_and_noise(jb.EulerDensity())[1]) > 0.05
+    # Euler steps are not good enough.
+    assert rms(error_and_noise(jb.EulerDensity())[1]) > 0.05
 
 
 def smoothed_by_quadrature(values, gap, sd):
@@ -236,13 +235,13 @@ def test_posterior_of_gibbs_is_of_second_order():
     )
     made = jb.gibbs(
         jax.random.key(0), model, times, observed, prior=jb.NormalPrior(0.0, 0.8), **options,
-        num_iterations=1500, num_chains=2,
+        num_iterations=800, num_chains=2,
     )  # fmt: skip
     theta = np.asarray(made.theta, float).reshape(-1)
     error = float(made.standard_error[0]) / deviation
-    assert made.trustworthy and error < 0.07
+    assert made.trustworthy and error < 0.1
     assert abs(theta.mean() - mean) / deviation < 5 * error + 0.05
-    assert abs(theta.std() / deviation - 1) < 0.1
+    assert abs(theta.std() / deviation - 1) < 0.14
     assert abs(float(made.step_error[0])) < 0.1 * deviation
 
 

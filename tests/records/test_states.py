@@ -107,7 +107,7 @@ def test_part_of_a_process_that_turns():
     made = jb.smooth(
         KEY, jb.ornstein_uhlenbeck(B), TIMES, values,
         observation=jb.LinearGaussian(matrix, covariance=0.2),
-        num_steps=50, num_draws=1000, num_warmup=100, proposal=jb.Coupling(0.5),
+        num_steps=20, num_draws=500, num_warmup=100, proposal=jb.Coupling(0.5),
     )  # fmt: skip
     exact = conditioned(B, matrix, 0.2, TIMES, values, np.asarray(made.times, float))
     assert_agrees(made, *exact)
@@ -144,7 +144,7 @@ def test_wells_that_are_seen_rarely():
     """Gaps of twenty units of time, within which the diffusion changes its well or does not: the
     probability of each is known from some hundreds of draws."""
     num_steps = 100
-    times, values, exact = seen_rarely(12, 20.0)
+    times, values, exact = seen_rarely(6, 20.0)
     made = jb.smooth(
         KEY, WELLS, times, values, observation=jb.LinearGaussian(covariance=0.09),
         initial=jb.GaussianLaw([-1.0], [[0.25]]), num_steps=num_steps, num_draws=200,
