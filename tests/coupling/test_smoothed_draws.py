@@ -123,7 +123,7 @@ def test_a_model_without_a_sampler_is_nearly_as_efficient_as_one_with():
     model, found = paper_model(), []
     for each in (model, without_sampler(model, reversible=True)):
         made = jb.sample_weighted_bridges(
-            jax.random.key(0), each, *INTERVAL, num_bridges=4_000, proposal=jb.Coupling(0.5)
+            jax.random.key(0), each, *INTERVAL, num_bridges=1_500, proposal=jb.Coupling(0.5)
         )
         found.append(float(made.efficiency))
         assert not jnp.any(made.truncated)

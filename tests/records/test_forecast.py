@@ -83,7 +83,7 @@ def test_later_draws_have_kalmans_law_and_are_paths(noisy):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "observation",
-    [jb.PoissonCounts(), jb.NegativeBinomialCounts(size=3.0), jb.Rounded(scale=0.3, width=1.0)],
+    [jb.NegativeBinomialCounts(size=3.0), jb.Rounded(scale=0.3, width=1.0)],
 )
 def test_scores_add_up_to_the_log_likelihood(observation):
     y = np.array([1.0, 0.0, 2.0, np.nan, 3.0, 1.0, 0.0, 1.0])

@@ -68,9 +68,9 @@ def test_both_wells_count():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dim", [1, 2])
-def test_tails_that_are_not_normal(dim):
+def test_tails_that_are_not_normal():
     """Of the hyperbolic law, near its mode and far out, where the first coordinate is seen once."""
+    dim = 2
     model, axis = jb.hyperbolic(0.5, dim), np.linspace(-40, 40, 801)
     points = np.stack(np.meshgrid(*dim * [axis], indexing="ij"), -1).reshape(-1, dim)
     nu = np.exp(jax.vmap(model.log_stationary)(jnp.asarray(points)))

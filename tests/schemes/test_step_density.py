@@ -102,10 +102,10 @@ def test_steps_integrate_to_one(density, dt, d, x64):
     assert abs(values.sum() * volume - 1) < 1e-8
 
 
-@pytest.mark.parametrize("d", slow_beyond(0, [2, 5]))
-def test_covariance_is_never_near_singular(d, x64):
+@pytest.mark.slow
+def test_covariance_is_never_near_singular(x64):
     """S ≥ ¼ I, however long the step: equality where A is symmetric and δ = 3/2 of its rate."""
-    rng = np.random.default_rng(10 + d)
+    d, rng = 3, np.random.default_rng(13)
     matrices = jnp.asarray([*rng.normal(size=(50, d, d)), -np.eye(d)])
     least = []
     for dt in (0.1, 1.5, 4.0, 1e3):
