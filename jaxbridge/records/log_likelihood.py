@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key
-from ..engine.compiled import compiled_sooner
+from ..engine.compiled import compiled_sooner, is_outermost
 from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..engine.pareto import NEARLY_EQUAL, largest_reliable_k
@@ -295,10 +295,10 @@ def log_likelihood(
     problem = records.stacked
     num_coarse = 0 if problem.density.is_exact else num_coarse_grids(problem.num_steps)
     grids = [records, *map(records.coarsened, range(1, 1 + num_coarse))]
-    guides, checks = zip(*map(_guides_and_checks, grids), strict=True)
-    filtered, rate = _run_stages(key, grids, list(guides), *size)
+    guides, check = _guides_and_check(grids)
+    filtered, rate = _run_stages(key, grids, guides, *size)
     result = _combine_filters(records, filtered, rate, num_filters * num_particles)
-    result = dataclasses.replace(result, guide=checks[0])
+    result = dataclasses.replace(result, guide=check)
     return throw_where_untrustworthy(result, "value", model) if throw else result
 
 
@@ -356,9 +356,17 @@ def _mean_of_filters(
     return jnp.sum(log_mean), widening * jnp.sqrt(jnp.sum(variance))
 
 
-def _guides_and_checks(records: Records) -> tuple[Guidance, GuideCheck]:
-    """Return the guide of each record and its diagnostics, at the parameters of the model."""
-    return records.each(lambda problem: linearised(problem, problem.model)[1:])
+def _guides_and_check(grids: list[Records]) -> tuple[list[Guidance], GuideCheck]:
+    """Return the guides of all records on each grid, and the diagnostics of those on the first."""
+    search = lambda records: records.each(lambda one: linearised(one, one.model)[1:])
+    if is_outermost():
+        guides, checks = zip(*map(search, grids), strict=True)
+        return list(guides), checks[0]
+    # Inside a compiled program, a loop over the grids compiles the searches once.
+    arrays, others = stacked(*grids)
+    guides, checks = lax.map(lambda grid: search(eqx.combine(grid, others)), arrays)
+    of_grid = lambda number, tree: jax.tree.map(lambda leaf: leaf[number], tree)
+    return [of_grid(number, guides) for number in range(len(grids))], of_grid(0, checks)
 
 
 def _exact_log_likelihood(

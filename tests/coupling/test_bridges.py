@@ -149,7 +149,7 @@ def test_state_dependent_full_sigma_on_a_long_interval():
         swirl(start),
         swirl(end),
         8.0,
-        num_bridges=8_000,
+        num_bridges=3_000,
         num_steps=400,
         coupling=jb.Coupling(-1.0),
         save_at=[1.0, 4.0, 7.0],

@@ -32,17 +32,17 @@ def test_chain_has_the_law_that_weights_give():
         lambda path: jnp.where(path[30, 0] > 0, 1.0, 0.0),
     ]
     weighted = jb.sample_weighted_bridges(
-        jax.random.key(0), *HARD, num_bridges=100_000, num_steps=60, proposal=jb.Guided()
+        jax.random.key(0), *HARD, num_bridges=40_000, num_steps=60, proposal=jb.Guided()
     )
     chain = jb.sample_exact_bridges(
-        jax.random.key(1), *HARD, num_bridges=20_000, num_steps=60,
+        jax.random.key(1), *HARD, num_bridges=10_000, num_steps=60,
         proposal=jb.Guided(), method="crank_nicolson", step_size=0.7,
     )  # fmt: skip
     assert chain.met.all() and 0.1 < chain.acceptance_rate < 0.9
     for fn in functions:
         exact, exact_error = float(weighted.mean(fn)), float(weighted.standard_error(fn))
         mean, error = batch_means(jax.vmap(fn)(chain.paths)[1000:])
-        assert np.hypot(error, exact_error) < 0.05
+        assert np.hypot(error, exact_error) < 0.07
         assert abs(mean - exact) < 5 * np.hypot(error, exact_error)
 
 
@@ -98,7 +98,7 @@ def test_fast_rotation(x64):
     those of the closed form, up to the step error that is told."""
     decay, speed, duration, num_steps = 1.0, 6.2832, 5.0, 100
     model = jb.ornstein_uhlenbeck([[decay, speed], [-speed, decay]])
-    ends, size, beta = (jnp.array([0.5, 0.2]), jnp.array([-0.4, 0.6])), 20_000, 0.9
+    ends, size, beta = (jnp.array([0.5, 0.2]), jnp.array([-0.4, 0.6])), 8_000, 0.9
     exact = jb.gaussian_bridge(model, *ends, float(duration), [duration / 2])
     mean, variance = exact.mean[0], jnp.diag(exact.covariance[0])
     chain = jb.sample_exact_bridges(

@@ -13,7 +13,6 @@ from helpers import (
 )
 
 import jaxbridge as jb
-from jaxbridge.coupling.smoothed_draws import SmoothedDraws
 
 CASES = exact_cases()
 
@@ -90,30 +89,6 @@ def test_random_gamma_and_more_counts_keep_the_law():
 
 
 @pytest.mark.slow
-def test_model_without_a_sampler_has_a_start_law_from_draws():
-    """The same model with and without its sampler; the law is in the result."""
-    with_sampler = jb.ornstein_uhlenbeck([[1.0, 0.5], [0.5, 1.0]])
-    model = jb.Diffusion(
-        lambda x, p: -p @ x, None, lambda x, p: -x @ p @ x, with_sampler.params.B, reversible=True
-    )
-    ends = ([0.9, 0.9], [1.2, 1.2])
-    case = exact_case(with_sampler, *ends, 1.0, 0.5, num_steps=20)._replace(model=model)
-    weighted = weighted_bridges(case, 5_000)
-    assert isinstance(weighted.coupling.start_law, SmoothedDraws)
-    assert_weighted_moments(
-        case.middle(weighted.paths), weighted.weights, case.mean, case.covariance
-    )
-    # Without a density a run replaces each draw, and says for how long.
-    case = case._replace(
-        model=jb.Diffusion(lambda x, p: -p @ x, params=model.params, reversible=True)
-    )
-    burn_in = float(weighted_bridges(case, 10).coupling.start_law.burn_in)
-    assert 8 <= burn_in <= 200 and burn_in == round(burn_in)  # in whole durations
-    given = weighted_bridges(case, 100, start_law=jb.Stationary(burn_in=7.0))
-    assert given.coupling.start_law.burn_in == 7.0
-
-
-@pytest.mark.slow
 def test_several_intervals_are_weighed_as_one_by_one():
     model, durations = paper_model(), jnp.array([1.0, 1.5])
     starts, ends = jnp.array([[0.3, 0.1], [0.785, 0.785]]), jnp.array([[0.0, 0.5], [1.0, 1.0]])
@@ -178,24 +153,3 @@ def test_a_law_that_does_not_cover_is_flagged_and_finite(mean, covariance):
     assert np.isfinite(weighted.log_weights).all()
     # Either the counts are cut off, or a few starts have all the weight.
     assert weighted.truncated.mean() > 0.05 or weighted.effective_sample_size < 50
-
-
-@pytest.mark.slow
-def test_double_precision():
-    """A start law in single precision beside points in double, and the other way round."""
-    with jax.enable_x64(True):
-        for point, law in (("float64", "float32"), ("float32", "float64")):
-            mu = jb.GaussianLaw(jnp.zeros(2, law), jnp.eye(2, dtype=law))
-            a, b = jnp.zeros(2, point), jnp.full(2, 0.3, point)
-            model = jb.ornstein_uhlenbeck(jnp.eye(2, dtype=point))
-            coupling = jb.Coupling(0.5, start_law=mu)
-            options = dict(num_steps=5, proposal=coupling)
-            estimate = jb.transition_log_density(
-                jax.random.key(0), model, a, b, jnp.asarray(1.0, point), num_proposals=10, **options
-            )
-            assert estimate.value.dtype == estimate.standard_error.dtype == point
-            chain = jb.sample_exact_bridges(
-                jax.random.key(0), model, a, b, jnp.asarray(1.0, point), num_bridges=5, **options
-            )
-            assert chain.paths.dtype == chain.log_weights.dtype == point
-            assert chain.num_simulated.dtype == "int32"

@@ -155,14 +155,13 @@ def test_short_steps_mix_as_well_as_long_ones():
 
 @pytest.mark.slow
 @pytest.mark.optimised
-@pytest.mark.parametrize("method", ["pmmh", "gibbs"])
-def test_rate_sigma_and_noise_are_found(method):
+def test_rate_sigma_and_noise_are_found():
     """By two steps between observations: the posterior is that of the chain of these steps, and how
     far that is from the exact one is told."""
-    posterior = getattr(jb, method)(
+    posterior = jb.pmmh(
         jax.random.key(0), model(curved=True), TIMES, record(), observation=SEEN, prior=log_prior,
         num_iterations=1500, num_warmup=700, num_chains=4, num_steps=2,
-        **{"pmmh": {"num_proposals": 4}, "gibbs": {"thin": 2}}[method],
+        num_proposals=4,
     )  # fmt: skip
     (exact, _), (of_steps, sd) = exact_posterior(), exact_posterior(law=ito_taylor_step, num=2)
     assert np.all(posterior.r_hat < 1.03)

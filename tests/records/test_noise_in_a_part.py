@@ -140,11 +140,6 @@ def test_orders_of_the_steps(x64):
 
     assert 1.9 < slope(ito_taylor_step) < 2.1
     assert 0.75 < slope(euler_step) < 1.1
-    # Those of the expansion are tested above.
-    options = {**case.options, "num_steps": 4, "density": jb.EulerDensity()}
-    made = jb.log_likelihood(KEY, *case.arguments, **options, num_particles=2, num_filters=2)
-    chain = case.kalman(4, euler_step).log_likelihood
-    assert abs(made.value - chain) < 1e-6 * max(abs(chain), 1)
 
 
 SCALE = lambda position: 1 + jnp.tanh(position) / 2
@@ -180,10 +175,10 @@ def test_where_sigma_depends_on_the_state(of, most, x64):
     made = jb.log_likelihood(KEY, moved, times, values, num_steps=8, **options)
     assert abs(made.value - exact) < most + 5 * made.standard_error
     assert made.standard_error < most
-    euler = jb.EulerDensity()
-    few = options | {"num_particles": 100, "num_filters": 2}
-    made = jb.log_likelihood(KEY, moved, times, values, num_steps=8, density=euler, **few)
-    assert abs(made.value - exact) > 0.9
+    if of == "position":
+        few = options | {"num_particles": 100, "num_filters": 2, "density": jb.EulerDensity()}
+        made = jb.log_likelihood(KEY, moved, times, values, num_steps=8, **few)
+        assert abs(made.value - exact) > 0.9
 
 
 @pytest.mark.slow

@@ -7,14 +7,6 @@ import pytest
 from linear_records import plane
 
 import jaxbridge as jb
-from jaxbridge.records import (
-    Paths,
-    as_record_problems,
-    blocks_of_both_cuts,
-    guided,
-    linearisations,
-    sweep,
-)
 
 LONG = plane(9)
 SHORT = LONG._replace(times=LONG.times[:6] + 1, values=-LONG.values[5::-1])
@@ -35,43 +27,6 @@ def test_likelihoods_multiply():
     assert abs(made.value - exact) < 1e-4
     assert made.effective_sample_size.shape == (15,)
     np.testing.assert_allclose(made.effective_sample_size, 5, rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_paths_beyond_the_end_of_the_shorter_one_are_nobodys():
-    """Paths of both records, in blocks that reach beyond the end of the shorter one, have the law
-    that each has by itself."""
-    model, times, values = both()
-    records = as_record_problems(
-        model, times, values, **LONG.options, num_steps=4, density=jb.EulerDensity()
-    )
-    (points, _), chains = linearisations(records, model), 200
-
-    def first(problem, points):
-        start = jnp.broadcast_to(points[0][:, None], (2, chains))
-        K, N = problem.record.dt.shape
-        rest = points[1:].reshape(K, N, 2, 1)
-        return start, jnp.broadcast_to(rest, (K, N, 2, chains))
-
-    def moved(problem, key, points, start, rest):
-        blocks = blocks_of_both_cuts(problem, points, guided(problem, model, points), 4)
-        scales = jnp.zeros((2, blocks.segment.shape[-1]))
-        return sweep(key, problem, model, blocks, scales, Paths(start, rest))[0]
-
-    @jax.jit
-    def step(paths, key):
-        return Paths(*records.each(moved, jax.random.split(key, 2), points, *paths)), None
-
-    paths = Paths(*records.each(first, points))
-    paths, _ = jax.lax.scan(step, paths, jax.random.split(jax.random.key(1), 30))
-    for number, record in enumerate((LONG, SHORT)):
-        exact = record.kalman(4)
-        ends = np.asarray(paths.points[number, : len(record.times) - 1, -1])
-        variance = np.diagonal(exact.covariance, axis1=1, axis2=2)[4::4]
-        error = np.sqrt(variance / chains)
-        assert np.all(np.abs(ends.mean(-1) - exact.mean[4::4]) < 4.5 * error)
-        ratio = ends.var(-1) / variance
-        assert np.all(np.abs(ratio - 1) < 4.5 * np.sqrt(2 / chains))
 
 
 @pytest.mark.slow

@@ -48,22 +48,6 @@ TIMES = np.array([0.0, 1.5, 2.5, 5.0, 7.0])
 
 
 @pytest.mark.slow
-def test_linear_process():
-    """Unequal gaps, nothing seen at one time; steps of the exact transition law."""
-    model = jb.ornstein_uhlenbeck(jnp.array([[1.0]]))
-    values = np.array([[0.8], [-0.5], [np.nan], [1.2], [0.1]])
-    made = jb.smooth(
-        KEY, model, TIMES, values, observation=jb.LinearGaussian(covariance=0.2),
-        num_steps=4, num_draws=500, num_warmup=50, num_chains=4, num_proposals=4,
-        proposal=jb.Coupling(0.0, scheme=jb.GaussianTransition()),
-    )  # fmt: skip
-    exact = conditioned(np.eye(1), np.eye(1), 0.2, TIMES, values, np.asarray(made.times, float))
-    assert made.paths.shape == (4, 500, 17, 1) and made.accepted.shape == (5,)
-    assert (made.accepted > 0.2).all()
-    assert_agrees(made, *exact)
-
-
-@pytest.mark.slow
 def test_gaps_are_known_after_a_long_time():
     """Those of .01 after 45,000 units of time, which single precision knows to .004."""
     times, values = np.array([0.0, 0.01, 0.03, 0.04]), np.zeros((4, 1))

@@ -98,7 +98,7 @@ def test_error_of_coupled_grids_counts_lost_paths():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("density", "method"), zip(EXPANSIONS.values(), ["weighted", "chain"], strict=True)
+    ("density", "method"), list(zip(EXPANSIONS.values(), ["weighted", "chain"], strict=True))
 )
 def test_error_of_a_mean(density, method, x64):
     """That of the mid-point, against the closed form."""
