@@ -152,6 +152,7 @@ from .schemes.step_density import (
     StepsFrom,
 )
 from .schemes.step_law import DegenerateLaw, StepLaw
+from .schemes.survival import log_survival
 from .tuning.choose_proposal import choose_proposal
 from .tuning.hitting_variation import HittingVariation, hitting_variation
 from .tuning.settings import Setting, WorkPrecision
@@ -278,6 +279,7 @@ __all__ = [
     "NormalPrior",
     "NormalPopulation",
     "path_log_likelihood",
+    "log_survival",
     # Diagnostics and costs.
     "hitting_counts",
     "HittingCounts",

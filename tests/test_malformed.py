@@ -141,6 +141,13 @@ CALLS = {
     "path_log_likelihood": small(
         jb.path_log_likelihood, model=MODEL, times=[0.0, 1.0], path=[[0.0, 0.0], [1.0, 0.0]]
     ),
+    "log_survival": small(
+        jb.log_survival,
+        model=MODEL,
+        times=[0.0, 1.0],
+        path=[[0.0, 0.0], [1.0, 0.0]],
+        inside=lambda x: 2 - x[0],
+    ),
     "log_likelihood": small(jb.log_likelihood, key=KEY, **NOISY, num_particles=4),
     "forecast": small(jb.forecast, key=KEY, **NOISY, num_particles=4),
     "smooth": small(jb.smooth, key=KEY, **NOISY, num_draws=4, num_warmup=2),

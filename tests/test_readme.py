@@ -56,6 +56,14 @@ CLAIMS = {
         and abs(page["density"].value + 5.69) < 0.15
         and page["angles"].shape == (500, 51)
     ),
+    "exits": lambda page: (
+        abs(page["mean"] - 0.4829) < 5 * page["error"]
+        and np.allclose(
+            page["safe_until"].mean(axis=0)[np.array([10, 50, 200])],
+            [0.7058, 0.3425, 0.0390],
+            atol=5 * 0.0079,
+        )
+    ),
     "counts_and_outliers": lambda page: (
         covers(page["posterior"].params["log_sigma"], -0.7)
         and covers(page["posterior"].params["log_size"], 2)

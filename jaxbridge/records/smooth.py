@@ -581,6 +581,7 @@ def _log_halving(
     return jnp.where(has_length(problem), D, 0)
 
 
+@compiled_sooner
 def _step_error_of_mean(
     values: Float[Array, "chains n ..."],
     coarse_values: Float[Array, "chains n ..."],

@@ -3,12 +3,14 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..engine.compiled import compiled_sooner
 from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion
 from ..schemes import MOST_TOO_LONG, UNKNOWN_SHARE, share_in_regime
 from .problem import RecordProblem
 
 
+@compiled_sooner
 def steps_are_too_long(
     problem: RecordProblem, model: Diffusion, path: Float[Array, "points d"]
 ) -> Bool[Array, ""]:

@@ -96,6 +96,14 @@ def path_log_likelihood(
     check_diffusion(model)
     if form is not None:
         check_choice("form", form, get_args(Form))
+    _, steps, path = as_grid_and_paths(times, path)
+    return log_likelihood_of_steps(model, steps, path, form)
+
+
+def as_grid_and_paths(
+    times: Numbers, path: Numbers
+) -> tuple[Float[Array, "*I K"], Float[Array, "*I K-1"], Float[Array, "*batch K d"]]:
+    """Validate times and paths at these times; return times, their differences, and paths."""
     grid, path = as_times("times", times), as_floating("path", path)
     times, steps = grid
     if path.ndim < 2 or path.shape[-2] < 2:
@@ -121,7 +129,7 @@ def path_log_likelihood(
             "`times` must be finite and increase strictly in each interval; got steps between "
             f"{np.min(steps)} and {np.max(steps)}. Sort them and remove duplicates."
         )
-    return log_likelihood_of_steps(model, steps.astype(path.dtype), path, form)
+    return times.astype(path.dtype), steps.astype(path.dtype), path
 
 
 def log_likelihood_of_steps(
