@@ -61,6 +61,7 @@ from .exact.density import (
     TransitionLogDensity,
     transition_log_density,
 )
+from .exact.exits import Exits, sample_exits
 from .exact.expectation import expectation
 from .exact.extrapolation import ExtrapolatedBridges, ExtrapolatedLogDensity, extrapolate
 from .exact.importance import (
@@ -280,6 +281,8 @@ __all__ = [
     "NormalPopulation",
     "path_log_likelihood",
     "log_survival",
+    "sample_exits",
+    "Exits",
     # Diagnostics and costs.
     "hitting_counts",
     "HittingCounts",

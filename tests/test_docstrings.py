@@ -20,6 +20,7 @@ RESULTS = {
     "Chain": ["sample_exact_bridges"],
     "Choice": ["choose_proposal"],
     "CoupledPairs": ["sample_exact_bridges"],
+    "Exits": ["sample_exits"],
     "ExtrapolatedBridges": ["extrapolate"],
     "ExtrapolatedLogDensity": ["extrapolate"],
     "Forecast": ["forecast"],

@@ -141,6 +141,17 @@ CALLS = {
     "path_log_likelihood": small(
         jb.path_log_likelihood, model=MODEL, times=[0.0, 1.0], path=[[0.0, 0.0], [1.0, 0.0]]
     ),
+    "sample_exits": small(
+        jb.sample_exits,
+        key=KEY,
+        model=MODEL,
+        start=[0.0, 0.0],
+        duration=1.0,
+        inside=lambda x: 2 - x[0],
+        num_paths=4,
+        num_runs=2,
+        num_steps=3,
+    ),
     "log_survival": small(
         jb.log_survival,
         model=MODEL,

@@ -7,6 +7,8 @@
 - `chains` runs Markov chains of bridges. Their kernels are `pseudo_marginal`, `renewal` and
     `crank_nicolson`, one module each, with common parts in `kernels`.
 - `density` estimates transition densities, as means of weights.
+- `log_means` has the errors of logs of means.
+- `exits` estimates probabilities of exits from a region.
 - `expectation` estimates means over bridges, with correct derivatives.
 - `extrapolation` combines two grids into an estimate without the leading discretisation error.
 """
@@ -15,7 +17,6 @@
 from .chains import sample_exact_bridges as sample_exact_bridges
 from .density import (
     estimate_log_density as estimate_log_density,
-    log_mean_and_error as log_mean_and_error,
     transition_log_density as transition_log_density,
 )
 from .exact_bridges import AbstractExactBridges as AbstractExactBridges
@@ -28,6 +29,10 @@ from .importance import (
 from .kernels import (
     Chain as Chain,
     acceptance_rate as acceptance_rate,
+)
+from .log_means import (
+    log_mean_and_error as log_mean_and_error,
+    log_mean_of_runs as log_mean_of_runs,
 )
 from .renewal import (
     first_paths as first_paths,

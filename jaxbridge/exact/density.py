@@ -4,8 +4,6 @@ The estimate of p_T is unbiased up to the discretisation error. So it suits pseu
 Metropolis–Hastings over the parameters of a model.
 """
 
-import math
-
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
@@ -39,6 +37,7 @@ from ..proposals import (
     resolve,
 )
 from ..schemes import StepError, dominates, step_faults, with_rounding
+from .log_means import log_mean_and_error
 
 # Smallest share of a sum of densities that counts in its diagnostics.
 _NO_SHARE = 1e-3
@@ -314,31 +313,3 @@ def estimate_log_density(
         share,
         num_steps,
     )
-
-
-def log_mean_and_error(
-    log_weights: Float[Array, "I n"],
-) -> tuple[Float[Array, " I"], Float[Array, " I"], Float[Array, " I"]]:
-    """Return the log of the mean of n weights, its standard error, and the effective sample size.
-
-    The standard error is by the delta method. It is infinite for one weight, or if all weights are
-    zero.
-    """
-    n = log_weights.shape[1]
-    # Weights relative to the largest one, so that sums of squares keep their digits.
-    largest = lax.stop_gradient(jnp.max(log_weights, axis=1, keepdims=True))
-    # If all weights are zero, -inf - (-inf) would be NaN.
-    largest = jnp.where(largest > -jnp.inf, largest, 0)
-    log_sum = logsumexp(log_weights - largest, axis=1)
-    log_squares = logsumexp(2 * (log_weights - largest), axis=1)
-    is_positive = log_sum > -jnp.inf
-    inverse_size = jnp.where(is_positive, jnp.exp(log_squares - 2 * log_sum), jnp.inf)
-    # The variance of the mean, relative to the square of the mean. The form Σw²/(Σw)² - 1/n would
-    # cancel for nearly equal weights.
-    log_mean = jnp.where(is_positive, log_sum - math.log(n), 0)
-    deviation = jnp.expm1(log_weights - largest - log_mean[:, None])
-    variance = jnp.sum(deviation**2, axis=1) / n / max(n - 1, 1)
-    # One weight does not determine a variance.
-    error = jnp.sqrt(variance) if n > 1 else jnp.full_like(variance, jnp.inf)
-    size = jnp.where(is_positive, 1 / jnp.where(is_positive, inverse_size, 1), 0)
-    return log_sum + largest[:, 0] - math.log(n), jnp.where(is_positive, error, jnp.inf), size

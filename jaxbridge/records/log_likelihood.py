@@ -34,7 +34,7 @@ from ..engine.verdict import (
     is_too_much_missing,
     throw_where_untrustworthy,
 )
-from ..exact import log_mean_and_error, transition_log_density
+from ..exact import log_mean_of_runs, transition_log_density
 from ..models.diffusion import Diffusion
 from ..models.jumps import JumpsLike
 from ..schemes import (
@@ -57,13 +57,6 @@ from .several import Records, as_record_problems, stacked
 # An estimate is unreliable with fewer effective particles, or with a larger standard error. The
 # largest of many k̂ may exceed its bound by `_LARGEST_OF_MANY` through estimation error alone.
 _FEWEST_TRUSTED, _MOST_SPREAD, _LARGEST_OF_MANY = 5, 0.6, 0.1
-# Half the 97.7 % quantile of Student's law, by one over its degrees of freedom.
-_STUDENT = (
-    1 / np.array([np.inf, 40, 20, 10, 7, 5, 4, 3, 2, 1]),
-    np.array([1.0, 1.032, 1.067, 1.142, 1.214, 1.324, 1.435, 1.653, 2.263, 6.984]),
-)
-# Above this bound e^{s²} overflows in single precision.
-_LARGEST_VARIANCE = 80.0
 
 _UNEXPLAINED = (
     "No particle explains some observation (`unexplained` is its index). Check whether it is an "
@@ -307,7 +300,7 @@ def _combine_filters(
     records: Records, grids: Filtered, rate: Float[Array, ""], num_weights: int
 ) -> LogLikelihood:
     """Combine the filters of all records on the grid and on coarser grids into a result."""
-    values, errors = jax.vmap(_mean_of_filters)(grids.log_estimate)
+    values, errors = jax.vmap(log_mean_of_runs)(grids.log_estimate)
     fine = jax.tree.map(lambda leaf: leaf[0], grids)
     value, error = values[0], errors[0]
     # Differences between grids below the rounding error of the sum over all steps do not count.
@@ -326,34 +319,6 @@ def _combine_filters(
         *step_error,
         rate,
     )
-
-
-def _mean_of_filters(
-    log_estimates: Float[Array, "records num_filters"],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the log-likelihood of all records, and its standard error.
-
-    Each record contributes the log of the mean of its filters.
-    """
-    n = log_estimates.shape[1]
-    log_mean, error, _ = log_mean_and_error(log_estimates)
-    if n == 1:
-        return jnp.sum(log_mean), jnp.sqrt(jnp.sum(error**2))
-    finite = jnp.isfinite(log_estimates)
-    number = jnp.maximum(jnp.sum(finite, axis=1, keepdims=True).astype(error.dtype), 2)
-    # Filters that lost all particles do not count for the spread.
-    centre = jnp.sum(jnp.where(finite, log_estimates, 0), axis=1, keepdims=True) / number
-    squares = jnp.where(finite, log_estimates - centre, 0) ** 2
-    spread = jnp.sum(squares / (number - 1), axis=1)
-    variance = jnp.maximum(error**2, jnp.expm1(jnp.minimum(spread, _LARGEST_VARIANCE)) / n)
-    # Welch–Satterthwaite degrees of freedom. Variances are relative to the largest, so that their
-    # squares are finite.
-    largest = jnp.max(variance)
-    is_usable = (largest > 0) & (largest < jnp.inf)
-    relative = jnp.where(is_usable, variance / jnp.where(is_usable, largest, 1), 1)
-    inverse_degrees = jnp.sum(relative**2) / jnp.sum(relative) ** 2 / (n - 1)
-    widening = jnp.interp(inverse_degrees, *(leaf.astype(error.dtype) for leaf in _STUDENT))
-    return jnp.sum(log_mean), widening * jnp.sqrt(jnp.sum(variance))
 
 
 def _guides_and_check(grids: list[Records]) -> tuple[list[Guidance], GuideCheck]:

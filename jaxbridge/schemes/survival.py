@@ -87,7 +87,7 @@ def _log_survival(
     dynamics_at = model.prepared().forward_at(paths[0, 0])
 
     def of_point(time, x):
-        return _distances(dynamics_at(time), named("inside", inside), x)
+        return distances(dynamics_at(time), named("inside", inside), x)
 
     g, s = jax.vmap(jax.vmap(of_point))(times, paths)  # each (P, K, number of functions)
     is_inside = g > 0
@@ -103,7 +103,7 @@ def _log_survival(
     return jnp.cumsum(each, axis=1)
 
 
-def _distances(
+def distances(
     dynamics: Dynamics, inside: Callable, x: Float[Array, " d"]
 ) -> tuple[Float[Array, " g"], Float[Array, " g"]]:
     """Return g(x) and s(x) = |σᵀ∇g|² of all functions that bound the region."""

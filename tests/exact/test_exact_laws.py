@@ -9,7 +9,7 @@ import pytest
 from helpers import assert_chain_moments, assert_weighted_moments, exact_cases, slow_cases
 
 import jaxbridge as jb
-from jaxbridge.exact.density import log_mean_and_error
+from jaxbridge.exact.log_means import log_mean_and_error
 from jaxbridge.exact.pseudo_marginal import accept_reject
 
 CASES = exact_cases()

@@ -8,9 +8,9 @@ from grid_filter import grid_filter
 from scipy.special import gammaln
 
 import jaxbridge as jb
-from jaxbridge.records.log_likelihood import _mean_of_filters
+from jaxbridge.exact import log_mean_of_runs
 
-MEAN = jax.jit(jax.vmap(_mean_of_filters))
+MEAN = jax.jit(jax.vmap(log_mean_of_runs))
 
 
 @pytest.mark.parametrize("spread", [0.1, 0.8])
