@@ -59,7 +59,7 @@ _LOST = "Some paths are not finite. Use more `num_steps`, or check the model."
 
 
 class Exits(AbstractResult):
-    """Probability of an exit from a region within a duration, and paths that leave it.
+    """Result of `sample_exits`: the probability of an exit from a region, and paths that leave it.
 
     - `log_probability`: log of the estimated probability. The mean of the estimated probability is
         the probability itself, up to the discretisation error.
@@ -171,7 +171,7 @@ def sample_exits(
     **Example:**
 
     ```python
-    exits = jb.sample_exits(key, model, a, 1.0, lambda x: 2.0 - x[0], num_paths=50)
+    exits = jb.sample_exits(key, model, start, 1.0, lambda x: 2.0 - x[0], num_runs=4)
     exits.log_probability, exits.standard_error
     ```
     """

@@ -129,7 +129,7 @@ def as_grid_and_paths(
             "`times` must be finite and increase strictly in each interval; got steps between "
             f"{np.min(steps)} and {np.max(steps)}. Sort them and remove duplicates."
         )
-    return times.astype(path.dtype), steps.astype(path.dtype), path
+    return jnp.asarray(times, path.dtype), steps.astype(path.dtype), path
 
 
 def log_likelihood_of_steps(
