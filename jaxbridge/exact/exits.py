@@ -77,8 +77,8 @@ class Exits(AbstractResult):
     log_probability: Float[Array, ""]
     standard_error: Float[Array, ""]
     log_estimates: Float[Array, " R"]
-    times: Float[Array, " N+1"]
-    paths: Float[Array, "R n N+1 d"]
+    times: Float[Array, " points"]
+    paths: Float[Array, "R n points d"]
     exited: Bool[Array, "R n"]
     exit_index: Int[Array, "R n"]
     num_levels: Int[Array, " R"]
@@ -198,7 +198,7 @@ class _Population(NamedTuple):
         run has ended.
     """
 
-    points: Float[Array, "N+1 d lanes"]
+    points: Float[Array, "points d lanes"]
     progress: Float[Array, "N lanes"]
     log_p: Float[Array, " R"]
     num_levels: Int[Array, " R"]

@@ -102,7 +102,7 @@ def path_log_likelihood(
 
 def as_grid_and_paths(
     times: Numbers, path: Numbers
-) -> tuple[Float[Array, "*I K"], Float[Array, "*I K-1"], Float[Array, "*batch K d"]]:
+) -> tuple[Float[Array, "*I K"], Float[Array, "*I steps"], Float[Array, "*batch K d"]]:
     """Validate times and paths at these times; return times, their differences, and paths."""
     grid, path = as_times("times", times), as_floating("path", path)
     times, steps = grid

@@ -79,7 +79,7 @@ def log_survival(
 def _log_survival(
     model: Diffusion,
     times: Float[Array, "P K"],
-    steps: Float[Array, "P K-1"],
+    steps: Float[Array, "P steps"],
     paths: Float[Array, "P K d"],
     inside: Callable,
 ) -> Float[Array, "P K"]:
