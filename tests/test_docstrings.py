@@ -88,6 +88,7 @@ SLOW = {
     "pseudo_marginal",
     "renewal",
     "sample_exact_bridges",
+    "sample_exits",
     "sample_weighted_bridges",
     "score",
     "simulate",

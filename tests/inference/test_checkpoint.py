@@ -62,20 +62,20 @@ def assert_equal(one, other):
 
 @pytest.mark.slow
 def test_an_interrupted_run_goes_on_to_the_same_draws(tmp_path, monkeypatch, caplog):
-    whole = run("record", tmp_path / "whole.npz")
+    whole = run("pmmh", tmp_path / "whole.npz")
     assert whole.theta.shape == (2, 25, 1)
     go_on = stop_after(monkeypatch, 4)
     with pytest.raises(Stopped):
-        run("record", tmp_path / "part.npz")
+        run("pmmh", tmp_path / "part.npz")
     go_on()
     with caplog.at_level("INFO", "jaxbridge"):
-        resumed = run("record", tmp_path / "part.npz")
+        resumed = run("pmmh", tmp_path / "part.npz")
         assert "part 4 of 9" in caplog.messages[0] and "part 9 of 9" in caplog.messages[-1]
         (tmp_path / "new.npz").unlink(missing_ok=True)
-        run("record", tmp_path / "new.npz")  # whose first part has too few draws for R̂
+        run("pmmh", tmp_path / "new.npz")  # whose first part has too few draws for R̂
         (tmp_path / "new.npz").unlink()
     assert_equal(resumed, whole)
-    assert_equal(run("record", tmp_path / "part.npz"), whole)  # nothing is left to do
+    assert_equal(run("pmmh", tmp_path / "part.npz"), whole)  # nothing is left to do
     assert sorted(file.name for file in tmp_path.iterdir()) == ["part.npz", "whole.npz"]
     assert np.any(whole.theta[:, 3:] != whole.theta[:, 2:3])
 

@@ -79,13 +79,13 @@ def test_posterior_is_that_of_the_grid():
     (mean, sd), levels = exact_posterior(*data)
     made = jb.gibbs(
         jax.random.key(0), MODEL, *data, **OPTIONS, population=jb.NormalPopulation(LEVEL),
-        num_iterations=1000, num_chains=4, thin=5,
+        num_iterations=1000, num_chains=4, thin=3,
     )  # fmt: skip
     assert made.names == ("level", "log_rate", "log_sd(level)") and made.trustworthy
     error, theta = np.asarray(made.standard_error), np.asarray(made.theta).reshape(-1, 3)
-    np.testing.assert_array_less(error, 0.1 * sd)
+    np.testing.assert_array_less(error, 0.13 * sd)
     np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error)
-    np.testing.assert_allclose(theta.std(0), sd, rtol=0.15)
+    np.testing.assert_allclose(theta.std(0), sd, rtol=0.2)
     of_units = made.unit_params["level"]
     assert of_units.shape == (4, 1000, NUM) and made.params["level"].shape == (4, 1000)
     size = np.asarray(jb.effective_sample_size(np.asarray(of_units), chains=True))

@@ -117,13 +117,13 @@ def test_first_states_have_the_stationary_law():
 
     jb.simulation_based_calibration(
         KEY, model, [0.0, 0.1], np.zeros(2), sampler, prior=jb.NormalPrior(0.0, 1.0),
-        observation=jb.LinearGaussian(covariance=0.01), num_simulations=300, num_steps=1,
+        observation=jb.LinearGaussian(covariance=0.01), num_simulations=120, num_steps=1,
     )  # fmt: skip
     nodes = np.linspace(-3, 3, 2001)
     density = np.exp((2 / 0.49) * (nodes**2 / 2 - nodes**4 / 4 + depth * nodes))
     mean = np.sum(nodes * density) / density.sum()
     sd = np.sqrt(np.sum((nodes - mean) ** 2 * density) / density.sum())
-    assert abs(np.mean(seen) - mean) < 4.5 * sd / np.sqrt(300)
+    assert abs(np.mean(seen) - mean) < 4.5 * sd / np.sqrt(120)
 
 
 def test_records_that_left_the_state_space_are_a_fault():
