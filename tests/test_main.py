@@ -2,24 +2,18 @@
 
 import errno
 import os
-import pathlib
 import subprocess
 import sys
 
 import pytest
 from helpers import slow_beyond
-from studies.benchmark import load
-from studies.rivals import load_rivals
 
 from jaxbridge.__main__ import COMMAND
 
-STUDIES = pathlib.Path(__file__).parents[1] / "notebooks"
 
-
-def run(*arguments, cwd, module="jaxbridge", **environment):
-    command = [sys.executable, "-m", module, *arguments]
+def run(*arguments, cwd, **environment):
+    command = [sys.executable, "-m", "jaxbridge", *arguments]
     in_haste = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1", "XLA_FLAGS": "", **environment}
-    in_haste["PYTHONPATH"] = os.pathsep.join([str(STUDIES), os.environ.get("PYTHONPATH", "")])
     options = dict(capture_output=True, text=True, timeout=600)
     return subprocess.run(command, cwd=cwd, env=in_haste, **options)
 
@@ -49,39 +43,6 @@ def test_quick_run_of_the_exact_studies(tmp_path):
         assert done.returncode == 0, done.stderr
         assert all(word in done.stdout for word in words) and "nan" not in done.stdout
         assert len(list((tmp_path / "pictures").glob("*.png"))) == pictures
-
-
-@pytest.mark.slow
-def test_quick_run_of_the_benchmark(tmp_path):
-    done = run("bench", "--quick", "--out", "pictures", cwd=tmp_path, module="studies")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("auto / best") == 1 and "Guided" in done.stdout
-    assert "NumPy" in done.stdout and "random numbers" in done.stdout
-    assert len(list((tmp_path / "pictures").glob("*.png"))) == 1
-    stored = load(tmp_path / "pictures" / "benchmark.json")
-    assert stored.ratios and stored.sigmas and stored.rates
-    (first,) = stored.first_calls
-    assert 0 < first.again < first.from_disk < 2 * first.first and first.programs > 0
-
-
-@pytest.mark.slow
-def test_quick_run_of_the_accuracy_part(tmp_path):
-    done = run("accuracy", "--quick", "--out", "pictures", cwd=tmp_path, module="studies")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.count("accuracy 0.") == 6  # targets of three tables, and three more
-    assert "Orders of the step error" in done.stdout and "Nanoseconds" in done.stdout
-    assert len(list((tmp_path / "pictures").glob("*.png"))) == 2
-
-
-@pytest.mark.slow
-def test_quick_run_beside_other_packages(tmp_path):
-    done = run("rivals", "--quick", "--out", "pictures", cwd=tmp_path, module="studies")
-    assert done.returncode == 0, done.stderr
-    for words in ("learnt score", "cuthbert", "particles", "numpyro", "DBridge"):
-        assert words in done.stdout  # with figures, or "not installed"
-    assert len(list((tmp_path / "pictures").glob("*.png"))) == 1
-    stored = load_rivals(tmp_path / "pictures" / "rivals.json")
-    assert stored.bridges and stored.filters and stored.posteriors
 
 
 @pytest.mark.parametrize(
