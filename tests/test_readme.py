@@ -118,7 +118,9 @@ CLAIMS = {
             abs(page["densities"][name].value + 3.018) < 0.3
             for name in ("drift and pull", "coupling")
         )
-        and abs(page["mean"] - 2) < 5 * page["error"] < 2
+        and abs(page["mean"] - 2) < 5 * page["of_mean"] < 2
+        and page["exits"].trustworthy
+        and abs(page["rate"] - 3.926e-5) < 5 * page["error"] < 2e-5
     ),
     "saving": lambda page: (
         covers(page["posterior"].params, 0.8) and page["both"].theta.shape == (600, 1)

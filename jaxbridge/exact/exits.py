@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
@@ -30,6 +31,7 @@ from ..engine.checks import (
     check_count,
     check_key,
     check_num_steps,
+    is_traced,
 )
 from ..engine.compiled import compiled_for
 from ..engine.entry import public_entry
@@ -94,6 +96,29 @@ class Exits(AbstractResult):
     def standard_error_of(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return the standard error of `mean(fn)`, from the spread of the runs."""
         return jax.tree.map(lambda leaf: self._mean_and_error(leaf)[1], self._values(fn))
+
+    def rate(self, after: Numbers) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return the probability of an exit per unit of time from `after` on, and its error.
+
+        It is the rate of a rare transition, if `after` is longer than the relaxation time inside
+        the region and the duration is shorter than the mean time until an exit.
+
+        **Raises:** `ValueError` unless `after` is at least zero and below the duration. A traced
+        number is not checked.
+        """
+        after, duration = as_numbers({"after": after})["after"], self.times[-1]
+        if not is_traced(after, duration) and not 0 <= after < duration:
+            raise ValueError(f"`after` must be in [0, {duration:g}); got {after:g}.")
+        after = after.astype(duration.dtype)
+        exit_times = self.times[1] * self.exit_index.astype(duration.dtype)
+        is_late = (self.exited & (exit_times > after)).astype(duration.dtype)
+        number = jnp.maximum(jnp.sum(self.exited, axis=1), 1).astype(duration.dtype)
+        late = jnp.sum(is_late, axis=1) / number * jnp.exp(self.log_estimates)
+        R, length = len(late), duration - after
+        if R == 1:
+            return late[0] / length, jnp.full_like(length, jnp.inf)
+        error = jnp.std(late, ddof=1) / np.sqrt(R).astype(late.dtype)
+        return jnp.mean(late) / length, error / length
 
     @property
     def verdict(self) -> Verdict:

@@ -90,6 +90,27 @@ def test_noise_that_grows_with_the_state():
     assert_agrees(exits, probability, 0.05)
 
 
+@pytest.mark.slow
+def test_a_rate_is_one_over_the_mean_passage_time():
+    """Over a barrier of six times the temperature, against quadrature."""
+    heat, start, end = 0.25, -1.0, 0.6
+    potential = lambda x: 1.5 * (x * x - 1) ** 2
+    model = jb.Diffusion(
+        lambda x, p: -jax.vmap(jax.grad(potential))(x), jnp.full(1, np.sqrt(2 * heat))
+    )
+    exits = jb.sample_exits(
+        jax.random.key(3), model, [start], 3.0, lambda x: end - x[0], num_steps=150
+    )
+    y = np.linspace(-3, end, 20_001)
+    inner = np.cumsum(np.exp(-potential(y) / heat)) * (y[1] - y[0])
+    passage = np.sum((np.exp(potential(y) / heat) * inner)[y >= start]) * (y[1] - y[0]) / heat
+    rate, error = exits.rate(after=1.0)
+    assert exits.trustworthy and error < 0.1 * rate
+    assert abs(rate - 1 / passage) < 4.5 * error + 0.02 / passage
+    with pytest.raises(ValueError, match="`after` must be in"):
+        exits.rate(after=3.0)
+
+
 def test_what_never_leaves_and_what_is_outside():
     """Without noise and without drift nothing leaves; who starts outside has left."""
     small = {"num_paths": 8, "num_runs": 2, "num_steps": 3}
