@@ -18,7 +18,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
@@ -101,7 +100,8 @@ class Exits(AbstractResult):
         """Return the probability of an exit per unit of time from `after` on, and its error.
 
         It is the rate of a rare transition, if `after` is longer than the relaxation time inside
-        the region and the duration is shorter than the mean time until an exit.
+        the region and the time that a transition itself takes, and the duration is shorter than the
+        mean time until an exit. If a later `after` gives a larger rate, it was too early.
 
         **Raises:** `ValueError` unless `after` is at least zero and below the duration. A traced
         number is not checked.
@@ -113,12 +113,10 @@ class Exits(AbstractResult):
         exit_times = self.times[1] * self.exit_index.astype(duration.dtype)
         is_late = (self.exited & (exit_times > after)).astype(duration.dtype)
         number = jnp.maximum(jnp.sum(self.exited, axis=1), 1).astype(duration.dtype)
-        late = jnp.sum(is_late, axis=1) / number * jnp.exp(self.log_estimates)
-        R, length = len(late), duration - after
-        if R == 1:
-            return late[0] / length, jnp.full_like(length, jnp.inf)
-        error = jnp.std(late, ddof=1) / np.sqrt(R).astype(late.dtype)
-        return jnp.mean(late) / length, error / length
+        log_late = self.log_estimates + jnp.log(jnp.sum(is_late, axis=1) / number)
+        log_mean, error = log_mean_of_runs(log_late[None])
+        rate = jnp.exp(log_mean) / (duration - after)
+        return rate, rate * error
 
     @property
     def verdict(self) -> Verdict:
