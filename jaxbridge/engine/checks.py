@@ -251,12 +251,12 @@ def nondifferentiable(tree: PyTree) -> PyTree:
 
 @nondifferentiable.def_jvp
 def _refuse(primals, tangents):
-    """Raise the error for derivatives of couplings."""
+    """Raise the error for derivatives of simulations whose course depends on the parameters."""
     raise TypeError(
-        "The weights that correct bridges to their exact law have no derivative path by path: "
-        "whether a pair meets, and how often a bridge is hit, also depends on the parameters of "
-        "the model and the coupling. Apply `jax.lax.stop_gradient` to these parameters when you "
-        "sample bridges, and differentiate a likelihood of their paths."
+        "These results have no derivative path by path: whether a pair meets, how often a bridge "
+        "is hit, or which path is continued also depends on the parameters. Apply "
+        "`jax.lax.stop_gradient` to the parameters when you sample, and differentiate a likelihood "
+        "of the paths."
     )
 
 

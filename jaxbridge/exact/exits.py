@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
@@ -31,6 +32,7 @@ from ..engine.checks import (
     check_key,
     check_num_steps,
     is_traced,
+    nondifferentiable,
 )
 from ..engine.compiled import compiled_for
 from ..engine.entry import public_entry
@@ -238,6 +240,7 @@ def _sample_exits(
     size: tuple[int, int, int],
 ) -> Exits:
     R, n, N = size
+    model, start, duration = nondifferentiable((model, start, duration))
     dynamics, dt = model.prepared().forward(start), duration / N
     num_noises = len(columns_of(dynamics.sigma(start), start))
     of_point = lambda x: distances(dynamics, named("inside", inside), x)
@@ -268,7 +271,7 @@ def _sample_exits(
             largest = jnp.where(jnp.isfinite(largest), largest, -jnp.inf)
             return x_next, (x_next, largest)
 
-        inputs = jnp.arange(N), points[:-1], points[1:], progress
+        inputs = np.arange(N, dtype=np.int32), points[:-1], points[1:], progress
         _, (later, progress) = lax.scan(one, points[0], inputs)
         return jnp.concatenate([points[:1], later]), progress
 
@@ -277,7 +280,7 @@ def _sample_exits(
         parent_key, path_key = jax.random.split(jax.random.fold_in(key, i + 1))
         so_far = lax.cummax(old.progress)
         reached = so_far[-1].reshape(R, n)
-        order = jnp.argsort(reached, axis=1)
+        order = jnp.argsort(reached, axis=1).astype(jnp.int32)
         bound = jnp.take_along_axis(reached, order[:, (n - 1) // 2, None], axis=1)
         is_last = bound[:, 0] > 0
         replaced = (reached <= bound) & ~(old.over | is_last)[:, None]
@@ -288,12 +291,13 @@ def _sample_exits(
         beyond = (n - number).astype(uniform.dtype)[:, None]
         rank = number[:, None] + jnp.floor(uniform * beyond).astype(jnp.int32)
         parent = jnp.take_along_axis(order, jnp.clip(rank, 0, n - 1), axis=1)
-        parent = jnp.where(replaced, parent, jnp.arange(n)) + n * jnp.arange(R)[:, None]
+        parent = jnp.where(replaced, parent, np.arange(n, dtype=np.int32))
+        parent = parent + n * np.arange(R, dtype=np.int32)[:, None]
         points, progress, so_far = (
             jnp.take(leaf, parent.ravel(), axis=-1) for leaf in (old.points, old.progress, so_far)
         )
         exceeds = so_far > jnp.repeat(bound[:, 0], n)
-        kept = jnp.where(replaced.ravel(), jnp.argmax(exceeds, axis=0) + 1, N)
+        kept = jnp.where(replaced.ravel(), jnp.argmax(exceeds, axis=0).astype(jnp.int32) + 1, N)
         points, progress = simulated(path_key, points, progress, kept)
         number_left = jnp.where(is_last, jnp.sum(reached > 0, axis=1, dtype=jnp.int32), n - number)
         share = number_left.astype(old.log_p.dtype) / n
