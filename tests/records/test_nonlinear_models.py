@@ -167,7 +167,7 @@ def test_likelihoods(name):
 def test_smoothed_paths(name):
     case, values, exact = recorded(name)
     made = jb.smooth(
-        KEY, case.model, case.times, values, **options(case), num_steps=20, num_draws=500
+        KEY, case.model, case.times, values, **options(case), num_steps=20, num_draws=1500
     )
     at_times = lambda path: path[::20, 0]
     mean = exact.weights @ exact.nodes
