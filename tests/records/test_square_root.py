@@ -213,7 +213,6 @@ def smoothed_by_quadrature(values, gap, sd):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_posterior_of_gibbs_is_of_second_order():
     """Of the rate, at five steps a gap: beside the exact posterior on a grid."""
     gap, sd = 0.5, 0.1

@@ -84,7 +84,6 @@ def test_states_stay_in_the_state_space():
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_part_of_a_process_that_turns():
     B, matrix = NON_REVERSIBLE, np.array([[1.0, -0.5]])
     values = np.array([[0.8], [-0.5], [np.nan], [1.2], [0.1]])
@@ -123,7 +122,6 @@ def seen_rarely(num, gap):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_wells_that_are_seen_rarely():
     """Gaps of twenty units of time, within which the diffusion changes its well or does not: the
     probability of each is known from some hundreds of draws."""
