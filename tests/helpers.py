@@ -1,6 +1,9 @@
 """Oracles and gates shared by the tests."""
 
+import ast
 import contextlib
+import functools
+import inspect
 import os
 import subprocess
 import sys
@@ -314,6 +317,29 @@ def assert_uniform_ranks(ranks, num_draws):
         counts = np.bincount(rank * 8 // (num_draws + 1), minlength=8)
         chi_square = ((counts - expected) ** 2 / expected).sum()
         assert chi_square < 7 + 5 * np.sqrt(14)  # five standard deviations of χ²_7
+
+
+def assert_calls_fit(code):
+    """The calls of functions of the package in this code fit their signatures."""
+    calls = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Call)]
+    names = [_names_of(node.func) for node in calls]
+    assert any(name[:1] == ["jb"] for name in names)
+    for node, (package, *path) in zip(calls, names, strict=True):
+        if package != "jb":
+            continue
+        signature = inspect.signature(functools.reduce(getattr, path, jb))
+        keywords = [keyword.arg for keyword in node.keywords]
+        starred = None in keywords or any(isinstance(arg, ast.Starred) for arg in node.args)
+        bind = signature.bind_partial if starred else signature.bind
+        bind(*node.args, **{name: None for name in keywords if name is not None})
+
+
+def _names_of(node):
+    """The names in an expression such as `jb.plot.work_precision`, or one that is empty."""
+    names = []
+    while isinstance(node, ast.Attribute):
+        names, node = [node.attr, *names], node.value
+    return [node.id, *names] if isinstance(node, ast.Name) else [""]
 
 
 def slow_cases(cases, everywhere):
