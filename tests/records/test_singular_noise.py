@@ -28,13 +28,13 @@ def weigher(model, values, observation):
 
 @pytest.mark.slow
 def test_a_negative_variance_explains_nothing():
-    """One that is found in a search, of one component or only of a combination of two."""
+    """One that is found in a search, of a combination of two components."""
     model = jb.Diffusion(drift, params=0.5)
     values = np.full((3, 2), 0.2)
-    for R in (lambda p: jnp.stack([0.3 + 0 * p, p]), lambda p: jnp.eye(2) + (p - 1) / 2):
-        weigh = weigher(model, values, jb.LinearGaussian(covariance=R))
-        assert np.isfinite(weigh(0.5))
-        assert weigh(-0.5) == -np.inf
+    R = lambda p: jnp.eye(2) + (p - 1) / 2
+    weigh = weigher(model, values, jb.LinearGaussian(covariance=R))
+    assert np.isfinite(weigh(0.5))
+    assert weigh(-0.5) == -np.inf
 
 
 @pytest.mark.slow
