@@ -158,7 +158,7 @@ def test_what_is_cut_off_is_counted():
 @pytest.mark.slow
 def test_ranks_of_true_parameters_are_uniform():
     """Simulation-based calibration with an unknown σ."""
-    num_sets, num_draws, times = 200, 31, jnp.linspace(0, 4, 9)
+    num_sets, num_draws, times = 400, 31, jnp.linspace(0, 4, 9)
 
     def one_set(key):
         parameter_key, data_key, run_key = jax.random.split(key, 3)
