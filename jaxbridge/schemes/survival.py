@@ -109,4 +109,5 @@ def distances(
     """Return g(x) and s(x) = |σᵀ∇g|² of all functions that bound the region."""
     value = lambda x: jnp.atleast_1d(as_returned("inside", inside(x)).astype(x.dtype))
     g, slope = jax.linearize(value, x)
-    return g, sum(slope(column) ** 2 for column in columns_of(dynamics.sigma(x), x))
+    along = jnp.stack([slope(column) for column in columns_of(dynamics.sigma(x), x)])
+    return g, jnp.sum(along**2, axis=0)
