@@ -184,28 +184,3 @@ def test_unknown_parameters_of_the_drift_are_not_refused():
         assert not problem.sigma_is_unknown and problem.theta.shape == (1,)
         with pytest.raises(ValueError, match="coordinates of `lamperti` depend"):
             as_problem(jax.random.key(0), as_parameters(model, lambda p: p[1:]), *arguments)
-
-
-@pytest.mark.slow
-def test_the_rate_is_inferred_as_in_other_fixed_coordinates():
-    """The score of the rate, whose coordinates do not matter where they are known."""
-    values = []
-    for moved in (
-        jb.lamperti(cir(), at=AT, reach=8.0),
-        jb.transform(cir(), jnp.log, jnp.exp),
-    ):
-        values.append(
-            jb.score(
-                jax.random.key(0),
-                moved.model,
-                TIMES,
-                moved.forward(OBSERVATIONS),
-                where=lambda p: p[0],
-                num_steps=40,
-                num_bridges=1_500,
-                proposal=jb.ModifiedDiffusionBridge(),
-            )
-        )
-    error = np.hypot(*(float(each.standard_error) for each in values))
-    assert error < 0.08
-    assert abs(values[0].value - values[1].value) < 5 * error + 0.02  # the step errors

@@ -355,25 +355,6 @@ def test_what_a_proposal_makes_of_another_ones_interval_does_not_spoil_derivativ
     np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
-@slow
-def test_auto_is_differentiable_where_it_tries_no_couplings():
-    """Pilot runs see numbers only, so the choice is that of a call without derivatives."""
-    model = jb.langevin(lambda x, p: -p * x @ x, 1.0)
-
-    def density(params):
-        made = jb.transition_log_density(
-            jax.random.key(0), model.with_params(params), jnp.zeros((2, 1)), [[0.3], [0.9]],
-            [0.1, 3.0], num_proposals=20, num_steps=10, proposal="auto",
-        )  # fmt: skip
-        return made.value.sum(), made.proposal.chosen
-
-    (value, chosen), slope = jax.value_and_grad(density, has_aux=True)(1.0)
-    plain, plainly_chosen = density(1.0)
-    np.testing.assert_allclose(value, plain, rtol=1e-5)
-    np.testing.assert_array_equal(chosen, plainly_chosen)
-    assert np.isfinite(slope)
-
-
 @pytest.mark.slow
 def test_what_auto_leaves_out_is_said():
     """An undeclared normaliser, for densities only; and an unknown time reversal."""

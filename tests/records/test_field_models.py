@@ -1,4 +1,4 @@
-"""Models that people bring: chaos, and populations that never are negative."""
+"""Models that people bring: populations that never are negative."""
 
 import functools
 
@@ -9,52 +9,6 @@ import pytest
 from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
-
-LORENZ = jnp.array([10.0, 28.0, 8 / 3])
-
-
-def lorenz(params):
-    """Lorenz's equations (1963) with noise of variance 9 dt."""
-
-    def drift(x, p):
-        return jnp.stack(
-            [p[0] * (x[1] - x[0]), x[0] * (p[1] - x[2]) - x[1], x[0] * x[1] - p[2] * x[2]]
-        )
-
-    return jb.Diffusion(drift, lambda x, p: jnp.full(3, 3.0, x.dtype), params=params)
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
-def test_lorenz_from_parameters_that_are_far_off():
-    """The first coordinate is not seen, the others every hundredth with variance 5. Where the
-    chains start the process cannot follow the data: with a guide from there, of four particles,
-    the variance of log p̂ was 1.3, and R̂ 2."""
-    start, times = jnp.array([1.5, -1.5, 25.0]), np.arange(101) * 0.01
-    fine = np.linspace(0, 1, 10_001)
-    hidden = np.asarray(jb.simulate(jax.random.key(1), lorenz(LORENZ), start, fine)[0], float)
-    noise = np.random.default_rng(0).normal(size=(101, 2))
-    observations = hidden[::100, 1:] + np.sqrt(5) * noise
-    observations[0] = np.nan
-    made = jb.pmmh(
-        jax.random.key(3),
-        lorenz(jnp.array([5.0, 15.0, 6.0])),
-        times,
-        observations,
-        observation=jb.LinearGaussian(matrix=[[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], covariance=5.0),
-        initial=start,
-        prior=jb.NormalPrior(np.zeros(3), 1000.0),
-        num_iterations=500,
-        num_warmup=500,
-        num_chains=2,
-        num_proposals=4,
-        num_steps=2,
-    )
-    assert (made.log_likelihood_variance < 0.05).all()
-    assert (made.r_hat < 1.1).all() and (made.effective_sample_size > 25).all()
-    low, high = np.quantile(np.asarray(made.theta).reshape(-1, 3), [0.025, 0.975], axis=0)
-    assert ((low < LORENZ) & (LORENZ < high)).all()
-
 
 RATES = jnp.log(jnp.array([0.5, 0.0025, 0.3]))
 NUM_STEPS, NOISE = 5, 10.0

@@ -80,30 +80,6 @@ def test_nothing_is_forgotten_where_all_weights_are_equal():
     assert made.forgetting == 0 and made.standard_error < 1e-5
 
 
-@pytest.mark.slow
-def test_a_side_that_all_filters_miss_is_found():
-    """Which of two wells X is in is not seen, only its square, by what follows it. Along a path in
-    one well all filters agree, and their mean is half of the likelihood."""
-    drift = lambda x, p: jnp.stack([2 * (x[0] - x[0] ** 3), x[0] ** 2 - x[1]])
-    model = jb.Diffusion(drift, jnp.diag(jnp.array([0.5, 0.2])))
-    times = np.arange(13) * 0.5
-    path = jb.simulate(jax.random.key(4), model, jnp.zeros(2), jnp.asarray(times), num_steps=50)[0]
-    values = np.asarray(path)[:, 1:] + 0.1 * np.random.default_rng(0).normal(size=(13, 1))
-    law, seen = jb.GaussianLaw([0.15, 0.0], np.diag([0.5, 0.01])), jb.LinearGaussian([[0, 1]], 0.01)
-    given = {"observation": seen, "initial": law, "num_steps": 10}
-    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=1600, **given)
-    problem = as_record_problems(model, times, values, seen, law, num_steps=10).problem(0)
-    guide = linearised(problem, model).guide
-    run = jax.jit(lambda key, rate, P: run_filters(
-        key, problem, model, forgetful(guide, rate), (8, P)
-    ).log_estimate, static_argnums=2)  # fmt: skip
-    free = run(jax.random.key(3), jnp.float32(1000), 4000)
-    error = np.hypot(np.std(free) / np.sqrt(8), made.standard_error)
-    assert made.forgetting > 0 and abs(made.value - np.mean(free)) < 5 * error < 0.4
-    sure = run(jax.random.key(2), jnp.float32(0), 400)
-    assert np.std(sure) < 0.2 and np.mean(sure) < np.mean(free) - 0.5
-
-
 def neuron():
     """FitzHugh and Nagumo's equations, whose spikes are hidden in noise."""
     noise, times = 0.316, np.arange(100) * 0.2

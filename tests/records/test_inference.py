@@ -139,22 +139,6 @@ def test_a_single_chain_is_compiled_in_time():
 
 @pytest.mark.slow
 @pytest.mark.optimised
-def test_short_steps_mix_as_well_as_long_ones():
-    """σ and the noise among the parameters: given paths instead of noise it would be N times as
-    slow."""
-    sizes = []
-    for num_steps in (4, 16):
-        made = jb.gibbs(
-            jax.random.key(3), model(), TIMES, record(), observation=SEEN, prior=log_prior,
-            num_iterations=500, num_warmup=300, num_chains=4, num_steps=num_steps,
-        )  # fmt: skip
-        assert not made.stuck.any() and (made.r_hat < 1.05).all()
-        sizes.append(made.effective_sample_size)
-    assert np.all(np.max(sizes, axis=0) < 1.5 * np.min(sizes, axis=0)), sizes
-
-
-@pytest.mark.slow
-@pytest.mark.optimised
 def test_rate_sigma_and_noise_are_found():
     """By two steps between observations: the posterior is that of the chain of these steps, and how
     far that is from the exact one is told."""
