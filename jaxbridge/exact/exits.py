@@ -4,11 +4,11 @@ The progress of a path is the largest value of -g that it attained, for a region
 a run are simulated. Then the half with the least progress is replaced: each of these paths becomes
 a copy of one of the others until that exceeded the level, the largest progress among the replaced,
 and is simulated again from there. This is repeated until most paths have left the region. If K_i
-of n paths were replaced at level i, the probability of an exit is estimated by
+of n paths were replaced at level i, the estimate of the probability is
 
-    p̂ = Π_i (1 - K_i / n) · (share of the last paths that have left the region),
+    p̂ = Π_i (1 - K_i / n) · (share of the last paths that have left the region).
 
-whose mean is the probability for these steps (Bréhier, Gazeau, Goudenège, Lelièvre & Rousset 2016).
+Its mean is the probability for these steps (Bréhier, Gazeau, Goudenège, Lelièvre & Rousset 2016).
 Within a step, g is a Brownian bridge, and its minimum is drawn from its law. Independent runs give
 the error.
 """
@@ -74,7 +74,8 @@ class Exits(AbstractResult):
         the verdict says otherwise.
     - `exit_index`: index of the first point after the exit, shape (R, n); N+1 without an exit.
     - `num_levels`: number of levels of each run, shape (R,).
-    - `num_nonfinite`: number of paths that are not finite. They count as paths without an exit.
+    - `num_nonfinite`: number of simulated paths that were not finite, replaced ones included. From
+        there on they have no exit.
     """
 
     log_probability: Float[Array, ""]
@@ -221,6 +222,7 @@ class _Population(NamedTuple):
     - `points`: states, and `progress`: the largest -g within each step.
     - `log_p`, `num_levels`, `over`: log of the product so far, number of levels, and whether the
         run has ended.
+    - `num_nonfinite`: number of replaced paths that were not finite.
     """
 
     points: Float[Array, "points d lanes"]
@@ -228,8 +230,10 @@ class _Population(NamedTuple):
     log_p: Float[Array, " R"]
     num_levels: Int[Array, " R"]
     over: Bool[Array, " R"]
+    num_nonfinite: Int[Array, ""]
 
 
+# A handful of levels, each of which simulates all paths.
 @compiled_for(lambda key, model, start, duration, inside, size: size[0] * size[1] * size[2] * 4)
 def _sample_exits(
     key: Key[Array, ""],
@@ -275,6 +279,8 @@ def _sample_exits(
         _, (later, progress) = lax.scan(one, points[0], inputs)
         return jnp.concatenate([points[:1], later]), progress
 
+    lost = lambda points: ~jnp.all(jnp.isfinite(points), axis=(0, 1))
+
     def level(i, old):
         """Replace the paths of least progress in all runs that go on."""
         parent_key, path_key = jax.random.split(jax.random.fold_in(key, i + 1))
@@ -309,6 +315,7 @@ def _sample_exits(
             log_p,
             old.num_levels + goes_on.astype(jnp.int32),
             old.over | is_last | is_lost,
+            old.num_nonfinite + jnp.sum(lost(old.points) & replaced.ravel(), dtype=jnp.int32),
         )
 
     points = jnp.broadcast_to(start[:, None], (N + 1, len(start), R * n))
@@ -317,7 +324,8 @@ def _sample_exits(
         jax.random.fold_in(key, 0), points, progress, jnp.zeros(R * n, jnp.int32)
     )
     zeros = jnp.zeros(R, start.dtype)
-    init = _Population(points, progress, zeros, jnp.zeros(R, jnp.int32), jnp.zeros(R, bool))
+    numbers = jnp.zeros(R, jnp.int32), jnp.zeros(R, bool), jnp.int32(0)
+    init = _Population(points, progress, zeros, *numbers)
     goes_on = lambda state: (state[0] < _MOST_LEVELS) & ~jnp.all(state[1].over)
     _, last = lax.while_loop(
         goes_on, lambda state: (state[0] + 1, level(*state)), (jnp.int32(0), init)
@@ -337,5 +345,5 @@ def _sample_exits(
         exited,
         index.reshape(R, n).astype(jnp.int32),
         last.num_levels,
-        jnp.sum(~jnp.all(jnp.isfinite(last.points), axis=(0, 1)), dtype=jnp.int32),
+        last.num_nonfinite + jnp.sum(lost(last.points), dtype=jnp.int32),
     )

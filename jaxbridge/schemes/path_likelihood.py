@@ -132,6 +132,14 @@ def as_grid_and_paths(
     return jnp.asarray(times, path.dtype), steps.astype(path.dtype), path
 
 
+def for_each_path(grid: Float[Array, "*I n"], batch: tuple[int, ...]) -> Float[Array, "P n"]:
+    """Repeat numbers of one grid, or of one grid per interval, for each path of a batch."""
+    n = grid.shape[-1]
+    if grid.ndim == 2:
+        grid = grid.reshape(len(grid), *[1] * (len(batch) - 1), n)
+    return jnp.broadcast_to(grid, (*batch, n)).reshape(-1, n)
+
+
 def log_likelihood_of_steps(
     model: Diffusion,
     steps: Float[Array, "*I K"],
@@ -140,9 +148,7 @@ def log_likelihood_of_steps(
 ) -> Float[Array, "*batch"]:
     """Return `path_log_likelihood` for given step sizes, of one grid or one grid per interval."""
     batch, (num_points, d) = path.shape[:-2], path.shape[-2:]
-    if steps.ndim == 2:
-        steps = steps.reshape(len(steps), *[1] * (len(batch) - 1), num_points - 1)
-    steps = jnp.broadcast_to(steps, (*batch, num_points - 1)).reshape(-1, num_points - 1)
+    steps = for_each_path(steps, batch)
     paths = path.reshape(-1, num_points, d)
     if form != "euler":
         known_sigma(model.diffusion(paths[0, 0]))

@@ -21,10 +21,11 @@ from ..engine.arguments import as_returned, check_function, named
 from ..engine.checks import Numbers
 from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
+from ..engine.lanes import over_points
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.dynamics import Dynamics
 from ..models.sigma import columns_of
-from .path_likelihood import as_grid_and_paths
+from .path_likelihood import as_grid_and_paths, for_each_path
 
 
 @public_entry
@@ -62,17 +63,10 @@ def log_survival(
     check_diffusion(model)
     check_function("inside", inside, "(x)")
     times, steps, path = as_grid_and_paths(times, path)
-    num_points, d = path.shape[-2:]
-    batch = path.shape[:-2]
-
-    def along_batch(leaf):
-        """Repeat an array along the times, (K,) or (I, K), for each path."""
-        if leaf.ndim == 2:
-            leaf = leaf.reshape(len(leaf), *[1] * (len(batch) - 1), leaf.shape[1])
-        return jnp.broadcast_to(leaf, (*batch, leaf.shape[-1])).reshape(-1, leaf.shape[-1])
-
-    of_paths = along_batch(times), along_batch(steps), path.reshape(-1, num_points, d)
-    return _log_survival(model, *of_paths, inside).reshape(*batch, num_points)
+    batch, (num_points, d) = path.shape[:-2], path.shape[-2:]
+    grids = for_each_path(times, batch), for_each_path(steps, batch)
+    paths = path.reshape(-1, num_points, d)
+    return _log_survival(model, *grids, paths, inside).reshape(*batch, num_points)
 
 
 @compiled_sooner
@@ -89,7 +83,8 @@ def _log_survival(
     def of_point(time, x):
         return distances(dynamics_at(time), named("inside", inside), x)
 
-    g, s = jax.vmap(jax.vmap(of_point))(times, paths)  # each (P, K, number of functions)
+    values = over_points(of_point)(times.ravel(), paths.reshape(-1, paths.shape[-1]))
+    g, s = (leaf.reshape(*times.shape, -1) for leaf in values)  # (P, K, number of functions)
     is_inside = g > 0
     both = is_inside[:, :-1] & is_inside[:, 1:]
     scale = jnp.sqrt(s[:, :-1] * s[:, 1:]) * steps[..., None]

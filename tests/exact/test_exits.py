@@ -133,6 +133,17 @@ def test_what_never_leaves_and_what_is_outside():
     assert single.standard_error == np.inf and not single.trustworthy
 
 
+def test_paths_that_were_lost_and_replaced_are_told():
+    """Those that explode come no nearer to the exit, so that hardly one of them is left at last."""
+    model = jb.Diffusion(lambda x, p: 50 * jnp.maximum(x, 0) ** 3, jnp.ones(1))
+    exits = jb.sample_exits(
+        jax.random.key(0), model, [0.0], 1.0, lambda x: x[0] + 1.5,
+        num_paths=40, num_runs=2, num_steps=20,
+    )  # fmt: skip
+    left = jnp.sum(~jnp.all(jnp.isfinite(exits.paths), axis=(2, 3)))
+    assert exits.num_nonfinite > left and "not finite" in exits.why()
+
+
 def test_refusals():
     with pytest.raises(ValueError, match="`start` must have shape"):
         jb.sample_exits(jax.random.key(0), BROWNIAN, [[0.0]], 1.0, lambda x: x[0])
