@@ -102,9 +102,10 @@ class Exits(AbstractResult):
     def rate(self, after: Numbers) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the probability of an exit per unit of time from `after` on, and its error.
 
-        It is the rate of a rare transition, if `after` is longer than the relaxation time inside
-        the region and the time that a transition itself takes, and the duration is shorter than the
-        mean time until an exit. If a later `after` gives a larger rate, it was too early.
+        It is the rate of a rare transition under two conditions. `after` must be longer than the
+        relaxation time inside the region and the time that a transition itself takes; if a later
+        `after` gives a larger rate, it was too early. The duration must be shorter than the mean
+        time until an exit.
 
         **Raises:** `ValueError` unless `after` is at least zero and below the duration. A traced
         number is not checked.

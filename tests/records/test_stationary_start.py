@@ -53,8 +53,8 @@ RECORDS = [(first, None) for first in (-1.0, 1.0)] + [(-1.0, -0.8, None, 0.3)]
 
 @pytest.mark.slow
 def test_both_wells_count():
-    """A beginning in either well: with the normal law at one mode in the
-    place of ν the first were told to be too small by 1.5 and 3.6."""
+    """A beginning in either well: with the normal law at one mode in the place of ν the first were
+    told to be too small by 1.5 and 3.6."""
     noise = 0.5
     for values in RECORDS:
         exact = on_the_grid(values, noise).log_likelihood
