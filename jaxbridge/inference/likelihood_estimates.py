@@ -24,6 +24,7 @@ from ..records import (
     guided,
     half_will_do,
     linearisations,
+    on_each_grid,
     rate_for_several,
     run_filters,
     steps_are_too_long,
@@ -31,7 +32,7 @@ from ..records import (
 from ..schemes import share_of_grid
 from .blocks import Block, with_keys
 from .parameters import Parameters
-from .record_paths import GuidedRecords, guided_near, likely_root, on_both_grids
+from .record_paths import GuidedRecords, guided_near, likely_root
 
 # A pilot run has at least so many filters at each θ, and so many particles in all of them.
 _FEWEST_FILTERS, _FEWEST_PARTICLES = 16, 128
@@ -243,9 +244,9 @@ class RecordLikelihood(AbstractLikelihood):
         if problem.num_steps == 1:
             return jnp.full((), jnp.nan, problem.like.dtype)
         estimate = lambda grid: self._estimate(key, model, grid, skips=True)
-        log_p, variance, _ = on_both_grids(estimate, self.fine, self.coarse)
+        estimates = on_each_grid(estimate, self.fine, self.coarse)
         # The mean of log p̂ is below log p by half the variance of log p̂.
-        fine, coarse = log_p + variance / 2
+        fine, coarse = (log_p + variance / 2 for log_p, variance, _ in estimates)
         error = share_of_grid(problem.density.order, problem.record.lengths) * (coarse - fine)
         one = lambda problem, points: steps_are_too_long(problem, model, points)
         # Then the difference of the two grids is no leading-order error.

@@ -462,7 +462,7 @@ def over_chains(function: Callable, key: Key[Array, ""], state: PyTree) -> Any:
 
     The first leaf of the state must be θ.
     """
-    theta = jax.tree.leaves(state)[0]
+    theta = _theta_of(state)
     if theta.ndim == 1:
         return function(key, state)
     keys = jax.random.split(key, len(theta))
@@ -479,12 +479,19 @@ def thinned_step_errors(
 
     Of `num_draws` draws 256 to 511 are selected, evenly spaced, or all if there are fewer than 512.
     `number` counts the draws from zero. It is negative in the warm-up, where none is selected.
+    The first leaf of the state must be θ.
     """
     every = max(1, num_draws // _STEP_ERRORS)
-    shape = jax.eval_shape(function, state)
+    theta = _theta_of(state)
+    none = jnp.full(theta.shape[:-1], jnp.nan, theta.dtype)
     is_selected = (number >= 0) & (number % every == every - 1)
     # `cond` computes the function for the selected draws only.
-    return lax.cond(is_selected, function, lambda _: jnp.full_like(shape, jnp.nan), state)
+    return lax.cond(is_selected, function, lambda _: none, state)
+
+
+def _theta_of(state: PyTree) -> Float[Array, "*chains p"]:
+    """Return θ, the first leaf of the state."""
+    return jax.tree.leaves(state)[0]
 
 
 @compiled_sooner

@@ -88,10 +88,17 @@ class RecordState(NamedTuple):
 
 
 class GuidedState(NamedTuple):
-    """A `RecordState` with the guides at its θ, which are computed once for each θ."""
+    """A `RecordState` with what is computed once for each state.
+
+    - `guides`: the guides at its θ.
+    - `noise`: noise ξ of the paths, from the last iteration.
+    - `log_weights`: log w of each record, from the last iteration.
+    """
 
     state: RecordState
     guides: Guidance
+    noise: Float[Array, "*chains R points d"]
+    log_weights: Float[Array, "*chains R"]
 
 
 class RecordPosterior(AbstractPosterior):
@@ -167,10 +174,11 @@ class RecordSampler(eqx.Module):
     completion: RecordPaths
     population: Population
 
-    def start(self, key: Key[Array, ""], state: RecordState) -> RecordState:
+    def start(self, key: Key[Array, ""], guided: GuidedState) -> RecordState:
         """Return the state with its first paths."""
+        state = guided.state
         theta = self.population.of_units(state.theta, state.units)
-        paths, log_scales = self.completion.first(key, self.completion.at(theta))
+        paths, log_scales = self.completion.first(key, GuidedTheta(theta, guided.guides))
         return state._replace(paths=paths, log_scales=log_scales)
 
     def step(
@@ -182,7 +190,8 @@ class RecordSampler(eqx.Module):
         moved, and whether the parameters of each record moved.
         """
         path_key, noise_key, walk_key, accept_key = jax.random.split(key, 4)
-        (state, guides), population = guided, self.population
+        state, guides, *_ = guided
+        population = self.population
         phi, units, log_scales = state.theta, state.units, state.log_scales
         here = GuidedTheta(population.of_units(phi, units), guides)
         # This move leaves the law of the path given θ invariant, whatever the guide.
@@ -223,7 +232,7 @@ class RecordSampler(eqx.Module):
         has_weight = nan_to_neg_inf(jnp.sum(held.log_weights)) > -jnp.inf
         new_state = new_state._replace(theta=phi, paths=held.paths)
         moved = accepted, has_weight, blocks_moved, units_moved
-        return GuidedState(new_state, held.at.guides), moved
+        return GuidedState(new_state, held.at.guides, noise, held.log_weights), moved
 
     def _weighted(self, theta: Float[Array, "*R p"], noise: Float[Array, "R points d"]):
         """Return the paths of this noise at θ, with their weights."""
@@ -268,17 +277,16 @@ class RecordSampler(eqx.Module):
         phi, z = population.given_units(population_key, phi, z)
         return phi, held, state._replace(units=z, unit_roots=roots), accepted
 
-    def change_by_coarse_steps(self, key: Key[Array, ""], guided: GuidedState) -> Float[Array, ""]:
+    def change_by_coarse_steps(self, guided: GuidedState) -> Float[Array, ""]:
         """Return the relative change of the likelihood by steps of twice the size.
 
         It is NaN if the path has no weight, and infinite if steps are too long for the drift.
         """
-        (state, guides), completion = guided, self.completion
-        here = GuidedTheta(self.population.of_units(state.theta, state.units), guides)
-        noise, log_weights = completion.noise(key, here, state.paths)
+        state = guided.state
+        theta = self.population.of_units(state.theta, state.units)
+        change = self.completion.change_by_coarse_steps(theta, guided.noise)
         # A path without weight, such as a placeholder, has no change.
-        change = completion.change_by_coarse_steps(here, noise)
-        return jnp.where(jnp.all(jnp.isfinite(log_weights)), change, jnp.nan)
+        return jnp.where(jnp.all(jnp.isfinite(guided.log_weights)), change, jnp.nan)
 
 
 def sample_records(
@@ -328,26 +336,28 @@ def _sample_records(
         of_records = functools.partial(population.of_units, z=first_chain(state.units, 2))
         completion = as_record_paths(parameters, records, of_records(phi))
         sampler = RecordSampler(completion, population)
+        guided = guided._replace(guides=_guides_of(completion, population, state))
 
-        def first(state):
+        def first(guided):
+            state = over_chains(sampler.start, jax.random.fold_in(key, 0), guided)
             if finds_root:
                 log_prior = population.log_density
                 likely = likely_root(parameters, completion.fine, log_prior, phi, root, of_records)
                 state = state._replace(root=jnp.broadcast_to(likely, state.root.shape))
-            return over_chains(sampler.start, jax.random.fold_in(key, 0), state)
+            return guided._replace(state=state)
 
         if fresh:
             # Stages share one compiled loop, and only the first one creates paths.
-            state = lax.cond(i == 0, first, lambda state: state, state)
-        return GuidedState(state, _guides_of(completion, population, state)), sampler
+            guided = lax.cond(i == 0, first, lambda guided: guided, guided)
+        return guided, sampler
 
     def number(guided):
         return guided.state.num_done.reshape(-1)[0]  # key 0 is for the first paths
 
     def changes(sampler, i, guided):
         theta = guided.state.theta
-        own_key = jax.random.fold_in(key_for("step error", key), number(guided))
-        function = lambda guided: over_chains(sampler.change_by_coarse_steps, own_key, guided)
+        of_chain = lambda guided: sampler.change_by_coarse_steps(guided)
+        function = of_chain if theta.ndim == 1 else jax.vmap(of_chain)
         if records.stacked.density.is_exact:
             return jnp.zeros(theta.shape[:-1], theta.dtype)
         if records.stacked.num_steps == 1:
@@ -371,8 +381,10 @@ def _sample_records(
 
     bounds = stages(skipped if fresh else 0, skipped + num_iterations)
     state = _initial_state(key, population, records, *start) if fresh else start
-    init = GuidedState(state, _no_guides(population, records, state))
-    (state, _), draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
+    noise = jnp.zeros_like(state.paths)
+    log_weights = jnp.zeros(noise.shape[:-2], noise.dtype)
+    init = GuidedState(state, _no_guides(population, records, state), noise, log_weights)
+    guided, draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
     draws, checks = draws
     fields, values = posterior_fields(population, *draws)
     units, theta_moved, blocks_moved, units_moved, has_weight, change = values
@@ -386,7 +398,7 @@ def _sample_records(
         | jnp.any(~jnp.any(units_moved, axis=-2), axis=-1),
         log_step_error=share_of_step_error(records) * change,
         sigma_varies=parameters.model.sigma_varies(records.stacked.like),
-        state=state,
+        state=guided.state,
         guide=jax.tree.map(lambda leaf: leaf[-1], checks),
         unit_params=_params_of_units(population, fields["theta"], units),
     )

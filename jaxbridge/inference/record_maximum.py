@@ -323,7 +323,7 @@ def _draws_at(
         hessian = (slopes[2 : 2 + p] - slopes[2 + p : 2 + 2 * p]) / (2 * h[:, None])
         hessian = (hessian + hessian.T) / 2
         rises = (values[2 + 2 * p :] - values[0]).reshape(2, p)
-        change = completion.change_by_coarse_steps(here, noise)
+        change = completion.change_by_coarse_steps(theta, noise)
         return _Draw(slopes[0], hessian, change, slopes[1], rises, accepted)
 
     def draw(state, i):

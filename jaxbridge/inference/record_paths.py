@@ -38,10 +38,10 @@ from ..records import (
     knots_and_log_weight,
     no_check,
     noise_and_log_weight,
+    on_each_grid,
     pair_noise,
     path_and_log_weights,
     points_and_check,
-    stacked,
     steps_are_too_long,
     sweep,
 )
@@ -166,21 +166,21 @@ class RecordPaths(eqx.Module):
         return _paths_of_noise(self.parameters, self.fine.records, at, noise)
 
     def change_by_coarse_steps(
-        self, at: GuidedTheta, noise: Float[Array, "R points d"]
+        self, theta: Float[Array, "*R p"], noise: Float[Array, "R points d"]
     ) -> Float[Array, ""]:
         """Return the relative change of the likelihood by steps of twice the size, from one ξ.
 
         It is infinite if steps are too long for the drift.
         """
-        parameters, theta = self.parameters, at.theta
+        parameters = self.parameters
 
-        def log_weights(grid, guides, noise):
-            one = lambda problem, model, *each: path_and_log_weights(problem, model, *each)
-            return _each(parameters, grid.records, one, theta, guides, noise)
+        def path_on_grid(grid_and_noise):
+            grid, noise = grid_and_noise
+            guides = _guides(parameters, grid, theta)
+            return _each(parameters, grid.records, path_and_log_weights, theta, guides, noise)
 
-        paths, log_fine = log_weights(self.fine, at.guides, noise)
-        guides = _guides(parameters, self.coarse, theta)
-        _, log_coarse = log_weights(self.coarse, guides, self._coarsened(noise))
+        both = (self.fine, noise), (self.coarse, self._coarsened(noise))
+        (paths, log_fine), (_, log_coarse) = on_each_grid(path_on_grid, *both)
         change = jnp.sum(jax.vmap(change_by_coarse_steps)(log_fine, log_coarse))
         too_long = _each(parameters, self.fine.records, steps_are_too_long, theta, paths)
         return jnp.where(jnp.any(too_long), jnp.inf, change)
@@ -249,21 +249,11 @@ def unguided(records: Records) -> GuidedRecords:
     return GuidedRecords(records, jnp.zeros(shape, dtype), no_check(records.number, dtype))
 
 
-def on_both_grids(function: Callable, fine: PyTree, coarse: PyTree) -> Any:
-    """Return `function` of `fine` and of `coarse`, stacked along a leading axis.
-
-    Both have arrays of the same shapes, so `function` is compiled once.
-    """
-    arrays, static = stacked(fine, coarse)
-    return lax.map(lambda arrays: function(eqx.combine(arrays, static)), arrays)
-
-
 def guided_near(
     fine: Records, coarse: Records, linearise: Callable[[Records], tuple[Array, GuideCheck]]
 ) -> tuple[GuidedRecords, GuidedRecords]:
     """Return both records with points of linearisation by `linearise`."""
-    points = on_both_grids(linearise, fine, coarse)
-    of_fine, of_coarse = (jax.tree.map(lambda leaf, i=i: leaf[i], points) for i in range(2))
+    of_fine, of_coarse = on_each_grid(linearise, fine, coarse)
     return GuidedRecords(fine, *of_fine), GuidedRecords(coarse, *of_coarse)
 
 
@@ -274,16 +264,25 @@ def no_paths(records: Records) -> tuple[Float[Array, "R points d"], Float[Array,
     return points, jnp.zeros((records.number, 2, num_blocks), points.dtype)
 
 
-@compiled_sooner
 def as_record_paths(
     parameters: Parameters, records: Records, theta: Float[Array, "*R p"]
 ) -> RecordPaths:
     """Return the paths of the records, linearised at θ."""
+    # Outside `jit` the search for a single record decides in Python which programs it compiles.
+    make = _as_record_paths if records.number == 1 else _compiled_record_paths
+    return make(parameters, records, theta)
 
+
+def _as_record_paths(
+    parameters: Parameters, records: Records, theta: Float[Array, "*R p"]
+) -> RecordPaths:
     def linearise(records):
         return _each(parameters, records, points_and_check, theta)
 
     return RecordPaths(parameters, *guided_near(records, records.coarsened(), linearise))
+
+
+_compiled_record_paths = compiled_sooner(_as_record_paths)
 
 
 def likely_root(

@@ -62,7 +62,7 @@ from .several import (
     Records as Records,
     as_record_problems as as_record_problems,
     linearisations as linearisations,
+    on_each_grid as on_each_grid,
     points_and_check as points_and_check,
-    stacked as stacked,
 )
 from .step_regime import steps_are_too_long as steps_are_too_long

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..engine.averages import nan_to_neg_inf
 from ..engine.captured import without_captured_derivatives
@@ -80,9 +80,7 @@ class GuideCheck(NamedTuple):
     @property
     def is_near(self) -> Bool[Array, "*R"]:
         """Return whether the guide is usable and its residuals are consistent with the noise."""
-        number = jnp.maximum(self.num_observed, 1).astype(self.largest_residual.dtype)
-        largest = jnp.sqrt(2 * jnp.log(number)) + _BEYOND_NOISE
-        return self.is_usable & (self.largest_residual < largest)
+        return _is_near(self)
 
     @property
     def rank(self) -> Float[Array, "*R"]:
@@ -100,6 +98,13 @@ class GuideCheck(NamedTuple):
         poor guide a fault, because weights and chains are exact with any guide.
         """
         return Fault(jnp.any(~self.is_near) & hampered, _POOR)
+
+
+@compiled_sooner
+def _is_near(check: GuideCheck) -> Bool[Array, "*R"]:
+    number = jnp.maximum(check.num_observed, 1).astype(check.largest_residual.dtype)
+    largest = jnp.sqrt(2 * jnp.log(number)) + _BEYOND_NOISE
+    return check.is_usable & (check.largest_residual < largest)
 
 
 class Linearised(NamedTuple):
@@ -195,9 +200,8 @@ def _in_program(own_problem: RecordProblem, own_model: Diffusion) -> Linearised:
     The guide keeps its derivatives by the observations and the initial law, but not by the model.
     """
     problem, model = without_derivatives((own_problem, own_model))
-    best = _from_filter(problem, model)
-    if not _is_linear(problem, model):
-        best = _best_of_loop(problem, model, best)
+    linear = _is_linear(problem, model)
+    best = (_from_filter if linear else _best_of_loop)(problem, model)
     own_problem = without_captured_derivatives(own_problem)  # like the model's parameters
     guide = _guide_of((own_problem, best.guide), model=model, points=best.points)
     return best._replace(guide=guide)
@@ -205,22 +209,35 @@ def _in_program(own_problem: RecordProblem, own_model: Diffusion) -> Linearised:
 
 def _is_linear(problem: RecordProblem, model: Diffusion) -> bool:
     """Return whether the guide is the same along any path."""
-    dynamics = model.forward_at(problem.like)(problem.record.times[0])
+    dynamics = model.forward_at(problem.like)(problem.record.first_time)
     cover = calls_for_cover(problem.initial, model, problem.like)
     return is_linear(dynamics, problem.like) and not cover and problem.jumps_are_affine(model)
 
 
-def _best_of_loop(problem: RecordProblem, model: Diffusion, best: Linearised) -> Linearised:
-    """Search from paths of particles until a guide is near the observations, in a compiled loop."""
+@compiled_sooner
+def _best_of_loop(problem: RecordProblem, model: Diffusion) -> Linearised:
+    """Search until a guide is near the observations, in a loop with one search for all starts."""
+    first = _filter_start(problem, model)
+    # Traced once, for the shapes and for the loop.
+    search_from = jax.jit(lambda start: _search(problem, model, start))
 
     def search(state: tuple[Int[Array, ""], Linearised]) -> tuple[Int[Array, ""], Linearised]:
         number, best = state
-        new = _from_particles(problem, model, number)
-        better = new.check.rank > best.check.rank
+        start = lax.cond(
+            number == 0,
+            lambda: first,
+            lambda: _particle_start(problem, model, number - 1),
+        )
+        new = search_from(start)
+        better = (number == 0) | (new.check.rank > best.check.rank)
         return number + 1, jax.tree.map(lambda a, b: jnp.where(better, a, b), new, best)
 
-    goes_on = lambda state: ~state[1].check.is_near & (state[0] < _MOST_PARTICLE_STARTS)
-    return lax.while_loop(goes_on, search, (jnp.int32(0), best))[1]
+    def goes_on(state: tuple[Int[Array, ""], Linearised]) -> Bool[Array, ""]:
+        number, best = state
+        return (number == 0) | ~best.check.is_near & (number <= _MOST_PARTICLE_STARTS)
+
+    none = _zeros_like(jax.eval_shape(search_from, first))
+    return lax.while_loop(goes_on, search, (jnp.int32(0), none))[1]
 
 
 class _SearchStart(NamedTuple):
@@ -325,13 +342,17 @@ def _search(problem: RecordProblem, model: Diffusion, start: _SearchStart) -> Li
         over = settled | (length < _SHORTEST)
         return _SearchState(search.turn + 1, points, best, check, path, length, over)
 
-    shapes = jax.eval_shape(at, points)[:2]
-    best, check = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    best, check = _zeros_like(jax.eval_shape(at, points)[:2])
     one = jnp.ones((), points.dtype)
     init = _SearchState(jnp.int32(0), points, best, check, points, one, jnp.zeros((), bool))
     goes_on = lambda search: ~search.over & (search.turn < _MOST_TURNS)
     final = lax.while_loop(goes_on, turn, init)
     return Linearised(*final.best, final.check)
+
+
+def _zeros_like(shapes: PyTree) -> PyTree:
+    """Return arrays of zeros with the shapes and dtypes of a pytree."""
+    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
 
 @eqx.filter_custom_jvp

@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.checks import Numbers, check_count, check_key
-from ..engine.compiled import compiled_sooner, is_outermost
+from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
 from ..engine.keys import key_for
 from ..engine.pareto import NEARLY_EQUAL, largest_reliable_k
@@ -52,7 +52,7 @@ from .guided_record import Guidance, forgetful
 from .initial import Initial
 from .observations import AbstractObservation
 from .particle_filter import Filtered, run_filters
-from .several import Records, as_record_problems, stacked
+from .several import Records, as_record_problems, on_each_grid, stacked
 
 # An estimate is unreliable with fewer effective particles, or with a larger standard error. The
 # largest of many k̂ may exceed its bound by `_LARGEST_OF_MANY` through estimation error alone.
@@ -324,14 +324,8 @@ def _combine_filters(
 def _guides_and_check(grids: list[Records]) -> tuple[list[Guidance], GuideCheck]:
     """Return the guides of all records on each grid, and the diagnostics of those on the first."""
     search = lambda records: records.each(lambda one: linearised(one, one.model)[1:])
-    if is_outermost():
-        guides, checks = zip(*map(search, grids), strict=True)
-        return list(guides), checks[0]
-    # Inside a compiled program, a loop over the grids compiles the searches once.
-    arrays, others = stacked(*grids)
-    guides, checks = lax.map(lambda grid: search(eqx.combine(grid, others)), arrays)
-    of_grid = lambda number, tree: jax.tree.map(lambda leaf: leaf[number], tree)
-    return [of_grid(number, guides) for number in range(len(grids))], of_grid(0, checks)
+    guides, checks = zip(*on_each_grid(search, *grids), strict=True)
+    return list(guides), checks[0]
 
 
 def _exact_log_likelihood(

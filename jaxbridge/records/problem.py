@@ -135,7 +135,7 @@ def problem_of(
     dim = m if observation.matrix is None else observation.matrix.shape[1]
     like = jnp.zeros(dim, record.values.dtype)
     _check_dimension(model, observation, like)
-    observation.check(record.values, like, record.times[0], model.params)
+    observation.check(record.values, like, record.first_time, model.params)
     if initial is None:
         if not model.has_density:
             raise ValueError(
@@ -219,7 +219,7 @@ def check_domain(model: Diffusion, observation: AbstractObservation, record: Rec
     d, values = record.values.shape[-1], record.values[record.which]
     if is_traced(model, observation, values):
         return
-    matrix, first_time = matrix_for(observation.matrix, d, values.dtype), record.times[0]
+    matrix, first_time = matrix_for(observation.matrix, d, values.dtype), record.first_time
     matrix, R, offset = (
         np.asarray(part, float)
         for part in (

@@ -91,6 +91,11 @@ class Record(eqx.Module):
         """Return the caller's times of the ends of segments."""
         return self.clock(self.since)
 
+    @property
+    def first_time(self) -> Float[Array, ""]:
+        """Return the caller's first time."""
+        return _first_time(self)
+
     def grid(self) -> Float[Array, " points"]:
         """Return the times of all points, since the first time."""
         return jnp.append(self._beginnings().ravel(), self.since[-1])
@@ -348,6 +353,11 @@ def _check_record(
             i, j = infinite[0]
             raise ValueError(f"`observations[{i}, {j}]` is infinite: pass NaN for a missing value.")
     return checked_times, values
+
+
+@compiled_sooner
+def _first_time(record: Record) -> Float[Array, ""]:
+    return record.times[0]
 
 
 @compiled_sooner

@@ -12,11 +12,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from ..engine.arguments import as_sequence, check_instance
 from ..engine.checks import Numbers
-from ..engine.compiled import compiled_sooner
+from ..engine.compiled import compiled_sooner, is_outermost
 from ..models.diffusion import Diffusion
 from ..models.jumps import JumpMap, Jumps, JumpsLike
 from ..schemes import AbstractStepDensity
@@ -223,6 +224,19 @@ def stacked(*alike: PyTree) -> tuple[PyTree, PyTree]:
     """
     arrays, others = zip(*(eqx.partition(tree, eqx.is_array) for tree in alike), strict=True)
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *arrays), others[0]
+
+
+def on_each_grid(function: Callable, *grids: PyTree) -> list:
+    """Return `function(grid)` of each grid: pytrees of one structure with arrays of one shape.
+
+    Inside a compiled program it is a loop, which compiles the function once. Outside, functions may
+    decide in Python which programs they compile.
+    """
+    if is_outermost():
+        return list(map(function, grids))
+    arrays, others = stacked(*grids)
+    results = lax.map(lambda arrays: function(eqx.combine(arrays, others)), arrays)
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], results) for i in range(len(grids))]
 
 
 def linearisations(

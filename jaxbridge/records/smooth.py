@@ -541,7 +541,7 @@ def _noise_varies(problem: RecordProblem, path: Float[Array, "K d"]) -> Bool[Arr
     model, like = problem.model, problem.like
     if model.sigma_varies(like) or model.sigma_is_invertible(like):
         return jnp.asarray(model.sigma_varies(like))
-    dynamics = model.forward_at(like)(problem.record.times[0])
+    dynamics = model.forward_at(like)(problem.record.first_time)
 
     def spread_by_drift(x):
         columns = columns_of(dynamics.sigma(x), x)

@@ -179,7 +179,7 @@ def as_matrix(matrix: Numbers | None) -> Float[Array, "m d"] | None:
 
 def matrix_for(matrix: Float[Array, "m d"] | None, d: int, dtype) -> Float[Array, "m d"]:
     """Return L as a matrix, shape (m, d): the identity for `None`."""
-    return jnp.eye(d, dtype=dtype) if matrix is None else matrix.astype(dtype)
+    return jnp.asarray(np.eye(d, dtype=dtype)) if matrix is None else matrix.astype(dtype)
 
 
 def check_matrix(matrix: Float[Array, "m d"] | None, m: int, like: Float[Array, " d"]) -> None:
