@@ -117,7 +117,6 @@ def test_nothing_is_left_of_a_density_that_noise_made_negative(densities):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_few_steps_of_a_sigma_that_turns():
     """The default scheme, by ten."""
     model = turning_model()

@@ -43,7 +43,6 @@ def exact_posterior(records):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_posterior_of_two_records_is_exact_and_of_second_order():
     """At five steps of σ(x) over an interval; each record has its own first state."""
     rng = np.random.default_rng(5)

@@ -138,7 +138,6 @@ def test_a_single_chain_is_compiled_in_time():
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_rate_sigma_and_noise_are_found():
     """By two steps between observations: the posterior is that of the chain of these steps, and how
     far that is from the exact one is told."""
@@ -160,7 +159,6 @@ def test_rate_sigma_and_noise_are_found():
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_several_records_have_one_posterior():
     parts = ((0, 25), (25, 40))
     times, values = zip(*((TIMES[i:j], record()[i:j]) for i, j in parts), strict=True)

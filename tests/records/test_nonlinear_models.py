@@ -193,7 +193,6 @@ def test_what_no_particle_explains_is_said():
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 def test_the_maximum_is_that_of_the_grid():
     """Of a model whose paths differ in weight, and whose steps are of first order."""
     case, values, _ = recorded("bent")

@@ -101,7 +101,6 @@ def test_filters_tell_it(name, density, num_steps, x64):
 
 
 @pytest.mark.slow
-@pytest.mark.optimised
 @pytest.mark.parametrize("num_steps", [4, 5])
 def test_smoothed_paths_tell_it(num_steps):
     """Means and squares at the times of observations: what half as many steps change, by exact
