@@ -305,6 +305,7 @@ def test_parameters_may_hold_what_is_no_array(name, monkeypatch):
     assert_same(made_by(silent_network), made_by(curved_model))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", slow_beyond(1, ["sample_bridges", "sample_weighted_bridges", *CHAINS])
 )

@@ -472,6 +472,7 @@ def test_unusual_stationary_densities(log_density, precision):
 # Dimensions
 
 
+@pytest.mark.optimised
 @hard(
     "d = 50",
     "matrices of d×d numbers and their O(d³) products, although σ = I needs none",

@@ -142,6 +142,7 @@ def test_calls_fit_the_functions(page):
 
 
 @pytest.mark.slow
+@pytest.mark.optimised
 @pytest.mark.usefixtures("unchecked")  # annotations, as for users
 @pytest.mark.parametrize(
     "page", [page for page in WITH_CODE if page.stem not in LONG], ids=lambda page: page.stem

@@ -45,6 +45,7 @@ def test_probabilities_are_those_of_an_independent_simulation(law):
     assert np.ptp(counts.probability) > 0.1
 
 
+@pytest.mark.slow
 def test_counts_are_geometric_and_independent():
     counts = jb.hitting_counts(jax.random.key(1), paper_model(), some_bridges(1), num_counts=8_000)
     values = np.asarray(counts.counts[0], float)

@@ -33,6 +33,7 @@ def make(model, coupling, start, end, duration, num_lanes, num_steps=NUM_STEPS, 
     return run(jax.random.key(seed))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gamma", slow_beyond(1, [0.5, -1.0]))
 @pytest.mark.parametrize("scheme", slow_beyond(1, [jb.Heun(), jb.Euler()]))
 def test_driven_path_is_the_forward_diffusion(gamma, scheme):

@@ -148,6 +148,7 @@ def assert_is_euler_step(driven, points, dt=0.5):
     assert_moments(points, driven - B @ driven * dt, sigma @ sigma.T * dt)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "gamma", [0.0, *(pytest.param(g, marks=pytest.mark.slow) for g in (-1.0, 0.7))]
 )

@@ -304,6 +304,7 @@ def test_no_lapack_call_is_compiled(d):
         assert "lapack" not in text(function)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [3, 5, 7])
 def test_many_lanes_inside_a_scan(d):
     """XLA's CPU compiler leaves part of some reductions inside loops uncomputed, from the

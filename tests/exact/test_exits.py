@@ -111,6 +111,7 @@ def test_a_rate_is_one_over_the_mean_passage_time():
         exits.rate(after=3.0)
 
 
+@pytest.mark.slow
 def test_what_never_leaves_and_what_is_outside():
     """Without noise and without drift nothing leaves; who starts outside has left."""
     small = {"num_paths": 8, "num_runs": 2, "num_steps": 3}

@@ -80,6 +80,7 @@ def test_pairs_of_two_gammas_are_two_proposals(densities):
         jb.extrapolate(*both)
 
 
+@pytest.mark.slow
 def test_its_noise_is_that_of_a_sum(densities):
     """The arithmetic, in NumPy: E + (E - E') with independent parts."""
     fine, coarse = densities

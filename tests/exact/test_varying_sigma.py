@@ -47,6 +47,7 @@ def in_sds(made, interval):
     return [np.asarray(value, float) / sd for value in values]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interval", slow_beyond(2, INTERVALS))
 @pytest.mark.parametrize("method", slow_beyond(1, ["weights", "crank_nicolson"]))
 def test_means_are_of_second_order_and_their_step_error_is_told(method, interval):

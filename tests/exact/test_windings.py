@@ -55,6 +55,7 @@ def test_densities_are_those_of_the_circle(end):
     assert_told(on_circle(np.pi / 2, end, 2.0).total(), exact)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("pull", "at", "sigma", "start", "end", "duration", "most"),
     [
@@ -70,6 +71,7 @@ def test_other_circles(pull, at, sigma, start, end, duration, most):
     assert_told(on_circle(start, end, duration, params, most).total(), np.log(exact))
 
 
+@pytest.mark.slow
 def test_a_torus_of_independent_angles_is_a_product():
     """And a line beside a circle."""
     both = jb.Diffusion(lambda x, p: jnp.stack([-jnp.sin(x[0]), -x[1]]))

@@ -195,6 +195,7 @@ def test_four_unknown_drifts_of_a_rotating_process():
     assert (made.params.sigma == model.params.sigma).all()
 
 
+@pytest.mark.slow
 def test_arviz_takes_the_draws():
     arviz = pytest.importorskip("arviz")
     made = jb.gibbs(

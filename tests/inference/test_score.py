@@ -81,6 +81,7 @@ def test_lost_paths_are_told():
         assert "2κθ < σ²" in result.why() and not result.trustworthy
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_score_with_a_state_dependent_sigma_is_of_second_order():
     """Cox, Ingersoll and Ross's process, whose score is known, with all parameters unknown and ten

@@ -57,6 +57,7 @@ def test_a_right_sampler_passes():
     assert abs(made.truth.std() / 2 - 1) < 5 / np.sqrt(120)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", [{"shift": 0.8}, {"stretch": 0.5}, {"stretch": 2.0}])
 def test_a_wrong_one_is_found(fault):
     assert calibrate(functools.partial(conjugate, **fault), 60).p_uniform[0] < 1e-3
@@ -67,6 +68,7 @@ def test_posteriors_that_are_not_trusted_are_a_fault():
     assert not made.trustworthy and "longer chains" in made.why()
 
 
+@pytest.mark.slow
 def test_a_constraint_cuts_the_prior():
     made = calibrate(conjugate, 20, constraint=lambda level: level > 1.5)
     assert np.all(made.truth > 1.5)
@@ -126,6 +128,7 @@ def test_first_states_have_the_stationary_law():
     assert abs(np.mean(seen) - mean) < 4.5 * sd / np.sqrt(120)
 
 
+@pytest.mark.slow
 def test_records_that_left_the_state_space_are_a_fault():
     """A square root process without room: its first steps lead below zero now and then."""
     model = jb.Diffusion(

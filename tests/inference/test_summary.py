@@ -21,6 +21,7 @@ def posterior():
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_numbers_are_those_of_the_draws(posterior):
     table, draws = posterior.summary(), np.asarray(posterior.theta, float).reshape(-1, 2)
     np.testing.assert_allclose(table.mean, draws.mean(axis=0), rtol=1e-6)

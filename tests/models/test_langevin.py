@@ -174,6 +174,7 @@ def fokker_planck_residual(model, x):
     return transport - jnp.einsum("ijij", jax.jacfwd(jax.jacfwd(V_nu))(x)) / 2
 
 
+@pytest.mark.slow
 @MATRIX_FIELDS
 @pytest.mark.parametrize("dim", slow_beyond(1, [2, 3]))
 def test_the_density_of_the_recipe_is_stationary(V, Q, dim, x64):

@@ -33,6 +33,7 @@ def joint_law(first, second):
     return np.concatenate(mean), np.block(blocks)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, num_steps",
     [
@@ -83,6 +84,7 @@ def assert_sinh_law(paths, start):
     assert_moments(y, mean, [[variance(s), lagged], [lagged, variance(t)]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver, num_steps",
     [

@@ -218,6 +218,7 @@ def two_wells_in_numpy(barrier):
     return functions
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_double_well_agrees_with_brownian_bridge_monte_carlo():
     name, duration, num_steps = "guided", 1.0, 800
@@ -529,6 +530,7 @@ def test_what_cannot_be_a_bridge_is_flagged_where_it_is_traced(unchecked, propos
         assert 1 <= float(estimate.effective_sample_size) <= 4.001
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start", "found"), [(6.0, 0), (1.0, 200)])
 def test_explosions_are_counted_and_never_returned(start, found):
     """The drift alone explodes in steps of one where |x| > √2."""

@@ -11,6 +11,7 @@ from jaxbridge.records.observations import Scalars
 from jaxbridge.records.tilted_step import Information, NormalStep
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("d", [1, 2])
 def test_shares_are_the_integrals_of_the_parts(d, x64):
     """∫ N(x; m, S) N(y; c·x, ρ) exp(rᵀu - ½ uᵀH u) dx with u = x - ξ, by completing the square."""

@@ -143,6 +143,7 @@ def with_ranks(uniforms):
     return jb.Forecast(*fields[0], jnp.asarray(uniforms), *fields[1])
 
 
+@pytest.mark.slow
 def test_both_tests_have_uniform_p_values_and_find_what_they_should():
     rng = np.random.default_rng(0)
     p_values = [with_ranks(rng.uniform(size=(150, 20))) for _ in range(10)]
@@ -156,6 +157,7 @@ def test_both_tests_have_uniform_p_values_and_find_what_they_should():
     assert np.mean(moving.p_independent < 0.05) > 0.9
 
 
+@pytest.mark.slow
 def test_missing_readings_do_not_count():
     u = np.random.default_rng(1).uniform(size=(100, 1))
     gaps = np.full((130, 1), np.nan)
@@ -284,6 +286,7 @@ def test_samples_beyond_limits_and_rounded():
     assert abs(np.mean(rounded == 1) - (stats.norm.cdf(1.6) - stats.norm.cdf(-0.4))) < 0.04
 
 
+@pytest.mark.slow
 def test_appended_readings_continue_the_record(noisy):
     """In two parts as in one: scores and laws are Kalman's, and no program depends on the past."""
     y, _, laws = noisy

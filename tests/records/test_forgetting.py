@@ -116,6 +116,7 @@ def bootstrap_filter(key, drift, values, noise, num_particles=5_000, num_steps=2
     return jnp.sum(jax.lax.scan(one, x, (jax.random.split(key, len(values)), values))[1])
 
 
+@pytest.mark.optimised
 @pytest.mark.slow
 def test_spikes_that_are_hidden_in_noise():
     """A guide that believes all that is seen later misses the likely paths, and its log p̂ is too

@@ -184,6 +184,7 @@ def test_harvests_of_a_geometric_brownian_motion():
     assert abs(made.value - exact) < told + 0.01
 
 
+@pytest.mark.slow
 def test_a_forecast_jumps():
     """Doses before the last reading and after it."""
     times, doses = np.arange(4.0), jb.Jumps([1.5, 4.5], [2.0, -3.0])

@@ -137,6 +137,7 @@ def test_what_is_for_constant_coefficients_says_what_to_use_instead():
         )
 
 
+@pytest.mark.slow
 def test_means_of_the_density_of_half_as_many_steps(x64):
     """E[e^D] = 1 for pairs of steps of the chain, where the noise grows with time: D compares the
     laws of steps at three times."""

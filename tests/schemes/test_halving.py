@@ -61,6 +61,7 @@ CASES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", slow_beyond(1, CASES))
 @pytest.mark.parametrize("refinement", slow_beyond(1, [1.0, 1.5]))
 def test_mean_is_that_of_half_as_many_steps(case, refinement):

@@ -52,6 +52,7 @@ def test_inverse_is_exact(name, x64):
         assert max(recovery_error(SCHEMES[name], full_model(), [0.01])) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make_model", "order"), [(full_model, 1.5), (diagonal_model, 1.5), (paper_model, 2.5)]
 )
@@ -125,6 +126,7 @@ def strong_errors(scheme, model, exact, step_counts, num_paths=2000, finest=1024
     return errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "order"), [("Euler", 0.5), ("Milstein", 1.0), ("Heun", 1.0), ("SemiImplicit", 0.5)]
 )

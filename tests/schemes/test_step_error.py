@@ -179,6 +179,7 @@ def test_changes_are_those_of_weights_and_factors():
     assert dominates(unknown, one) and not Verdict(step_faults(unknown, one)).trustworthy
 
 
+@pytest.mark.slow
 def test_few_paths_do_not_bias_the_log_of_a_mean():
     """Of log-normal e^D with mean one nothing changes; of 30 of them the log of the mean is
     some .01 too small, and with half of its variance by a fifth of that or less."""
