@@ -61,6 +61,7 @@ from .exact.density import (
     TransitionLogDensity,
     transition_log_density,
 )
+from .exact.events import Events, sample_events
 from .exact.exits import Exits, sample_exits
 from .exact.expectation import expectation
 from .exact.extrapolation import ExtrapolatedBridges, ExtrapolatedLogDensity, extrapolate
@@ -283,6 +284,8 @@ __all__ = [
     "log_survival",
     "sample_exits",
     "Exits",
+    "sample_events",
+    "Events",
     # Diagnostics and costs.
     "hitting_counts",
     "HittingCounts",

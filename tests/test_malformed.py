@@ -152,6 +152,18 @@ CALLS = {
         num_runs=2,
         num_steps=3,
     ),
+    "sample_events": small(
+        jb.sample_events,
+        key=KEY,
+        model=MODEL,
+        start=[0.0, 0.0],
+        duration=1.0,
+        event=lambda path: path[-1, 0] - 2,
+        num_paths=4,
+        num_runs=2,
+        num_steps=3,
+        num_moves=2,
+    ),
     "log_survival": small(
         jb.log_survival,
         model=MODEL,

@@ -62,6 +62,8 @@ CLAIMS = {
     "exits": lambda page: (
         abs(page["exits"].log_probability + 8.96) < 5 * page["exits"].standard_error
         and abs(page["mean"] - 0.4829) < 5 * page["error"]
+        and abs(page["reached"].log_probability + 9.742) < 5 * page["reached"].standard_error
+        and abs(page["high"].log_probability + 16.104) < 5 * page["high"].standard_error
         and np.allclose(
             page["safe_until"].mean(axis=0)[np.array([10, 50, 200])],
             [0.7058, 0.3425, 0.0390],

@@ -1,67 +1,35 @@
-"""Exits from a region, however rare, by adaptive multilevel splitting (Cérou & Guyader 2007).
+"""Exits from a region, however rare, by adaptive multilevel splitting (`splitting`).
 
-The progress of a path is the largest value of -g that it attained, for a region g > 0. All paths of
-a run are simulated. Then the half with the least progress is replaced: each of these paths becomes
-a copy of one of the others until that exceeded the level, the largest progress among the replaced,
-and is simulated again from there. This is repeated until most paths have left the region. If K_i
-of n paths were replaced at level i, the estimate of the probability is
-
-    p̂ = Π_i (1 - K_i / n) · (share of the last paths that have left the region).
-
-Its mean is the probability for these steps (Bréhier, Gazeau, Goudenège, Lelièvre & Rousset 2016).
-Within a step, g is a Brownian bridge, and its minimum is drawn from its law. Independent runs give
-the error.
+The score of a path is the largest value of -g that it attained, for a region g > 0. A path that is
+replaced becomes a copy of another one until that exceeded the level, and is simulated again from
+there. The mean of p̂ is then the probability for these steps (Bréhier, Gazeau, Goudenège, Lelièvre
+& Rousset 2016). Within a step, g is a Brownian bridge, and its minimum is drawn from its law.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from ..engine.arguments import check_function, named
-from ..engine.averages import PathFunction, as_path_function
-from ..engine.checks import (
-    Numbers,
-    as_floating,
-    as_numbers,
-    check_count,
-    check_key,
-    check_num_steps,
-    is_traced,
-    nondifferentiable,
-)
+from ..engine.checks import Numbers, as_numbers, is_traced, nondifferentiable
 from ..engine.compiled import compiled_for
 from ..engine.entry import public_entry
 from ..engine.lanes import over_lanes
-from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
-from ..models.diffusion import Diffusion, check_diffusion
+from ..engine.verdict import throw_where_untrustworthy
+from ..models.diffusion import Diffusion
 from ..models.sigma import columns_of
 from ..schemes.heun import Heun
 from ..schemes.survival import distances
 from .log_means import log_mean_of_runs
-
-# Each level at least halves the probability, so that this many reach 1e-30.
-_MOST_LEVELS = 100
-# Largest relative error of a probability that its standard error describes.
-_MOST_SPREAD = 0.5
-
-_UNFINISHED = (
-    "Some run ended before most of its paths had left the region: no path of it goes on, or the "
-    "probability is below 1e-30. Use more `num_paths`, a longer `duration`, or a function `inside` "
-    "that decreases on the way out."
-)
-_APART = (
-    "The estimates of the runs differ by more than their mean, so that it may be far off. Use more "
-    "`num_paths`, more `num_runs`, or a function `inside` that measures progress better."
-)
-_LOST = "Some paths are not finite. Use more `num_steps`, or check the model."
+from .splitting import MOST_LEVELS, AbstractRareEvent, check_splitting, is_lost, next_level
 
 
-class Exits(AbstractResult):
+class Exits(AbstractRareEvent):
     """Result of `sample_exits`: the probability of an exit from a region, and paths that leave it.
 
     - `log_probability`: log of the estimated probability. The mean of the estimated probability is
@@ -88,16 +56,15 @@ class Exits(AbstractResult):
     num_levels: Int[Array, " R"]
     num_nonfinite: Int[Array, ""]
 
-    def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """Return the mean of `fn(path)` given an exit.
+    _unfinished: ClassVar[str] = (
+        "Some run ended before most of its paths had left the region: no path of it goes on, or "
+        "the probability is below 1e-30. Use more `num_paths`, a longer `duration`, or a function "
+        "`inside` that decreases on the way out."
+    )
 
-        `fn` is a function of one path of shape (N+1, d), by default the path itself.
-        """
-        return jax.tree.map(lambda leaf: self._mean_and_error(leaf)[0], self._values(fn))
-
-    def standard_error_of(self, fn: PathFunction = lambda path: path) -> PyTree:
-        """Return the standard error of `mean(fn)`, from the spread of the runs."""
-        return jax.tree.map(lambda leaf: self._mean_and_error(leaf)[1], self._values(fn))
+    @property
+    def _occurred(self):
+        return self.exited
 
     def rate(self, after: Numbers) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return the probability of an exit per unit of time from `after` on, and its error.
@@ -121,44 +88,6 @@ class Exits(AbstractResult):
         log_mean, error = log_mean_of_runs(log_late[None])
         rate = jnp.exp(log_mean) / (duration - after)
         return rate, rate * error
-
-    @property
-    def verdict(self) -> Verdict:
-        """Return the faults of the estimate, each with a remedy.
-
-        - a run without an exit of most of its paths;
-        - runs that differ by more than their mean;
-        - paths that are not finite;
-        - a value that is not finite.
-        """
-        unfinished = jnp.any(2 * jnp.sum(self.exited, axis=1) <= self.exited.shape[1])
-        return Verdict(
-            (
-                Fault(unfinished, _UNFINISHED),
-                Fault(~(self.standard_error < _MOST_SPREAD), _APART),
-                Fault(self.num_nonfinite > 0, _LOST),
-            )
-        ).with_finite(self.log_probability)
-
-    def _values(self, fn: PathFunction) -> PyTree:
-        """Evaluate `fn` on all paths."""
-        like = jax.ShapeDtypeStruct(self.paths.shape[2:], self.paths.dtype)
-        return jax.vmap(jax.vmap(as_path_function("fn", fn, like)))(self.paths)
-
-    def _mean_and_error(
-        self, values: Float[Array, "R n ..."]
-    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return the mean of values given an exit, and its error."""
-        R = len(values)
-        exited = self.exited.reshape(*self.exited.shape, *[1] * (values.ndim - 2))
-        number = jnp.maximum(jnp.sum(exited, axis=1), 1).astype(values.dtype)
-        of_runs = jnp.sum(jnp.where(exited, values, 0), axis=1) / number
-        share = jax.nn.softmax(self.log_estimates).reshape(R, *[1] * (values.ndim - 2))
-        mean = jnp.sum(share * of_runs, axis=0)
-        squares = jnp.sum((share * (of_runs - mean)) ** 2, axis=0)
-        if R == 1:
-            return mean, jnp.full_like(mean, jnp.inf)
-        return mean, jnp.sqrt(squares * R / (R - 1))
 
 
 @public_entry
@@ -202,18 +131,10 @@ def sample_exits(
     exits.log_probability, exits.standard_error
     ```
     """
-    check_key(key)
-    check_diffusion(model)
     check_function("inside", inside, "(x)")
-    num_paths = check_count("num_paths", num_paths, minimum=2)
-    num_runs = check_count("num_runs", num_runs)
-    num_steps = check_num_steps(num_steps, 1)
-    start = as_floating("start", start)
-    if start.ndim != 1:
-        raise ValueError(f"`start` must have shape (d,), a single point; got {start.shape}.")
-    duration = as_numbers({"duration": duration})["duration"].astype(start.dtype)
-    model.forward(start)  # raises if coefficients depend on time
-    exits = _sample_exits(key, model, start, duration, inside, (num_runs, num_paths, num_steps))
+    sizes = num_runs, num_paths, num_steps
+    start, duration, size = check_splitting(key, model, start, duration, *sizes)
+    exits = _sample_exits(key, model, start, duration, inside, size)
     return throw_where_untrustworthy(exits, "log_probability", model) if throw else exits
 
 
@@ -280,43 +201,25 @@ def _sample_exits(
         _, (later, progress) = lax.scan(one, points[0], inputs)
         return jnp.concatenate([points[:1], later]), progress
 
-    lost = lambda points: ~jnp.all(jnp.isfinite(points), axis=(0, 1))
-
-    def level(i, old):
+    def renewed(i, old):
         """Replace the paths of least progress in all runs that go on."""
         parent_key, path_key = jax.random.split(jax.random.fold_in(key, i + 1))
         so_far = lax.cummax(old.progress)
-        reached = so_far[-1].reshape(R, n)
-        order = jnp.argsort(reached, axis=1).astype(jnp.int32)
-        bound = jnp.take_along_axis(reached, order[:, (n - 1) // 2, None], axis=1)
-        is_last = bound[:, 0] > 0
-        replaced = (reached <= bound) & ~(old.over | is_last)[:, None]
-        number = jnp.sum(reached <= bound, axis=1, dtype=jnp.int32)
-        is_lost = (number == n) & ~is_last
-        # A path of the same run that goes beyond the bound, at random.
-        uniform = jax.random.uniform(parent_key, (R, n), old.points.dtype)
-        beyond = (n - number).astype(uniform.dtype)[:, None]
-        rank = number[:, None] + jnp.floor(uniform * beyond).astype(jnp.int32)
-        parent = jnp.take_along_axis(order, jnp.clip(rank, 0, n - 1), axis=1)
-        parent = jnp.where(replaced, parent, np.arange(n, dtype=np.int32))
-        parent = parent + n * np.arange(R, dtype=np.int32)[:, None]
+        level = next_level(parent_key, so_far[-1].reshape(R, n), old.over)
         points, progress, so_far = (
-            jnp.take(leaf, parent.ravel(), axis=-1) for leaf in (old.points, old.progress, so_far)
+            jnp.take(leaf, level.parent, axis=-1) for leaf in (old.points, old.progress, so_far)
         )
-        exceeds = so_far > jnp.repeat(bound[:, 0], n)
-        kept = jnp.where(replaced.ravel(), jnp.argmax(exceeds, axis=0).astype(jnp.int32) + 1, N)
+        exceeds = so_far > jnp.repeat(level.bound, n)
+        replaced = level.replaced.ravel()
+        kept = jnp.where(replaced, jnp.argmax(exceeds, axis=0).astype(jnp.int32) + 1, N)
         points, progress = simulated(path_key, points, progress, kept)
-        number_left = jnp.where(is_last, jnp.sum(reached > 0, axis=1, dtype=jnp.int32), n - number)
-        share = number_left.astype(old.log_p.dtype) / n
-        log_p = old.log_p + jnp.where(old.over, 0, jnp.log(share))
-        goes_on = ~(old.over | is_last)
         return _Population(
             points,
             progress,
-            log_p,
-            old.num_levels + goes_on.astype(jnp.int32),
-            old.over | is_last | is_lost,
-            old.num_nonfinite + jnp.sum(lost(old.points) & replaced.ravel(), dtype=jnp.int32),
+            old.log_p + level.log_share,
+            old.num_levels + level.goes_on.astype(jnp.int32),
+            level.over,
+            old.num_nonfinite + jnp.sum(is_lost(old.points) & replaced, dtype=jnp.int32),
         )
 
     points = jnp.broadcast_to(start[:, None], (N + 1, len(start), R * n))
@@ -327,9 +230,9 @@ def _sample_exits(
     zeros = jnp.zeros(R, start.dtype)
     numbers = jnp.zeros(R, jnp.int32), jnp.zeros(R, bool), jnp.int32(0)
     init = _Population(points, progress, zeros, *numbers)
-    goes_on = lambda state: (state[0] < _MOST_LEVELS) & ~jnp.all(state[1].over)
+    goes_on = lambda state: (state[0] < MOST_LEVELS) & ~jnp.all(state[1].over)
     _, last = lax.while_loop(
-        goes_on, lambda state: (state[0] + 1, level(*state)), (jnp.int32(0), init)
+        goes_on, lambda state: (state[0] + 1, renewed(*state)), (jnp.int32(0), init)
     )
     exceeds = lax.cummax(last.progress) > 0
     exited = exceeds[-1].reshape(R, n)
@@ -346,5 +249,5 @@ def _sample_exits(
         exited,
         index.reshape(R, n).astype(jnp.int32),
         last.num_levels,
-        last.num_nonfinite + jnp.sum(lost(last.points), dtype=jnp.int32),
+        last.num_nonfinite + jnp.sum(is_lost(last.points), dtype=jnp.int32),
     )

@@ -1,0 +1,252 @@
+"""Rare events of whole paths, by splitting with moves of their noise (`splitting`).
+
+The event is any condition on a path: where it ends, its mean, its maximum. A path is a function of
+its noise z ~ N(0, I). A copy of a path is renewed by moves z' = √(1 - β²) z + β ζ with ζ ~ N(0, I),
+which are accepted if the score stays above the level. They leave the law of z given that level
+invariant (subset simulation: Au & Beck 2001; Cotter, Roberts, Stuart & White 2013). β is adapted.
+"""
+
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Key
+
+from ..engine.arguments import check_function
+from ..engine.averages import as_path_function
+from ..engine.checks import Numbers, check_count, nondifferentiable
+from ..engine.compiled import compiled_for
+from ..engine.entry import public_entry
+from ..engine.lanes import over_lanes
+from ..engine.verdict import throw_where_untrustworthy
+from ..models.diffusion import Diffusion
+from ..models.sigma import columns_of
+from ..schemes.heun import Heun
+from .log_means import log_mean_of_runs
+from .splitting import MOST_LEVELS, AbstractRareEvent, check_splitting, is_lost, next_level
+
+# Acceptance rate of the moves that β is adapted to.
+_ACCEPTANCE = 0.4
+
+
+class Events(AbstractRareEvent):
+    """Result of `sample_events`: the probability of an event, and paths on which it occurs.
+
+    - `log_probability`: log of the estimated probability.
+    - `standard_error`: standard error of `log_probability`, from the spread of the runs.
+    - `log_estimates`: log estimates of all runs, shape (R,).
+    - `times`: times of the points of paths, shape (N+1,).
+    - `paths`: paths of all runs, shape (R, n, N+1, d).
+    - `occurred`: whether the event occurs on each path, shape (R, n). It does on at least half of
+        them, unless the verdict says otherwise.
+    - `num_levels`: number of levels of each run, shape (R,).
+    - `num_nonfinite`: number of simulated paths that were not finite. On them the event does not
+        occur.
+    """
+
+    log_probability: Float[Array, ""]
+    standard_error: Float[Array, ""]
+    log_estimates: Float[Array, " R"]
+    times: Float[Array, " points"]
+    paths: Float[Array, "R n points d"]
+    occurred: Bool[Array, "R n"]
+    num_levels: Int[Array, " R"]
+    num_nonfinite: Int[Array, ""]
+
+    _unfinished: ClassVar[str] = (
+        "Some run ended before the event occurred on most of its paths: no path of it goes on, or "
+        "the probability is below 1e-30. Use more `num_paths`, or a function `event` that varies "
+        "with the path also far from the event, and increases towards it."
+    )
+
+    @property
+    def _occurred(self):
+        return self.occurred
+
+
+@public_entry
+def sample_events(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Numbers,
+    duration: Numbers,
+    event: Callable,
+    *,
+    num_paths: int = 1000,
+    num_runs: int = 16,
+    num_steps: int = 100,
+    num_moves: int = 10,
+    throw: bool = False,
+) -> Events:
+    """Estimate the probability of an event of a path, and sample paths on which it occurs.
+
+    Events may be that X(T) is in a set, or that a mean or a maximum exceeds a bound. For the exit
+    from a region `sample_exits` is better: it also sees what happens between the points.
+
+    **Arguments:**
+
+    - `key`: typed key.
+    - `model`: the diffusion. Its coefficients must not depend on time.
+    - `start`: where all paths begin, shape (d,).
+    - `duration`: length of the paths, in units of time.
+    - `event`: function of a path of shape (N+1, d), positive where the event occurs. Paths with
+        larger values are continued, so it should increase towards the event: for a ball
+        `lambda path: radius - jnp.linalg.norm(path[-1] - centre)`, and not only its sign.
+    - `num_paths`: number n of paths of a run.
+    - `num_runs`: number R of independent runs. Their spread gives the error.
+    - `num_steps`: number N of Heun steps.
+    - `num_moves`: number of moves of each path after each level. Too few leave copies alike.
+    - `throw`: raise an error at run time if the result is not `trustworthy`.
+
+    **Returns:** `Events`. The cost grows with the log of the probability, not with its inverse. The
+    discretisation error is that of Heun's scheme, which is not estimated: compare with half as many
+    steps.
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments, and for coefficients that depend
+    on time.
+
+    **Example:**
+
+    ```python
+    high = jb.sample_events(key, model, start, 1.0, lambda path: path[-1, 0] - 2.0, num_runs=4)
+    high.log_probability, high.standard_error
+    ```
+    """
+    check_function("event", event, "(path)")
+    num_moves = check_count("num_moves", num_moves)
+    sizes = num_runs, num_paths, num_steps
+    start, duration, size = check_splitting(key, model, start, duration, *sizes)
+    _check_event(event, jax.ShapeDtypeStruct((size[2] + 1, len(start)), start.dtype))
+    events = _sample_events(key, model, start, duration, event, size, num_moves)
+    return throw_where_untrustworthy(events, "log_probability", model) if throw else events
+
+
+def _check_event(event: Callable, like: jax.ShapeDtypeStruct) -> None:
+    """Raise `ValueError` unless `event` returns one real number for each path."""
+    value = jax.eval_shape(as_path_function("event", event, like), like)
+    if getattr(value, "shape", None) != () or not jnp.issubdtype(value.dtype, jnp.floating):
+        raise ValueError(
+            f"`event` must return one real number for a path of shape {like.shape}, positive where "
+            f"the event occurs; it returned {value}. For several conditions return their `jnp.min`."
+        )
+
+
+class _Population(NamedTuple):
+    """Noise of the paths of all runs, with lanes last: run after run.
+
+    - `noise`: the noise of all steps, and `scores`: the values of `event`.
+    - `log_scales`: log β of the moves of each run.
+    - `log_p`, `num_levels`, `over`: log of the product so far, number of levels, and whether the
+        run has ended.
+    - `num_nonfinite`: number of simulated paths that were not finite.
+    """
+
+    noise: Float[Array, "N noises lanes"]
+    scores: Float[Array, " lanes"]
+    log_scales: Float[Array, " R"]
+    log_p: Float[Array, " R"]
+    num_levels: Int[Array, " R"]
+    over: Bool[Array, " R"]
+    num_nonfinite: Int[Array, ""]
+
+
+# About ten levels.
+@compiled_for(
+    lambda key, model, start, duration, event, size, moves: size[0] * size[1] * size[2] * moves * 10
+)
+def _sample_events(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Float[Array, " d"],
+    duration: Float[Array, ""],
+    event: Callable,
+    size: tuple[int, int, int],
+    num_moves: int,
+) -> Events:
+    R, n, N = size
+    model, start, duration = nondifferentiable((model, start, duration))
+    dynamics, dt = model.prepared().forward(start), duration / N
+    shape = N, len(columns_of(dynamics.sigma(start), start)), R * n
+    score = as_path_function("event", event, jax.ShapeDtypeStruct((N + 1, len(start)), start.dtype))
+
+    @over_lanes(-1, -1)
+    def step(x, normal):
+        return Heun().step(dynamics, x, dt, jnp.sqrt(dt) * normal)
+
+    def path_of(noise):
+        def one(x, normal):
+            x = step(x, normal)
+            return x, x
+
+        first = jnp.broadcast_to(start[:, None], (len(start), R * n))
+        return jnp.concatenate([first[None], lax.scan(one, first, noise)[1]])
+
+    def score_of(noise):
+        """Return the score of each path, -inf for one that is not finite, and their number."""
+        points = path_of(noise)
+        lost = is_lost(points)
+        scores = jax.vmap(score, -1)(points).astype(start.dtype)
+        return jnp.where(lost | jnp.isnan(scores), -jnp.inf, scores), jnp.sum(lost, dtype=jnp.int32)
+
+    of_lanes = lambda of_runs: jnp.repeat(of_runs, n)
+
+    def renewed(i, old):
+        """Replace the paths of the lowest scores in all runs that go on, and move all others."""
+        parent_key, move_key = jax.random.split(jax.random.fold_in(key, i + 1))
+        level = next_level(parent_key, old.scores.reshape(R, n), old.over)
+        noise, scores = (jnp.take(leaf, level.parent, axis=-1) for leaf in (old.noise, old.scores))
+        bound, goes_on = of_lanes(level.bound), of_lanes(level.goes_on)
+
+        def move(j, state):
+            noise, scores, log_scales, number = state
+            beta = of_lanes(jnp.exp(log_scales))
+            fresh = jax.random.normal(jax.random.fold_in(move_key, j), shape, start.dtype)
+            candidate = jnp.sqrt(1 - beta**2) * noise + beta * fresh
+            new, num_lost = score_of(candidate)
+            accepted = (new > bound) & goes_on
+            rate = jnp.mean(accepted.reshape(R, n).astype(start.dtype), axis=1)
+            adapted = jnp.minimum(log_scales + (rate - _ACCEPTANCE), 0)
+            return (
+                jnp.where(accepted, candidate, noise),
+                jnp.where(accepted, new, scores),
+                jnp.where(level.goes_on, adapted, log_scales),
+                number + num_lost,
+            )
+
+        init = noise, scores, old.log_scales, old.num_nonfinite
+        noise, scores, log_scales, num_nonfinite = lax.fori_loop(0, num_moves, move, init)
+        return _Population(
+            noise,
+            scores,
+            log_scales,
+            old.log_p + level.log_share,
+            old.num_levels + level.goes_on.astype(jnp.int32),
+            level.over,
+            num_nonfinite,
+        )
+
+    noise = jax.random.normal(jax.random.fold_in(key, 0), shape, start.dtype)
+    scores, num_lost = score_of(noise)
+    zeros = jnp.zeros(R, start.dtype)
+    numbers = jnp.zeros(R, jnp.int32), jnp.zeros(R, bool), num_lost
+    goes_on = lambda state: (state[0] < MOST_LEVELS) & ~jnp.all(state[1].over)
+    _, last = lax.while_loop(
+        goes_on,
+        lambda state: (state[0] + 1, renewed(*state)),
+        (jnp.int32(0), _Population(noise, scores, zeros, zeros, *numbers)),
+    )
+    paths = jnp.moveaxis(path_of(last.noise).reshape(N + 1, len(start), R, n), (2, 3), (0, 1))
+    log_estimates = jnp.where(last.over, last.log_p, -jnp.inf)
+    log_mean, error = log_mean_of_runs(log_estimates[None])
+    return Events(
+        log_mean,
+        error,
+        log_estimates,
+        dt * jnp.arange(N + 1, dtype=dt.dtype),
+        paths,
+        last.scores.reshape(R, n) > 0,
+        last.num_levels,
+        last.num_nonfinite,
+    )

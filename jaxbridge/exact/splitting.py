@@ -1,0 +1,190 @@
+"""Adaptive multilevel splitting (Cérou & Guyader 2007): common parts of exits and events.
+
+A score measures how far a path has come, and the event is that it is positive. A run starts with n
+simulated paths. Then the half with the lowest scores is replaced: each of these paths becomes a
+copy of one of the others, which is renewed such that its score stays above the level, the highest
+score among the replaced. This is repeated until the event occurs on most paths. If K_i of n paths
+were replaced at level i, the estimate of the probability is
+
+    p̂ = Π_i (1 - K_i / n) · (share of the last paths on which the event occurs).
+
+Independent runs give the error.
+"""
+
+from abc import abstractmethod
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+
+from ..engine.averages import PathFunction, as_path_function
+from ..engine.checks import (
+    Numbers,
+    as_floating,
+    as_numbers,
+    check_count,
+    check_key,
+    check_num_steps,
+)
+from ..engine.verdict import AbstractResult, Fault, Verdict
+from ..models.diffusion import Diffusion, check_diffusion
+
+# Each level at least halves the probability, so that this many reach 1e-30.
+MOST_LEVELS = 100
+# Largest relative error of a probability that its standard error describes.
+_MOST_SPREAD = 0.5
+
+_APART = (
+    "The estimates of the runs differ by more than their mean, so that it may be far off. Use more "
+    "`num_paths`, more `num_runs`, or a function that measures progress better."
+)
+_LOST = "Some paths are not finite. Use more `num_steps`, or check the model."
+
+
+class AbstractRareEvent(AbstractResult):
+    """Probability of a rare event, and paths on which it occurs, from R runs of n paths."""
+
+    log_probability: eqx.AbstractVar[Float[Array, ""]]
+    standard_error: eqx.AbstractVar[Float[Array, ""]]
+    log_estimates: eqx.AbstractVar[Float[Array, " R"]]
+    times: eqx.AbstractVar[Float[Array, " points"]]
+    paths: eqx.AbstractVar[Float[Array, "R n points d"]]
+    num_levels: eqx.AbstractVar[Int[Array, " R"]]
+    num_nonfinite: eqx.AbstractVar[Int[Array, ""]]
+    _unfinished: ClassVar[str]
+
+    @property
+    @abstractmethod
+    def _occurred(self) -> Bool[Array, "R n"]:
+        """Return whether the event occurs on each path."""
+
+    def mean(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """Return the mean of `fn(path)` given the event.
+
+        `fn` is a function of one path of shape (N+1, d), by default the path itself.
+        """
+        return jax.tree.map(lambda leaf: self._mean_and_error(leaf)[0], self._values(fn))
+
+    def standard_error_of(self, fn: PathFunction = lambda path: path) -> PyTree:
+        """Return the standard error of `mean(fn)`, from the spread of the runs."""
+        return jax.tree.map(lambda leaf: self._mean_and_error(leaf)[1], self._values(fn))
+
+    @property
+    def verdict(self) -> Verdict:
+        """Return the faults of the estimate, each with a remedy.
+
+        - a run in which the event does not occur on most of the last paths;
+        - runs that differ by more than their mean;
+        - paths that are not finite;
+        - a value that is not finite.
+        """
+        unfinished = jnp.any(2 * jnp.sum(self._occurred, axis=1) <= self._occurred.shape[1])
+        return Verdict(
+            (
+                Fault(unfinished, self._unfinished),
+                Fault(~(self.standard_error < _MOST_SPREAD), _APART),
+                Fault(self.num_nonfinite > 0, _LOST),
+            )
+        ).with_finite(self.log_probability)
+
+    def _values(self, fn: PathFunction) -> PyTree:
+        """Evaluate `fn` on all paths."""
+        like = jax.ShapeDtypeStruct(self.paths.shape[2:], self.paths.dtype)
+        return jax.vmap(jax.vmap(as_path_function("fn", fn, like)))(self.paths)
+
+    def _mean_and_error(
+        self, values: Float[Array, "R n ..."]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the mean of values given the event, and its error."""
+        R = len(values)
+        occurred = self._occurred.reshape(*self._occurred.shape, *[1] * (values.ndim - 2))
+        number = jnp.maximum(jnp.sum(occurred, axis=1), 1).astype(values.dtype)
+        of_runs = jnp.sum(jnp.where(occurred, values, 0), axis=1) / number
+        share = jax.nn.softmax(self.log_estimates).reshape(R, *[1] * (values.ndim - 2))
+        mean = jnp.sum(share * of_runs, axis=0)
+        squares = jnp.sum((share * (of_runs - mean)) ** 2, axis=0)
+        if R == 1:
+            return mean, jnp.full_like(mean, jnp.inf)
+        return mean, jnp.sqrt(squares * R / (R - 1))
+
+
+def check_splitting(
+    key: Key[Array, ""],
+    model: Diffusion,
+    start: Numbers,
+    duration: Numbers,
+    num_runs: int,
+    num_paths: int,
+    num_steps: int,
+) -> tuple[Float[Array, " d"], Float[Array, ""], tuple[int, int, int]]:
+    """Validate the common arguments; return the start, the duration, and (R, n, N).
+
+    **Raises:** `ValueError` and `TypeError` for invalid arguments, and for coefficients that depend
+    on time.
+    """
+    check_key(key)
+    check_diffusion(model)
+    num_paths = check_count("num_paths", num_paths, minimum=2)
+    num_runs = check_count("num_runs", num_runs)
+    num_steps = check_num_steps(num_steps, 1)
+    start = as_floating("start", start)
+    if start.ndim != 1:
+        raise ValueError(f"`start` must have shape (d,), a single point; got {start.shape}.")
+    duration = as_numbers({"duration": duration})["duration"].astype(start.dtype)
+    model.forward(start)  # raises if coefficients depend on time
+    return start, duration, (num_runs, num_paths, num_steps)
+
+
+class Level(NamedTuple):
+    """Selection of the paths of all runs at one level.
+
+    - `bound`: the level of each run.
+    - `replaced`: whether each path is replaced.
+    - `parent`: index of the path that replaces each, or its own, among all paths.
+    - `log_share`: log of the factor of p̂; zero for runs that are over.
+    - `goes_on`: whether each run replaces paths.
+    - `over`: whether each run has ended.
+    """
+
+    bound: Float[Array, " R"]
+    replaced: Bool[Array, "R n"]
+    parent: Int[Array, " lanes"]
+    log_share: Float[Array, " R"]
+    goes_on: Bool[Array, " R"]
+    over: Bool[Array, " R"]
+
+
+def next_level(key: Key[Array, ""], scores: Float[Array, "R n"], over: Bool[Array, " R"]) -> Level:
+    """Select the paths that are replaced, and those that replace them, in all runs."""
+    R, n = scores.shape
+    order = jnp.argsort(scores, axis=1).astype(jnp.int32)
+    bound = jnp.take_along_axis(scores, order[:, (n - 1) // 2, None], axis=1)
+    is_last = bound[:, 0] > 0
+    replaced = (scores <= bound) & ~(over | is_last)[:, None]
+    number = jnp.sum(scores <= bound, axis=1, dtype=jnp.int32)
+    is_lost = (number == n) & ~is_last
+    # A path of the same run that is above the bound, at random.
+    uniform = jax.random.uniform(key, (R, n), scores.dtype)
+    above = (n - number).astype(uniform.dtype)[:, None]
+    rank = number[:, None] + jnp.floor(uniform * above).astype(jnp.int32)
+    parent = jnp.take_along_axis(order, jnp.clip(rank, 0, n - 1), axis=1)
+    parent = jnp.where(replaced, parent, np.arange(n, dtype=np.int32))
+    parent = parent + n * np.arange(R, dtype=np.int32)[:, None]
+    number_left = jnp.where(is_last, jnp.sum(scores > 0, axis=1, dtype=jnp.int32), n - number)
+    share = number_left.astype(scores.dtype) / n
+    return Level(
+        bound[:, 0],
+        replaced,
+        parent.ravel(),
+        jnp.where(over, 0, jnp.log(share)),
+        ~(over | is_last),
+        over | is_last | is_lost,
+    )
+
+
+def is_lost(points: Float[Array, "points d lanes"]) -> Bool[Array, " lanes"]:
+    """Return whether each path is not finite."""
+    return ~jnp.all(jnp.isfinite(points), axis=(0, 1))
