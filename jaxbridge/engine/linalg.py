@@ -12,7 +12,7 @@ import operator
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 
 def dot(left: Float[Array, " d"], right: Float[Array, " d"]) -> Float[Array, ""]:
@@ -43,18 +43,31 @@ def sum_first_axis(terms: Float[Array, "d *shape"]) -> Float[Array, "*shape"]:
 
 
 def log_of_product(numbers: list[Float[Array, ""]]) -> Float[Array, ""]:
-    """Compute the log of the product of positive numbers with few logarithms.
+    """Compute the log of the product of positive numbers with one logarithm.
 
-    The result is NaN if a number is not positive.
+    The product itself may be out of range. The result is NaN if a number is not positive.
     """
-    groups = [numbers[i : i + _FACTORS] for i in range(0, len(numbers), _FACTORS)]
-    value = _sum([jnp.log(functools.reduce(operator.mul, group)) for group in groups])
+    # A logarithm is slow, a power of two is not. All but one number become m 2^e with m in [1, 2),
+    # so the product of these is in range.
+    *others, last = numbers
+    parts = [_mantissa_and_exponent(number) for number in others]
+    value = jnp.log(functools.reduce(operator.mul, [*(m for m, _ in parts), last]))
+    if parts:
+        exponent = functools.reduce(operator.add, [e for _, e in parts])
+        value = value + exponent.astype(last.dtype) * np.log(2).astype(last.dtype)
     return jnp.where(functools.reduce(jnp.minimum, numbers) > 0, value, jnp.nan)
 
 
-# A logarithm is slow, so products of four are formed first; of moderate numbers they do not
-# overflow.
-_FACTORS = 4
+def _mantissa_and_exponent(number: Float[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
+    """Return m in [1, 2) and e with m 2^e equal to a positive number; e has derivative zero."""
+    info = jnp.finfo(number.dtype)
+    integer = np.dtype(f"int{info.bits}")
+    width, bias = integer.type(info.nmant), integer.type(info.maxexp - 1)
+    bits = lax.bitcast_convert_type(number, integer)
+    # 2^-127 would be no normal number.
+    exponent = lax.min(lax.shift_right_arithmetic(bits, width) - bias, bias - integer.type(1))
+    power = lax.bitcast_convert_type(lax.shift_left(bias - exponent, width), number.dtype)
+    return number * lax.stop_gradient(power), exponent
 
 
 def matvec(matrix: Float[Array, "n m"], vector: Float[Array, " m"]) -> Float[Array, " n"]:
@@ -132,7 +145,11 @@ def solve(matrix: Float[Array, "d d"], right: Float[Array, "d *m"]) -> Float[Arr
     if d == 1:
         return right / matrix[0, 0]
     if d == 2:
-        (a, b), (c, e) = matrix
+        # Rows of size one, so that products of two entries are in range in all units.
+        size = lax.stop_gradient(jnp.abs(matrix[:, 0]) + jnp.abs(matrix[:, 1]))
+        size = jnp.where(size > 0, size, 1)
+        (a, b), (c, e) = matrix / size[:, None]
+        right = right / size.reshape(2, *[1] * (right.ndim - 1))
         first, second = e * right[0] - b * right[1], a * right[1] - c * right[0]
         return jnp.stack([first, second]) / (a * e - b * c)
     rows = jnp.concatenate([matrix, right.reshape(d, -1)], axis=1)
@@ -419,7 +436,8 @@ def polar_factor(matrix: Float[Array, "d d"]) -> Float[Array, "d d"]:
     if d == 1:
         return jnp.where(matrix < 0, -1, 1).astype(matrix.dtype)
     if d == 2:
-        (a, b), (c, e) = matrix
+        size = lax.stop_gradient(_sum([jnp.abs(x) for x in matrix.ravel()]))
+        (a, b), (c, e) = matrix / jnp.where(size > 0, size, 1)
         sign = jnp.where(a * e - b * c < 0, -1, 1).astype(matrix.dtype)
         # matrix + sign × its cofactor matrix is a multiple of a rotation or reflection
         p, q = a + sign * e, c - sign * b

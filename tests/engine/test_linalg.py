@@ -11,6 +11,7 @@ from jaxbridge.engine.linalg import (
     cholesky,
     dot,
     inverse,
+    log_of_product,
     lower_factor,
     matmul,
     matvec,
@@ -368,3 +369,20 @@ def test_spectral_radius():
         np.testing.assert_allclose(spectral_radius(jnp.asarray(matrix)), exact, rtol=0.3)
     assert spectral_radius(jnp.array([[0.0, 1.0], [0.0, 0.0]])) == 0
     assert spectral_radius(jnp.zeros((2, 2))) == 0
+
+
+@pytest.mark.parametrize("scale", [1e-30, 1e-18, 1e18, 1e36])
+def test_products_out_of_range(scale):
+    """Determinants of such matrices under- or overflow; their logs, inverses and polar factors do
+    not."""
+    matrix = jnp.asarray([[2.0, -0.5], [0.3, 1.0]]) * jnp.float32(scale)
+    exact = np.asarray(matrix, float)
+    np.testing.assert_allclose(inverse(matrix), np.linalg.inv(exact), rtol=1e-5)
+    np.testing.assert_allclose(
+        polar_factor(matrix), polar_factor_by_svd(exact[None] / scale)[0], atol=1e-5
+    )
+    numbers = [jnp.float32(scale * x) for x in (0.7, 2.0, 1.3)]
+    log = np.log(np.array([0.7, 2.0, 1.3]) * scale).sum()
+    np.testing.assert_allclose(log_of_product(numbers), log, rtol=1e-6)
+    slope = jax.grad(lambda x: log_of_product([x, *numbers[1:]]))(numbers[0])
+    np.testing.assert_allclose(slope * numbers[0], 1, rtol=1e-6)
