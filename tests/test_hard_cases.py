@@ -148,7 +148,7 @@ def test_very_unlikely_bridges(precision):
     exact = lambda a, b: float(jb.ou_transition(model, a, 1.0).log_density(b))
     start, end = jnp.array([5.0, -5.0], dtype), jnp.array([6.0, -6.0], dtype)
     law = jb.fit_start_law(jax.random.key(0), model, start, end, 1.0, coupling=jb.Coupling(0.5))
-    options = dict(num_proposals=10_000, num_steps=50)
+    options = dict(num_proposals=5_000, num_steps=50)
     estimate = jb.transition_log_density(
         jax.random.key(1),
         model,
@@ -164,7 +164,7 @@ def test_very_unlikely_bridges(precision):
     # No pair crosses 28 standard deviations: that is said, not hidden.
     far = (jnp.array([10.0, 10.0], dtype), jnp.array([-10.0, -10.0], dtype))
     bridges = jb.sample_bridges(
-        jax.random.key(0), model, *far, 1.0, num_bridges=5, max_proposals=2_000
+        jax.random.key(0), model, *far, 1.0, num_bridges=5, max_proposals=1_000
     )
     assert not bridges.met.any() and np.isnan(bridges.paths).all()
     assert bridges.num_proposals <= 10_000

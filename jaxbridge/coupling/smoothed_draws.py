@@ -132,7 +132,8 @@ def _fit(points: Float[Array, "M d"]) -> SmoothedDraws:
     num, d = points.shape
     mean, spread = jnp.mean(points, axis=0), jnp.std(points, axis=0)
     # A lower bound on the spread: without it equal points would have no density.
-    spread = jnp.maximum(spread, 1e-3 * jnp.max(spread) + 1e-6 * (1 + jnp.max(jnp.abs(points))))
+    least = 1e-3 * jnp.max(spread) + 1e-6 * jnp.max(jnp.abs(points))
+    spread = jnp.maximum(spread, jnp.where(least > 0, least, 1))
     white = (points - mean) / spread
     # The small multiple of I keeps the factorisation stable.
     correlation = white.T @ white / num + 1e-4 * jnp.eye(d, dtype=points.dtype)

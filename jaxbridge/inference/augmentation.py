@@ -88,7 +88,10 @@ class Augmentation(eqx.Module):
             ends = (block.intervals.start, block.intervals.end)
             for end, point in zip(ends, (array[..., 0, :], array[..., -1, :]), strict=True):
                 # Traced ends cannot be compared. Ends may differ from the observations by rounding.
-                if not is_traced(end, point) and not np.allclose(point, end, atol=1e-6, rtol=1e-4):
+                if is_traced(end, point):
+                    continue
+                rounding = 1e-6 * float(np.max(np.abs(end)))
+                if not np.allclose(point, end, atol=rounding, rtol=1e-4):
                     raise ValueError(
                         "`init` is a state of other data: its paths do not start and end at these "
                         "observations. Pass the same observations as before, or unknown "

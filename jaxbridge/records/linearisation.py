@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from ..engine.linalg import matmul, matvec
+from ..engine.linalg import all_finite, matmul, matvec
 from .motion import Motion
 from .observations import Scalars
 from .record import Steps
@@ -24,6 +24,9 @@ from .tilted_step import NormalStep
 
 # Shares of a step that would leave the state space. The largest share that stays inside is used.
 _SHARES = 2.0 ** -np.arange(12)
+
+# Larger variances overflow soon. They may be large: states are in the user's units.
+_LARGEST_VARIANCE = 1e30
 
 
 class LinearisedStep(NamedTuple):
@@ -114,7 +117,7 @@ def stay_inside(
 
 
 def _finite(new, old):
-    """Return `new` if all its entries are bounded, otherwise `old`."""
-    # The bound is far below overflow, so that products of a few entries stay finite.
-    good = jnp.all(jnp.stack([jnp.all(jnp.abs(leaf) < 1e12) for leaf in new]))
+    """Return the mean and the covariance `new` if they are bounded, otherwise `old`."""
+    mean, covariance = new
+    good = all_finite(mean) & jnp.all(jnp.abs(covariance) < _LARGEST_VARIANCE)
     return jax.tree.map(lambda a, b: jnp.where(good, a, b), new, old)

@@ -70,31 +70,3 @@ def test_derivatives_are_differences(how, diffusion, x64):
         ahead = [float(density(point + k * 1e-3 * step)) for k in (-2, -1, 1, 2)]
         difference = (ahead[0] - 8 * ahead[1] + 8 * ahead[2] - ahead[3]) / 12e-3
         assert abs(slope @ step - difference) < 1e-6 * scale
-
-
-@pytest.mark.slow
-def test_what_was_seen_has_derivatives_too(x64):
-    """Of the likelihood and of the weights by the noise of observations, which the guide follows:
-    in reverse mode, against differences."""
-    model = jb.Diffusion(lambda x, p: -jnp.sinh(x), params=1.0)
-    times, values = np.arange(3) * 0.5, np.array([[0.3], [0.1], [-0.4]])
-
-    def estimate(covariance):
-        made = jb.log_likelihood(
-            jax.random.key(0), model, times, values, initial=[0.2], num_steps=3, num_particles=5,
-            num_filters=2, observation=jb.LinearGaussian(covariance=covariance),
-        )  # fmt: skip
-        return made.value
-
-    def weight(covariance):
-        seen = jb.LinearGaussian(covariance=covariance)
-        paths = jb.innovations(model, times, values, observation=seen, initial=[0.2], num_steps=3)
-        return paths.log_density(1.0, 0.3 * jnp.ones(paths.size))
-
-    for function in (estimate, weight):
-        slope = jax.grad(function)(0.1)
-        difference = (function(0.1 + 1e-5) - function(0.1 - 1e-5)) / 2e-5
-        # The points along which paths are guided are held: only weights by noise know them.
-        if function is estimate:
-            np.testing.assert_allclose(slope, jax.jvp(function, (0.1,), (1.0,))[1], rtol=1e-8)
-        assert np.isfinite(slope) and np.isfinite(difference)
