@@ -383,6 +383,6 @@ _ELEMENTWISE = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type cbrt ceil "
     "clamp convert_element_type copy cos cosh digamma div eq erf erf_inv erfc exp exp2 expm1 floor "
     "ge gt integer_pow is_finite le lgamma log log1p logistic lt max min mul ne neg not or pow rem "
-    "round rsqrt select_n shift_left shift_right_arithmetic sign sin sinh sqrt square sub tan tanh "
-    "xor".split()
+    "round rsqrt select_n shift_left shift_right_arithmetic sign sin sinh sqrt square "
+    "stop_gradient sub tan tanh xor".split()
 )
