@@ -9,7 +9,7 @@ from helpers import assert_calls_fit
 
 FOLDER = pathlib.Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-# The pages of `test_readme` have the rest.
+# The calls of all others are only compared with signatures.
 RUN = ["01_quickstart"]
 
 

@@ -47,7 +47,7 @@ def log_of_product(numbers: list[Float[Array, ""]]) -> Float[Array, ""]:
 
     The product itself may be out of range. The result is NaN if a number is not positive.
     """
-    # A logarithm is slow, a power of two is not. All but one number become m 2^e with m in [1, 2),
+    # A logarithm is slow, a power of two is not. All but one number become m 2^e with m in [1, 4),
     # so the product of these is in range.
     *others, last = numbers
     parts = [_mantissa_and_exponent(number) for number in others]
@@ -59,7 +59,7 @@ def log_of_product(numbers: list[Float[Array, ""]]) -> Float[Array, ""]:
 
 
 def _mantissa_and_exponent(number: Float[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
-    """Return m in [1, 2) and e with m 2^e equal to a positive number; e has derivative zero."""
+    """Return m in [1, 4) and e with m 2^e equal to a positive number; e has derivative zero."""
     info = jnp.finfo(number.dtype)
     integer = np.dtype(f"int{info.bits}")
     width, bias = integer.type(info.nmant), integer.type(info.maxexp - 1)

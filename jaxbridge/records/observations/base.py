@@ -179,6 +179,7 @@ def as_matrix(matrix: Numbers | None) -> Float[Array, "m d"] | None:
 
 def matrix_for(matrix: Float[Array, "m d"] | None, d: int, dtype) -> Float[Array, "m d"]:
     """Return L as a matrix, shape (m, d): the identity for `None`."""
+    # NumPy's identity needs no compiled program.
     return jnp.asarray(np.eye(d, dtype=dtype)) if matrix is None else matrix.astype(dtype)
 
 
