@@ -25,7 +25,15 @@ from ..models.diffusion import Diffusion
 from ..models.sigma import columns_of
 from ..schemes.heun import Heun
 from .log_means import log_mean_of_runs
-from .splitting import MOST_LEVELS, AbstractRareEvent, check_splitting, is_lost, next_level
+from .splitting import (
+    AbstractRareEvent,
+    Runs,
+    check_splitting,
+    is_lost,
+    new_runs,
+    next_level,
+    run_levels,
+)
 
 # Acceptance rate of the moves that β is adapted to.
 _ACCEPTANCE = 0.4
@@ -138,18 +146,13 @@ class _Population(NamedTuple):
 
     - `noise`: the noise of all steps, and `scores`: the values of `event`.
     - `log_scales`: log β of the moves of each run.
-    - `log_p`, `num_levels`, `over`: log of the product so far, number of levels, and whether the
-        run has ended.
-    - `num_nonfinite`: number of simulated paths that were not finite.
+    - `runs`: bookkeeping of the runs.
     """
 
     noise: Float[Array, "N noises lanes"]
     scores: Float[Array, " lanes"]
     log_scales: Float[Array, " R"]
-    log_p: Float[Array, " R"]
-    num_levels: Int[Array, " R"]
-    over: Bool[Array, " R"]
-    num_nonfinite: Int[Array, ""]
+    runs: Runs
 
 
 # About ten levels.
@@ -195,7 +198,7 @@ def _sample_events(
     def renewed(i, old):
         """Replace the paths of the lowest scores in all runs that go on, and move all others."""
         parent_key, move_key = jax.random.split(jax.random.fold_in(key, i + 1))
-        level = next_level(parent_key, old.scores.reshape(R, n), old.over)
+        level = next_level(parent_key, old.scores.reshape(R, n), old.runs.over)
         noise, scores = (jnp.take(leaf, level.parent, axis=-1) for leaf in (old.noise, old.scores))
         bound, goes_on = of_lanes(level.bound), of_lanes(level.goes_on)
 
@@ -215,38 +218,23 @@ def _sample_events(
                 number + num_lost,
             )
 
-        init = noise, scores, old.log_scales, old.num_nonfinite
-        noise, scores, log_scales, num_nonfinite = lax.fori_loop(0, num_moves, move, init)
-        return _Population(
-            noise,
-            scores,
-            log_scales,
-            old.log_p + level.log_share,
-            old.num_levels + level.goes_on.astype(jnp.int32),
-            level.over,
-            num_nonfinite,
-        )
+        init = noise, scores, old.log_scales, jnp.int32(0)
+        noise, scores, log_scales, num_lost = lax.fori_loop(0, num_moves, move, init)
+        return _Population(noise, scores, log_scales, old.runs.after(level, num_lost))
 
     noise = jax.random.normal(jax.random.fold_in(key, 0), shape, start.dtype)
     scores, num_lost = score_of(noise)
-    zeros = jnp.zeros(R, start.dtype)
-    numbers = jnp.zeros(R, jnp.int32), jnp.zeros(R, bool), num_lost
-    goes_on = lambda state: (state[0] < MOST_LEVELS) & ~jnp.all(state[1].over)
-    _, last = lax.while_loop(
-        goes_on,
-        lambda state: (state[0] + 1, renewed(*state)),
-        (jnp.int32(0), _Population(noise, scores, zeros, zeros, *numbers)),
-    )
+    runs, zeros = new_runs(R, start.dtype, num_lost), jnp.zeros(R, start.dtype)
+    last = run_levels(renewed, _Population(noise, scores, zeros, runs))
     paths = jnp.moveaxis(path_of(last.noise).reshape(N + 1, len(start), R, n), (2, 3), (0, 1))
-    log_estimates = jnp.where(last.over, last.log_p, -jnp.inf)
-    log_mean, error = log_mean_of_runs(log_estimates[None])
+    log_mean, error = log_mean_of_runs(last.runs.log_estimates[None])
     return Events(
         log_mean,
         error,
-        log_estimates,
+        last.runs.log_estimates,
         dt * jnp.arange(N + 1, dtype=dt.dtype),
         paths,
         last.scores.reshape(R, n) > 0,
-        last.num_levels,
-        last.num_nonfinite,
+        last.runs.num_levels,
+        last.runs.num_nonfinite,
     )

@@ -26,7 +26,15 @@ from ..models.sigma import columns_of
 from ..schemes.heun import Heun
 from ..schemes.survival import distances
 from .log_means import log_mean_of_runs
-from .splitting import MOST_LEVELS, AbstractRareEvent, check_splitting, is_lost, next_level
+from .splitting import (
+    AbstractRareEvent,
+    Runs,
+    check_splitting,
+    is_lost,
+    new_runs,
+    next_level,
+    run_levels,
+)
 
 
 class Exits(AbstractRareEvent):
@@ -142,17 +150,12 @@ class _Population(NamedTuple):
     """Paths of all runs, with lanes last: run after run.
 
     - `points`: states, and `progress`: the largest -g within each step.
-    - `log_p`, `num_levels`, `over`: log of the product so far, number of levels, and whether the
-        run has ended.
-    - `num_nonfinite`: number of replaced paths that were not finite.
+    - `runs`: bookkeeping of the runs; replaced paths that were not finite are counted.
     """
 
     points: Float[Array, "points d lanes"]
     progress: Float[Array, "N lanes"]
-    log_p: Float[Array, " R"]
-    num_levels: Int[Array, " R"]
-    over: Bool[Array, " R"]
-    num_nonfinite: Int[Array, ""]
+    runs: Runs
 
 
 # A handful of levels, each of which simulates all paths.
@@ -205,7 +208,7 @@ def _sample_exits(
         """Replace the paths of least progress in all runs that go on."""
         parent_key, path_key = jax.random.split(jax.random.fold_in(key, i + 1))
         so_far = lax.cummax(old.progress)
-        level = next_level(parent_key, so_far[-1].reshape(R, n), old.over)
+        level = next_level(parent_key, so_far[-1].reshape(R, n), old.runs.over)
         points, progress, so_far = (
             jnp.take(leaf, level.parent, axis=-1) for leaf in (old.points, old.progress, so_far)
         )
@@ -213,41 +216,28 @@ def _sample_exits(
         replaced = level.replaced.ravel()
         kept = jnp.where(replaced, jnp.argmax(exceeds, axis=0).astype(jnp.int32) + 1, N)
         points, progress = simulated(path_key, points, progress, kept)
-        return _Population(
-            points,
-            progress,
-            old.log_p + level.log_share,
-            old.num_levels + level.goes_on.astype(jnp.int32),
-            level.over,
-            old.num_nonfinite + jnp.sum(is_lost(old.points) & replaced, dtype=jnp.int32),
-        )
+        num_lost = jnp.sum(is_lost(old.points) & replaced, dtype=jnp.int32)
+        return _Population(points, progress, old.runs.after(level, num_lost))
 
     points = jnp.broadcast_to(start[:, None], (N + 1, len(start), R * n))
     progress = jnp.full((N, R * n), -jnp.inf, start.dtype)
     points, progress = simulated(
         jax.random.fold_in(key, 0), points, progress, jnp.zeros(R * n, jnp.int32)
     )
-    zeros = jnp.zeros(R, start.dtype)
-    numbers = jnp.zeros(R, jnp.int32), jnp.zeros(R, bool), jnp.int32(0)
-    init = _Population(points, progress, zeros, *numbers)
-    goes_on = lambda state: (state[0] < MOST_LEVELS) & ~jnp.all(state[1].over)
-    _, last = lax.while_loop(
-        goes_on, lambda state: (state[0] + 1, renewed(*state)), (jnp.int32(0), init)
-    )
+    last = run_levels(renewed, _Population(points, progress, new_runs(R, start.dtype)))
     exceeds = lax.cummax(last.progress) > 0
     exited = exceeds[-1].reshape(R, n)
     index = jnp.where(exceeds[-1], jnp.argmax(exceeds, axis=0) + 1, N + 1)
     paths = jnp.moveaxis(last.points.reshape(N + 1, len(start), R, n), (2, 3), (0, 1))
-    log_estimates = jnp.where(last.over, last.log_p, -jnp.inf)
-    log_mean, error = log_mean_of_runs(log_estimates[None])
+    log_mean, error = log_mean_of_runs(last.runs.log_estimates[None])
     return Exits(
         log_mean,
         error,
-        log_estimates,
+        last.runs.log_estimates,
         dt * jnp.arange(N + 1, dtype=dt.dtype),
         paths,
         exited,
         index.reshape(R, n).astype(jnp.int32),
-        last.num_levels,
-        last.num_nonfinite + jnp.sum(is_lost(last.points), dtype=jnp.int32),
+        last.runs.num_levels,
+        last.runs.num_nonfinite + jnp.sum(is_lost(last.points), dtype=jnp.int32),
     )

@@ -12,12 +12,14 @@ Independent runs give the error.
 """
 
 from abc import abstractmethod
-from typing import ClassVar, NamedTuple
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.averages import PathFunction, as_path_function
@@ -33,7 +35,7 @@ from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..models.diffusion import Diffusion, check_diffusion
 
 # Each level at least halves the probability, so that this many reach 1e-30.
-MOST_LEVELS = 100
+_MOST_LEVELS = 100
 # Largest relative error of a probability that its standard error describes.
 _MOST_SPREAD = 0.5
 
@@ -183,6 +185,48 @@ def next_level(key: Key[Array, ""], scores: Float[Array, "R n"], over: Bool[Arra
         ~(over | is_last),
         over | is_last | is_lost,
     )
+
+
+class Runs(NamedTuple):
+    """Bookkeeping of all runs.
+
+    - `log_p`: log of the product of the factors of p̂ so far.
+    - `num_levels`: number of levels.
+    - `over`: whether the run has ended.
+    - `num_nonfinite`: number of paths that were not finite, of all runs.
+    """
+
+    log_p: Float[Array, " R"]
+    num_levels: Int[Array, " R"]
+    over: Bool[Array, " R"]
+    num_nonfinite: Int[Array, ""]
+
+    def after(self, level: Level, num_lost: Int[Array, ""]) -> "Runs":
+        """Return the runs after a level, at which `num_lost` paths were not finite."""
+        return Runs(
+            self.log_p + level.log_share,
+            self.num_levels + level.goes_on.astype(jnp.int32),
+            level.over,
+            self.num_nonfinite + num_lost,
+        )
+
+    @property
+    def log_estimates(self) -> Float[Array, " R"]:
+        """Return log p̂ of each run, -inf for a run without an end."""
+        return jnp.where(self.over, self.log_p, -jnp.inf)
+
+
+def new_runs(number: int, dtype: np.dtype, num_lost: int | Int[Array, ""] = 0) -> Runs:
+    """Return the runs before their first level."""
+    zeros = jnp.zeros(number, jnp.int32)
+    return Runs(jnp.zeros(number, dtype), zeros, zeros > 0, jnp.asarray(num_lost, jnp.int32))
+
+
+def run_levels(renewed: Callable[[Int[Array, ""], Any], Any], init: Any) -> Any:
+    """Apply `renewed(i, state)` at level i = 0, 1, ... until all of `state.runs` are over."""
+    goes_on = lambda state: (state[0] < _MOST_LEVELS) & ~jnp.all(state[1].runs.over)
+    step = lambda state: (state[0] + 1, renewed(*state))
+    return lax.while_loop(goes_on, step, (jnp.int32(0), init))[1]
 
 
 def is_lost(points: Float[Array, "points d lanes"]) -> Bool[Array, " lanes"]:
