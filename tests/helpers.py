@@ -310,15 +310,6 @@ def assert_chain_moments(values, mean, covariance):
         assert error.max() < 0.1
 
 
-def assert_uniform_ranks(ranks, num_draws):
-    """Ranks (n, p) of n true parameters among so many draws, in eight bins (Talts et al. 2018)."""
-    expected = len(ranks) / 8
-    for rank in ranks.T:
-        counts = np.bincount(rank * 8 // (num_draws + 1), minlength=8)
-        chi_square = ((counts - expected) ** 2 / expected).sum()
-        assert chi_square < 7 + 5 * np.sqrt(14)  # five standard deviations of χ²_7
-
-
 def assert_calls_fit(code):
     """The calls of functions of the package in this code fit their signatures."""
     calls = [node for node in ast.walk(ast.parse(code)) if isinstance(node, ast.Call)]

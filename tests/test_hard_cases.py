@@ -147,8 +147,10 @@ def test_very_unlikely_bridges(precision):
     model, dtype = paper_model(), jnp.dtype(precision)
     exact = lambda a, b: float(jb.ou_transition(model, a, 1.0).log_density(b))
     start, end = jnp.array([5.0, -5.0], dtype), jnp.array([6.0, -6.0], dtype)
-    law = jb.fit_start_law(jax.random.key(0), model, start, end, 1.0, coupling=jb.Coupling(0.5))
-    options = dict(num_proposals=5_000, num_steps=50)
+    law = jb.fit_start_law(
+        jax.random.key(0), model, start, end, 1.0, coupling=jb.Coupling(0.5), num_pilot=400
+    )
+    options = dict(num_proposals=4_000, num_steps=50)
     estimate = jb.transition_log_density(
         jax.random.key(1),
         model,

@@ -237,19 +237,6 @@ def test_chain_without_a_bridge_is_nan_and_said():
         assert np.isnan(state.position).all() and not info.is_accepted
 
 
-@slow
-def test_chain_that_finds_its_first_bridge_late_goes_on():
-    arguments = (paper_model(), [0.0, 0.0], [2.0, -2.0], 1.0)  # 7 % of the pairs meet
-    for method in ("pseudo_marginal", "renewal"):
-        chain = jb.sample_exact_bridges(
-            jax.random.key(2), *arguments, num_bridges=400, method=method, max_proposals=1
-        )
-        met = np.asarray(chain.met)
-        first = met.argmax()
-        assert 0 < first < 200 and met[first:].all() and chain.accepted[first]
-        assert np.isnan(chain.paths[:first]).all() and np.isfinite(chain.paths[first:]).all()
-
-
 @pytest.mark.slow
 def test_cut_off_counts_are_flagged():
     chain = jb.sample_exact_bridges(

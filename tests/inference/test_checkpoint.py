@@ -82,16 +82,16 @@ def test_an_interrupted_run_goes_on_to_the_same_draws(tmp_path, monkeypatch, cap
 
 @pytest.mark.slow
 def test_a_file_of_another_run_is_refused(tmp_path):
-    run("record", tmp_path / "run.npz")
+    run("pmmh", tmp_path / "run.npz")
     with pytest.raises(ValueError, match="does not begin with the draws of this call"):
-        run("record", tmp_path / "run.npz", MODEL.with_params(1.5))
+        run("pmmh", tmp_path / "run.npz", MODEL.with_params(1.5))
     (tmp_path / "text.npz").write_text("no arrays")
     (tmp_path / "empty.npz").write_text("")
     whole = (tmp_path / "run.npz").read_bytes()
     (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
     for name in ("text", "empty", "half"):
         with pytest.raises(ValueError, match="is not a file of such a run"):
-            run("record", tmp_path / f"{name}.npz")
+            run("pmmh", tmp_path / f"{name}.npz")
 
 
 def test_paths_that_cannot_be_files_are_refused(tmp_path):

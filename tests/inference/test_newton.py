@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from inference_oracles import maximum_of, ou_1d, ou_data, ou_log_likelihood
-from kalman import exact_step, kalman
+from inference_oracles import ou_log_likelihood
 
 import jaxbridge as jb
 from jaxbridge.inference.newton import Slope, falls, is_maximum, maximum_faults, newton_passes
@@ -101,28 +100,3 @@ def test_a_record_without_a_maximum():
     seen = jb.LinearGaussian(covariance=0.09)
     made = estimate(log_rate(), times, values, observation=seen, initial=law, **SHORT)
     assert not made.trustworthy and ("no maximum" in made.why() or "No maximum" in made.why())
-
-
-@pytest.mark.slow
-def test_a_linear_record_from_far_away():
-    """The maximum of Kalman's filter, to a small part of the standard errors, which are right."""
-    times = np.arange(40) * 0.5
-    values = ou_data(0, times, 0.3) + 0.3 * np.random.default_rng(1).normal(size=(40, 1))
-
-    def log_likelihood(p):
-        one = np.eye(1)
-        step = exact_step(p[0] * one, p[1] ** 2 * one)
-        return kalman(step, times, values, one, 0.09 * one, np.zeros(1), one, 1).log_likelihood
-
-    exact, exact_sd = maximum_of(log_likelihood, [0.5, 1.0])
-    made = estimate(
-        ou_1d(2.0), times, values, observation=jb.LinearGaussian(covariance=0.09),
-        initial=jb.GaussianLaw([0.0], [[1.0]]), constraint=lambda p: (p[0] > 0) & (p[1] > 0),
-        num_iterations=200, num_bridges=10, num_steps=10,
-    )  # fmt: skip
-    sd = np.sqrt(np.diagonal(made.covariance))
-    np.testing.assert_allclose(sd, exact_sd, rtol=0.01)
-    rough = np.mean(made.iterates[100:], axis=0)
-    assert np.max(np.abs(rough - exact) / sd) > 1  # Newton's method has a way to go
-    assert made.trustworthy, made.why()
-    np.testing.assert_array_less(np.abs(made.theta - exact), 0.01 * sd)

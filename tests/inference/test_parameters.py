@@ -1,7 +1,6 @@
 """Which parameters are unknown."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -51,15 +50,3 @@ def test_a_score_of_no_bridges_is_unknown():
     assert score.num_missing == 2 and not score.trustworthy
     assert np.isnan(score.gradient).all() and np.isinf(score.standard_error).all()
     assert "no pair met" in score.why()
-
-
-@pytest.mark.slow
-def test_a_simulated_score_of_no_bridges_is_unknown():
-    """Its step error too, and no pair is to blame."""
-    at_ends = lambda x, p: (jnp.abs(x[0] - 1) < 0.01) | (jnp.abs(x[0] - 2) < 0.01)
-    model = jb.Diffusion(
-        lambda x, p: p * (1 - x), lambda x, p: jnp.sqrt(x) / 2, domain=at_ends, params=1.0
-    )
-    score = jb.score(jax.random.key(0), model, [0, 1], [1.0, 2.0], num_steps=8, num_bridges=20)
-    assert score.num_missing == 1 and np.isnan(score.gradient).all()
-    assert np.isnan(score.step_error).all() and "pair" not in score.why()

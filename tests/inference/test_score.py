@@ -85,33 +85,22 @@ def test_lost_paths_are_told():
 @pytest.mark.slow
 def test_score_with_a_state_dependent_sigma_is_of_second_order():
     """Cox, Ingersoll and Ross's process, whose score is known, with all parameters unknown and ten
-    steps per unit interval. Euler steps are far off."""
+    steps per unit interval."""
     at, h, times = np.array([1.1, 0.55, 0.62]), 1e-5, np.arange(31.0)
     model = jb.Diffusion(
         lambda x, p: p[0] * (p[1] - x), lambda x, p: p[2] * jnp.sqrt(x),
         domain=lambda x, p: x[0] > 0, params=tuple(at.tolist()),
     )  # fmt: skip
 
-    def off(seed, target):
-        """Return the error of the score, and the bound that it reports, in standard deviations."""
-        data = cir.simulate(at, times, np.random.default_rng(seed))
-        ups, downs = (
-            np.array([cir.log_likelihood(at + sign * row, times, data) for row in h * np.eye(3)])
-            for sign in (1, -1)
-        )
-        made = jb.score(
-            jax.random.key(seed),
-            model,
-            times,
-            data,
-            num_bridges=1_000,
-            num_steps=10,
-            proposal=jb.Guided(density=target),
-        )
-        reported = 4 * np.sqrt(np.diagonal(made.covariance)) + np.abs(made.step_error)
-        sd = np.sqrt(np.abs(np.diagonal(made.information)))
-        return np.abs(made.gradient - (ups - downs) / (2 * h)) / sd, reported / sd
-
-    error, reported = off(2, None)
-    assert (error < reported + 0.02).all() and (error < 0.2).all()
-    assert off(1, jb.EulerDensity())[0].max() > 0.4
+    data = cir.simulate(at, times, np.random.default_rng(2))
+    ups, downs = (
+        np.array([cir.log_likelihood(at + sign * row, times, data) for row in h * np.eye(3)])
+        for sign in (1, -1)
+    )
+    made = jb.score(
+        jax.random.key(2), model, times, data, num_bridges=1_000, num_steps=10, proposal=jb.Guided()
+    )
+    sd = np.sqrt(np.abs(np.diagonal(made.information)))
+    error = np.abs(made.gradient - (ups - downs) / (2 * h)) / sd
+    reported = 4 * np.sqrt(np.diagonal(made.covariance)) + np.abs(made.step_error)
+    assert (error < reported / sd + 0.02).all() and (error < 0.2).all()

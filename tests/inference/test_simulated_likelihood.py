@@ -47,18 +47,6 @@ def check_maximum(made, exact, sd):
 
 
 @pytest.mark.slow
-def test_rate_and_noise():
-    """From parameters that are many standard errors off, further than the optimiser goes."""
-    times, data, exact, sd = ou_problem()
-    options = dict(SHORT, num_bridges=100, num_steps=20)
-    made = estimate(jax.random.key(0), ou_1d(2.0, 1.5), times, data, **options)
-    check_maximum(made, exact, sd)
-    assert made.iterates.shape == (20, 2) and abs(made.iterates[-1, 1] - exact[1]) > 5 * sd[1]
-    assert made.score.effective_sample_size.shape == (100,)
-    assert (made.score.effective_sample_size > 50).all()
-
-
-@pytest.mark.slow
 def test_steps_of_one_size():
     """Intervals of several numbers of steps, and the best proposal for each."""
     times, data, exact, sd = ou_problem()

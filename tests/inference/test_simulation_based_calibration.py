@@ -84,27 +84,6 @@ def test_refusals():
 
 
 @pytest.mark.slow
-def test_gibbs_is_calibrated_with_doses():
-    """Rate and noise of a process with a dose in the middle of a record."""
-    model = jb.Diffusion(
-        lambda x, p: -jnp.exp(p["rate"]) * x, [0.4], params={"rate": 0.0, "noise": -1.0}
-    )
-    made = jb.simulation_based_calibration(
-        KEY,
-        model,
-        0.5 * np.arange(12),
-        np.zeros(12),
-        functools.partial(jb.gibbs, num_iterations=500, num_warmup=200, num_steps=2, thin=2),
-        prior=jb.NormalPrior({"rate": 0.0, "noise": -1.0}, 0.3),
-        observation=jb.LinearGaussian(covariance=lambda p: jnp.exp(2 * p["noise"])),
-        initial=[1.0],
-        jumps=jb.Jumps([2.7], [2.0]),
-        num_simulations=40,
-    )
-    assert made.trustworthy and np.all(made.p_uniform > 1e-3)
-
-
-@pytest.mark.slow
 def test_first_states_have_the_stationary_law():
     """Of two wells of different depth, seen at once: the share of simulated records in each."""
     depth = 0.4

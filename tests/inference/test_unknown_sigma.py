@@ -60,28 +60,3 @@ def test_posterior_of_two_records_is_exact_and_of_second_order():
     assert np.all(np.abs(theta.mean(0) - mean) / sd < 4 * error + 0.05)
     assert np.all(np.abs(theta.std(0) / sd - 1) < 0.2)
     assert np.all(np.abs(made.step_error) + 2 * made.step_uncertainty < 0.3 * sd)
-
-
-@pytest.mark.slow
-def test_the_constant_of_the_first_state_does_not_matter():
-    """Constant σ in the plane: an observation that is constant in time has no spread."""
-    plane = jb.Diffusion(
-        lambda x, p: -x, lambda x, p: jnp.exp(p) * jnp.array([[1.0, 0.0], [0.3, 1.0]]), params=0.0
-    )
-    values = jb.simulate(jax.random.key(0), plane, [0.2, 0.0], 0.5 * np.arange(30.0))[0]
-    made = jb.gibbs(
-        jax.random.key(1), plane, 0.5 * np.arange(30.0), values, num_steps=4,
-        prior=jb.NormalPrior(0.0, 1.0), num_iterations=1500,
-    )  # fmt: skip
-    # Exact transitions: x' ~ N(e^-δ x, e^{2θ} V (1 - e^{-2δ}) / 2), so e^{2θ} has a closed form.
-    decay, root = np.exp(-0.5), np.array([[1.0, 0.0], [0.3, 1.0]])
-    white = np.linalg.solve(root, (values[1:] - decay * values[:-1]).T) / np.sqrt(
-        (1 - decay**2) / 2
-    )
-    theta = np.linspace(-0.6, 0.6, 1001)
-    log_posterior = -white.size * theta - np.sum(white**2) * np.exp(-2 * theta) / 2 - theta**2 / 2
-    weights = np.exp(log_posterior - log_posterior.max())
-    mean = weights @ theta / weights.sum()
-    sd = np.sqrt(weights @ theta**2 / weights.sum() - mean**2)
-    error = float(made.standard_error[0])
-    assert abs(float(jnp.mean(made.theta)) - mean) < 5 * error + 0.05 * sd

@@ -292,49 +292,6 @@ PULLED = [
 NUM = 6
 
 
-def pulled_choice():
-    """Three proposals in turn, of which two are used."""
-    chosen = jnp.array([0, 2, 0, 0, 2, 2], jnp.int32)
-    return chosen_of(tuple(PULLED), chosen, (0, 2))
-
-
-def pulled_setting():
-    """Ornstein–Uhlenbeck transitions, and the sum of their log densities as a function of B."""
-    rng = np.random.default_rng(2)
-    starts, ends = rng.normal(size=(2, NUM, 2)).astype(np.float32) * 0.5
-
-    def at(B):
-        model = jb.ornstein_uhlenbeck(jnp.array([[1.0, 0.4], [-0.3, 0.8]]))
-        return model.with_params(model.params._replace(B=B))
-
-    return starts, ends, at, jnp.array([[1.0, 0.4], [-0.3, 0.8]])
-
-
-@slow
-def test_each_interval_is_differentiated_by_its_own_proposal():
-    """In parameters and end points, in reverse mode: as one by one in forward mode."""
-    starts, ends, at, B = pulled_setting()
-
-    def values(arguments, proposal):
-        B, ends = arguments
-        return jb.transition_log_density(
-            jax.random.key(0), at(B), starts, ends, 0.5, num_proposals=8, num_steps=10,
-            proposal=proposal,
-        ).value  # fmt: skip
-
-    choice = pulled_choice()
-    alone = [jax.jacfwd(values)((B, ends), PULLED[i]) for i in choice.used]
-    own = np.asarray(choice.chosen == 0)
-    expected = jax.tree.map(
-        lambda first, second: np.where(own.reshape(-1, *[1] * (first.ndim - 1)), first, second),
-        *alone,
-    )
-    found = jax.jacrev(values)((B, ends), choice)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=2e-4, atol=2e-4), found, expected
-    )
-
-
 @pytest.mark.slow
 def test_what_a_proposal_makes_of_another_ones_interval_does_not_spoil_derivatives():
     """Where the explicit path of a guide overflows its derivative is not a number, times zero as
@@ -368,16 +325,3 @@ def test_what_auto_leaves_out_is_said():
     assert "left out" not in str(as_proposal("auto", model, jnp.zeros(1)))
     blind = as_proposal("auto", BLIND, jnp.zeros(1))
     assert "time reversal" in blind.left_out
-
-
-@pytest.mark.slow
-def test_pairs_that_never_met_in_a_small_pilot_are_tried_again():
-    """From one side of a ring to the other, two ways round: what is pulled to the end point goes
-    through the middle, and of 32 pairs hardly one meets."""
-    model = jb.langevin(lambda x, p: -p * (x @ x - 1) ** 2, params=20.0)
-    choice = jb.choose_proposal(
-        jax.random.key(0), model, [1.0, 0.0], [-1.0, 0.0], 1.0, num_steps=50, num_pilot=32,
-        candidates=[jb.ModifiedDiffusionBridge(), jb.Guided("path"), jb.Coupling(0.0)],
-    )  # fmt: skip
-    assert int(choice.chosen[0]) == 2
-    assert choice.efficiency[2, 0] > 1e-3 > choice.efficiency[0, 0]

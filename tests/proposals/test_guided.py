@@ -240,25 +240,6 @@ def test_double_well_agrees_with_brownian_bridge_monte_carlo():
     assert abs(float(estimate.value) - oracle) < 5 * error + 0.01
 
 
-@slow
-def test_couplings_agree():
-    """Two families: the Euler scheme at its step, and the diffusion up to O(δ²)."""
-    duration = 1.0
-    model, ends = two_wells(), ([-1.0, 0.0], [0.8, 0.3])
-    box = jb.GaussianLaw([0.0, 0.0], [[0.9, 0.0], [0.0, 0.35]])
-    coupled = jb.transition_log_density(
-        jax.random.key(0), model, *ends, duration, num_proposals=60_000,
-        num_steps=round(50 * duration), proposal=jb.Coupling(0.0, start_law=box),
-    )  # fmt: skip
-    guided = jb.transition_log_density(
-        jax.random.key(1), model, *ends, duration, num_proposals=40_000,
-        num_steps=round(400 * duration), proposal=jb.Guided(),
-    )  # fmt: skip
-    error = np.hypot(float(coupled.standard_error), float(guided.standard_error))
-    assert error < 0.03
-    assert abs(float(coupled.value - guided.value)) < 5 * error + 0.015
-
-
 @pytest.mark.slow
 def test_noise_makes_the_path_and_the_path_gives_the_noise(precision):
     """The maps are inverse to each other, and a path's weight is a function of the path."""

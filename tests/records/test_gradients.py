@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers import slow_beyond
 from jax.flatten_util import ravel_pytree
 
 import jaxbridge as jb
@@ -22,34 +21,21 @@ def sigma(x, p):
     return size * jnp.array([[1.0, 0.0], [0.3, 0.8]]) + 0.1 * jnp.diag(jnp.tanh(x))
 
 
-CONSTANT = lambda x, p: p["scale"] * jnp.array([[1.0, 0.0], [0.3, 0.8]])
-NOISE = lambda p: p["noise"] ** 2
-SEEN = {
-    "partly exactly": jb.LinearGaussian(
-        [[1.0, 0.5], [0.0, 1.0]], lambda p: jnp.array([0.0, NOISE(p)])
-    ),
-    "exactly": jb.LinearGaussian([[1.0, 0.5], [0.0, 1.0]], 0.0),
-}
-CASES = [
-    ("partly exactly", sigma),
-    ("exactly", CONSTANT),
-]
+# Partly exact.
+SEEN = jb.LinearGaussian([[1.0, 0.5], [0.0, 1.0]], lambda p: jnp.array([0.0, p["noise"] ** 2]))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("how", "diffusion"), slow_beyond(1, CASES))
-def test_derivatives_are_differences(how, diffusion, x64):
+def test_derivatives_are_differences(x64):
     """In parameters, of drift, σ, noise and initial law, and in noise."""
-    seen = SEEN[how]
-    columns = seen.matrix.shape[0]
-    values = np.random.default_rng(2).normal(scale=0.5, size=(4, columns))
+    values = np.random.default_rng(2).normal(scale=0.5, size=(4, 2))
     values[2, 0] = np.nan
     times = np.array([0.0, 0.3, 0.5, 0.9])
     model = jb.Diffusion(drift, diffusion, params=PARAMS)
     initial = lambda p: jb.GaussianLaw(
         jnp.stack([p["mean"], p["mean"] ** 2]), p["scale"] ** 2 * jnp.eye(2)
     )
-    options = {"observation": seen, "initial": initial, "num_steps": 3}
+    options = {"observation": SEEN, "initial": initial, "num_steps": 3}
     paths = jb.innovations(model, times, values, **options)
     theta, of_vector = ravel_pytree(jax.tree.map(jnp.float64, PARAMS))
     xi = jax.random.normal(jax.random.key(0), (paths.size,))
@@ -60,9 +46,7 @@ def test_derivatives_are_differences(how, diffusion, x64):
         return paths.log_density(of_vector(point[: len(theta)]), point[len(theta) :])
 
     slope = jax.jit(jax.grad(density))(point)
-    assert np.isfinite(slope).all()
-    depends = np.array([True, how != "exactly", True, True])  # in alphabetical order
-    np.testing.assert_array_equal(np.asarray(slope[: len(theta)]) != 0, depends)
+    assert np.isfinite(slope).all() and np.all(slope[: len(theta)] != 0)
     scale = max(1, float(np.abs(slope).max()))
     steps = np.eye(len(point))[[*range(len(theta)), len(theta), len(theta) + 3, -1]]
     for step in [*steps, np.random.default_rng(3).normal(size=len(point))]:

@@ -10,7 +10,6 @@ from helpers import run_program
 
 import jaxbridge as jb
 from jaxbridge.engine.checks import nondifferentiable
-from jaxbridge.engine.diagnostics import effective_size_of_chains
 from jaxbridge.records import (
     as_record_problems,
     linearised,
@@ -156,28 +155,6 @@ def test_rate_sigma_and_noise_are_found():
     told, doubt = np.asarray(posterior.step_error), np.asarray(posterior.step_uncertainty)
     assert np.all(np.abs(told - (of_steps - exact)) < 4.5 * doubt)
     assert np.all(doubt < 0.045 * sd)
-
-
-@pytest.mark.slow
-def test_several_records_have_one_posterior():
-    parts = ((0, 25), (25, 40))
-    times, values = zip(*((TIMES[i:j], record()[i:j]) for i, j in parts), strict=True)
-    posterior = jb.gibbs(
-        jax.random.key(1), model(), times, values, observation=SEEN, prior=log_prior,
-        num_warmup=600, num_chains=4, num_steps=2, thin=2, num_iterations=1000,
-    )  # fmt: skip
-    mean, sd = exact_posterior(parts=parts)
-    error = np.asarray(posterior.standard_error)
-    theta = np.asarray(posterior.theta).reshape(-1, 3)
-    assert np.all(posterior.r_hat < 1.03) and not np.any(getattr(posterior, "stuck", False))
-    np.testing.assert_array_less(np.abs(theta.mean(0) - mean), 5 * error + 0.02 * sd)
-    assert np.all(posterior.step_error == 0) and np.all(posterior.step_uncertainty == 0)
-    # A walk has about 270 effective draws, of which the sd is known to 6 %.
-    squares = (posterior.theta - mean.astype(np.float32)) ** 2
-    size = np.asarray(effective_size_of_chains(squares))
-    error = np.asarray(jnp.std(squares, axis=(0, 1))) / np.sqrt(size) / (2 * sd**2)
-    np.testing.assert_array_less(error, 0.11)
-    np.testing.assert_array_less(np.abs(theta.std(0) / sd - 1), 4.5 * error + 0.02)
 
 
 @pytest.mark.parametrize("law", [lambda params: [0.0], lambda params: jb.GaussianLaw([0.0], [[1]])])

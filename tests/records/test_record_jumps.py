@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from linear_records import plane
 from scipy import stats
-from scipy.linalg import expm
 
 import jaxbridge as jb
 
@@ -41,56 +40,6 @@ def test_the_likelihood_is_kalmans():
     assert abs(made.value - EXACT) < 1e-4 * abs(EXACT)
     assert made.effective_sample_size.shape == RECORD.times.shape  # not where it only jumps
     assert abs(EXACT - RECORD.kalman(1, exact=True).log_likelihood) > 1  # without jumps
-
-
-@pytest.mark.slow
-def test_maps_of_jumps_see_parameters():
-    """Doses of which an unknown part acts, beside a pull, at two values of both."""
-
-    def apply(x, u, params):
-        return (1 - params["pull"]) * x + params["part"] * u
-
-    def drift(x, params):
-        return -jnp.asarray(RECORD.A, x.dtype) @ x
-
-    params = {"part": 0.6, "pull": 0.2}
-    model = jb.Diffusion(drift, jnp.asarray(RECORD.sigma), params=params)
-    of = jb.innovations(
-        model,
-        RECORD.times,
-        RECORD.values,
-        **RECORD.options,
-        num_steps=1,
-        jumps=jb.Jumps(AT, INPUTS, apply),
-    )
-
-    def exact(part, pull):
-        A, V = RECORD.A, RECORD.sigma @ RECORD.sigma.T
-        block = lambda dt: expm(np.block([[-A, V], [np.zeros((2, 2)), A.T]]) * dt)
-        mean, covariance, total = RECORD.mean, RECORD.covariance, 0.0
-        times = list(WHOLE.times)
-        for k, y in enumerate(WHOLE.values):
-            if k:
-                E = block(times[k] - times[k - 1])
-                F, Q = E[:2, :2], E[:2, 2:] @ E[:2, :2].T
-                mean, covariance = F @ mean, F @ covariance @ F.T + Q
-            seen = np.isfinite(y)
-            if seen.any():
-                L, R = RECORD.matrix[seen], RECORD.noise[np.ix_(seen, seen)]
-                S = L @ covariance @ L.T + R
-                total += stats.multivariate_normal(L @ mean, S).logpdf(y[seen])
-                gain = covariance @ L.T @ np.linalg.inv(S)
-                mean = mean + gain @ (y[seen] - L @ mean)
-                covariance = covariance - gain @ L @ covariance
-            if ROWS[k].any():
-                mean = (1 - pull) * mean + part * ROWS[k]
-                covariance = (1 - pull) ** 2 * covariance
-        return total
-
-    xi = jax.random.normal(KEY, (of.size,))
-    for part, pull in ((0.6, 0.2), (0.9, -0.1)):
-        value = of.log_weight({"part": jnp.float32(part), "pull": jnp.float32(pull)}, xi)
-        assert abs(value - exact(part, pull)) < 1e-4 * abs(value)
 
 
 @pytest.fixture(scope="module")

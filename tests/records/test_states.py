@@ -5,7 +5,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from grid_filter import grid_filter
 from helpers import NON_REVERSIBLE
 from scipy.linalg import expm, solve_continuous_lyapunov
 
@@ -48,22 +47,6 @@ TIMES = np.array([0.0, 1.5, 2.5, 5.0, 7.0])
 
 
 @pytest.mark.slow
-def test_gaps_are_known_after_a_long_time():
-    """Those of .01 after 45,000 units of time, which single precision knows to .004."""
-    times, values = np.array([0.0, 0.01, 0.03, 0.04]), np.zeros((4, 1))
-
-    def paths(start):
-        made = jb.smooth(
-            KEY, jb.ornstein_uhlenbeck([[1.0]]), start + times, values,
-            observation=jb.LinearGaussian(covariance=0.1), num_steps=2, num_draws=3, num_warmup=0,
-            num_chains=2, num_proposals=2, proposal=jb.ModifiedDiffusionBridge(),
-        )  # fmt: skip
-        return made.paths
-
-    np.testing.assert_allclose(paths(45_000.0), paths(0.0), atol=1e-5)
-
-
-@pytest.mark.slow
 def test_states_stay_in_the_state_space():
     """The last one as well, of which no bridge begins; and what was seen is a function of the
     parameters as they are, not as they were prepared."""
@@ -102,39 +85,3 @@ DRIFT = lambda x: 2 * x * (1 - x**2)
 WELLS = jb.Diffusion(
     lambda x, p: DRIFT(x), [0.8], lambda x, p: jnp.sum((x**2 - x**4 / 2) / 0.32)
 )  # not normalised, without a sampler
-
-
-def seen_rarely(num, gap):
-    """What was seen of the wells, at what times; and the probability of the right one, by grid."""
-    rng, x, values = np.random.default_rng(0), -1.0, []
-    for _ in range(num):
-        values.append(x + 0.3 * rng.normal())
-        for _ in range(round(gap / 0.005)):
-            x += DRIFT(x) * 0.005 + 0.8 * np.sqrt(0.005) * rng.normal()
-    values = np.array(values)
-    values[5:7] = np.nan
-    nodes = np.linspace(-2.6, 2.6, 521)
-    logs = np.where(np.isnan(values), 0, -((values - nodes[:, None]) ** 2) / 0.18).T
-    initial = np.exp(-((nodes + 1) ** 2) / 0.5)
-    arguments = (DRIFT, lambda x: np.full_like(x, 0.64), nodes, initial, np.full(num - 1, gap))
-    exact = grid_filter(*arguments, logs)
-    return np.arange(num) * gap, values[:, None], exact.weights @ (nodes > 0)
-
-
-@pytest.mark.slow
-def test_wells_that_are_seen_rarely():
-    """Gaps of twenty units of time, within which the diffusion changes its well or does not: the
-    probability of each is known from some hundreds of draws."""
-    num_steps = 100
-    times, values, exact = seen_rarely(6, 20.0)
-    made = jb.smooth(
-        KEY, WELLS, times, values, observation=jb.LinearGaussian(covariance=0.09),
-        initial=jb.GaussianLaw([-1.0], [[0.25]]), num_steps=num_steps, num_draws=200,
-        num_warmup=100, proposal=jb.Coupling(0.0),
-    )  # fmt: skip
-    assert not made.stuck.any() and made.num_truncated == 0
-    share = lambda path: (path[::num_steps, 0] > 0).astype(jnp.float32)
-    # Where all draws agree there is no standard error: that of one in so many.
-    error = np.maximum(made.standard_error(share), 1 / 200)
-    assert ((0.2 < exact) & (exact < 0.8)).any() and (error < 0.1).all()
-    np.testing.assert_array_less(np.abs(made.mean(share) - exact), 4.5 * error)

@@ -113,16 +113,3 @@ def test_the_beginning_is_a_smooth_function_of_parameters(x64):
     density = jax.jit(paths.log_density)
     differences = (density(1.0 + 1e-4, xi) - density(1.0 - 1e-4, xi)) / 2e-4
     assert np.isfinite(value) and abs(slope - differences) < 1e-5 * abs(slope)
-
-
-@pytest.mark.slow
-def test_how_much_of_the_start_noise_reaches():
-    """By normal noise itself, where that can tell; and with one law for two narrow wells."""
-    values, seen = record((-1.0, None)), jb.LinearGaussian(covariance=1.0)
-    paths = jb.innovations(wells(), *values, observation=seen, num_steps=1)
-    xi = jax.random.normal(KEY, (20_000, paths.size))
-    weights = jnp.exp(jax.jit(jax.vmap(lambda xi: paths.log_weight(None, xi)))(xi))
-    share = jnp.mean(weights) ** 2 / jnp.mean(weights**2)
-    assert abs(paths.start_share() - share) < 0.05
-    normal = jb.innovations(jb.ornstein_uhlenbeck([[1.0]]), *values, observation=seen, num_steps=1)
-    assert normal.start_share() == 1

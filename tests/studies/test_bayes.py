@@ -52,9 +52,9 @@ def test_distant_observations_are_draws_from_the_stationary_law():
 
 @pytest.mark.slow
 def test_study_runs_and_renders(tmp_path, monkeypatch):
-    """With few of its samplers, for each takes long to compile."""
-    few = ("approximate, gamma = 0.5, Euler", "exact, coupling, N = 12")
-    monkeypatch.setattr(bayes, "SAMPLERS", {name: bayes.SAMPLERS[name] for name in few})
+    """With one of its samplers, for each takes long to compile."""
+    name = "exact, coupling, N = 12"
+    monkeypatch.setattr(bayes, "SAMPLERS", {name: bayes.SAMPLERS[name]})
     monkeypatch.delitem(bayes.DISTANT, 'exact, "auto"')
     examples = run_bayes(jax.random.key(0), 0.04)
     text = format_bayes(examples)
