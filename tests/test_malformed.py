@@ -350,17 +350,17 @@ def test_some_malformed_arguments(call, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("call", CALLS)
 def test_malformed_arguments(call, monkeypatch):
-    """Of each argument every sixth value, each time others."""
+    """Of each argument every ninth value, each time others."""
     shift = list(CALLS).index(call)
-    assert not faults(call, lambda i: list(VALUES)[(shift + i) % 6 :: 6], monkeypatch)
+    assert not faults(call, lambda i: list(VALUES)[(shift + i) % 9 :: 9], monkeypatch)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("call", [call for call in CALLS if call not in NOT_TRACED])
 def test_malformed_functions_and_models(call, monkeypatch):
-    """Which are seen when programs are traced: of each argument every sixth, each time others."""
+    """Which are seen when programs are traced: of each argument every ninth, each time others."""
     shift = list(CALLS).index(call)
-    values_of = lambda i: OF_FUNCTIONS[(shift + i) % 6 :: 6]
+    values_of = lambda i: OF_FUNCTIONS[(shift + i) % 9 :: 9]
     with jax.numpy_dtype_promotion("standard"):  # as optax asks for
         assert not faults(call, values_of, monkeypatch, traced=True)
 
@@ -415,12 +415,12 @@ def main_number(result):
 @pytest.mark.parametrize("call", ESTIMATES)
 def test_outcomes_of_malformed_numbers(call):
     """An estimate that is not finite is not trustworthy, and what is refused is named. Each number
-    stands in every sixth place, each in others."""
+    stands in every ninth place, each in others."""
     shift = list(ESTIMATES).index(call)
     call, arguments = ESTIMATES[call]()
     wrong = []
     for i, value in enumerate(NUMBERS):
-        for name, changed in list(with_number(arguments, value))[(shift + i) % 6 :: 6]:
+        for name, changed in list(with_number(arguments, value))[(shift + i) % 9 :: 9]:
             try:
                 made = {k: each() if callable(each) else each for k, each in changed.items()}
                 with jax.numpy_dtype_promotion("standard"):  # as optax asks for

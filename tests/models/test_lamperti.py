@@ -50,17 +50,9 @@ def test_the_reversal_follows_from_the_density(x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "proposal",
-    [
-        jb.Coupling(0.0, scheme=jb.Heun()),
-        jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
-    ],
-    ids=["coupling", "modified diffusion bridge"],
-)
-def test_densities_are_those_of_cir(proposal):
-    """What needs a constant σ serves: the trapezoid density, Heun of second order."""
-    start, end = 0.15, 0.3
+def test_densities_are_those_of_cir():
+    """What needs a constant σ serves."""
+    start, end, proposal = 0.15, 0.3, jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity())
     moved = jb.lamperti(cir(), at=AT, reach=8.0)
     assert not jb.effects(moved.model).solves.simulated  # σ is the identity
     estimate = jb.transition_log_density(

@@ -12,13 +12,12 @@ from linear_records import four, plane
 import jaxbridge as jb
 
 KEY = jax.random.key(0)
-RECORDS = {"exact part": plane(exact_part=True), "four": four()}
+PLANE, FOUR = plane(exact_part=True), four()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", RECORDS)
-def test_the_filter_is_kalmans(name):
-    record = RECORDS[name]
+def test_the_filter_is_kalmans():
+    record = PLANE
     made = jb.log_likelihood(
         KEY,
         *record.arguments,
@@ -58,7 +57,7 @@ def test_the_first_state_may_be_known_in_part():
 @pytest.mark.slow
 def test_the_filter_is_kalmans_to_many_digits(x64):
     """The model is not reversible; it is seen in part, at unequal times, some not at all."""
-    record = RECORDS["four"]
+    record = FOUR
     made = jb.log_likelihood(
         KEY,
         *record.arguments,
@@ -76,7 +75,7 @@ def test_the_filter_is_kalmans_to_many_digits(x64):
 
 @pytest.mark.slow
 def test_the_default_steps_are_exact_and_others_of_second_order():
-    record = RECORDS["exact part"]
+    record = PLANE
     options = {**record.options, "num_particles": 10, "num_steps": 20}
     exact, euler = record.kalman(20, exact=True), record.kalman(20)
     made = jb.log_likelihood(KEY, *record.arguments, **options | {"num_steps": 1})
@@ -91,7 +90,7 @@ def test_the_default_steps_are_exact_and_others_of_second_order():
 
 @pytest.mark.slow
 def test_innovations_are_weighted_alike():
-    record = RECORDS["exact part"]
+    record = PLANE
     paths = jb.innovations(
         *record.arguments, **record.options, num_steps=10, density=jb.EulerDensity()
     )
@@ -104,9 +103,8 @@ def test_innovations_are_weighted_alike():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", RECORDS)
-def test_smoothed_paths_are_those_of_rauch_tung_and_striebel(name):
-    record = RECORDS[name]
+def test_smoothed_paths_are_those_of_rauch_tung_and_striebel():
+    record = PLANE
     made = jb.smooth(
         KEY,
         *record.arguments,
@@ -131,13 +129,10 @@ def test_smoothed_paths_are_those_of_rauch_tung_and_striebel(name):
     faults = made.why().splitlines()
     assert all("discretisation" in fault or "No fault" in fault for fault in faults)
     assert np.all(made.accepted[made.accepted > 0] > 0.99)  # guiding is exact here
-    if name == "exact part":
-        seen = np.isfinite(record.values[:, 0])
-        shown = np.asarray(made.paths[:, :, ::5]) @ record.matrix[0]
-        np.testing.assert_allclose(
-            shown[..., seen], np.broadcast_to(record.values[seen, 0], shown[..., seen].shape),
-            atol=1e-5,
-        )  # fmt: skip
+    seen = np.isfinite(record.values[:, 0])
+    shown = np.asarray(made.paths[:, :, ::5])[..., seen, :] @ record.matrix[0]
+    expected = np.broadcast_to(record.values[seen, 0], shown.shape)
+    np.testing.assert_allclose(shown, expected, atol=1e-5)
 
 
 @pytest.mark.slow

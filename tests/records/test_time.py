@@ -65,20 +65,6 @@ def test_a_seasonal_process_is_kalmans(x64):
 
 
 @pytest.mark.slow
-def test_a_constant_function_of_time_gives_the_very_numbers():
-    values = np.sin(2 * TIMES)[:, None]
-    plain = jb.Diffusion(lambda x, p: -p * x - x**3, lambda x, p: 0.5 + 0 * x, params=1.2)
-    timed = jb.Diffusion(
-        lambda x, p, t: -p * x - x**3 + 0 * t, lambda x, p, t: 0.5 + 0 * (x + t), params=1.2
-    )
-    assert timed.depends_on_time and not plain.depends_on_time
-    options = {"density": jb.EulerDensity()}
-    a, b = (told(model, values, 4, **options) for model in (plain, timed))
-    np.testing.assert_allclose(a.log_estimates, b.log_estimates, rtol=1e-5)
-    np.testing.assert_allclose(a.step_error, b.step_error, atol=1e-4)
-
-
-@pytest.mark.slow
 def test_noise_of_observations_may_depend_on_time():
     """Seen well before time 5, and hardly after: as two kinds of rows."""
     model = jb.ornstein_uhlenbeck([[1.0]])
