@@ -111,7 +111,9 @@ CLAIMS = {
     ),
     "progress": lambda page: bool(page["bridges"].met.all()),
     "saving": lambda page: (
-        covers(page["posterior"].params, 0.8) and page["both"].theta.shape == (600, 1)
+        covers(page["posterior"].params, 0.8)
+        and page["both"].theta.shape == (600, 1)
+        and page["again"].sizes == {"draw": 600, "parameter": 1}
     ),
     "several_devices": lambda page: bool(page["bridges"].met.all()),
     "several_records": lambda page: max(page["values_at"], key=page["values_at"].get) == 0.0,

@@ -9,7 +9,7 @@ time.
 import math
 from abc import abstractmethod
 from functools import reduce
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from .checks import all_finite_leaves, is_traced
+from .labelled import dataset
 from .pareto import FEWEST_EFFECTIVE, is_reliable, largest_reliable_k_of
 
 _NO_FAULT = "No fault was found."
@@ -161,6 +162,23 @@ class AbstractResult(eqx.Module):
         **Raises:** `TypeError` inside `jit`, where the values are traced.
         """
         return self.verdict.why()
+
+    def to_xarray(self) -> Any:
+        """Return all arrays of this result with names of their axes, as an `xarray.Dataset`.
+
+        Axes are named "interval", "chain", "draw", "time", "state", "parameter" and so on. Times
+        and names of parameters are coordinates. Attributes are numbers of the result, and `why()`.
+        `to_netcdf` of the dataset saves it. This needs the package xarray.
+
+        **Raises:** `TypeError` inside `jit`, where the values are traced.
+
+        **Example:**
+
+        ```python
+        bridges.to_xarray().paths.mean("draw").to_netcdf("means.nc")
+        ```
+        """
+        return dataset(self)
 
 
 _Result = TypeVar("_Result", bound=AbstractResult)

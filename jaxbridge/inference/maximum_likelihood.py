@@ -108,7 +108,7 @@ class MaximumLikelihood(AbstractResult):
     covariance: Float[Array, "p p"] | None
     step_error: Float[Array, " p"]
     step_uncertainty: Float[Array, " p"]
-    iterates: Float[Array, "n p"]
+    iterates: Float[Array, "iterations p"]
     score: Score | None
     num_missing: Int[Array, ""]
     num_truncated: Int[Array, ""]

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
+from ..engine.labelled import named_leaves
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..schemes import LEAST_UNCERTAINTY, StepError, dominates, step_faults, unknown_where
 from .parameters import Parameters, init_vectors, of_rows
@@ -325,17 +326,9 @@ class AbstractPosterior(AbstractResult):
         def of_chains(leaf):
             return jax.device_get(leaf if self.theta.ndim == 3 else leaf[None])
 
-        def named_leaves(params):
-            named = jax.tree_util.tree_leaves_with_path(params)
-            return {
-                jax.tree_util.keystr(path, simple=True, separator=".") or "theta": of_chains(leaf)
-                for path, leaf in named
-                if eqx.is_array(leaf)
-            }
-
-        posterior = named_leaves(self.params)
-        units = named_leaves(getattr(self, "unit_params", None))
-        posterior |= {f"unit_params.{name}": draws for name, draws in units.items()}
+        leaves = named_leaves(self.params)
+        leaves |= named_leaves(getattr(self, "unit_params", None), "unit_params")
+        posterior = {name or "theta": of_chains(leaf) for name, leaf in leaves.items()}
         # Entries of θ without a parameter of the model.
         of_entries = jnp.moveaxis(self._chains, -1, 0)
         for name, draws in zip(self.names, of_entries, strict=True):

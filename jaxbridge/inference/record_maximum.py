@@ -111,7 +111,7 @@ class RecordMaximumLikelihood(AbstractResult):
     covariance: Float[Array, "p p"]
     step_error: Float[Array, " p"]
     step_uncertainty: Float[Array, " p"]
-    iterates: Float[Array, "n p"]
+    iterates: Float[Array, "iterations p"]
     gradient: Float[Array, " p"]
     effective_sample_size: Float[Array, " p"]
     r_hat: Float[Array, " p"]

@@ -84,13 +84,13 @@ class Forecast(AbstractResult):
     states: Float[Array, "P times d"]
     readings: Float[Array, "P times m"]
     filtered: Float[Array, "P times d"]
-    uniforms: Float[Array, "n m"]
-    log_scores: Float[Array, " n"]
-    crps: Float[Array, "n m"]
-    effective_sample_size: Float[Array, " n"]
+    uniforms: Float[Array, "readings m"]
+    log_scores: Float[Array, " readings"]
+    crps: Float[Array, "readings m"]
+    effective_sample_size: Float[Array, " readings"]
 
     @property
-    def residuals(self) -> Float[Array, "n m"]:
+    def residuals(self) -> Float[Array, "readings m"]:
         """Return the quantiles of N(0, 1) at `uniforms`.
 
         They are independent and normal if the model is right.

@@ -118,8 +118,8 @@ class LogLikelihood(AbstractResult):
     value: Float[Array, ""]
     standard_error: Float[Array, ""]
     log_estimates: Float[Array, " num_filters"]
-    effective_sample_size: Float[Array, " n"]
-    pareto_k: Float[Array, " n"]
+    effective_sample_size: Float[Array, " readings"]
+    pareto_k: Float[Array, " readings"]
     num_weights: int = eqx.field(static=True)
     num_nonfinite: Int[Array, ""]
     step_error: Float[Array, ""]
@@ -179,7 +179,7 @@ class LogLikelihood(AbstractResult):
         return jnp.any(self.pareto_k > self._most_k)
 
     @property
-    def _most_k(self) -> Float[Array, " n"]:
+    def _most_k(self) -> Float[Array, " readings"]:
         """Return the bounds on k̂ for so many weights, larger ones for nearly equal weights."""
         most = largest_reliable_k(self.num_weights) + _LARGEST_OF_MANY
         share, most_of_equal = NEARLY_EQUAL
