@@ -22,8 +22,8 @@ by number of steps, and `blocks` selects a proposal for each group. The methods 
 
 A complete path determines σ, so these methods do not apply to an unknown σ. For an unknown σ, and
 by default for σ(x), `score` and `maximum_likelihood` differentiate Σ_k log p̂_θ(x_{k-1}, x_k) with
-fixed noise. This sum is smooth in θ for guided proposals (`simulated_likelihood`). For an unknown σ
-`gibbs` treats the observations as a record without noise.
+fixed noise. This sum is smooth in θ for guided proposals (`simulated_likelihood`). `gibbs` then
+treats the observations as a record without noise.
 
 *Records* with noisy, partial or missing observations. The likelihood is E[w(θ, ξ)], the mean weight
 of paths that are functions of normal noise ξ (`record_paths`). `gibbs` samples from

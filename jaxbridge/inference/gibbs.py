@@ -61,6 +61,7 @@ from .record_paths import (
     OF_UNKNOWN_SIGMA,
     check_no_bridges,
     check_no_record,
+    not_default,
 )
 
 # Largest share of iterations with truncated weights.
@@ -202,7 +203,8 @@ def gibbs(
     - `key`: typed key.
     - `model`: the diffusion. Chains start from its `params`. If σ depends on the unknown
         parameters, exact observations count as a record whose noise is zero. Then arguments about
-        bridges do not apply.
+        bridges do not apply. If σ depends on the state, they do so by default, too, because the
+        steps of records are of second order; with arguments about bridges steps are of first order.
     - `times`: increasing, shape (n + 1,), in the model's unit of time.
     - `observations`: values of the diffusion at these times, shape (n + 1, d), or (n + 1,) in one
         dimension. Pass several independent records as lists of `times` and `observations`, or with
@@ -283,8 +285,11 @@ def gibbs(
         check_no_record(initial=initial, initial_time=initial_time, jumps=jumps)
         problem = as_problem(key, parameters, times, observations, num_steps, step_size)
         parameters.model.check_invertible_sigma(problem.like)
-        if problem.sigma_is_unknown or population is not None:
-            # Given its complete path σ cannot move, but given its noise it can.
+        # Given its complete path σ cannot move, but given its noise it can.
+        only_noise = problem.sigma_is_unknown or population is not None
+        # Where σ varies, the likelihood of a path is of first order, and that of noise of second.
+        is_free = not not_default(for_bridges) and not isinstance(init, GibbsState)
+        if only_noise or (is_free and model.sigma_varies(problem.like)):
             check_no_bridges(OF_POPULATION if population else OF_UNKNOWN_SIGMA, **for_bridges)
             observation, initial = LinearGaussian(covariance=0.0), _wide_law(problem.intervals)
     if observation is not None:

@@ -1,7 +1,7 @@
 """Gibbs sampling of parameters and paths, given noisy or partial records.
 
-Exact observations are a record without noise. They are treated here if σ is unknown, or if
-parameters vary between records.
+Exact observations are a record without noise. They are treated here if σ is unknown or depends on
+the state, or if parameters vary between records.
 
 The state is (θ, path). Two moves alternate:
 

@@ -210,15 +210,20 @@ def check_no_bridges(condition: str = _OF_NOISE, **arguments: Any) -> None:
     Such arguments are for complete observations without noise and a known σ that is the same for
     all records. `condition` is the part of this that does not hold, with its remedy.
     """
-    usual = lambda name, value: isinstance(value, str) and value == _USUAL.get(name)
-    names = [
-        name for name, value in arguments.items() if value is not None and not usual(name, value)
-    ]
+    names = not_default(arguments)
     if names:
         raise ValueError(
             f"{' and '.join(f'`{name}`' for name in names)}: only for complete observations "
             f"{condition}"
         )
+
+
+def not_default(arguments: dict[str, Any]) -> list[str]:
+    """Return the names of arguments about bridges that are neither `None` nor their default."""
+    usual = lambda name, value: isinstance(value, str) and value == _USUAL.get(name)
+    return [
+        name for name, value in arguments.items() if value is not None and not usual(name, value)
+    ]
 
 
 def check_no_record(**arguments: Any) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxbridge as jb
+import jaxbridge.inference.gibbs as of_gibbs
 
 LEVEL = 0.5
 
@@ -60,3 +61,19 @@ def test_posterior_of_two_records_is_exact_and_of_second_order():
     assert np.all(np.abs(theta.mean(0) - mean) / sd < 4 * error + 0.05)
     assert np.all(np.abs(theta.std(0) / sd - 1) < 0.2)
     assert np.all(np.abs(made.step_error) + 2 * made.step_uncertainty < 0.3 * sd)
+
+
+@pytest.mark.parametrize("how", [{}, {"proposal": "auto"}, {"init": jnp.float32(1.5)}])
+def test_a_known_sigma_that_varies_is_treated_as_an_unknown_one(how, monkeypatch):
+    """For its steps are of second order, those of complete paths of first."""
+    monkeypatch.setattr(of_gibbs, "sample_records", lambda *arguments: "noise")
+    monkeypatch.setattr(of_gibbs, "_run", lambda *arguments: "paths")
+    drift = lambda x, p: p * (1 - x)
+    varying = jb.Diffusion(drift, lambda x, p: 0.3 * jnp.sqrt(1 + x**2), params=1.0)
+    run = lambda model, **how: jb.gibbs(
+        jax.random.key(0), model, [0.0, 1.0, 2.0], [1.0, 1.2, 0.9], num_steps=2,
+        prior=jb.NormalPrior(1.0, 1.0), **how,
+    )  # fmt: skip
+    assert run(varying, **how) == "noise"
+    assert run(jb.Diffusion(drift, [0.3], params=1.0), **how) == "paths"
+    assert run(varying, **how | {"proposal": jb.ModifiedDiffusionBridge()}) == "paths"
