@@ -66,6 +66,7 @@ SLOW = {
     "Guided",
     "Milstein",
     "ModifiedDiffusionBridge",
+    "PoissonCounts",
     "ResidualBridge",
     "SemiImplicit",
     "Transformed",

@@ -109,6 +109,7 @@ def test_means_are_extrapolated_entry_by_entry():
     np.testing.assert_allclose(noise, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_nothing_is_left_of_a_density_that_noise_made_negative(densities):
     fine, _ = densities
     larger = density(jax.random.key(2), 16, 100)

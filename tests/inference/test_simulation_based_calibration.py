@@ -48,6 +48,7 @@ def calibrate(sampler, num=200, **options):
     )
 
 
+@pytest.mark.slow
 def test_a_right_sampler_passes():
     made = calibrate(conjugate, 60)
     assert made.names == ("level",) and made.truth.shape == made.uniforms.shape == (60, 1)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, loglog_slope, slow_beyond
+from helpers import FULL_SIGMA, NON_REVERSIBLE, PAPER_B, loglog_slope
 from scipy.stats import multivariate_normal
 
 import jaxbridge as jb
@@ -509,7 +509,8 @@ def generator(model, g):
     return of
 
 
-@pytest.mark.parametrize("d", slow_beyond(1, [1, 2, 3]))
+@pytest.mark.slow
+@pytest.mark.parametrize("d", [1, 2, 3])
 def test_quadratic_steps_are_of_weak_order_2(d, x64):
     """E g(x') = g + δLg + ½δ²L²g + O(δ³) for cubic and exponential g, by quadrature over the
     noise: an oracle that has no square root and no expansion of the step in it."""
