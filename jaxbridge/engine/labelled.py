@@ -33,6 +33,7 @@ _DIMENSIONS = {
     "iterations": "iteration",
     "points": "time",
     "readings": "reading",
+    "records": "record",
     "times": "time",
 }
 

@@ -190,6 +190,7 @@ def gibbs(
     population: NormalPopulation | None = None,
     num_warmup: int | None = None,
     covariance: Numbers | None = None,
+    save_states: bool = False,
     num_counts: int | None = None,
     max_proposals: int | None = None,
     max_trials: int | None = None,
@@ -242,6 +243,9 @@ def gibbs(
         parameters that vary are represented by their population means.
     - `num_warmup`, `covariance`: for records only. The warm-up, by default of 500 iterations,
         adapts the sizes of moves and the guide. `covariance` is as in `pmmh`.
+    - `save_states`: for records only. Whether the result contains the states at the times of the
+        observations and the log densities of these, for each draw: for smoothed states with all
+        uncertainty, and for `arviz.loo`. By default it does not, because they take memory.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`. The renewal chain
         and approximate bridges take only `max_proposals`.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.
@@ -316,10 +320,10 @@ def gibbs(
         start = (units.first_point(theta), root) if state is None else state
         num_warmup = check_count("num_warmup", 500 if num_warmup is None else num_warmup, 0)
         size = (num_warmup, num_iterations, thin)
-        how = size, covariance is None, progress_meter
+        how = size, covariance is None, bool(save_states), progress_meter
         return sample_records(key, units, records, start, *how)
     assert problem is not None
-    check_no_record(num_warmup=num_warmup, covariance=covariance)
+    check_no_record(num_warmup=num_warmup, covariance=covariance, save_states=save_states or None)
     check_kernel(parameter_kernel)
     log_prior = as_log_prior(prior, parameters, problem.theta)
     theta, state = starting_points(

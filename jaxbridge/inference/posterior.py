@@ -313,7 +313,9 @@ class AbstractPosterior(AbstractResult):
         each record ("unit_params.rate") and the log standard deviations ("log_sd(rate)"). The group
         `sample_stats` contains the other values of each draw, for instance whether moves were
         accepted. There `log_likelihood` of `pmmh` has the name `log_likelihood_estimate`, because
-        ArviZ expects one log-likelihood for each observation. This needs the package ArviZ.
+        ArviZ expects one log-likelihood for each observation. With `save_states` of `gibbs` the
+        group `log_likelihood` contains these, given the states, for `arviz.loo`; `posterior`
+        contains the states. This needs the package ArviZ.
 
         **Example:**
 
@@ -334,18 +336,22 @@ class AbstractPosterior(AbstractResult):
         for name, draws in zip(self.names, of_entries, strict=True):
             if name.startswith(f"{LOG_SD}("):
                 posterior[name] = jax.device_get(draws)
-        others = ("params", "theta", "unit_params", *self._combinations)
+        others = ("params", "theta", "unit_params", "states", "log_densities", *self._combinations)
         names = [field.name for field in dataclasses.fields(self) if field.name not in others]
         stats = {name: getattr(self, name) for name in names}
         stats = {name: of_chains(value) for name, value in stats.items() if eqx.is_array(value)}
         if "log_likelihood" in stats:  # a group of ArviZ, with a value for each observation
             stats["log_likelihood_estimate"] = stats.pop("log_likelihood")
         groups = {"posterior": posterior, "sample_stats": stats}
+        if getattr(self, "states", None) is not None:
+            posterior["states"] = of_chains(self.states)
+            logs = of_chains(self.log_densities)
+            logs = logs.reshape(*logs.shape[:2], -1)
+            seen = ~np.all(np.isnan(logs), axis=(0, 1))
+            groups["log_likelihood"] = {"observations": logs[..., seen]}
         # Version 1 changed the arguments of `from_dict`.
         is_new = int(arviz.__version__.split(".")[0]) >= 1
-        if is_new:
-            return arviz.from_dict(groups)
-        return arviz.from_dict(posterior=posterior, sample_stats=stats)
+        return arviz.from_dict(groups) if is_new else arviz.from_dict(**groups)
 
 
 def last(first: Any, second: Any, share: float) -> Any:

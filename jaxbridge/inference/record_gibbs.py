@@ -128,6 +128,10 @@ class RecordPosterior(AbstractPosterior):
         fault only if chains mix poorly, too.
     - `unit_params`: all parameters of each record, with leading axes (*chains, n, R); `None`
         without a `population`.
+    - `states`: the states of R records at the K times of their observations, shape
+        (*chains, n, R, K, d); NaN after the end of a record. `None` without `save_states`.
+    - `log_densities`: log density of each observation given the state and the parameters of a draw,
+        shape (*chains, n, R, K). NaN if nothing was observed.
     """
 
     params: PyTree
@@ -141,6 +145,8 @@ class RecordPosterior(AbstractPosterior):
     state: RecordState
     guide: GuideCheck | None = None
     unit_params: PyTree = None
+    states: Float[Array, "*chains n records K d"] | None = None
+    log_densities: Float[Array, "*chains n records K"] | None = None
 
     _combinations: ClassVar[dict[str, Combination]] = {
         "stuck": lambda first, second, share: first & second,
@@ -296,6 +302,7 @@ def sample_records(
     start: tuple[Float[Array, "*chains p"], Float[Array, "p p"]] | RecordState,
     size: tuple[int, int, int],
     finds_root: bool,
+    saves_states: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> RecordPosterior:
     """Sample parameters and paths.
@@ -303,11 +310,12 @@ def sample_records(
     - `start`: initial φ and the root S of its first moves, or the state of earlier draws.
     - `size`: (number of warm-up iterations, number of draws, iterations per draw).
     - `finds_root`: whether S is replaced by one with the width of the likelihood.
+    - `saves_states`: whether the states at observations are returned for each draw.
 
     **Raises:** `ValueError` if a chain never has paths with a positive weight.
     """
-    arguments = (key, population, records, start, size, finds_root, progress_meter)
-    posterior, never = _sample_records(*arguments)
+    options = (finds_root, saves_states, progress_meter)
+    posterior, never = _sample_records(key, population, records, start, size, *options)
     check_likelihood_was_found(never)
     return posterior
 
@@ -320,6 +328,7 @@ def _sample_records(
     start: tuple[Float[Array, "*chains p"], Float[Array, "p p"]] | RecordState,
     size: tuple[int, int, int],
     finds_root: bool,
+    saves_states: bool,
     progress_meter: diffrax.AbstractProgressMeter | None,
 ) -> tuple[RecordPosterior, Bool[Array, "*chains"]]:
     """Return the posterior, and whether each chain never had paths with a weight."""
@@ -364,6 +373,13 @@ def _sample_records(
             return jnp.full(theta.shape[:-1], jnp.nan, theta.dtype)
         return thinned_step_errors(function, guided, i - skipped, num_iterations)
 
+    def at_observations(sampler, state):
+        of_chain = lambda theta, units, paths: sampler.completion.at_observations(
+            population.of_units(theta, units), paths
+        )
+        several = jax.vmap(of_chain) if state.theta.ndim > 1 else of_chain
+        return several(state.theta, state.units, state.paths)
+
     def draw(sampler, guided, i):
         def iterate(guided, i):
             step = lambda key, guided: sampler.step(key, guided, i < num_warmup)
@@ -376,7 +392,8 @@ def _sample_records(
         weights = jnp.any(has_weight, axis=0), changes(sampler, i, guided)
         units = guided.state.units
         moved = jnp.any(theta_moved, axis=0), share[..., 0], jnp.any(units_moved, axis=0)
-        result = theta, units, *moved, *weights
+        seen = at_observations(sampler, guided.state) if saves_states else ()
+        result = theta, units, *moved, *weights, seen
         return guided, (result, sampler.completion.fine.check)
 
     bounds = stages(skipped if fresh else 0, skipped + num_iterations)
@@ -387,7 +404,7 @@ def _sample_records(
     guided, draws = metered_stages(begin, draw, init, bounds, num_iterations, progress_meter)
     draws, checks = draws
     fields, values = posterior_fields(population, *draws)
-    units, theta_moved, blocks_moved, units_moved, has_weight, change = values
+    units, theta_moved, blocks_moved, units_moved, has_weight, change, seen = values
     real = movable(records)
     ever = jnp.any(blocks_moved > 0, axis=-4)  # in any draw
     posterior = RecordPosterior(
@@ -401,8 +418,24 @@ def _sample_records(
         state=guided.state,
         guide=jax.tree.map(lambda leaf: leaf[-1], checks),
         unit_params=_params_of_units(population, fields["theta"], units),
+        **_saved(records, *seen),
     )
     return posterior, ~jnp.any(has_weight, axis=-1)
+
+
+def _saved(
+    records: Records,
+    states: Float[Array, "*chains n R ends d"] | None = None,
+    log_densities: Float[Array, "*chains n R ends"] | None = None,
+) -> dict[str, Array]:
+    """Return the states at observations and the log densities of these, or nothing."""
+    if states is None or log_densities is None:
+        return {}
+    seen = ~jnp.all(jnp.isnan(records.stacked.record.values), axis=-1)
+    log_densities = jnp.where(seen, log_densities, jnp.nan)
+    axis = log_densities.ndim - 1
+    by_observation = lambda values: records.by_observation(values, axis)
+    return {"states": by_observation(states), "log_densities": by_observation(log_densities)}
 
 
 def _initial_state(

@@ -36,11 +36,13 @@ from ..records import (
     guided,
     has_segments,
     knots_and_log_weight,
+    log_observation_densities,
     no_check,
     noise_and_log_weight,
     on_each_grid,
     pair_noise,
     path_and_log_weights,
+    path_of_knots,
     points_and_check,
     steps_are_too_long,
     sweep,
@@ -164,6 +166,18 @@ class RecordPaths(eqx.Module):
     ) -> tuple[Float[Array, "R points d"], Float[Array, " R"]]:
         """Return the paths of ξ, and log w of each record."""
         return _paths_of_noise(self.parameters, self.fine.records, at, noise)
+
+    def at_observations(
+        self, theta: Float[Array, "*R p"], paths: Float[Array, "R points d"]
+    ) -> tuple[Float[Array, "R ends d"], Float[Array, "R ends"]]:
+        """Return the states at the ends of segments, and log g of the observations there."""
+
+        def one(problem, model, knots):
+            states = path_of_knots(problem, model, knots)[:: problem.num_steps]
+            scalars = problem.scalars(model)
+            return states, log_observation_densities(problem, model, scalars, states)
+
+        return _each(self.parameters, self.fine.records, one, theta, paths)
 
     def change_by_coarse_steps(
         self, theta: Float[Array, "*R p"], noise: Float[Array, "R points d"]

@@ -39,10 +39,12 @@ from .guided_record import (
     change_by_coarse_steps as change_by_coarse_steps,
     guided as guided,
     knots_and_log_weight as knots_and_log_weight,
+    log_observation_densities as log_observation_densities,
     noise_and_log_weight as noise_and_log_weight,
     pair_noise as pair_noise,
     path_and_log_weight as path_and_log_weight,
     path_and_log_weights as path_and_log_weights,
+    path_of_knots as path_of_knots,
 )
 from .initial import Initial as Initial
 from .observations import (

@@ -33,7 +33,7 @@ from .guided_steps import (
 from .information_filter import information_filter
 from .initial import initial_law, log_ratio
 from .linearisation import LinearisedStep, linear_step
-from .observations import Row, Scalars
+from .observations import Row, Scalars, log_density_of
 from .problem import RecordProblem
 from .record import Steps
 from .segments import at_every_step, flat, following, split_first, split_last
@@ -290,6 +290,18 @@ def _corrections(
     at_observations = of_points(problem.rows, path[:: problem.num_steps])
     of_start = log_ratio(problem.initial, model, guide.initial, path[0])
     return at_observations.at[0].add(of_start)
+
+
+def log_observation_densities(
+    problem: RecordProblem, model: Diffusion, scalars: Scalars, states: Float[Array, "ends d"]
+) -> Float[Array, " ends"]:
+    """Return log g of the observations, given the states at the ends of segments."""
+    corrected = correction(problem, model)
+
+    def log_g(scalars, row, x):
+        return log_density_of(scalars, x) + corrected(row, x)
+
+    return over_points(log_g)(scalars, problem.rows, states)
 
 
 def change_by_coarse_steps(

@@ -12,6 +12,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -92,6 +93,19 @@ class Records(eqx.Module):
     def num_points(self, number: int) -> int:
         """Return the number of points of a path of this record that users see."""
         return self.num_segments[number] * self.stacked.record.num_equal_steps + 1
+
+    def by_observation(self, values: Float[Array, "..."], axis: int) -> Array:
+        """Return the entries at observations of values at the ends of segments.
+
+        `axis` is that of the ends; records are before it. Entries beyond the last observation of a
+        record are NaN.
+        """
+        which, number = self.stacked.record.which, max(self.num_times)
+        real = np.arange(number) < np.array(self.num_times)[:, None]
+        at = lambda leaf, which, real: jnp.where(
+            real.reshape(-1, *[1] * (leaf.ndim - axis)), jnp.take(leaf, which, axis - 1), jnp.nan
+        )
+        return jax.vmap(at, (axis - 1, 0, 0), axis - 1)(values, which, real)
 
     def at_observations(self, values: Float[Array, "R ends"]) -> Float[Array, " n"]:
         """Return the entries at observations, record after record.

@@ -36,7 +36,6 @@ from ..engine.averages import nan_to_neg_inf
 from ..engine.checks import is_traced, nondifferentiable
 from ..engine.compiled import compiled_sooner
 from ..engine.keys import key_for
-from ..engine.lanes import over_points
 from ..engine.linalg import any_cholesky, any_inverse, dot, semidefinite_cholesky, solve_lower
 from ..engine.progress import metered_scan
 from ..exact import acceptance_rate
@@ -50,9 +49,8 @@ from ..proposals import (
     best_at_worst,
     resolve,
 )
-from .guided_record import correction
 from .initial import bound
-from .observations import Scalars, log_density_of
+from .observations import Scalars
 from .path_blocks import tuned
 from .problem import RecordProblem
 from .record import Record
@@ -110,13 +108,8 @@ class StateSampler(eqx.Module):
     def log_target(self, x: Float[Array, "C ends d"]) -> Float[Array, "C ends"]:
         """Return log g(y_k|x_k). That of the first state includes the log density of its law."""
         problem = self.problem
-        corrected = correction(problem, problem.model)
-
-        def log_g(scalars, row, x):
-            return log_density_of(scalars, x) + corrected(row, x)
-
-        of_chain = over_points(log_g)
-        logs = jax.vmap(lambda x: of_chain(self.scalars, problem.rows, x))(x)
+        of_chain = lambda x: log_observation_densities(problem, problem.model, self.scalars, x)
+        logs = jax.vmap(of_chain)(x)
         law = bound(problem.initial, problem.model)
         if isinstance(law, Stationary):
             logs = logs.at[:, 0].add(jax.vmap(self.model.log_stationary)(x[:, 0]))
