@@ -64,7 +64,8 @@ CLAIMS = {
     ),
     "exits": lambda page: (
         abs(page["exits"].log_probability + 8.96) < 5 * page["exits"].standard_error
-        and abs(page["mean"] - 0.4829) < 5 * page["error"]
+        and abs(page["mean"] - 0.4829) < 5 * page["standard_error"]
+        and abs(page["first"].mean() - 0.7009) < 5 * page["error"]
         and abs(page["reached"].log_probability + 9.742) < 5 * page["reached"].standard_error
         and abs(page["high"].log_probability + 16.104) < 5 * page["high"].standard_error
         and np.allclose(
