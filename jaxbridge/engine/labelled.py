@@ -61,7 +61,7 @@ def dataset(result: Any) -> Any:
         name = field.removeprefix("_")  # a property of this name has what users see of the field
         value = getattr(result, name, None)
         if isinstance(value, bool | int | float):
-            numbers[name] = value if not isinstance(value, bool) else int(value)
+            numbers[name] = int(value) if isinstance(value, bool) else value
         elif annotation is PyTree:
             for path, leaf in named_leaves(value, name).items():
                 own = tuple(f"{path}_{i}" for i in range(leaf.ndim))
