@@ -43,9 +43,9 @@ def underdamped_langevin(
 
         dQ = P dt,    dP = (-∇U(Q) - γP) dt + √(2γτ) dW,    log ν = -(U(q) + ½|p|²) / τ + constant.
 
-    The model is hypoelliptic: noise enters P only. Bridges and transition densities do not apply;
-    use `simulate`, or records with an `observation`. `params` of the model is an
-    `UnderdampedLangevinParams`.
+    The model is hypoelliptic: noise enters P only. Functions for bridges and transition densities
+    do not apply; use `simulate`, or records with an `observation`, such as two exact states.
+    `params` of the model is an `UnderdampedLangevinParams`.
 
     **Arguments:**
 
