@@ -83,19 +83,19 @@ def test_batched_chain_is_the_kernel_stepped():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["crank_nicolson", "pseudo_marginal"])
-def test_a_chain_goes_on_from_a_path(method):
+def test_a_chain_goes_on_from_a_path():
     """As the kernel does from the same position; of several intervals each from its own."""
-    coupled = method != "crank_nicolson"
-    options = dict(num_steps=20, proposal=jb.Coupling(0.5) if coupled else jb.Guided())
+    options = dict(num_steps=20, proposal=jb.Coupling(0.5))
     key, n = jax.random.key(5), 12
     bend = jnp.sin(jnp.linspace(0.0, jnp.pi, 21))[:, None]
     start, end = (jnp.asarray(point) for point in ARGUMENTS[1:3])
     path = start + jnp.linspace(0.0, 1.0, 21)[:, None] * (end - start) + 0.1 * bend
-    run = functools.partial(jb.sample_exact_bridges, num_bridges=n, method=method, **options)
+    run = functools.partial(
+        jb.sample_exact_bridges, num_bridges=n, method="pseudo_marginal", **options
+    )
     chain = run(key, *ARGUMENTS, position=path)
 
-    kernel = getattr(jb, method)(*ARGUMENTS, **options)
+    kernel = jb.pseudo_marginal(*ARGUMENTS, **options)
     run_key, init_key = jax.random.split(key)
     step = lambda state, key: (lambda new: (new[0], new[0].position))(kernel.step(key, state))
     first = kernel.init(path, init_key)
@@ -111,7 +111,7 @@ def test_a_chain_goes_on_from_a_path(method):
     for i, moved in enumerate(np.cumsum(both.accepted, axis=1)):
         still = np.asarray(both.paths[i])[moved == 0]
         np.testing.assert_allclose(still, np.broadcast_to(given[i], still.shape), atol=1e-6)
-    assert not coupled or not both.accepted[:, 0].all()  # guided moves of this process all succeed
+    assert not both.accepted[:, 0].all()
 
 
 @pytest.mark.slow
@@ -223,18 +223,17 @@ def test_weights_of_given_bridges_have_their_law_in_the_chain():
 @slow
 def test_chain_without_a_bridge_is_nan_and_said():
     arguments = (paper_model(), [0.0, 0.0], [9.0, 0.0], 0.01)
-    for method in ("pseudo_marginal", "renewal"):
-        chain = jb.sample_exact_bridges(
-            jax.random.key(0), *arguments, num_bridges=20, method=method, max_proposals=9
-        )
-        assert not chain.met.any() and not chain.accepted.any()
-        assert np.isnan(chain.paths).all()
-        # In each step, and for the first path; renewal tries to hit besides.
-        assert chain.num_simulated == (21 * 9 if method == "pseudo_marginal" else 20 * 10 + 9)
-        kernel = getattr(jb, method)(*arguments, max_proposals=9)
-        state = kernel.init(None, jax.random.key(0))
-        state, info = kernel.step(jax.random.key(1), state)
-        assert np.isnan(state.position).all() and not info.is_accepted
+    chain = jb.sample_exact_bridges(
+        jax.random.key(0), *arguments, num_bridges=20, method="renewal", max_proposals=9
+    )
+    assert not chain.met.any() and not chain.accepted.any()
+    assert np.isnan(chain.paths).all()
+    # In each step, where renewal tries to hit besides, and for the first path.
+    assert chain.num_simulated == 20 * 10 + 9
+    kernel = jb.renewal(*arguments, max_proposals=9)
+    state = kernel.init(None, jax.random.key(0))
+    state, info = kernel.step(jax.random.key(1), state)
+    assert np.isnan(state.position).all() and not info.is_accepted
 
 
 @pytest.mark.slow
