@@ -150,7 +150,7 @@ def test_very_unlikely_bridges(precision):
     law = jb.fit_start_law(
         jax.random.key(0), model, start, end, 1.0, coupling=jb.Coupling(0.5), num_pilot=400
     )
-    options = dict(num_proposals=4_000, num_steps=50)
+    options = dict(num_proposals=10_000, num_steps=50)
     estimate = jb.transition_log_density(
         jax.random.key(1),
         model,
