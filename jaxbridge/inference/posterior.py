@@ -342,16 +342,17 @@ class AbstractPosterior(AbstractResult):
         stats = {name: of_chains(value) for name, value in stats.items() if eqx.is_array(value)}
         if "log_likelihood" in stats:  # a group of ArviZ, with a value for each observation
             stats["log_likelihood_estimate"] = stats.pop("log_likelihood")
-        groups = {"posterior": posterior, "sample_stats": stats}
-        if getattr(self, "states", None) is not None:
-            posterior["states"] = of_chains(self.states)
-            logs = of_chains(self.log_densities)
+        groups: dict[str, Any] = {"posterior": posterior, "sample_stats": stats}
+        states, logs = (getattr(self, name, None) for name in ("states", "log_densities"))
+        if states is not None:
+            posterior["states"], logs = of_chains(states), of_chains(logs)
             logs = logs.reshape(*logs.shape[:2], -1)
             seen = ~np.all(np.isnan(logs), axis=(0, 1))
             groups["log_likelihood"] = {"observations": logs[..., seen]}
         # Version 1 changed the arguments of `from_dict`.
         is_new = int(arviz.__version__.split(".")[0]) >= 1
-        return arviz.from_dict(groups) if is_new else arviz.from_dict(**groups)
+        from_dict: Any = arviz.from_dict
+        return from_dict(groups) if is_new else from_dict(**groups)
 
 
 def last(first: Any, second: Any, share: float) -> Any:

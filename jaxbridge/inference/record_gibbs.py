@@ -405,6 +405,7 @@ def _sample_records(
     draws, checks = draws
     fields, values = posterior_fields(population, *draws)
     units, theta_moved, blocks_moved, units_moved, has_weight, change, seen = values
+    states, log_densities = _by_observation(records, *seen) if saves_states else (None, None)
     real = movable(records)
     ever = jnp.any(blocks_moved > 0, axis=-4)  # in any draw
     posterior = RecordPosterior(
@@ -418,24 +419,22 @@ def _sample_records(
         state=guided.state,
         guide=jax.tree.map(lambda leaf: leaf[-1], checks),
         unit_params=_params_of_units(population, fields["theta"], units),
-        **_saved(records, *seen),
+        states=states,
+        log_densities=log_densities,
     )
     return posterior, ~jnp.any(has_weight, axis=-1)
 
 
-def _saved(
+def _by_observation(
     records: Records,
-    states: Float[Array, "*chains n R ends d"] | None = None,
-    log_densities: Float[Array, "*chains n R ends"] | None = None,
-) -> dict[str, Array]:
-    """Return the states at observations and the log densities of these, or nothing."""
-    if states is None or log_densities is None:
-        return {}
+    states: Float[Array, "*chains n R ends d"],
+    log_densities: Float[Array, "*chains n R ends"],
+) -> tuple[Float[Array, "*chains n R K d"], Float[Array, "*chains n R K"]]:
+    """Return the states at observations, and the log densities of these."""
     seen = ~jnp.all(jnp.isnan(records.stacked.record.values), axis=-1)
     log_densities = jnp.where(seen, log_densities, jnp.nan)
     axis = log_densities.ndim - 1
-    by_observation = lambda values: records.by_observation(values, axis)
-    return {"states": by_observation(states), "log_densities": by_observation(log_densities)}
+    return records.by_observation(states, axis), records.by_observation(log_densities, axis)
 
 
 def _initial_state(

@@ -49,6 +49,7 @@ from ..proposals import (
     best_at_worst,
     resolve,
 )
+from .guided_record import log_observation_densities
 from .initial import bound
 from .observations import Scalars
 from .path_blocks import tuned
