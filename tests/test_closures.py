@@ -76,11 +76,6 @@ def log_likelihood(model, observation, _, initial):
     return jb.log_likelihood(KEY, model, TIMES, POINTS, **options).value
 
 
-def smooth(model, observation, _, initial):
-    options = dict(observation=observation, initial=initial, num_draws=4, num_steps=2)
-    return jb.smooth(KEY, model, TIMES, POINTS, **options).paths[0, 0, 2, 0]
-
-
 def path_log_likelihood(model, *_):
     return jb.path_log_likelihood(model, TIMES, POINTS)
 
@@ -104,7 +99,6 @@ FUNCTIONS = {
     "path_log_likelihood": path_log_likelihood,
     "simulate": simulate,
     "log_likelihood": log_likelihood,
-    "smooth": smooth,
     "couplings": density(COUPLING),
     "gibbs": of_intervals(jb.gibbs, prior=PRIOR, num_iterations=2),
     "maximum_likelihood": of_intervals(jb.maximum_likelihood, num_iterations=2),
