@@ -106,7 +106,7 @@ FUNCTIONS = {
 
 NESTINGS = {
     "jit(jacfwd)": lambda f: jax.jit(jax.jacfwd(f)),
-    "jit(vmap(hessian))": lambda f: lambda x: jax.jit(jax.vmap(jax.hessian(f)))(x[None])[0],
+    "jit(vmap(grad))": lambda f: lambda x: jax.jit(jax.vmap(jax.grad(f)))(x[None])[0],
 }
 
 

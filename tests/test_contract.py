@@ -134,7 +134,6 @@ CHAINS = ("pseudo_marginal", "renewal", "crank_nicolson")
 # One of those that make their programs alike.
 MAPPED = (
     "sample_bridges", "sample_weighted_bridges", "transition_log_density", "expectation", "pmmh",
-    "log_likelihood",
 )  # fmt: skip
 
 

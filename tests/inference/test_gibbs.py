@@ -318,35 +318,6 @@ def test_what_is_cut_off_is_counted():
 
 
 @pytest.mark.slow
-def test_paths_that_stand_in_for_bridges_count_as_missing():
-    """On the short interval with the far jump pairs never meet. Its first path is hardly ever hit,
-    so no proposal is called for, and a chain that looked only at calls would tell nothing."""
-    times, data = np.array([0.0, 1.0, 2.0, 2.001]), np.array([[0.0], [0.2], [0.3], [6.0]])
-    options = dict(
-        OPTIONS,
-        num_iterations=4,
-        num_steps=4,
-        proposal=jb.Coupling(0.0),
-        max_proposals=50,
-        num_chains=2,
-    )
-    made = jb.gibbs(jax.random.key(0), ou_1d(), times, data, **options)
-    expected = np.broadcast_to([True, True, False], made.state.found.shape)
-    np.testing.assert_array_equal(made.state.found, expected)
-    assert (made.num_missing >= 1).all()
-    on = jb.gibbs(jax.random.key(1), ou_1d(), times, data, init=made.state, **options)
-    assert (on.num_missing >= 1).all() and not on.state.found[..., 2].any()
-    # Told that a proposal had found it, it counts what is called for only, often nothing.
-    told = made.state._replace(found=jnp.ones_like(made.state.found))
-    on = jb.gibbs(jax.random.key(1), ou_1d(), times, data, init=told, **options)
-    assert (on.num_missing == 0).any()
-    # By a proposal that is pulled to the end point it is replaced, and counts no more.
-    options |= dict(proposal=jb.ModifiedDiffusionBridge(), max_proposals=None, num_iterations=40)
-    on = jb.gibbs(jax.random.key(1), ou_1d(), times, data, init=made.state, **options)
-    assert on.state.found.all() and (on.num_missing[..., -1] == 0).all()
-
-
-@pytest.mark.slow
 def test_a_state_must_fit_the_observations(unchecked):
     options = dict(OPTIONS, num_iterations=2, proposal=jb.ModifiedDiffusionBridge())
     key = jax.random.key(0)
@@ -358,19 +329,6 @@ def test_a_state_must_fit_the_observations(unchecked):
     ]:
         with pytest.raises(ValueError, match=message):
             jb.gibbs(key, ou_1d(), times, data, num_steps=num_steps, init=state, **options)
-
-
-@pytest.mark.slow
-def test_a_run_that_replaces_a_sampler_would_depend_on_the_parameters(unchecked):
-    """Without a density there is no start law that serves for all; with one there is."""
-    drift, log_nu = lambda x, p: -p * x, lambda x, p: -p * x @ x
-    unknown = jb.Diffusion(drift, params=1.0, reversible=True)
-    known = jb.Diffusion(drift, None, log_nu, 1.0, reversible=True)
-    data, options = (TIMES[:4], DATA[:4]), dict(prior=PRIOR, num_iterations=2, num_steps=4)
-    key = jax.random.key(0)
-    for model, proposal in [(unknown, "auto"), (known, jb.Coupling(0.0))]:  # "auto" does without
-        made = jb.gibbs(key, model, *data, **options, proposal=proposal)
-        assert made.theta.shape == (2, 1) and made.num_missing.sum() == 0
 
 
 def test_a_prior_may_have_the_shape_of_the_parameters():

@@ -1,6 +1,5 @@
 """Maximum likelihood against the maximum of the closed form."""
 
-import cir
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +7,6 @@ import numpy as np
 import optax
 import pytest
 from inference_oracles import (
-    maximum_of,
     multivariate_ou,
     ou_1d,
     ou_data,
@@ -130,27 +128,3 @@ def test_a_network_is_trained_without_a_hessian():
     points = jnp.linspace(-0.4, 0.4, 9)[:, None]  # where the process is
     drift = jax.vmap(model.with_params(made.params).drift)(points)
     assert jnp.sqrt(jnp.mean((drift + 2 * points) ** 2)) < 0.3 < jnp.sqrt(jnp.mean(4 * points**2))
-
-
-@pytest.mark.slow
-def test_maximum_with_a_state_dependent_sigma_is_of_second_order():
-    """The drift of Cox, Ingersoll and Ross's process with known σ, in ten steps per interval. By
-    Euler steps the rate was off by up to 0.7 standard errors, which were twice too large."""
-    sigma, times = float(cir.TRUTH[2]), np.arange(61.0)
-    data = cir.simulate(cir.TRUTH, times, np.random.default_rng(1))
-    exact, sd = maximum_of(
-        lambda drift: cir.log_likelihood([*drift, sigma], times, data), cir.TRUTH[:2]
-    )
-    model = jb.Diffusion(
-        lambda x, p: p[0] * (p[1] - x), lambda x, p: sigma * jnp.sqrt(x),
-        domain=lambda x, p: x[0] > 0, params=(1.0, 0.5),
-    )  # fmt: skip
-    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
-        made = jb.maximum_likelihood(
-            jax.random.key(1), model, times, data, num_steps=10,
-            num_iterations=200, constraint=lambda p: (p[0] > 0) & (p[1] > 0),
-        )  # fmt: skip
-    off, noise = (np.asarray(made.theta) - exact) / sd, np.array(made.monte_carlo_errors) / sd
-    assert (np.abs(off) < 4 * noise + 0.05).all() and (noise < 0.1).all()
-    np.testing.assert_allclose(np.array(made.standard_errors) / sd, 1, atol=0.05)
-    assert made.trustworthy, made.why()

@@ -97,22 +97,6 @@ def test_posterior_is_that_of_the_grid():
     np.testing.assert_array_equal(draws["unit_params.level"].values.reshape(-1, NUM), of_units)
 
 
-@pytest.mark.slow
-def test_constraints_hold_for_means_and_for_records():
-    """Records that hardly move, for which a normal law of rates would allow negative ones."""
-    model = jb.Diffusion(lambda x, p: -p["rate"] * x, [0.3], params={"rate": 0.2})
-    times, values = 4 * [np.arange(4.0)], [np.full((4, 1), y) for y in (1.0, 1.6, 2.7, 4.5)]
-    options = OPTIONS | dict(prior=jb.NormalPrior(0.5, 1.0), constraint=lambda p: p["rate"] > 0)
-    run = lambda **how: jb.gibbs(
-        jax.random.key(0), model, times, values, **options, num_iterations=50, **how,
-        population=jb.NormalPopulation(lambda params: params["rate"]),
-    )  # fmt: skip
-    made = run(num_warmup=50, num_chains=4)
-    assert np.all(made.params["rate"] > 0) and np.all(made.unit_params["rate"] > 0)
-    more = run(**made.continuation)
-    np.testing.assert_array_equal(more.state.num_done, made.state.num_done + 50)
-
-
 def test_entries_of_arrays_may_vary():
     params = {"B": jnp.eye(2), "rates": jnp.ones(3), "count": 3}
     parameters = Parameters(jb.Diffusion(lambda x, p: -x, params=params), None)

@@ -85,30 +85,6 @@ def test_refusals():
 
 
 @pytest.mark.slow
-def test_first_states_have_the_stationary_law():
-    """Of two wells of different depth, seen at once: the share of simulated records in each."""
-    depth = 0.4
-    drift = lambda x, p: x - x**3 + depth
-    log_nu = lambda x, p: (2 / 0.49) * jnp.sum(x**2 / 2 - x**4 / 4 + depth * x)
-    model = jb.Diffusion(drift, lambda x, p: 0.7 * jnp.ones(1), log_nu, params={"free": 0.0})
-    seen = []
-
-    def sampler(key, model, times, observations, **given):
-        seen.append(float(observations[0, 0]))
-        return Drawn(np.zeros((10, 1)), np.array([10.0]), True)
-
-    jb.simulation_based_calibration(
-        KEY, model, [0.0, 0.1], np.zeros(2), sampler, prior=jb.NormalPrior(0.0, 1.0),
-        observation=jb.LinearGaussian(covariance=0.01), num_simulations=120, num_steps=1,
-    )  # fmt: skip
-    nodes = np.linspace(-3, 3, 2001)
-    density = np.exp((2 / 0.49) * (nodes**2 / 2 - nodes**4 / 4 + depth * nodes))
-    mean = np.sum(nodes * density) / density.sum()
-    sd = np.sqrt(np.sum((nodes - mean) ** 2 * density) / density.sum())
-    assert abs(np.mean(seen) - mean) < 4.5 * sd / np.sqrt(120)
-
-
-@pytest.mark.slow
 def test_records_that_left_the_state_space_are_a_fault():
     """A square root process without room: its first steps lead below zero now and then."""
     model = jb.Diffusion(

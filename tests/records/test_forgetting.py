@@ -114,27 +114,3 @@ def bootstrap_filter(key, drift, values, noise, num_particles=5_000, num_steps=2
     start_key, key = jax.random.split(key)
     x = jax.random.normal(start_key, (2, num_particles)) + jnp.array([[0.0], [-0.8]])
     return jnp.sum(jax.lax.scan(one, x, (jax.random.split(key, len(values)), values))[1])
-
-
-@pytest.mark.optimised
-@pytest.mark.slow
-def test_spikes_that_are_hidden_in_noise():
-    """A guide that believes all that is seen later misses the likely paths, and its log p̂ is too
-    small by three."""
-    model, times, values, noise = neuron()
-    drift = jax.vmap(model.drift, -1, -1)
-    bootstrap = jax.jit(lambda key: bootstrap_filter(key, drift, values[:, 0], noise))
-    each = np.array([bootstrap(key) for key in jax.random.split(jax.random.key(1), 8)])
-    exact, error = each.mean(), each.std() / np.sqrt(len(each))
-    assert error < 0.15
-    seen = jb.LinearGaussian([[1.0, 0.0]], noise**2)
-    law = jb.GaussianLaw([0.0, -0.8], np.eye(2))
-    given = {"observation": seen, "initial": law, "num_steps": 20}
-    made = jb.log_likelihood(jax.random.key(2), model, times, values, num_particles=500, **given)
-    assert made.forgetting > 0
-    allowed = 5 * np.hypot(made.standard_error, error)
-    assert abs(made.value - exact) < allowed < 1.5
-    problem = as_record_problems(model, times, values, seen, law, num_steps=20).problem(0)
-    guide = linearised(problem, model).guide
-    sure = run_filters(jax.random.key(2), problem, model, guide, (8, 400))
-    assert logsumexp(sure.log_estimate) - np.log(8) < exact - allowed

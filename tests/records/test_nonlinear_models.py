@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from grid_filter import grid_filter
-from scipy.optimize import minimize_scalar
 from scipy.special import gammaln
 
 import jaxbridge as jb
@@ -190,41 +189,6 @@ def test_what_no_particle_explains_is_said():
     assert made.value == -jnp.inf and made.unexplained == 0
     with pytest.raises(Exception, match="No particle explains"):
         jax.block_until_ready(jb.log_likelihood(*arguments, **options, throw=True).value)
-
-
-@pytest.mark.slow
-def test_the_maximum_is_that_of_the_grid():
-    """Of a model whose paths differ in weight, and whose steps are of first order."""
-    case, values, _ = recorded("bent")
-    drift = lambda x, p: jnp.sin(2 * x) - p * x
-    model = jb.Diffusion(drift, lambda x, p: 0.4 * jnp.sqrt(1 + x**2), params=1.0)
-    nodes = np.linspace(-4, 4, 401)
-    initial = np.exp(-((nodes - case.start) ** 2) / 0.5)
-    logs = case.log_density(values, nodes)
-
-    def minus(point):
-        drift = lambda x: np.sin(2 * x) - point * x
-        made = grid_filter(drift, case.variance, nodes, initial, np.diff(case.times), logs)
-        return -made.log_likelihood
-
-    exact = minimize_scalar(minus, bounds=(0.5, 5), options={"xatol": 1e-3}).x
-    with jax.numpy_dtype_promotion("standard"):  # optax raises a float to a whole number
-        estimate = jb.maximum_likelihood(
-            KEY,
-            model,
-            case.times,
-            values,
-            **options(case),
-            num_steps=10,
-            num_bridges=60,
-            constraint=lambda p: p > 0,
-        )
-    error = np.hypot(estimate.monte_carlo_errors, estimate.step_uncertainty)
-    assert estimate.newton and np.all(estimate.r_hat < 1.1)
-    np.testing.assert_array_less(error, 0.22 * np.asarray(estimate.standard_errors))
-    told = np.asarray(estimate.theta - estimate.step_error)
-    grid = 0.02 * np.asarray(estimate.standard_errors)
-    np.testing.assert_array_less(np.abs(told - exact), 4.5 * error + grid)
 
 
 # Brownian motion of which nothing is seen, lost where a step leads below zero.

@@ -52,22 +52,6 @@ RECORDS = [(first, None) for first in (-1.0, 1.0)] + [(-1.0, -0.8, None, 0.3)]
 
 
 @pytest.mark.slow
-def test_both_wells_count():
-    """A beginning in either well: with the normal law at one mode in the place of ν the first were
-    told to be too small by 1.5 and 3.6."""
-    noise = 0.5
-    for values in RECORDS:
-        exact = on_the_grid(values, noise).log_likelihood
-        made = jb.log_likelihood(
-            KEY, wells(), *record(values), num_steps=10,
-            observation=jb.LinearGaussian(covariance=noise**2), num_particles=400,
-        )  # fmt: skip
-        allowed = 5 * made.standard_error + abs(made.step_error) + 2 * made.step_uncertainty
-        assert abs(made.value - exact) < allowed < 0.3
-        assert made.effective_sample_size[0] > 200
-
-
-@pytest.mark.slow
 def test_tails_that_are_not_normal():
     """Of the hyperbolic law, near its mode and far out, where the first coordinate is seen once."""
     dim = 2
