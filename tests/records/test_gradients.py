@@ -31,7 +31,7 @@ def test_derivatives_are_differences(x64):
     values = np.random.default_rng(2).normal(scale=0.5, size=(4, 2))
     values[2, 0] = np.nan
     times = np.array([0.0, 0.3, 0.5, 0.9])
-    model = jb.Diffusion(drift, diffusion, params=PARAMS)
+    model = jb.Diffusion(drift, sigma, params=PARAMS)
     initial = lambda p: jb.GaussianLaw(
         jnp.stack([p["mean"], p["mean"] ** 2]), p["scale"] ** 2 * jnp.eye(2)
     )
