@@ -105,7 +105,7 @@ class RecordPosterior(AbstractPosterior):
     """Posterior draws of the unknown parameters, from `gibbs` for a record.
 
     The records have an `observation`. Exact observations count as records, too, if σ is unknown or
-    with a `population`.
+    depends on the state, or with a `population`.
 
     Arrays have a leading axis of chains if there are several.
 

@@ -283,14 +283,6 @@ def test_no_derivative_is_taken_of_a_choice_with_couplings(unchecked):
             )(jnp.full((3, 2), 0.3))
 
 
-PULLED = [
-    jb.ModifiedDiffusionBridge(jb.ItoTaylorDensity()),
-    jb.Guided("end", jb.ItoTaylorDensity()),
-    jb.Guided("path", jb.ItoTaylorDensity()),
-]
-NUM = 6
-
-
 @pytest.mark.slow
 def test_what_a_proposal_makes_of_another_ones_interval_does_not_spoil_derivatives():
     """Where the explicit path of a guide overflows its derivative is not a number, times zero as

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.scipy.special import logsumexp
 
 import jaxbridge as jb
 from jaxbridge.records import Filtered, as_record_problems, linearised, run_filters
@@ -78,39 +77,3 @@ def test_nothing_is_forgotten_where_all_weights_are_equal():
     given = {"observation": SEEN, "initial": LAW, "num_steps": 4}
     made = jb.log_likelihood(jax.random.key(0), MODEL, TIMES, VALUES, **given)
     assert made.forgetting == 0 and made.standard_error < 1e-5
-
-
-def neuron():
-    """FitzHugh and Nagumo's equations, whose spikes are hidden in noise."""
-    noise, times = 0.316, np.arange(100) * 0.2
-    drift = lambda x, p: jnp.stack([(x[0] - x[0] ** 3 - x[1]) / 0.1, 1.5 * x[0] - x[1] + 0.8])
-    model = jb.Diffusion(drift, lambda x, p: jnp.array([[0.0], [0.3]], x.dtype))
-    start = jnp.array([0.3, -1.0])
-    hidden = jb.simulate(jax.random.key(5), model, start, jnp.asarray(times), num_steps=200)[0]
-    values = np.asarray(hidden[:, :1]) + noise * np.random.default_rng(0).normal(size=(100, 1))
-    return model, times, values, noise
-
-
-def bootstrap_filter(key, drift, values, noise, num_particles=5_000, num_steps=20):
-    """log p̂ of particles that know nothing of what is coming, by Euler's steps."""
-    dt = 0.2 / num_steps
-
-    def step(x, key):
-        dW = np.sqrt(dt) * jax.random.normal(key, (num_particles,))
-        return x + drift(x) * dt + jnp.stack([jnp.zeros_like(dW), 0.3 * dW]), None
-
-    def seen(x, y, uniform):
-        log_weight = -(((y - x[0]) / noise) ** 2) / 2 - np.log(noise * np.sqrt(2 * np.pi))
-        bounds = jnp.cumsum(jax.nn.softmax(log_weight))
-        positions = (jnp.arange(num_particles, dtype=uniform.dtype) + uniform) / num_particles
-        ancestors = jnp.minimum(jnp.searchsorted(bounds, positions), num_particles - 1)
-        return x[:, ancestors], logsumexp(log_weight) - np.log(num_particles)
-
-    def one(x, inputs):
-        key, y = inputs
-        x, log_mean = seen(x, y, jax.random.uniform(key))
-        return jax.lax.scan(step, x, jax.random.split(key, num_steps))[0], log_mean
-
-    start_key, key = jax.random.split(key)
-    x = jax.random.normal(start_key, (2, num_particles)) + jnp.array([[0.0], [-0.8]])
-    return jnp.sum(jax.lax.scan(one, x, (jax.random.split(key, len(values)), values))[1])

@@ -79,9 +79,3 @@ def test_part_of_a_process_that_turns():
     assert_agrees(made, *exact)
     # The steps of bridges of linear models are exact, too.
     assert np.all(made.step_error() == 0)
-
-
-DRIFT = lambda x: 2 * x * (1 - x**2)
-WELLS = jb.Diffusion(
-    lambda x, p: DRIFT(x), [0.8], lambda x, p: jnp.sum((x**2 - x**4 / 2) / 0.32)
-)  # not normalised, without a sampler
