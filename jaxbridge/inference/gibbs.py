@@ -104,7 +104,7 @@ class GibbsPosterior(AbstractPosterior):
     - `theta`: the unknown parameters as vectors, shape (*chains, n, p).
     - `names`: names of the entries of θ, for instance "alpha" or "B[0,1]". The keys of a dictionary
         are in alphabetical order.
-    - `parameters_moved`: whether θ moved, shape (*chains, n).
+    - `parameters_moved`: fraction of the moves of θ that were accepted, shape (*chains, n).
     - `bridges_moved`: fraction of the bridges that were replaced, shape (*chains, n).
     - `num_simulated`: number of simulated or reweighted paths, shape (*chains, n).
     - `num_missing`: number of bridges that were needed but not found within `max_proposals`, shape
@@ -126,7 +126,7 @@ class GibbsPosterior(AbstractPosterior):
     params: PyTree
     theta: Float[Array, "*chains n p"]
     names: tuple[str, ...] = eqx.field(static=True)
-    parameters_moved: Bool[Array, "*chains n"]
+    parameters_moved: Float[Array, "*chains n"]
     bridges_moved: Float[Array, "*chains n"]
     num_simulated: Int[Array, "*chains n"]
     num_missing: Int[Array, "*chains n"]
@@ -424,7 +424,7 @@ def _run(
     # `bridges_moved` counts the moves of all iterations of a draw.
     num_bridges = thin * sampler.augmentation.num_intervals
     info = info._replace(
-        parameters_moved=info.parameters_moved > 0,
+        parameters_moved=info.parameters_moved.astype(state.theta.dtype) / thin,
         bridges_moved=info.bridges_moved.astype(state.theta.dtype) / num_bridges,
     )
     return GibbsPosterior(

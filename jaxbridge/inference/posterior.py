@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int, Key, PyTree
+from jaxtyping import Array, Bool, Float, Int, Key, Num, PyTree
 
 from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled_sooner
@@ -373,8 +373,11 @@ def average(first: Any, second: Any, share: float) -> Any:
     return None if first is None else (1 - share) * first + share * second
 
 
-def refused_moves(accepted: Bool[Array, "*chains n"]) -> Fault:
-    """Return the fault of a random walk whose acceptance rate is below 5 %."""
+def refused_moves(accepted: Num[Array, "*chains n"]) -> Fault:
+    """Return the fault of a random walk whose acceptance rate is below 5 %.
+
+    `accepted` are fractions of accepted moves, or whether a single move was accepted.
+    """
     return Fault(jnp.any(jnp.mean(accepted, axis=-1) < _LEAST_ACCEPTED), _REFUSED)
 
 

@@ -6,8 +6,8 @@ the state, or if parameters vary between records.
 The state is (θ, path). Two moves alternate:
 
 - The path moves given θ.
-- The path is converted to its noise ξ (`record_paths`), and θ moves given ξ by a normal random
-  walk. The target is π(θ) w(θ, ξ). The path changes with θ.
+- The path is converted to its noise ξ (`record_paths`), and θ moves a few times given ξ by a normal
+  random walk. The target is π(θ) w(θ, ξ). The path changes with θ.
 
 Hence any parameters may be unknown: those of the drift, of σ, of the noise and of the initial law.
 This holds for every step size.
@@ -65,6 +65,10 @@ from .record_paths import (
 )
 from .warm_up import stages
 
+# Number of moves of θ for each sweep over the paths. A move costs a tenth to a half of
+# a sweep, and most chains mix poorly by their moves of θ.
+_NUM_MOVES = 4
+
 
 class RecordState(NamedTuple):
     """State of a chain of `gibbs` for a record. Several chains have a leading axis.
@@ -115,7 +119,8 @@ class RecordPosterior(AbstractPosterior):
         logs of its standard deviations follow, with names such as "log_sd(rate)".
     - `names`: names of the entries of θ, for instance "alpha" or "B[0,1]". The keys of a dictionary
         are in alphabetical order.
-    - `parameters_moved`: whether θ moved given the noise of the paths, shape (*chains, n).
+    - `parameters_moved`: fraction of the moves of θ, given the noise of the paths, that were
+        accepted, shape (*chains, n).
     - `blocks_moved`: fraction of the blocks of the path that moved, shape (*chains, n).
     - `stuck`: whether some block, or the parameters of some record, never moved, shape (*chains).
         Then the draws do not represent the posterior, and `standard_error` is infinite.
@@ -137,7 +142,7 @@ class RecordPosterior(AbstractPosterior):
     params: PyTree
     theta: Float[Array, "*chains n p"]
     names: tuple[str, ...] = eqx.field(static=True)
-    parameters_moved: Bool[Array, "*chains n"]
+    parameters_moved: Float[Array, "*chains n"]
     blocks_moved: Float[Array, "*chains n"]
     stuck: Bool[Array, "*chains"]
     log_step_error: Float[Array, "*chains n"]
@@ -192,19 +197,47 @@ class RecordSampler(eqx.Module):
     ) -> tuple[GuidedState, tuple[Array, ...]]:
         """Move the paths given θ, then θ given ξ; `learning` adapts the scales of both moves.
 
-        Return the state, whether θ moved, whether the paths have a weight, whether each block
-        moved, and whether the parameters of each record moved.
+        Return the state, the fraction of accepted moves of θ, whether the paths have a weight,
+        whether each block moved, and whether the parameters of each record moved.
         """
-        path_key, noise_key, walk_key, accept_key = jax.random.split(key, 4)
+        path_key, noise_key, walk_key = jax.random.split(key, 3)
         state, guides, *_ = guided
-        population = self.population
-        phi, units, log_scales = state.theta, state.units, state.log_scales
-        here = GuidedTheta(population.of_units(phi, units), guides)
+        here = GuidedTheta(self.population.of_units(state.theta, state.units), guides)
         # This move leaves the law of the path given θ invariant, whatever the guide.
-        paths, blocks_moved = self.completion.renewed(path_key, here, state.paths, log_scales)
+        paths, blocks_moved = self.completion.renewed(path_key, here, state.paths, state.log_scales)
         noise, log_weights = self.completion.noise(noise_key, here, paths)
-        old = _Weighted(here, paths, log_weights)
         number = state.num_done + 1
+        scales = tuned(state.log_scales, blocks_moved, number.astype(log_weights.dtype))
+        scales = jnp.where(learning, scales, state.log_scales)
+
+        def move(carry, i):
+            at = noise, learning, _NUM_MOVES * (number - 1) + i
+            return self._moved_parameters(jax.random.fold_in(walk_key, i), carry, *at)
+
+        init = state._replace(log_scales=scales), _Weighted(here, paths, log_weights)
+        (state, held), moved = lax.scan(move, init, 1 + jnp.arange(_NUM_MOVES))
+        accepted, units_moved = moved
+        share = jnp.mean(accepted.astype(log_weights.dtype), axis=0)
+        has_weight = nan_to_neg_inf(jnp.sum(held.log_weights)) > -jnp.inf
+        state = state._replace(paths=held.paths, num_done=number)
+        moved = share, has_weight, blocks_moved, jnp.any(units_moved, axis=0)
+        return GuidedState(state, held.at.guides, noise, held.log_weights), moved
+
+    def _moved_parameters(
+        self,
+        key: Key[Array, ""],
+        carry: tuple[RecordState, _Weighted],
+        noise: Float[Array, "R points d"],
+        learning: Bool[Array, ""],
+        number: Int[Array, ""],
+    ) -> tuple[tuple[RecordState, _Weighted], tuple[Bool[Array, ""], Bool[Array, " R"]]]:
+        """Move φ given ξ, then the parameters of each record; `number` counts these moves from one.
+
+        Return the state, and whether φ and z of each record moved.
+        """
+        walk_key, accept_key = jax.random.split(key)
+        state, old = carry
+        population, phi, units = self.population, state.theta, state.units
         step = jax.random.normal(walk_key, phi.shape, phi.dtype)
         moves = population.moves(number)
         step = jnp.where(moves, step, 0)
@@ -215,7 +248,7 @@ class RecordSampler(eqx.Module):
         new = self._weighted(population.of_units(proposed, units), noise)
         # Given ξ the target is π(θ) w(θ, ξ): the density of ξ cancels.
         rate = acceptance_rate(
-            nan_to_neg_inf(jnp.sum(log_weights)) + population.log_density(phi),
+            nan_to_neg_inf(jnp.sum(old.log_weights)) + population.log_density(phi),
             jnp.where(inside, nan_to_neg_inf(jnp.sum(new.log_weights)), -jnp.inf)
             + population.log_density(proposed),
         )
@@ -223,22 +256,14 @@ class RecordSampler(eqx.Module):
         phi, held = jax.tree.map(
             lambda new, old: jnp.where(accepted, new, old), (proposed, new), (phi, old)
         )
-        scales = tuned(log_scales, blocks_moved, number.astype(rate.dtype))
-        # Entries that did not move keep their scales.
         root = adapt_covariance(state.root, step, rate, number, learning)
-        new_state = state._replace(
-            root=jnp.where(moves[:, None], root, state.root),
-            log_scales=jnp.where(learning, scales, log_scales),
-            num_done=number,
-        )
-        units_moved = jnp.ones(log_weights.shape, bool)
+        # Entries that did not move keep their scales.
+        state = state._replace(theta=phi, root=jnp.where(moves[:, None], root, state.root))
+        units_moved = jnp.ones(old.log_weights.shape, bool)
         if population.varies:
-            given = phi, held, noise, new_state, learning
-            phi, held, new_state, units_moved = self._moved_units(key_for("units", key), *given)
-        has_weight = nan_to_neg_inf(jnp.sum(held.log_weights)) > -jnp.inf
-        new_state = new_state._replace(theta=phi, paths=held.paths)
-        moved = accepted, has_weight, blocks_moved, units_moved
-        return GuidedState(new_state, held.at.guides, noise, held.log_weights), moved
+            given = held, noise, state, learning, number
+            held, state, units_moved = self._moved_units(key_for("units", key), *given)
+        return (state, held), (accepted, units_moved)
 
     def _weighted(self, theta: Float[Array, "*R p"], noise: Float[Array, "R points d"]):
         """Return the paths of this noise at θ, with their weights."""
@@ -248,18 +273,18 @@ class RecordSampler(eqx.Module):
     def _moved_units(
         self,
         key: Key[Array, ""],
-        phi: Float[Array, " p"],
-        old: "_Weighted",
+        old: _Weighted,
         noise: Float[Array, "R points d"],
         state: RecordState,
         learning: Bool[Array, ""],
-    ) -> tuple[Float[Array, " p"], "_Weighted", RecordState, Bool[Array, " R"]]:
+        number: Int[Array, ""],
+    ) -> tuple[_Weighted, RecordState, Bool[Array, " R"]]:
         """Move z of each record given ξ and φ, then φ given the parameters of the records.
 
         Also return whether z of each record moved.
         """
         walk_key, accept_key, population_key = jax.random.split(key, 3)
-        population, z = self.population, state.units
+        population, phi, z = self.population, state.theta, state.units
         step = jax.random.normal(walk_key, z.shape, z.dtype)
         proposed = z + jnp.einsum("rij,rj->ri", state.unit_roots, step)
         inside = population.allowed(phi, proposed)
@@ -276,12 +301,10 @@ class RecordSampler(eqx.Module):
             return jnp.where(accepted.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
         z, held = jax.tree.map(choose, (proposed, new), (z, old))
-        adapt = lambda root, step, rate: adapt_covariance(
-            root, step, rate, state.num_done, learning
-        )
+        adapt = lambda root, step, rate: adapt_covariance(root, step, rate, number, learning)
         roots = jax.vmap(adapt)(state.unit_roots, step, rate)
         phi, z = population.given_units(population_key, phi, z)
-        return phi, held, state._replace(units=z, unit_roots=roots), accepted
+        return held, state._replace(theta=phi, units=z, unit_roots=roots), accepted
 
     def change_by_coarse_steps(self, guided: GuidedState) -> Float[Array, ""]:
         """Return the relative change of the likelihood by steps of twice the size.
@@ -391,7 +414,7 @@ def _sample_records(
         share = jnp.mean(blocks_moved.astype(theta.dtype), axis=0)
         weights = jnp.any(has_weight, axis=0), changes(sampler, i, guided)
         units = guided.state.units
-        moved = jnp.any(theta_moved, axis=0), share[..., 0], jnp.any(units_moved, axis=0)
+        moved = jnp.mean(theta_moved, axis=0), share[..., 0], jnp.any(units_moved, axis=0)
         seen = at_observations(sampler, guided.state) if saves_states else ()
         result = theta, units, *moved, *weights, seen
         return guided, (result, sampler.completion.fine.check)

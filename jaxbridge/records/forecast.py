@@ -27,6 +27,7 @@ from ..engine.diagnostics import p_uniform
 from ..engine.entry import public_entry
 from ..engine.lanes import over_lanes
 from ..engine.resampling import systematic
+from ..engine.times import Times
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
 from ..models.jumps import Jumps, JumpsLike
@@ -208,51 +209,27 @@ def forecast(
     **Source:** bootstrap filter of Gordon, Salmond & Smith (1993), with a conditioned last step.
     """
     check_key(key)
-    particles = None
-    if after is not None:
-        check_instance("after", after, Forecast, "a result of `forecast`")
-        if initial is not None or num_particles is not None:
-            raise ValueError(
-                "with `after` the start is its last particles: omit `initial` and `num_particles`."
-            )
-        last = len(after.log_scores) - 1
-        particles = after.filtered[:, last]
-        initial, num_particles = jnp.nanmean(particles, axis=0), len(particles)
-        if initial_time is None:
-            if is_traced(after.times):
-                raise ValueError(
-                    "inside `jit` and `vmap` the times of `after` are unknown: pass the time of "
-                    "its last reading as `initial_time`."
-                )
-            initial_time = float(after.times[last])
-        if isinstance(jumps, Jumps):
-            jumps = jumps.since(float(np.asarray(initial_time)))
-    num_particles = 1000 if num_particles is None else num_particles
-    num_particles = check_count("num_particles", num_particles, 2)
     if are_several(times, observations):
         raise ValueError(
             "`forecast` takes one record, with `times` of shape (n,) and `observations` of shape "
             "(n, m): call it for each of several records."
         )
+    particles = None
+    if after is not None:
+        if initial is not None or num_particles is not None:
+            raise ValueError(
+                "with `after` the start is its last particles: omit `initial` and `num_particles`."
+            )
+        particles, initial_time = _last_particles(after, initial_time)
+        initial, num_particles = jnp.nanmean(particles, axis=0), len(particles)
+        if isinstance(jumps, Jumps):
+            jumps = jumps.since(float(np.asarray(initial_time)))
+    num_particles = 1000 if num_particles is None else num_particles
+    num_particles = check_count("num_particles", num_particles, 2)
+    checked_times, rows = as_times_and_rows(times, observations)
     at = () if at is None else at
     later = as_floating("at", at)
-    if later.ndim != 1:
-        raise ValueError(f"`at` must have shape (F,); got shape {later.shape}.")
-    if later.size and not is_traced(times, at):
-        all_times = np.append(np.asarray(times, float)[-1:], np.asarray(at, float))
-        if not np.all(np.diff(all_times) > 0):
-            raise ValueError(
-                f"`at` must increase, and begin after the last of `times`, {all_times[0]:g}; got "
-                f"{all_times[1:]}."
-            )
-    checked_times, rows = as_times_and_rows(times, observations)
-    if after is not None and not is_traced(times):
-        begin, end = float(checked_times.values[0]), float(np.asarray(initial_time))
-        if begin <= end:
-            raise ValueError(
-                f"`times` must begin after the last reading of `after`, at {end:g}; they begin at "
-                f"{begin:g}."
-            )
+    _check_order(checked_times, at, later, None if after is None else initial_time)
     num_times = len(rows) + len(later)
     if later.size:
         times, observations = _with_later(times, rows, at, len(later))
@@ -287,6 +264,51 @@ def forecast(
         *(score[which[:num_read]] for score in scores),
     )
     return throw_where_untrustworthy(made, "states", model) if throw else made
+
+
+def _last_particles(
+    after: Forecast, initial_time: Numbers | None
+) -> tuple[Float[Array, "P d"], Numbers]:
+    """Return the particles at the last reading of `after`, and the time of this reading.
+
+    **Raises:** `TypeError` for another object; `ValueError` if the time is unknown.
+    """
+    check_instance("after", after, Forecast, "a result of `forecast`")
+    last = len(after.log_scores) - 1
+    particles = after.filtered[:, last]
+    if initial_time is not None:
+        return particles, initial_time
+    if is_traced(after.times):
+        raise ValueError(
+            "inside `jit` and `vmap` the times of `after` are unknown: pass the time of its last "
+            "reading as `initial_time`."
+        )
+    return particles, float(after.times[last])
+
+
+def _check_order(
+    times: Times, at: Numbers, later: Float[Array, "..."], begin: Numbers | None
+) -> None:
+    """Raise `ValueError` unless `times` follow `begin` and `at` follows `times`.
+
+    Traced times are not checked.
+    """
+    if later.ndim != 1:
+        raise ValueError(f"`at` must have shape (F,); got shape {later.shape}.")
+    if begin is not None and not is_traced(times, begin):
+        first, last = float(times.values[0]), float(np.asarray(begin))
+        if first <= last:
+            raise ValueError(
+                f"`times` must begin after the last reading of `after`, at {last:g}; they begin at "
+                f"{first:g}."
+            )
+    if later.size and not is_traced(times, at):
+        all_times = np.append(np.asarray(times.values)[-1:], np.asarray(at, float))
+        if not np.all(np.diff(all_times) > 0):
+            raise ValueError(
+                f"`at` must increase, and begin after the last of `times`, {all_times[0]:g}; got "
+                f"{all_times[1:]}."
+            )
 
 
 class _Scores(NamedTuple):
