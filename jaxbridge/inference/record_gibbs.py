@@ -67,7 +67,7 @@ from .warm_up import stages
 
 # Number of moves of θ for each sweep over the paths. A move costs a tenth to a half of
 # a sweep, and most chains mix poorly by their moves of θ.
-_NUM_MOVES = 4
+_NUM_MOVES = 8
 
 
 class RecordState(NamedTuple):

@@ -79,7 +79,7 @@ def test_posterior_is_that_of_the_grid():
     (mean, sd), levels = exact_posterior(*data)
     made = jb.gibbs(
         jax.random.key(0), MODEL, *data, **OPTIONS, population=jb.NormalPopulation(LEVEL),
-        num_iterations=1000, num_chains=4, thin=3,
+        num_iterations=1000, num_chains=4,
     )  # fmt: skip
     assert made.names == ("level", "log_rate", "log_sd(level)") and made.trustworthy
     error, theta = np.asarray(made.standard_error), np.asarray(made.theta).reshape(-1, 3)

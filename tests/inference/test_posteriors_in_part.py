@@ -88,6 +88,6 @@ def assert_posterior(made):
 @pytest.mark.optimised
 def test_gibbs_has_the_posterior():
     made = jb.gibbs(
-        KEY, MODEL, TIMES, record(), prior=PRIOR, num_iterations=1500, num_chains=4, **OPTIONS
+        KEY, MODEL, TIMES, record(), prior=PRIOR, num_iterations=400, num_chains=4, **OPTIONS
     )
     assert_posterior(made)

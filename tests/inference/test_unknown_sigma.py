@@ -53,7 +53,7 @@ def test_posterior_of_two_records_is_exact_and_of_second_order():
         jax.random.key(0), square_root(), [np.arange(len(x)) for x in records],
         [x[:, None] for x in records],
         prior=jb.NormalPrior({"rate": 0.0, "sigma": -0.5}, {"rate": 1.0, "sigma": 1.0}),
-        num_steps=5, num_iterations=1200, num_chains=2,
+        num_steps=5, num_iterations=500, num_chains=2,
     )  # fmt: skip
     theta = np.asarray(made.theta, float).reshape(-1, 2)
     error = np.asarray(made.standard_error) / sd

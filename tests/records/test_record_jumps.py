@@ -193,7 +193,7 @@ def test_a_posterior_of_doses():
         initial=[0.0],
         initial_time=0.0,
         prior=jb.NormalPrior({"rate": 0.0, "part": 0.0}, {"rate": 1.0, "part": 1.0}),
-        num_iterations=3000,
+        num_iterations=1000,
         num_warmup=500,
         num_steps=2,
         jumps=doses,

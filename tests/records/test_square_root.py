@@ -234,7 +234,7 @@ def test_posterior_of_gibbs_is_of_second_order():
     )
     made = jb.gibbs(
         jax.random.key(0), model, times, observed, prior=jb.NormalPrior(0.0, 0.8), **options,
-        num_iterations=800, num_chains=2,
+        num_iterations=400, num_chains=2,
     )  # fmt: skip
     theta = np.asarray(made.theta, float).reshape(-1)
     error = float(made.standard_error[0]) / deviation
