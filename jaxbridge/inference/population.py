@@ -96,11 +96,11 @@ class Population(eqx.Module):
     def first_root(self, root: Float[Array, "p p"]) -> Float[Array, "p+q p+q"]:
         """Return S of the first moves of φ, given that of θ.
 
-        Entries that do not move in the same iteration (`moves`) are independent.
+        Entries that do not move together (`moves`) are independent.
         """
         of_spreads = _FIRST_SPREAD * jnp.eye(len(self.varies), dtype=root.dtype)
-        first, second = self.moves(jnp.int32(0)), self.moves(jnp.int32(1))
-        together = (first[:, None] & first) | (second[:, None] & second)
+        groups = self._groups
+        together = np.any(groups[:, :, None] & groups[:, None], axis=0)
         return jnp.where(together, block_diag(root, of_spreads), 0) if self.varies else root
 
     def check_state(self, state: Any) -> None:
@@ -127,19 +127,22 @@ class Population(eqx.Module):
             [theta, jnp.broadcast_to(first, (*theta.shape[:-1], len(first)))], -1
         )
 
-    def moves(self, number: Int[Array, ""]) -> Bool[Array, "p+q"]:
-        """Return the mask of the entries of φ that move in this iteration, given z.
+    @property
+    def _groups(self) -> Bool[np.ndarray, "G p+q"]:
+        """Return the masks of the entries of φ that move together given z, in turns.
 
-        Entries of the population law and entries that are the same for all records move in
-        alternate iterations. Given z the former are known far better; in a joint move they would
-        allow only small steps.
+        θ moves in every other turn, and each spread alone: a spread near zero has a wide law, and
+        moves of other entries would hold it.
         """
-        p, at = len(self.parameters.names), list(self.varies)
-        of_population = np.zeros(p + len(at), bool)
-        of_population[[*at, *range(p, p + len(at))]] = True
-        if len(at) in (0, p):
-            return jnp.ones(len(of_population), bool)
-        return of_population == (number % 2 == 0)
+        p, q = len(self.parameters.names), len(self.varies)
+        each = np.eye(p + q, dtype=bool)
+        of_theta = each[:p].any(axis=0)
+        return np.stack([mask for spread in each[p:] for mask in (of_theta, spread)] or [of_theta])
+
+    def moves(self, number: Int[Array, ""]) -> Bool[Array, "p+q"]:
+        """Return the mask of the entries of φ that move at this turn, given z."""
+        groups = jnp.asarray(self._groups)
+        return groups[number % len(groups)]
 
     def full(self, phi: Float[Array, "p+q"]) -> PyTree:
         """Return all parameters of the model, at the means of the population."""
