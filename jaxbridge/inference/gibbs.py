@@ -104,7 +104,7 @@ class GibbsPosterior(AbstractPosterior):
     - `theta`: the unknown parameters as vectors, shape (*chains, n, p).
     - `names`: names of the entries of θ, for instance "alpha" or "B[0,1]". The keys of a dictionary
         are in alphabetical order.
-    - `parameters_moved`: fraction of the moves of θ that were accepted, shape (*chains, n).
+    - `parameters_moved`: fraction of accepted moves of θ, shape (*chains, n).
     - `bridges_moved`: fraction of the bridges that were replaced, shape (*chains, n).
     - `num_simulated`: number of simulated or reweighted paths, shape (*chains, n).
     - `num_missing`: number of bridges that were needed but not found within `max_proposals`, shape

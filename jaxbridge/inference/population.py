@@ -94,14 +94,9 @@ class Population(eqx.Module):
         return (*names, *(f"{LOG_SD}({names[j]})" for j in self.varies))
 
     def first_root(self, root: Float[Array, "p p"]) -> Float[Array, "p+q p+q"]:
-        """Return S of the first moves of φ, given that of θ.
-
-        Entries that do not move together (`moves`) are independent.
-        """
+        """Return S of the first moves of φ, given that of θ."""
         of_spreads = _FIRST_SPREAD * jnp.eye(len(self.varies), dtype=root.dtype)
-        groups = self._groups
-        together = np.any(groups[:, :, None] & groups[:, None], axis=0)
-        return jnp.where(together, block_diag(root, of_spreads), 0) if self.varies else root
+        return block_diag(root, of_spreads) if self.varies else root
 
     def check_state(self, state: Any) -> None:
         """Raise `ValueError` if a state has another number of entries that vary.

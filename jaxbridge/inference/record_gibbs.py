@@ -65,8 +65,8 @@ from .record_paths import (
 )
 from .warm_up import stages
 
-# Number of moves of θ for each sweep over the paths. A move costs a tenth to a half of
-# a sweep, and most chains mix poorly by their moves of θ.
+# Number of moves of θ for each sweep over the paths. θ mixes more slowly than the paths, and a move
+# of it costs a tenth to a half of a sweep.
 _NUM_MOVES = 8
 
 
@@ -119,8 +119,8 @@ class RecordPosterior(AbstractPosterior):
         logs of its standard deviations follow, with names such as "log_sd(rate)".
     - `names`: names of the entries of θ, for instance "alpha" or "B[0,1]". The keys of a dictionary
         are in alphabetical order.
-    - `parameters_moved`: fraction of the moves of θ, given the noise of the paths, that were
-        accepted, shape (*chains, n).
+    - `parameters_moved`: fraction of accepted moves of θ given the noise of the paths, shape
+        (*chains, n).
     - `blocks_moved`: fraction of the blocks of the path that moved, shape (*chains, n).
     - `stuck`: whether some block, or the parameters of some record, never moved, shape (*chains).
         Then the draws do not represent the posterior, and `standard_error` is infinite.
@@ -260,10 +260,11 @@ class RecordSampler(eqx.Module):
         # Entries that did not move keep their scales.
         state = state._replace(theta=phi, root=jnp.where(moves[:, None], root, state.root))
         units_moved = jnp.ones(old.log_weights.shape, bool)
+        carry = state, held
         if population.varies:
-            given = held, noise, state, learning, number
-            held, state, units_moved = self._moved_units(key_for("units", key), *given)
-        return (state, held), (accepted, units_moved)
+            given = carry, noise, learning, number
+            carry, units_moved = self._moved_units(key_for("units", key), *given)
+        return carry, (accepted, units_moved)
 
     def _weighted(self, theta: Float[Array, "*R p"], noise: Float[Array, "R points d"]):
         """Return the paths of this noise at θ, with their weights."""
@@ -273,17 +274,17 @@ class RecordSampler(eqx.Module):
     def _moved_units(
         self,
         key: Key[Array, ""],
-        old: _Weighted,
+        carry: tuple[RecordState, _Weighted],
         noise: Float[Array, "R points d"],
-        state: RecordState,
         learning: Bool[Array, ""],
         number: Int[Array, ""],
-    ) -> tuple[_Weighted, RecordState, Bool[Array, " R"]]:
+    ) -> tuple[tuple[RecordState, _Weighted], Bool[Array, " R"]]:
         """Move z of each record given ξ and φ, then φ given the parameters of the records.
 
-        Also return whether z of each record moved.
+        Return the state, and whether z of each record moved.
         """
         walk_key, accept_key, population_key = jax.random.split(key, 3)
+        state, old = carry
         population, phi, z = self.population, state.theta, state.units
         step = jax.random.normal(walk_key, z.shape, z.dtype)
         proposed = z + jnp.einsum("rij,rj->ri", state.unit_roots, step)
@@ -304,7 +305,7 @@ class RecordSampler(eqx.Module):
         adapt = lambda root, step, rate: adapt_covariance(root, step, rate, number, learning)
         roots = jax.vmap(adapt)(state.unit_roots, step, rate)
         phi, z = population.given_units(population_key, phi, z)
-        return held, state._replace(theta=phi, units=z, unit_roots=roots), accepted
+        return (state._replace(theta=phi, units=z, unit_roots=roots), held), accepted
 
     def change_by_coarse_steps(self, guided: GuidedState) -> Float[Array, ""]:
         """Return the relative change of the likelihood by steps of twice the size.

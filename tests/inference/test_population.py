@@ -110,6 +110,19 @@ def test_entries_of_arrays_may_vary():
             varies(wrong)
 
 
+def test_each_spread_moves_alone_between_moves_of_theta():
+    parameters = Parameters(
+        jb.Diffusion(lambda x, p: -x, params={"a": 0.0, "b": 0.0, "c": 0.0}), None
+    )
+    turns = lambda population: [
+        list(map(int, as_population(population, parameters, jnp.sum, 2).moves(jnp.int32(i))))
+        for i in range(4)
+    ]
+    theta, first, second = [1, 1, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1]
+    assert turns(jb.NormalPopulation(lambda p: (p["a"], p["c"]))) == [theta, first, theta, second]
+    assert turns(None) == 4 * [[1, 1, 1]]
+
+
 def test_what_does_not_fit_is_refused():
     times, values = panel()
     with pytest.raises(TypeError, match="`population` must be a `NormalPopulation`"):
