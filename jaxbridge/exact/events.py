@@ -11,6 +11,7 @@ from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key
 
@@ -22,14 +23,15 @@ from ..engine.entry import public_entry
 from ..engine.lanes import over_lanes
 from ..engine.verdict import throw_where_untrustworthy
 from ..models.diffusion import Diffusion
-from ..models.sigma import columns_of
-from ..schemes.heun import Heun
-from .log_means import log_mean_of_runs
+from ..schemes import AbstractStepDensity
 from .splitting import (
     AbstractRareEvent,
     Runs,
+    Size,
     check_splitting,
+    estimate,
     is_lost,
+    make_step,
     new_runs,
     next_level,
     run_levels,
@@ -52,6 +54,8 @@ class Events(AbstractRareEvent):
     - `num_levels`: number of levels of each run, shape (R,).
     - `num_nonfinite`: number of simulated paths that were not finite. On them the event does not
         occur.
+    - `step_error`: estimated discretisation error of `log_probability`, from R further runs with
+        half as many steps; `step_uncertainty`: its standard error.
     """
 
     log_probability: Float[Array, ""]
@@ -62,6 +66,8 @@ class Events(AbstractRareEvent):
     occurred: Bool[Array, "R n"]
     num_levels: Int[Array, " R"]
     num_nonfinite: Int[Array, ""]
+    step_error: Float[Array, ""]
+    step_uncertainty: Float[Array, ""]
 
     _unfinished: ClassVar[str] = (
         "Some run ended before the event occurred on most of its paths: no path of it goes on, or "
@@ -86,6 +92,7 @@ def sample_events(
     num_runs: int = 16,
     num_steps: int = 100,
     num_moves: int = 10,
+    density: AbstractStepDensity | None = None,
     throw: bool = False,
 ) -> Events:
     """Estimate the probability of an event of a path, and sample paths on which it occurs.
@@ -104,13 +111,15 @@ def sample_events(
         `lambda path: radius - jnp.linalg.norm(path[-1] - centre)`, and not only its sign.
     - `num_paths`: number n of paths of a run.
     - `num_runs`: number R of independent runs. Their spread gives the error.
-    - `num_steps`: number N of Heun steps.
+    - `num_steps`: number N of steps.
     - `num_moves`: number of moves of each path after each level. Too few leave copies alike.
+    - `density`: density of a step, by default the most accurate one, as in `innovations`. For stiff
+        drift and constant σ pass `LocalLinearDensity()`.
     - `throw`: raise an error at run time if the result is not `trustworthy`.
 
     **Returns:** `Events`. The cost grows with the log of the probability, not with its inverse. The
-    discretisation error is that of Heun's scheme, which is not estimated: compare with half as many
-    steps.
+    discretisation error is that of the probability of the event at the N+1 points. It takes as much
+    time again; linear models have none.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments, and for coefficients that depend
     on time.
@@ -125,9 +134,12 @@ def sample_events(
     check_function("event", event, "(path)")
     num_moves = check_count("num_moves", num_moves)
     sizes = num_runs, num_paths, num_steps
-    start, duration, size = check_splitting(key, model, start, duration, *sizes)
-    _check_event(event, jax.ShapeDtypeStruct((size[2] + 1, len(start)), start.dtype))
-    events = _sample_events(key, model, start, duration, event, size, num_moves)
+    checked = check_splitting(key, model, start, duration, *sizes, density)
+    start, duration, size, density = checked
+    if density.is_exact:
+        size = size._replace(num_coarse=0)
+    _check_event(event, jax.ShapeDtypeStruct((size.num_steps + 1, len(start)), start.dtype))
+    events = _sample_events(key, model, start, duration, event, size, num_moves, density)
     return throw_where_untrustworthy(events, "log_probability", model) if throw else events
 
 
@@ -149,7 +161,7 @@ class _Population(NamedTuple):
     - `runs`: bookkeeping of the runs.
     """
 
-    noise: Float[Array, "N noises lanes"]
+    noise: Float[Array, "N d lanes"]
     scores: Float[Array, " lanes"]
     log_scales: Float[Array, " R"]
     runs: Runs
@@ -157,7 +169,9 @@ class _Population(NamedTuple):
 
 # About ten levels.
 @compiled_for(
-    lambda key, model, start, duration, event, size, moves: size[0] * size[1] * size[2] * moves * 10
+    lambda key, model, start, duration, event, size, moves, density: (
+        size.num_lanes * size.num_steps * moves * 10
+    )
 )
 def _sample_events(
     key: Key[Array, ""],
@@ -165,26 +179,36 @@ def _sample_events(
     start: Float[Array, " d"],
     duration: Float[Array, ""],
     event: Callable,
-    size: tuple[int, int, int],
+    size: Size,
     num_moves: int,
+    density: AbstractStepDensity,
 ) -> Events:
-    R, n, N = size
+    R, n, N = size.all_runs, size.num_paths, size.num_steps
     model, start, duration = nondifferentiable((model, start, duration))
-    dynamics, dt = model.prepared().forward(start), duration / N
-    shape = N, len(columns_of(dynamics.sigma(start), start)), R * n
-    score = as_path_function("event", event, jax.ShapeDtypeStruct((N + 1, len(start)), start.dtype))
-
-    @over_lanes(-1, -1)
-    def step(x, normal):
-        return Heun().step(dynamics, x, dt, jnp.sqrt(dt) * normal)
+    model = model.prepared()
+    dynamics, dt, d = model.forward(start), duration / N, len(start)
+    shape = N, d, R * n
+    score = as_path_function("event", event, jax.ShapeDtypeStruct((N + 1, d), start.dtype))
+    step = over_lanes(-1, -1, -1)(make_step(density, dynamics, start, dt))
 
     def path_of(noise):
-        def one(x, normal):
-            x = step(x, normal)
-            return x, x
+        """Return the paths; on the coarse grid a pair of steps is one, by the sum of their noise.
 
-        first = jnp.broadcast_to(start[:, None], (len(start), R * n))
-        return jnp.concatenate([first[None], lax.scan(one, first, noise)[1]])
+        The first step of such a pair only leads to the point between its ends.
+        """
+
+        def one(carry, inputs):
+            before, x, earlier = carry
+            i, normal = inputs
+            doubled = size.is_doubled(i)
+            xi = jnp.where(doubled, (earlier + normal) * np.sqrt(0.5), normal)
+            x_next = step(jnp.where(doubled, before, x), xi.astype(x.dtype), doubled)
+            return (x, x_next, normal), x_next
+
+        first = jnp.broadcast_to(start[:, None], shape[1:])
+        init = first, first, jnp.zeros_like(first)
+        later = lax.scan(one, init, (np.arange(N, dtype=np.int32), noise))[1]
+        return jnp.concatenate([first[None], later])
 
     def score_of(noise):
         """Return the score of each path, -inf for one that is not finite, and their number."""
@@ -226,15 +250,17 @@ def _sample_events(
     scores, num_lost = score_of(noise)
     runs, zeros = new_runs(R, start.dtype, num_lost), jnp.zeros(R, start.dtype)
     last = run_levels(renewed, _Population(noise, scores, zeros, runs))
-    paths = jnp.moveaxis(path_of(last.noise).reshape(N + 1, len(start), R, n), (2, 3), (0, 1))
-    log_mean, error = log_mean_of_runs(last.runs.log_estimates[None])
+    paths = jnp.moveaxis(path_of(last.noise).reshape(N + 1, d, R, n), (2, 3), (0, 1))
+    order, fine = density.usual_order, slice(size.num_runs)
+    found = estimate(last.runs.log_estimates, size, order, model, paths[fine, 0], dt)
     return Events(
-        log_mean,
-        error,
-        last.runs.log_estimates,
+        found.log_probability,
+        found.standard_error,
+        last.runs.log_estimates[fine],
         dt * jnp.arange(N + 1, dtype=dt.dtype),
-        paths,
-        last.scores.reshape(R, n) > 0,
-        last.runs.num_levels,
+        paths[fine],
+        last.scores.reshape(R, n)[fine] > 0,
+        last.runs.num_levels[fine],
         last.runs.num_nonfinite,
+        *found.step_error,
     )

@@ -8,9 +8,11 @@ were replaced at level i, the estimate of the probability is
 
     p̂ = Π_i (1 - K_i / n) · (share of the last paths on which the event occurs).
 
-Independent runs give the error.
+Independent runs give the error. As many more runs take steps of twice the size, and tell the
+discretisation error.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -32,7 +34,25 @@ from ..engine.checks import (
     check_num_steps,
 )
 from ..engine.verdict import AbstractResult, Fault, Verdict
+from ..models.bridge_problem import Intervals
 from ..models.diffusion import Diffusion, check_diffusion
+from ..models.dynamics import Dynamics
+from ..schemes import (
+    MOST_TOO_LONG,
+    UNKNOWN_SHARE,
+    AbstractStepDensity,
+    StepError,
+    check_step_density,
+    known_transition,
+    most_accurate_density,
+    share_in_regime,
+    share_of_order,
+    share_of_pairs,
+    step_faults,
+    unknown_where,
+    with_transition,
+)
+from .log_means import log_mean_of_runs
 
 # Each level at least halves the probability, so that this many reach 1e-30.
 _MOST_LEVELS = 100
@@ -43,7 +63,10 @@ _APART = (
     "The estimates of the runs differ by more than their mean, so that it may be far off. Use more "
     "`num_paths`, more `num_runs`, or a function that measures progress better."
 )
-_LOST = "Some paths are not finite. Use more `num_steps`, or check the model."
+_LOST = (
+    "Some paths are not finite. Use more `num_steps`, or check the model. Where σ vanishes, or its "
+    "derivatives are not finite, pass `density=jb.EulerDensity()`."
+)
 
 
 class AbstractRareEvent(AbstractResult):
@@ -56,6 +79,8 @@ class AbstractRareEvent(AbstractResult):
     paths: eqx.AbstractVar[Float[Array, "R n points d"]]
     num_levels: eqx.AbstractVar[Int[Array, " R"]]
     num_nonfinite: eqx.AbstractVar[Int[Array, ""]]
+    step_error: eqx.AbstractVar[Float[Array, ""]]
+    step_uncertainty: eqx.AbstractVar[Float[Array, ""]]
     _unfinished: ClassVar[str]
 
     @property
@@ -81,14 +106,18 @@ class AbstractRareEvent(AbstractResult):
         - a run in which the event does not occur on most of the last paths;
         - runs that differ by more than their mean;
         - paths that are not finite;
+        - a discretisation error that is unknown or too uncertain, or that dominates and exceeds
+            0.05;
         - a value that is not finite.
         """
+        step_error = StepError(self.step_error, self.step_uncertainty)
         unfinished = jnp.any(2 * jnp.sum(self._occurred, axis=1) <= self._occurred.shape[1])
         return Verdict(
             (
                 Fault(unfinished, self._unfinished),
                 Fault(~(self.standard_error < _MOST_SPREAD), _APART),
                 Fault(self.num_nonfinite > 0, _LOST),
+                *step_faults(step_error, self.standard_error),
             )
         ).with_finite(self.log_probability)
 
@@ -113,6 +142,32 @@ class AbstractRareEvent(AbstractResult):
         return mean, jnp.sqrt(squares * R / (R - 1))
 
 
+class Size(NamedTuple):
+    """Sizes of a splitting.
+
+    - `num_runs`, `num_paths`, `num_steps`: R, n and N of the runs that give the result.
+    - `num_coarse`: number of further runs, with steps of twice the size.
+    """
+
+    num_runs: int
+    num_paths: int
+    num_steps: int
+    num_coarse: int
+
+    @property
+    def all_runs(self) -> int:
+        return self.num_runs + self.num_coarse
+
+    @property
+    def num_lanes(self) -> int:
+        return self.all_runs * self.num_paths
+
+    def is_doubled(self, i: Int[Array, ""]) -> Bool[Array, " lanes"]:
+        """Return whether step i of each path is the second of a pair that one step replaces."""
+        is_coarse = np.arange(self.num_lanes) >= self.num_runs * self.num_paths
+        return is_coarse & (i % 2 == 1)
+
+
 def check_splitting(
     key: Key[Array, ""],
     model: Diffusion,
@@ -121,8 +176,9 @@ def check_splitting(
     num_runs: int,
     num_paths: int,
     num_steps: int,
-) -> tuple[Float[Array, " d"], Float[Array, ""], tuple[int, int, int]]:
-    """Validate the common arguments; return the start, the duration, and (R, n, N).
+    density: AbstractStepDensity | None,
+) -> tuple[Float[Array, " d"], Float[Array, ""], Size, AbstractStepDensity]:
+    """Validate the common arguments; return the start, the duration, the size and the density.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments, and for coefficients that depend
     on time.
@@ -132,12 +188,80 @@ def check_splitting(
     num_paths = check_count("num_paths", num_paths, minimum=2)
     num_runs = check_count("num_runs", num_runs)
     num_steps = check_num_steps(num_steps, 1)
+    density = check_step_density(density)
     start = as_floating("start", start)
     if start.ndim != 1:
         raise ValueError(f"`start` must have shape (d,), a single point; got {start.shape}.")
     duration = as_numbers({"duration": duration})["duration"].astype(start.dtype)
     model.forward(start)  # raises if coefficients depend on time
-    return start, duration, (num_runs, num_paths, num_steps)
+    if density is None:
+        density = most_accurate_density(model, start, normal_steps=False)
+    num_coarse = num_runs if num_steps > 1 else 0
+    return start, duration, Size(num_runs, num_paths, num_steps, num_coarse), density
+
+
+def make_step(
+    density: AbstractStepDensity,
+    dynamics: Dynamics,
+    start: Float[Array, " d"],
+    dt: Float[Array, ""],
+) -> Callable[..., Float[Array, " d"]]:
+    """Return `step(x, ξ, doubled)`, the end of a step of length δ, or 2δ if `doubled`."""
+    single, double = (known_transition(density, dynamics, start, length) for length in (dt, 2 * dt))
+
+    def step(x, xi, doubled):
+        transition = jax.tree.map(lambda one, two: jnp.where(doubled, two, one), single, double)
+        steps = with_transition(density, transition).steps_from(dynamics, x)
+        return steps.law(jnp.where(doubled, 2 * dt, dt)).end(xi)
+
+    return step
+
+
+class Estimate(NamedTuple):
+    """Log of the probability, its standard error, and its discretisation error."""
+
+    log_probability: Float[Array, ""]
+    standard_error: Float[Array, ""]
+    step_error: StepError
+
+
+def estimate(
+    log_estimates: Float[Array, " runs"],
+    size: Size,
+    order: float,
+    model: Diffusion,
+    paths: Float[Array, "R points d"],
+    dt: Float[Array, ""],
+) -> Estimate:
+    """Return the estimate from those of all runs.
+
+    `paths` are some paths given the event. The discretisation error of order δ^p is unknown if
+    their steps are too long for the drift.
+    """
+    fine, coarse = log_estimates[: size.num_runs], log_estimates[size.num_runs :]
+    value, error = log_mean_of_runs(fine[None])
+    if math.isinf(order):
+        return Estimate(value, error, StepError(jnp.zeros_like(value), jnp.zeros_like(value)))
+    if size.num_coarse == 0:
+        unknown = jnp.full_like(value, jnp.nan)
+        return Estimate(value, error, StepError(unknown, unknown))
+    of_coarse, its_error = log_mean_of_runs(coarse[None])
+    share = share_of_pairs(jnp.full_like(value, share_of_order(order)), size.num_steps)
+    is_known = jnp.isfinite(value) & jnp.isfinite(of_coarse)
+    change = jnp.where(is_known, of_coarse, 0) - jnp.where(is_known, value, 0)
+    step_error = StepError(share * change, share * jnp.hypot(error, its_error))
+    too_long = _steps_are_too_long(model, paths, dt)
+    return Estimate(value, error, unknown_where(too_long | ~is_known, step_error))
+
+
+def _steps_are_too_long(
+    model: Diffusion, paths: Float[Array, "R points d"], dt: Float[Array, ""]
+) -> Bool[Array, ""]:
+    """Return whether over 2 % of these steps exceed the relaxation time of the drift."""
+    begins, ends = (part.reshape(-1, paths.shape[-1]) for part in (paths[:, :-1], paths[:, 1:]))
+    lengths = jnp.broadcast_to(dt, len(begins))
+    share = share_in_regime(jnp.ones_like(lengths), model, Intervals(begins, ends, lengths), 1)
+    return jnp.mean((share == UNKNOWN_SHARE).astype(dt.dtype)) > MOST_TOO_LONG
 
 
 class Level(NamedTuple):

@@ -68,6 +68,10 @@ class StepLaw(NamedTuple):
         noise = jnp.sqrt(S) * xi if S.ndim == 0 else matvec(cholesky(S), xi)
         return self.mean + jnp.sqrt(self.dt) * self.sigma.mv(noise)
 
+    def end(self, xi: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Return the end of the step with the noise ξ ~ N(0, I)."""
+        return self.bent(self.point(xi))
+
     def bent(self, point: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return the end of the step whose normal part ends in `point`,
 
@@ -170,6 +174,10 @@ class DegenerateLaw(NamedTuple):
     def _moves(self):
         """Return the mask of the coordinates with noise."""
         return jnp.diagonal(self.root) > 0
+
+    def end(self, xi: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Return the end of the step with the noise ξ ~ N(0, I)."""
+        return self.mean + matvec(self.root, xi)
 
     def solve(self, displacement: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return Λ⁻¹ times the displacement; zero for coordinates without noise."""

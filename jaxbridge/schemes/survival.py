@@ -7,8 +7,8 @@ with the probability
     exp(-2 g(x_i) g(x_{i+1}) / (s δ)),
 
 if both points are inside (Baldi 1995; Gobet 2000). Near a smooth boundary every diffusion is of
-this kind up to O(δ). If σ depends on the state, g / √s is the distance from the boundary in units
-of the noise at each of the two points.
+this kind up to O(δ). If s depends on the state, g / √s is the distance of each of the two points
+from the boundary in units of the noise, with the mean of √s on the way there.
 """
 
 from collections.abc import Callable
@@ -22,10 +22,15 @@ from ..engine.checks import Numbers
 from ..engine.compiled import compiled_sooner
 from ..engine.entry import public_entry
 from ..engine.lanes import over_points
+from ..engine.linalg import matmul
 from ..models.diffusion import Diffusion, check_diffusion
 from ..models.dynamics import Dynamics
 from ..models.sigma import columns_of
+from ..models.tracing import uses_argument
 from .path_likelihood import as_grid_and_paths, for_each_path
+
+# Bounds of the factor from √s to its mean on the way to the boundary, which far away is a guess.
+_LARGEST_CHANGE = 4.0
 
 
 @public_entry
@@ -101,8 +106,27 @@ def _log_survival(
 def distances(
     dynamics: Dynamics, inside: Callable, x: Float[Array, " d"]
 ) -> tuple[Float[Array, " g"], Float[Array, " g"]]:
-    """Return g(x) and s(x) = |σᵀ∇g|² of all functions that bound the region."""
-    value = lambda x: jnp.atleast_1d(as_returned("inside", inside(x)).astype(x.dtype))
-    g, slope = jax.linearize(value, x)
-    along = jnp.stack([slope(column) for column in columns_of(dynamics.sigma(x), x)])
-    return g, jnp.sum(along**2, axis=0)
+    """Return g(x) and the mean of s = |σᵀ∇g|² from x to the boundary, for all functions g.
+
+    The mean is (√s - ½ g ∂√s/∂g)², with the derivative along V∇g. To first order √s at the boundary
+    is √s - g ∂√s/∂g.
+    """
+
+    def of_point(x):
+        value = lambda x: jnp.atleast_1d(as_returned("inside", inside(x)).astype(x.dtype))
+        g, slope = jax.linearize(value, x)
+        columns = jnp.stack(columns_of(dynamics.sigma(x), x))
+        along = jnp.stack([slope(column) for column in columns])
+        return jnp.sum(along**2, axis=0), (g, along, columns)
+
+    s, (g, along, columns) = of_point(x)
+    if not uses_argument(lambda x: of_point(x)[0], x):
+        return g, s
+    moves = s > 0
+    safe = jnp.where(moves, s, 1)
+    change_of = lambda direction: jax.jvp(lambda x: of_point(x)[0], (x,), (direction,))[1]
+    # A direction for each g, along which that g changes by one.
+    changes = jax.vmap(change_of)(matmul((along / safe).T, columns))
+    relative = 1 - g * jnp.diagonal(changes) / (4 * safe)
+    bounded = jnp.clip(relative, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
+    return g, jnp.where(moves, s * bounded**2, 0)

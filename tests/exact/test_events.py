@@ -71,6 +71,39 @@ def test_an_integral_that_is_large():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("num_steps", "is_small"), [(5, False), (160, True)])
+def test_the_error_of_long_steps_is_told(num_steps, is_small):
+    """Euler steps of an Ornstein-Uhlenbeck process end in another normal law, which is known."""
+    T, level, dt = 2.0, 2.0, 2.0 / num_steps
+    log_tail = lambda variance: stats.norm.logsf(level / np.sqrt(variance))
+    decay = (1 - 0.7 * dt) ** 2
+    simulated = 0.64 * dt * (1 - decay**num_steps) / (1 - decay)
+    exact = 0.64 * (1 - np.exp(-1.4 * T)) / 1.4
+    error = log_tail(simulated) - log_tail(exact)
+    event = lambda path: path[-1, 0] - level
+    long = jb.sample_events(
+        jax.random.key(4), SLOW, [0.0], T, event, num_steps=num_steps, density=jb.EulerDensity(),
+        num_paths=1000 if is_small else 4000,
+    )  # fmt: skip
+    assert abs(long.log_probability - log_tail(simulated)) < 4.5 * long.standard_error
+    # An error of first order; that of the told one is also of higher order.
+    assert abs(long.step_error - error) < 4.5 * long.step_uncertainty + 0.6 * abs(error)
+    assert bool(long.trustworthy) is is_small
+    assert is_small or "The discretisation error (`step_error`) exceeds" in long.why()
+
+
+@pytest.mark.slow
+def test_noise_that_grows_with_the_state():
+    """By steps of second order: Euler's are off by .18 with ten steps."""
+    model = jb.Diffusion(lambda x, p: 0.5 * x, lambda x, p: 0.8 * x)
+    event = lambda path: path[-1, 0] - 9.0
+    events = jb.sample_events(jax.random.key(5), model, [1.0], 1.0, event, num_steps=10)
+    exact = stats.norm.logsf((np.log(9) - 0.5 + 0.32) / 0.8)
+    assert_agrees(events, exact, 0.02)
+    assert events.step_uncertainty < 0.05
+
+
+@pytest.mark.slow
 @pytest.mark.optimised
 def test_errors_are_those_of_repetitions():
     """Of 24 repetitions with few paths."""

@@ -79,15 +79,51 @@ def test_exits_of_an_ornstein_uhlenbeck_process(width):
     assert_agrees(exits, 1 - stays, 0.03)
 
 
+def growing(num_steps, level, num_runs):
+    """Exits of a geometric Brownian motion beyond a level, and their exact probability."""
+    model = jb.Diffusion(lambda x, p: 0.5 * x, lambda x, p: 0.8 * x)
+    exits = jb.sample_exits(
+        jax.random.key(2), model, [1.0], 1.0, lambda x: level - x[0],
+        num_steps=num_steps, num_runs=num_runs,
+    )  # fmt: skip
+    mu, sigma, distance = 0.5 - 0.32, 0.8, np.log(level)
+    z = np.array([distance - mu, distance + mu]) / sigma
+    probability = stats.norm.sf(z[0]) + np.exp(2 * mu * distance / sigma**2) * stats.norm.sf(z[1])
+    return exits, probability
+
+
 @pytest.mark.slow
 def test_noise_that_grows_with_the_state():
-    """A geometric Brownian motion reaches nine times its start with probability 1e-5."""
-    model = jb.Diffusion(lambda x, p: 0 * x, lambda x, p: 0.5 * x)
-    exits = jb.sample_exits(jax.random.key(2), model, [1.0], 1.0, lambda x: 9 - x[0], num_steps=100)
-    level = np.log(9)
-    z = np.array([level + 0.125, level - 0.125]) / 0.5
-    probability = stats.norm.sf(z[0]) + np.exp(-2 * 0.125 * level / 0.25) * stats.norm.sf(z[1])
+    """σ is nine times as large at the boundary as at the start; 6e-6 for the farther one."""
+    exits, probability = growing(16, 9.0, 32)
+    error = float(exits.standard_error)
+    assert abs(exits.log_probability - np.log(probability)) < 4.5 * error + 0.02 < 0.16
+    exits, probability = growing(60, 40.0, 16)
     assert_agrees(exits, probability, 0.05)
+
+
+@pytest.mark.slow
+def test_the_error_of_long_steps_is_told():
+    """In an Ornstein-Uhlenbeck process, whose steps are exact, but not its exits between them."""
+    model = jb.ornstein_uhlenbeck([[1.0]], sigma=[[0.8]])
+    stays = survival(lambda x: -x, lambda x: 0.64 + 0 * x, -8.0, 1.5, 0.2, 2.0)
+
+    def exits(num_steps):
+        return jb.sample_exits(
+            jax.random.key(1), model, [0.2], 2.0, lambda x: 1.5 - x[0],
+            num_steps=num_steps, num_runs=64,
+        )  # fmt: skip
+
+    long, short = exits(4), exits(16)
+    error = long.log_probability - np.log(1 - stays)
+    assert error > 4.5 * long.standard_error and not long.trustworthy
+    assert "discretisation error (`step_error`) exceeds" in long.why()
+    assert abs(long.step_error - error) < 4.5 * long.step_uncertainty + 0.5 * error
+    assert_agrees(short, 1 - stays, 0.02)
+    unknown = jb.sample_exits(
+        jax.random.key(1), model, [0.2], 2.0, lambda x: 1.5 - x[0], num_steps=1, num_paths=50
+    )
+    assert jnp.isnan(unknown.step_error) and "is unknown" in unknown.why()
 
 
 @pytest.mark.slow
@@ -114,7 +150,7 @@ def test_a_rate_is_one_over_the_mean_passage_time():
 @pytest.mark.slow
 def test_what_never_leaves_and_what_is_outside():
     """Without noise and without drift nothing leaves; who starts outside has left."""
-    small = {"num_paths": 8, "num_runs": 2, "num_steps": 3}
+    small = {"num_paths": 8, "num_runs": 2, "num_steps": 3, "density": jb.EulerDensity()}
     still = jb.Diffusion(lambda x, p: 0 * x, lambda x, p: 0 * x)
 
     @jax.jit

@@ -101,6 +101,25 @@ def test_noise_that_depends_on_the_state_and_on_time():
     assert_survives(made[:, -1], 2 * stats.norm.cdf(1) - 1, 0.002)
 
 
+@pytest.mark.parametrize("ends", [(7.0, 8.0, 0.05), (8.0, 8.5, 0.02)])
+def test_noise_that_varies_on_the_way_to_the_boundary(ends):
+    """The logarithm of a geometric Brownian motion is a Brownian motion, so that this is exact."""
+    x, y, duration = ends
+    model = jb.Diffusion(lambda x, p: 0 * x, lambda x, p: 0.8 * x)
+    log_stays = jb.log_survival(model, [0.0, duration], [[x], [y]], lambda x: 9 - x[0])[1]
+    exact = np.log1p(-np.exp(-2 * np.log(9 / x) * np.log(9 / y) / (0.64 * duration)))
+    np.testing.assert_allclose(log_stays, exact, rtol=0.02)
+
+
+def test_two_functions_with_one_boundary():
+    """1.5² - |x|² is no distance from the circle, but nearly the same comes out."""
+    planar = jb.Diffusion(lambda x, p: 0 * x, jnp.ones(2))
+    ends = [0.0, 0.1], [[1.2, 0.0], [1.2, 0.1]]
+    by_square = jb.log_survival(planar, *ends, lambda x: 2.25 - x @ x)[1]
+    by_distance = jb.log_survival(planar, *ends, lambda x: 1.5 - jnp.linalg.norm(x))[1]
+    np.testing.assert_allclose(by_square, by_distance, rtol=0.1)
+
+
 def test_outside_and_without_noise():
     """Nothing returns; a position moves without noise; all derivatives are finite."""
     path = np.array([[0.5], [-0.1], [0.4]])
