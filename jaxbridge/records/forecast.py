@@ -31,7 +31,7 @@ from ..engine.times import Times
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
 from ..models.jumps import Jumps, JumpsLike
-from ..schemes import AbstractStepDensity
+from ..schemes import AbstractStepDensity, StepError, share_of_grid, step_faults
 from .cover import cover, covered_start
 from .guided_record import correction
 from .guided_steps import Guide, end_of_step, guided_law, guided_start
@@ -79,6 +79,9 @@ class Forecast(AbstractResult):
     - `crps`: continuous ranked probability score of each component, in its unit; smaller is better.
         Shape (n, m).
     - `effective_sample_size`: effective number of particles at each reading, shape (n,).
+    - `step_error`: estimated discretisation error of `states`: the root mean square of the errors
+        of their means, in standard deviations, and of the logs of these; shape (). NaN for a single
+        step. `step_uncertainty` is its standard error.
     """
 
     times: Float[np.ndarray, " times"] | Float[Array, " times"]
@@ -89,6 +92,8 @@ class Forecast(AbstractResult):
     log_scores: Float[Array, " readings"]
     crps: Float[Array, "readings m"]
     effective_sample_size: Float[Array, " readings"]
+    step_error: Float[Array, ""]
+    step_uncertainty: Float[Array, ""]
 
     @property
     def residuals(self) -> Float[Array, "readings m"]:
@@ -118,15 +123,17 @@ class Forecast(AbstractResult):
 
     @property
     def verdict(self) -> Verdict:
-        """Return the possible faults: few effective particles, lost ones, or a score that is not
-        finite.
+        """Return the possible faults: few effective particles, lost ones, a discretisation error
+        that is unknown or exceeds 0.05 standard deviations, or a score that is not finite.
 
         The tests of the model, `p_uniform` and `p_independent`, are no part of it.
         """
         poor = jnp.any(self.effective_sample_size < _FEWEST_PARTICLES)
         lost = jnp.mean(~jnp.all(jnp.isfinite(self.states), axis=-1), axis=0)
         faults = Fault(poor, _POOR), Fault(jnp.any(lost > _MOST_LOST), _LOST)
-        return Verdict(faults).with_finite(jnp.nansum(self.log_scores))
+        of_mean = jnp.asarray(len(self.states) ** -0.5, self.step_error.dtype)
+        steps = step_faults(StepError(self.step_error, self.step_uncertainty), of_mean)
+        return Verdict((*faults, *steps)).with_finite(jnp.nansum(self.log_scores))
 
 
 @compiled_sooner
@@ -251,6 +258,11 @@ def forecast(
     # An earlier `initial_time` has an entry in front, which is left out.
     since, which = problem.record.since, problem.record.which[-num_times:]
     states, readings, filtered, scores = _run(key, problem, num_particles, particles)
+    step_error = jnp.zeros((2,), states.dtype)
+    if num_times > 1 and not problem.density.is_exact:
+        coarse, *_ = _run(key, records.coarsened().problem(0), num_particles, particles)
+        share = share_of_grid(problem.density.order, problem.record.lengths)
+        step_error = _step_error(states[which][1:], coarse[which][1:], share)
     num_read = num_times - len(later)
     of_times = lambda draws: jnp.swapaxes(draws[which], 0, 1)
     all_times = problem.record.clock.exactly(since[which])
@@ -262,8 +274,28 @@ def forecast(
         of_times(readings),
         of_times(filtered),
         *(score[which[:num_read]] for score in scores),
+        *step_error,
     )
     return throw_where_untrustworthy(made, "states", model) if throw else made
+
+
+@compiled_sooner
+def _step_error(
+    states: Float[Array, "times P d"], coarse: Float[Array, "times P d"], share: float
+) -> StepError:
+    """Return the step error of the laws of `states`, from those by steps of twice the size."""
+    (mean, sd), (of_coarse, its_sd) = (
+        (jnp.nanmean(draws, axis=1), jnp.nanstd(draws, axis=1)) for draws in (states, coarse)
+    )
+    varies = (sd > 1e-6 * jnp.max(sd, initial=0)) & (its_sd > 0)
+    safe, its_safe = jnp.where(varies, sd, 1), jnp.where(varies, its_sd, 1)
+    squares = ((of_coarse - mean) / safe) ** 2 + jnp.log(its_safe / safe) ** 2
+    # Of normal draws: 2/P for two means, and 1/P for two logs of standard deviations.
+    by_chance = 3 / states.shape[1]
+    number = jnp.maximum(jnp.sum(varies), 1).astype(sd.dtype)
+    change = jnp.sum(jnp.where(varies, squares, 0)) / number - by_chance
+    value = share * jnp.sqrt(jnp.maximum(change, 0))
+    return StepError(value, jnp.full_like(value, share * by_chance**0.5))
 
 
 def _last_particles(

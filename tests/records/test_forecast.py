@@ -93,6 +93,31 @@ def test_scores_add_up_to_the_log_likelihood():
 
 
 @pytest.mark.slow
+def test_the_error_of_long_steps_is_told():
+    """Euler steps of an Ornstein-Uhlenbeck process have normal laws, which are known."""
+    later, start = np.arange(1, 4), 2.0
+
+    def made(num_steps):
+        return jb.forecast(
+            KEY, OU, [0.0], [start], observation=jb.LinearGaussian(covariance=0.0), at=later,
+            num_steps=num_steps, num_particles=4000, density=jb.EulerDensity(),
+        )  # fmt: skip
+
+    def error(num_steps):
+        dt, exact = 1 / num_steps, np.exp(-later)
+        decay = (1 - dt) ** (num_steps * later)
+        sd = np.sqrt((1 - exact**2) / 2)
+        simulated = np.sqrt(dt * (1 - decay**2) / (1 - (1 - dt) ** 2))
+        return np.sqrt(np.mean((start * (decay - exact) / sd) ** 2 + np.log(simulated / sd) ** 2))
+
+    long, short = made(4), made(32)
+    assert not long.trustworthy and "(`step_error`) exceeds" in long.why()
+    assert abs(long.step_error - error(4)) < 0.5 * error(4) and error(4) > 0.1
+    assert short.trustworthy
+    assert abs(short.step_error - error(32)) < 2 * short.step_uncertainty < 0.06
+    assert jnp.isnan(made(1).step_error) and "is unknown" in made(1).why()
+
+
 def test_an_exact_first_reading_of_a_law_that_is_not_normal():
     log_nu = lambda x, p: (2 / 0.49) * jnp.sum(x**2 / 2 - x**4 / 4)
     model = jb.Diffusion(lambda x, p: x - x**3, lambda x, p: 0.7 * jnp.ones(1), log_nu)
@@ -136,7 +161,7 @@ def test_exact_readings():
 
 
 def with_ranks(uniforms):
-    fields = [jnp.zeros(1)] * 4, [jnp.zeros(len(uniforms))] * 3
+    fields = [jnp.zeros(1)] * 4, [jnp.zeros(len(uniforms))] * 5
     return jb.Forecast(*fields[0], jnp.asarray(uniforms), *fields[1])
 
 
