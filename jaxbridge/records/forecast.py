@@ -255,8 +255,7 @@ def forecast(
     )
     observation.check_sample()
     problem = records.problem(0)
-    # An earlier `initial_time` has an entry in front, which is left out.
-    since, which = problem.record.since, problem.record.which[-num_times:]
+    since, which = problem.record.since, problem.record.which
     states, readings, filtered, scores = _run(key, problem, num_particles, particles)
     step_error = jnp.zeros((2,), states.dtype)
     if num_times > 1 and not problem.density.is_exact:

@@ -85,8 +85,8 @@ _LOST = (
 class LogLikelihood(AbstractResult):
     """Estimated log-likelihood of a record, from `log_likelihood`.
 
-    Below, n is the number of observations. An earlier `initial_time` adds one entry in front, and
-    several records are joined one after the other.
+    Below, n is the number of observations. Several records are joined one after the other. An
+    earlier `initial_time` counts with the first observation.
 
     - `value`: log p̂(y). `exp(value)` is unbiased up to the discretisation error. It is -inf if no
         particle explains the observations.
@@ -131,8 +131,8 @@ class LogLikelihood(AbstractResult):
     def unexplained(self) -> Int[Array, ""]:
         """Return the first index at which `effective_sample_size` is 0, or -1.
 
-        No particle explains the observation there. An earlier `initial_time` has index 0. Without
-        an `observation`, index k is the transition to observation k + 1.
+        No particle explains the observation there. Without an `observation`, index k is the
+        transition to observation k + 1.
         """
         lost = self.effective_sample_size == 0
         return jnp.where(jnp.any(lost), jnp.argmax(lost), -1)
@@ -312,8 +312,8 @@ def _combine_filters(
         value,
         error,
         jnp.sum(fine.log_estimate, axis=0),
-        records.at_observations(jnp.mean(fine.size, axis=1)),
-        records.at_observations(fine.pareto_k),
+        records.at_observations(jnp.mean(fine.size, axis=1), jnp.minimum),
+        records.at_observations(fine.pareto_k, jnp.maximum),
         num_weights,
         jnp.sum(fine.num_nonfinite),
         *step_error,

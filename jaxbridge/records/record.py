@@ -55,7 +55,8 @@ class Record(eqx.Module):
     - `since`: times of the ends of segments since the first time, shape (K + 1,).
     - `dt`: lengths of the steps, shape (K, N). A path does not move in a step of length zero.
     - `values`: observations at the ends of segments, shape (K + 1, m), NaN for missing values.
-    - `which`: index of the end of a segment for each observation.
+    - `which`: index of the end of a segment for each observation. An earlier `initial_time` has
+        none.
     - `jump`: possible jump at the beginning of each segment, leading axis K; `None` without jumps.
     - `lengths`: lengths of the steps of a segment, before any coarsening, in units of equal steps.
     """
@@ -215,21 +216,23 @@ def _with_jumps(
     **Returns:** for each record all times, whether each is one of the record, and the possible jump
     at the beginning of each interval between them.
     """
-    if jumps is None:
-        return [(times, times.shape[0] * (True,), None) for times, _ in checked]
-    example = next(entry for entry in jumps if entry is not None)
+    entries = len(checked) * [None] if jumps is None else jumps
+    example = next((entry for entry in entries if entry is not None), None)
 
-    def split(times: Times, entry: Jumps | None):
+    def split(record: tuple[Times, Array], entry: Jumps | None):
+        times, values = record
+        all_times, is_observed, jump = times, np.ones(times.shape[0], bool), None
         if entry is not None:
             all_times, is_observed, jump = entry.split(times)
-            return all_times, tuple(is_observed.tolist()), jump
-        none = jnp.zeros(len(times.gaps), bool)
-        jump = Jump(jnp.repeat(example.inputs[:1], len(none), axis=0), none)
-        return times, times.shape[0] * (True,), jump
+        elif example is not None:
+            none = jnp.zeros(len(times.gaps), bool)
+            jump = Jump(jnp.repeat(example.inputs[:1], len(none), axis=0), none)
+        # An earlier `initial_time` has no row.
+        num_before = times.shape[0] - len(values)
+        is_observed[np.flatnonzero(is_observed)[:num_before]] = False
+        return all_times, tuple(is_observed.tolist()), jump
 
-    return of_each(
-        split, [(times, entry) for (times, _), entry in zip(checked, jumps, strict=True)]
-    )
+    return of_each(split, list(zip(checked, entries, strict=True)))
 
 
 def split_records(times: Numbers, observations: Numbers) -> list[tuple[Numbers, Numbers]]:
@@ -326,20 +329,14 @@ def _check_record(
 ) -> tuple[Times, Float[Array, "n m"]]:
     """Validate the times and observations of one record.
 
-    **Returns:** the times, and the observations as an array with one row per time. A missing
-    observation is added at `initial_time`.
+    **Returns:** the times, and the observations as an array with one row per time. An earlier
+    `initial_time` precedes these times, without a row.
 
     **Raises:** `ValueError` that names the invalid time or observation.
     """
     checked_times, values = as_times_and_rows(times, observations)
     if initial_time is not None:
-        observed_times = checked_times
-        checked_times = observed_times.preceded("initial_time", initial_time)
-        # No time is added if the times begin with `initial_time`.
-        missing = jnp.full(
-            (len(checked_times.gaps) - len(observed_times.gaps), *values.shape[1:]), jnp.nan
-        )
-        values = jnp.concatenate([missing.astype(values.dtype), values])
+        checked_times = checked_times.preceded("initial_time", initial_time)
     if checked_times.shape[0] < 2 or values.shape[1] == 0:
         raise ValueError(
             "a record needs at least two times (an earlier `initial_time` counts as one) and one "

@@ -107,16 +107,22 @@ class Records(eqx.Module):
         )
         return jax.vmap(at, (axis - 1, 0, 0), axis - 1)(values, which, real)
 
-    def at_observations(self, values: Float[Array, "R ends"]) -> Float[Array, " n"]:
+    def at_observations(
+        self, values: Float[Array, "R ends"], worse: Callable[[Array, Array], Array]
+    ) -> Float[Array, " n"]:
         """Return the entries at observations, record after record.
 
-        `values` has an entry for each end of a segment.
+        `values` has an entry for each end of a segment. `worse` joins the entry of x_0, which may
+        be earlier, and that of the first observation.
         """
-        # `which` is padded to the longest record, so only its first entries count.
-        records = zip(values, self.stacked.record.which, self.num_times, strict=True)
-        return jnp.concatenate(
-            [record_values[which[:num]] for record_values, which, num in records]
-        )
+
+        def of_record(values, which, number):
+            # `which` is padded to the longest record, so only its first entries count.
+            read = values[which[:number]]
+            return read.at[0].set(worse(values[0], read[0]))
+
+        each = zip(values, self.stacked.record.which, self.num_times, strict=True)
+        return jnp.concatenate([of_record(*record) for record in each])
 
 
 def as_record_problems(

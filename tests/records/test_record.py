@@ -129,6 +129,16 @@ def test_a_record_may_begin_before_its_first_time():
     assert log_weight(1e6 + TIMES, initial_time=1e6 - 0.5) == expected != log_weight(TIMES)
 
 
+def test_only_readings_have_entries():
+    """Neither an earlier time of the initial law has one, nor has a jump."""
+    jumps = jb.Jumps([0.5, 2.25], np.zeros((2, 2)))
+    for entry, begins in ((None, 0.0), (None, -1.0), (jumps, -1.0)):
+        (record,) = as_records([(TIMES, VALUES)], 2, None, begins, entry and [entry])
+        np.testing.assert_allclose(record.since[record.which], TIMES - begins)
+        np.testing.assert_array_equal(record.values[record.which], VALUES)
+        assert np.sum(np.isfinite(record.values)) == VALUES.size
+
+
 def test_all_that_take_a_record_refuse_times_that_cannot_be_resolved():
     """Where the season counts, and where it would have to be `initial_time` that is resolved."""
     key, prior = jax.random.key(0), jb.NormalPrior(1.0, 1.0)

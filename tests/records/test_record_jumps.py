@@ -197,7 +197,11 @@ def test_a_posterior_of_doses():
         num_warmup=500,
         num_steps=2,
         jumps=doses,
+        save_states=True,
     )
+    # At the 16 times of the readings, without one for the earlier `initial_time`.
+    smoothed = posterior.states[:, 0, :, 0].mean(0)
+    assert smoothed.shape == (16,) and np.sqrt(np.mean((smoothed - y) ** 2)) < 0.25
     rates, parts = np.linspace(-1.2, 0.8, 120), np.linspace(-1.4, 0.4, 120)
     logs = np.array(
         [
