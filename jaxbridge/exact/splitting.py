@@ -165,7 +165,7 @@ class Size(NamedTuple):
     def is_doubled(self, i: Int[Array, ""]) -> Bool[Array, " lanes"]:
         """Return whether step i of each path is the second of a pair that one step replaces."""
         is_coarse = np.arange(self.num_lanes) >= self.num_runs * self.num_paths
-        return is_coarse & (i % 2 == 1)
+        return jnp.asarray(is_coarse) & (i % 2 == 1)
 
 
 def check_splitting(
