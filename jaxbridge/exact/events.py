@@ -252,7 +252,7 @@ def _sample_events(
     last = run_levels(renewed, _Population(noise, scores, zeros, runs))
     paths = jnp.moveaxis(path_of(last.noise).reshape(N + 1, d, R, n), (2, 3), (0, 1))
     order, fine = density.usual_order, slice(size.num_runs)
-    found = estimate(last.runs.log_estimates, size, order, model, paths[fine, 0], dt)
+    found = estimate(last.runs.log_estimates, size, order, model, density, paths[fine, 0], dt)
     return Events(
         found.log_probability,
         found.standard_error,

@@ -197,10 +197,10 @@ def _sample_exits(
     def step(x, normal, uniform, doubled):
         """Return the next point, and the largest -g on the way."""
         x_next = step_to(x, normal, doubled)
-        (g, s), (g_next, s_next) = of_point(x), of_point(x_next)
-        spread = -2 * jnp.sqrt(s * s_next) * dt * jnp.log(uniform)
+        (g, root), (g_next, next_root) = of_point(x), of_point(x_next)
+        spread = -2 * root * next_root * dt * jnp.log(uniform)
         spread = jnp.where(doubled, 2 * spread, spread)
-        lowest = (g + g_next - jnp.sqrt((g_next - g) ** 2 + spread)) / 2
+        lowest = (g + g_next - jnp.hypot(g_next - g, jnp.sqrt(spread))) / 2
         return x_next, -jnp.min(lowest)
 
     def simulated(key, points, progress, kept):
@@ -253,7 +253,7 @@ def _sample_exits(
     index = jnp.where(exceeds[-1], jnp.argmax(exceeds, axis=0) + 1, N + 1)
     paths = jnp.moveaxis(last.points.reshape(N + 1, d, R, n), (2, 3), (0, 1))
     fine = slice(size.num_runs)
-    found = estimate(last.runs.log_estimates, size, _ORDER, model, paths[fine, 0], dt)
+    found = estimate(last.runs.log_estimates, size, _ORDER, model, density, paths[fine, 0], dt)
     return Exits(
         found.log_probability,
         found.standard_error,

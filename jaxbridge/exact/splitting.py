@@ -42,6 +42,7 @@ from ..schemes import (
     UNKNOWN_SHARE,
     AbstractStepDensity,
     StepError,
+    StepLaw,
     check_step_density,
     known_transition,
     most_accurate_density,
@@ -56,6 +57,8 @@ from .log_means import log_mean_of_runs
 
 # Each level at least halves the probability, so that this many reach 1e-30.
 _MOST_LEVELS = 100
+# Largest quadratic part of a step relative to its linear part (`schemes.step_law`).
+_MOST_BENT = 0.5
 # Largest relative error of a probability that its standard error describes.
 _MOST_SPREAD = 0.5
 
@@ -230,6 +233,7 @@ def estimate(
     size: Size,
     order: float,
     model: Diffusion,
+    density: AbstractStepDensity,
     paths: Float[Array, "R points d"],
     dt: Float[Array, ""],
 ) -> Estimate:
@@ -250,18 +254,31 @@ def estimate(
     is_known = jnp.isfinite(value) & jnp.isfinite(of_coarse)
     change = jnp.where(is_known, of_coarse, 0) - jnp.where(is_known, value, 0)
     step_error = StepError(share * change, share * jnp.hypot(error, its_error))
-    too_long = _steps_are_too_long(model, paths, dt)
+    too_long = _steps_are_too_long(model, density, paths, dt)
     return Estimate(value, error, unknown_where(too_long | ~is_known, step_error))
 
 
 def _steps_are_too_long(
-    model: Diffusion, paths: Float[Array, "R points d"], dt: Float[Array, ""]
+    model: Diffusion,
+    density: AbstractStepDensity,
+    paths: Float[Array, "R points d"],
+    dt: Float[Array, ""],
 ) -> Bool[Array, ""]:
-    """Return whether over 2 % of these steps exceed the relaxation time of the drift."""
+    """Return whether over 2 % of these steps exceed the relaxation time of the drift, or lead to
+    points where σ differs much from that at their beginning."""
     begins, ends = (part.reshape(-1, paths.shape[-1]) for part in (paths[:, :-1], paths[:, 1:]))
     lengths = jnp.broadcast_to(dt, len(begins))
     share = share_in_regime(jnp.ones_like(lengths), model, Intervals(begins, ends, lengths), 1)
-    return jnp.mean((share == UNKNOWN_SHARE).astype(dt.dtype)) > MOST_TOO_LONG
+    dynamics = model.forward(begins[0])
+
+    def bends(x):
+        law = density.steps_from(dynamics, x).law(dt)
+        if not isinstance(law, StepLaw) or law.curvature is None:
+            return jnp.zeros((), bool)
+        return jnp.sqrt(dt) * jnp.max(jnp.abs(law.curvature)) > _MOST_BENT
+
+    too_long = (share == UNKNOWN_SHARE) | jax.vmap(bends)(begins)
+    return jnp.mean(too_long.astype(dt.dtype)) > MOST_TOO_LONG
 
 
 class Level(NamedTuple):

@@ -10,6 +10,7 @@ If the model is right, the rank of a reading among draws of its predictive law i
 independent of the others (Rosenblatt 1952; Diebold, Gunther & Tay 1998).
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.special import gammaincc, logsumexp, ndtri
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from ..engine.arguments import check_instance
 from ..engine.averages import effective_size, nan_to_neg_inf, normalise_weights
@@ -31,7 +32,7 @@ from ..engine.times import Times
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
 from ..models.diffusion import Diffusion
 from ..models.jumps import Jumps, JumpsLike
-from ..schemes import AbstractStepDensity, StepError, share_of_grid, step_faults
+from ..schemes import AbstractStepDensity, StepError, share_of_grid, step_faults, unknown_where
 from .cover import cover, covered_start
 from .guided_record import correction
 from .guided_steps import Guide, end_of_step, guided_law, guided_start
@@ -41,6 +42,7 @@ from .problem import RecordProblem
 from .record import are_several, as_times_and_rows
 from .segments import split_first, split_last
 from .several import as_record_problems
+from .step_regime import steps_are_too_long
 from .tilted_step import Information
 
 # Draws from fewer effective particles are too much alike.
@@ -79,9 +81,10 @@ class Forecast(AbstractResult):
     - `crps`: continuous ranked probability score of each component, in its unit; smaller is better.
         Shape (n, m).
     - `effective_sample_size`: effective number of particles at each reading, shape (n,).
-    - `step_error`: estimated discretisation error of `states`: the root mean square of the errors
-        of their means, in standard deviations, and of the logs of these; shape (). NaN for a single
-        step. `step_uncertainty` is its standard error.
+    - `step_error`: estimated discretisation error of `states`, the largest of all times: the root
+        of the sum of the squared errors of the mean, in standard deviations, and of the log of the
+        standard deviation; shape (). NaN for a single step. `step_uncertainty` is its standard
+        error.
     """
 
     times: Float[np.ndarray, " times"] | Float[Array, " times"]
@@ -261,7 +264,7 @@ def forecast(
     if num_times > 1 and not problem.density.is_exact:
         coarse, *_ = _run(key, records.coarsened().problem(0), num_particles, particles)
         share = share_of_grid(problem.density.order, problem.record.lengths)
-        step_error = _step_error(states[which][1:], coarse[which][1:], share)
+        step_error = _step_error(problem, states, coarse, which[1:], share)
     num_read = num_times - len(later)
     of_times = lambda draws: jnp.swapaxes(draws[which], 0, 1)
     all_times = problem.record.clock.exactly(since[which])
@@ -280,21 +283,28 @@ def forecast(
 
 @compiled_sooner
 def _step_error(
-    states: Float[Array, "times P d"], coarse: Float[Array, "times P d"], share: float
+    problem: RecordProblem,
+    states: Float[Array, "ends P d"],
+    coarse: Float[Array, "ends P d"],
+    which: Int[Array, " times"],
+    share: float,
 ) -> StepError:
-    """Return the step error of the laws of `states`, from those by steps of twice the size."""
-    (mean, sd), (of_coarse, its_sd) = (
-        (jnp.nanmean(draws, axis=1), jnp.nanstd(draws, axis=1)) for draws in (states, coarse)
-    )
-    varies = (sd > 1e-6 * jnp.max(sd, initial=0)) & (its_sd > 0)
-    safe, its_safe = jnp.where(varies, sd, 1), jnp.where(varies, its_sd, 1)
-    squares = ((of_coarse - mean) / safe) ** 2 + jnp.log(its_safe / safe) ** 2
-    # Of normal draws: 2/P for two means, and 1/P for two logs of standard deviations.
-    by_chance = 3 / states.shape[1]
-    number = jnp.maximum(jnp.sum(varies), 1).astype(sd.dtype)
-    change = jnp.sum(jnp.where(varies, squares, 0)) / number - by_chance
-    value = share * jnp.sqrt(jnp.maximum(change, 0))
-    return StepError(value, jnp.full_like(value, share * by_chance**0.5))
+    """Return the largest step error of the laws of `states`, from those by twice the step size."""
+    laws = [(jnp.nanmean(x, axis=1), jnp.nanstd(x, axis=1)) for x in (states, coarse)]
+    path = jnp.append(jnp.repeat(laws[0][0][:-1], problem.num_steps, axis=0), laws[0][0][-1:], 0)
+    too_long = steps_are_too_long(problem, problem.model, path)
+    (mean, sd), (its_mean, its_sd) = jax.tree.map(lambda leaf: leaf[which], laws)
+    is_lost = jnp.mean(~jnp.isfinite(coarse[which]), axis=1) > _MOST_LOST
+    is_known = jnp.isfinite(mean + sd + its_mean + its_sd) & ~is_lost
+    varies = is_known & (sd > 1e-6 * jnp.max(sd, initial=0, where=is_known)) & (its_sd > 0)
+    shift = jnp.where(varies, its_mean - mean, 0) / jnp.where(varies, sd, 1)
+    spread = jnp.log(jnp.where(varies, its_sd, 1) / jnp.where(varies, sd, 1))
+    squares = jnp.max(jnp.mean(shift**2 + spread**2, axis=-1), initial=0)
+    # Of normal draws a square has the mean 2/P + 1/P. The largest of n is greater by 4 log(n) / P.
+    by_chance = (3 + 4 * math.log(max(len(which), 1))) / states.shape[1]
+    value = share * jnp.sqrt(jnp.maximum(squares - by_chance, 0))
+    error = StepError(value, jnp.full_like(value, share * by_chance**0.5))
+    return unknown_where(too_long | ~jnp.all(is_known), error)
 
 
 def _last_particles(

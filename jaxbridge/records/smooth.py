@@ -135,8 +135,9 @@ class Smoothed(AbstractResult):
         - Euler steps of a σ with fewer columns than rows;
         - steps so long that the variance of D exceeds 1 in some interval (for quadratic steps: on
             average), or that more than half of the coarse paths are lost;
-        - steps longer than the relaxation time of the drift on over 2 % of the intervals. In this
-            case `step_uncertainty` is infinite.
+        - steps longer than the relaxation time of the drift, or than a cycle of time-dependent
+            coefficients, on over 2 % of the intervals. In this case `step_uncertainty` is
+            infinite.
         """
         return self._step_errors(fn)[0]
 

@@ -48,7 +48,8 @@ _TOO_LARGE = (
 )
 _TOO_LONG = (
     "The discretisation error is unknown, because steps are longer than the relaxation time of "
-    f"the drift (for a posterior: in more than a tenth of the draws). {_SHORTER}"
+    "the drift, or σ or time-dependent coefficients change too much within a step (for a "
+    f"posterior: in more than a tenth of the draws). {_SHORTER}"
 )
 _TOO_LONG_OR_VARYING_SIGMA = (
     "The discretisation error is unknown. Either steps are longer than the relaxation time of the "

@@ -29,8 +29,8 @@ from ..models.sigma import columns_of
 from ..models.tracing import uses_argument
 from .path_likelihood import as_grid_and_paths, for_each_path
 
-# Bounds of the factor from √s to its mean on the way to the boundary, which far away is a guess.
-_LARGEST_CHANGE = 4.0
+# Least s at the boundary, as a share of s at a point: far away the former is a guess.
+_LEAST_SHARE = 1 / 16
 
 
 @public_entry
@@ -43,7 +43,8 @@ def log_survival(
 
     - `model`: the diffusion. Its drift is not used.
     - `times`, `path`: as in `path_log_likelihood`.
-    - `inside`: differentiable function `(x)`, positive inside the region and negative outside.
+    - `inside`: differentiable function `(x)`, positive inside the region and negative outside, with
+        a gradient that is not zero on the boundary.
         For an intersection of regions it returns one value for each.
 
     **Returns:** log probabilities of shape (..., K), in the dtype of `path`: entry k is that of no
@@ -89,12 +90,13 @@ def _log_survival(
         return distances(dynamics_at(time), named("inside", inside), x)
 
     values = over_points(of_point)(times.ravel(), paths.reshape(-1, paths.shape[-1]))
-    g, s = (leaf.reshape(*times.shape, -1) for leaf in values)  # (P, K, number of functions)
+    g, root = (leaf.reshape(*times.shape, -1) for leaf in values)  # (P, K, number of functions)
     is_inside = g > 0
     both = is_inside[:, :-1] & is_inside[:, 1:]
-    scale = jnp.sqrt(s[:, :-1] * s[:, 1:]) * steps[..., None]
-    can_leave = both & (scale > 0)
-    exponent = 2 * g[:, :-1] * g[:, 1:] / jnp.where(can_leave, scale, 1)
+    moves = root > 0
+    can_leave = both & moves[:, :-1] & moves[:, 1:] & (steps[..., None] > 0)
+    distance = g / jnp.where(moves, root, 1)
+    exponent = 2 * distance[:, :-1] * distance[:, 1:] / jnp.where(can_leave, steps[..., None], 1)
     # Below, exponents are one where nothing can leave, so that derivatives are finite.
     log_stays = jnp.log(-jnp.expm1(-jnp.where(can_leave, exponent, 1)))
     log_stays = jnp.where(both, jnp.where(can_leave, log_stays, 0), -jnp.inf)
@@ -106,10 +108,9 @@ def _log_survival(
 def distances(
     dynamics: Dynamics, inside: Callable, x: Float[Array, " d"]
 ) -> tuple[Float[Array, " g"], Float[Array, " g"]]:
-    """Return g(x) and the mean of s = |σᵀ∇g|² from x to the boundary, for all functions g.
+    """Return g(x) and the mean of √s = |σᵀ∇g| from x to the boundary, for all functions g.
 
-    The mean is (√s - ½ g ∂√s/∂g)², with the derivative along V∇g. To first order √s at the boundary
-    is √s - g ∂√s/∂g.
+    Towards the boundary s changes by -g ∂s/∂g to first order, with the derivative along V∇g.
     """
 
     def of_point(x):
@@ -121,12 +122,12 @@ def distances(
 
     s, (g, along, columns) = of_point(x)
     if not uses_argument(lambda x: of_point(x)[0], x):
-        return g, s
+        return g, jnp.sqrt(s)
     moves = s > 0
     safe = jnp.where(moves, s, 1)
     change_of = lambda direction: jax.jvp(lambda x: of_point(x)[0], (x,), (direction,))[1]
     # A direction for each g, along which that g changes by one.
     changes = jax.vmap(change_of)(matmul((along / safe).T, columns))
-    relative = 1 - g * jnp.diagonal(changes) / (4 * safe)
-    bounded = jnp.clip(relative, 1 / _LARGEST_CHANGE, _LARGEST_CHANGE)
-    return g, jnp.where(moves, s * bounded**2, 0)
+    at_boundary = jnp.maximum(safe - g * jnp.diagonal(changes), _LEAST_SHARE * safe)
+    mean = (jnp.sqrt(safe) + jnp.sqrt(at_boundary)) / 2
+    return g, jnp.where(moves, mean, 0)

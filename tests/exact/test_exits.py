@@ -127,6 +127,33 @@ def test_the_error_of_long_steps_is_told():
 
 
 @pytest.mark.slow
+def test_a_region_that_is_no_distance():
+    """1.5² - x² in few steps, in all units; the centre of the strip is a critical point."""
+    n = np.arange(1, 400, 2)
+    terms = 4 / (n * np.pi) * np.sin(n * np.pi / 2) * np.exp(-((n * np.pi / 3) ** 2) / 2)
+    free = jb.Diffusion(lambda x, p: 0 * x, lambda x, p: p * jnp.ones(1), params=1.0)
+
+    @jax.jit
+    def exits(unit):
+        inside = lambda x: 2.25 * unit**2 - x @ x
+        model = free.with_params(unit)
+        return jb.sample_exits(jax.random.key(0), model, [0.0], 1.0, inside, num_steps=4)
+
+    for unit in (1.0, 1e-6, 1e6):
+        assert_agrees(exits(unit), 1 - np.sum(terms), 0.02)
+
+
+@pytest.mark.slow
+def test_noise_that_turns_within_a_step():
+    """Of σ = 1 + .9 sin 25x neither 20 steps nor ten see anything: log p is -18."""
+    model = jb.Diffusion(lambda x, p: 0 * x, lambda x, p: 1 + 0.9 * jnp.sin(25 * x))
+    exits = jb.sample_exits(
+        jax.random.key(0), model, [0.0], 1.0, lambda x: 2 - x[0], num_steps=20, num_paths=100
+    )
+    assert jnp.isnan(exits.step_error) and "σ" in exits.why()
+
+
+@pytest.mark.slow
 def test_a_rate_is_one_over_the_mean_passage_time():
     """Over a barrier of six times the temperature, against quadrature."""
     heat, start, end = 0.25, -1.0, 0.6

@@ -108,14 +108,25 @@ def test_the_error_of_long_steps_is_told():
         decay = (1 - dt) ** (num_steps * later)
         sd = np.sqrt((1 - exact**2) / 2)
         simulated = np.sqrt(dt * (1 - decay**2) / (1 - (1 - dt) ** 2))
-        return np.sqrt(np.mean((start * (decay - exact) / sd) ** 2 + np.log(simulated / sd) ** 2))
+        return np.sqrt(np.max((start * (decay - exact) / sd) ** 2 + np.log(simulated / sd) ** 2))
 
     long, short = made(4), made(32)
     assert not long.trustworthy and "(`step_error`) exceeds" in long.why()
     assert abs(long.step_error - error(4)) < 0.5 * error(4) and error(4) > 0.1
     assert short.trustworthy
-    assert abs(short.step_error - error(32)) < 2 * short.step_uncertainty < 0.06
+    assert abs(short.step_error - error(32)) < 2 * short.step_uncertainty < 0.1
     assert jnp.isnan(made(1).step_error) and "is unknown" in made(1).why()
+
+
+def test_lost_coarse_paths_have_an_unknown_error():
+    """Of a cubic drift far away, where steps of twice the size explode."""
+    cubic = jb.Diffusion(lambda x, p: x - x**3, [[0.5]])
+    made = jb.forecast(
+        KEY, cubic, [0.0], [np.nan], observation=jb.LinearGaussian(covariance=0.1),
+        initial=[3.0], at=[1.0, 2.0], num_steps=16, num_particles=100,
+    )  # fmt: skip
+    assert np.all(np.isfinite(made.states)) and jnp.isnan(made.step_error)
+    assert not made.trustworthy
 
 
 def test_an_exact_first_reading_of_a_law_that_is_not_normal():
