@@ -135,6 +135,7 @@ from .records.observations import (
     StudentT,
 )
 from .records.smooth import Smoothed, smooth
+from .records.smoothing_kernel import smoothing_kernel
 from .schemes.base import AbstractScheme
 from .schemes.euler import Euler
 from .schemes.gaussian_transition import GaussianTransition
@@ -259,6 +260,7 @@ __all__ = [
     "LogLikelihood",
     "smooth",
     "Smoothed",
+    "smoothing_kernel",
     "innovations",
     "Innovations",
     # Inference from discrete observations.

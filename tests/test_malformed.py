@@ -174,6 +174,7 @@ CALLS = {
     "log_likelihood": small(jb.log_likelihood, key=KEY, **NOISY, num_particles=4),
     "forecast": small(jb.forecast, key=KEY, **NOISY, num_particles=4),
     "smooth": small(jb.smooth, key=KEY, **NOISY, num_draws=4, num_warmup=2),
+    "smoothing_kernel": small(jb.smoothing_kernel, **NOISY),
     "innovations": small(jb.innovations, **NOISY),
     "gibbs": small(jb.gibbs, key=KEY, **RECORD, **RATE, num_iterations=2, proposal=GUIDED),
     "gibbs of a record": small(jb.gibbs, key=KEY, **RECORD, **RATE, **FEW, observation=SEEN),

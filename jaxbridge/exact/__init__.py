@@ -28,6 +28,7 @@ from .importance import (
 )
 from .kernels import (
     Chain as Chain,
+    Kernel as Kernel,
     acceptance_rate as acceptance_rate,
 )
 from .log_means import (

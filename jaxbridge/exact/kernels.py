@@ -43,7 +43,10 @@ _TOO_FEW_MOVES = (
 
 
 class Kernel(NamedTuple):
-    """Markov kernel on bridges, from `pseudo_marginal`, `renewal` or `crank_nicolson`.
+    """Markov kernel on paths.
+
+    Those of `pseudo_marginal`, `renewal` and `crank_nicolson` are for bridges, and that of
+    `smoothing_kernel` is for paths given a record.
 
     It has the interface of the sampling algorithms of BlackJAX, so code for these can run it.
 

@@ -379,7 +379,7 @@ def smooth(
             num_points = records.num_points(number)
         else:
             start_key, key = jax.random.split(key)
-            firsts = _guided_paths(start_key, problem, linearisation, num_chains)
+            firsts = guided_paths(start_key, problem, linearisation, num_chains)
             sizes = (*counts, num_proposals)
             draws = sample_states(key, problem, bridges, firsts, sizes, progress_meter)
             density = _least_accurate(problem, bridges)
@@ -415,7 +415,7 @@ def _least_accurate(problem: RecordProblem, proposal: AbstractProposal) -> Abstr
 
 
 @compiled_sooner
-def _guided_paths(
+def guided_paths(
     key: Key[Array, ""], problem: RecordProblem, linearisation: Linearised, num_chains: int
 ) -> Float[Array, "chains points d"]:
     """Sample the knots of independent guided paths.
@@ -447,7 +447,7 @@ def _run_block_chains(
     points, guide, _ = linearisation
     start_key, key = jax.random.split(key)
 
-    firsts = jnp.moveaxis(_guided_paths(start_key, problem, linearisation, num_chains), 0, -1)
+    firsts = jnp.moveaxis(guided_paths(start_key, problem, linearisation, num_chains), 0, -1)
     (K, N), d = problem.record.dt.shape, problem.dim
     paths = Paths(firsts[0], firsts[1:].reshape(K, N, d, num_chains))
     both = blocks_of_both_cuts(problem, points, guide, block_length)
