@@ -53,7 +53,8 @@ def dataset(result: Any) -> Any:
             "from `jit` and call `to_xarray()` there."
         )
     fields = {field.name: field.type for field in dataclasses.fields(result)}
-    # The leaves of parameters begin with the axes of the draws, as θ does.
+    # The leaves of parameters begin with the axes of the draws, as θ does. Those of each record
+    # have one more axis.
     of_draws = _labelled(result, "theta", fields["theta"])[0][:-1] if "theta" in fields else ()
     arrays: dict[str, _Labelled] = {}
     numbers: dict[str, Any] = {"why": result.why()}
@@ -64,8 +65,9 @@ def dataset(result: Any) -> Any:
             numbers[name] = int(value) if isinstance(value, bool) else value
         elif annotation is PyTree:
             for path, leaf in named_leaves(value, name).items():
+                first = (*of_draws, "record") if name == "unit_params" else of_draws
                 own = tuple(f"{path}_{i}" for i in range(leaf.ndim))
-                arrays[path] = ((*of_draws, *own[len(of_draws) :]), jax.device_get(leaf))
+                arrays[path] = ((*first, *own[len(first) :]), jax.device_get(leaf))
         elif value is not None and _axes(annotation) is not None:
             arrays[name] = _labelled(result, name, annotation)
     arrays["trustworthy"] = _labelled(result, "trustworthy", Bool[Array, "*I"])

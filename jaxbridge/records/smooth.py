@@ -73,6 +73,13 @@ _CUT_OFF = (
     "Some weights of the `proposal` were truncated at its bound on the work. Increase the bound, "
     "or use another proposal."
 )
+# A longer stay of a point, as a share of the draws and in draws, is no chance of frequent moves.
+_LONGEST_STAY, _FEWEST_STAYS = 0.05, 50
+_STAYED = (
+    "A part of the path stayed the same in more than 5 % of the draws of a chain, because few "
+    "paths have large weights. The mean and its error may miss such paths. Use more `num_draws`, "
+    "more steps, or a shorter `block_length`."
+)
 _APART = "Chains disagree (R̂ above 1.1 at some points). Use more `num_draws` and `num_warmup`."
 
 
@@ -180,7 +187,7 @@ class Smoothed(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the draws, each with a remedy.
 
-        - a block that never moved;
+        - a block that never moved, or a part of the path that stayed the same for long;
         - truncated weights;
         - chains that disagree at some points;
         - a poor guide, together with the first or the third of these;
@@ -194,6 +201,7 @@ class Smoothed(AbstractResult):
         return Verdict(
             (
                 Fault(stuck, _STUCK),
+                Fault(~stuck & self._stayed, _STAYED),
                 Fault(self.num_truncated > 0, _CUT_OFF),
                 Fault(apart, _APART),
                 *guide,
@@ -205,6 +213,17 @@ class Smoothed(AbstractResult):
     def _chains_agree(self) -> Bool[Array, ""]:
         """Return whether R̂ is small at all points that are not constant."""
         return jnp.all((self.r_hat() < _MOST_R_HAT) | ~self._varies)
+
+    @property
+    def _stayed(self) -> Bool[Array, ""]:
+        """Return whether a point stayed the same for more than 5 % of the draws of a chain."""
+        n = self.paths.shape[1]
+        moved = jnp.any(self.paths[:, 1:] != self.paths[:, :-1], axis=-1)
+        draw = jnp.arange(1, n, dtype=jnp.int32)[:, None]
+        since_move = draw - lax.cummax(jnp.where(moved, draw, 0), axis=1)
+        longest = jnp.max(since_move, axis=(0, 1), initial=0)
+        varies = jnp.any(self._varies, axis=-1)
+        return jnp.any(varies & (longest > max(_LONGEST_STAY * n, _FEWEST_STAYS)))
 
     @property
     def _varies(self) -> Bool[Array, "K d"]:

@@ -94,6 +94,7 @@ def test_posterior_is_that_of_the_grid():
     np.testing.assert_array_less(np.abs(of_units.mean(0) - levels), 5 * error)
     draws = made.to_arviz().posterior
     assert "log_sd(level)" in draws
+    assert made.to_xarray()["unit_params.level"].dims == ("chain", "draw", "record")
     np.testing.assert_array_equal(draws["unit_params.level"].values.reshape(-1, NUM), of_units)
 
 

@@ -37,6 +37,14 @@ def test_chains_in_two_wells_know_little():
     assert (np.asarray(apart.effective_sample_size()) < 8).all() and not apart.trustworthy
 
 
+def test_a_long_stay_is_a_fault():
+    """Of one point of one chain, at a value that others take as well: R̂ does not see it."""
+    paths = jax.random.normal(jax.random.key(0), (4, 1000, 3, 1))
+    short, long = (paths.at[1, 300 : 300 + n, 1].set(0.5) for n in (40, 70))
+    assert smoothed(short).trustworthy and not smoothed(long).trustworthy
+    assert "stayed the same" in smoothed(long).why()
+
+
 def test_a_point_that_never_moves_is_no_disagreement():
     paths = jax.random.normal(jax.random.key(0), (4, 500, 3, 1)).at[:, :, 0].set(1.0)
     assert smoothed(paths).trustworthy
