@@ -223,7 +223,7 @@ class Smoothed(AbstractResult):
         since_move = draw - lax.cummax(jnp.where(moved, draw, 0), axis=1)
         longest = jnp.max(since_move, axis=(0, 1), initial=0)
         varies = jnp.any(self._varies, axis=-1)
-        return jnp.any(varies & (longest > max(_LONGEST_STAY * n, _FEWEST_STAYS)))
+        return jnp.any(varies & (longest > max(int(_LONGEST_STAY * n), _FEWEST_STAYS)))
 
     @property
     def _varies(self) -> Bool[Array, "K d"]:
