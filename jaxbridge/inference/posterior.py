@@ -314,8 +314,9 @@ class AbstractPosterior(AbstractResult):
         `sample_stats` contains the other values of each draw, for instance whether moves were
         accepted. There `log_likelihood` of `pmmh` has the name `log_likelihood_estimate`, because
         ArviZ expects one log-likelihood for each observation. With `save_states` of `gibbs` the
-        group `log_likelihood` contains these, given the states, for `arviz.loo`; `posterior`
-        contains the states. This needs the package ArviZ.
+        group `log_likelihood` contains these, given the states, for `arviz.loo`, with the record
+        and the index of the time of each; `posterior` contains the states. This needs the package
+        ArviZ.
 
         **Example:**
 
@@ -344,15 +345,17 @@ class AbstractPosterior(AbstractResult):
             stats["log_likelihood_estimate"] = stats.pop("log_likelihood")
         groups: dict[str, Any] = {"posterior": posterior, "sample_stats": stats}
         states, logs = (getattr(self, name, None) for name in ("states", "log_densities"))
+        labels: dict[str, Any] = {}
         if states is not None:
             posterior["states"], logs = of_chains(states), of_chains(logs)
-            logs = logs.reshape(*logs.shape[:2], -1)
-            seen = ~np.all(np.isnan(logs), axis=(0, 1))
+            seen = ~np.all(np.isnan(logs), axis=(0, 1))  # (records, times)
             groups["log_likelihood"] = {"observations": logs[..., seen]}
+            readings = [f"record {i}, time {k}" for i, k in np.argwhere(seen)]
+            labels = {"coords": {"reading": readings}, "dims": {"observations": ["reading"]}}
         # Version 1 changed the arguments of `from_dict`.
         is_new = int(arviz.__version__.split(".")[0]) >= 1
         from_dict: Any = arviz.from_dict
-        return from_dict(groups) if is_new else from_dict(**groups)
+        return from_dict(groups, **labels) if is_new else from_dict(**groups, **labels)
 
 
 def last(first: Any, second: Any, share: float) -> Any:

@@ -67,6 +67,9 @@ def test_states_have_the_law_given_all_that_was_seen():
         np.testing.assert_allclose(of_record, expected, atol=1e-4)
     group = made.to_arviz().log_likelihood["observations"]
     assert group.shape == (2, 2000, 17) and np.isfinite(group.values).all()
+    assert group.dims[2] == "reading" and list(group.reading.values[[3, 4, -1]]) == [
+        "record 0, time 3", "record 0, time 5", "record 1, time 5",
+    ]  # fmt: skip
     assert made.to_xarray().states.dims == ("chain", "draw", "record", "time", "state")
 
 
