@@ -118,8 +118,8 @@ def sample_events(
     - `throw`: raise an error at run time if the result is not `trustworthy`.
 
     **Returns:** `Events`. The cost grows with the log of the probability, not with its inverse. The
-    discretisation error is that of the probability of the event at the N+1 points. It takes as much
-    time again; linear models have none.
+    discretisation error is that of the probability of the event at the N+1 points. Its estimate
+    takes as much time again. Linear models have no such error.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments, and for coefficients that depend
     on time.
@@ -192,9 +192,10 @@ def _sample_events(
     step = over_lanes(-1, -1, -1)(make_step(density, dynamics, start, dt))
 
     def path_of(noise):
-        """Return the paths; on the coarse grid a pair of steps is one, by the sum of their noise.
+        """Return the paths.
 
-        The first step of such a pair only leads to the point between its ends.
+        On the coarse grid one step of length 2δ replaces each pair, with the sum of their noise.
+        The first step of a pair only leads to the point between both ends.
         """
 
         def one(carry, inputs):

@@ -240,7 +240,7 @@ def estimate(
     """Return the estimate from those of all runs.
 
     `paths` are some paths given the event. The discretisation error of order δ^p is unknown if
-    their steps are too long for the drift.
+    their steps are too long for the drift or for σ.
     """
     fine, coarse = log_estimates[: size.num_runs], log_estimates[size.num_runs :]
     value, error = log_mean_of_runs(fine[None])

@@ -28,9 +28,7 @@ from ..engine.compiled import compiled_sooner
 from ..records import (
     Guidance,
     GuideCheck,
-    Paths,
     Records,
-    blocks_of_both_cuts,
     change_by_coarse_steps,
     cuts,
     guided,
@@ -45,7 +43,7 @@ from ..records import (
     path_of_knots,
     points_and_check,
     steps_are_too_long,
-    sweep,
+    swept_path,
 )
 from ..schemes import share_of_grid
 from .parameters import Parameters, of_rows
@@ -139,11 +137,8 @@ class RecordPaths(eqx.Module):
         records, points, _ = self.fine
 
         def one(problem, model, key, points, guide, log_scales, path):
-            (K, N), d = problem.record.dt.shape, problem.dim
-            both = blocks_of_both_cuts(problem, points, guide, _BLOCK_LENGTH)
-            old = Paths(path[0][:, None], path[1:].reshape(K, N, d, 1))
-            new, accepted = sweep(key, problem, model, both, log_scales, old)
-            return jnp.concatenate([new.start.T, new.points.reshape(K * N, d)]), accepted
+            along = points, guide
+            return swept_path(key, problem, model, along, _BLOCK_LENGTH, log_scales, path)
 
         keys = jax.random.split(key, records.number)
         arguments = keys, points, at.guides, log_scales, paths

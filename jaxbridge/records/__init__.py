@@ -53,11 +53,9 @@ from .observations import (
 )
 from .particle_filter import Filtered as Filtered, run_filters as run_filters
 from .path_blocks import (
-    Paths as Paths,
-    blocks_of_both_cuts as blocks_of_both_cuts,
     cuts as cuts,
     has_segments as has_segments,
-    sweep as sweep,
+    swept_path as swept_path,
     tuned as tuned,
 )
 from .several import (

@@ -491,6 +491,26 @@ def sweep(
     return lax.scan(one, paths, (jnp.arange(2), both, log_scales))
 
 
+def swept_path(
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    model: Diffusion,
+    linearisation: tuple[Float[Array, "points d"], Guidance],
+    length: int,
+    log_scales: Float[Array, "2 B"],
+    path: Float[Array, "points d"],
+) -> tuple[Float[Array, "points d"], Bool[Array, "2 B 1"]]:
+    """Move the blocks of both partitions of one path, by its knots, and return which of them moved.
+
+    `linearisation` are the points along which the model is linearised, and the guide along them.
+    """
+    (K, N), d = problem.record.dt.shape, problem.dim
+    both = blocks_of_both_cuts(problem, *linearisation, length)
+    old = Paths(path[0][:, None], path[1:].reshape(K, N, d, 1))
+    new, accepted = sweep(key, problem, model, both, log_scales, old)
+    return jnp.concatenate([new.start.T, new.points.reshape(K * N, d)]), accepted
+
+
 def tuned(
     log_scales: Float[Array, "*moves"], accepted: Bool[Array, "*moves C"], number: Float[Array, ""]
 ) -> Float[Array, "*moves"]:

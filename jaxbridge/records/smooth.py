@@ -73,7 +73,7 @@ _CUT_OFF = (
     "Some weights of the `proposal` were truncated at its bound on the work. Increase the bound, "
     "or use another proposal."
 )
-# A longer stay of a point, as a share of the draws and in draws, is no chance of frequent moves.
+# Longest stay of a point that is no fault: as a share of the draws, and, for few draws, in draws.
 _LONGEST_STAY, _FEWEST_STAYS = 0.05, 50
 _STAYED = (
     "A part of the path stayed the same in more than 5 % of the draws of a chain, because few "

@@ -16,7 +16,7 @@ from .guide_search import Linearised, linearised, no_check
 from .guided_record import guided
 from .initial import Initial
 from .observations import AbstractObservation
-from .path_blocks import Paths, blocks_of_both_cuts, cuts, sweep, tuned
+from .path_blocks import cuts, swept_path, tuned
 from .problem import RecordProblem
 from .record import are_several
 from .several import as_record_problems
@@ -91,7 +91,7 @@ def smoothing_kernel(
     ```
     """
     block_length = check_count("block_length", block_length, 2)
-    num_warmup = check_count("num_warmup", num_warmup, 0)
+    warmup = jnp.int32(check_count("num_warmup", num_warmup, 0))
     if are_several(times, observations):
         raise ValueError(
             "`smoothing_kernel` takes one record: build a kernel for each of several records."
@@ -138,7 +138,7 @@ def smoothing_kernel(
     @public_entry
     def step(rng_key, state):
         check_key(rng_key)
-        return _step(rng_key, problem, linearisation, block_length, num_warmup, state)
+        return _step(rng_key, problem, linearisation, block_length, warmup, state)
 
     return Kernel(init, step)
 
@@ -155,16 +155,14 @@ def _step(
     problem: RecordProblem,
     linearisation: Linearised,
     block_length: int,
-    num_warmup: int,
+    num_warmup: Int[Array, ""],
     state: SmoothingState,
 ) -> tuple[SmoothingState, SmoothingInfo]:
     """Move all blocks of the path, and adapt the sizes of the moves in the warm-up."""
     problem, linearisation, state = nondifferentiable((problem, linearisation, state))
-    (K, N), d, (path, log_scales, number) = problem.record.dt.shape, problem.dim, state
-    both = blocks_of_both_cuts(problem, linearisation.points, linearisation.guide, block_length)
-    old = Paths(path[0][:, None], path[1:].reshape(K, N, d, 1))
-    new, accepted = sweep(key, problem, problem.model, both, log_scales, old)
-    path = jnp.concatenate([new.start.T, new.points.reshape(K * N, d)])
+    path, log_scales, number = state
+    given = problem, problem.model, linearisation[:2]
+    path, accepted = swept_path(key, *given, block_length, log_scales, path)
     adapted = tuned(log_scales, accepted, (number + 1).astype(path.dtype))
     log_scales = jnp.where(number < num_warmup, adapted, log_scales)
     return SmoothingState(path, log_scales, number + 1), SmoothingInfo(accepted[..., 0])

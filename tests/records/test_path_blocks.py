@@ -7,14 +7,8 @@ import pytest
 
 import jaxbridge as jb
 from jaxbridge.inference.record_gibbs import RecordPosterior, RecordState
-from jaxbridge.records import (
-    Paths,
-    as_record_problems,
-    blocks_of_both_cuts,
-    has_segments,
-    linearised,
-    sweep,
-)
+from jaxbridge.records import as_record_problems, linearised
+from jaxbridge.records.path_blocks import Paths, blocks_of_both_cuts, has_segments, sweep
 
 MODEL = jb.ornstein_uhlenbeck([[1.0]])
 TIMES, COUNTS = np.arange(7) * 0.3, np.array([2.0, 1, 0, 3, 2, 1, 1])[:, None]

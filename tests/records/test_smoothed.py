@@ -38,7 +38,7 @@ def test_chains_in_two_wells_know_little():
 
 
 def test_a_long_stay_is_a_fault():
-    """Of one point of one chain, at a value that others take as well: R̂ does not see it."""
+    """Of one point of one chain, at a value that others take as well, so that R̂ stays near 1."""
     paths = jax.random.normal(jax.random.key(0), (4, 1000, 3, 1))
     short, long = (paths.at[1, 300 : 300 + n, 1].set(0.5) for n in (40, 70))
     assert smoothed(short).trustworthy and not smoothed(long).trustworthy
