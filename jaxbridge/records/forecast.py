@@ -39,7 +39,7 @@ from .guided_steps import Guide, end_of_step, guided_law, guided_start
 from .initial import Initial, calls_for_cover, initial_law
 from .observations import AbstractObservation, Scalars
 from .problem import RecordProblem
-from .record import are_several, as_times_and_rows
+from .record import check_is_one, as_times_and_rows
 from .segments import split_first, split_last
 from .several import as_record_problems
 from .step_regime import steps_are_too_long
@@ -219,11 +219,7 @@ def forecast(
     **Source:** bootstrap filter of Gordon, Salmond & Smith (1993), with a conditioned last step.
     """
     check_key(key)
-    if are_several(times, observations):
-        raise ValueError(
-            "`forecast` takes one record, with `times` of shape (n,) and `observations` of shape "
-            "(n, m): call it for each of several records."
-        )
+    check_is_one("forecast", times, observations, "call it")
     particles = None
     if after is not None:
         if initial is not None or num_particles is not None:

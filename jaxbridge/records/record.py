@@ -262,6 +262,15 @@ def are_several(times: Numbers, observations: Numbers) -> bool:
     return _num_axes(observations) == 3 or _has_rows(times)
 
 
+def check_is_one(name: str, times: Numbers, observations: Numbers, instead: str) -> None:
+    """Raise `ValueError` if the function `name` was passed several records."""
+    if are_several(times, observations):
+        raise ValueError(
+            f"`{name}` takes one record, with `times` of shape (n,) and `observations` of shape "
+            f"(n, m): {instead} for each of several records."
+        )
+
+
 def _has_rows(times: Numbers) -> bool:
     """Return whether `times` contains several rows, each with two times or more."""
     # Times of shape (n, 1) count as one record; its check reports the wrong shape.

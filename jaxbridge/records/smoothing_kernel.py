@@ -18,7 +18,7 @@ from .initial import Initial
 from .observations import AbstractObservation
 from .path_blocks import cuts, swept_path, tuned
 from .problem import RecordProblem
-from .record import are_several
+from .record import check_is_one
 from .several import as_record_problems
 from .smooth import guided_paths
 
@@ -92,10 +92,7 @@ def smoothing_kernel(
     """
     block_length = check_count("block_length", block_length, 2)
     warmup = jnp.int32(check_count("num_warmup", num_warmup, 0))
-    if are_several(times, observations):
-        raise ValueError(
-            "`smoothing_kernel` takes one record: build a kernel for each of several records."
-        )
+    check_is_one("smoothing_kernel", times, observations, "build a kernel")
     problem = as_record_problems(
         model,
         times,
