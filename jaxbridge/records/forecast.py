@@ -39,7 +39,7 @@ from .guided_steps import Guide, end_of_step, guided_law, guided_start
 from .initial import Initial, calls_for_cover, initial_law
 from .observations import AbstractObservation, Scalars
 from .problem import RecordProblem
-from .record import check_is_one, as_times_and_rows
+from .record import as_times_and_rows, check_is_one
 from .segments import split_first, split_last
 from .several import as_record_problems
 from .step_regime import steps_are_too_long
