@@ -245,7 +245,7 @@ def gibbs(
         adapts the sizes of moves and the guide. `covariance` is as in `pmmh`.
     - `save_states`: for records only. Whether the result contains the states at the times of the
         observations and the log densities of these, for each draw: for smoothed states with all
-        uncertainty, and for `arviz.loo`. By default it does not, because they take memory.
+        uncertainty, and for `arviz.loo`. By default it does not, because they take memory and time.
     - `num_counts`, `max_proposals`, `max_trials`: as in `sample_exact_bridges`. The renewal chain
         and approximate bridges take only `max_proposals`.
     - `progress_meter`: a progress meter of diffrax, for instance `diffrax.TextProgressMeter()`.

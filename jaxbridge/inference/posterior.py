@@ -314,9 +314,9 @@ class AbstractPosterior(AbstractResult):
         `sample_stats` contains the other values of each draw, for instance whether moves were
         accepted. There `log_likelihood` of `pmmh` has the name `log_likelihood_estimate`, because
         ArviZ expects one log-likelihood for each observation. With `save_states` of `gibbs` the
-        group `log_likelihood` contains these, given the states, for `arviz.loo`, with the record
-        and the index of the time of each; `posterior` contains the states. This needs the package
-        ArviZ.
+        group `log_likelihood` contains these for `arviz.loo`, with the record and the index of the
+        time of each: log densities given θ and the states at the times before and after. The group
+        `posterior` contains the states. This needs the package ArviZ.
 
         **Example:**
 

@@ -135,8 +135,9 @@ class RecordPosterior(AbstractPosterior):
         without a `population`.
     - `states`: the states of R records at the K times of their observations, shape
         (*chains, n, R, K, d); NaN after the end of a record. `None` without `save_states`.
-    - `log_densities`: log density of each observation given the state and the parameters of a draw,
-        shape (*chains, n, R, K). NaN if nothing was observed.
+    - `log_densities`: log density of each observation given the parameters of a draw and its states
+        at the times before and after, for leave-one-out validation, shape (*chains, n, R, K). NaN
+        if nothing was observed.
     """
 
     params: PyTree
@@ -397,12 +398,14 @@ def _sample_records(
             return jnp.full(theta.shape[:-1], jnp.nan, theta.dtype)
         return thinned_step_errors(function, guided, i - skipped, num_iterations)
 
-    def at_observations(sampler, state):
-        of_chain = lambda theta, units, paths: sampler.completion.at_observations(
-            population.of_units(theta, units), paths
-        )
-        several = jax.vmap(of_chain) if state.theta.ndim > 1 else of_chain
-        return several(state.theta, state.units, state.paths)
+    def at_observations(sampler, guided):
+        def of_chain(key, guided):
+            state, guides, *_ = guided
+            at = GuidedTheta(population.of_units(state.theta, state.units), guides)
+            return sampler.completion.at_observations(key, at, state.paths)
+
+        its_key = key_for("observations", jax.random.fold_in(key, number(guided)))
+        return over_chains(of_chain, its_key, guided)
 
     def draw(sampler, guided, i):
         def iterate(guided, i):
@@ -416,7 +419,7 @@ def _sample_records(
         weights = jnp.any(has_weight, axis=0), changes(sampler, i, guided)
         units = guided.state.units
         moved = jnp.mean(theta_moved, axis=0), share[..., 0], jnp.any(units_moved, axis=0)
-        seen = at_observations(sampler, guided.state) if saves_states else ()
+        seen = at_observations(sampler, guided) if saves_states else ()
         result = theta, units, *moved, *weights, seen
         return guided, (result, sampler.completion.fine.check)
 

@@ -34,7 +34,7 @@ from ..records import (
     guided,
     has_segments,
     knots_and_log_weight,
-    log_observation_densities,
+    log_densities_left_out,
     no_check,
     noise_and_log_weight,
     on_each_grid,
@@ -163,16 +163,20 @@ class RecordPaths(eqx.Module):
         return _paths_of_noise(self.parameters, self.fine.records, at, noise)
 
     def at_observations(
-        self, theta: Float[Array, "*R p"], paths: Float[Array, "R points d"]
+        self, key: Key[Array, ""], at: GuidedTheta, paths: Float[Array, "R points d"]
     ) -> tuple[Float[Array, "R ends d"], Float[Array, "R ends"]]:
-        """Return the states at the ends of segments, and log g of the observations there."""
+        """Return the states at the ends of segments, and the log densities of the observations.
 
-        def one(problem, model, knots):
+        These are given θ and the states at the ends before and after (`records.left_out`).
+        """
+        records, points, _ = self.fine
+
+        def one(problem, model, key, points, guide, knots):
             states = path_of_knots(problem, model, knots)[:: problem.num_steps]
-            scalars = problem.scalars(model)
-            return states, log_observation_densities(problem, model, scalars, states)
+            return states, log_densities_left_out(key, problem, model, (points, guide), knots)
 
-        return _each(self.parameters, self.fine.records, one, theta, paths)
+        keys = jax.random.split(key, records.number)
+        return _each(self.parameters, records, one, at.theta, keys, points, at.guides, paths)
 
     def change_by_coarse_steps(
         self, theta: Float[Array, "*R p"], noise: Float[Array, "R points d"]

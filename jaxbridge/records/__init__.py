@@ -39,7 +39,6 @@ from .guided_record import (
     change_by_coarse_steps as change_by_coarse_steps,
     guided as guided,
     knots_and_log_weight as knots_and_log_weight,
-    log_observation_densities as log_observation_densities,
     noise_and_log_weight as noise_and_log_weight,
     pair_noise as pair_noise,
     path_and_log_weight as path_and_log_weight,
@@ -47,6 +46,7 @@ from .guided_record import (
     path_of_knots as path_of_knots,
 )
 from .initial import Initial as Initial
+from .left_out import log_densities_left_out as log_densities_left_out
 from .observations import (
     AbstractObservation as AbstractObservation,
     LinearGaussian as LinearGaussian,

@@ -19,6 +19,7 @@ because their draws do not show their error.
 """
 
 import functools
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -167,7 +168,7 @@ def blocks_of(
         lambda first, tail: jnp.concatenate([first[None], tail]), guide.first, guide.scalars
     )
     all_scalars = _pad_rows(all_scalars, d)
-    missing = _missing_like(jax.tree.map(lambda leaf: leaf[0], all_scalars))
+    missing = missing_like(jax.tree.map(lambda leaf: leaf[0], all_scalars))
 
     def scalars_at(place: np.ndarray, absent: np.ndarray) -> Scalars:
         """Return the scalars at these ends of segments, missing ones where `absent`."""
@@ -203,7 +204,7 @@ def blocks_of(
     )
 
 
-def _missing_like(scalars: Scalars) -> Scalars:
+def missing_like(scalars: Scalars) -> Scalars:
     """Return scalars of the same shape, all missing."""
     return Scalars(
         jnp.zeros_like(scalars.rows),
@@ -262,10 +263,8 @@ def move(
 
     **Returns:** the paths, and which blocks accepted their proposals.
     """
-    noise_key, start_key, accept_key = jax.random.split(key, 3)
-    lanes = _lanes_of(blocks, scale, paths)
-    first = _new_starts(start_key, problem, model, blocks, lanes)
-    last, new = _new_points(noise_key, problem, model, blocks, lanes, first)
+    propose_key, accept_key = jax.random.split(key)
+    lanes, first, last, new = _proposed(propose_key, problem, model, blocks, scale, paths)
     rate = acceptance_rate(nan_to_neg_inf(last.log_old), nan_to_neg_inf(last.log_new))
     accepted = jax.random.uniform(accept_key, rate.shape, rate.dtype) < rate
 
@@ -277,6 +276,35 @@ def move(
     begin = jnp.argmax(blocks.segment.T.ravel() == 0)
     start = jnp.where(accepted, first.new, lanes.start).reshape(d, B, C)[:, 0]
     return Paths(start, lax.dynamic_slice_in_dim(points, begin, K)), accepted.reshape(B, C)
+
+
+def _proposed(
+    key: Key[Array, ""],
+    problem: RecordProblem,
+    model: Diffusion,
+    blocks: Blocks,
+    scale: Float[Array, " B"],
+    paths: Paths,
+) -> tuple[_Lanes, _PathPair, _PathPair, Float[Array, "J N d lanes"]]:
+    """Return the lanes, the old and new paths at their beginnings and ends, and the new knots."""
+    noise_key, start_key = jax.random.split(key)
+    lanes = _lanes_of(blocks, scale, paths)
+    first = _new_starts(start_key, problem, model, blocks, lanes)
+    return lanes, first, *_new_points(noise_key, problem, model, blocks, lanes, first)
+
+
+def log_evidence(
+    key: Key[Array, ""], problem: RecordProblem, model: Diffusion, blocks: Blocks, paths: Paths
+) -> Float[Array, " B"]:
+    """Estimate the log density of the observations in each block and of its end.
+
+    It is given the beginning of the block. Both ends are those of `paths`, and new paths between
+    them, one for each chain, are the sample.
+    """
+    scale = jnp.ones(blocks.segment.shape[1], paths.start.dtype)
+    _, _, last, _ = _proposed(key, problem, model, blocks, scale, paths)
+    log_weights = nan_to_neg_inf(last.log_new).reshape(len(scale), -1)
+    return jax.nn.logsumexp(log_weights, axis=1) - math.log(log_weights.shape[1])
 
 
 def _lanes_of(blocks: Blocks, scale: Float[Array, " B"], paths: Paths) -> _Lanes:
