@@ -35,7 +35,7 @@ GRID = np.linspace(-2, 2, 81)
 
 
 def kalman_on_grid(values):
-    """Logs of prior times likelihood, and the smoothed means and variances, for each θ and record."""
+    """Log of prior times likelihood for each θ, and smoothed means and variances of each record."""
     laws, logs = [], []
     for theta in GRID:
         step = exact_step(np.array([[np.exp(theta)]]), np.array([[VARIANCE]]))
