@@ -134,6 +134,7 @@ from .records.observations import (
     Rounded,
     StudentT,
 )
+from .records.simulated import simulate_observations
 from .records.smooth import Smoothed, smooth
 from .records.smoothing_kernel import smoothing_kernel
 from .schemes.base import AbstractScheme
@@ -176,6 +177,7 @@ __all__ = [
     "lamperti",
     "Transformed",
     "simulate",
+    "simulate_observations",
     "Jumps",
     "windings",
     # Hypoelliptic and time-dependent models.

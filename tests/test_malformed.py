@@ -173,6 +173,7 @@ CALLS = {
     ),
     "log_likelihood": small(jb.log_likelihood, key=KEY, **NOISY, num_particles=4),
     "forecast": small(jb.forecast, key=KEY, **NOISY, num_particles=4),
+    "simulate_observations": small(jb.simulate_observations, key=KEY, **NOISY),
     "smooth": small(jb.smooth, key=KEY, **NOISY, num_draws=4, num_warmup=2),
     "smoothing_kernel": small(jb.smoothing_kernel, **NOISY),
     "innovations": small(jb.innovations, **NOISY),

@@ -23,7 +23,7 @@ from ..engine.progress import metered
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..models.diffusion import Diffusion
 from ..models.jumps import Jumps
-from ..records import AbstractObservation, Initial, forecast
+from ..records import AbstractObservation, Initial, simulate_observations
 from ..records.record import as_rows
 from .parameters import Constraint, as_parameters
 from .priors import NormalPrior, as_normal
@@ -40,9 +40,6 @@ _LOST = (
     "no ranks, so that the others are a selection. Use more `num_steps`, or coordinates without a "
     "boundary (`transform`)."
 )
-# Number of particles from which a simulated record is drawn. If the stationary law is not normal,
-# their first states are a sample of it by importance resampling.
-_NUM_PARTICLES = 500
 # Number of attempts to draw parameters that satisfy the constraint.
 _MOST_ATTEMPTS = 1000
 
@@ -155,9 +152,7 @@ def simulation_based_calibration(
     check_instance("prior", prior, NormalPrior, "a `NormalPrior`, from which parameters are drawn")
     num_simulations = check_count("num_simulations", num_simulations, 2)
     parameters = as_parameters(model, where, constraint, prior)
-    rows = as_rows(observations)
-    is_read = np.isfinite(np.asarray(rows))
-    unread = np.full(is_read.shape, np.nan, rows.dtype)
+    is_read = np.isfinite(np.asarray(as_rows(observations)))
     like = parameters.vector(parameters.params)
     law = as_normal(prior, parameters, like)
     root = np.linalg.cholesky(np.linalg.inv(np.asarray(law.precision, float)))
@@ -169,22 +164,17 @@ def simulation_based_calibration(
         given["constraint"] = constraint
 
     def one(number: int):
-        prior_key, record_key, pick_key, run_key, rank_key = jax.random.split(
-            jax.random.fold_in(key, number), 5
-        )
+        its_key = jax.random.fold_in(key, number)
+        prior_key, record_key, run_key, rank_key = jax.random.split(its_key, 4)
         truth = _draw(prior_key, parameters, law.mean, root)
-        # Without readings each particle is a path of the model, with readings.
-        drawn = forecast(
+        record = simulate_observations(
             record_key,
             parameters.bind(truth),
             times,
-            unread,
-            num_particles=_NUM_PARTICLES,
+            observations,
             num_steps=num_steps,
             **options,
         )
-        picked = jax.random.randint(pick_key, (), 0, _NUM_PARTICLES)
-        record = jnp.where(is_read, drawn.readings[picked], jnp.nan)
         if np.any(np.isnan(record[is_read])):
             unknown = np.full(len(truth), np.nan)
             return truth, unknown, unknown, False

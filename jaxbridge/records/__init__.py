@@ -26,7 +26,6 @@ are:
 
 # The names that other folders import from this one.
 from .exact_observations import as_observations as as_observations
-from .forecast import forecast as forecast
 from .forgetting import half_will_do as half_will_do, rate_for_several as rate_for_several
 from .guide_search import (
     GuideCheck as GuideCheck,
@@ -65,4 +64,5 @@ from .several import (
     on_each_grid as on_each_grid,
     points_and_check as points_and_check,
 )
+from .simulated import simulate_observations as simulate_observations
 from .step_regime import steps_are_too_long as steps_are_too_long

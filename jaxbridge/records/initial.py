@@ -47,6 +47,10 @@ _NEWTON_STEPS = 50
 # About `_ENOUGH` effective points determine a covariance.
 _WIDTHS, _NUM_POINTS, _ENOUGH = 2.0 ** np.arange(8), 128, 10
 
+# A normal law falls by ½ at one standard deviation. If log ν falls by more than `_FALL` there, the
+# width is replaced. If it is unknown, it starts from `_WIDEST`.
+_FALL, _WIDEST, _NUM_HALVINGS = 4.0, 2.0**40, 80
+
 Initial = Any  # a point, a `GaussianLaw`, `Stationary()`, or a function of params to one of these
 
 
@@ -166,6 +170,7 @@ def _stationary(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     mode = _law_at_mode(model, like)
     if is_normal(model, like):
         return mode
+    mode = _of_finite_width(model, mode)
     points, log_weights = ladder(model, mode)
     weights = normalise_weights(log_weights)
     mean = weights @ points
@@ -177,6 +182,29 @@ def _stationary(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     # If the moments are not finite, the law at the mode is used.
     usable = jnp.all(jnp.isfinite(mean)) & jnp.all(jnp.isfinite(root))
     return jax.tree.map(lambda a, b: jnp.where(usable, a, b), NormalStep(mean, root), mode)
+
+
+def _of_finite_width(model: Diffusion, mode: NormalStep) -> NormalStep:
+    """Return the law at the mode with narrower columns of its root where log ν falls too far.
+
+    The curvature may vanish at the mode, as for ν ∝ exp(-x⁴), and then says nothing about the
+    width. A column is halved until log ν falls by at most 1 on one of its sides.
+    """
+    d, dtype = mode.mean.shape[0], mode.mean.dtype
+    is_known = jnp.all(jnp.isfinite(mode.root))
+    root = jnp.where(is_known, mode.root, _WIDEST * jnp.eye(d, dtype=dtype))
+    factors = jnp.asarray(0.5 ** np.arange(_NUM_HALVINGS), dtype)
+    log_nu = jax.vmap(lambda x: nan_to_neg_inf(model.log_stationary(x)))
+
+    def factor(column):
+        steps = factors[:, None] * column
+        nearer = jnp.maximum(log_nu(mode.mean + steps), log_nu(mode.mean - steps))
+        fall = log_nu(mode.mean[None]) - nearer
+        # Of a normal law it is ½. The first factor stays unless the fall is much larger.
+        enough = fall <= jnp.where(factors == 1, _FALL, 1)
+        return jnp.where(jnp.any(enough), factors[jnp.argmax(enough)], 1)
+
+    return mode._replace(root=root * lax.stop_gradient(jax.vmap(factor)(root.T)))
 
 
 def ladder(model: Diffusion, mode: NormalStep) -> tuple[Float[Array, "n d"], Float[Array, " n"]]:

@@ -11,6 +11,7 @@ from grid_filter import grid_filter
 from scipy.stats import norm
 
 import jaxbridge as jb
+from jaxbridge.records.initial import initial_law
 
 KEY = jax.random.key(0)
 NODES = np.linspace(-3, 3, 601)
@@ -49,6 +50,22 @@ def record(values):
 
 
 RECORDS = [(first, None) for first in (-1.0, 1.0)] + [(-1.0, -0.8, None, 0.3)]
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+@pytest.mark.parametrize("power", [4, 6])
+def test_curvature_that_vanishes_at_the_mode(power, unit):
+    """The widths of the densities exp(-x^p) and exp(-x₀^p - x₁²/2), with x in any unit."""
+    nodes = np.linspace(-4, 4, 2001)
+    weights = np.exp(-(nodes**power))
+    width = unit * np.sqrt(weights @ nodes**2 / weights.sum())
+    one = jb.langevin(lambda x, p: -jnp.sum((x / unit) ** power))
+    two = jb.langevin(lambda x, p: -((x[0] / unit) ** power) - (x[1] / unit) ** 2 / 2)
+    for model, expected in (one, [width]), (two, [width, unit]):
+        law = initial_law(jb.Stationary(), model, jnp.zeros(len(expected)))
+        found = jnp.sqrt(jnp.sum(law.root**2, axis=1))
+        np.testing.assert_allclose(found, expected, rtol=0.15)
+        np.testing.assert_array_less(jnp.abs(law.mean), 0.2 * np.array(expected))
 
 
 @pytest.mark.slow
