@@ -28,9 +28,11 @@ from .peers import where_installed
 
 NUM_STEPS = 10
 LIBRARY = "jaxbridge, `log_likelihood`"
+KALMAN = "Kalman filter, by hand in NumPy"
 _ROTATION = np.array([[1.0, 1.5], [-1.0, 0.5]])
 _RATES = 0.5, 0.0025, 0.3
 _WELL_SIGMA = 0.7
+_LINEAR = "OU, one of two observed"
 
 
 class Record(NamedTuple):
@@ -104,7 +106,7 @@ def _predation_variance(x: Any) -> Any:
 def records(quick: bool) -> list[Record]:
     """Those of the study, simulated in a hundred Euler steps a gap; quickly, the first."""
     scenes = [
-        Record("OU, one of two observed", _ou_drift, _unit_variance, True, (0.0, 0.0), 0.5, 0.1,
+        Record(_LINEAR, _ou_drift, _unit_variance, True, (0.0, 0.0), 0.5, 0.1,
                np.empty(50), None),
         Record("double well", _well_drift, _well_variance, True, (1.0,), 0.5, 0.1,
                np.empty(50), None),
@@ -226,6 +228,9 @@ def run_filters(
     for record in records(quick):
         say(f"filters: {record.name}, here")
         rows.append(_library_row(key, record, num_particles, num_filters))
+        if record.name == _LINEAR:
+            value, seconds = timed(functools.partial(kalman_log_likelihood, record))
+            rows.append(FilterRow(record.name, KALMAN, value, 0.0, 0.0, 0.0, seconds, seconds))
         for modules, run in (
             (("cuthbert.filtering", "cuthbert.smc.particle_filter",
               "cuthbertlib.resampling.systematic", "cuthbertlib.resampling.adaptive"), _cuthbert),

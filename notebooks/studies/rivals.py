@@ -1,8 +1,8 @@
 """The same tasks by other packages and by this one, in one run on one machine.
 
-The tasks are bridges (`rival_bridges`), filters (`rival_filters`) and posteriors
-(`rival_posteriors`). A package that is not installed has a row that says so. Results are stored as
-JSON, and the page `notebooks/rivals.md` is made from that file.
+The tasks are bridges (`rival_bridges`), filters (`rival_filters`), posteriors (`rival_posteriors`)
+and rare events (`rival_events`). A package that is not installed has a row that says so. Results
+are stored as JSON, and the page `notebooks/rivals.md` is made from that file.
 """
 
 import datetime
@@ -21,6 +21,7 @@ from jaxbridge.studies.report import Row, Say, Study, Table, markdown, silent, t
 from .benchmark import num_cores
 from .peers import versions
 from .rival_bridges import BridgeRow, run_bridges
+from .rival_events import NUM_STEPS as EVENT_STEPS, EventRow, run_events
 from .rival_filters import NUM_STEPS, FilterRow, run_filters
 from .rival_posteriors import PosteriorRow, run_posteriors
 
@@ -28,14 +29,15 @@ _PACKAGES = ("jax", "numpyro", "particles", "cuthbert", "equinox", "optax", "num
 
 
 class Sizes(NamedTuple):
-    """Size of each task: paths of a bridge, training iterations, particles, filters, and draws of a
-    posterior."""
+    """Size of each task: paths of a bridge, training iterations, particles, filters, draws of a
+    posterior, and simulated paths of an event."""
 
     paths: int = 1_000
     iterations: int = 1_000
     particles: int = 100
     filters: int = 64
     draws: int = 4_000
+    simulated: int = 100_000
 
 
 class Rivals(NamedTuple):
@@ -50,15 +52,17 @@ class Rivals(NamedTuple):
     bridges: list[BridgeRow]
     filters: list[FilterRow]
     posteriors: list[PosteriorRow]
+    events: list[EventRow]
 
 
 def run_rivals(key: Key[Array, ""], quick: bool, sizes: Sizes, say: Say = silent) -> Rivals:
-    """Run all three parts; with `quick` only the first task of each."""
+    """Run all parts; with `quick` only the first task of each."""
     before = _load()
-    keys = jax.random.split(key, 3)
+    keys = jax.random.split(key, 4)
     bridges = run_bridges(keys[0], quick, sizes.paths, sizes.iterations, say)
     filters = run_filters(keys[1], quick, sizes.particles, sizes.filters, say)
     posteriors = run_posteriors(keys[2], quick, sizes.draws, say)
+    events = run_events(keys[3], quick, sizes.simulated, say)
     return Rivals(
         jax.devices()[0].device_kind,
         f"{platform.machine()}, {num_cores()} cores",
@@ -69,6 +73,7 @@ def run_rivals(key: Key[Array, ""], quick: bool, sizes: Sizes, say: Say = silent
         bridges,
         filters,
         posteriors,
+        events,
     )
 
 
@@ -81,7 +86,7 @@ def rivals_files(rivals: Rivals) -> dict[str, str]:
     """Return all results as JSON, and the page made from them, by file name."""
     content: dict[str, Any] = rivals._asdict()
     content["sizes"] = rivals.sizes._asdict()
-    for name in ("bridges", "filters", "posteriors"):
+    for name in ("bridges", "filters", "posteriors", "events"):
         content[name] = [row._asdict() for row in content[name]]
     text = json.dumps(content, indent=1, ensure_ascii=False)
     return {"rivals.json": text + "\n", "rivals.md": as_page(rivals)}
@@ -95,6 +100,7 @@ def load_rivals(path: Path) -> Rivals:
     content["bridges"] = [BridgeRow(**row) for row in content["bridges"]]
     content["filters"] = [FilterRow(**row) for row in content["filters"]]
     content["posteriors"] = [PosteriorRow(**row) for row in content["posteriors"]]
+    content["events"] = [EventRow(**row) for row in content["events"]]
     return Rivals(**content)
 
 
@@ -163,6 +169,25 @@ def posterior_table(rows: Sequence[PosteriorRow]) -> Table:
     ]
 
 
+def event_table(rows: Sequence[EventRow]) -> Table:
+    """Return the table of log probabilities, their errors and seconds."""
+    titles = ("event", "method", "log P̂", "log P̂ - log P", "effective paths", "first call, s",
+              "later call, s", "effective paths per s")  # fmt: skip
+    return titles, [
+        (
+            r.event,
+            r.way,
+            r.why or _with_error(r.log_probability, r.standard_error, ".2f"),
+            _number(r.error, "+.2f"),
+            _number(r.worth, ",.0f"),
+            _number(r.first, ".1f"),
+            _number(r.again, ".1f"),
+            _number(None if r.worth is None or r.again is None else r.worth / r.again, ",.0f"),
+        )
+        for r in rows
+    ]
+
+
 def _number(value: float | None, form: str) -> str:
     return "" if value is None else format(value, form)
 
@@ -178,12 +203,13 @@ def _tables(rivals: Rivals) -> list[Table]:
         bridge_table(rivals.bridges),
         filter_table(rivals.filters),
         posterior_table(rivals.posteriors),
+        event_table(rivals.events),
     ]
 
 
 def in_plain_characters(rivals: Rivals) -> str:
     """Return the tables as they are printed."""
-    words = (2, 2, 3)
+    words = (2, 2, 3, 2)
     shown = zip(_tables(rivals), words, strict=True)
     return "\n\n".join(table(*each, number) for each, number in shown)
 
@@ -200,13 +226,13 @@ the number of cores makes all times longer, at times several times longer."""
 
 def as_page(rivals: Rivals) -> str:
     """Return the text of `notebooks/rivals.md`."""
-    bridges, filters, posteriors = (markdown(*each) for each in _tables(rivals))
+    bridges, filters, posteriors, events = (markdown(*each) for each in _tables(rivals))
     sizes = rivals.sizes
     return f"""\
 # Comparison with other packages
 
-jaxbridge and other packages run the same tasks: bridges, particle filters and posteriors. In the
-stored run:
+jaxbridge and other packages run the same tasks: bridges, particle filters, posteriors and
+rare events. In the stored run:
 
 {_SUMMARY}
 `python -m studies rivals`, in the folder `notebooks`, runs all packages that are installed. It
@@ -231,6 +257,11 @@ All times are from one machine. JAX uses float32, NumPy float64. `first call` in
 
 {_about_posteriors(sizes)}
 {posteriors}
+
+## Rare events
+
+{_about_events(sizes)}
+{events}
 
 ## Results in detail
 
@@ -351,6 +382,28 @@ Read the table so: a mean error of 0 and an sd ratio of 1 are right.
 """
 
 
+def _about_events(sizes: Sizes) -> str:
+    """Describe the events, the methods and the columns."""
+    return f"""\
+The events are over one unit of time, in {EVENT_STEPS} steps:
+
+- **passage**: a Brownian motion from 0 exceeds a level.
+- **end in a set**: dX = -X dt + dW from 0 ends between 2.4 and 2.6.
+- **transition between wells**: dX = 4(X - X³) dt + 0.5 dW from -1 exceeds 0.5.
+
+The first two have a closed form. The third is the solution of the backward equation on two grids,
+extrapolated. The methods:
+
+- **jaxbridge** makes independent runs of multilevel splitting, with default settings. Times include
+  the estimate of the discretisation error.
+- **simulation**: {sizes.simulated:,} Euler paths in NumPy, and a count. It misses passages between
+  two points of a path.
+
+Read the table so: `effective paths` is the number of simulated paths *with the event* that have the
+same standard error.
+"""
+
+
 _DETAILS = """\
 **Bridges**
 
@@ -389,7 +442,7 @@ _DETAILS = """\
 
 
 def _run(key: Key[Array, ""], quick: bool, say: Say) -> Rivals:
-    sizes = Sizes(500, 50, 50, 8, 500) if quick else Sizes()
+    sizes = Sizes(500, 50, 50, 8, 500, 1_000) if quick else Sizes()
     return run_rivals(key, quick, sizes, say)
 
 
@@ -402,6 +455,7 @@ The same tasks by all packages. "first call" includes compilation, "later call" 
 Bridges: the share of paths that count, and the error of log p.
 Filters: the spread of one log-likelihood, and the time for one filter of variance one.
 Posteriors: errors of the means, in exact posterior standard deviations.
+Events: the error of log P, and the number of simulated paths with the event of the same error.
 A package that is not installed has a row that says so.""",
     lambda figures, made: {"how_to_choose.png": figures.how_to_choose()},
     rivals_files,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate
-from studies import figures, rival_bridges, rival_filters, rival_posteriors
+from studies import figures, rival_bridges, rival_events, rival_filters, rival_posteriors
 from studies.peers import NOT_INSTALLED, in_r, where_installed
 from studies.rivals import (
     Rivals,
@@ -101,7 +101,7 @@ def test_what_is_missing_has_a_row_that_says_so(monkeypatch):
     monkeypatch.setattr(rival_filters, "_library_row", lambda *_: rival_filters.FilterRow("", ""))
     monkeypatch.setattr(rival_posteriors, "_library_rows", lambda *_: [])
     key = jax.random.key(0)
-    _, *filters = rival_filters.run_filters(key, True, 2, 2, silent)
+    _, _, *filters = rival_filters.run_filters(key, True, 2, 2, silent)
     assert [(r.way, r.why) for r in filters] == [
         ("cuthbert", NOT_INSTALLED),
         ("particles", NOT_INSTALLED),
@@ -129,6 +129,10 @@ def made_up():
         ],
         [rival_filters.FilterRow("OU", "here", -50.0, 0.1, 0.05, 0.4, 3.0, 0.01)],
         [rival_posteriors.PosteriorRow("OU", "here", "rate", 0.05, 0.02, 1.0, 900.0, 9.0, 3.0)],
+        [
+            rival_events.EventRow("passage", "here", -3.0, 0.1, 0.02, 95.0, 4.0, 0.5),
+            rival_events.EventRow("passage", "simulation", worth=0.0, again=1.0, why="none"),
+        ],
     )
 
 
@@ -142,6 +146,8 @@ def test_results_survive_their_file_and_the_page_has_their_tables(tmp_path):
         "|  | sde (R) | not installed |",
         "| OU | here | -50.00 ± 0.10 | +0.05 | 0.4 | 10 | 1.6 | 3.0 |",
         "| OU | here | rate | +0.050 ± 0.020 | 1.00 | 900 | 9.0 | 3.0 | 300 |",
+        "| passage | here | -3.00 ± 0.10 | +0.02 | 95 | 4.0 | 0.5 | 190 |",
+        "|  | simulation | none |  | 0 |  | 1.0 | 0 |",
     ):
         assert row in page
 
@@ -155,6 +161,13 @@ def test_the_chart_names_what_there_is():
     figure = figures.how_to_choose()
     (ax,) = figure.axes
     assert any("gibbs" in text.get_text() for text in ax.texts)
+
+
+def test_the_probability_of_a_transition_is_that_of_the_equation():
+    """A finer grid, without extrapolation, gives the same."""
+    value = rival_events.transition_log_probability()
+    fine = rival_events._transition(6_000)
+    assert abs(np.log(fine) - value) < 1e-4
 
 
 @pytest.mark.slow
