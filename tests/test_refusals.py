@@ -568,8 +568,8 @@ reads = lambda reader, model=PAPER: of(READERS[reader], KEY, model, **RECORD)
 RECORDS = [
     ("vector", linear([1.0, 0.0]), r"`matrix` must have shape \(m, d\)"),
     ("missing", linear([[NAN, 0.0]]), "`matrix` must be finite"),
-    ("negative", linear(covariance=-1.0), "without negative variances"),
-    ("indefinite", linear(covariance=[[1.0, 2.0], [2.0, 1.0]]), "negative variances"),
+    ("negative", linear(covariance=-1.0), "must not be negative"),
+    ("indefinite", linear(covariance=[[1.0, 2.0], [2.0, 1.0]]), "positive semidefinite"),
     ("triangular", linear(covariance=[[1.0, 2.0], [0.0, 9.0]]), "symmetric"),
     ("one row", linear(covariance=np.ones((1, 2))), "`covariance` must have shape"),
     ("infinite", linear(covariance=np.inf), "must be finite"),

@@ -48,7 +48,7 @@ class StartLaw(Protocol):
     """
 
     def sample(self, key: Key[Array, ""], model: Diffusion) -> Float[Array, " d"]:
-        """Return one draw, shape (d,)."""
+        """Return one draw, shape (d,). `model` is the diffusion, for laws that depend on it."""
         ...
 
     def log_density(self, x: Float[Array, " d"]) -> Float[Array, ""]:

@@ -14,6 +14,8 @@ from .entry import public_entry
 
 # A spread of at most so many units in the last place is rounding error.
 _ROUNDING = 64.0
+# Number of draws without which the halves of a chain have no variance.
+_FEWEST = 4
 
 
 def vary(draws: Float[Array, "..."], axis: int | tuple[int, ...]) -> Bool[Array, "..."]:
@@ -102,9 +104,11 @@ def effective_size_of_chains(draws: Float[Array, "chains n ..."]) -> Float[Array
 
     W is the variance within chains and B the variance of their means. Chains that disagree
     therefore have a small effective sample size, however long they are. For a single chain, the
-    result is that of `effective_sample_size`.
+    result is that of `effective_sample_size`. Chains of fewer than 4 draws count as one draw each.
     """
     num_chains, n = draws.shape[:2]
+    if n < _FEWEST:
+        return jnp.full(draws.shape[2:], num_chains, draws.dtype)
     if num_chains == 1:
         return effective_sample_size(draws[0])
     covariance = jnp.mean(jax.vmap(_autocovariance)(draws), axis=0) / (n - 1)
@@ -157,7 +161,20 @@ def potential_scale_reduction(draws: Numbers) -> Float[Array, "..."]:
 
     **Raises:** `ValueError` for fewer than 4 draws in each chain.
     """
-    return _potential_scale_reduction(_as_chains(draws))
+    return r_hat_of_chains(_as_chains(draws))
+
+
+@jax.jit
+def r_hat_of_chains(draws: Float[Array, "chains n ..."]) -> Float[Array, "..."]:
+    """Compute R̂, which is NaN for chains of fewer than 4 draws."""
+    if draws.shape[1] < _FEWEST:
+        return jnp.full(draws.shape[2:], jnp.nan, draws.dtype)
+    n = draws.shape[1] // 2
+    halves = jnp.concatenate([draws[:, :n], draws[:, -n:]])
+    between = jnp.var(jnp.mean(halves, axis=1), axis=0, ddof=1)
+    within = jnp.mean(jnp.var(halves, axis=1, ddof=1), axis=0)
+    R_hat = jnp.sqrt((n - 1) / n + between / within)
+    return jnp.where(vary(draws, (0, 1)), R_hat, jnp.nan)
 
 
 def _as_chains(draws: Numbers) -> Float[Array, "chains n ..."]:
@@ -166,19 +183,9 @@ def _as_chains(draws: Numbers) -> Float[Array, "chains n ..."]:
     **Raises:** `ValueError` for fewer than 4 draws in each chain.
     """
     draws = as_floating("draws", draws)
-    if draws.ndim < 2 or draws.shape[0] < 1 or draws.shape[1] < 4:
+    if draws.ndim < 2 or draws.shape[0] < 1 or draws.shape[1] < _FEWEST:
         raise ValueError(
             "`draws` must be chains of at least 4 draws each, shape (chains, n, ...); got shape "
             f"{draws.shape}."
         )
     return draws
-
-
-@jax.jit
-def _potential_scale_reduction(draws):
-    n = draws.shape[1] // 2
-    halves = jnp.concatenate([draws[:, :n], draws[:, -n:]])
-    between = jnp.var(jnp.mean(halves, axis=1), axis=0, ddof=1)
-    within = jnp.mean(jnp.var(halves, axis=1, ddof=1), axis=0)
-    R_hat = jnp.sqrt((n - 1) / n + between / within)
-    return jnp.where(vary(draws, (0, 1)), R_hat, jnp.nan)

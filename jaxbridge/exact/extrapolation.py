@@ -39,11 +39,12 @@ _REMAINING = (
 class ExtrapolatedLogDensity(AbstractResult):
     """Result of `extrapolate` for two `TransitionLogDensity`.
 
-    - `value`: log of the combination, which is unbiased on the natural scale up to an error of
-        higher order. It is -inf if noise makes the combination negative or zero.
+    - `value`: log of p_N + (p_N - p_{N/2}) / (2^q - 1) for the densities on both grids and steps of
+        order q. This combination has an error of higher order. `value` is -inf if noise
+        makes it negative or zero.
     - `standard_error`: standard error of `value`, by the delta method; infinite if `value` is -inf.
     - `removed`: the value of the finer grid minus `value`: the estimated discretisation bias of the
-        finer grid.
+        finer grid. Infinite if `value` is -inf.
     - `fine`, `coarse`: the two estimates.
     """
 

@@ -198,7 +198,7 @@ def _draw(key, parameters, mean: Float[Array, " p"], root: np.ndarray) -> Float[
             return theta
     raise ValueError(
         f"none of {_MOST_ATTEMPTS:,} draws of `prior` satisfies `constraint`: pass a prior with "
-        "more mass there."
+        "more mass where the constraint holds."
     )
 
 

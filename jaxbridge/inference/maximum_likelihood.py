@@ -88,8 +88,8 @@ class MaximumLikelihood(AbstractResult):
     - `newton`: whether Newton's method converged to a maximum. Then the next step is short compared
         with the standard errors or the Monte Carlo errors, and the information is positive
         definite. Moreover the Monte Carlo error in every direction is at most half a standard
-        error. If false, `params` are not a maximum: use more iterations, a larger learning rate or
-        more bridges, unless the maximum is outside the constraint.
+        error. If false, a maximum is not established: use more iterations, a larger learning rate
+        or more bridges, unless the maximum is outside the constraint.
     - `fall`: decrease of the log-likelihood one standard error below and above the estimate in each
         parameter, shape (2, p), less its linear part. The other parameters move to their maximum
         given this one, to second order. Values are scaled so that a quadratic log-likelihood gives
@@ -120,7 +120,8 @@ class MaximumLikelihood(AbstractResult):
     def verdict(self) -> Verdict:
         """Return the faults of the estimate, each with a remedy.
 
-        - no maximum, or none inside;
+        - no maximum was established (`newton`), or the log-likelihood hardly falls around the
+          estimate (`fall`);
         - faults of the weights of `score`;
         - a discretisation error that is unknown, too uncertain, or larger than a standard error;
         - an estimate or covariance that is not finite;
@@ -210,8 +211,8 @@ def maximum_likelihood(
       likelihood is a smooth function of θ.
     - The mean of a log density estimate is too small by half its relative variance. An estimate of
       this bias is added. The remaining bias falls with the square of `num_bridges`. Compared with a
-      standard error it is small if the root of the number of intervals is small compared with the
-      square of `effective_sample_size`.
+      standard error it is small if the square root of the number of intervals is small compared
+      with the square of `score.effective_sample_size`.
     - The law of the data depends on σ σᵀ only. If σ is a matrix, choose unknown entries that σ σᵀ
       determines.
 

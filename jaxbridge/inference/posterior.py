@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, Num, PyTree
 
 from ..engine.checks import check_count, is_traced
 from ..engine.compiled import compiled_sooner
-from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
+from ..engine.diagnostics import effective_size_of_chains, r_hat_of_chains
 from ..engine.labelled import named_leaves
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..schemes import LEAST_UNCERTAINTY, StepError, dominates, step_faults, unknown_where
@@ -130,7 +130,7 @@ class AbstractPosterior(AbstractResult):
         """Return the effective sample size of each unknown parameter, from all chains, shape (p,).
 
         It is small if chains disagree. It is zero if the parameter, or a path drawn with it, never
-        moved in some chain.
+        moved in some chain. Chains of fewer than four draws count as one draw each.
         """
         return jnp.where(self._moved, effective_size_of_chains(self._chains), 0)
 
@@ -142,8 +142,11 @@ class AbstractPosterior(AbstractResult):
 
     @property
     def r_hat(self) -> Float[Array, " p"]:
-        """Return R̂ of each unknown parameter, from the halves of all chains, shape (p,)."""
-        return potential_scale_reduction(self._chains)
+        """Return R̂ of each unknown parameter, from the halves of all chains, shape (p,).
+
+        NaN for a parameter that never moved, and for fewer than four draws.
+        """
+        return r_hat_of_chains(self._chains)
 
     @property
     def step_error(self) -> Float[Array, " p"]:
@@ -261,7 +264,8 @@ class AbstractPosterior(AbstractResult):
     def summary(self) -> PosteriorSummary:
         """Return a table of the posterior, which prints as text; not inside `jit`.
 
-        It has means, standard deviations, quantiles, errors, R̂, effective sample sizes and the
+        It has means, standard deviations, quantiles (2.5, 50 and 97.5 %), errors, R̂, effective
+        sample sizes and the
         verdict. `print(posterior)` shows it, too.
 
         **Raises:** `TypeError` inside `jit` or `vmap`, where no numbers exist.

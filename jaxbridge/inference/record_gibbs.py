@@ -137,7 +137,7 @@ class RecordPosterior(AbstractPosterior):
         (*chains, n, R, K, d); NaN after the end of a record. `None` without `save_states`.
     - `log_densities`: log density of each observation given the parameters of a draw and its states
         at the times before and after, for leave-one-out validation, shape (*chains, n, R, K). NaN
-        if nothing was observed.
+        if nothing was observed. `None` without `save_states`.
     """
 
     params: PyTree

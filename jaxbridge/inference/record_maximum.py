@@ -41,7 +41,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PyTree
 
 from ..engine.checks import all_finite_leaves, nondifferentiable
 from ..engine.compiled import compiled_sooner
-from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction
+from ..engine.diagnostics import effective_size_of_chains, r_hat_of_chains
 from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict
 from ..records import GuideCheck, Records, tuned
@@ -413,7 +413,7 @@ def _summary(
         iterates,
         slope.gradient,
         effective_size_of_chains(draws.gradient),
-        potential_scale_reduction(draws.gradient),
+        r_hat_of_chains(draws.gradient),
         stuck,
         info.refused,
         passes.converged & is_maximum(slope),

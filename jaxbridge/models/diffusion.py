@@ -231,7 +231,7 @@ class Diffusion(eqx.Module):
         return self._dynamics_at(x, time).sigma(x).as_matrix(x.shape[0], x.dtype)
 
     def reverse_drift(self, x: Numbers) -> Float[Array, " d"]:
-        """Return α*(x), shape (d,): equation (reversedrift) of the paper.
+        """Return α*(x), shape (d,): the drift of the time reversal (section 2 of the paper).
 
         **Raises:** `ValueError` for a model that is not declared reversible and has neither
         `log_stationary` nor `reverse_drift`, and if the coefficients depend on time.
@@ -285,8 +285,8 @@ class Diffusion(eqx.Module):
     def reversibility_residual(self, points: Numbers) -> Float[Array, "n d"]:
         """Return α - ½ (V ∇log ν + div V) at each of the `points`, shape (n, d).
 
-        It is zero everywhere if and only if the diffusion is reversible. This is equation
-        (timereversible) of the paper, divided by ν.
+        It is zero everywhere if and only if the diffusion is reversible. This is the paper's
+        condition of reversibility (section 2), divided by ν.
 
         **Raises:** `ValueError` for points of another shape and for a model without a stationary
         density.
@@ -363,10 +363,10 @@ class Diffusion(eqx.Module):
 
     @property
     def coordinates(self) -> Callable[[PyTree], PyTree] | None:
-        """Return a function of the prepared parameters; `None` if coordinates depend on none.
+        """Return a function of parameters with values that coordinates of the state depend on.
 
-        Its values depend on the same parameters as the coordinates of the state. Coordinates from
-        `lamperti` depend on the parameters of σ, others on none.
+        Only models from `lamperti` have one: their coordinates depend on the parameters of σ. It is
+        `None` for other models.
         """
         return self._coordinates
 
@@ -398,7 +398,10 @@ class Diffusion(eqx.Module):
 
     @property
     def reverse_drift_effect(self) -> decisions.Effect:
-        """Return the decision whether α* is derived by automatic differentiation."""
+        """Return whether α* is derived by automatic differentiation, as an `Effect`.
+
+        Its fields are `simulated` and `why`. It does not check that a reversal is known.
+        """
         return decisions.reverse_drift(self.reversible, self._reverse_drift is not None)
 
     @property
@@ -473,7 +476,11 @@ class Diffusion(eqx.Module):
         return self._sigma_traits(like)[0]
 
     def sigma_is_invertible(self, like: Float[Array, " d"]) -> bool:
-        """Return whether σ is invertible: noise enters all coordinates. Nothing is computed."""
+        """Return whether σ has at least as many columns as rows.
+
+        Only shapes are examined: a square σ(x) that is singular counts as invertible. `like` is a
+        point of the right shape and dtype.
+        """
         return self._sigma_traits(like)[1]
 
     def is_linear(self, like: Float[Array, " d"]) -> bool:

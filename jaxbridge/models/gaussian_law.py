@@ -19,7 +19,8 @@ class GaussianLaw(eqx.Module):
     """Normal distribution N(mean, covariance).
 
     **Arguments:** `mean`, shape (d,); `covariance`, shape (d, d), symmetric and positive
-    semidefinite. For a singular covariance `sample` and `log_density` return NaN.
+    semidefinite. A singular covariance is for `initial` of records only: its `log_density` is NaN,
+    and `sample` is NaN in some coordinates.
 
     **Raises:** `ValueError` for shapes that do not fit, for a mean that is not finite, and for a
     covariance that is not symmetric or has a negative eigenvalue, beyond rounding errors.

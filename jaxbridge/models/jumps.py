@@ -126,7 +126,7 @@ class Jumps(eqx.Module):
         if not (np.all(np.isfinite(at)) and np.all(np.diff(at) > 0)):
             raise ValueError(
                 f"`times` of `Jumps` must be finite and increase; got {at}. Sort them with their "
-                "`inputs`, and add the inputs of equal times."
+                "`inputs`, and combine jumps at equal times into one."
             )
         self.times = tuple(at.tolist())
         numbers = as_floating("inputs", inputs)

@@ -26,7 +26,9 @@ def stationary_diffusion(
     """Return the diffusion with stationary density ν, diffusion matrix V and skew-symmetric field
     Q:
 
-        α = ½ ν⁻¹ div(ν (V + Q)),    σ = the Cholesky factor of V.
+        α = ½ ν⁻¹ div(ν (V + Q)),    σ = the Cholesky factor of V,
+
+    where (div M)_i = Σ_j ∂_j M_ij.
 
     Every diffusion with stationary density ν and V = σσᵀ has this form (Ma, Chen & Fox 2015). Its
     time reversal has -Q instead of Q, so it is reversible if Q = 0.

@@ -250,7 +250,11 @@ class CoupledPairs(AbstractSingleProposal):
     def log_halving(
         self, model: Diffusion, intervals: Intervals, paths: Float[Array, "P points d"], n: int
     ) -> Float[Array, " P"]:
-        """Return D of `halving` for the first few of the n paths of each interval, else NaN."""
+        """Return the log change of the weight of each path by half as many steps (`halving`).
+
+        `paths` has n successive paths of each interval. For constant σ only the first few of each
+        interval have a value; it is NaN for the others.
+        """
         dynamics = model.forward(intervals.start[0])
         density, _ = step_law_of(self.coupling, model, intervals.start[0])
         num_rows = num_looked(_LOOKED * n, dynamics.sigma_varies)

@@ -188,7 +188,10 @@ class AbstractGuidedProposal(AbstractSingleProposal):
         return jnp.full_like(intervals.duration, share_of_order(self.target.usual_order))
 
     def remaining(self, num_steps: int) -> Float[np.ndarray, " points"]:
-        """Return (T - t_i) / T for all i, from 1 to 0, shape (N+1,)."""
+        """Return (T - t_i) / T for i = 0, ..., N = `num_steps`, from 1 to 0, shape (N+1,).
+
+        **Raises:** `ValueError` if the last step is shorter than rounding errors of time.
+        """
         if num_steps**-self.refinement < _SHORTEST_STEP:
             raise ValueError(
                 f"`refinement` = {self.refinement:g} makes the last of {num_steps} steps shorter "

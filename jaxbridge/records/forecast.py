@@ -210,9 +210,9 @@ def forecast(
     **Example:**
 
     ```python
-    model, seen = jb.ornstein_uhlenbeck([[1.0]]), jb.LinearGaussian(covariance=0.1)
-    readings = [0.3, 0.1, 0.6]
-    made = jb.forecast(key, model, [0.0, 1.0, 2.0], readings, observation=seen, at=[3.0, 4.0])
+    model, observation = jb.ornstein_uhlenbeck([[1.0]]), jb.LinearGaussian(covariance=0.1)
+    past = [0.0, 1.0, 2.0], [0.3, 0.1, 0.6]
+    made = jb.forecast(key, model, *past, observation=observation, at=[3.0, 4.0])
     jnp.quantile(made.readings[:, -2:, 0], jnp.array([0.05, 0.95]), axis=0)  # bands, shape (2, 2)
     ```
 

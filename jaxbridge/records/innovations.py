@@ -75,9 +75,10 @@ class Innovations(NamedTuple):
         return self._of_each(of_record)
 
     def path(self, params: PyTree, xi: Float[Array, " size"]) -> Any:
-        """Return the path of the noise `xi` at the parameters `params`, shape (M + 1, d).
+        """Return the path of the noise `xi` at the parameters `params`.
 
-        For a list of records it is a list of paths.
+        It has one point for each of `times`, shape (len(times), d). For several records it is a
+        list of paths.
         """
         paths, stored = self._run(params, xi)[0], self.records.stacked.record.stored
         return self._of_each(lambda i: paths[i, stored[: self.records.num_points(i)]])
@@ -129,7 +130,7 @@ class Innovations(NamedTuple):
         return self.verdict.trustworthy
 
     def why(self) -> str:
-        """Return the faults with their remedies, one per line.
+        """Return the faults with their remedies, one per line; "No fault was found." without any.
 
         **Raises:** `TypeError` inside `jit`, because it needs concrete numbers.
         """
@@ -192,7 +193,8 @@ def innovations(
     - `observations`: shape (n, m), or (n,) for one component. NaN or `None` marks a missing value.
     - Pass several independent records as lists of `times` and `observations`, or with a leading
         axis. They are lanes of one program.
-    - `observation`: observation model, a `LinearGaussian` or an `ObservationDensity`.
+    - `observation`: observation model, for instance a `LinearGaussian`, `PoissonCounts` or an
+        `ObservationDensity`.
     - `initial`: law of the state at the first time, or a function of `params` that returns it:
         - a point, shape (d,);
         - a `GaussianLaw`, whose covariance may be singular if part of the state is known;

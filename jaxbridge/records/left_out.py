@@ -50,8 +50,8 @@ def log_densities_left_out(
     paths = Paths(copies(knots[0]), copies(knots[1:].reshape(K, N, d)))
 
     def evidence(hidden: Bool[Array, " ends"], segment: np.ndarray) -> Float[Array, " B"]:
-        seen, its_guide = _without(problem, guide, hidden)
-        return log_evidence(key, seen, model, blocks_of(seen, points, its_guide, segment), paths)
+        rest, its_guide = _without(problem, guide, hidden)
+        return log_evidence(key, rest, model, blocks_of(rest, points, its_guide, segment), paths)
 
     result, num_blocks = jnp.zeros(K + 1, points.dtype), K // 2 + 1
     for offset in (0, 1):
@@ -78,6 +78,6 @@ def _without(
         return jax.tree.map(hide, scalars, missing_like(scalars))
 
     values = jnp.where(hidden[:, None], jnp.nan, problem.record.values)
-    seen = eqx.tree_at(lambda problem: problem.record.values, problem, values)
+    rest = eqx.tree_at(lambda problem: problem.record.values, problem, values)
     first, scalars = without(guide.first, hidden[0]), without(guide.scalars, hidden[1:])
-    return seen, guide._replace(first=first, scalars=scalars)
+    return rest, guide._replace(first=first, scalars=scalars)

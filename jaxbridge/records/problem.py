@@ -140,7 +140,8 @@ def problem_of(
         if not model.has_density:
             raise ValueError(
                 "`initial` is missing, and the model has no stationary law to use by default: pass "
-                "a point or a `GaussianLaw` as `initial`, or a `log_stationary` to `Diffusion`."
+                "a point or a `GaussianLaw` as `initial`, or a `log_stationary` to `Diffusion` "
+                "(with `normalised=True` for likelihoods)."
             )
         initial = Stationary()
     initial = as_initial(initial)

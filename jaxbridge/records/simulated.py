@@ -55,9 +55,9 @@ def simulate_observations(
     **Example:**
 
     ```python
-    model, seen = jb.ornstein_uhlenbeck([[1.0]]), jb.LinearGaussian(covariance=0.1)
+    model, observation = jb.ornstein_uhlenbeck([[1.0]]), jb.LinearGaussian(covariance=0.1)
     times, like = jnp.arange(10.0), jnp.zeros(10)
-    made = jb.simulate_observations(key, model, times, like, observation=seen, num_steps=4)
+    made = jb.simulate_observations(key, model, times, like, observation=observation, num_steps=4)
     ```
     """
     check_key(key)

@@ -18,7 +18,7 @@ from ..coupling import step_law_of
 from ..engine.averages import PathFunction, as_path_function
 from ..engine.checks import Numbers, check_count, check_key
 from ..engine.compiled import compiled_sooner
-from ..engine.diagnostics import effective_size_of_chains, potential_scale_reduction, vary
+from ..engine.diagnostics import effective_size_of_chains, r_hat_of_chains, vary
 from ..engine.entry import public_entry
 from ..engine.progress import metered_scan
 from ..engine.verdict import AbstractResult, Fault, Verdict, throw_where_untrustworthy
@@ -179,9 +179,10 @@ class Smoothed(AbstractResult):
     def r_hat(self, fn: PathFunction = lambda path: path) -> PyTree:
         """Return R̂ of `fn(path)`, from the halves of all chains: near 1 if they agree.
 
-        It is NaN for values that do not vary, such as coordinates that are observed exactly.
+        It is NaN for values that do not vary, such as coordinates that are observed exactly, and
+        for fewer than four draws of each chain.
         """
-        return jax.tree.map(potential_scale_reduction, self._values(fn))
+        return jax.tree.map(r_hat_of_chains, self._values(fn))
 
     @property
     def verdict(self) -> Verdict:

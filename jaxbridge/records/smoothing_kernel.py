@@ -85,8 +85,8 @@ def smoothing_kernel(
     **Example:**
 
     ```python
-    seen = jb.LinearGaussian(covariance=0.01)
-    kernel = jb.smoothing_kernel(model, times, observations, observation=seen, num_steps=4)
+    observation = jb.LinearGaussian(covariance=0.01)
+    kernel = jb.smoothing_kernel(model, times, observations, observation=observation, num_steps=4)
     state, info = kernel.step(jax.random.key(1), kernel.init(None, jax.random.key(0)))
     ```
     """

@@ -76,8 +76,8 @@ def path_log_likelihood(
         "ito" for a reversible model with a stationary density, "trapezoid" for other reversible or
         one-dimensional models, and "ito_taylor" otherwise.
 
-    **Returns:** log-likelihoods of shape (...), in the dtype of `path`. They are logs of densities,
-    relative to the law of σW, or to Lebesgue measure for "euler".
+    **Returns:** log-likelihoods, shape `path.shape[:-2]`, in the dtype of `path`. They are logs of
+    densities, relative to the law of σW, or to Lebesgue measure for "euler".
 
     **Raises:** `ValueError` for shapes that do not fit, times that do not increase, coefficients
     that depend on time, a σ with fewer columns than rows, or a form that is invalid for the model.

@@ -402,8 +402,9 @@ class LocalLinearDensity(AbstractStepDensity):
 
         x' ~ N(x + M_δ [α(x) + ¼ δ Σ_k ∂²α(λ_k, λ_k)], Γ_δ).
 
-    The second term in brackets is the mean change of the drift by the noise, with λ_k = σ_k for
-    short steps. For an invertible σ, Σ_k λ_k λ_kᵀ = 2 σ (S⁻¹ + I)⁻¹ σᵀ with Γ_δ = δ σ S σᵀ. So the
+    The second term in brackets is the mean change of the drift by the noise. It contains second
+    derivatives of α in the directions λ_k; λ_k = σ_k for short steps and for fewer columns than
+    rows. For an invertible σ, Σ_k λ_k λ_kᵀ = 2 σ (S⁻¹ + I)⁻¹ σᵀ with Γ_δ = δ σ S σᵀ. So the
     term is right for long steps in a contracting drift, and bounded in an expanding one.
 
     - Its error is O(δ²) along a path, like that of `ItoTaylorDensity`.

@@ -35,6 +35,13 @@ def test_a_chain_that_never_moves_is_worth_nothing():
     assert "never moved" in made.why()
 
 
+def test_few_draws_are_not_trusted():
+    """Of three draws there is no R̂, and the verdict says so."""
+    made = posterior(np.ones((2, 3), bool))
+    assert np.isnan(made.r_hat).all() and made.effective_sample_size == 2
+    assert not made.trustworthy and "R̂" in made.why() and "3 draws" in str(made)
+
+
 def test_a_walk_that_is_hardly_ever_accepted_is_not_trusted():
     accepted = np.arange(4000) % 25 == np.zeros((2, 1))
     made = posterior(accepted)

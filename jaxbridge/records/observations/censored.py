@@ -33,8 +33,8 @@ class Censored(AbstractComponents):
     **Example:**
 
     ```python
-    seen = jb.Censored(scale=0.2, lower=-0.5)
-    seen.sample(key, jnp.array([-0.4]))  # a reading of this state: -0.5 or more
+    observation = jb.Censored(scale=0.2, lower=-0.5)
+    observation.sample(key, jnp.array([-0.4]))  # a reading of this state: -0.5 or more
     ```
     """
 

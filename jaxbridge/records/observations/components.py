@@ -32,7 +32,9 @@ class AbstractComponents(AbstractObservation):
     """Base class of observation models with independent components.
 
     With η = L x + offset, component y_j depends on the state through η_j alone. Subclasses define
-    `log_density`, `guide` and `draw`, which act on all components at once, and `check_data`.
+    `quantities` (the offset and all other `Quantity` fields), `check_data`, and three functions of
+    all components at once: `log_density`, `draw`, and `guide`, which returns the mean and variance
+    of a normal law of each η_j given y_j.
 
     - `matrix`: L, shape (m, d), or `None` for the identity.
     - `offset`: the `Quantity` of the offset.

@@ -218,6 +218,6 @@ def _check_covariance(R: Array) -> None:
         good = np.abs(matrix - matrix.T).max() <= size and np.linalg.eigvalsh(matrix).min() >= -size
     if not good:
         raise ValueError(
-            "`covariance` must be symmetric, without negative variances (zero for exact "
-            f"components); got {matrix}."
+            "`covariance` must not be negative; a matrix must be symmetric and positive "
+            f"semidefinite (zero variances for exact components); got {matrix}."
         )

@@ -15,9 +15,9 @@ from .components import AbstractComponents, Link, check_positive, log_where_posi
 
 
 class LogNormal(AbstractComponents):
-    """Observation model with proportional errors: log y_j = log m_j + s ε_j, normal ε_j.
+    """Observation model with proportional errors: log y_j = log μ_j + s ε_j, ε_j ~ N(0, 1).
 
-    With η = L x + offset the medians m are e^η (`link="log"`) or η (`link="identity"`). The guide
+    With η = L x + offset the medians μ are e^η (`link="log"`) or η (`link="identity"`). The guide
     is exact for "log"; for "identity" it has the moments of a log-normal law around y.
 
     **Arguments:**
@@ -26,7 +26,8 @@ class LogNormal(AbstractComponents):
     - `scale`: s, for small values the relative error; shape () or (m,), or a function `params -> s`
         or `(params, t) -> s`.
     - `offset`: shape () or (m,), or such a function.
-    - `link`: "log" for a state that is a logarithm, "identity" for a positive state.
+    - `link`: "log" (default) for a state that is a logarithm, "identity" for a positive state. With
+        "identity" the density is zero where η is not positive.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments; `ValueError` for observations
     that are not positive.
@@ -34,8 +35,8 @@ class LogNormal(AbstractComponents):
     **Example:**
 
     ```python
-    seen = jb.LogNormal(scale=0.1)
-    seen.sample(key, jnp.array([0.7]))  # a reading of this state
+    errors = jb.LogNormal(scale=0.1)
+    errors.sample(key, jnp.array([0.7]))  # an observation of this state
     ```
     """
 

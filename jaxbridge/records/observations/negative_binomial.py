@@ -43,8 +43,8 @@ class NegativeBinomialCounts(AbstractComponents):
     **Example:**
 
     ```python
-    seen = jb.NegativeBinomialCounts(size=5.0, offset=3.0)
-    seen.sample(key, jnp.array([0.2]))  # a count in this state
+    observation = jb.NegativeBinomialCounts(size=5.0, offset=3.0)
+    observation.sample(key, jnp.array([0.2]))  # a count in this state
     ```
     """
 

@@ -24,14 +24,16 @@ class PoissonCounts(AbstractComponents):
     """Observation model of Poisson counts with means μ_j, independent given the state.
 
     With η = L x + offset the means are e^η (`link="log"`) or η (`link="identity"`). Paths are
-    guided by the law of η given y under Jeffreys' prior, for which μ is Gamma(y + ½)-distributed.
+    guided by the normal law with the mean and variance of η given y under Jeffreys' prior: μ then
+    has the law Gamma(y + ½, 1).
 
     **Arguments:**
 
     - `matrix`: L, shape (m, d); by default `None`: each component of the state has counts.
     - `offset`: shape () or (m,), or a function `params -> offset` or `(params, t) -> offset`; for
         instance the log of an exposure.
-    - `link`: "log" for a state that is a logarithm, "identity" for a positive state.
+    - `link`: "log" (default) for a state that is a logarithm, "identity" for a positive state. With
+        "identity" the density is zero where η is negative.
 
     **Raises:** `ValueError` and `TypeError` for invalid arguments; `ValueError` for observations
     that are not whole numbers from 0 on.
@@ -40,8 +42,8 @@ class PoissonCounts(AbstractComponents):
 
     ```python
     model = jb.ornstein_uhlenbeck([[1.0]])
-    seen = jb.PoissonCounts(offset=jnp.log(20.0))
-    jb.log_likelihood(key, model, [0.0, 1.0], [17, 25], observation=seen)
+    observation = jb.PoissonCounts(offset=jnp.log(20.0))
+    jb.log_likelihood(key, model, [0.0, 1.0], [17, 25], observation=observation)
     ```
     """
 

@@ -30,8 +30,8 @@ class Rounded(AbstractComponents):
     **Example:**
 
     ```python
-    seen = jb.Rounded(scale=0.2, width=1.0)
-    seen.sample(key, jnp.array([0.7]))  # a reading of this state, a whole number
+    observation = jb.Rounded(scale=0.2, width=1.0)
+    observation.sample(key, jnp.array([0.7]))  # a reading of this state, a whole number
     ```
     """
 

@@ -30,8 +30,8 @@ class StudentT(AbstractComponents):
     **Example:**
 
     ```python
-    seen = jb.StudentT(scale=0.2, df=4.0)
-    seen.sample(key, jnp.array([0.7]))  # a reading of this state
+    observation = jb.StudentT(scale=0.2, df=4.0)
+    observation.sample(key, jnp.array([0.7]))  # a reading of this state
     ```
     """
 
