@@ -44,6 +44,34 @@ def test_a_brownian_bridge_stays_positive(sigma):
     assert_survives(made[:, -1], exact)
 
 
+@pytest.mark.parametrize("at", [0.25, 0.5, 0.9])
+def test_paths_to_their_first_hit_are_bessel_bridges(at):
+    """Given the first hit of 1 at time 1, 1 - X has the law of |three-dimensional bridge|.
+
+    Bridges end slightly below 1, and their weights are the probabilities to stay below it.
+    """
+    near = 0.01
+    bridges = jb.sample_weighted_bridges(
+        jax.random.key(0), jb.Diffusion(lambda x, p: 0 * x), [0.0], [1 - near], 1.0,
+        num_bridges=20_000, num_steps=50, proposal=jb.Guided(),
+    )  # fmt: skip
+    stays = jb.log_survival(BROWNIAN, bridges.times, bridges.paths, lambda x: 1 - x[0])[:, -1]
+    weights = np.exp(np.asarray(bridges.log_weights + stays, float))
+    weights /= weights.sum()
+    where = int(np.argmin(np.abs(np.asarray(bridges.times) - at)))
+    distance = 1 - np.asarray(bridges.paths[:, where, 0], float)
+    # The norm of N((1 - t, 0, 0), t (1 - t) I) is a noncentral chi.
+    t = float(bridges.times[where])
+    scale = np.sqrt(t * (1 - t))
+    law = stats.ncx2(3, (1 - t) ** 2 / scale**2)
+    for power, expected in (1, law.expect(np.sqrt)), (2, law.mean()):
+        values = (distance / scale) ** power
+        mean = weights @ values
+        error = np.sqrt(weights**2 @ (values - mean) ** 2)
+        assert abs(mean - expected) < 4.5 * error + near**2 / scale**2
+        assert error < 0.05 * expected
+
+
 @pytest.mark.parametrize("drift", [0.0, 0.8])
 def test_first_passage_of_a_level(drift):
     """The distribution function of an inverse Gaussian law at every time, whatever the grid."""
