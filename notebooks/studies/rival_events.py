@@ -80,8 +80,8 @@ def _transition(n: int) -> float:
     up, down = half / h**2 + _well_drift(x) / (2 * h), half / h**2 - _well_drift(x) / (2 * h)
     # The last point absorbs; nothing comes as far as the first.
     up[-1] = down[-1] = 0.0
-    generator = sparse.diags_array([down[1:], -up - down, up[:-1]], offsets=[-1, 0, 1]).tocsc()
-    eye = sparse.eye_array(len(x)).tocsc()
+    generator = sparse.diags([down[1:], -up - down, up[:-1]], [-1, 0, 1]).tocsc()  # pyright: ignore
+    eye = sparse.eye(len(x)).tocsc()
     u, step = np.zeros(len(x)), 1.0 / n
     u[-1] = 1.0
     implicit = splu(eye - step / 4 * generator)
