@@ -229,6 +229,17 @@ def check_precision(names: str, dtype: jnp.dtype) -> None:
         )
 
 
+def is_positive_definite(matrix: np.ndarray) -> bool:
+    """Return whether a matrix is finite, symmetric and positive definite, in any units."""
+    diagonal = np.diagonal(matrix)
+    if not np.all(np.isfinite(matrix)) or np.any(diagonal <= 0):
+        return False
+    scale = np.sqrt(diagonal)
+    correlation = matrix / scale[:, None] / scale
+    is_symmetric = np.allclose(correlation, correlation.T, atol=1e-5)
+    return bool(is_symmetric and np.linalg.eigvalsh(correlation)[0] > 0)
+
+
 def all_finite_leaves(tree: PyTree) -> Bool[Array, ""]:
     """Return whether all floating point numbers in the tree are finite."""
     # Integers and static parts are always finite.

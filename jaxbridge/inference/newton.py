@@ -127,8 +127,20 @@ def newton_passes(
 
 def is_maximum(slope: Slope) -> Bool[Array, ""]:
     """Return whether the information is positive definite by more than the Monte Carlo errors."""
-    clear = _NOISE**2 * slope.information - slope.covariance
+    clear, _ = _in_units_of_curvature(_NOISE**2 * slope.information - slope.covariance)
     return jnp.all(jnp.linalg.eigvalsh(jnp.where(jnp.isfinite(clear), clear, -1)) > 0)
+
+
+def _in_units_of_curvature(
+    matrix: Float[Array, "p p"],
+) -> tuple[Float[Array, "p p"], Float[Array, " p"]]:
+    """Return the matrix in units of parameters in which its diagonal is ±1, and these units.
+
+    Then rounding errors of a parameter with large curvature do not hide those of the others.
+    """
+    scale = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))
+    scale = jnp.where((scale > 0) & jnp.isfinite(scale), scale, 1)
+    return matrix / scale[:, None] / scale, scale
 
 
 def falls(slope: Slope, offsets: Float[Array, "2 p p"]) -> Float[Array, "2 p"]:
@@ -175,9 +187,7 @@ def ascent_direction(
     Parameters are scaled such that the curvatures along the axes are ±1. Then the eigenvalues of
     the information are replaced by their absolute values, so every step ascends.
     """
-    scale = jnp.sqrt(jnp.abs(jnp.diagonal(information)))
-    scale = jnp.where((scale > 0) & jnp.isfinite(scale), scale, 1)
-    scaled = information / scale[:, None] / scale
+    scaled, scale = _in_units_of_curvature(information)
     scaled = jnp.where(
         jnp.all(jnp.isfinite(scaled)), scaled, jnp.eye(len(scale), dtype=scale.dtype)
     )

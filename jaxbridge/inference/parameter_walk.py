@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..engine.checks import Numbers, as_floating, is_traced
+from ..engine.checks import Numbers, as_floating, is_positive_definite, is_traced
 from ..engine.linalg import any_cholesky, any_inverse
 from .priors import GivenDensity, NormalDensity
 
@@ -43,8 +43,7 @@ def first_root(
         matrix = jnp.diag(matrix) if matrix.ndim == 1 else matrix
         if not is_traced(matrix):
             array = np.asarray(matrix, float)
-            symmetric = np.allclose(array, array.T, rtol=1e-5)
-            if not (np.all(np.isfinite(array)) and symmetric and np.linalg.eigvalsh(array)[0] > 0):
+            if not is_positive_definite(array):
                 raise ValueError(
                     "`covariance` must be finite, symmetric and positive definite; got "
                     f"{covariance}."

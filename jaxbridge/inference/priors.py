@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from ..engine.arguments import as_returned, check_function, named
 from ..engine.captured import Captured
-from ..engine.checks import as_floating, is_traced
+from ..engine.checks import as_floating, is_positive_definite, is_traced
 from ..engine.compiled import compiled_sooner
 from ..engine.linalg import any_inverse, dot, matvec
 from .parameters import Parameters
@@ -99,9 +99,9 @@ def as_normal(
             f"({p}, {p}) or a pytree like the unknown parameters; got shape {variance.shape}."
         )
     if not is_traced(mean, variance):
-        values = np.asarray(variance)
-        least = np.linalg.eigvalsh(values).min() if values.ndim == 2 else np.min(values)
-        if not (np.all(np.isfinite(np.asarray(mean))) and np.isfinite(least) and least > 0):
+        values = np.asarray(variance, float)
+        matrix = values if values.ndim == 2 else np.diag(np.atleast_1d(values))
+        if not (np.all(np.isfinite(np.asarray(mean))) and is_positive_definite(matrix)):
             raise ValueError(
                 "`prior` must have a finite mean and a positive (definite) variance; got "
                 f"{prior.mean} and {prior.variance}."

@@ -41,8 +41,9 @@ from ..models.tracing import uses_argument
 from .observations import Scalars, log_density_of
 from .tilted_step import NormalStep
 
-# Number of iterations of Newton's method for the mode of ν, from the origin.
-_NEWTON_STEPS = 50
+# Number of iterations of Newton's method for the mode of ν, from the origin or a point up to
+# 2^±`_MOST_DOUBLINGS`.
+_NEWTON_STEPS, _MOST_DOUBLINGS = 50, 40
 # Widths of the laws of the ladder relative to the law at the mode, and number of points of each.
 # About `_ENOUGH` effective points determine a covariance.
 _WIDTHS, _NUM_POINTS, _ENOUGH = 2.0 ** np.arange(8), 128, 10
@@ -191,8 +192,8 @@ def _of_finite_width(model: Diffusion, mode: NormalStep) -> NormalStep:
     width. A column is halved until log ν falls by at most 1 on one of its sides.
     """
     d, dtype = mode.mean.shape[0], mode.mean.dtype
-    is_known = jnp.all(jnp.isfinite(mode.root))
-    root = jnp.where(is_known, mode.root, _WIDEST * jnp.eye(d, dtype=dtype))
+    is_flat = ~jnp.all(jnp.isfinite(mode.root)) & jnp.isfinite(model.log_stationary(mode.mean))
+    root = jnp.where(is_flat, _WIDEST * jnp.eye(d, dtype=dtype), mode.root)
     factors = jnp.asarray(0.5 ** np.arange(_NUM_HALVINGS), dtype)
     log_nu = jax.vmap(lambda x: nan_to_neg_inf(model.log_stationary(x)))
 
@@ -243,7 +244,12 @@ def likeliest(
 
 
 def _law_at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
-    """Return the normal law at the mode of ν, with the curvature of log ν there."""
+    """Return the normal law at the mode of ν, with the curvature of log ν there.
+
+    If Newton's method starts away from the origin (`_begin`) and finds no maximum, as for a density
+    that grows without bound towards an edge, the law is around this beginning and as wide as its
+    distance from the origin.
+    """
     log_nu = model.log_stationary
     eye = jnp.eye(like.shape[0], dtype=like.dtype)
 
@@ -253,15 +259,42 @@ def _law_at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
         off = jnp.sum(jnp.abs(hessian), axis=1) - jnp.abs(jnp.diagonal(hessian))
         least = jnp.min(jnp.diagonal(hessian) - off)
         size = jnp.max(jnp.abs(hessian)) + jnp.finfo(like.dtype).tiny
-        concave = cholesky(hessian)
-        good = jnp.all(jnp.isfinite(concave))
-        return jnp.where(good, hessian, hessian + (0.1 * size - jnp.minimum(least, 0)) * eye)
+        is_concave = jnp.all(jnp.isfinite(cholesky(hessian)))
+        shifted = hessian + (0.1 * size - jnp.minimum(least, 0)) * eye
+        return jnp.where(is_concave, hessian, shifted), is_concave
 
-    def newton(_, x):
-        new_x = x + matvec(inverse(precision(x)), jax.grad(log_nu)(x))
-        return jnp.where(jnp.all(jnp.isfinite(new_x)), new_x, x)
+    def newton(_, state):
+        x, share = state
+        new_x = x + share * matvec(inverse(precision(x)[0]), jax.grad(log_nu)(x))
+        # Shorter steps if this one leaves the support of ν.
+        is_inside = jnp.all(jnp.isfinite(new_x)) & jnp.isfinite(log_nu(new_x))
+        new_share = jnp.where(is_inside, jnp.minimum(2 * share, 1), share / 2)
+        return jnp.where(is_inside, new_x, x), new_share
 
+    begin = _begin(log_nu, like)
+    state = begin, jnp.ones((), like.dtype)
     # The last step gives the mode's derivative by the parameters (implicit function theorem).
-    mode = lax.fori_loop(0, _NEWTON_STEPS, newton, jnp.zeros_like(like))
-    mode = newton(0, lax.stop_gradient(mode))
-    return NormalStep(mode, cholesky(inverse(precision(mode))))
+    state = lax.fori_loop(0, _NEWTON_STEPS, newton, state)
+    mode, _ = newton(0, lax.stop_gradient(state))
+    its_precision, is_maximum = precision(mode)
+    at_mode = NormalStep(mode, cholesky(inverse(its_precision)))
+    around = NormalStep(begin, jnp.diag(jnp.abs(begin)))
+    return jax.tree.map(
+        lambda a, b: jnp.where(is_maximum | jnp.all(begin == 0), a, b), at_mode, around
+    )
+
+
+def _begin(log_nu: Callable[[Array], Array], like: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Return the origin, or if log ν is not smooth there a point where ν has much of its mass.
+
+    This is the best of the points ±2^k (1, ..., 1), for positive states in any unit.
+    """
+    origin = jnp.zeros_like(like)
+    sizes = jnp.asarray(2.0 ** np.arange(-_MOST_DOUBLINGS, _MOST_DOUBLINGS + 1), like.dtype)
+    sizes = jnp.concatenate([sizes, -sizes])
+    points = jnp.broadcast_to(sizes[:, None], (len(sizes), like.shape[0]))
+    # Mass of a ball as wide as its distance from the origin.
+    log_mass = jax.vmap(log_nu)(points) + like.shape[0] * jnp.log(jnp.abs(sizes))
+    best = points[jnp.argmax(nan_to_neg_inf(log_mass))]
+    is_smooth = jnp.isfinite(log_nu(origin)) & jnp.all(jnp.isfinite(jax.grad(log_nu)(origin)))
+    return jnp.where(is_smooth, origin, lax.stop_gradient(best))

@@ -52,6 +52,16 @@ def test_steps_end_in_the_noise():
         assert found == some and np.abs(made.theta[0]) < 5 * noise / information
 
 
+@pytest.mark.parametrize("correlation", [0.9, 1.1])
+def test_parameters_in_very_different_units(correlation):
+    """Curvatures 1e8 to 1e-8, of a maximum and of a saddle."""
+    scale = jnp.array([1e4, 1.0, 1e-4])
+    information = correlation * jnp.ones((3, 3)) + (1 - correlation) * jnp.eye(3)
+    information = information * scale[:, None] * scale
+    zeros = jnp.zeros(3), jnp.zeros((3, 3)), information, jnp.zeros((2, 3))
+    assert bool(is_maximum(Slope(*zeros))) == (correlation < 1)
+
+
 @pytest.mark.parametrize("scale", [1.0, 100.0])
 def test_a_slope_that_levels_off_has_no_maximum(scale):
     """Its maximum is at minus infinity: the gradient vanishes and the information is positive."""

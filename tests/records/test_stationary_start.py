@@ -3,12 +3,14 @@ a grid."""
 
 import functools
 
+import cir
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from grid_filter import grid_filter
-from scipy.stats import norm
+from scipy.special import gammaln
+from scipy.stats import gamma, norm
 
 import jaxbridge as jb
 from jaxbridge.records.initial import initial_law
@@ -66,6 +68,42 @@ def test_curvature_that_vanishes_at_the_mode(power, unit):
         found = jnp.sqrt(jnp.sum(law.root**2, axis=1))
         np.testing.assert_allclose(found, expected, rtol=0.15)
         np.testing.assert_array_less(jnp.abs(law.mean), 0.2 * np.array(expected))
+
+
+def square_root_process(shape, mean):
+    """dX = (mean - X) dt + σ√X dW with this shape of the stationary gamma law."""
+    rate, variance = shape / mean, 2 * mean / shape
+    constant = shape * np.log(rate) - gammaln(shape)
+    return jb.Diffusion(
+        lambda x, p: mean - x,
+        lambda x, p: jnp.sqrt(variance * x) * jnp.ones(1),
+        lambda x, p: jnp.sum((shape - 1) * jnp.log(x) - rate * x) + constant,
+        domain=lambda x, p: x[0] > 0,
+        normalised=True,
+    )
+
+
+@pytest.mark.parametrize("mean", [1e-4, 1.0, 1e5])
+@pytest.mark.parametrize("shape", [0.5, 2.5, 100.0])
+def test_a_law_on_the_half_line(shape, mean):
+    """Mean and width of gamma laws, whose log densities are not finite at the origin."""
+    law = initial_law(jb.Stationary(), square_root_process(shape, mean), jnp.zeros(1))
+    np.testing.assert_allclose(law.mean, [mean], rtol=0.1)
+    np.testing.assert_allclose(law.root, [[mean / np.sqrt(shape)]], rtol=0.1)
+
+
+@pytest.mark.parametrize("mean", [1.0, 1e5])
+def test_likelihood_from_a_law_on_the_half_line(mean):
+    """Of two exact readings: the gamma density times the transition density."""
+    model, readings = square_root_process(2.5, mean), mean * np.array([0.7, 1.1])
+    made = jb.log_likelihood(
+        KEY, model, [0.0, 0.4], readings, observation=jb.LinearGaussian(covariance=0.0),
+        num_steps=8,
+    )  # fmt: skip
+    exact = gamma.logpdf(readings[0], 2.5, scale=mean / 2.5)
+    exact += cir.log_density((1.0, mean, np.sqrt(2 * mean / 2.5)), *readings, 0.4)
+    assert made.trustworthy, made.why()
+    assert abs(made.value - exact) < 4.5 * made.standard_error + abs(made.step_error) + 0.01
 
 
 @pytest.mark.slow
