@@ -71,7 +71,7 @@ class MaximumLikelihood(AbstractResult):
     - `params`: all parameters of the model, with estimates of the unknown ones.
     - `standard_errors`: pytree like the unknown parameters, from the observed information.
     - `monte_carlo_errors`: Monte Carlo errors of the search, in the same form. More `num_bridges`
-        reduce them.
+        reduce them. In addition the search may stop 0.03 standard errors from the maximum.
     - `theta`, `covariance`: the estimate as a vector, shape (p,), and the inverse of the observed
         information, shape (p, p).
     - `step_error`, `step_uncertainty`: estimated discretisation bias of `theta` (estimate minus
