@@ -80,6 +80,9 @@ _LOST = (
     "boundary. If the diffusion attains its boundary (for dX = κ(θ - X) dt + σ√X dW if 2κθ < σ²), "
     "no particle represents these paths."
 )
+# Pilot runs have at most so many filters. More filters are run in batches of this size, so that all
+# stages are one program.
+_BATCH = 8
 
 
 class LogLikelihood(AbstractResult):
@@ -96,12 +99,12 @@ class LogLikelihood(AbstractResult):
     - `log_estimates`: log p̂ of each filter, shape (num_filters,).
     - `effective_sample_size`: effective number of particles at each observation, before resampling,
         mean over the filters, shape (n,); without an `observation` that of each transition.
-    - `pareto_k`: k̂ of the weights of all filters at each observation, shape (n,); without an
-        `observation` that of each transition. Above 0.7 `value` is usually too small by more than
-        `standard_error`. For W < 2,155 weights the limit is 1 - 1 / log10(W). The verdict allows
-        0.1 more, and 1 for nearly equal weights. k̂ is infinite for fewer than 25 weights, unless
-        all are equal.
-    - `num_weights`: W, the number of weights behind each k̂, those of all filters.
+    - `pareto_k`: k̂ of the weights of all filters at each observation, shape (n,): the mean over
+        batches of at most eight filters. Without an `observation` that of each transition. Above
+        0.7 `value` is usually too small by more than `standard_error`. For W < 2,155 weights in a
+        batch the limit is 1 - 1 / log10(W). The verdict allows 0.1 more, and 1 for nearly equal
+        weights. k̂ is infinite for fewer than 25 weights, unless all are equal.
+    - `num_weights`: number of weights at an observation, those of all filters.
     - `num_nonfinite`: number of particles that diverged or left the state space.
     - `step_error`: estimated discretisation bias of `value` (estimate minus limit), from a grid
         with half as many steps. Zero if steps are exact. NaN with one step, unless it is quadratic
@@ -181,9 +184,10 @@ class LogLikelihood(AbstractResult):
     @property
     def _most_k(self) -> Float[Array, " readings"]:
         """Return the bounds on k̂ for so many weights, larger ones for nearly equal weights."""
-        most = largest_reliable_k(self.num_weights) + _LARGEST_OF_MANY
+        num_filters = max(self.log_estimates.shape[0], 1)
+        num_particles = self.num_weights // num_filters
+        most = largest_reliable_k(min(num_filters, _BATCH) * num_particles) + _LARGEST_OF_MANY
         share, most_of_equal = NEARLY_EQUAL
-        num_particles = self.num_weights / self.log_estimates.shape[0]
         is_equal = self.effective_sample_size > share * num_particles
         return jnp.where(is_equal, most_of_equal, most).astype(self.pareto_k.dtype)
 
@@ -371,18 +375,19 @@ _PILOT, _CONFIRMATION, _RUN = range(3)
 def _run_stages(
     key: Key[Array, ""], grids: list[Records], guides: list[Guidance], R: int, P: int
 ) -> tuple[Filtered, Float[Array, ""]]:
-    """Run filters of all records on each grid, with the chosen discount rate.
+    """Run R filters of P particles for all records on each grid, with the chosen discount rate.
 
     Pilot runs choose the rate in the same loop, so that the filter is compiled once.
 
     **Returns:** the filters, with a leading axis of grids, and the rate.
     """
     (arrays, other_leaves), number = stacked(*zip(grids, guides, strict=True)), grids[0].number
-    rates = rates_for(grids[0])
+    rates, num_batches = rates_for(grids[0]), -(-R // _BATCH)
+    batch = -(-R // num_batches)
     pilot_key = key_for("forgetting", key)
-    keys = jnp.stack(
-        [pilot_key, key_for("confirmed", pilot_key), key]
-    )  # indexed by the kind of stage
+    # Indexed by the kind of stage plus the number of the batch.
+    batch_keys = [key, *(jax.random.fold_in(key, i) for i in range(1, num_batches))]
+    keys = jnp.stack([pilot_key, key_for("confirmed", pilot_key), *batch_keys])
 
     @jax.jit  # traced once, for `eval_shape` and for the loop
     def run(grid, rate, key):
@@ -391,15 +396,16 @@ def _run_stages(
 
         def filters(problem, key, guide):
             guide = forgetful(guide, rate)
-            return run_filters(key, problem, problem.model, guide, (R, P), moving)
+            return run_filters(key, problem, problem.model, guide, (batch, P), moving)
 
         return records.each(filters, jax.random.split(key, number), guides)
 
     def stage(best, inputs):
-        grid, rate, kind = inputs
+        grid, rate, kind, number = inputs
 
         def make(best):
-            filtered = run(grid, jnp.where(kind == _PILOT, rate, best.rate), keys[kind])
+            its_rate = jnp.where(kind == _PILOT, rate, best.rate)
+            filtered = run(grid, its_rate, keys[kind + number])
             choices = chosen_of(best, rate, filtered, P), confirmed(best, filtered, P), best
             return jax.tree.map(lambda *leaves: jnp.stack(leaves)[kind], *choices), filtered
 
@@ -411,10 +417,24 @@ def _run_stages(
         is_needless = (kind == _PILOT) & best.settled | (kind == _CONFIRMATION) & (best.rate == 0)
         return lax.cond(is_needless, left_out, make, best)
 
-    kinds = np.array([*len(rates) * [_PILOT], _CONFIRMATION, *len(grids) * [_RUN]])
+    kinds = np.array([*len(rates) * [_PILOT], _CONFIRMATION, *len(grids) * num_batches * [_RUN]])
     # Pilot runs use the grid with half as many steps, if that is enough.
     on_grid = np.where(kinds == _RUN, 0, int(len(grids) > 1 and half_will_do(grids[0])))
-    on_grid[kinds == _RUN] = np.arange(len(grids))
+    on_grid[kinds == _RUN] = np.repeat(np.arange(len(grids)), num_batches)
+    numbers = np.zeros_like(kinds)
+    numbers[kinds == _RUN] = np.tile(np.arange(num_batches), len(grids))
     rates = jnp.pad(rates, (0, len(kinds) - len(rates)))
-    best, filtered = lax.scan(stage, undecided(rates.dtype), (on_grid, rates, kinds))
-    return jax.tree.map(lambda leaf: leaf[kinds == _RUN], filtered), best.rate
+    best, filtered = lax.scan(stage, undecided(rates.dtype), (on_grid, rates, kinds, numbers))
+
+    def of_grids(leaf):
+        """Return the filters of all batches, with leading axes of grids and records."""
+        return leaf[kinds == _RUN].reshape(len(grids), num_batches, *leaf.shape[1:])
+
+    def joined(leaf):
+        leaf = jnp.moveaxis(of_grids(leaf), 1, 2)  # (grids, records, batches, filters, ...)
+        return leaf.reshape(*leaf.shape[:2], -1, *leaf.shape[4:])[:, :, :R]
+
+    pareto_k = jnp.mean(of_grids(filtered.pareto_k), axis=1)
+    return jax.tree.map(joined, filtered._replace(pareto_k=filtered.log_estimate))._replace(
+        pareto_k=pareto_k
+    ), best.rate
