@@ -80,9 +80,9 @@ _LOST = (
     "boundary. If the diffusion attains its boundary (for dX = κ(θ - X) dt + σ√X dW if 2κθ < σ²), "
     "no particle represents these paths."
 )
-# Pilot runs have at most so many filters. More filters are run in batches of this size, so that all
-# stages are one program.
-_BATCH = 8
+# Pilot runs have at most so many filters, or more of few particles. More filters run in batches of
+# this size, so that all stages are one program.
+_BATCH, _PARTICLES = 8, 1000
 
 
 class LogLikelihood(AbstractResult):
@@ -100,7 +100,7 @@ class LogLikelihood(AbstractResult):
     - `effective_sample_size`: effective number of particles at each observation, before resampling,
         mean over the filters, shape (n,); without an `observation` that of each transition.
     - `pareto_k`: k̂ of the weights of all filters at each observation, shape (n,): the mean over
-        batches of at most eight filters. Without an `observation` that of each transition. Above
+        batches of filters. Without an `observation` that of each transition. Above
         0.7 `value` is usually too small by more than `standard_error`. For W < 2,155 weights in a
         batch the limit is 1 - 1 / log10(W). The verdict allows 0.1 more, and 1 for nearly equal
         weights. k̂ is infinite for fewer than 25 weights, unless all are equal.
@@ -186,7 +186,8 @@ class LogLikelihood(AbstractResult):
         """Return the bounds on k̂ for so many weights, larger ones for nearly equal weights."""
         num_filters = max(self.log_estimates.shape[0], 1)
         num_particles = self.num_weights // num_filters
-        most = largest_reliable_k(min(num_filters, _BATCH) * num_particles) + _LARGEST_OF_MANY
+        in_batch = -(-num_filters // _num_batches(num_filters, num_particles))
+        most = largest_reliable_k(in_batch * num_particles) + _LARGEST_OF_MANY
         share, most_of_equal = NEARLY_EQUAL
         is_equal = self.effective_sample_size > share * num_particles
         return jnp.where(is_equal, most_of_equal, most).astype(self.pareto_k.dtype)
@@ -371,6 +372,11 @@ def _exact_log_likelihood(
 _PILOT, _CONFIRMATION, _RUN = range(3)
 
 
+def _num_batches(num_filters: int, num_particles: int) -> int:
+    """Return the number of batches of filters."""
+    return -(-num_filters // max(_BATCH, _PARTICLES // max(num_particles, 1)))
+
+
 @compiled_sooner
 def _run_stages(
     key: Key[Array, ""], grids: list[Records], guides: list[Guidance], R: int, P: int
@@ -382,12 +388,13 @@ def _run_stages(
     **Returns:** the filters, with a leading axis of grids, and the rate.
     """
     (arrays, other_leaves), number = stacked(*zip(grids, guides, strict=True)), grids[0].number
-    rates, num_batches = rates_for(grids[0]), -(-R // _BATCH)
+    rates, num_batches = rates_for(grids[0]), _num_batches(R, P)
     batch = -(-R // num_batches)
     pilot_key = key_for("forgetting", key)
     # Indexed by the kind of stage plus the number of the batch.
-    batch_keys = [key, *(jax.random.fold_in(key, i) for i in range(1, num_batches))]
-    keys = jnp.stack([pilot_key, key_for("confirmed", pilot_key), *batch_keys])
+    keys = jnp.stack([pilot_key, key_for("confirmed", pilot_key), key])
+    later_batches = jnp.arange(1, num_batches)
+    keys = jnp.concatenate([keys, jax.vmap(jax.random.fold_in, (None, 0))(key, later_batches)])
 
     @jax.jit  # traced once, for `eval_shape` and for the loop
     def run(grid, rate, key):
@@ -401,11 +408,11 @@ def _run_stages(
         return records.each(filters, jax.random.split(key, number), guides)
 
     def stage(best, inputs):
-        grid, rate, kind, number = inputs
+        grid, rate, kind, which_batch = inputs
 
         def make(best):
             its_rate = jnp.where(kind == _PILOT, rate, best.rate)
-            filtered = run(grid, its_rate, keys[kind + number])
+            filtered = run(grid, its_rate, keys[kind + which_batch])
             choices = chosen_of(best, rate, filtered, P), confirmed(best, filtered, P), best
             return jax.tree.map(lambda *leaves: jnp.stack(leaves)[kind], *choices), filtered
 
@@ -421,20 +428,18 @@ def _run_stages(
     # Pilot runs use the grid with half as many steps, if that is enough.
     on_grid = np.where(kinds == _RUN, 0, int(len(grids) > 1 and half_will_do(grids[0])))
     on_grid[kinds == _RUN] = np.repeat(np.arange(len(grids)), num_batches)
-    numbers = np.zeros_like(kinds)
-    numbers[kinds == _RUN] = np.tile(np.arange(num_batches), len(grids))
+    which_batch = np.zeros_like(kinds)
+    which_batch[kinds == _RUN] = np.tile(np.arange(num_batches), len(grids))
     rates = jnp.pad(rates, (0, len(kinds) - len(rates)))
-    best, filtered = lax.scan(stage, undecided(rates.dtype), (on_grid, rates, kinds, numbers))
+    best, filtered = lax.scan(stage, undecided(rates.dtype), (on_grid, rates, kinds, which_batch))
 
-    def of_grids(leaf):
-        """Return the filters of all batches, with leading axes of grids and records."""
-        return leaf[kinds == _RUN].reshape(len(grids), num_batches, *leaf.shape[1:])
+    by_batch = lambda leaf: leaf[kinds == _RUN].reshape(len(grids), num_batches, *leaf.shape[1:])
 
     def joined(leaf):
-        leaf = jnp.moveaxis(of_grids(leaf), 1, 2)  # (grids, records, batches, filters, ...)
+        """Join the filters of all batches. `leaf` has axes of grids, batches, records, filters."""
+        leaf = jnp.moveaxis(leaf, 1, 2)
         return leaf.reshape(*leaf.shape[:2], -1, *leaf.shape[4:])[:, :, :R]
 
-    pareto_k = jnp.mean(of_grids(filtered.pareto_k), axis=1)
-    return jax.tree.map(joined, filtered._replace(pareto_k=filtered.log_estimate))._replace(
-        pareto_k=pareto_k
-    ), best.rate
+    log_estimate, size, pareto_k, num_nonfinite = jax.tree.map(by_batch, filtered)
+    of_all = joined(log_estimate), joined(size), jnp.mean(pareto_k, axis=1), joined(num_nonfinite)
+    return Filtered(*of_all), best.rate
