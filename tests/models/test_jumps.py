@@ -94,7 +94,7 @@ def test_a_map_sees_inputs_and_parameters():
         (([], []), "J ≥ 1"),
         ((1.0, 2.0), "shape (J,)"),
         (([1.0, 0.0], [1.0, 1.0]), "Sort them with their `inputs`"),
-        (([1.0, 1.0], [1.0, 1.0]), "add the inputs of equal times"),
+        (([1.0, 1.0], [1.0, 1.0]), "combine jumps at equal times"),
         (([np.nan], [1.0]), "must be finite"),
         (([0.0, 1.0], [1.0]), "one row per time"),
         (([0.0], [np.nan]), "finite"),
