@@ -10,7 +10,7 @@ from ..engine.entry import public_entry
 from ..models.diffusion import Diffusion
 from ..models.jumps import JumpsLike
 from .forecast import forecast
-from .initial import Initial, bound
+from .initial import Initial, as_initial, bound
 from .observations import AbstractObservation
 from .record import as_rows
 
@@ -62,7 +62,7 @@ def simulate_observations(
     """
     check_key(key)
     rows = as_rows(observations)
-    is_stationary = initial is None or isinstance(bound(initial, model), Stationary)
+    is_stationary = initial is None or isinstance(bound(as_initial(initial), model), Stationary)
     num_paths = _NUM_STATIONARY if is_stationary else 2
     path_key, pick_key = jax.random.split(key)
     # Without readings each particle is a path of the model, with readings.
