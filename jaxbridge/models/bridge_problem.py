@@ -168,10 +168,11 @@ def as_intervals(start: Numbers, end: Numbers, duration: Numbers) -> tuple[Inter
         )
     num_intervals = max(lengths, default=1)
     d = points["start"].shape[-1]
+    # Conversion first: then a Python number compiles what an array does.
     intervals = Intervals(
-        jnp.broadcast_to(points["start"], (num_intervals, d)).astype(dtype),
-        jnp.broadcast_to(points["end"], (num_intervals, d)).astype(dtype),
-        jnp.broadcast_to(duration, (num_intervals,)).astype(dtype),
+        jnp.broadcast_to(points["start"].astype(dtype), (num_intervals, d)),
+        jnp.broadcast_to(points["end"].astype(dtype), (num_intervals, d)),
+        jnp.broadcast_to(duration.astype(dtype), (num_intervals,)),
     )
     return intervals, bool(lengths), duration.ndim == 1
 
