@@ -246,8 +246,8 @@ def likeliest(
 def _law_at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     """Return the normal law at the mode of ν, with the curvature of log ν there.
 
-    If Newton's method starts away from the origin (`_begin`) and finds no maximum, as for a density
-    that grows without bound towards an edge, the law is around this beginning and as wide as its
+    Newton's method finds no maximum of a density that grows without bound towards an edge. If it
+    started away from the origin (`_begin`), the law is then around this beginning. Its width is the
     distance from the origin.
     """
     log_nu = model.log_stationary
