@@ -44,6 +44,7 @@ def _seconds_compiled() -> list[float]:
 
 def timed_once_compiled(function: Callable[[], T]) -> tuple[T, float]:
     """Time a call that always compiles, like `timed`, without the seconds of compilation."""
+    # The listener adds to this list while the function runs.
     total = _seconds_compiled()
     before = total[0]
     result, seconds = timed(function)
@@ -52,6 +53,7 @@ def timed_once_compiled(function: Callable[[], T]) -> tuple[T, float]:
 
 def fastest(function: Callable[[], T], repeats: int = 3) -> tuple[T, float]:
     """Return the result and the seconds of the fastest of `repeats` runs."""
+    # Other work on the machine only makes runs longer.
     return min((timed(function) for _ in range(repeats)), key=lambda run: run[1])
 
 

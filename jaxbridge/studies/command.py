@@ -81,6 +81,7 @@ class Command(NamedTuple):
         options = parser.parse_args(arguments)
         try:
             options.out.mkdir(parents=True, exist_ok=True)
+            # A study may run for minutes: find out now whether its results can be written.
             with tempfile.TemporaryFile(dir=options.out):
                 pass
         except OSError as error:
@@ -91,6 +92,7 @@ class Command(NamedTuple):
         """Run one study, print its tables, and return the files that were written."""
         print(f"{study.title}{_QUICK if options.quick else ''}\n")
         results = study.run(jax.random.key(options.seed), options.quick, _show_progress)
+        # The tables start on a line of their own.
         _end_progress()
         print(f"{study.tables(results)}\n\n{study.what_to_see}\n")
         written = []
@@ -102,6 +104,7 @@ class Command(NamedTuple):
                 path.write_text(before + text, encoding="utf-8")
             written.append(file)
         try:
+            # matplotlib is an extra.
             figures = importlib.import_module(self.figures)
         except ImportError as error:
             print(f"no pictures: {error}\n")
@@ -119,6 +122,7 @@ class Command(NamedTuple):
         If the file cannot be written, end the program with one line. No partial file is left, and
         earlier files and tables stay.
         """
+        # A rename in the same folder replaces the file at once.
         partial = path.with_name(f".{path.name}")
         try:
             yield partial

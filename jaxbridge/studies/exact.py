@@ -27,6 +27,7 @@ Ends = tuple[Point, Point]
 UNLIKELY: Ends = ((0.785, 0.785), (1.091, 1.091))
 VERY_UNLIKELY: Ends = ((2.0, -2.0), (3.0, -3.0))
 _GAMMA = 0.5
+# Steps of all paths in [0, 1], as in the paper.
 _NUM_STEPS = 50
 # Share of proposals of the unlikely bridge that meet at this γ, from the approximate study.
 _SHARE_MET = 0.811
@@ -85,6 +86,7 @@ def run_exact(key: Key[Array, ""], scale: float, say: Say) -> list[ExactResult]:
     """
     # ν as a Gaussian law: the very unlikely bridge has another one, and shares all programs.
     coupling = jb.Coupling(_GAMMA, start_law=stationary_law())
+    # The chain of the paper, with the start law that it prints.
     published = jb.Coupling.as_published(_GAMMA)
     runs = [
         (UNLIKELY, "pseudo-marginal", 50_000, coupling, "44"),
@@ -108,6 +110,7 @@ def run_exact(key: Key[Array, ""], scale: float, say: Say) -> list[ExactResult]:
 
     say("fitting a start law, and compiling all methods")
     law, *_ = compile_side_by_side([fit, *(partial(compiling, i) for i in range(len(runs)))])
+    # Pairs for the very unlikely bridge hardly ever meet from ν.
     fitted = jb.Coupling(_GAMMA, start_law=law)
     runs += [
         (VERY_UNLIKELY, "pseudo-marginal", 50_000, fitted, ""),
@@ -117,6 +120,7 @@ def run_exact(key: Key[Array, ""], scale: float, say: Say) -> list[ExactResult]:
     results = []
     for i, (ends, method, iterations, _, paper_seconds) in enumerate(runs):
         say(f"{_words(ends)}, {method}")
+        # All programs are compiled, so this is the time of the run alone.
         timed_run = timed(partial(simulate, i, None))
         results.append(_result(timed_run, ends, method, round(iterations * scale), paper_seconds))
     return results
@@ -155,6 +159,7 @@ def _chain(
         proposal=coupling,
         method=method,
         max_proposals=max_proposals,
+        # Points half way are enough, and save memory.
         save_at=[0.5],
     )
     return np.asarray(chain.paths[:, 0]), None, float(chain.num_simulated)
@@ -176,6 +181,7 @@ def _weights(key, model, ends: Ends, iterations, coupling, max_proposals):
         max_proposals=max_proposals,
     )
     weighted = jb.weigh_bridges(key, model, bridges)
+    # Time 1/2, where the condition at both ends matters most.
     middle = np.asarray(weighted.paths[:, _NUM_STEPS // 2])
     weights = np.asarray(weighted.weights, float)
     return middle, weights, float(weighted.num_simulated)
@@ -188,11 +194,13 @@ def _judge(middle, weights, law: jb.GaussianLaw) -> tuple[Any, Fit, Any, float]:
     if weights is None:
         fit, sizes = compare(middle, law), np.asarray(jb.effective_sample_size(middle))
         return middle, fit, deviations.std(0) / np.sqrt(sizes), float(sizes.min())
+    # Deviations are means under the weights; samples are for the pictures.
     weights = weights / weights.sum()
     mean = weights @ deviations
     spread = np.sqrt(weights @ (deviations - mean) ** 2)
     indices = np.random.default_rng(0).choice(len(middle), size=len(middle), p=weights)
     fit = Fit(mean, spread - 1, compare(middle[indices], law).ks_distance)
+    # Standard error of a self-normalised mean.
     error = np.sqrt(weights**2 @ (deviations - mean) ** 2)
     return middle[indices], fit, error, float(1 / (weights**2).sum())
 
@@ -210,6 +218,7 @@ def run_variation(key: Key[Array, ""], num_bridges: int, say: Say) -> list[Varia
         return [partial(_variation, key, model, ends, *law, num_bridges) for law in laws]
 
     say("compiling the variation of 1/pi")
+    # γ and the ends are traced, so these two programs serve all rows.
     compile_side_by_side(of_both_laws(UNLIKELY, 0.0))
     for name, ends in bridges.items():
         for gamma in (0.0, 0.5, 0.9, 0.99):
@@ -277,6 +286,7 @@ def run_cost(
 
 def slope(costs: Sequence[Cost]) -> float:
     """Fit the exponent p of seconds ∝ T^p, from T = 10 on."""
+    # On shorter intervals acceptance still changes with T.
     long = np.array([(c.duration, c.seconds) for c in costs if c.duration >= 10])
     duration, seconds = np.log(long).T
     return float(np.polyfit(duration, seconds, 1)[0])
@@ -290,6 +300,7 @@ def draw_as_many(key: Key[Array, ""], result: ExactResult) -> Floor:
     """
     proposals = result.iterations / _SHARE_MET
     trials = result.simulated * result.iterations - proposals
+    # About as many lanes as the samplers have in a batch.
     lanes = 8_192
     rounds = max(1, round(proposals / lanes)), max(1, round(trials / lanes))
 
@@ -309,6 +320,7 @@ def draw_as_many(key: Key[Array, ""], result: ExactResult) -> Floor:
             )
         return total
 
+    # The first call compiles.
     timed(lambda: run(key))
     _, seconds = fastest(lambda: run(key))
     return Floor(_NUM_STEPS * lanes * (4 * rounds[0] + 2 * rounds[1]), seconds)

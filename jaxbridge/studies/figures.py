@@ -51,10 +51,12 @@ def variation(results: Sequence[Any]) -> Figure:
     figure = Figure(figsize=(3.6 * len(bridges), 3.4), layout="constrained")
     for ax, bridge in zip(figure.subplots(1, len(bridges), squeeze=False)[0], bridges, strict=True):
         group = [result for result in results if result.bridge == bridge]
+        # Values of γ are far from equally spaced.
         place = np.arange(len(group))
         for i, (label, name) in enumerate([("ν", "right"), ("as printed", "published")]):
             variations = [getattr(result, name) for result in group]
             ratio = [float(v.ratio) for v in variations]
+            # Bars of two standard errors hold about 95 %.
             error = [2 * float(v.ratio_error) for v in variations]
             style = {"color": COLOURS[i], "marker": MARKERS[i], "capsize": 3, "markersize": 5}
             ax.errorbar(place + 0.08 * i, ratio, error, label=label, **style)

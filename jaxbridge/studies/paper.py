@@ -21,6 +21,7 @@ from .clock import compile_side_by_side, timed
 from .report import Say, Study, silent, table
 
 Point = tuple[float, float]
+# Symmetric, so the process is reversible.
 _B = np.array([[1.5, 1.0], [1.0, 1.5]])
 
 
@@ -107,6 +108,7 @@ def run_study(
     """Run every case by every method, in the order of the table."""
     runs = list(itertools.product(cases, METHODS))
     say("compiling")
+    # γ is traced, but γ = -1 (independent motions) is a program of its own.
     kinds = {(case.gamma == -1, method): (case, method) for case, method in runs}
     compile_side_by_side([partial(_bridges, key, *run, num_bridges, 1) for run in kinds.values()])
     results = []
@@ -122,7 +124,9 @@ def run_case(key: Key[Array, ""], case: Case, method: str, num_bridges: int) -> 
     **Raises:** `RuntimeError` if a bridge is missing or misses an end point.
     """
     result, seconds = timed(lambda: _bridges(key, case, method, num_bridges, None))
+    # Saved are both ends and time 1/2.
     first, middle, last = np.moveaxis(np.asarray(result.paths), 1, 0)
+    # In the precision of the paths, so that the comparison may be exact.
     ends = np.array([case.start, case.end], first.dtype)
     if not (np.all(first == ends[0]) and np.all(last == ends[1])):
         raise RuntimeError(f"not all paths are bridges {case.bridge}: {case}, {method}.")

@@ -40,6 +40,7 @@ def silent(what: str) -> None:
 
 def table(titles: Row, rows: Iterable[Row], words: int = 1) -> str:
     """Lay out rows under titles as plain text; the first `words` columns are left-aligned."""
+    # An entry that repeats the one above is left blank.
     lines = [titles, *_unrepeated(rows)]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     head, *body = (
