@@ -43,7 +43,7 @@ def simulate_observations(
     - `key`: a typed key.
     - `model`: the diffusion at fixed parameters.
     - `times`, `observation`, `initial`, `num_steps`, `step_size`, `initial_time`, `jumps`: as in
-        `forecast`, for one record.
+        `forecast`, for one record. Use short steps, because their error is not reported.
     - `observations`: the record, or any numbers of its shape. Simulated ones have its shape and its
         missing values; other values do not matter.
 
