@@ -37,7 +37,7 @@ from .cover import cover, covered_start
 from .guided_record import correction
 from .guided_steps import Guide, end_of_step, guided_law, guided_start
 from .initial import Initial, calls_for_cover, initial_law
-from .observations import AbstractObservation, Scalars
+from .observations import AbstractObservation, Scalars, missing_like
 from .problem import RecordProblem
 from .record import as_times_and_rows, check_is_one
 from .segments import split_first, split_last
@@ -415,7 +415,7 @@ def _run(
         x, _ = lax.scan(one, x, (noise[:-2], before))
         # Without a reading both are the same step, so that later draws are paths.
         repeated = jnp.where(jnp.any(scalars.seen), noise[-1], noise[-2])
-        predicted, _ = take(x, noise[-2], last, _missing(scalars))
+        predicted, _ = take(x, noise[-2], last, missing_like(scalars))
         after, log_weight = take(x, repeated, last, scalars)
         return read(read_key, predicted, after, log_weight, row)
 
@@ -443,7 +443,7 @@ def _starts(key, problem: RecordProblem, first: Scalars, nothing: Information, P
     zeros = jnp.zeros(d, dtype)
     if not calls_for_cover(problem.initial, model, problem.like):
         law = lambda scalars: guided_start(normal, scalars, zeros, nothing)
-        x, _ = over_lanes(-1)(law(_missing(first)).point_and_log_weight)(zeta)
+        x, _ = over_lanes(-1)(law(missing_like(first)).point_and_log_weight)(zeta)
         after, log_weight = over_lanes(-1)(law(first).point_and_log_weight)(repeated)
         return x, after, log_weight
     law = cover(model, normal)
@@ -456,12 +456,6 @@ def _starts(key, problem: RecordProblem, first: Scalars, nothing: Information, P
     log_weight = given.log_integral + law.log_ratio(model, x)
     is_read = jnp.any(first.seen)
     return predicted, jnp.where(is_read, x, predicted), jnp.where(is_read, log_weight, 0)
-
-
-def _missing(scalars: Scalars) -> Scalars:
-    """Return the same scalars as if all were missing."""
-    zeros = [jnp.zeros_like(leaf) for leaf in scalars]
-    return Scalars(*zeros)._replace(variances=jnp.ones_like(scalars.variances))
 
 
 def _rank(key, y: Float[Array, " m"], draws: Float[Array, "P m"]) -> Float[Array, " m"]:

@@ -168,9 +168,9 @@ def is_normal(model: Diffusion, like: Float[Array, " d"]) -> bool:
 def _stationary(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
     """Return ν if it is normal, otherwise the normal law with its mean and covariance."""
     model = model.prepared()
-    mode = _law_at_mode(model, like)
-    if is_normal(model, like):
-        return mode
+    if is_normal(model, like):  # then log ν is smooth at the origin
+        return _law_at_mode(model, jnp.zeros_like(like))
+    mode = _law_at_mode(model, _begin(model.log_stationary, like))
     mode = _of_finite_width(model, mode)
     points, log_weights = ladder(model, mode)
     weights = normalise_weights(log_weights)
@@ -243,22 +243,22 @@ def likeliest(
     return jnp.where(any_positive, points[best], normal.mean)
 
 
-def _law_at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
+def _law_at_mode(model: Diffusion, begin: Float[Array, " d"]) -> NormalStep:
     """Return the normal law at the mode of ν, with the curvature of log ν there.
 
     Newton's method finds no maximum of a density that grows without bound towards an edge. If it
-    started away from the origin (`_begin`), the law is then around this beginning. Its width is the
-    distance from the origin.
+    starts away from the origin, the law is then around this beginning. Its width is the distance
+    from the origin.
     """
-    log_nu = model.log_stationary
-    eye = jnp.eye(like.shape[0], dtype=like.dtype)
+    log_nu, dtype = model.log_stationary, begin.dtype
+    eye = jnp.eye(begin.shape[0], dtype=dtype)
 
     def precision(x):
         hessian = -jax.hessian(log_nu)(x)
         # If log ν is not concave here, Gershgorin's bound shifts the eigenvalues above zero.
         off = jnp.sum(jnp.abs(hessian), axis=1) - jnp.abs(jnp.diagonal(hessian))
         least = jnp.min(jnp.diagonal(hessian) - off)
-        size = jnp.max(jnp.abs(hessian)) + jnp.finfo(like.dtype).tiny
+        size = jnp.max(jnp.abs(hessian)) + jnp.finfo(dtype).tiny
         is_concave = jnp.all(jnp.isfinite(cholesky(hessian)))
         shifted = hessian + (0.1 * size - jnp.minimum(least, 0)) * eye
         return jnp.where(is_concave, hessian, shifted), is_concave
@@ -271,8 +271,7 @@ def _law_at_mode(model: Diffusion, like: Float[Array, " d"]) -> NormalStep:
         new_share = jnp.where(is_inside, jnp.minimum(2 * share, 1), share / 2)
         return jnp.where(is_inside, new_x, x), new_share
 
-    begin = _begin(log_nu, like)
-    state = begin, jnp.ones((), like.dtype)
+    state = begin, jnp.ones((), dtype)
     # The last step gives the mode's derivative by the parameters (implicit function theorem).
     state = lax.fori_loop(0, _NEWTON_STEPS, newton, state)
     mode, _ = newton(0, lax.stop_gradient(state))

@@ -40,7 +40,7 @@ from .guided_steps import Guide, end_of_step, guided_law, guided_start
 from .information_filter import information_filter
 from .initial import log_ratio
 from .linearisation import LinearisedStep
-from .observations import Row, Scalars
+from .observations import Row, Scalars, missing_like
 from .problem import RecordProblem
 from .record import Steps
 from .segments import flat, following, split_last
@@ -201,16 +201,6 @@ def blocks_of(
         jnp.where(is_first, guide.initial.root[..., None], 0),
         guide.initial.mean,
         goes_on,
-    )
-
-
-def missing_like(scalars: Scalars) -> Scalars:
-    """Return scalars of the same shape, all missing."""
-    return Scalars(
-        jnp.zeros_like(scalars.rows),
-        jnp.zeros_like(scalars.values),
-        jnp.ones_like(scalars.variances),
-        jnp.zeros_like(scalars.seen),
     )
 
 

@@ -445,7 +445,7 @@ _DETAILS = """\
 
 **Rare events**
 
-- Simulation counts passages at the points of a path only, so it is too small by 13 % for the level
+- Simulation counts passages at the points of a path only, so it is too small by 12 % for the level
   2. The levels of `sample_exits` take passages between two points into account.
 - For the two rarest events 100,000 paths have the event twice, or never.
 """

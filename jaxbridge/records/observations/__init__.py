@@ -8,6 +8,7 @@ from .base import (
     check_observation as check_observation,
     log_density_of as log_density_of,
     matrix_for as matrix_for,
+    missing_like as missing_like,
 )
 from .censored import Censored as Censored
 from .components import AbstractComponents as AbstractComponents

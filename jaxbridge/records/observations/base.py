@@ -33,6 +33,16 @@ class Scalars(NamedTuple):
     seen: Bool[Array, " m"]
 
 
+def missing_like(scalars: Scalars) -> Scalars:
+    """Return scalars of the same shape, all missing."""
+    return Scalars(
+        jnp.zeros_like(scalars.rows),
+        jnp.zeros_like(scalars.values),
+        jnp.ones_like(scalars.variances),
+        jnp.zeros_like(scalars.seen),
+    )
+
+
 class Row(NamedTuple):
     """Observation y at one time, NaN for missing components, and the time."""
 
